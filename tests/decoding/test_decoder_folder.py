@@ -133,10 +133,16 @@ def test_the_weights_of_another_size_are_refused(folder: Path) -> None:
 
 def test_the_latents_of_another_encoder_are_refused(whole_decoder: Path, base_folder: Path) -> None:
     decoder = load_decoder(whole_decoder)
-    decoder.require_encoder(WorldModel.from_pretrained(base_folder), subject="run")
+    decoder.require_fit(WorldModel.from_pretrained(base_folder), "released", subject="run")
     other = WorldModel.random(ModelSizes.model_validate(TINY), seed=4)
     with pytest.raises(InputError, match=r"another encoder than that of run.*vjepa2-ac decoder CONFIG"):
-        decoder.require_encoder(other, subject="run")
+        decoder.require_fit(other, "released", subject="run")
+
+
+def test_frames_that_are_cut_otherwise_are_refused(whole_decoder: Path, base_folder: Path) -> None:
+    decoder = load_decoder(whole_decoder)
+    with pytest.raises(InputError, match=r"data\.crop released.*square, as of run"):
+        decoder.require_fit(WorldModel.from_pretrained(base_folder), "square", subject="run")
 
 
 def test_a_model_of_other_sizes_is_refused_even_with_these_weights(whole_decoder: Path) -> None:
@@ -145,4 +151,4 @@ def test_a_model_of_other_sizes_is_refused_even_with_these_weights(whole_decoder
     decoder = load_decoder(whole_decoder)
     same = replace(decoder, card=replace(decoder.card, encoder=larger.encoder_fingerprint()))
     with pytest.raises(InputError, match="4x24 latents to images of 32 px"):
-        same.require_encoder(larger, subject="run")
+        same.require_fit(larger, "released", subject="run")

@@ -123,7 +123,7 @@ def test_from_a_cache_nothing_is_said_about_the_truth(config: Config, decoder: s
 
 @pytest.mark.parametrize(
     ("changed", "words"),
-    [({"encoder": "another"}, "another encoder"), ({"crop": "square"}, "cropped as 'square'")],
+    [({"encoder": "another"}, "another encoder"), ({"crop": "square"}, "data.crop square")],
 )
 def test_a_decoder_that_does_not_fit_is_refused(
     changed: dict[str, str], words: str, config: Config, tmp_path: Path

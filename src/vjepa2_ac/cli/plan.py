@@ -92,7 +92,7 @@ def _plan(options: argparse.Namespace) -> int:
     decoder = given_decoder(options)
     session = load_planning_session(options)
     if decoder is not None:
-        decoder.require_encoder(session.world_model, subject=options.subject)
+        decoder.require_fit(session.world_model, session.config.data.crop, subject=options.subject)
     if not options.durations:
         request = request.with_equal_durations(session.config.planning.horizon)
     with ConsoleReporter() as reporter:

@@ -73,11 +73,11 @@ class TrainedDecoder:
         """Return its name and its encoder's fingerprint, for a JSON of what it has shown."""
         return {"name": self.name, "encoder": self.card.encoder}
 
-    def require_encoder(self, world_model: WorldModel, *, subject: str) -> None:
-        """Refuse a model with another encoder than the decoder's.
+    def require_fit(self, world_model: WorldModel, crop: str, *, subject: str) -> None:
+        """Refuse a model with another encoder than the decoder's, and frames that are cut otherwise (`data.crop`).
 
         Raises:
-            InputError: It has.
+            InputError: One of them is another.
         """
         shape = self.card.shape
         sizes = (world_model.num_tokens, world_model.latent_dim, world_model.image_size)
@@ -94,6 +94,13 @@ class TrainedDecoder:
                 found=f"the decoder of another encoder than that of {subject}",
                 needed="one that was trained on the latents of this encoder: others would be read wrongly",
                 fix="Train one with `vjepa2-ac decoder CONFIG`, on the config of this model",
+            )
+        if crop != self.card.crop:
+            raise InputError(
+                where=f"{self.where} {self.name}",
+                found=f"a decoder of frames with data.crop {self.card.crop}",
+                needed=f"{crop}, as of {subject}: frames that are cut otherwise look otherwise to it",
+                fix="Train a decoder with this data.crop",
             )
 
 

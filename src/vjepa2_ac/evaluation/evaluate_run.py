@@ -27,7 +27,7 @@ from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.decoded.record import NEIGHBOURS, TRUE_FRAMES
 from vjepa2_ac.evaluation.decoded_rollouts.measure import measure_decoded
-from vjepa2_ac.evaluation.decoded_rollouts.setup import HandsOf, decoding_of, require_fitting
+from vjepa2_ac.evaluation.decoded_rollouts.setup import HandsOf, decoding_of
 from vjepa2_ac.evaluation.evaluate import ClipName, Contender, FramesOfRow, RepeatableClips, evaluate
 from vjepa2_ac.evaluation.measure import ClipSample
 from vjepa2_ac.evaluation.request import EvaluationOptions, settle
@@ -95,7 +95,7 @@ def measure_subject(
     world_model = run.world_model if run else load_model(subject, config)
     require_widths(world_model, dataset.widths, where=subject)
     if decoder is not None:
-        require_fitting(decoder, world_model, config, subject=subject)
+        decoder.require_fit(world_model, config.data.crop, subject=subject)
     through_cache = with_latents_if_there(config, dataset, world_model)
     contenders, notes = contenders_of(subject, config, run, world_model, asked)
     if through_cache.config.is_cache and not asked.calibrate:

@@ -98,7 +98,7 @@ def imagine_clip(subject: str, asked: ImagineOptions, *, reporter: Reporter = SI
     run = load_run(Path(subject), asked.evaluation.checkpoint) if is_run(subject) else None
     world_model = run.world_model if run else load_model(subject, config)
     require_widths(world_model, dataset.widths, where=subject)
-    decoder.require_encoder(world_model, subject=subject)
+    decoder.require_fit(world_model, config.data.crop, subject=subject)
     contenders, _ = contenders_of(subject, config, run, world_model, asked.evaluation)
     for each in contenders:
         if isinstance(each.model, WorldModel):

@@ -56,7 +56,7 @@ def imagine_image(
     """
     model, config = session.world_model, session.config
     decoder = load_decoder(decoder_name)
-    decoder.require_encoder(model, subject=session.subject)
+    decoder.require_fit(model, config.data.crop, subject=session.subject)
     decoder.to(model.device)
     space = measured_space(config.data, len(seen.state))
     if not space.is_pose or space.frame == CAMERA_POSE.frame:

@@ -29,7 +29,7 @@ from vjepa2_ac.distributed.launch import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, require_widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.decoded.hand import HandPositions, HandProbe
-from vjepa2_ac.evaluation.decoded_rollouts.setup import fitted_probe, require_fitting
+from vjepa2_ac.evaluation.decoded_rollouts.setup import fitted_probe
 from vjepa2_ac.evaluation.evaluate import Contender
 from vjepa2_ac.evaluation.evaluate_run import contenders_of, load_model
 from vjepa2_ac.evaluation.request import EvaluationOptions, settle
@@ -118,7 +118,7 @@ def measure_sides(subject: str, asked: SidesOptions, *, reporter: Reporter = SIL
     run = load_run(Path(subject), asked.evaluation.checkpoint) if is_run(subject) else None
     world_model = run.world_model if run else load_model(subject, config)
     require_widths(world_model, dataset.widths, where=subject)
-    require_fitting(decoder, world_model, config, subject=subject)
+    decoder.require_fit(world_model, config.data.crop, subject=subject)
     positions = hand_positions(dataset, world_model.image_size)
     if isinstance(positions, str) or config.data.is_cache:
         found = positions if isinstance(positions, str) else "latents of a cache, which has no frames"

@@ -180,7 +180,7 @@ def open_model(data: RunData, reporter: Reporter = SILENT, *, check_only: bool =
     world_model = data.world_model or load_base(config.model, seed=config.seed)
     extrinsics_for(world_model, data.first_clip)
     if data.decoder is not None:
-        data.decoder.require_encoder(world_model, subject=str(config.model.base or "the random model"))
+        data.decoder.require_fit(world_model, config.data.crop, subject=str(config.model.base or "the random model"))
     dataset = with_latents(config, data.dataset, world_model, accelerator, reporter, check_only=check_only)
     replayed = data.replayed
     if replayed is not None:

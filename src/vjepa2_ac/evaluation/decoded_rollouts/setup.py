@@ -7,13 +7,11 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from vjepa2_ac.config import Config
 from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.data.clips.loader import batches_of, validation_windows
 from vjepa2_ac.data.clips.transforms import input_to_pixels, pixels_to_input
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
 from vjepa2_ac.decoding.frame_pairs import as_images
-from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.decoded.hand import HandPositions, HandProbe, fit_hand_probe
 from vjepa2_ac.evaluation.decoded_rollouts.measure import CACHE, Decoding, HandReader
 from vjepa2_ac.model.network.world_model import WorldModel
@@ -24,26 +22,6 @@ HandsOf = Callable[[Dataset, int], HandPositions | str]
 _NOBODY = "nobody says where the hand is in these data"
 _BATCH = 16
 MOST_CLIPS = 255  # of the training split, for the probe: so few are read without worker processes
-
-
-def require_fitting(decoder: TrainedDecoder, world_model: WorldModel, config: Config, *, subject: str) -> None:
-    """Refuse a decoder that would show other latents than it was trained on.
-
-    Raises:
-        InputError: Encoder, image size or crop differ.
-    """
-    decoder.require_encoder(world_model, subject=subject)
-    card, where = decoder.card, f"{decoder.where} {decoder.name}"
-    if card.shape.image_size != world_model.image_size:
-        found, needed = card.shape.image_size, world_model.image_size
-        raise InputError(where=where, found=f"images of {found} px", needed=f"{needed} px, as {subject} sees")
-    if card.crop != config.data.crop:
-        raise InputError(
-            where=where,
-            found=f"frames cropped as {card.crop!r}",
-            needed=f"{config.data.crop!r}, as data.crop of {subject}: frames cut otherwise look otherwise to it",
-            fix="Train a decoder with this data.crop",
-        )
 
 
 def decoding_of(decoder: TrainedDecoder, world_model: WorldModel, dataset: Dataset, hands: HandsOf | None) -> Decoding:

@@ -91,7 +91,7 @@ def run_benchmark(
     """
     stride = _require_steerable(session)
     if decoder is not None:
-        decoder.require_encoder(session.world_model, subject=session.subject)
+        decoder.require_fit(session.world_model, session.config.data.crop, subject=session.subject)
     if options.films:
         video_library()
     with user_can_write(folder):
