@@ -424,3 +424,14 @@ def test_quick_benchmark_of_latents_tells_speed_size_and_added_error(
     assert [kind for kind, *_ in added] == ["fp32", "bf16", "int8"]
     assert all(float(one) == 0 for kind, *percent in added if kind == "fp32" for one in percent)
     assert all(abs(float(one)) < 2 for _, *percent in added for one in percent)
+
+
+def test_a_decoder_is_timed_beside_the_linear_one(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for bench in imported("decoder", monkeypatch):
+        bench.main(["--quick", "--json", str(tmp_path / "rows.json")])
+    found = re.findall(r"^(linear|tiny) +(show|learn) +\S+ +\S+ +(\S+)$", capsys.readouterr().out, re.MULTILINE)
+    assert [row[:2] for row in found] == [("linear", "show"), ("tiny", "show"), ("linear", "learn"), ("tiny", "learn")]
+    assert [ratio for way, _, ratio in found if way == "linear"] == ["1.00", "1.00"]
+    assert len(json.loads((tmp_path / "rows.json").read_text())["rows"]) == 4
