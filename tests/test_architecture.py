@@ -58,6 +58,7 @@ ORDERS: dict[str, list[str]] = {
         "verdict examples",
         "evaluate",
         "decoded_rollouts",
+        "subject",
         "evaluate_run",
         "imagined_image",
         "imagined",

@@ -194,6 +194,13 @@ class LatentBatch:
     episode_ids: tuple[str, ...]
     starts: tuple[int, ...]
 
+    def clip(self, row: int) -> LatentBatch:
+        """Return one clip, as a batch."""
+        one = slice(row, row + 1)
+        extrinsics = None if self.extrinsics is None else self.extrinsics[one]
+        tensors = self.latents[one], self.states[one], self.actions[one], extrinsics
+        return LatentBatch(*tensors, self.episode_ids[one], self.starts[one])
+
 
 StepRanges = Sequence[tuple[int, int]]  # [start, end) of control steps, ascending and apart
 

@@ -69,6 +69,15 @@ class StateSpace(Space):
     frame: Literal["base", "camera"] = "base"  # of poses
 
     @property
+    def is_base_pose(self) -> bool:
+        """Whether it is a pose in the robot base frame, along whose axes directions have names."""
+        return self.is_pose and self.frame == "base"
+
+    def path_length(self, states: Float[np.ndarray, "time dim"]) -> float:
+        """Return the sizes of the motions from state to state, added up: of poses in metres."""
+        return float(np.linalg.norm(np.diff(states[:, self.sized], axis=0), axis=1).sum())
+
+    @property
     def change_names(self) -> tuple[str, ...]:
         """The names of the numbers' changes: dx, dy, ...; of a vector those of its numbers."""
         return self.names if self.position is None else tuple(f"d{name}" for name in self.names)

@@ -19,21 +19,6 @@ from vjepa2_ac.decoding.frame_pairs import as_images, as_pixels, require_space_f
 from vjepa2_ac.encoding.cache_lookup import needed_frames
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.checkpoints.loading import load_base
-from vjepa2_ac.model.network.world_model import WorldModel
-
-
-@pytest.fixture
-def encoded(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """How many frames went through the encoder, a number for each call."""
-    counted: list[int] = []
-    encode = WorldModel.encode
-
-    def counting(model: WorldModel, frames: torch.Tensor, chunk: int = 16) -> torch.Tensor:
-        counted.append(frames.shape[0] * frames.shape[1])
-        return encode(model, frames, chunk)
-
-    monkeypatch.setattr(WorldModel, "encode", counting)
-    return counted
 
 
 def test_the_image_is_the_encoder_input_up_to_rounding() -> None:
@@ -90,17 +75,17 @@ def test_each_storage_type_is_as_exact_as_it_says(
     assert torch.equal(pairs.images, exact.images)
 
 
-def test_frames_are_encoded_once(make_config: MakeConfig, encode_split: EncodeSplit, encoded: list[int]) -> None:
+def test_frames_are_encoded_once(make_config: MakeConfig, encode_split: EncodeSplit, encoded_frames: list[int]) -> None:
     config = make_config()
     first = encode_split(config)
-    assert sum(encoded) == len(first) <= 40
-    encoded.clear()
+    assert sum(encoded_frames) == len(first) <= 40
+    encoded_frames.clear()
     again = encode_split(config)
-    assert not encoded
+    assert not encoded_frames
     assert torch.equal(again.read(range(40)).latents, first.read(range(40)).latents)
     again.files[1].path.unlink()
     encode_split(config)
-    assert sum(encoded) == again.files[1].frames, "only what is missing"
+    assert sum(encoded_frames) == again.files[1].frames, "only what is missing"
 
 
 @pytest.mark.parametrize("frames", [1, 7, 30, 10_000])

@@ -34,20 +34,6 @@ from vjepa2_ac.training.loop import train
 CAMERA = "exterior_1_left"
 
 
-@pytest.fixture
-def encoded_frames(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """How many frames went through the encoder, a number for each chunk."""
-    counted: list[int] = []
-    encode = WorldModel.encode
-
-    def counting(model: WorldModel, frames: torch.Tensor, chunk: int = 16) -> torch.Tensor:
-        counted.append(frames.shape[0] * frames.shape[1])
-        return encode(model, frames, chunk)
-
-    monkeypatch.setattr(WorldModel, "encode", counting)
-    return counted
-
-
 def files_of(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 

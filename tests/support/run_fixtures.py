@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+import torch
 
 import killable
 from killable import Nursery
@@ -15,6 +16,7 @@ from synthetic import write_synthetic_droid
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict, parse_config
 from vjepa2_ac.episode import Progress
+from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import SILENT, NullReporter
 
 if TYPE_CHECKING:
@@ -153,3 +155,17 @@ def as_yaml(config: Config) -> str:
     import yaml
 
     return yaml.safe_dump(config_as_dict(config))
+
+
+@pytest.fixture
+def encoded_frames(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many frames went through the encoder, a number for each chunk."""
+    counted: list[int] = []
+    encode = WorldModel.encode
+
+    def counting(model: WorldModel, frames: torch.Tensor, chunk: int = 16) -> torch.Tensor:
+        counted.append(frames.shape[0] * frames.shape[1])
+        return encode(model, frames, chunk)
+
+    monkeypatch.setattr(WorldModel, "encode", counting)
+    return counted

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, get_args, overload
 
 import numpy as np
-import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
@@ -17,9 +16,9 @@ from vjepa2_ac.config.loading import config_as_dict, config_from
 from vjepa2_ac.data.clips import dataset as datasets
 from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.data.clips.loader import validation_batches
-from vjepa2_ac.data.clips.transforms import Crop, pixels_to_input, view
+from vjepa2_ac.data.clips.transforms import Crop
 from vjepa2_ac.data.clips.windows import require_stride
-from vjepa2_ac.encoding.batch import encode_batch
+from vjepa2_ac.encoding.batch import encode_batch, encode_frames
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.world_model import WorldModel
@@ -123,7 +122,5 @@ def encode(
     if frames.dtype != np.uint8 or frames.ndim < 3 or frames.shape[-1] != 3 or 0 in frames.shape:
         found = f"{frames.dtype} of the shape {' x '.join(map(str, frames.shape))}"
         raise InputError(where="encode", found=found, needed="RGB frames: uint8, ... x height x width x 3")
-    cropped = np.ascontiguousarray(view(frames.reshape(-1, *frames.shape[-3:]), crop))
-    pixels = torch.from_numpy(cropped).to(model.device)[None]
-    latents = model.encode(pixels_to_input(pixels, model.image_size), chunk=chunk)
+    latents = encode_frames(model, frames.reshape(-1, *frames.shape[-3:]), crop, chunk=chunk)
     return latents.reshape(*frames.shape[:-3], *latents.shape[-2:])

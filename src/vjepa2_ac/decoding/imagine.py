@@ -17,6 +17,7 @@ from torch import Tensor
 from vjepa2_ac.decoding.decoder_folder import DecoderCard
 from vjepa2_ac.decoding.frame_pairs import as_pixels
 from vjepa2_ac.decoding.network import Decoder
+from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.planning.counterfactual.named_actions import counterfactual_states, feasible_actions
 from vjepa2_ac.spaces import StateSpace
 
@@ -42,6 +43,12 @@ class Start:
     state: Float[np.ndarray, " state_dim"]
     space: StateSpace
     extrinsics: Float[Tensor, " 6"] | None = None
+
+    @classmethod
+    def of(cls, batch: LatentBatch, space: StateSpace) -> Start:
+        """Return the start of the first clip of a batch."""
+        extrinsics = None if batch.extrinsics is None else batch.extrinsics[0, 0]
+        return cls(batch.latents[0, 0], batch.states[0, 0].double().cpu().numpy(), space, extrinsics)
 
 
 @dataclass(frozen=True, eq=False)

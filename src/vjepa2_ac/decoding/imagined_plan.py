@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float, UInt8
 
 from vjepa2_ac.data.clips.transforms import frames_as_seen, view
+from vjepa2_ac.data.clips.windows import spread_with_ends
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
 from vjepa2_ac.decoding.imagine import shown
 from vjepa2_ac.planning.controller import Decision
@@ -42,8 +43,7 @@ def imagine_plan(answer: PlanResult, decoder: TrainedDecoder) -> ImaginedPlan:
     given = torch.stack([controller.encoded(image) for image in (answer.question.start, goal)])
     start, decoded_goal = shown(decoder.decoder, given)
     frames = _rollout(answer.decision, decoder, steps=answer.space.steps)
-    count = len(frames)
-    places = sorted({round(place) for place in np.linspace(0, count - 1, min(count, _MOST_STEPS))}) if count else []
+    places = spread_with_ends(len(frames), _MOST_STEPS)
     seen = frames_as_seen(view(goal[None], controller.crop), decoder.card.shape.image_size)[0]
     return ImaginedPlan(start, {place + 1: frames[place] for place in places}, seen, decoded_goal)
 

@@ -5,13 +5,14 @@ Training, evaluation and planning only see the result of this module.
 
 from __future__ import annotations
 
+import numpy as np
 import torch
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, UInt8
 from torch import Tensor
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.clips.dataset import Dataset
-from vjepa2_ac.data.clips.transforms import pixels_to_input
+from vjepa2_ac.data.clips.transforms import Crop, pixels_to_input, view
 from vjepa2_ac.data.sources.latents.cache_key import Encoding
 from vjepa2_ac.data.sources.latents.dtypes import unpack_latents
 from vjepa2_ac.encoding.cache_lookup import require_encoding
@@ -47,6 +48,22 @@ def encode_batch(world_model: WorldModel, batch: Batch, *, device: torch.device,
         episode_ids=batch.episode_ids,
         starts=batch.starts,
     )
+
+
+@torch.no_grad()
+def encode_frames(
+    world_model: WorldModel, frames: UInt8[np.ndarray, "time height width 3"], crop: Crop, *, chunk: int = 16
+) -> Float[Tensor, "time tokens dim"]:
+    """Return the latents of camera frames, each encoded independently, on the model's device.
+
+    Args:
+        world_model: The model whose frozen encoder is used.
+        frames: RGB, uncropped, of any size.
+        crop: The part of a frame that the model sees.
+        chunk: Frames per encoder call.
+    """
+    pixels = torch.from_numpy(np.ascontiguousarray(view(frames, crop))).to(world_model.device)[None]
+    return world_model.encode(pixels_to_input(pixels, world_model.image_size), chunk=chunk)[0]
 
 
 def encoding_of(world_model: WorldModel, config: Config) -> Encoding:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -13,7 +12,7 @@ import torch
 from jaxtyping import UInt8
 
 from vjepa2_ac import __version__
-from vjepa2_ac.config import Config
+from vjepa2_ac.config import Config, PlanningConfig
 from vjepa2_ac.data.clips.clip_reader import frames_of
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
 from vjepa2_ac.data.clips.loader import batches_of, validation_windows
@@ -21,33 +20,25 @@ from vjepa2_ac.data.clips.streams import copies_for
 from vjepa2_ac.data.clips.transforms import frames_as_seen
 from vjepa2_ac.decoding.decoder_folder import load_decoder
 from vjepa2_ac.distributed.launch import make_accelerator
-from vjepa2_ac.encoding.batch import encode_batch, require_widths
+from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.encoding.training_cache import with_latents_if_there
 from vjepa2_ac.episode import Batch, LatentBatch
-from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.decoded.record import NEIGHBOURS, TRUE_FRAMES
 from vjepa2_ac.evaluation.decoded_rollouts.measure import measure_decoded
 from vjepa2_ac.evaluation.decoded_rollouts.setup import HandsOf, decoding_of
-from vjepa2_ac.evaluation.evaluate import ClipName, Contender, FramesOfRow, RepeatableClips, evaluate
+from vjepa2_ac.evaluation.evaluate import ClipName, FramesOfRow, RepeatableClips, evaluate
 from vjepa2_ac.evaluation.measure import ClipSample
-from vjepa2_ac.evaluation.request import EvaluationOptions, settle
-from vjepa2_ac.evaluation.result import About, Evaluation, Role, TrainingCurve
+from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions, settle
+from vjepa2_ac.evaluation.result import About, Evaluation, TrainingCurve
 from vjepa2_ac.evaluation.stride_calibration.measure import calibrate_model
-from vjepa2_ac.model.adapter.merging import base_only, unadapted_copy
-from vjepa2_ac.model.checkpoints.loading import load_base
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.evaluation.subject import load_subject
 from vjepa2_ac.model.quantization import require_8_bits
-from vjepa2_ac.places import BUILTIN
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.runs.checkpoint_selection import select_checkpoint
 from vjepa2_ac.runs.folder import METRICS, is_run
-from vjepa2_ac.runs.loading import TrainedRun, load_run
+from vjepa2_ac.runs.loading import TrainedRun
 from vjepa2_ac.runs.metrics_log import read_metrics_log, warnings_of
 from vjepa2_ac.storage import try_writing_at, user_can_write
 from vjepa2_ac.storage.structured import utc_now
-
-BASE = "base"
-_NO_BASE = "There is no base to compare with: it takes states or actions of other widths than this robot's."
 
 
 @dataclass(frozen=True)
@@ -81,29 +72,19 @@ def measure_subject(
     config, planning, folder = settle(subject, asked)
     if is_run(subject):
         select_checkpoint(Path(subject), asked.checkpoint)
-    with user_can_write(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        try_writing_at(folder)
+    _make_writable(folder)
     decoder = None if asked.decoder is None else load_decoder(asked.decoder)
     accelerator = make_accelerator(config)
-    if asked.probes.planning_clips and planning.quantize != "off":
-        dtype = getattr(torch, config.model.dtype)
-        require_8_bits(planning.quantize, dtype, accelerator.device, where="planning.quantize")
+    if asked.probes.planning_clips:
+        _require_quantizable(config, planning, accelerator.device)
     dataset = open_dataset(config.data, progress=reporter.task("looking through the data"))
     chosen = validation_windows(dataset, asked.split, clips=asked.clips)
-    run = load_run(Path(subject), asked.checkpoint) if is_run(subject) else None
-    world_model = run.world_model if run else load_model(subject, config)
-    require_widths(world_model, dataset.widths, where=subject)
-    if decoder is not None:
-        decoder.require_fit(world_model, config.data.crop, subject=subject)
+    loaded = load_subject(subject, config, asked, dataset, decoder)
+    run, world_model, contenders = loaded.run, loaded.world_model, loaded.contenders
     through_cache = with_latents_if_there(config, dataset, world_model)
-    contenders, notes = contenders_of(subject, config, run, world_model, asked)
     if through_cache.config.is_cache and not asked.calibrate:
         world_model.set_encoder_aside()
-    for each in contenders:  # the encoder of the first one is enough
-        if isinstance(each.model, WorldModel):
-            each.model.predictor.to(accelerator.device).eval()
-    world_model.to(accelerator.device).eval()
+    loaded.put_on(accelerator.device)
     calibration = None
     if asked.calibrate:
         sample, progress = ClipSample(asked.split, asked.clips), reporter.task("calibrating strides")
@@ -111,13 +92,12 @@ def measure_subject(
     encode = partial(encode_batch, world_model, device=accelerator.device, chunk=config.model.encode_chunk)
     read = partial(batches_of, batch_size=config.validation.batch_size, copies=copies_for(accelerator.device))
     clips = _clips(through_cache, chosen, read, encode, world_model.image_size)
-    has_base_frame = dataset.spaces.state.frame == "base"
     with accelerator.autocast():
         evaluation = evaluate(
             contenders,
             clips,
             _about(subject, run, config, dataset, asked),
-            probes=replace(asked.probes, planning=planning, axis_clips=asked.probes.axis_clips * has_base_frame),
+            probes=_probes(asked, planning, dataset),
             reporter=reporter,
         )
         decoded = None
@@ -129,9 +109,28 @@ def measure_subject(
         decoded=decoded,
         training=training_curves(Path(subject)) if run else (),
         calibration=calibration,
-        notes=(*notes, *(_warnings(Path(subject)) if run else ()), *evaluation.notes),
+        notes=(*loaded.notes, *(_warnings(Path(subject)) if run else ()), *evaluation.notes),
     )
     return Measured(evaluation, run.chosen if run else "", folder)
+
+
+def _make_writable(folder: Path) -> None:
+    """Make the folder of the output, and write in it once, before anything takes long."""
+    with user_can_write(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        try_writing_at(folder)
+
+
+def _probes(asked: EvaluationOptions, planning: PlanningConfig, dataset: Dataset) -> ProbeOptions:
+    """Return the probes that these data allow: axes are those of poses in the robot base frame."""
+    axis_clips = asked.probes.axis_clips if dataset.spaces.state.is_base_pose else 0
+    return replace(asked.probes, planning=planning, axis_clips=axis_clips)
+
+
+def _require_quantizable(config: Config, planning: PlanningConfig, device: torch.device) -> None:
+    """Refuse quantized planning where the weights or the device do not allow it."""
+    if planning.quantize != "off":
+        require_8_bits(planning.quantize, getattr(torch, config.model.dtype), device, where="planning.quantize")
 
 
 def _warnings(folder: Path) -> list[str]:
@@ -150,78 +149,6 @@ def training_curves(folder: Path) -> tuple[TrainingCurve, ...]:
         TrainingCurve(name, tuple(step for step, _ in found), tuple(value for _, value in found))
         for name, found in points.items()
     )
-
-
-def load_model(name: str, config: Config) -> WorldModel:
-    """Load a model by its name, with the config's other settings of a model."""
-    return load_base(config.model.model_copy(update={"base": name, "random": None}), seed=config.seed)
-
-
-def contenders_of(
-    subject: str, config: Config, run: TrainedRun | None, world_model: WorldModel, asked: EvaluationOptions
-) -> tuple[list[Contender], tuple[str, ...]]:
-    """Return the models to measure, the base first and the subject last; and notes on them."""
-    against = asked.against if asked.against is not None else (BASE,) * (run is not None)
-    found: list[Contender] = []
-    notes: tuple[str, ...] = ()
-    if BASE in against and run is not None and config.model.base is not None:
-        if world_model.fresh_heads is not None:
-            notes = (_NO_BASE,)
-        else:
-            found.append(_contender(BASE, "base", world_model, partial(base_only, world_model)))
-    elif BASE in against and run is None:
-        if config.model.base is None:
-            raise InputError(
-                where="--against base", found="a config without model.base", needed="a base to compare with"
-            )
-        found.append(Contender(BASE, "base", _like(world_model, config.model.base, config, subject)))
-    name = "adapter" if world_model.adaptation is not None and world_model.adaptation.kind == "lora" else "model"
-    for other in against:
-        if other != BASE:
-            taken = {each.name for each in found} | {name, BASE, "persistence", TRUE_FRAMES, *NEIGHBOURS}
-            called = Path(other).name if Path(other).name not in taken else other
-            found.append(_contender(called, "other", _like(world_model, other, config, subject)))
-    return [*found, _contender(name, "trained", world_model)], notes
-
-
-def _contender(
-    name: str, role: Role, model: WorldModel, switched: Callable[[], AbstractContextManager[object]] = nullcontext
-) -> Contender:
-    """Return a model to measure unmerged; a merged copy plans in its place (see `planning.model_setup`)."""
-    adaptation = model.adaptation
-    plans_as_it_is = adaptation is None or (role == "base" and adaptation.kind == "lora")  # whose adapter is off then
-    return Contender(name, role, model, switched, None if plans_as_it_is else partial(unadapted_copy, model))
-
-
-def _like(world_model: WorldModel, other: str, config: Config, subject: str) -> WorldModel:
-    """Load another run or model that can be measured on the same latents.
-
-    Raises:
-        InputError: It has another encoder, or takes other states or actions.
-    """
-    if not (other.startswith(BUILTIN) or Path(other).exists()):
-        raise InputError(
-            where=f"--against {other}",
-            found="no such file or folder",
-            needed="base, the folder of a run, or a model: what model.base takes",
-        )
-    loaded = load_run(Path(other)).world_model if is_run(other) else load_model(other, config)
-    same = loaded.image_size == world_model.image_size
-    if not same or loaded.encoder_fingerprint() != world_model.encoder_fingerprint():
-        raise InputError(
-            where=f"--against {other}",
-            found=f"another encoder than that of {subject}",
-            needed="the same one: errors are compared on the same latents",
-            fix="Evaluate each by itself, and put their ratios to persistence side by side with `vjepa2-ac compare`",
-        )
-    ours, theirs = world_model.sizes.predictor, loaded.sizes.predictor
-    if (ours.state_dim, ours.action_dim) != (theirs.state_dim, theirs.action_dim):
-        raise InputError(
-            where=f"--against {other}",
-            found=f"a model of states of {theirs.state_dim} and actions of {theirs.action_dim} numbers",
-            needed=f"{ours.state_dim} and {ours.action_dim}, as {subject} takes",
-        )
-    return loaded
 
 
 def _clips(

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from vjepa2_ac.distances import absolute_difference
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.evaluation.measure import Predictor
+from vjepa2_ac.evaluation.measure import Predictor, prediction
 from vjepa2_ac.evaluation.metrics import L1
 from vjepa2_ac.evaluation.result import Example, PredictionErrors
 
@@ -45,10 +45,7 @@ def chosen_clips(errors: PredictionErrors, moved: Float[np.ndarray, " clips"], c
 @torch.no_grad()
 def predicted_rollout(model: Predictor, batch: LatentBatch, row: int) -> Float[Tensor, "horizon tokens dim"]:
     """Return a model's prediction of one clip from its first frame, in float32 on the CPU."""
-    one = slice(row, row + 1)
-    camera = None if batch.extrinsics is None else batch.extrinsics[one, :-1]
-    rolled = model.rollout(batch.latents[one, :1], batch.actions[one], batch.states[one, :-1], camera)
-    return rolled[0].float().cpu()
+    return prediction(model, batch.clip(row))[0].float().cpu()
 
 
 def make_example(

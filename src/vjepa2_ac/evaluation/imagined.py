@@ -29,18 +29,15 @@ from vjepa2_ac.decoding.imagine import (
     worth_knowing,
 )
 from vjepa2_ac.distributed.launch import make_accelerator
-from vjepa2_ac.encoding.batch import encode_batch, require_widths
+from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.evaluate import Contender
-from vjepa2_ac.evaluation.evaluate_run import contenders_of, load_model
-from vjepa2_ac.evaluation.imagined_image import actions_by_name
+from vjepa2_ac.evaluation.imagined_image import actions_by_name, require_directions
 from vjepa2_ac.evaluation.request import EvaluationOptions, settle
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.evaluation.subject import load_subject
 from vjepa2_ac.planning.counterfactual.named_actions import ACTION_NAMES, STEP_M
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
-from vjepa2_ac.runs.folder import is_run
-from vjepa2_ac.runs.loading import load_run
 from vjepa2_ac.spaces import StateSpace
 
 _SEARCHED = 64  # clips, among which the one with the most motion is shown
@@ -86,8 +83,7 @@ def imagine_clip(subject: str, asked: ImagineOptions, *, reporter: Reporter = SI
         InputError: Subject, data, decoder, clip or actions cannot be used.
     """
     decoder = load_decoder(asked.decoder)
-    config, planning, _ = settle(subject, asked.evaluation)
-    config = _long_enough(config, asked)
+    config, planning, _ = settle(subject, asked.evaluation, frames=asked.steps + 1)
     accelerator = make_accelerator(config)
     dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
     if config.data.is_cache:
@@ -95,22 +91,15 @@ def imagine_clip(subject: str, asked: ImagineOptions, *, reporter: Reporter = SI
             where="data.source", found="latents, without frames", needed="the data set itself, to show what is true"
         )
     window = _window(dataset, asked)
-    run = load_run(Path(subject), asked.evaluation.checkpoint) if is_run(subject) else None
-    world_model = run.world_model if run else load_model(subject, config)
-    require_widths(world_model, dataset.widths, where=subject)
-    decoder.require_fit(world_model, config.data.crop, subject=subject)
-    contenders, _ = contenders_of(subject, config, run, world_model, asked.evaluation)
-    for each in contenders:
-        if isinstance(each.model, WorldModel):
-            each.model.to(accelerator.device).eval()
+    loaded = load_subject(subject, config, asked.evaluation, dataset, decoder)
+    loaded.put_on(accelerator.device)
     decoder.to(accelerator.device)
     (batch,) = batches_of(dataset, [window], batch_size=1)
-    encode = partial(encode_batch, world_model, device=accelerator.device, chunk=config.model.encode_chunk)
-    size = world_model.image_size
+    size = loaded.world_model.image_size
     chosen = _actions_of(asked, batch, dataset, limits=planning.limits)
     with accelerator.autocast():
-        latents = encode(batch)
-        rollouts = _rollouts(contenders, decoder, latents, chosen, dataset.spaces.state)
+        latents = encode_batch(loaded.world_model, batch, device=accelerator.device, chunk=config.model.encode_chunk)
+        rollouts = _rollouts(loaded.contenders, decoder, latents, chosen, dataset.spaces.state)
         decoded = shown(decoder.decoder, latents.latents[0])
     frames = _seen(batch, size)
     imagination = Imagination(
@@ -147,9 +136,7 @@ def _rollouts(
     space: StateSpace,
 ) -> list[Imagined]:
     """Roll out: recorded actions by every model, others by the one that is looked at."""
-    extrinsics = None if batch.extrinsics is None else batch.extrinsics[0, 0]
-    states = batch.states[0].double().cpu().numpy()
-    start = Start(batch.latents[0, 0], states[0], space, extrinsics)
+    start, states = Start.of(batch, space), batch.states[0].double().cpu().numpy()
     found = []
     for name, actions in chosen.items():
         for contender in contenders:
@@ -174,21 +161,10 @@ def _actions_of(asked: ImagineOptions, batch: Batch, dataset: Dataset, limits: L
         if word == TRUE:
             chosen[AS_RECORDED] = recorded
             continue
-        if not dataset.spaces.state.is_pose or dataset.spaces.state.frame != "base":
-            raise InputError(
-                where=f"--actions {word}",
-                found="states that are no poses in the robot base frame",
-                needed="poses: other actions are directions in that frame",
-                fix="Give --actions true",
-            )
+        require_directions(dataset.spaces.state, where=f"--actions {word}", fix="Give --actions true")
         name = word if word in ACTION_NAMES else Path(word).name  # with its ending: never one of the other names
         chosen[word if name in chosen else name] = actions_by_name(word, len(recorded), asked.size_m, limits)
     return chosen
-
-
-def _long_enough(config: Config, asked: ImagineOptions) -> Config:
-    """Return the config with clips of as many model steps as are to be imagined."""
-    return config.model_copy(update={"data": config.data.model_copy(update={"frames": asked.steps + 1})})
 
 
 def _window(dataset: Dataset, asked: ImagineOptions) -> tuple[int, int]:
@@ -223,8 +199,7 @@ def _motion(dataset: Dataset, episode: int, start: int) -> float:
     """Return how far the robot moves in a clip, added up over its model steps."""
     steps = range(start, start + dataset.config.clip_steps, dataset.config.model_stride)
     states = dataset.source.read(episode, None, dataset.needed_steps(episode)).states[list(steps)]
-    sized = dataset.spaces.state.sized
-    return float(np.linalg.norm(np.diff(states[:, sized], axis=0), axis=1).sum())
+    return dataset.spaces.state.path_length(states)
 
 
 def _seen(batch: Batch, size: int) -> UInt8[np.ndarray, "time size size 3"]:

@@ -10,15 +10,16 @@ import torch
 from jaxtyping import Float, UInt8
 
 from vjepa2_ac.config import LimitsConfig
-from vjepa2_ac.data.clips.transforms import input_to_pixels, pixels_to_input, view
+from vjepa2_ac.data.clips.transforms import frames_as_seen, view
 from vjepa2_ac.data.sources.configured_spaces import measured_space
 from vjepa2_ac.decoding.decoder_folder import load_decoder
 from vjepa2_ac.decoding.imagine import Imagination, Imagined, Start, imagined_latents, shown, worth_knowing
+from vjepa2_ac.encoding.batch import encode_frames
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.counterfactual.actions_file import read_actions
 from vjepa2_ac.planning.counterfactual.named_actions import ACTION_NAMES, STEP_M, named_actions
 from vjepa2_ac.planning.session import PlanningSession
-from vjepa2_ac.spaces import CAMERA_POSE
+from vjepa2_ac.spaces import StateSpace
 
 _RATE_HZ = 15.0  # of a robot, where nobody says: DROID's
 
@@ -59,23 +60,16 @@ def imagine_image(
     decoder.require_fit(model, config.data.crop, subject=session.subject)
     decoder.to(model.device)
     space = measured_space(config.data, len(seen.state))
-    if not space.is_pose or space.frame == CAMERA_POSE.frame:
-        raise InputError(
-            where="--state",
-            found="states that are no poses in the robot base frame",
-            needed="poses: actions by name are directions in that frame",
-        )
+    require_directions(space, where="--state")
     chosen = {name: actions_by_name(name, steps, size_m, config.planning.limits) for name in actions}
-    frames = torch.from_numpy(np.ascontiguousarray(view(seen.image[None], config.data.crop)))[None]
-    inputs = pixels_to_input(frames.to(model.device), model.image_size)
     camera = None if seen.extrinsics is None else torch.as_tensor(seen.extrinsics, dtype=torch.float32)
     start = Start(
-        latents=model.encode(inputs)[0, 0],
+        latents=encode_frames(model, seen.image[None], config.data.crop)[0],
         state=np.asarray(seen.state, dtype=np.float64),
         space=space,
         extrinsics=None if camera is None else camera.to(model.device),
     )
-    first = np.asarray(input_to_pixels(inputs)[0, 0].permute(1, 2, 0).contiguous().cpu().numpy())
+    first = frames_as_seen(view(seen.image[None], config.data.crop), model.image_size)[0]
     decoded_first = shown(decoder.decoder, start.latents[None])[0]
     return Imagination(
         subject=session.subject,
@@ -93,6 +87,21 @@ def imagine_image(
             *worth_knowing(decoder.card, first, decoded_first),
         ),
     )
+
+
+def require_directions(space: StateSpace, *, where: str, fix: str = "") -> None:
+    """Refuse states in which actions by name, which are directions in the robot base frame, mean nothing.
+
+    Raises:
+        InputError: They are no poses, or poses in the camera's frame.
+    """
+    if not space.is_base_pose:
+        raise InputError(
+            where=where,
+            found="states that are no poses in the robot base frame",
+            needed="poses: actions by name are directions in that frame",
+            fix=fix,
+        )
 
 
 def actions_by_name(word: str, steps: int, size_m: float, limits: LimitsConfig) -> Float[np.ndarray, "steps 7"]:

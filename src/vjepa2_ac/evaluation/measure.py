@@ -85,7 +85,7 @@ def measured(
     """
     arrays: dict[tuple[Way, Mode, str], Float[np.ndarray, "clips horizon"]] = {}
     for way, mode in wanted:
-        predicted = _prediction(model, batch, way, mode, others)
+        predicted = prediction(model, batch, way, mode, others)
         if watch is not None:
             watch(way, mode, predicted)
         for metric in metrics:
@@ -152,8 +152,8 @@ def with_other_actions(
         before = batch.actions[-1:]
 
 
-def _prediction(
-    model: Predictor, batch: LatentBatch, way: Way, mode: Mode, others: Tensor | None
+def prediction(
+    model: Predictor, batch: LatentBatch, way: Way = "true", mode: Mode = "rollout", others: Tensor | None = None
 ) -> Float[Tensor, "batch horizon tokens dim"]:
     """Return the frames after the first as predicted; states are the true ones, whatever the actions."""
     seen = batch.latents[:, :1] if mode == "rollout" else batch.latents[:, :-1]

@@ -49,13 +49,20 @@ class EvaluationOptions:
     planning: tuple[str, ...] = ()  # settings in place of the config's, such as planning.samples=200
 
 
-def settle(subject: str, asked: EvaluationOptions) -> tuple[Config, PlanningConfig, Path]:
+def settle(subject: str, asked: EvaluationOptions, *, frames: int | None = None) -> tuple[Config, PlanningConfig, Path]:
     """Return the config to measure with, how one step is planned, and the folder for what is written.
+
+    Args:
+        subject: The folder of a run; or a model, as in `model.base`.
+        asked: The options.
+        frames: Of a clip; None: as `data.frames` says.
 
     Raises:
         InputError: The subject is no run and no data are named, a setting is wrong, or a folder is missing.
     """
     config, folder = _config_of(subject, asked)
+    if frames is not None:
+        config = config.model_copy(update={"data": config.data.model_copy(update={"frames": frames})})
     _check_long_enough(config, asked.probes)
     return config, _planning_of(subject, config, asked), folder
 

@@ -14,8 +14,9 @@ from torch import Tensor
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.planning import PlanningConfig
-from vjepa2_ac.data.clips.transforms import Crop, pixels_to_input, view
+from vjepa2_ac.data.clips.transforms import Crop, view
 from vjepa2_ac.data.sources.configured_spaces import spaces_of
+from vjepa2_ac.encoding.batch import encode_frames
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.input_heads import widths_of_model
@@ -221,9 +222,7 @@ class Controller:
 
     def encoded(self, image: UInt8[np.ndarray, "height width 3"]) -> Float[Tensor, "tokens dim"]:
         """Return the latents of what the model sees of an image, on its device."""
-        frames = torch.from_numpy(np.ascontiguousarray(view(image[None], self.crop)))[None]
-        frames = frames.to(self._model.device)
-        return self._model.encode(pixels_to_input(frames, self._model.image_size))[0, 0]
+        return encode_frames(self._model, image[None], self.crop)[0]
 
     def _decided(self, goal: Goal, seen: Sequence[Seen], before: Plan | None) -> Decision:
         latents, state = seen[-1]
@@ -278,7 +277,7 @@ def _axes_of(world_model: WorldModel, config: PlanningConfig, spaces: Spaces) ->
     """Return the model's axes where they are calibrated."""
     if config.axes is None:
         return None
-    if not spaces.state.is_pose or spaces.state.frame != "base":
+    if not spaces.state.is_base_pose:
         raise no_vertical_axis(f"planning.axes: {config.axes}")
     return Axes.read(config.axes, Fingerprints.of(world_model))
 

@@ -48,12 +48,12 @@ class Resimulation:
         simulation: How the data set was recorded.
         number: Under which the episode was recorded.
         start: Control step.
-        camera: Of the simulated arm.
+        camera: Of the data set: one of `RECORDED_CAMERAS`.
     """
 
     def __init__(self, simulation: RecordedSimulation, number: int, start: int, camera: str) -> None:
         self._spec, self._number, self.start = simulation.spec, number, start
-        self._camera = camera if simulation.spec.cameras == 3 else "exterior_1"
+        self._camera = camera_of(simulation, camera)
         self._arm = arm_of(number, simulation.spec)
 
     @property
@@ -114,6 +114,11 @@ class Resimulation:
         )
 
 
+def camera_of(simulation: RecordedSimulation, camera: str) -> str:
+    """Return the camera of the simulated arm that a camera of the data set is; recorded with one, all are the same."""
+    return RECORDED_CAMERAS[camera] if simulation.spec.cameras == 3 else "exterior_1"
+
+
 def resimulate(folder: str | Path, episode: Episode, start: int, camera: str = "exterior_1_left") -> Resimulation:
     """Simulate an episode of a recorded data set again up to a control step, and make sure that it is the same.
 
@@ -136,7 +141,7 @@ def resimulate(folder: str | Path, episode: Episode, start: int, camera: str = "
         raise InputError(where=where, found=f"control step {start}", needed=f"0 to {steps - 1}")
     if camera not in RECORDED_CAMERAS:
         raise InputError(where=where, found=f"camera {camera!r}", needed=f"one of {', '.join(RECORDED_CAMERAS)}")
-    again = Resimulation(simulation, number, start, RECORDED_CAMERAS[camera])
+    again = Resimulation(simulation, number, start, camera)
     _require_same(again.under(np.zeros((0, 7)), 1), episode, start, f"{where}: control step {start}", simulation)
     return again
 

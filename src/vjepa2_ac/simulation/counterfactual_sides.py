@@ -8,37 +8,30 @@ that ignores its actions, is 0.5. Where the hand truly moves by less than 2 pixe
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import partial
-from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
 from vjepa2_ac.data.clips.loader import batches_of, validation_windows
-from vjepa2_ac.data.clips.transforms import pixels_to_input, view
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
 from vjepa2_ac.decoding.imagine import Start, imagined_latents
 from vjepa2_ac.distributed.launch import make_accelerator
-from vjepa2_ac.encoding.batch import encode_batch, require_widths
+from vjepa2_ac.encoding.batch import encode_batch, encode_frames
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.decoded.hand import HandPositions, HandProbe
 from vjepa2_ac.evaluation.decoded_rollouts.setup import fitted_probe
-from vjepa2_ac.evaluation.evaluate import Contender
-from vjepa2_ac.evaluation.evaluate_run import contenders_of, load_model
 from vjepa2_ac.evaluation.request import EvaluationOptions, settle
+from vjepa2_ac.evaluation.subject import Subject, load_subject
 from vjepa2_ac.intervals import Estimate, share_of
-from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.counterfactual.named_actions import STEP_M, named_actions
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
-from vjepa2_ac.runs.folder import is_run
-from vjepa2_ac.runs.loading import load_run
 from vjepa2_ac.simulation.counterfactual import resimulate
 from vjepa2_ac.simulation.hand_in_images import hand_positions
 
@@ -111,33 +104,27 @@ def measure_sides(subject: str, asked: SidesOptions, *, reporter: Reporter = SIL
         InputError: Subject, data or decoder cannot be used; or the data were not simulated.
     """
     decoder = load_decoder(asked.decoder)
-    config, planning, _ = settle(subject, asked.evaluation)
-    config = config.model_copy(update={"data": config.data.model_copy(update={"frames": asked.steps + 1})})
+    config, planning, _ = settle(subject, asked.evaluation, frames=asked.steps + 1)
     accelerator = make_accelerator(config)
     dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
-    run = load_run(Path(subject), asked.evaluation.checkpoint) if is_run(subject) else None
-    world_model = run.world_model if run else load_model(subject, config)
-    require_widths(world_model, dataset.widths, where=subject)
-    decoder.require_fit(world_model, config.data.crop, subject=subject)
-    positions = hand_positions(dataset, world_model.image_size)
+    size = decoder.card.shape.image_size
+    positions = hand_positions(dataset, size)
     if isinstance(positions, str) or config.data.is_cache:
         found = positions if isinstance(positions, str) else "latents of a cache, which has no frames"
         raise InputError(where=config.data.path, found=found, needed="a data set that `simulate record` made")
-    contenders, _ = contenders_of(subject, config, run, world_model, asked.evaluation)
-    for each in contenders:
-        if isinstance(each.model, WorldModel):
-            each.model.to(accelerator.device).eval()
-    probe = fitted_probe(dataset, positions, world_model.image_size)
+    loaded = load_subject(subject, config, asked.evaluation, dataset, decoder)
+    loaded.put_on(accelerator.device)
+    probe = fitted_probe(dataset, positions, size)
     reader = _Reader(decoder.to(accelerator.device), probe, positions)
-    imagine = _Imagination(config, dataset, world_model, contenders, reader)
+    imagine = _Imagination(config, dataset, loaded, reader)
     windows, cells = validation_windows(dataset, asked.split, clips=asked.starts), []
     progress = reporter.task("actions that were not taken", "starts")
     for done, window in enumerate(windows, 1):
         with accelerator.autocast():
             cells += imagine.cells_of(window, asked, planning.limits)
         progress(done, len(windows))
-    sources = (DECODED_TRUTH, *(one.name for one in contenders))
-    return Sides(tuple(cells), sources, world_model.image_size, probe.fitted_on)
+    sources = (DECODED_TRUTH, *(one.name for one in loaded.contenders))
+    return Sides(tuple(cells), sources, size, probe.fitted_on)
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,8 +145,7 @@ class _Reader:
 class _Imagination:
     config: Config
     dataset: Dataset
-    world_model: WorldModel
-    contenders: Sequence[Contender]
+    subject: Subject
     reader: _Reader
 
     def cells_of(self, window: tuple[int, int], asked: SidesOptions, limits: LimitsConfig) -> list[Cell]:
@@ -173,8 +159,14 @@ class _Imagination:
             actions = named_actions(action, asked.steps, size_m=asked.size_m, limits=limits)
             outcome = arm.under(actions, self.config.data.model_stride)
             true = self.reader.positions(name, outcome.states)
-            read = {DECODED_TRUTH: self._encoded(outcome.frames)}
-            for each in self.contenders:
+            truth = encode_frames(
+                self.subject.world_model,
+                outcome.frames,
+                self.config.data.crop,
+                chunk=self.config.model.encode_chunk,
+            )
+            read = {DECODED_TRUTH: truth}
+            for each in self.subject.contenders:
                 with each.switched():
                     imagined = imagined_latents(each.model, start, actions)
                 read[each.name] = torch.cat([start.latents[None], imagined.to(start.latents)])
@@ -189,17 +181,9 @@ class _Imagination:
 
     def _start(self, window: tuple[int, int]) -> tuple[Start, str]:
         (batch,) = batches_of(self.dataset, [window], batch_size=1)
-        encode = partial(encode_batch, self.world_model, chunk=self.config.model.encode_chunk)
-        latents = encode(batch, device=next(self.world_model.parameters()).device)
-        extrinsics = None if latents.extrinsics is None else latents.extrinsics[0, 0]
-        state = latents.states[0, 0].double().cpu().numpy()
-        return Start(latents.latents[0, 0], state, self.dataset.spaces.state, extrinsics), batch.episode_ids[0]
-
-    def _encoded(self, frames: UInt8[np.ndarray, "time h w 3"]) -> torch.Tensor:
-        """Return the latents of what really happens."""
-        seen = torch.from_numpy(np.ascontiguousarray(view(frames, self.config.data.crop)))[None]
-        inputs = pixels_to_input(seen.to(next(self.world_model.parameters()).device), self.world_model.image_size)
-        return self.world_model.encode(inputs, chunk=self.config.model.encode_chunk)[0]
+        model, chunk = self.subject.world_model, self.config.model.encode_chunk
+        latents = encode_batch(model, batch, device=model.device, chunk=chunk)
+        return Start.of(latents, self.dataset.spaces.state), batch.episode_ids[0]
 
 
 def _along(read: Float[np.ndarray, "time 2"], direction: Float[np.ndarray, "steps 2"]) -> Float[np.ndarray, " steps"]:

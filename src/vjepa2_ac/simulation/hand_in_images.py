@@ -11,8 +11,8 @@ from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.data.clips.transforms import Crop, crop_box
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.decoded.hand import HandPositions
-from vjepa2_ac.simulation.counterfactual import RECORDED_CAMERAS
-from vjepa2_ac.simulation.recording.simulation_file import SIMULATION_FILE, RecordedSimulation, read_simulation
+from vjepa2_ac.simulation.counterfactual import RECORDED_CAMERAS, camera_of
+from vjepa2_ac.simulation.recording.simulation_file import SIMULATION_FILE, read_simulation
 from vjepa2_ac.simulation.world.camera import FRAME_SIZE
 from vjepa2_ac.simulation.world.projection import hand_pixels
 
@@ -29,7 +29,7 @@ def hand_positions(dataset: Dataset, size: int) -> HandPositions | str:
     config = dataset.config
     if not (Path(config.path) / SIMULATION_FILE).is_file():
         return f"the data were not simulated: no {SIMULATION_FILE} beside them"
-    if not dataset.spaces.state.is_pose or dataset.spaces.state.frame != "base":
+    if not dataset.spaces.state.is_base_pose:
         return "the states are not poses in the robot base frame"
     if (camera := config.cameras[0]) not in RECORDED_CAMERAS:
         return f"the simulator has no camera {camera}"
@@ -46,11 +46,6 @@ def hand_positions(dataset: Dataset, size: int) -> HandPositions | str:
         return as_seen(found, config.crop, size)
 
     return positions
-
-
-def camera_of(simulation: RecordedSimulation, camera: str) -> str:
-    """Return the camera of the simulated arm that a camera of the data set is; recorded with one, all are the same."""
-    return RECORDED_CAMERAS[camera] if simulation.spec.cameras == 3 else "exterior_1"
 
 
 def as_seen(positions: Float[np.ndarray, "time 2"], crop: Crop, size: int) -> Float[np.ndarray, "time 2"]:

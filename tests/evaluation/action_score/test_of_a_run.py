@@ -102,7 +102,7 @@ def test_a_trained_model_plans_merged_and_its_errors_are_measured_unmerged(
     )
     found = evaluate_subject(str(run), asking).evaluation.models
     assert planned == [adapter.get("kind") == "none", True]  # a base whose adapter is switched off plans as it is
-    monkeypatch.setattr("vjepa2_ac.evaluation.evaluate_run.unadapted_copy", lambda model: model)
+    monkeypatch.setattr("vjepa2_ac.evaluation.subject.unadapted_copy", lambda model: model)
     as_it_is = evaluate_subject(str(run), replace(asking, out=tmp_path / "other")).evaluation.models
     for name, result in found.items():
         plans, others = result.plans, as_it_is[name].plans

@@ -35,6 +35,7 @@ from vjepa2_ac.evaluation.decoded.record import (
 from vjepa2_ac.evaluation.decoded.similarity import cycle_error, scales_for, similarities
 from vjepa2_ac.evaluation.distribution.mmd import discrepancy, noise_floor
 from vjepa2_ac.evaluation.evaluate import ClipName, Contender, FramesOfRow, RepeatableClips
+from vjepa2_ac.evaluation.measure import prediction
 from vjepa2_ac.evaluation.result import Example
 from vjepa2_ac.evaluation.video.features import MOST_FRAMES, frames_used, video_features
 from vjepa2_ac.intervals import mean_of
@@ -92,13 +93,13 @@ def measure_decoded(
     """
     wanted = {(one.episode_id, one.start): one for one in examples}
     names = tuple(one.name for one in contenders)
-    seen = _Seen(decoding, names)
+    seen = _Seen(decoding, names, wanted)
     progress = reporter.task("decoded rollouts")
     for batch, frames_of_row in clips.read(None):
         predicted = {one.name: _rollout(one, batch) for one in contenders}
         images = _decoded(batch, predicted, decoding, frames_of_row)
         seen.add(images, batch, predicted)
-        seen.keep_strips(images, batch, wanted, _shown_models(contenders))
+        seen.keep_strips(images, batch, _shown_models(contenders))
         progress(len(seen.ids), clips.count)
     return seen.result()
 
@@ -126,8 +127,8 @@ class _Images:
 class _Seen:
     """The numbers of each clip so far."""
 
-    def __init__(self, decoding: Decoding, models: tuple[str, ...]) -> None:
-        self.decoding, self.models = decoding, models
+    def __init__(self, decoding: Decoding, models: tuple[str, ...], wanted: Mapping[ClipName, Example]) -> None:
+        self.decoding, self.models, self.wanted = decoding, models, wanted
         self.ids: list[str] = []
         self._arrays: dict[Any, list[np.ndarray]] = {}  # by what it is; [clips, ...]
         self._strips: dict[ClipName, DecodedStrip] = {}
@@ -150,16 +151,13 @@ class _Seen:
         if isinstance(self.decoding.hand, HandReader):
             self._read_hands(self.decoding.hand, images, batch)
 
-    def keep_strips(
-        self, images: _Images, batch: LatentBatch, wanted: Mapping[ClipName, Example], models: Sequence[str]
-    ) -> None:
+    def keep_strips(self, images: _Images, batch: LatentBatch, models: Sequence[str]) -> None:
         """Store the images of the clips that are shown."""
         for row, name in enumerate(zip(batch.episode_ids, batch.starts, strict=True)):
-            if name in wanted:
+            if name in self.wanted:
                 kinds = [*((TRUE_FRAMES,) * (images.true is not None)), DECODED_TRUTH, *models]
                 rows = {kind: as_pixels(images.video_of(kind)[row]) for kind in kinds}
-                self._strips[name] = DecodedStrip(wanted[name].why, *name, rows)
-        self._order = list(wanted)
+                self._strips[name] = DecodedStrip(self.wanted[name].why, *name, rows)
 
     def result(self) -> DecodedRollouts:
         """Return what was measured.
@@ -182,7 +180,7 @@ class _Seen:
             cycle={key[1]: values for key, values in arrays.items() if key[0] == "cycle"},
             video=video,
             hand=hand,
-            strips=tuple(self._strips[name] for name in self._order if name in self._strips),
+            strips=tuple(self._strips[name] for name in self.wanted if name in self._strips),
             absent=self._absent() | why_no_video | why_no_hand,
         )
 
@@ -259,9 +257,8 @@ class _Seen:
 
 def _rollout(contender: Contender, batch: LatentBatch) -> Float[Tensor, "batch horizon tokens dim"]:
     """Return the frames after the first under the true actions; states are the recorded ones."""
-    extrinsics = None if batch.extrinsics is None else batch.extrinsics[:, :-1]
     with contender.switched(), torch.no_grad():
-        return contender.model.rollout(batch.latents[:, :1], batch.actions, batch.states[:, :-1], extrinsics)
+        return prediction(contender.model, batch)
 
 
 @torch.no_grad()

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from vjepa2_ac.data.clips.windows import spread_with_ends
 from vjepa2_ac.reports.figures.page import Page, written_page
 
 _WIDTH, _SIDE, _TITLE = 16.0, 0.3, 0.6  # inches, as all below
@@ -58,7 +59,7 @@ def _draw(page: Page, clip: ClipFigure, top: float) -> None:
 
 def _film(frames: UInt8[np.ndarray, "time height width 3"]) -> UInt8[np.ndarray, "height _ 3"]:
     """Return some frames side by side, with a little white between them."""
-    chosen = np.unique(np.linspace(0, len(frames) - 1, num=_MOST_FRAMES).round().astype(int))
+    chosen = spread_with_ends(len(frames), _MOST_FRAMES)
     gap = max(1, frames.shape[2] // 50)
     spaced = np.pad(frames[chosen], ((0, 0), (0, 0), (0, gap), (0, 0)), constant_values=255)
     return np.concatenate(list(spaced), axis=1)

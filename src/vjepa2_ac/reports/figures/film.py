@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import UInt8
 from matplotlib.colors import to_rgb
 
+from vjepa2_ac.data.clips.windows import spread_with_ends
 from vjepa2_ac.media.image_file import resized
 from vjepa2_ac.reports.figures.caption import text_image
 from vjepa2_ac.reports.figures.page import BLUE, GREEN, GREY, ORANGE
@@ -69,8 +70,7 @@ def draw_strip(film: FilmStrip, *, side: int = 128) -> UInt8[np.ndarray, "height
         film: What is shown.
         side: Height and width of an image, in pixels.
     """
-    count = len(film.seconds)
-    places = sorted({round(place) for place in np.linspace(0, count - 1, min(count, _MOST_COLUMNS))})
+    places = spread_with_ends(len(film.seconds), _MOST_COLUMNS)
     width = _LABEL + len(places) * (side + 2 * _BORDER + _GAP)
     heads = [f"{film.seconds[place]:.2f} s" if place else "start, given" for place in places]
     lines = [_line(text_image(film.title, width, height=_HEAD, points=10.5, bold=True), width)]
@@ -158,8 +158,7 @@ def _padded(panel: np.ndarray, height: int) -> np.ndarray:
 
 def _line(line: np.ndarray, width: int) -> np.ndarray:
     """Return a line filled up with white, and a gap below it."""
-    filled = np.concatenate([line[:, :width], _blank(len(line), max(0, width - line.shape[1]))], axis=1)
-    return np.concatenate([filled, _blank(_GAP, width)])
+    return np.concatenate([_padded_across(line, width), _blank(_GAP, width)])
 
 
 def _legend(kinds: set[Kind], width: int) -> np.ndarray:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 from markupsafe import Markup
 
+from vjepa2_ac.data.clips.windows import spread_with_ends
 from vjepa2_ac.evaluation.result import Evaluation, Example
 from vjepa2_ac.reports.html.formatting import decimal, seconds
 from vjepa2_ac.reports.html.images import colours_of, css_gradient, jpeg_urls, png_url
@@ -55,12 +56,12 @@ class _Shown:
     @property
     def columns(self) -> list[int]:
         """The times of the strip."""
-        return _spread(len(self.example.true_colours), _MOST_COLUMNS)
+        return spread_with_ends(len(self.example.true_colours), _MOST_COLUMNS)
 
     @property
     def turns(self) -> list[int]:
         """The times of the animation."""
-        return _spread(len(self.example.true_colours), MOST_FRAMES)
+        return spread_with_ends(len(self.example.true_colours), MOST_FRAMES)
 
     def when(self, time: int) -> str:
         return "now" if time == 0 else f"+{seconds(time * self.seconds_per_step)}"
@@ -120,7 +121,7 @@ def _tracks(example: Example, models: Sequence[str], *, has_frames: bool) -> lis
 
 def animation_style(examples: Sequence[Example]) -> str:
     """Return the CSS that shows n frames one after the other, for each n that occurs."""
-    counts = sorted({len(_spread(len(example.true_colours), MOST_FRAMES)) for example in examples[:MOST_EXAMPLES]})
+    counts = sorted({min(len(example.true_colours), MOST_FRAMES) for example in examples[:MOST_EXAMPLES]})
     rules = []
     for count in counts:
         rules.append(f"@keyframes turn-{count}{{0%{{opacity:1}}{100 / count:.4f}%{{opacity:0}}100%{{opacity:0}}}}")
@@ -131,16 +132,10 @@ def animation_style(examples: Sequence[Example]) -> str:
     return "\n".join(rules)
 
 
-def _spread(times: int, most: int) -> list[int]:
-    """Return some of the times, the first and the last among them."""
-    return sorted({round(x) for x in np.linspace(0, times - 1, min(most, times))})
-
-
 def _frames(example: Example) -> dict[int, UInt8[np.ndarray, "height width 3"]]:
     """Return the visible photographs, by time."""
     if example.frames is None:
         return {}
     times = len(example.true_colours)
-    return {
-        time: example.frames[time] for time in sorted({*_spread(times, _MOST_COLUMNS), *_spread(times, MOST_FRAMES)})
-    }
+    shown = {time for most in (_MOST_COLUMNS, MOST_FRAMES) for time in spread_with_ends(times, most)}
+    return {time: example.frames[time] for time in sorted(shown)}

@@ -71,8 +71,7 @@ class ImaginedStrip:
         """Return the latents of a batch of validation clips, after looking for the clip with the most motion."""
         if not self._is_found:
             for row, states in enumerate(encoded.states.double().cpu().numpy()):
-                sized = states[:, self._dataset.spaces.state.sized]
-                motion = float(np.linalg.norm(np.diff(sized, axis=0), axis=1).sum())
+                motion = self._dataset.spaces.state.path_length(states)
                 if self._clip is None or motion > self._clip.motion:
                     self._clip = _clip_of(batch, encoded, row, motion)
         return encoded
