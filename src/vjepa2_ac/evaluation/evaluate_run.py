@@ -27,6 +27,7 @@ from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.decoded.record import NEIGHBOURS, TRUE_FRAMES
 from vjepa2_ac.evaluation.decoded_rollouts.measure import measure_decoded
+from vjepa2_ac.evaluation.decoded_rollouts.metric_networks import load_metric_networks
 from vjepa2_ac.evaluation.decoded_rollouts.setup import HandsOf, decoding_of
 from vjepa2_ac.evaluation.evaluate import ClipName, Contender, FramesOfRow, RepeatableClips, evaluate
 from vjepa2_ac.evaluation.measure import ClipSample
@@ -75,7 +76,8 @@ def measure_subject(
         hands: Returns where the hand is in the images of a data set, if its data say so; with a decoder only.
 
     Raises:
-        InputError: The subject, the data, the decoder, or a model to compare with cannot be used; the split is empty.
+        InputError: The subject, the data, the decoder, a file of a metric, or a model to compare with cannot be used;
+            the split is empty.
     """
     asked = asked or EvaluationOptions()
     config, planning, folder = settle(subject, asked)
@@ -85,6 +87,7 @@ def measure_subject(
         folder.mkdir(parents=True, exist_ok=True)
         try_writing_at(folder)
     decoder = None if asked.decoder is None else load_decoder(asked.decoder)
+    networks = load_metric_networks(asked)
     accelerator = make_accelerator(config)
     if asked.probes.planning_clips and planning.quantize != "off":
         dtype = getattr(torch, config.model.dtype)
@@ -123,6 +126,7 @@ def measure_subject(
         decoded = None
         if decoder is not None:
             decoding = decoding_of(decoder.to(accelerator.device), world_model, through_cache, hands)
+            decoding = replace(decoding, networks=networks.to(accelerator.device))
             decoded = measure_decoded(contenders, clips, decoding, evaluation.examples, reporter=reporter)
     evaluation = replace(
         evaluation,
