@@ -33,7 +33,7 @@ from vjepa2_ac.evaluation.decoded.record import (
     VideoDiscrepancy,
 )
 from vjepa2_ac.evaluation.decoded.similarity import cycle_error, scales_for, similarities
-from vjepa2_ac.evaluation.decoded_rollouts.metric_networks import MetricNetworks, frechet_of, lpips_of
+from vjepa2_ac.evaluation.decoded_rollouts.metric_networks import MetricNetworks, frechet_of, lpips_by_pair
 from vjepa2_ac.evaluation.distribution.mmd import discrepancy, noise_floor
 from vjepa2_ac.evaluation.evaluate import ClipName, Contender, FramesOfRow, RepeatableClips
 from vjepa2_ac.evaluation.result import Example
@@ -217,9 +217,8 @@ class _Seen:
         """Measure images by LPIPS, and clips by I3D, if there are files of them."""
         networks = self.decoding.networks
         if networks.lpips is not None and not networks.why_no_lpips(self._size):
-            for source, shown in images.sources.items():
-                for reference, true in images.references.items():
-                    self._add(("lpips", source, reference), lpips_of(networks.lpips, shown, true))
+            for pair, values in lpips_by_pair(networks.lpips, images.sources, images.references).items():
+                self._add(("lpips", *pair), values)
         if networks.i3d is not None and not networks.why_no_features(self._frames):
             for source in self._videos(images):
                 self._add(("i3d", source), networks.i3d.features(images.video_of(source)))

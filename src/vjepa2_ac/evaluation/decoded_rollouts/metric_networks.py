@@ -10,13 +10,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from vjepa2_ac.evaluation.decoded.record import Reference
 from vjepa2_ac.evaluation.request import EvaluationOptions
 from vjepa2_ac.evaluation.video.frechet import LEAST_FRAMES, I3d, frechet_video_distance
 from vjepa2_ac.evaluation.video.lpips import LEAST_SIDE, Lpips, LpipsFiles, load_lpips
 from vjepa2_ac.evaluation.video.record import NO_I3D, NO_LPIPS, FrechetVideoDistances
 
-IMAGES = 32
-"""Images that go through LPIPS at once: of VGG and 256 pixels they take 2 GB."""
+IMAGES = 8
+"""Images of each source that go through LPIPS at once: of VGG, 256 pixels and six sources they take 1.6 GB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,13 +62,27 @@ def load_metric_networks(asked: EvaluationOptions) -> MetricNetworks:
     return MetricNetworks(lpips, i3d)
 
 
-def lpips_of(
-    network: Lpips, shown: Float[Tensor, "batch horizon 3 size size"], true: Float[Tensor, "batch horizon 3 size size"]
-) -> Float[np.ndarray, "batch horizon"]:
-    """Return LPIPS of every pair of whole images in 0 .. 1."""
-    pairs = zip(*(torch.split(one.float().flatten(0, 1), IMAGES) for one in (shown, true)), strict=True)
-    found = torch.cat([network(one, other) for one, other in pairs])
-    return np.asarray(found.reshape(shown.shape[:2]).double().cpu().numpy())
+def lpips_by_pair(
+    network: Lpips,
+    sources: Mapping[str, Float[Tensor, "batch horizon 3 size size"]],
+    references: Mapping[Reference, Float[Tensor, "batch horizon 3 size size"]],
+) -> dict[tuple[str, Reference], Float[np.ndarray, "batch horizon"]]:
+    """Return LPIPS of whole images in 0 .. 1, of every source and reference; features are computed once of each.
+
+    Args:
+        network: On the device of the images.
+        sources: By name.
+        references: By name; one that is a source, too, is the same images.
+    """
+    every: dict[str, Tensor] = dict(sources) | {str(name): one for name, one in references.items()}
+    images = {name: one.float().flatten(0, 1) for name, one in every.items()}
+    shape = next(iter(sources.values())).shape[:2]
+    found: dict[tuple[str, Reference], list[Tensor]] = {(one, other): [] for one in sources for other in references}
+    for first in range(0, shape[0] * shape[1], IMAGES):
+        features = {name: network.features(one[first : first + IMAGES]) for name, one in images.items()}
+        for (one, other), parts in found.items():
+            parts.append(network.distance(features[one], features[other]))
+    return {pair: torch.cat(parts).reshape(shape).double().cpu().numpy() for pair, parts in found.items()}
 
 
 def frechet_of(

@@ -6,12 +6,11 @@ is the metric that people compare, `vgg` the usual loss; do not report the one t
 
 from __future__ import annotations
 
-import math
 import pickle
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeAlias
 
 import torch
 from jaxtyping import Float
@@ -21,6 +20,7 @@ from vjepa2_ac.evaluation.video.weights_file import WeightsFile
 
 Backbone = Literal["alex", "vgg"]
 LEAST_SIDE = 32  # pixels: of fewer the pooled images have none
+Features: TypeAlias = "list[Float[Tensor, 'images channels rows columns']]"  # from fine to coarse
 _MEAN, _DEVIATION = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # of images in -1 .. 1
 _EPSILON = 1e-10
 
@@ -114,17 +114,29 @@ class Lpips(nn.Module):
             raise ValueError(f"images of {size} px; LPIPS needs {LEAST_SIDE} px a side")
         if float(true.detach().amin()) < 0 or float(true.detach().amax()) > 1:  # a prediction may be outside
             raise ValueError("true images outside 0 .. 1; LPIPS scales them to -1 .. 1 itself")
-        with torch.autocast(predicted.device.type, enabled=False):
-            pairs = zip(self._features(predicted), self._features(true), self.heads, strict=True)
-            total = torch.zeros(math.prod(predicted.shape[:-3]), device=predicted.device)
-            for one, other, head in pairs:
-                total = total + torch.einsum("nchw,c->nhw", (one - other).square(), head).mean(dim=(1, 2))
-        return total.reshape(predicted.shape[:-3])
+        flat = (images.reshape(-1, *images.shape[-3:]) for images in (predicted, true))
+        return self.distance(*map(self.features, flat)).reshape(predicted.shape[:-3])
 
-    def _features(self, images: Float[Tensor, "*batch 3 height width"]) -> list[Tensor]:
-        """Return the compared features [images channel rows columns], each place of length 1 over channels."""
+    def distance(self, one: Features, other: Features) -> Float[Tensor, " images"]:
+        """Return the distance of each pair of images, from their features."""
+        with torch.autocast(one[0].device.type, enabled=False):
+            levels = [
+                torch.einsum("nchw,c->nhw", (mine - its).square(), head).mean(dim=(1, 2))
+                for mine, its, head in zip(one, other, self.heads, strict=True)
+            ]
+            return torch.stack(levels).sum(dim=0)
+
+    def features(self, images: Float[Tensor, "images 3 height width"]) -> Features:
+        """Return the compared features of images in 0 .. 1: each place of length 1 over channels.
+
+        To compare images with several others, compute their features once.
+        """
+        with torch.autocast(images.device.type, enabled=False):
+            return self._features(images)
+
+    def _features(self, images: Float[Tensor, "images 3 height width"]) -> Features:
         mean, deviation = (torch.tensor(one, device=images.device)[:, None, None] for one in (_MEAN, _DEVIATION))
-        features = (2 * images.float().reshape(-1, *images.shape[-3:]) - 1 - mean) / deviation
+        features = (2 * images.float() - 1 - mean) / deviation
         found = []
         for layer in self.layers:
             if layer.pool:
