@@ -47,6 +47,7 @@ def add_to(commands: Commands) -> None:
     add_checkpoint(parser)
     text = "decode the rollouts and measure the images, too: what `vjepa2-ac decoder` made, or builtin:sim-tiny"
     argument(parser, "--decoder FOLDER", text, as_model)
+    _add_metric_files(parser.add_argument_group("files of metrics of decoded images (see docs/decoding.md)"))
     argument(parser, "--calibrate", "measure the one-step error at other strides, too", action="store_true")
     _add_probes(parser.add_argument_group("use of the actions"))
     _add_planning(parser.add_argument_group("plans (they take long: see docs/evaluation.md)"))
@@ -56,6 +57,14 @@ def add_to(commands: Commands) -> None:
     parser = command(commands, "compare", _compare, text)
     argument(parser, "runs RUN", "folders with a metrics.json, two or more", as_path, nargs="+")
     argument(parser, "--out PNG", "the image (comparison.png)", as_path, default=Path("comparison.png"))
+
+
+def _add_metric_files(group: argparse._ArgumentGroup) -> None:
+    text = "LPIPS of the decoded images, by these weights: alexnet-owt-7be5be79.pth or vgg16-397923af.pth"
+    argument(group, "--lpips FILE", text, as_path)
+    argument(group, "--lpips-heads FILE", "its heads: alex.pth or vgg.pth of version 0.1", as_path)
+    text = "FVD of the decoded clips, which is biased, by this I3D network: i3d_torchscript.pt"
+    argument(group, "--i3d FILE", text, as_path)
 
 
 def _add_probes(group: argparse._ArgumentGroup) -> None:

@@ -8,10 +8,11 @@ from vjepa2_ac.console.progress import MetricsTable, with_interval
 from vjepa2_ac.evaluation.action_score.metrics import AXES, metrics_of, signed_along, ways_of
 from vjepa2_ac.evaluation.action_score.protocol import BEST_SCORE, STEPS
 from vjepa2_ac.evaluation.axis_fit import AxisFit
-from vjepa2_ac.evaluation.decoded.estimates import hand_of, similarity_of, skill_of
-from vjepa2_ac.evaluation.decoded.record import NEIGHBOURS, TRUE_FRAMES, Found, Reference
+from vjepa2_ac.evaluation.decoded.estimates import fvd_of, hand_of, lpips_of, similarity_of, skill_of
+from vjepa2_ac.evaluation.decoded.record import NEIGHBOURS, TRUE_FRAMES, DecodedRollouts, Found, Reference
 from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persistence, stratum_over_persistence
 from vjepa2_ac.evaluation.result import ACTIONS, ActionRanking, Evaluation, Landscapes, PlanningStudy, Sensitivity
+from vjepa2_ac.evaluation.video.record import FVD_LABEL, NO_I3D, NO_LPIPS
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.reports.comparison import Comparison
 
@@ -31,7 +32,7 @@ def evaluation_tables(evaluation: Evaluation) -> tuple[Table, ...]:
 
 
 def decoded_lines(evaluation: Evaluation) -> tuple[str, ...]:
-    """Return two lines on the images of the rollouts; none without a decoder."""
+    """Return two lines on the images of the rollouts, and one for each file of a metric; none without a decoder."""
     found = evaluation.decoded
     if found is None:
         return ()
@@ -45,7 +46,25 @@ def decoded_lines(evaluation: Evaluation) -> tuple[str, ...]:
     second = f"Skill where something moves (0 persistence, 1 decoded truth): {_named(skill, '.2f')}."
     if found.hand is not None:
         second += f" The hand is off by (px of {found.hand.size}): {_named(hand, '.1f')}."
-    return (*lines, second)
+    return (*lines, second, *_metric_file_lines(found, against, ahead))
+
+
+def _metric_file_lines(found: DecodedRollouts, against: Reference, ahead: str) -> list[str]:
+    """Return LPIPS and FVD if their files were named, or why there is none."""
+    sources, reference, lines = (*NEIGHBOURS, *found.models), against.replace("_", " "), []
+    if found.lpips is not None:
+        lpips = {name: lpips_of(found, name, against)[-1] for name in sources}
+        name = f"LPIPS ({found.lpips.backbone})"
+        lines.append(f"{name}, {ahead}, against the {reference} (0 identical): {_named(lpips, '.3f')}.")
+    elif found.absent.get("lpips", NO_LPIPS) != NO_LPIPS:
+        lines.append(f"LPIPS: not measured, {found.absent['lpips']}.")
+    if found.fvd is not None:
+        fvd = {name: fvd_of(found, name, against).value for name in sources}
+        shown = [f"{name.replace('_', ' ')} {value:.1f}" for name, value in fvd.items() if value is not None]
+        lines.append(f"{FVD_LABEL} of {found.fvd.clips} clips to the {reference}: {', '.join(shown) or 'none'}.")
+    elif found.absent.get("fvd", NO_I3D) != NO_I3D:
+        lines.append(f"{FVD_LABEL}: not measured, {found.absent['fvd']}.")
+    return lines
 
 
 def _named(found: dict[str, Found], form: str) -> str:

@@ -24,6 +24,7 @@ from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.encoding.training_cache import with_latents_if_there
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.evaluation.decoded_rollouts.measure import measure_decoded
+from vjepa2_ac.evaluation.decoded_rollouts.metric_networks import load_metric_networks
 from vjepa2_ac.evaluation.decoded_rollouts.setup import HandsOf, decoding_of
 from vjepa2_ac.evaluation.evaluate import ClipName, FramesOfRow, RepeatableClips, evaluate
 from vjepa2_ac.evaluation.measure import ClipSample
@@ -66,7 +67,8 @@ def measure_subject(
         hands: Returns where the hand is in the images of a data set, if its data say so; with a decoder only.
 
     Raises:
-        InputError: The subject, the data, the decoder, or a model to compare with cannot be used; the split is empty.
+        InputError: The subject, the data, the decoder, a file of a metric, or a model to compare with cannot be used;
+            the split is empty.
     """
     asked = asked or EvaluationOptions()
     config, planning, folder = settle(subject, asked)
@@ -74,6 +76,7 @@ def measure_subject(
         select_checkpoint(Path(subject), asked.checkpoint)
     _make_writable(folder)
     decoder = None if asked.decoder is None else load_decoder(asked.decoder)
+    networks = load_metric_networks(asked)
     accelerator = make_accelerator(config)
     if asked.probes.planning_clips:
         _require_quantizable(config, planning, accelerator.device)
@@ -103,6 +106,7 @@ def measure_subject(
         decoded = None
         if decoder is not None:
             decoding = decoding_of(decoder.to(accelerator.device), world_model, through_cache, hands)
+            decoding = replace(decoding, networks=networks.to(accelerator.device))
             decoded = measure_decoded(contenders, clips, decoding, evaluation.examples, reporter=reporter)
     evaluation = replace(
         evaluation,

@@ -46,6 +46,9 @@ class EvaluationOptions:
     probes: ProbeOptions = field(default_factory=ProbeOptions)
     calibrate: bool = False  # also measure the error at other strides
     decoder: str | None = None  # folder of a decoder, or builtin:sim-tiny: rollouts are decoded and measured as images
+    lpips: Path | None = None  # with a decoder: torchvision's AlexNet or VGG16, for LPIPS; no file, no LPIPS
+    lpips_heads: Path | None = None  # its heads
+    i3d: Path | None = None  # with a decoder: i3d_torchscript.pt, for FVD; no file, no FVD
     planning: tuple[str, ...] = ()  # settings in place of the config's, such as planning.samples=200
 
 
@@ -58,13 +61,35 @@ def settle(subject: str, asked: EvaluationOptions, *, frames: int | None = None)
         frames: Of a clip; None: as `data.frames` says.
 
     Raises:
-        InputError: The subject is no run and no data are named, a setting is wrong, or a folder is missing.
+        InputError: The subject is no run and no data are named, a setting is wrong, a folder is missing, or files of
+            metrics are named without a decoder or incompletely.
     """
+    _check_metric_files(asked)
     config, folder = _config_of(subject, asked)
     if frames is not None:
         config = config.model_copy(update={"data": config.data.model_copy(update={"frames": frames})})
     _check_long_enough(config, asked.probes)
     return config, _planning_of(subject, config, asked), folder
+
+
+def _check_metric_files(asked: EvaluationOptions) -> None:
+    files = {"--lpips": asked.lpips, "--lpips-heads": asked.lpips_heads, "--i3d": asked.i3d}
+    given = [option for option, path in files.items() if path is not None]
+    if given and asked.decoder is None:
+        raise InputError(
+            where=" ".join(given),
+            found="no --decoder",
+            needed="a decoder: LPIPS and FVD are of decoded images",
+            fix="Add --decoder FOLDER; `vjepa2-ac decoder CONFIG` trains one",
+        )
+    missing = {"--lpips", "--lpips-heads"} - set(given)
+    if len(missing) == 1:
+        raise InputError(
+            where=next(option for option in given if option != "--i3d"),
+            found=f"no {missing.pop()}",
+            needed="both files of LPIPS: a backbone (--lpips) and its heads (--lpips-heads)",
+            fix="docs/decoding.md says where to get them",
+        )
 
 
 def _config_of(subject: str, asked: EvaluationOptions) -> tuple[Config, Path]:

@@ -7,7 +7,9 @@ from typing import Any
 from vjepa2_ac.evaluation.decoded.estimates import (
     Curve,
     cycle_of,
+    fvd_of,
     hand_of,
+    lpips_of,
     moving_share_of,
     similarity_of,
     skill_of,
@@ -21,6 +23,7 @@ from vjepa2_ac.evaluation.decoded.record import (
     TRUE_FRAMES,
     DecodedRollouts,
 )
+from vjepa2_ac.evaluation.video.record import FVD_LABEL, FVD_MEANING, LPIPS_MEANING, NO_I3D, NO_LPIPS
 
 
 def decoded_as_dict(found: DecodedRollouts) -> dict[str, Any]:
@@ -32,6 +35,8 @@ def decoded_as_dict(found: DecodedRollouts) -> dict[str, Any]:
         "neighbours": {name: _source(found, name) for name in NEIGHBOURS},
         "hand": _hand(found),
         "video_mmd": _video(found),
+        "lpips": _absent_lpips(found) if found.lpips is None else found.lpips.about(),
+        "fvd": _absent_fvd(found) if found.fvd is None else found.fvd.about(),
     }
 
 
@@ -56,6 +61,8 @@ def _source(found: DecodedRollouts, name: str) -> dict[str, Any]:
         "cycle_error": _curve(cycle_of(found, name)),
         "hand_error_px": _curve(hand_of(found, name)),
         "video_mmd": _video_of(found, name),
+        "lpips": {f"against_{reference}": _curve(lpips_of(found, name, reference)) for reference in REFERENCES},
+        "fvd": {f"against_{reference}": fvd_of(found, name, reference).as_dict() for reference in REFERENCES},
     }
 
 
@@ -90,6 +97,15 @@ def _video(found: DecodedRollouts) -> dict[str, Any]:
     if video is None:
         return {"value": None, "reason": found.absent["video"], "meaning": MEANING}
     return {"meaning": MEANING, "frames": video.frames, "noise_floor": video.noise_floor, "notes": video.notes}
+
+
+def _absent_lpips(found: DecodedRollouts) -> dict[str, Any]:
+    return {"value": None, "reason": found.absent.get("lpips", NO_LPIPS), "meaning": LPIPS_MEANING}
+
+
+def _absent_fvd(found: DecodedRollouts) -> dict[str, Any]:
+    reason = found.absent.get("fvd", NO_I3D)
+    return {"value": None, "reason": reason, "label": FVD_LABEL, "meaning": FVD_MEANING}
 
 
 def _curve(curve: Curve) -> list[dict[str, Any]]:

@@ -11,18 +11,29 @@ from decoded_worlds import Known, clips, contenders, decoder
 from tiny_models import tiny_model
 from vjepa2_ac.data.clips.transforms import images_to_input
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.evaluation.decoded.estimates import cycle_of, hand_of, moving_share_of, similarity_of, skill_of
+from vjepa2_ac.evaluation.decoded.estimates import (
+    cycle_of,
+    fvd_of,
+    hand_of,
+    lpips_of,
+    moving_share_of,
+    similarity_of,
+    skill_of,
+)
 from vjepa2_ac.evaluation.decoded.hand import HandProbe
 from vjepa2_ac.evaluation.decoded.record import (
     DECODED_PERSISTENCE,
     DECODED_TRUTH,
     NEIGHBOURS,
+    REFERENCES,
     REGIONS,
     SIMILARITIES,
     DecodedRollouts,
 )
 from vjepa2_ac.evaluation.decoded_rollouts.measure import Decoding, HandReader, measure_decoded
+from vjepa2_ac.evaluation.decoded_rollouts.metric_networks import IMAGES, MetricNetworks, lpips_by_pair
 from vjepa2_ac.evaluation.result import Example
+from vjepa2_ac.evaluation.video.lpips import Lpips
 from vjepa2_ac.reports.decoded_json import decoded_as_dict
 from worlds import TIME, Copier, Halfway, Oracle, clips_batch
 
@@ -190,3 +201,62 @@ def test_hands_are_read_from_every_source_and_measured_against_where_they_are() 
     assert [one.value for one in hand_of(found, "adapter")] == pytest.approx([3.0] * (TIME - 1))
     assert (found.hand.size, found.hand.mean_position) == (size, 3.0)
     assert hand_of(found, "raw_persistence")[0].reason
+
+
+def random_lpips() -> Lpips:
+    network = Lpips("alex")
+    for number, value in enumerate(network.parameters()):
+        drawn = torch.rand(value.shape, generator=torch.Generator().manual_seed(number))
+        value.copy_(drawn - 0.5 if value.ndim == 4 else drawn)
+    return network
+
+
+NETWORKS = MetricNetworks(lpips=random_lpips())
+
+
+def test_lpips_of_a_perfect_predictor_is_that_of_the_decoded_truth_and_of_a_copier_that_of_persistence() -> None:
+    models = contenders(Oracle(), Copier())
+    found = measure_decoded(models, clips(clips_batch(6), TRAINED), Decoding(TRAINED, networks=NETWORKS))
+    assert found.lpips is not None
+    for reference in REFERENCES:
+        for source, neighbour in (("adapter", DECODED_TRUTH), ("base", DECODED_PERSISTENCE)):
+            np.testing.assert_array_equal(
+                found.lpips.by_clip[source, reference], found.lpips.by_clip[neighbour, reference]
+            )
+    assert (found.lpips.by_clip["adapter", "decoded_truth"] == 0).all()
+    (one, *_) = lpips_of(found, "base", "truth")
+    assert one.value == pytest.approx(found.lpips.by_clip["base", "truth"][:, 0].mean())
+    assert one.estimate is not None
+    assert one.estimate.low < one.value < one.estimate.high
+    assert "lpips" not in found.absent
+
+
+def test_lpips_of_parts_is_that_of_the_images_one_by_one() -> None:
+    shown, true = torch.rand(2, 2, IMAGES - 1, 3, 32, 32, generator=torch.Generator().manual_seed(0))
+    network = random_lpips()
+    values = lpips_by_pair(network, {"adapter": shown}, {"truth": true})["adapter", "truth"]
+    np.testing.assert_allclose(values, network(shown, true).numpy(), rtol=1e-4)
+
+
+def test_of_images_below_32_pixels_there_is_no_lpips_but_the_reason() -> None:
+    batch = replace(BATCH, latents=BATCH.latents[:, :, :1])
+    small = decoder(tokens=1)
+    found = measure_decoded(contenders(Copier()), clips(batch, small), Decoding(small, networks=NETWORKS))
+    assert found.lpips is None
+    reason = decoded_as_dict(found)["models"]["adapter"]["lpips"]["against_truth"][0]["reason"]
+    assert reason == "images of 16 pixels; it needs 32 a side"
+
+
+def test_from_a_cache_lpips_is_against_the_decoded_truth_alone() -> None:
+    decoding = Decoding(TRAINED, has_frames=False, networks=NETWORKS)
+    found = measure_decoded(contenders(Copier()), clips(clips_batch(6), TRAINED), decoding)
+    assert lpips_of(found, "adapter", "decoded_truth")[0].value > 0
+    assert "cache" in lpips_of(found, "adapter", "truth")[0].reason
+    assert fvd_of(found, "adapter", "truth").value is None
+
+
+def test_a_model_may_have_the_name_of_a_metric() -> None:
+    models = [replace(contenders(Copier())[0], name=name) for name in ("hand", "cycle", "video", "i3d", "lpips")]
+    found = measure_decoded(models, clips(clips_batch(6), TRAINED), Decoding(TRAINED))
+    assert dict(found.cycle) == {}
+    assert similarity_of(found, "cycle", "truth", "whole", "ssim")[0].estimate is not None

@@ -1,36 +1,20 @@
 """The Frechet distance has its closed form and its bias; FVD takes one known file, or says why there is none."""
 
-import hashlib
-import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from scipy import linalg
-from torch import Tensor, nn
 
+from metric_files import know_i3d, write_i3d
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.video.frechet import NO_I3D, I3d, frechet_distance, frechet_video_distance
+from vjepa2_ac.evaluation.video.frechet import I3d, frechet_distance, frechet_video_distance
 
 
-class Tiny(nn.Module):
-    """Stands in for I3D: takes its arguments, and says what it was given."""
-
-    def forward(self, videos: Tensor, rescale: bool, resize: bool, return_features: bool) -> Tensor:
-        """Return the mean of each channel at the first and the last time, which no flag may change."""
-        if rescale or resize or not return_features or videos.shape[-1] != 224 or videos.shape[1] != 3:
-            return videos
-        return torch.cat([videos[:, :, 0].mean(dim=[2, 3]), videos[:, :, -1].mean(dim=[2, 3])], dim=1)
-
-
-@pytest.fixture(scope="module")
-def network(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    path = tmp_path_factory.mktemp("i3d") / "tiny.pt"
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # of TorchScript itself
-        torch.jit.save(torch.jit.script(Tiny()), str(path))
-    return path, hashlib.sha256(path.read_bytes()).hexdigest()
+@pytest.fixture
+def network(tmp_path: Path) -> Path:
+    return write_i3d(tmp_path)
 
 
 def with_moments(mean: np.ndarray, covariance: np.ndarray) -> np.ndarray:
@@ -73,32 +57,35 @@ def test_one_row_and_other_widths_are_refused() -> None:
             frechet_distance(one, other)
 
 
-def test_fvd_is_the_distance_of_the_networks_features(network: tuple[Path, str]) -> None:
-    path, sha256 = network
+def test_fvd_is_the_distance_of_the_networks_features(network: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    know_i3d(monkeypatch, network)
     generator = torch.Generator().manual_seed(0)
     imagined, true = torch.rand(2, 5, 12, 3, 16, 16, generator=generator)
-    i3d = I3d(path, sha256=sha256)
+    i3d = I3d(network)
     found = i3d.features(true, chunk=2)
     resized = torch.nn.functional.interpolate(true[:, 11], size=(224, 224), mode="bilinear", align_corners=False)
     np.testing.assert_allclose(found[:, 3:], (2 * resized - 1).mean(dim=(2, 3)).numpy(), rtol=1e-4, atol=1e-5)
-    distance = frechet_video_distance(imagined, true, i3d)
+    distance = frechet_video_distance(i3d.features(imagined), found)
     assert distance.value == pytest.approx(frechet_distance(i3d.features(imagined), found))
     assert distance.as_dict()["label"] == "FVD (biased)"
+    with pytest.raises(ValueError, match="10 frames; I3D needs 11"):
+        i3d.features(true[:, :10])
 
 
-def test_absent_fvd_is_none_with_its_reason(network: tuple[Path, str]) -> None:
-    videos = torch.zeros(4, 10, 3, 16, 16)
-    assert frechet_video_distance(videos, videos, None).as_dict() == {
-        "value": None, "clips": 4, "reason": NO_I3D, "label": "FVD (biased)",
+def test_absent_fvd_is_none_with_its_reason() -> None:
+    assert frechet_video_distance(np.zeros((1, 3)), np.zeros((1, 3))).as_dict() == {
+        "value": None, "clips": 1, "reason": "it needs two clips or more", "label": "FVD (biased)",
     }  # fmt: skip
-    i3d = I3d(network[0], sha256=network[1])
-    assert "10 frames; I3D needs 11" in frechet_video_distance(videos, videos, i3d).reason
-    longer = torch.zeros(1, 12, 3, 16, 16)
-    assert "two clips" in frechet_video_distance(longer, longer, i3d).reason
+    broken = np.array([[0.0, np.nan], [1.0, 2.0]])
+    assert frechet_video_distance(broken, np.eye(2)).reason == "some features are not finite"
 
 
-def test_a_file_of_another_hash_is_not_loaded(network: tuple[Path, str]) -> None:
-    with pytest.raises(InputError, match="bec6519f66ea534e"):
-        I3d(network[0])
-    with pytest.raises(InputError, match="cannot be read"):
-        I3d(network[0].with_name("none.pt"))
+def test_a_file_of_another_hash_is_not_loaded(network: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(InputError, match=r"--i3d .*a file of SHA-256 .*begins with bec6519f66ea534e"):
+        I3d(network)
+    with pytest.raises(InputError, match=r"--i3d .*cannot be read"):
+        I3d(network.with_name("none.pt"))
+    network.write_bytes(b"no network")
+    know_i3d(monkeypatch, network)
+    with pytest.raises(InputError, match="cannot load it"):
+        I3d(network)

@@ -1,46 +1,27 @@
 """LPIPS equals lpips 0.1.4 (recorded values), passes gradients to the images, and takes known files only."""
 
-import hashlib
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+from metric_files import know_lpips, sha256_of, write_lpips
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.video.lpips import Backbone, Lpips, LpipsFiles, load_lpips
+from vjepa2_ac.evaluation.video.lpips import BACKBONES, Backbone, Lpips, LpipsFiles, load_lpips
 
 # lpips 0.1.4 on torch 2.13.0, version 0.1, normalize=True, with plain stacks of the same convolutions in torchvision's
-# place, on `images` and the weights of `write`: paler, shifted, unrelated.
+# place, on `images` and the weights of `write_lpips`: paler, shifted, unrelated.
 RECORDED: dict[Backbone, list[float]] = {
     "alex": [0.002501914743334055, 0.008731486275792122, 0.14271697402000427],
     "vgg": [0.0026000658981502056, 0.007551541551947594, 0.09465347975492477],
 }
 
 
-def drawn(name: str, shape: tuple[int, ...]) -> Tensor:
-    """Return weights that depend on a name only: NumPy's old generator promises never to change."""
-    normal = np.random.RandomState(sum(map(ord, name))).standard_normal(shape)
-    return torch.from_numpy((normal * np.sqrt(2 / max(1, int(np.prod(shape[1:]))))).astype(np.float32))
-
-
-def write(folder: Path, backbone: Backbone) -> LpipsFiles:
-    """Write a backbone, with a classifier that is of no use, and heads; return them with their hashes."""
-    network = Lpips(backbone)
-    weights = {
-        f"features.{index}.{kind}": drawn(f"{index}.{kind}", tuple(value.shape))
-        for index, convolution in network.convolutions.items()
-        for kind, value in convolution.named_parameters()
-    }
-    heads = {
-        f"lin{number}.model.1.weight": drawn(f"lin{number}", (1, len(head), 1, 1)).abs()
-        for number, head in enumerate(network.heads)
-    }
-    torch.save(weights | {"classifier.1.weight": torch.zeros(3)}, folder / "backbone.pth")
-    torch.save(heads, folder / "heads.pth")
-    hashes = [hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in ("backbone.pth", "heads.pth")]
-    return LpipsFiles(folder / "backbone.pth", folder / "heads.pth", *hashes)
+def loaded(folder: Path, backbone: Backbone, monkeypatch: pytest.MonkeyPatch) -> Lpips:
+    files = write_lpips(folder, backbone)
+    know_lpips(monkeypatch, backbone, files)
+    return load_lpips(files)
 
 
 def images(size: int = 64) -> tuple[Tensor, Tensor]:
@@ -53,8 +34,9 @@ def images(size: int = 64) -> tuple[Tensor, Tensor]:
 
 
 @pytest.mark.parametrize("backbone", ["alex", "vgg"])
-def test_distances_equal_those_of_lpips(tmp_path: Path, backbone: Backbone) -> None:
-    network = load_lpips(backbone, write(tmp_path, backbone))
+def test_distances_equal_those_of_lpips(tmp_path: Path, backbone: Backbone, monkeypatch: pytest.MonkeyPatch) -> None:
+    network = loaded(tmp_path, backbone, monkeypatch)
+    assert network.backbone == backbone
     predicted, true = images()
     assert network(predicted, true).tolist() == pytest.approx(RECORDED[backbone], abs=1e-6, rel=1e-4)
     assert network(true, true).tolist() == [0.0] * 3
@@ -62,8 +44,10 @@ def test_distances_equal_those_of_lpips(tmp_path: Path, backbone: Backbone) -> N
         assert float(network(predicted[1], true[1])) == pytest.approx(RECORDED[backbone][1], rel=1e-4)
 
 
-def test_gradients_reach_the_image_alone_and_are_finite_where_all_features_are_zero(tmp_path: Path) -> None:
-    network = load_lpips("alex", write(tmp_path, "alex"))
+def test_gradients_reach_the_image_alone_and_are_finite_where_all_features_are_zero(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    network = loaded(tmp_path, "alex", monkeypatch)
     assert not any(value.requires_grad for value in network.parameters())
     predicted, true = images()
     predicted.requires_grad_()
@@ -75,20 +59,40 @@ def test_gradients_reach_the_image_alone_and_are_finite_where_all_features_are_z
     assert torch.isfinite(gradient).all()
 
 
-def test_other_files_are_refused(tmp_path: Path) -> None:
-    files = write(tmp_path, "alex")
-    with pytest.raises(InputError, match="7be5be79"):
-        load_lpips("alex", LpipsFiles(files.backbone, files.heads))
-    with pytest.raises(InputError, match="df73285e"):
-        load_lpips("alex", LpipsFiles(files.backbone, files.heads, files.backbone_sha256))
-    with pytest.raises(InputError, match="cannot be read"):
-        load_lpips("alex", LpipsFiles(tmp_path / "none.pth", files.heads))
+def test_other_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    files = write_lpips(tmp_path, "alex")
+    with pytest.raises(InputError, match=r"--lpips .*a file of SHA-256 .*begins with 7be5be79 or 397923af"):
+        load_lpips(files)
+    monkeypatch.setitem(BACKBONES, "alex", sha256_of(files.backbone)[:8])
+    with pytest.raises(InputError, match=r"--lpips-heads .*begins with df73285e"):
+        load_lpips(files)
+    know_lpips(monkeypatch, "alex", files)
+    with pytest.raises(InputError, match=r"--lpips .*a file of SHA-256"):
+        load_lpips(LpipsFiles(files.heads, files.backbone))
+    with pytest.raises(InputError, match=r"--lpips .*cannot be read"):
+        load_lpips(LpipsFiles(tmp_path / "none.pth", files.heads))
+    with pytest.raises(InputError, match=r"--lpips-heads .*cannot be read"):
+        load_lpips(LpipsFiles(files.backbone, tmp_path))
+
+
+def test_the_heads_of_another_backbone_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    alex, vgg = write_lpips(tmp_path, "alex"), write_lpips(tmp_path, "vgg")
+    know_lpips(monkeypatch, "alex", alex)
+    know_lpips(monkeypatch, "vgg", vgg)
+    with pytest.raises(InputError, match=r"--lpips-heads .*alex\.pth of weights"):
+        load_lpips(LpipsFiles(alex.backbone, vgg.heads))
+
+
+def test_known_files_without_the_weights_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    files = write_lpips(tmp_path, "alex")
+    know_lpips(monkeypatch, "vgg", files)
     with pytest.raises(InputError, match=r"features\.0\.weight of shape \[64, 3, 3, 3\]"):
-        load_lpips("vgg", files)
+        load_lpips(files)
     files.heads.write_bytes(b"not weights")
-    found = hashlib.sha256(b"not weights").hexdigest()
+    know_lpips(monkeypatch, "alex", files)
+    monkeypatch.setitem(BACKBONES, "vgg", "none")
     with pytest.raises(InputError, match="no PyTorch weights"):
-        load_lpips("alex", LpipsFiles(files.backbone, files.heads, files.backbone_sha256, found))
+        load_lpips(files)
 
 
 def test_images_that_are_too_small_or_of_another_range_are_refused() -> None:

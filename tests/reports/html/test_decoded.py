@@ -4,10 +4,12 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+from markupsafe import escape
 
 from evaluation_results import evaluation
 from vjepa2_ac.evaluation.decoded.estimates import hand_of, similarity_of
 from vjepa2_ac.evaluation.decoded.record import (
+    ABSENT,
     NEIGHBOURS,
     REFERENCES,
     REGIONS,
@@ -16,6 +18,7 @@ from vjepa2_ac.evaluation.decoded.record import (
     DecodedStrip,
     HandErrors,
 )
+from vjepa2_ac.evaluation.video.record import FrechetVideoDistance, FrechetVideoDistances, LpipsDistances
 from vjepa2_ac.intervals import mean_of
 from vjepa2_ac.reports.html.decoded import decoded_section
 from vjepa2_ac.reports.html.formatting import value
@@ -93,3 +96,25 @@ def test_with_large_noisy_images_the_page_stays_small() -> None:
     page = report_page(replace(USUAL, decoded=decoded(size=256, strips=6)), "verdict")
     assert len(page) < 5_000_000
     assert "<script" not in page
+
+
+def test_each_absent_metric_has_a_name_and_an_unknown_one_is_shown_as_it_is() -> None:
+    absent = {what: f"reason {number}" for number, what in enumerate([*ABSENT, "new"])}
+    section = decoded_section(replace(USUAL, decoded=replace(decoded(), hand=None, absent=absent)))
+    for what, reason in absent.items():
+        assert f"{value_of_name(what)}: not measured, {reason}." in section
+
+
+def value_of_name(what: str) -> str:
+    return str(escape(ABSENT.get(what, what)))
+
+
+def test_lpips_and_fvd_have_columns_and_their_meaning_if_they_were_measured() -> None:
+    full, shape = decoded(), (len(USUAL.clips.episode_ids), USUAL.horizon)
+    by_clip = {(source, "truth"): np.full(shape, 0.123) for source in (*NEIGHBOURS, *USUAL.models)}
+    fvd = FrechetVideoDistances({"truth": {"adapter": FrechetVideoDistance(87.65, 48)}}, 48, 400)
+    measured = replace(full, lpips=LpipsDistances("vgg", by_clip), fvd=fvd)
+    section = decoded_section(replace(USUAL, decoded=measured))
+    for words in ("LPIPS (vgg)</th>", "FVD (biased)</th>", "0.123", "<td>87.7</td>", "covariance is singular"):
+        assert words in section
+    assert "LPIPS (" not in decoded_section(replace(USUAL, decoded=full))

@@ -17,6 +17,7 @@ from vjepa2_ac.evaluation.decoded.record import (
     Region,
     Similarity,
 )
+from vjepa2_ac.evaluation.video.record import FrechetVideoDistance
 from vjepa2_ac.intervals import Estimate, bootstrapped, mean_of
 
 Curve = tuple[Found, ...]  # at horizon 1, 2, ...; index h - 1
@@ -81,6 +82,24 @@ def hand_of(found: DecodedRollouts, source: str) -> Curve:
     if hand is None or source not in hand.pixels:
         return (Found(None, found.absent.get("hand", "not measured of this one")),) * found.horizon
     return tuple(_known(hand, column, found.episode_ids) for column in hand.pixels[source].T)
+
+
+def lpips_of(found: DecodedRollouts, source: str, reference: Reference) -> Curve:
+    """Return the mean LPIPS of whole images by horizon; 0 is identical."""
+    values = None if found.lpips is None else found.lpips.by_clip.get((source, reference))
+    if values is None:
+        reason = found.absent.get("truth") if reference == "truth" and found.lpips is not None else None
+        return (Found(None, reason or found.absent.get("lpips", "not measured of this one")),) * found.horizon
+    return tuple(Found(mean_of(column, found.episode_ids)) for column in values.T)
+
+
+def fvd_of(found: DecodedRollouts, source: str, reference: Reference) -> FrechetVideoDistance:
+    """Return FVD of whole clips, which is biased and has no interval."""
+    if found.fvd is not None and source in found.fvd.against.get(reference, {}):
+        return found.fvd.against[reference][source]
+    reason = found.absent.get("truth") if reference == "truth" and found.fvd is not None else None
+    reason = reason or found.absent.get("fvd", "not measured of this one")
+    return FrechetVideoDistance(None, len(found.episode_ids), reason)
 
 
 def _known(hand: HandErrors, column: Float[np.ndarray, " clips"], ids: Sequence[str]) -> Found:

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from vjepa2_ac.evaluation.distribution.mmd import Discrepancy
+from vjepa2_ac.evaluation.video.record import FVD_LABEL, FrechetVideoDistances, LpipsDistances
 from vjepa2_ac.intervals import Estimate
 
 Reference = Literal["truth", "decoded_truth"]
@@ -36,6 +37,18 @@ MEANING = (
     " it does not see, this does not see."
 )
 """The words that stand beside a V-JEPA 2 MMD wherever it is shown."""
+
+ABSENT: Mapping[str, str] = {
+    "truth": "Against the truth",
+    "cycle": "Cycle error",
+    "video": "V-JEPA 2 MMD",
+    "hand": "The hand's position",
+    "ssim": "SSIM",
+    "ms_ssim": "MS-SSIM",
+    "lpips": "LPIPS",
+    "fvd": FVD_LABEL,
+}
+"""What may be absent, and what a reader knows it by."""
 
 NEIGHBOURS = (DECODED_TRUTH, DECODED_PERSISTENCE, RAW_PERSISTENCE)
 TRUE_FRAMES = "truth"
@@ -107,5 +120,7 @@ class DecodedRollouts:
     cycle: Mapping[str, Float[np.ndarray, "clips horizon"]]  # of models and the decoded truth
     video: VideoDiscrepancy | None = None
     hand: HandErrors | None = None
+    lpips: LpipsDistances | None = None
+    fvd: FrechetVideoDistances | None = None
     strips: tuple[DecodedStrip, ...] = ()
-    absent: Mapping[str, str] = field(default_factory=dict)  # truth, ssim, ms_ssim, cycle, video, hand -> the reason
+    absent: Mapping[str, str] = field(default_factory=dict)  # a key of ABSENT -> the reason

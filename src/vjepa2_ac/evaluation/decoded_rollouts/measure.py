@@ -7,7 +7,7 @@ gives the bits of the decoded truth. Images are compared at the encoder's size, 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -33,18 +33,20 @@ from vjepa2_ac.evaluation.decoded.record import (
     VideoDiscrepancy,
 )
 from vjepa2_ac.evaluation.decoded.similarity import cycle_error, scales_for, similarities
+from vjepa2_ac.evaluation.decoded_rollouts.metric_networks import MetricNetworks, frechet_of, lpips_by_pair
 from vjepa2_ac.evaluation.distribution.mmd import discrepancy, noise_floor
 from vjepa2_ac.evaluation.evaluate import ClipName, Contender, FramesOfRow, RepeatableClips
 from vjepa2_ac.evaluation.measure import prediction
 from vjepa2_ac.evaluation.result import Example
 from vjepa2_ac.evaluation.video.features import MOST_FRAMES, frames_used, video_features
+from vjepa2_ac.evaluation.video.record import FrechetVideoDistances, LpipsDistances
 from vjepa2_ac.intervals import mean_of
 from vjepa2_ac.media.image_similarity import moving_region
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import SILENT, Reporter
 
 LEAST_CLIPS, LEAST_EPISODES = 20, 5
-"""Of a video MMD: of fewer, pairs of episodes say nothing."""
+"""Of a video MMD and FVD: of fewer, pairs of episodes say nothing."""
 
 CACHE = "the latents come from a cache, which holds only small frames"
 _NO_ENCODER = "the latents come from a cache, and the encoder was set aside"
@@ -69,6 +71,7 @@ class Decoding:
     encoder: WorldModel | None = None  # whose frozen encoder sees the images; None: it was set aside
     chunk: int = 16  # frames that go through the encoder at once
     hand: HandReader | str = _NOT_ASKED  # or the reason why there is none
+    networks: MetricNetworks = field(default_factory=MetricNetworks)
 
 
 def measure_decoded(
@@ -146,6 +149,7 @@ class _Seen:
             for reference, true in images.references.items():
                 for (region, metric), values in similarities(shown, true, moving).items():
                     self._add((source, reference, region, metric), values)
+        self._measure_by_networks(images)
         if self.decoding.encoder is not None:
             self._encode(self.decoding.encoder, images, {**predicted, DECODED_TRUTH: batch.latents[:, 1:]})
         if isinstance(self.decoding.hand, HandReader):
@@ -170,6 +174,8 @@ class _Seen:
         arrays = {key: np.concatenate(parts) for key, parts in self._arrays.items()}
         video, why_no_video = self._video(arrays)
         hand, why_no_hand = self._hand(arrays)
+        lpips, why_no_lpips = self._lpips(arrays)
+        fvd, why_no_fvd = self._fvd(arrays)
         return DecodedRollouts(
             decoder=_description(self.decoding.decoder),
             episode_ids=tuple(self.ids),
@@ -177,11 +183,13 @@ class _Seen:
             horizon=self._frames - 1,
             arrays={key: values for key, values in arrays.items() if len(key) == 4},
             moving_share=arrays.get(("moving",)),
-            cycle={key[1]: values for key, values in arrays.items() if key[0] == "cycle"},
+            cycle=_by_source(arrays, "cycle"),
             video=video,
             hand=hand,
+            lpips=lpips,
+            fvd=fvd,
             strips=tuple(self._strips[name] for name in self.wanted if name in self._strips),
-            absent=self._absent() | why_no_video | why_no_hand,
+            absent=self._absent() | why_no_video | why_no_hand | why_no_lpips | why_no_fvd,
         )
 
     def _add(self, key: tuple[str, ...], values: np.ndarray) -> None:
@@ -194,11 +202,24 @@ class _Seen:
             self._add(("cycle", source), cycle_error(again, true))
         if self._frames > MOST_FRAMES:
             return
-        videos = [*self.models, DECODED_TRUTH, DECODED_PERSISTENCE, *((TRUE_FRAMES,) * (images.true is not None))]
-        for source in videos:
+        for source in self._videos(images):
             inputs = images_to_input(images.video_of(source))
             features = video_features(world_model.present_encoder, inputs, self.decoding.chunk)
             self._add(("video", source), features.double().cpu().numpy())
+
+    def _videos(self, images: _Images) -> list[str]:
+        """Return of which sources whole clips are compared."""
+        return [*self.models, DECODED_TRUTH, DECODED_PERSISTENCE, *((TRUE_FRAMES,) * (images.true is not None))]
+
+    def _measure_by_networks(self, images: _Images) -> None:
+        """Measure images by LPIPS, and clips by I3D, if there are files of them."""
+        networks = self.decoding.networks
+        if networks.lpips is not None and not networks.why_no_lpips(self._size):
+            for pair, values in lpips_by_pair(networks.lpips, images.sources, images.references).items():
+                self._add(("lpips", *pair), values)
+        if networks.i3d is not None and not networks.why_no_features(self._frames):
+            for source in self._videos(images):
+                self._add(("i3d", source), networks.i3d.features(images.video_of(source)))
 
     def _read_hands(self, hand: HandReader, images: _Images, batch: LatentBatch) -> None:
         states = batch.states[:, 1:].double().cpu().numpy()
@@ -210,15 +231,13 @@ class _Seen:
         self._add(("hand_mean",), np.linalg.norm(hand.probe.offset.numpy() - true, axis=-1))
 
     def _video(self, arrays: Mapping[Any, np.ndarray]) -> tuple[VideoDiscrepancy | None, dict[str, str]]:
-        features = {key[1]: values for key, values in arrays.items() if key[0] == "video"}
-        clips, episodes = len(self.ids), len(set(self.ids))
+        features = _by_source(arrays, "video")
         if self.decoding.encoder is None:
             return None, {"video": _NO_ENCODER}
         if not features:
             return None, {"video": f"clips of {self._frames} frames; the encoder takes {MOST_FRAMES} at most"}
-        if clips < LEAST_CLIPS or episodes < LEAST_EPISODES:
-            found = f"{clips} clips of {episodes} episodes"
-            return None, {"video": f"{found}; it needs {LEAST_CLIPS} clips and {LEAST_EPISODES} episodes"}
+        if reason := _too_few(self.ids):
+            return None, {"video": reason}
         used = frames_used(self._frames)
         against = {
             reference: {
@@ -240,11 +259,25 @@ class _Seen:
         hand = self.decoding.hand
         if isinstance(hand, str):
             return None, {"hand": hand}
-        pixels = {key[1]: values for key, values in arrays.items() if key[0] == "hand"}
+        pixels = _by_source(arrays, "hand")
         if TRUE_FRAMES not in pixels:
             return None, {"hand": CACHE}
         by_clip, mean = np.nanmean(pixels[TRUE_FRAMES], axis=1), float(np.nanmean(arrays["hand_mean",]))
         return HandErrors(pixels, self._size, mean_of(by_clip, self.ids), hand.probe.fitted_on, mean), {}
+
+    def _lpips(self, arrays: Mapping[Any, np.ndarray]) -> tuple[LpipsDistances | None, dict[str, str]]:
+        networks = self.decoding.networks
+        reason = networks.why_no_lpips(self._size)
+        if networks.lpips is None or reason:
+            return None, {"lpips": reason}
+        by_clip = {key[1:]: values for key, values in arrays.items() if len(key) == 3}
+        return LpipsDistances(networks.lpips.backbone, by_clip), {}
+
+    def _fvd(self, arrays: Mapping[Any, np.ndarray]) -> tuple[FrechetVideoDistances | None, dict[str, str]]:
+        reason = self.decoding.networks.why_no_features(self._frames) or _too_few(self.ids)
+        if reason:
+            return None, {"fvd": reason}
+        return frechet_of(_by_source(arrays, "i3d"), (TRUE_FRAMES, DECODED_TRUTH), TRUE_FRAMES), {}
 
     def _absent(self) -> dict[str, str]:
         found = {} if self.decoding.has_frames else {"truth": CACHE}
@@ -259,6 +292,20 @@ def _rollout(contender: Contender, batch: LatentBatch) -> Float[Tensor, "batch h
     """Return the frames after the first under the true actions; states are the recorded ones."""
     with contender.switched(), torch.no_grad():
         return prediction(contender.model, batch)
+
+
+def _by_source(arrays: Mapping[Any, np.ndarray], kind: str) -> dict[str, np.ndarray]:
+    """Return what was measured of whole sources; a model may have the name of a kind."""
+    return {key[1]: values for key, values in arrays.items() if len(key) == 2 and key[0] == kind}
+
+
+def _too_few(episode_ids: Sequence[str]) -> str:
+    """Return why distributions of clips are not compared; "": there are enough."""
+    clips, episodes = len(episode_ids), len(set(episode_ids))
+    if clips >= LEAST_CLIPS and episodes >= LEAST_EPISODES:
+        return ""
+    found = f"{clips} clips of {episodes} episodes"
+    return f"{found}; it needs {LEAST_CLIPS} clips and {LEAST_EPISODES} episodes"
 
 
 @torch.no_grad()

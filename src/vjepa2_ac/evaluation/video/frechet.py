@@ -8,7 +8,6 @@ V-JEPA 2 MMD instead; FVD is for comparison with published numbers, of as many c
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
@@ -17,26 +16,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vjepa2_ac.evaluation.video.weights_file import checked_file
+from vjepa2_ac.evaluation.video.record import FrechetVideoDistance
+from vjepa2_ac.evaluation.video.weights_file import WeightsFile
 
 I3D_SHA256 = "bec6519f66ea534e953026b4ae2c65553c17bf105611c746d904657e5860a5e2"  # i3d_torchscript.pt, 51,235,320 bytes
-FVD_LABEL = "FVD (biased)"
-NO_I3D = "No FVD: it needs the file i3d_torchscript.pt, which is not shipped; name its path."
 LEAST_FRAMES = 11  # of fewer, I3D's last pooling over time has none
 _SIDE = 224  # pixels
-
-
-@dataclass(frozen=True)
-class FrechetVideoDistance:
-    """FVD, or why there is none."""
-
-    value: float | None
-    clips: int  # in each set; the bias depends on it
-    reason: str = ""  # why there is no value
-
-    def as_dict(self) -> dict[str, float | int | str | None]:
-        """Return plain values, for JSON."""
-        return {"value": self.value, "clips": self.clips, "reason": self.reason or None, "label": FVD_LABEL}
 
 
 def frechet_distance(one: Float[np.ndarray, "clips dim"], other: Float[np.ndarray, "others dim"]) -> float:
@@ -66,21 +51,32 @@ class I3d:
 
     Args:
         path: The file `i3d_torchscript.pt`.
-        sha256: Of the file.
         device: Where to compute.
 
     Raises:
-        InputError: The file is missing, or another one.
+        InputError: The file is missing, another one, or this version of PyTorch cannot load it.
     """
 
-    def __init__(self, path: Path, *, sha256: str = I3D_SHA256, device: torch.device | str = "cpu") -> None:
-        content = checked_file(path, sha256, "the I3D network of FVD as TorchScript")
+    def __init__(self, path: Path, *, device: torch.device | str = "cpu") -> None:
+        file = WeightsFile(path, "--i3d", "the I3D network of FVD as TorchScript, i3d_torchscript.pt")
+        _, content = file.known({"i3d": I3D_SHA256})
         with warnings.catch_warnings():
             # PyTorch 2.13 deprecates TorchScript, and this network exists in no other form with a known hash.
             warnings.filterwarnings("ignore", message=".*torch.jit.*", category=DeprecationWarning)
             load = cast("Any", torch.jit.load)
-            self._network = load(content, map_location=device).eval()
+            try:
+                self._network = load(content, map_location=device).eval()
+            except RuntimeError as error:
+                reason = (str(error).splitlines() or [type(error).__name__])[0]
+                found = f"PyTorch {torch.__version__} cannot load it ({reason})"
+                raise file.error(found, fix="Leave --i3d out, or use another version of PyTorch") from None
         self._device = torch.device(device)
+
+    def to(self, device: torch.device) -> I3d:
+        """Move the network to a device."""
+        self._network.to(device)
+        self._device = device
+        return self
 
     @torch.no_grad()
     def features(
@@ -110,23 +106,17 @@ class I3d:
 
 
 def frechet_video_distance(
-    imagined: Float[Tensor, "batch time 3 height width"],
-    true: Float[Tensor, "batch time 3 height width"],
-    i3d: I3d | None,
+    imagined: Float[np.ndarray, "clips dim"], true: Float[np.ndarray, "clips dim"]
 ) -> FrechetVideoDistance:
-    """Return FVD of two sets of videos in 0 .. 1; without the network, with too few frames or clips the reason why not.
+    """Return FVD of two sets of I3D features; of fewer than two clips, or features that are not finite, the reason.
 
     Args:
-        imagined: Predicted videos.
-        true: As many true ones.
-        i3d: The network; None: there is no file.
+        imagined: Of predicted videos, by `I3d.features`.
+        true: Of as many true ones.
     """
     clips = len(imagined)
-    if i3d is None:
-        return FrechetVideoDistance(None, clips, NO_I3D)
-    if imagined.shape[1] < LEAST_FRAMES:
-        reason = f"No FVD: clips of {imagined.shape[1]} frames; I3D needs {LEAST_FRAMES}."
-        return FrechetVideoDistance(None, clips, reason)
     if clips < 2:
-        return FrechetVideoDistance(None, clips, "No FVD: it needs two clips or more.")
-    return FrechetVideoDistance(frechet_distance(i3d.features(imagined), i3d.features(true)), clips)
+        return FrechetVideoDistance(None, clips, "it needs two clips or more")
+    if not (np.isfinite(imagined).all() and np.isfinite(true).all()):
+        return FrechetVideoDistance(None, clips, "some features are not finite")
+    return FrechetVideoDistance(frechet_distance(imagined, true), clips)

@@ -1,39 +1,36 @@
 """How alike do two images look to a network trained on photographs: LPIPS, from files that the user names.
 
-No weights are shipped or downloaded. Without the files the metric is absent (`NO_LPIPS`), never computed with random
-weights. `alex` is the metric that people compare, `vgg` the usual loss; do not report the one that was trained on.
+No weights are shipped or downloaded. Without the files the metric is absent, never computed with random weights. `alex`
+is the metric that people compare, `vgg` the usual loss; do not report the one that was trained on.
 """
 
 from __future__ import annotations
 
-import math
 import pickle
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeAlias
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.video.weights_file import checked_file
+from vjepa2_ac.evaluation.video.weights_file import WeightsFile
 
 Backbone = Literal["alex", "vgg"]
-NO_LPIPS = "No LPIPS: it needs the weights of a backbone and of its heads, which are not shipped; name their files."
 LEAST_SIDE = 32  # pixels: of fewer the pooled images have none
+Features: TypeAlias = "list[Float[Tensor, 'images channels rows columns']]"  # from fine to coarse
 _MEAN, _DEVIATION = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # of images in -1 .. 1
 _EPSILON = 1e-10
 
 
 @dataclass(frozen=True)
 class LpipsFiles:
-    """The two files, and what their SHA-256 must begin with; None: the published file's digits."""
+    """The two files. Which backbone it is follows from its hash."""
 
     backbone: Path  # torchvision's weights: alexnet-owt-7be5be79.pth or vgg16-397923af.pth
     heads: Path  # of lpips 0.1.4: weights/v0.1/alex.pth or vgg.pth
-    backbone_sha256: str | None = None
-    heads_sha256: str | None = None
 
 
 class _Layer(NamedTuple):
@@ -73,8 +70,10 @@ _LAYERS: dict[Backbone, tuple[_Layer, ...]] = {
     ),
 }
 _PADDING = {11: 2, 5: 2, 3: 1}  # by kernel
-_BACKBONES = {"alex": "7be5be79", "vgg": "397923af"}  # the digits in the names of torchvision's files
-_HEADS = {
+BACKBONES: dict[str, str] = {"alex": "7be5be79", "vgg": "397923af"}
+"""What the SHA-256 of torchvision's files begins with: the digits in their names."""
+
+HEADS: dict[str, str] = {
     "alex": "df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0",
     "vgg": "a78928a0af1e5f0fcb1f3b9e8f8c3a2a5a3de244d830ad5c1feddc79b8432868",
 }
@@ -91,6 +90,7 @@ class Lpips(nn.Module):
 
     def __init__(self, backbone: Backbone) -> None:
         super().__init__()
+        self.backbone = backbone
         self.layers = _LAYERS[backbone]
         self.convolutions = nn.ModuleDict({
             str(one.place): nn.Conv2d(one.inputs, one.outputs, one.kernel, one.stride, _PADDING[one.kernel])
@@ -114,17 +114,29 @@ class Lpips(nn.Module):
             raise ValueError(f"images of {size} px; LPIPS needs {LEAST_SIDE} px a side")
         if float(true.detach().amin()) < 0 or float(true.detach().amax()) > 1:  # a prediction may be outside
             raise ValueError("true images outside 0 .. 1; LPIPS scales them to -1 .. 1 itself")
-        with torch.autocast(predicted.device.type, enabled=False):
-            pairs = zip(self._features(predicted), self._features(true), self.heads, strict=True)
-            total = torch.zeros(math.prod(predicted.shape[:-3]), device=predicted.device)
-            for one, other, head in pairs:
-                total = total + torch.einsum("nchw,c->nhw", (one - other).square(), head).mean(dim=(1, 2))
-        return total.reshape(predicted.shape[:-3])
+        flat = (images.reshape(-1, *images.shape[-3:]) for images in (predicted, true))
+        return self.distance(*map(self.features, flat)).reshape(predicted.shape[:-3])
 
-    def _features(self, images: Float[Tensor, "*batch 3 height width"]) -> list[Tensor]:
-        """Return the compared features [images channel rows columns], each place of length 1 over channels."""
+    def distance(self, one: Features, other: Features) -> Float[Tensor, " images"]:
+        """Return the distance of each pair of images, from their features."""
+        with torch.autocast(one[0].device.type, enabled=False):
+            levels = [
+                torch.einsum("nchw,c->nhw", (mine - its).square(), head).mean(dim=(1, 2))
+                for mine, its, head in zip(one, other, self.heads, strict=True)
+            ]
+            return torch.stack(levels).sum(dim=0)
+
+    def features(self, images: Float[Tensor, "images 3 height width"]) -> Features:
+        """Return the compared features of images in 0 .. 1: each place of length 1 over channels.
+
+        To compare images with several others, compute their features once.
+        """
+        with torch.autocast(images.device.type, enabled=False):
+            return self._features(images)
+
+    def _features(self, images: Float[Tensor, "images 3 height width"]) -> Features:
         mean, deviation = (torch.tensor(one, device=images.device)[:, None, None] for one in (_MEAN, _DEVIATION))
-        features = (2 * images.float().reshape(-1, *images.shape[-3:]) - 1 - mean) / deviation
+        features = (2 * images.float() - 1 - mean) / deviation
         found = []
         for layer in self.layers:
             if layer.pool:
@@ -136,39 +148,45 @@ class Lpips(nn.Module):
         return found
 
 
-def load_lpips(backbone: Backbone, files: LpipsFiles) -> Lpips:
+def load_lpips(files: LpipsFiles) -> Lpips:
     """Return LPIPS with the weights of two files, of which nothing is unpickled but tensors.
 
     Raises:
-        InputError: A file is missing, another one than was published, or lacks weights.
+        InputError: A file is missing, another one than was published, the heads of another backbone, or lacks weights.
     """
+    names = "torchvision's backbone of LPIPS, alexnet-owt-7be5be79.pth or vgg16-397923af.pth"
+    backbone_file = WeightsFile(files.backbone, "--lpips", names)
+    name, content = backbone_file.known(BACKBONES)
+    backbone: Backbone = "alex" if name == "alex" else "vgg"
+    heads_name = f"the heads of LPIPS for this backbone, {backbone}.pth of weights/v0.1"
+    heads_file = WeightsFile(files.heads, "--lpips-heads", heads_name)
+    weights, heads = (
+        _tensors(backbone_file, content),
+        _tensors(heads_file, heads_file.known({name: HEADS[backbone]})[1]),
+    )
     network = Lpips(backbone)
-    expected = files.backbone_sha256 or _BACKBONES[backbone], files.heads_sha256 or _HEADS[backbone]
-    weights = _tensors(files.backbone, expected[0], f"torchvision's backbone of LPIPS ({backbone})")
-    heads = _tensors(files.heads, expected[1], f"the heads of LPIPS ({backbone}, version 0.1)")
     with torch.no_grad():
         for index, convolution in network.convolutions.items():
-            for name, value in convolution.named_parameters():
-                _copy(value, weights, f"features.{index}.{name}", files.backbone)
+            for kind, value in convolution.named_parameters():
+                _copy(value, weights, f"features.{index}.{kind}", backbone_file)
         for number, head in enumerate(network.heads):
-            _copy(head.view(1, -1, 1, 1), heads, f"lin{number}.model.1.weight", files.heads)
+            _copy(head.view(1, -1, 1, 1), heads, f"lin{number}.model.1.weight", heads_file)
     return network
 
 
-def _tensors(path: Path, sha256: str, what: str) -> dict[str, Tensor]:
-    content = checked_file(path, sha256, what)
+def _tensors(file: WeightsFile, content: BytesIO) -> dict[str, Tensor]:
     try:
         found = torch.load(content, map_location="cpu", weights_only=True)
     except (RuntimeError, pickle.UnpicklingError, EOFError, ValueError):
         found = None
     if not isinstance(found, dict):
-        raise InputError(where=str(path), found="no PyTorch weights", needed=what)
+        raise file.error("no PyTorch weights")
     return found
 
 
-def _copy(into: Tensor, weights: dict[str, Tensor], name: str, path: Path) -> None:
+def _copy(into: Tensor, weights: dict[str, Tensor], name: str, file: WeightsFile) -> None:
     value = weights.get(name)
     if not isinstance(value, Tensor) or value.shape != into.shape:
         found = f"{name} of shape {list(value.shape)}" if isinstance(value, Tensor) else f"no {name}"
-        raise InputError(where=str(path), found=found, needed=f"{name} of shape {list(into.shape)}")
+        raise file.error(found, needed=f"{name} of shape {list(into.shape)}")
     into.copy_(value)

@@ -3,29 +3,44 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 
 from vjepa2_ac.errors import InputError
 
 
-def checked_file(path: Path, sha256: str, what: str) -> BytesIO:
-    """Return the content of a file whose SHA-256 begins with the given digits.
+@dataclass(frozen=True)
+class WeightsFile:
+    """A file as it was named."""
 
-    Args:
-        path: The file.
-        sha256: All 64 hexadecimal digits; or the first ones, where a file's own name gives no more.
-        what: What the file should be, for the message.
+    path: Path
+    option: str  # that names it, for messages: --i3d
+    what: str  # the file should be, for messages
 
-    Raises:
-        InputError: There is no such file, or it is another one.
-    """
-    fix = f"Give the path of {what}, whose SHA-256 begins with {sha256[:16]}"
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(where=str(path), found=f"cannot be read ({error.strerror})", needed=what, fix=fix) from None
-    found = hashlib.sha256(content).hexdigest()
-    if not sha256 or not found.startswith(sha256.lower()):
-        raise InputError(where=str(path), found=f"a file of SHA-256 {found[:16]}", needed=what, fix=fix)
-    return BytesIO(content)
+    def known(self, hashes: Mapping[str, str]) -> tuple[str, BytesIO]:
+        """Return which one of the known files it is, and its content.
+
+        Args:
+            hashes: What the SHA-256 of each known file begins with, by its name: all 64 hexadecimal digits; or the
+                first ones, where a file's own name gives no more.
+
+        Raises:
+            InputError: There is no such file, or it is another one.
+        """
+        begins = " or ".join(digits[:16] for digits in hashes.values())
+        fix = f"Give {self.option} the path of the file whose SHA-256 begins with {begins}; docs/decoding.md says where"
+        try:
+            content = self.path.read_bytes()
+        except OSError as error:
+            raise self.error(f"cannot be read ({error.strerror})", fix=fix) from None
+        found = hashlib.sha256(content).hexdigest()
+        for name, digits in hashes.items():
+            if digits and found.startswith(digits.lower()):
+                return name, BytesIO(content)
+        raise self.error(f"a file of SHA-256 {found[:16]}", fix=fix)
+
+    def error(self, found: str, *, needed: str = "", fix: str = "") -> InputError:
+        """Return the error of a file that cannot be used."""
+        return InputError(where=f"{self.option} {self.path}", found=found, needed=needed or self.what, fix=fix)

@@ -10,8 +10,18 @@ import numpy as np
 from jaxtyping import UInt8
 from markupsafe import Markup
 
-from vjepa2_ac.evaluation.decoded.estimates import Curve, cycle_of, hand_of, moving_share_of, similarity_of, skill_of
+from vjepa2_ac.evaluation.decoded.estimates import (
+    Curve,
+    cycle_of,
+    fvd_of,
+    hand_of,
+    lpips_of,
+    moving_share_of,
+    similarity_of,
+    skill_of,
+)
 from vjepa2_ac.evaluation.decoded.record import (
+    ABSENT,
     DECODED_PERSISTENCE,
     DECODED_TRUTH,
     MEANING,
@@ -25,6 +35,7 @@ from vjepa2_ac.evaluation.decoded.record import (
     Similarity,
 )
 from vjepa2_ac.evaluation.result import Evaluation
+from vjepa2_ac.evaluation.video.record import FVD_LABEL, FVD_MEANING, LPIPS_MEANING, FrechetVideoDistance
 from vjepa2_ac.reports.figures.film import FilmStrip, Kind, Row, draw_strip
 from vjepa2_ac.reports.html.charts import Line, axis_at, line_chart, nice_axis
 from vjepa2_ac.reports.html.formatting import NOT_MEASURED, decimal, percent, seconds, value
@@ -76,7 +87,7 @@ def decoded_section(evaluation: Evaluation) -> Markup:
         rows=rows,
         ahead=seconds(evaluation.seconds_ahead),
         notes=_notes(found),
-        meaning=MEANING if found.video is not None else "",
+        meanings=_meanings(found),
         strips=shown,
     )
 
@@ -130,10 +141,14 @@ def _table(found: DecodedRollouts) -> tuple[list[str], list[list[Any]]]:
             _cell(cycle_of(found, source)),
             _cell(hand_of(found, source), 1),
             _video_cell(found, source),
+            *([] if found.lpips is None else [_cell(lpips_of(found, source, against))]),
+            *([] if found.fvd is None else [_fvd_cell(fvd_of(found, source, against))]),
         ]
         rows.append([label, *cells])
     head = ["PSNR (dB)", "PSNR where something moves", "SSIM", "MS-SSIM", "skill by PSNR where something moves"]
     head += ["skill by SSIM", "cycle error", "hand off by (px)", "V-JEPA 2 MMD to the truth"]
+    head += [] if found.lpips is None else [f"LPIPS ({found.lpips.backbone})"]
+    head += [] if found.fvd is None else [FVD_LABEL]
     return ["", *head], rows
 
 
@@ -150,17 +165,22 @@ def _video_cell(found: DecodedRollouts, source: str) -> Markup | str:
     return NOT_MEASURED if one is None else value(one.squared, 4) + f"; p {decimal(one.p_value)}"
 
 
+def _fvd_cell(found: FrechetVideoDistance) -> str:
+    return NOT_MEASURED if found.value is None else decimal(found.value, 1)
+
+
+def _meanings(found: DecodedRollouts) -> dict[str, str]:
+    """Return the words that stand beside metrics, by their names."""
+    return {
+        **({} if found.video is None else {"V-JEPA 2 MMD": MEANING}),
+        **({} if found.lpips is None else {f"LPIPS ({found.lpips.backbone})": LPIPS_MEANING}),
+        **({} if found.fvd is None else {FVD_LABEL: f"of {found.fvd.clips} clips. {FVD_MEANING}"}),
+    }
+
+
 def _notes(found: DecodedRollouts) -> list[str]:
     """Return why something is absent, and how good the probe is."""
-    named = {
-        "truth": "Against the truth",
-        "cycle": "Cycle error",
-        "video": "V-JEPA 2 MMD",
-        "hand": "The hand's position",
-        "ssim": "SSIM",
-        "ms_ssim": "MS-SSIM",
-    }
-    notes = [f"{named[what]}: not measured, {reason}." for what, reason in found.absent.items()]
+    notes = [f"{ABSENT.get(what, what)}: not measured, {reason}." for what, reason in found.absent.items()]
     skill = skill_of(found, found.models[-1], "truth", "moving", "psnr_db")[-1]
     if skill.estimate is None and "truth" not in found.absent:
         notes.append(f"Skill by PSNR where something moves: {skill.reason}.")
@@ -172,6 +192,8 @@ def _notes(found: DecodedRollouts) -> list[str]:
             else [f"Two halves of the true episodes stay below a V-JEPA 2 MMD of {decimal(floor, 4)}."]
         )
         notes += found.video.notes
+    if found.fvd is not None:
+        notes += [f"{FVD_LABEL}: {note}." for note in found.fvd.notes]
     if found.hand is not None:
         frames, episodes = found.hand.fitted_on
         notes.append(
