@@ -85,6 +85,7 @@ ORDERS: dict[str, list[str]] = {
         "counterfactual",
         "imagined_truth hand_in_images",
         "counterfactual_sides",
+        "gripper_sides",
     ],
 }
 

@@ -8,7 +8,8 @@ that ignores its actions, is 0.5. Where the hand truly moves by less than 2 pixe
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -22,8 +23,9 @@ from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
 from vjepa2_ac.data.clips.loader import batches_of, validation_windows
-from vjepa2_ac.data.clips.transforms import pixels_to_input, view
+from vjepa2_ac.data.clips.transforms import input_to_pixels, pixels_to_input, view
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
+from vjepa2_ac.decoding.frame_pairs import as_images
 from vjepa2_ac.decoding.imagine import Start, imagined_latents
 from vjepa2_ac.distributed.launch import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, require_widths
@@ -39,8 +41,9 @@ from vjepa2_ac.planning.counterfactual.named_actions import STEP_M, named_action
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
 from vjepa2_ac.runs.folder import is_run
 from vjepa2_ac.runs.loading import load_run
-from vjepa2_ac.simulation.counterfactual import resimulate
+from vjepa2_ac.simulation.counterfactual import Outcome, resimulate
 from vjepa2_ac.simulation.hand_in_images import hand_positions
+from vjepa2_ac.simulation.world.projection import HAND_MIDDLE_M
 
 AXES: Mapping[str, tuple[str, str]] = {"x": ("forward", "back"), "y": ("left", "right"), "z": ("up", "down")}
 """Axis of the robot base frame -> the named actions along it."""
@@ -110,6 +113,22 @@ def measure_sides(subject: str, asked: SidesOptions, *, reporter: Reporter = SIL
     Raises:
         InputError: Subject, data or decoder cannot be used; or the data were not simulated.
     """
+    setup = open_setup(subject, asked, reporter)
+    size = setup.world_model.image_size
+    positions = positions_in(setup)
+    probe = fitted_probe(setup.dataset, positions, size)
+    names = [name for pair in AXES.values() for name in pair]
+    starts = setup.counterfactuals(names, reporter)
+    cells = tuple(_cell(case, positions, probe) for cases in starts for case in cases.values())
+    return Sides(cells, setup.sources, size, probe.fitted_on)
+
+
+def open_setup(subject: str, asked: SidesOptions, reporter: Reporter = SILENT) -> CounterfactualSetup:
+    """Load the models, the decoder and the data.
+
+    Raises:
+        InputError: Subject, data or decoder cannot be used.
+    """
     decoder = load_decoder(asked.decoder)
     config, planning, _ = settle(subject, asked.evaluation)
     config = config.model_copy(update={"data": config.data.model_copy(update={"frames": asked.steps + 1})})
@@ -119,73 +138,92 @@ def measure_sides(subject: str, asked: SidesOptions, *, reporter: Reporter = SIL
     world_model = run.world_model if run else load_model(subject, config)
     require_widths(world_model, dataset.widths, where=subject)
     decoder.require_fit(world_model, config.data.crop, subject=subject)
-    positions = hand_positions(dataset, world_model.image_size)
-    if isinstance(positions, str) or config.data.is_cache:
-        found = positions if isinstance(positions, str) else "latents of a cache, which has no frames"
-        raise InputError(where=config.data.path, found=found, needed="a data set that `simulate record` made")
     contenders, _ = contenders_of(subject, config, run, world_model, asked.evaluation)
     for each in contenders:
         if isinstance(each.model, WorldModel):
             each.model.to(accelerator.device).eval()
-    probe = fitted_probe(dataset, positions, world_model.image_size)
-    reader = _Reader(decoder.to(accelerator.device), probe, positions)
-    imagine = _Imagination(config, dataset, world_model, contenders, reader)
-    windows, cells = validation_windows(dataset, asked.split, clips=asked.starts), []
-    progress = reporter.task("actions that were not taken", "starts")
-    for done, window in enumerate(windows, 1):
-        with accelerator.autocast():
-            cells += imagine.cells_of(window, asked, planning.limits)
-        progress(done, len(windows))
-    sources = (DECODED_TRUTH, *(one.name for one in contenders))
-    return Sides(tuple(cells), sources, world_model.image_size, probe.fitted_on)
+    decoder = decoder.to(accelerator.device)
+    limits, autocast = planning.limits, accelerator.autocast
+    return CounterfactualSetup(asked, config, limits, dataset, contenders, world_model, decoder, autocast)
+
+
+def positions_in(setup: CounterfactualSetup, along_m: float = HAND_MIDDLE_M) -> HandPositions:
+    """Return where a point of the hand is in the images; `along_m` as of `hand_positions`.
+
+    Raises:
+        InputError: The data were not simulated, or do not say where the hand is.
+    """
+    config = setup.config.data
+    positions = hand_positions(setup.dataset, setup.world_model.image_size, along_m=along_m)
+    if isinstance(positions, str) or config.is_cache:
+        found = positions if isinstance(positions, str) else "latents of a cache, which has no frames"
+        raise InputError(where=config.path, found=found, needed="a data set that `simulate record` made")
+    return positions
 
 
 @dataclass(frozen=True, eq=False)
-class _Reader:
-    """Reads positions of the hand from latents."""
+class Counterfactual:
+    """What happens from one start under a named action, and what is imagined: at the start and after each step."""
 
-    decoder: TrainedDecoder
-    probe: HandProbe
-    positions: HandPositions
-
-    def of(self, latents: torch.Tensor) -> Float[np.ndarray, "time 2"]:
-        """Return the positions in the decoded images."""
-        with torch.autocast(latents.device.type, enabled=False), torch.no_grad():
-            return self.probe.read(self.decoder.decoder.decode(latents.float()))
+    episode_id: str
+    start: int  # control step
+    name: str  # of the action
+    outcome: Outcome
+    seen: Float[torch.Tensor, "time 3 size size"]  # the outcome's frames as the encoder sees them, 0 .. 1
+    decoded: Mapping[str, Float[torch.Tensor, "time 3 size size"]]  # source -> images, 0 .. 1
 
 
 @dataclass(frozen=True, eq=False)
-class _Imagination:
+class CounterfactualSetup:
+    """Models, a decoder and simulated data. Use `open_setup` to make one."""
+
+    asked: SidesOptions
     config: Config
+    limits: LimitsConfig
     dataset: Dataset
-    world_model: WorldModel
     contenders: Sequence[Contender]
-    reader: _Reader
+    world_model: WorldModel  # its encoder is that of all contenders
+    decoder: TrainedDecoder
+    autocast: Callable[[], AbstractContextManager[object]]  # to the run's precision
 
-    def cells_of(self, window: tuple[int, int], asked: SidesOptions, limits: LimitsConfig) -> list[Cell]:
-        """Return the cells of one start: a model's images and the simulator's under every named action."""
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """What is decoded: the truth, and the models' rollouts."""
+        return (DECODED_TRUTH, *(one.name for one in self.contenders))
+
+    def counterfactuals(self, names: Sequence[str], reporter: Reporter = SILENT) -> Iterator[dict[str, Counterfactual]]:
+        """Yield what happens from each start, by the name of the action.
+
+        Raises:
+            InputError: The split has no clips, or the simulator shows something else than was recorded.
+        """
+        windows = validation_windows(self.dataset, self.asked.split, clips=self.asked.starts)
+        progress = reporter.task("actions that were not taken", "starts")
+        for done, window in enumerate(windows, 1):
+            with self.autocast():
+                cases = self._from(window, names)
+            yield cases
+            progress(done, len(windows))
+
+    def _from(self, window: tuple[int, int], names: Sequence[str]) -> dict[str, Counterfactual]:
         episode, first = window
         camera = self.config.data.cameras[0]
         arm = resimulate(self.config.data.path, self.dataset.source.read(episode, camera), first, camera)
-        start, name = self._start(window)
-        cells = []
-        for action in (one for pair in AXES.values() for one in pair):
-            actions = named_actions(action, asked.steps, size_m=asked.size_m, limits=limits)
+        start, episode_id = self._start(window)
+        cases = {}
+        for name in names:
+            actions = named_actions(name, self.asked.steps, size_m=self.asked.size_m, limits=self.limits)
             outcome = arm.under(actions, self.config.data.model_stride)
-            true = self.reader.positions(name, outcome.states)
-            read = {DECODED_TRUTH: self._encoded(outcome.frames)}
+            inputs = self._inputs(outcome.frames)
+            encoded = self.world_model.encode(inputs, chunk=self.config.model.encode_chunk)[0]
+            decoded = {DECODED_TRUTH: self._decoded(encoded)}
             for each in self.contenders:
                 with each.switched():
                     imagined = imagined_latents(each.model, start, actions)
-                read[each.name] = torch.cat([start.latents[None], imagined.to(start.latents)])
-            moved = true[1:] - true[0]
-            length = np.linalg.norm(moved, axis=1)
-            with np.errstate(invalid="ignore", divide="ignore"):
-                along = {
-                    source: _along(self.reader.of(latents), moved / length[:, None]) for source, latents in read.items()
-                }
-            cells.append(Cell(name, first, action, np.nan_to_num(length), along))
-        return cells
+                decoded[each.name] = self._decoded(torch.cat([start.latents[None], imagined.to(start.latents)]))
+            seen = as_images(input_to_pixels(inputs[0]))
+            cases[name] = Counterfactual(episode_id, first, name, outcome, seen, decoded)
+        return cases
 
     def _start(self, window: tuple[int, int]) -> tuple[Start, str]:
         (batch,) = batches_of(self.dataset, [window], batch_size=1)
@@ -195,11 +233,24 @@ class _Imagination:
         state = latents.states[0, 0].double().cpu().numpy()
         return Start(latents.latents[0, 0], state, self.dataset.spaces.state, extrinsics), batch.episode_ids[0]
 
-    def _encoded(self, frames: UInt8[np.ndarray, "time h w 3"]) -> torch.Tensor:
-        """Return the latents of what really happens."""
+    def _inputs(self, frames: UInt8[np.ndarray, "time h w 3"]) -> torch.Tensor:
+        """Return what really happens as the encoder takes it, as one clip."""
         seen = torch.from_numpy(np.ascontiguousarray(view(frames, self.config.data.crop)))[None]
-        inputs = pixels_to_input(seen.to(next(self.world_model.parameters()).device), self.world_model.image_size)
-        return self.world_model.encode(inputs, chunk=self.config.model.encode_chunk)[0]
+        return pixels_to_input(seen.to(next(self.world_model.parameters()).device), self.world_model.image_size)
+
+    def _decoded(self, latents: torch.Tensor) -> torch.Tensor:
+        with torch.autocast(latents.device.type, enabled=False), torch.no_grad():
+            return self.decoder.decoder.decode(latents.float())
+
+
+def _cell(case: Counterfactual, positions: HandPositions, probe: HandProbe) -> Cell:
+    """Return how far the hand moves in the images, along the true displacement."""
+    true = positions(case.episode_id, case.outcome.states)
+    moved = true[1:] - true[0]
+    length = np.linalg.norm(moved, axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        along = {source: _along(probe.read(images), moved / length[:, None]) for source, images in case.decoded.items()}
+    return Cell(case.episode_id, case.start, case.name, np.nan_to_num(length), along)
 
 
 def _along(read: Float[np.ndarray, "time 2"], direction: Float[np.ndarray, "steps 2"]) -> Float[np.ndarray, " steps"]:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.data.clips.loader import batches_of, validation_windows
@@ -52,12 +54,24 @@ def fitted_probe(dataset: Dataset, positions: HandPositions, size: int) -> HandP
         InputError: The split has no clips.
     """
     images, found, ids = [], [], []
+    for seen, states, name in frames_of_training(dataset, size):
+        images.append(seen)
+        found.append(positions(name, states))
+        ids += [name] * len(seen)
+    return fit_hand_probe(torch.cat(images), np.concatenate(found), ids)
+
+
+def frames_of_training(
+    dataset: Dataset, size: int
+) -> Iterator[tuple[Float[Tensor, "time 3 size size"], Float[np.ndarray, "time state_dim"], str]]:
+    """Yield true frames of the training split as the encoder sees them, their states and the id of their episode.
+
+    Raises:
+        InputError: The split has no clips.
+    """
     for batch in batches_of(dataset, validation_windows(dataset, "train", clips=MOST_CLIPS), batch_size=_BATCH):
         if batch.frames is None:
             raise ValueError("a batch without frames")
         seen = as_images(input_to_pixels(pixels_to_input(batch.frames, size)))
         for row, name in enumerate(batch.episode_ids):
-            images.append(seen[row])
-            found.append(positions(name, batch.states[row].double().numpy()))
-            ids += [name] * len(seen[row])
-    return fit_hand_probe(torch.cat(images), np.concatenate(found), ids)
+            yield seen[row], batch.states[row].double().numpy(), name
