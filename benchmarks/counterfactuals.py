@@ -66,7 +66,7 @@ def gripper_rows(found: GripperSides) -> Iterator[dict[str, Any]]:
         for action in (*ACTIONS, None):
             for step in range(steps):
                 side, extent = found.of(source, action, step), found.extent(source, action, step)
-                share = side.share
+                share, latent = side.share, found.extent_in_latents(source, action, step)
                 yield {
                     "source": source,
                     "axis": action or "gripper",
@@ -77,23 +77,34 @@ def gripper_rows(found: GripperSides) -> Iterator[dict[str, Any]]:
                     "share": None if share is None else share.as_dict(),
                     "chance": CHANCE,
                     "extent": None if extent is None else extent.as_dict(),
+                    "extent_in_latents": None if latent is None else latent.as_dict(),
                 }
 
 
 def gripper_table(found: GripperSides) -> str:
     """Return the rows as Markdown."""
-    titles = ("source", "action", "after step", "to the true side", "cells", "left out", "chance", "extent")
+    titles = (
+        "source",
+        "action",
+        "after step",
+        "to the true side",
+        "cells",
+        "left out",
+        "chance",
+        "extent",
+        "in latents",
+    )
     lines = ["| " + " | ".join(titles) + " |", "|---" * len(titles) + "|"]
     for row in gripper_rows(found):
-        share, extent = (with_interval(row[name]) for name in ("share", "extent"))
-        cells = (row["source"], row["axis"], row["step"], share, row["cells"], row["left_out"], row["chance"], extent)
+        share, *extents = (with_interval(row[name]) for name in ("share", "extent", "extent_in_latents"))
+        cells = (row["source"], row["axis"], row["step"], share, row["cells"], row["left_out"], row["chance"], *extents)
         lines.append("| " + " | ".join(map(str, cells)) + " |")
     frames, episodes = found.probe_fitted_on
     lines.append("")
     lines.append(
         f"Images of {found.image_px} px; differences to `none`; left out where the true closedness differs by less than"
-        f" {LEAST_CLOSEDNESS:g}; extent: what is read over what is true; the probe was fitted on {frames} true frames"
-        f" of {episodes} training episodes."
+        f" {LEAST_CLOSEDNESS:g}; extent: what is read over what is true; in latents: along the true difference; the"
+        f" probe was fitted on {frames} true frames of {episodes} training episodes."
     )
     for source, reading in found.readings.items():
         lines.append(

@@ -14,9 +14,17 @@ from vjepa2_ac.simulation.gripper_sides import ACTIONS, TRUE_FRAMES, GripperCell
 from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
 
 
+def latent(read: float, true: float) -> dict[str, np.ndarray]:
+    """Return inner products of latents that have one number."""
+    return {"m": np.array([read * true]), "decoded_truth": np.array([true * true])}
+
+
 def sides(*cells: tuple[str, str, float, float]) -> GripperSides:
     """Return cells of one step: episode, name of the action, true difference, difference that is read."""
-    made = [GripperCell(one, 0, name, np.array([true]), {"m": np.array([read])}) for one, name, true, read in cells]
+    made = [
+        GripperCell(one, 0, name, np.array([true]), {"m": np.array([read])}, latent(3 * read, true))
+        for one, name, true, read in cells
+    ]
     return GripperSides(tuple(made), ("m",), 96, (10, 2), {})
 
 
@@ -48,6 +56,10 @@ def test_extent_is_what_is_read_over_what_is_true() -> None:
     assert opened is not None
     assert whole.value == pytest.approx(0.2 / 2.0)
     assert opened.value == pytest.approx(0.5)
+    in_latents = found.extent_in_latents("m", "open")
+    assert in_latents is not None
+    assert in_latents.value == pytest.approx(1.5)
+    assert found.extent_in_latents("truth") is None, "frames are no latents"
 
 
 def test_the_true_gripper_closes_under_close_and_opens_under_open(tmp_path: Path) -> None:
@@ -66,4 +78,7 @@ def test_the_true_frames_show_what_the_simulator_measures(tmp_path: Path) -> Non
     found = measure_gripper("builtin:sim-tiny", replace(asked_of_tiny(tmp_path, data), starts=3))
     assert found.of(TRUE_FRAMES).share == share_of(3, 3), "the gripper is either open or closed: one action counts"
     assert found.readings[TRUE_FRAMES].error < 0.8 * found.readings[TRUE_FRAMES].error_of_mean
+    whole = found.extent_in_latents("decoded_truth")
+    assert whole is not None
+    assert whole.value == 1
     assert {values.shape for cell in found.cells for values in cell.read.values()} == {(2,)}

@@ -170,7 +170,8 @@ class Counterfactual:
     name: str  # of the action
     outcome: Outcome
     seen: Float[torch.Tensor, "time 3 size size"]  # the outcome's frames as the encoder sees them, 0 .. 1
-    decoded: Mapping[str, Float[torch.Tensor, "time 3 size size"]]  # source -> images, 0 .. 1
+    latents: Mapping[str, Float[torch.Tensor, "time tokens dim"]]  # source -> encoded truth, or a rollout
+    decoded: Mapping[str, Float[torch.Tensor, "time 3 size size"]]  # source -> these as images, 0 .. 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,14 +216,14 @@ class CounterfactualSetup:
             actions = named_actions(name, self.asked.steps, size_m=self.asked.size_m, limits=self.limits)
             outcome = arm.under(actions, self.config.data.model_stride)
             inputs = self._inputs(outcome.frames)
-            encoded = self.world_model.encode(inputs, chunk=self.config.model.encode_chunk)[0]
-            decoded = {DECODED_TRUTH: self._decoded(encoded)}
+            latents = {DECODED_TRUTH: self.world_model.encode(inputs, chunk=self.config.model.encode_chunk)[0]}
             for each in self.contenders:
                 with each.switched():
                     imagined = imagined_latents(each.model, start, actions)
-                decoded[each.name] = self._decoded(torch.cat([start.latents[None], imagined.to(start.latents)]))
+                latents[each.name] = torch.cat([start.latents[None], imagined.to(start.latents)])
+            decoded = {source: self._decoded(one) for source, one in latents.items()}
             seen = as_images(input_to_pixels(inputs[0]))
-            cases[name] = Counterfactual(episode_id, first, name, outcome, seen, decoded)
+            cases[name] = Counterfactual(episode_id, first, name, outcome, seen, latents, decoded)
         return cases
 
     def _start(self, window: tuple[int, int]) -> tuple[Start, str]:

@@ -48,6 +48,7 @@ class GripperCell:
     name: str  # of the action
     true: Float[np.ndarray, " steps"]  # measured by the simulator
     read: Mapping[str, Float[np.ndarray, " steps"]]  # source -> read from its images
+    latent: Mapping[str, Float[np.ndarray, " steps"]]  # source -> inner product of its latents' difference and the true
 
 
 @dataclass(frozen=True)
@@ -70,22 +71,36 @@ class GripperSides:
 
     def of(self, source: str, action: str | None = None, step: int = -1) -> Side:
         """Return the count for one source, under an action (None: both), after a model step (-1: last)."""
-        cells = [cell for cell in self.cells if action in {None, cell.name}]
-        counted = [cell for cell in cells if _counts(cell, step)]
+        counted = self._counted(action, step)
         right = sum(bool(cell.read[source][step] * cell.true[step] > 0) for cell in counted)
-        return Side(right, len(counted), len(cells) - len(counted))
+        cells = sum(action in {None, cell.name} for cell in self.cells)
+        return Side(right, len(counted), cells - len(counted))
 
     def extent(self, source: str, action: str | None = None, step: int = -1) -> Estimate | None:
         """Return the mean difference that is read over the true one, with an interval over episodes.
 
         1: as far as in truth; 0: not at all; below 0: the other way. None: no cell counts.
         """
-        counted = [cell for cell in self.cells if action in {None, cell.name} and _counts(cell, step)]
+        counted = self._counted(action, step)
         if not counted:
             return None
         true = np.array([cell.true[step] for cell in counted])
         read = np.array([cell.read[source][step] for cell in counted])
         return ratio(read * np.sign(true), np.abs(true), [cell.episode_id for cell in counted])
+
+    def extent_in_latents(self, source: str, action: str | None = None, step: int = -1) -> Estimate | None:
+        """Return how far the difference of latents goes along the true one: the same without decoder and probe.
+
+        1: as far as in truth; 0: not at all. None: no cell counts, or the source has no latents.
+        """
+        counted = self._counted(action, step)
+        if not counted or source not in counted[0].latent:
+            return None
+        along, whole = (np.array([cell.latent[one][step] for cell in counted]) for one in (source, DECODED_TRUTH))
+        return ratio(along, whole, [cell.episode_id for cell in counted])
+
+    def _counted(self, action: str | None, step: int) -> list[GripperCell]:
+        return [cell for cell in self.cells if action in {None, cell.name} and _counts(cell, step)]
 
 
 def measure_gripper(subject: str, asked: SidesOptions, *, reporter: Reporter = SILENT) -> GripperSides:
@@ -121,7 +136,9 @@ def _cell(
     case, unmoved = cases[name], cases[_NONE]
     true = (case.outcome.states - unmoved.outcome.states)[1:, _GRIPPER]
     differences = {source: (values - read[_NONE][source])[1:] for source, values in read[name].items()}
-    return GripperCell(case.episode_id, case.start, name, true, differences)
+    moved = {source: (latents - unmoved.latents[source])[1:].double() for source, latents in case.latents.items()}
+    along = {source: (one * moved[DECODED_TRUTH]).sum(dim=(1, 2)).cpu().numpy() for source, one in moved.items()}
+    return GripperCell(case.episode_id, case.start, name, true, differences, along)
 
 
 def _reading(read: Float[np.ndarray, " frames"], states: Float[np.ndarray, "frames 7"], probe: GripperProbe) -> Reading:
