@@ -86,6 +86,7 @@ ORDERS: dict[str, list[str]] = {
         "counterfactual",
         "imagined_truth hand_in_images",
         "counterfactual_sides",
+        "gripper_sides",
     ],
 }
 

@@ -7,14 +7,9 @@ import pytest
 
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 
-from paths import ROOT
-from vjepa2_ac.config.loading import load_config
-from vjepa2_ac.decoding.decoder_folder import DecoderCard, save_decoder
-from vjepa2_ac.decoding.network import Decoder, DecoderShape
+from counterfactual_requests import asked_of_tiny
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.request import EvaluationOptions
-from vjepa2_ac.model.checkpoints.loading import load_base
-from vjepa2_ac.simulation.counterfactual_sides import AXES, Cell, Sides, SidesOptions, measure_sides
+from vjepa2_ac.simulation.counterfactual_sides import AXES, Cell, Sides, measure_sides
 
 
 def sides(*cells: tuple[str, float, float]) -> Sides:
@@ -40,25 +35,8 @@ def test_where_the_hand_hardly_moves_no_side_is_true() -> None:
     assert found.of("m", "z").share is None
 
 
-def asked(tmp_path: Path, path: Path) -> SidesOptions:
-    settings = [
-        f"data.path={path}", "data.frames=3", "data.stride=4", "data.workers=0", "data.test_share=0.3",
-        "data.validation_share=0.2", "planning.limits.xyz=[0.05,0.05,0.05]",
-    ]  # fmt: skip
-    config = load_config(ROOT / "configs/demo.yaml", settings)
-    model = load_base(config.model, seed=0)
-    shape = DecoderShape("linear", model.latent_dim, 6, 16)
-    encoder = model.encoder_fingerprint()
-    card = DecoderCard("vjepa2-ac decoder 1", shape, encoder, "released", "fp32", "data", ("camera",), 3, 30, 100)
-    weights = Decoder(shape).state_dict()
-    save_decoder(tmp_path / "decoder", card, weights, weights)
-    return SidesOptions(
-        str(tmp_path / "decoder"), starts=1, steps=2, evaluation=EvaluationOptions(data=config, out=tmp_path / "out")
-    )
-
-
 def test_every_start_has_a_cell_for_each_direction_and_the_true_hand_moves(simulated: Path, tmp_path: Path) -> None:
-    found = measure_sides("builtin:sim-tiny", asked(tmp_path, simulated))
+    found = measure_sides("builtin:sim-tiny", asked_of_tiny(tmp_path, simulated))
     assert sorted(cell.name for cell in found.cells) == sorted(name for pair in AXES.values() for name in pair)
     assert found.sources == ("decoded_truth", "model")
     assert all(cell.true_px[1] > cell.true_px[0] > 1 for cell in found.cells)
@@ -68,4 +46,4 @@ def test_every_start_has_a_cell_for_each_direction_and_the_true_hand_moves(simul
 
 def test_data_that_were_not_simulated_are_refused(data_folder: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="were not simulated"):
-        measure_sides("builtin:sim-tiny", asked(tmp_path, data_folder))
+        measure_sides("builtin:sim-tiny", asked_of_tiny(tmp_path, data_folder))

@@ -8,7 +8,8 @@ that ignores its actions, is 0.5. Where the hand truly moves by less than 2 pixe
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -20,7 +21,9 @@ from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
 from vjepa2_ac.data.clips.loader import batches_of, validation_windows
+from vjepa2_ac.data.clips.transforms import frames_as_seen, view
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
+from vjepa2_ac.decoding.frame_pairs import as_images
 from vjepa2_ac.decoding.imagine import Start, imagined_latents
 from vjepa2_ac.distributed.launch import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, encode_frames
@@ -32,8 +35,9 @@ from vjepa2_ac.evaluation.subject import Subject, load_subject
 from vjepa2_ac.intervals import Estimate, share_of
 from vjepa2_ac.planning.counterfactual.named_actions import STEP_M, named_actions
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
-from vjepa2_ac.simulation.counterfactual import resimulate
+from vjepa2_ac.simulation.counterfactual import Outcome, resimulate
 from vjepa2_ac.simulation.hand_in_images import hand_positions
+from vjepa2_ac.simulation.world.projection import HAND_MIDDLE_M
 
 AXES: Mapping[str, tuple[str, str]] = {"x": ("forward", "back"), "y": ("left", "right"), "z": ("up", "down")}
 """Axis of the robot base frame -> the named actions along it."""
@@ -103,87 +107,135 @@ def measure_sides(subject: str, asked: SidesOptions, *, reporter: Reporter = SIL
     Raises:
         InputError: Subject, data or decoder cannot be used; or the data were not simulated.
     """
+    setup = open_setup(subject, asked, reporter)
+    positions = setup.positions()
+    probe = fitted_probe(setup.dataset, positions, setup.image_size)
+    names = [name for pair in AXES.values() for name in pair]
+    starts = setup.counterfactuals(names, reporter)
+    cells = tuple(_cell(case, positions, probe) for cases in starts for case in cases.values())
+    return Sides(cells, setup.sources, setup.image_size, probe.fitted_on)
+
+
+def open_setup(subject: str, asked: SidesOptions, reporter: Reporter = SILENT) -> CounterfactualSetup:
+    """Load the decoder, the data and the models. Cheap failures first.
+
+    Raises:
+        InputError: Subject, data or decoder cannot be used; or the data were not simulated.
+    """
     decoder = load_decoder(asked.decoder)
     config, planning, _ = settle(subject, asked.evaluation, frames=asked.steps + 1)
     accelerator = make_accelerator(config)
     dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
-    size = decoder.card.shape.image_size
-    positions = hand_positions(dataset, size)
-    if isinstance(positions, str) or config.data.is_cache:
-        found = positions if isinstance(positions, str) else "latents of a cache, which has no frames"
-        raise InputError(where=config.data.path, found=found, needed="a data set that `simulate record` made")
+    _positions_in(dataset, decoder.card.shape.image_size)
     loaded = load_subject(subject, config, asked.evaluation, dataset, decoder)
     loaded.put_on(accelerator.device)
-    probe = fitted_probe(dataset, positions, size)
-    reader = _Reader(decoder.to(accelerator.device), probe, positions)
-    imagine = _Imagination(config, dataset, loaded, reader)
-    windows, cells = validation_windows(dataset, asked.split, clips=asked.starts), []
-    progress = reporter.task("actions that were not taken", "starts")
-    for done, window in enumerate(windows, 1):
-        with accelerator.autocast():
-            cells += imagine.cells_of(window, asked, planning.limits)
-        progress(done, len(windows))
-    sources = (DECODED_TRUTH, *(one.name for one in loaded.contenders))
-    return Sides(tuple(cells), sources, size, probe.fitted_on)
+    decoder = decoder.to(accelerator.device)
+    return CounterfactualSetup(asked, config, planning.limits, dataset, loaded, decoder, accelerator.autocast)
+
+
+def _positions_in(dataset: Dataset, size: int, along_m: float = HAND_MIDDLE_M) -> HandPositions:
+    """Return where a point of the hand is in images of a size, or refuse the data."""
+    positions = hand_positions(dataset, size, along_m=along_m)
+    if isinstance(positions, str) or dataset.config.is_cache:
+        found = positions if isinstance(positions, str) else "latents of a cache, which has no frames"
+        raise InputError(where=dataset.config.path, found=found, needed="a data set that `simulate record` made")
+    return positions
 
 
 @dataclass(frozen=True, eq=False)
-class _Reader:
-    """Reads positions of the hand from latents."""
+class Counterfactual:
+    """What happens from one start under a named action, and what is imagined: at the start and after each step."""
 
-    decoder: TrainedDecoder
-    probe: HandProbe
-    positions: HandPositions
-
-    def of(self, latents: torch.Tensor) -> Float[np.ndarray, "time 2"]:
-        """Return the positions in the decoded images."""
-        with torch.autocast(latents.device.type, enabled=False), torch.no_grad():
-            return self.probe.read(self.decoder.decoder.decode(latents.float()))
+    episode_id: str
+    start: int  # control step
+    name: str  # of the action
+    outcome: Outcome
+    seen: Float[torch.Tensor, "time 3 size size"]  # the outcome's frames as the encoder sees them, 0 .. 1
+    latents: Mapping[str, Float[torch.Tensor, "time tokens dim"]]  # source -> encoded truth, or a rollout
+    decoded: Mapping[str, Float[torch.Tensor, "time 3 size size"]]  # source -> these as images, 0 .. 1
 
 
 @dataclass(frozen=True, eq=False)
-class _Imagination:
+class CounterfactualSetup:
+    """Models, a decoder and simulated data. Use `open_setup` to make one."""
+
+    asked: SidesOptions
     config: Config
+    limits: LimitsConfig
     dataset: Dataset
     subject: Subject
-    reader: _Reader
+    decoder: TrainedDecoder
+    autocast: Callable[[], AbstractContextManager[object]]  # to the run's precision
 
-    def cells_of(self, window: tuple[int, int], asked: SidesOptions, limits: LimitsConfig) -> list[Cell]:
-        """Return the cells of one start: a model's images and the simulator's under every named action."""
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """What is decoded: the truth, and the models' rollouts."""
+        return (DECODED_TRUTH, *(one.name for one in self.subject.contenders))
+
+    @property
+    def image_size(self) -> int:
+        """Height and width of the images, in pixels."""
+        return self.decoder.card.shape.image_size
+
+    def positions(self, along_m: float = HAND_MIDDLE_M) -> HandPositions:
+        """Return where a point of the hand is in the images; `along_m` as of `hand_positions`."""
+        return _positions_in(self.dataset, self.image_size, along_m)
+
+    def counterfactuals(self, names: Sequence[str], reporter: Reporter = SILENT) -> Iterator[dict[str, Counterfactual]]:
+        """Yield what happens from each start, by the name of the action.
+
+        Raises:
+            InputError: The split has no clips, or the simulator shows something else than was recorded.
+        """
+        windows = validation_windows(self.dataset, self.asked.split, clips=self.asked.starts)
+        progress = reporter.task("actions that were not taken", "starts")
+        for done, window in enumerate(windows, 1):
+            with self.autocast():
+                cases = self._from(window, names)
+            yield cases
+            progress(done, len(windows))
+
+    def _from(self, window: tuple[int, int], names: Sequence[str]) -> dict[str, Counterfactual]:
         episode, first = window
         camera = self.config.data.cameras[0]
         arm = resimulate(self.config.data.path, self.dataset.source.read(episode, camera), first, camera)
-        start, name = self._start(window)
-        cells = []
-        for action in (one for pair in AXES.values() for one in pair):
-            actions = named_actions(action, asked.steps, size_m=asked.size_m, limits=limits)
+        start, episode_id = self._start(window)
+        cases, crop = {}, self.config.data.crop
+        for name in names:
+            actions = named_actions(name, self.asked.steps, size_m=self.asked.size_m, limits=self.limits)
             outcome = arm.under(actions, self.config.data.model_stride)
-            true = self.reader.positions(name, outcome.states)
-            truth = encode_frames(
-                self.subject.world_model,
-                outcome.frames,
-                self.config.data.crop,
-                chunk=self.config.model.encode_chunk,
+            encoded = encode_frames(
+                self.subject.world_model, outcome.frames, crop, chunk=self.config.model.encode_chunk
             )
-            read = {DECODED_TRUTH: truth}
+            latents = {DECODED_TRUTH: encoded}
             for each in self.subject.contenders:
                 with each.switched():
                     imagined = imagined_latents(each.model, start, actions)
-                read[each.name] = torch.cat([start.latents[None], imagined.to(start.latents)])
-            moved = true[1:] - true[0]
-            length = np.linalg.norm(moved, axis=1)
-            with np.errstate(invalid="ignore", divide="ignore"):
-                along = {
-                    source: _along(self.reader.of(latents), moved / length[:, None]) for source, latents in read.items()
-                }
-            cells.append(Cell(name, first, action, np.nan_to_num(length), along))
-        return cells
+                latents[each.name] = torch.cat([start.latents[None], imagined.to(start.latents)])
+            decoded = {source: self._decoded(one) for source, one in latents.items()}
+            seen = torch.from_numpy(frames_as_seen(view(outcome.frames, crop), self.image_size)).permute(0, 3, 1, 2)
+            cases[name] = Counterfactual(episode_id, first, name, outcome, as_images(seen), latents, decoded)
+        return cases
 
     def _start(self, window: tuple[int, int]) -> tuple[Start, str]:
         (batch,) = batches_of(self.dataset, [window], batch_size=1)
         model, chunk = self.subject.world_model, self.config.model.encode_chunk
         latents = encode_batch(model, batch, device=model.device, chunk=chunk)
         return Start.of(latents, self.dataset.spaces.state), batch.episode_ids[0]
+
+    def _decoded(self, latents: torch.Tensor) -> torch.Tensor:
+        with torch.autocast(latents.device.type, enabled=False), torch.no_grad():
+            return self.decoder.decoder.decode(latents.float())
+
+
+def _cell(case: Counterfactual, positions: HandPositions, probe: HandProbe) -> Cell:
+    """Return how far the hand moves in the images, along the true displacement."""
+    true = positions(case.episode_id, case.outcome.states)
+    moved = true[1:] - true[0]
+    length = np.linalg.norm(moved, axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        along = {source: _along(probe.read(images), moved / length[:, None]) for source, images in case.decoded.items()}
+    return Cell(case.episode_id, case.start, case.name, np.nan_to_num(length), along)
 
 
 def _along(read: Float[np.ndarray, "time 2"], direction: Float[np.ndarray, "steps 2"]) -> Float[np.ndarray, " steps"]:

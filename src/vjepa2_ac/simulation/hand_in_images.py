@@ -14,17 +14,18 @@ from vjepa2_ac.evaluation.decoded.hand import HandPositions
 from vjepa2_ac.simulation.counterfactual import RECORDED_CAMERAS, camera_of
 from vjepa2_ac.simulation.recording.simulation_file import SIMULATION_FILE, read_simulation
 from vjepa2_ac.simulation.world.camera import FRAME_SIZE
-from vjepa2_ac.simulation.world.projection import hand_pixels
+from vjepa2_ac.simulation.world.projection import HAND_MIDDLE_M, hand_pixels
 
 _FIXED = "exterior"
 
 
-def hand_positions(dataset: Dataset, size: int) -> HandPositions | str:
+def hand_positions(dataset: Dataset, size: int, *, along_m: float = HAND_MIDDLE_M) -> HandPositions | str:
     """Return where the hand is in images of the encoder's size; or why nobody knows.
 
     Args:
         dataset: Its clips are of the config's first camera.
         size: Height and width of an image, in pixels.
+        along_m: Distance of the point from the flange, towards the fingers; the middle of the hand by default.
     """
     config = dataset.config
     if not (Path(config.path) / SIMULATION_FILE).is_file():
@@ -42,7 +43,8 @@ def hand_positions(dataset: Dataset, size: int) -> HandPositions | str:
         return f"{camera} moves with the hand"
 
     def positions(episode_id: str, states: Float[np.ndarray, "time 7"]) -> Float[np.ndarray, "time 2"]:
-        found = hand_pixels(np.asarray(states, np.float64), simulation.world_of(episode_id), seen_by)
+        world = simulation.world_of(episode_id)
+        found = hand_pixels(np.asarray(states, np.float64), world, seen_by, along_m=along_m)
         return as_seen(found, config.crop, size)
 
     return positions

@@ -5,6 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.decoded.hand import fit_hand_probe
 
 SIZE = 48
@@ -42,5 +43,5 @@ def test_frames_without_a_hand_do_not_count() -> None:
     expected = fit_hand_probe(images[some], positions[some], [ids[place] for place in some])
     found = fit_hand_probe(images, hidden, ids)
     np.testing.assert_array_equal(found.read(images), expected.read(images))
-    with pytest.raises(ValueError, match="two are needed"):
+    with pytest.raises(InputError, match="needed: two"):
         fit_hand_probe(images, positions, ["one"] * 120)

@@ -7,35 +7,27 @@ image's upper left corner, x to the right and y down, of the image as the encode
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from vjepa2_ac.evaluation.decoded.ridge import LinearReader, fit_ridge
+
 HandPositions = Callable[[str, Float[np.ndarray, "time 7"]], Float[np.ndarray, "time 2"]]
 """From the id of an episode and its states to positions in the image; NaN: behind the camera."""
 
 _SIDE = 32  # pixels, to which images are shrunk
-_RIDGES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # over the mean squared norm of the features
-_FOLDS = 4  # of episodes, among which the ridge is chosen
 
 
-@dataclass(frozen=True, eq=False)
-class HandProbe:
+class HandProbe(LinearReader):
     """Reads the position of the hand from images of one size."""
-
-    mean: Float[Tensor, " features"]
-    weights: Float[Tensor, "features 2"]
-    offset: Float[Tensor, " 2"]  # the mean position
-    fitted_on: tuple[int, int]  # frames, episodes
 
     def read(self, images: Float[Tensor, "*batch 3 size size"]) -> Float[np.ndarray, "*batch 2"]:
         """Return x and y in pixels."""
-        flat = _features(images.reshape(-1, *images.shape[-3:])).to(self.mean)
-        found = (flat - self.mean) @ self.weights + self.offset
-        return np.asarray(found.reshape(*images.shape[:-3], 2).numpy())
+        found = self.of(_features(images.reshape(-1, *images.shape[-3:])))
+        return found.reshape(*images.shape[:-3], 2)
 
 
 def fit_hand_probe(
@@ -51,36 +43,10 @@ def fit_hand_probe(
         episode_ids: Of each frame.
 
     Raises:
-        ValueError: Fewer than two episodes show a hand.
+        InputError: Fewer than two episodes show a hand.
     """
-    known = np.isfinite(positions).all(axis=1)
-    names, fold = np.unique(np.array(episode_ids)[known], return_inverse=True)
-    if len(names) < 2:
-        raise ValueError(f"{len(names)} episodes with a hand in the image; two are needed to choose the ridge")
-    features = _features(images)[torch.from_numpy(known)].double()
-    true = torch.from_numpy(positions[known]).double()
-    of_fold = torch.from_numpy(fold % min(_FOLDS, len(names)))
-    errors = [0.0] * len(_RIDGES)
-    for left_out in range(int(of_fold.max()) + 1):
-        rest = of_fold != left_out
-        for place, (mean, weights, offset) in enumerate(_fits(features[rest], true[rest])):
-            read = (features[~rest] - mean) @ weights + offset
-            errors[place] += float((read - true[~rest]).norm(dim=1).sum())
-    mean, weights, offset = _fits(features, true)[int(np.argmin(errors))]
-    return HandProbe(mean, weights, offset, (len(features), len(names)))
-
-
-def _fits(features: Tensor, true: Tensor) -> list[tuple[Tensor, Tensor, Tensor]]:
-    """Return mean, weights and offset for every ridge, from one decomposition."""
-    mean, offset = features.mean(dim=0), true.mean(dim=0)
-    centred = features - mean
-    values, vectors = torch.linalg.eigh(centred @ centred.T)
-    inside = vectors.T @ (true - offset)
-    scale = values.mean()
-    return [
-        (mean, centred.T @ (vectors @ (inside / (values.clamp(min=0) + ridge * scale)[:, None])), offset)
-        for ridge in _RIDGES
-    ]
+    fit = fit_ridge(_features(images), positions, episode_ids)
+    return HandProbe(fit.mean, fit.weights, fit.offset, fit.fitted_on)
 
 
 def _features(images: Float[Tensor, "frames 3 size size"]) -> Float[Tensor, "frames features"]:

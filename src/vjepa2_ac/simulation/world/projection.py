@@ -16,6 +16,8 @@ from vjepa2_ac.simulation.world.domains import Domain
 SECOND_CAMERA_TURN_DEG = -100.0
 HAND_MIDDLE_M = 0.035
 """Distance of the middle of the hand from the flange, towards the fingers."""
+FINGERS_MIDDLE_M = 0.11
+"""Distance of the middle of the fingers from the flange."""
 
 
 def exterior_pose(domain: Domain, camera: str = "exterior_1") -> Float[np.ndarray, "4 4"]:
@@ -35,6 +37,8 @@ def hand_pixels(
     domain: Domain,
     camera: str = "exterior_1",
     size: tuple[int, int] = FRAME_SIZE,
+    *,
+    along_m: float = HAND_MIDDLE_M,
 ) -> Float[np.ndarray, "time 2"]:
     """Return where the middle of the hand is in the image: x, y in pixels (legend: this file's docstring).
 
@@ -45,11 +49,12 @@ def hand_pixels(
         domain: Their world.
         camera: `exterior_1` or `exterior_2`; the wrist's camera is fixed to the hand.
         size: Height and width of the image.
+        along_m: Distance of the point from the flange, towards the fingers.
 
     Raises:
         ValueError: No such camera.
     """
-    hand = states[:, :3] + HAND_MIDDLE_M * matrices_from_euler(states[:, 3:6])[:, :, 2]
+    hand = states[:, :3] + along_m * matrices_from_euler(states[:, 3:6])[:, :, 2]
     return pixels_of(hand @ domain.base_pose()[:3, :3].T, exterior_pose(domain, camera), domain, size)
 
 
