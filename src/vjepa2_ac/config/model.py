@@ -23,8 +23,12 @@ _MOST_PATTERNS = 64  # that select layers by name
 _USUAL_ALPHA = 32.0  # of every config here, at any rank
 
 
+Family = Literal["v2", "v2.1"]
+FramePath = Literal["tubelet", "image"]
+
+
 class EncoderSizes(Section):
-    """Sizes of the frozen video encoder; the defaults are ViT-g/16's."""
+    """Sizes of the frozen video encoder; the defaults are those of V-JEPA 2's ViT-g/16."""
 
     width: Width = 1408
     """Width of a latent."""
@@ -34,6 +38,10 @@ class EncoderSizes(Section):
     """Attention heads; width / heads is the size of a head."""
     mlp_ratio: Ratio = 48 / 11
     """Hidden width of the MLP over the width."""
+    family: Family = "v2"
+    """V-JEPA 2, or 2.1: other rotary positions, and a learned vector for the kind of input."""
+    frame: FramePath = "tubelet"
+    """How a frame enters. tubelet: twice, as a video of two equal frames. image (2.1 only): as one image."""
 
 
 class PredictorSizes(Section):
@@ -50,9 +58,9 @@ class PredictorSizes(Section):
     use_extrinsics: bool = False
     """Whether the camera pose is one more input token per time step."""
     action_dim: VectorWidth = 7
-    """VectorWidth of an action. Where the data's are others, its encoder is replaced by a fresh one."""
+    """Width of an action. Where the data's are others, its encoder is replaced by a fresh one."""
     state_dim: VectorWidth = 7
-    """VectorWidth of a state, likewise."""
+    """Width of a state, likewise."""
 
 
 class ModelSizes(Section):
@@ -85,6 +93,10 @@ class ModelSizes(Section):
                 )
             if not int(part.width * part.mlp_ratio):
                 raise ValueError(f"{name}.mlp_ratio {part.mlp_ratio} leaves nothing of {name}.width {part.width}")
+        if self.encoder.frame == "image" and self.encoder.family == "v2":
+            raise ValueError("encoder.frame image: V-JEPA 2 has no path for images, only 2.1 has; take tubelet")
+        if self.encoder.family == "v2.1" and self.image_size == self.patch_size:
+            raise ValueError("image_size of one patch: V-JEPA 2.1 scales positions to a grid of two patches or more")
         return self
 
     @model_validator(mode="after")
