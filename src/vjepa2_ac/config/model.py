@@ -25,6 +25,7 @@ _USUAL_ALPHA = 32.0  # of every config here, at any rank
 
 Family = Literal["v2", "v2.1"]
 FramePath = Literal["tubelet", "image"]
+EncoderKey = Literal["ema_encoder", "target_encoder", "encoder"]
 
 
 class EncoderSizes(Section):
@@ -118,14 +119,33 @@ class ModelSizes(Section):
         return self
 
 
+class EncoderConfig(Section):
+    """An encoder of its own, under a predictor that does not bring one."""
+
+    path: Annotated[str, AfterValidator(places.of_an_encoder)]
+    """Meta's `.pt` of V-JEPA 2 or 2.1 (`vjepa2-ac download --list`), a transformers folder, the same from the Hub as
+    `hf://owner/name` or `hf://owner/name@revision`, or the folder of a model of this project."""
+    key: EncoderKey | None = None
+    """Which encoder of a `.pt`; null: the first of these that it has. A predictor knows the one it was trained on."""
+    frame: FramePath = "tubelet"
+    """How a frame enters. tubelet: twice, as a video of two equal frames, as all published predictors had it. image
+    (V-JEPA 2.1 only): as one image, through patches of its own."""
+    heads: Heads | None = None
+    """Attention heads of an encoder of a width that nobody has published; null: those of the published width."""
+
+
 class ModelConfig(Section):
     """Which world model to start from."""
 
     base: Annotated[Annotated[str, AfterValidator(places.of_a_model)] | None, Affects.RUN] = None
     """The model to adapt: the official `.pt`, a folder written by `save_pretrained`, or `builtin:sim-tiny` (the tiny
     model of the demo, which comes with the package)."""
+    encoder: Annotated[EncoderConfig | None, Affects.RUN] = None
+    """A pretrained encoder, for a fresh predictor (`random`) or one that comes without (a `base` that holds a predictor
+    alone); null: the base's own. Its family, width, depth, heads and MLP are the file's."""
     random: Annotated[ModelSizes | None, Affects.RUN] = None
-    """Instead of `base`: a fresh model of these sizes; with `adapter.kind: none` that is training from scratch."""
+    """Instead of `base`: a fresh predictor of these sizes, and, without `encoder`, a random encoder; with
+    `adapter.kind: none` that is training from scratch."""
     random_start: Annotated[Literal["persistence", "released"], Affects.RUN] = "persistence"
     """Initialisation of a `random` model: close to copying the last frame, or as in the released recipe."""
     sizes: Annotated[ModelSizes, Affects.RUN | Affects.PLAN] = ModelSizes()
