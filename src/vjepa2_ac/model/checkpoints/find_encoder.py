@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from vjepa2_ac.config import EncoderSizes, ModelSizes
 from vjepa2_ac.config.model import EncoderConfig
-from vjepa2_ac.errors import InputError, UnreachableError
+from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.base_model import find_model
 from vjepa2_ac.model.checkpoints.encoder_file import FoundEncoder, encoder_in_file, with_frame_path
 from vjepa2_ac.model.checkpoints.encoder_folder import encoder_in_folder
@@ -17,6 +17,7 @@ from vjepa2_ac.model.checkpoints.meta_file import open_file
 from vjepa2_ac.model.checkpoints.published import published_as
 from vjepa2_ac.model.sizes import check_sizes
 from vjepa2_ac.places import HUB
+from vjepa2_ac.storage.remote.hub import from_hub
 from vjepa2_ac.storage.structured import message_of
 
 logger = logging.getLogger(__name__)
@@ -34,7 +35,8 @@ def find_encoder(config: EncoderConfig) -> FoundEncoder:
         UnreachableError: The Hub cannot be reached, and the repository is not in its cache.
     """
     if config.path.startswith(HUB):
-        return encoder_in_folder(_from_hub(config.path), config, name=config.path)
+        folder = from_hub(config.path, _FILES, where=f"model.encoder.path: {config.path}")
+        return encoder_in_folder(folder, config, name=config.path)
     path = find_model(config.path, knob="model.encoder.path", needed=_NEEDED, fix=_FIX)
     if path.is_dir():
         return encoder_in_folder(path, config, name=path.name)
@@ -76,27 +78,3 @@ def expected_sizes(config: EncoderConfig, given: ModelSizes) -> ModelSizes:
     )
     encoder = with_frame_path(sizes, config.frame, where=config.path)
     return given.model_copy(update={"encoder": encoder})
-
-
-def _from_hub(name: str) -> Path:
-    """Return the folder of a repository in the Hub's cache, after downloading what is missing."""
-    from huggingface_hub import snapshot_download
-    from huggingface_hub.errors import GatedRepoError, HfHubHTTPError, LocalEntryNotFoundError, RepositoryNotFoundError
-
-    repository, _, revision = name.removeprefix(HUB).partition("@")
-    where, log_in = f"model.encoder.path: {name}", "for one that is not public, `hf auth login` or set HF_TOKEN"
-    try:
-        return Path(snapshot_download(repository, revision=revision or None, allow_patterns=_FILES))
-    except GatedRepoError:
-        fix = f"Ask for it on its page; then {log_in}"
-        raise InputError(where=where, found="a repository that must be asked for", needed="access", fix=fix) from None
-    except RepositoryNotFoundError:
-        found = "no such repository, or none for you"
-        raise InputError(where=where, found=found, needed="hf://owner/name", fix=f"Check the name; {log_in}") from None
-    except LocalEntryNotFoundError:
-        raise UnreachableError(
-            where=where, found="the Hub cannot be reached", fix="Check the network, or name a folder of this machine"
-        ) from None
-    except (HfHubHTTPError, OSError, ValueError) as error:
-        said = str(error).strip().splitlines()[0][:200]
-        raise InputError(where=where, found=f"an answer of the Hub: {said}", fix=f"Check the name; {log_in}") from None
