@@ -12,14 +12,13 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from vjepa2_ac.config import Config
+from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.clips.transforms import Crop, view
 from vjepa2_ac.data.sources.configured_spaces import spaces_of
 from vjepa2_ac.encoding.batch import encode_frames
-from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.network.input_heads import widths_of_model
+from vjepa2_ac.model.network.input_heads import heads_to_replace, widths_as_text, widths_of_model
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.axes.axes_file import no_vertical_axis
 from vjepa2_ac.planning.axes.mapping import Axes
@@ -93,7 +92,7 @@ class Controller:
                 action; or it needs a camera pose and none is given, or the other way round; or its blocks cannot be
                 compiled or quantized to 8 bits; or vectors have no limits; or `planning.axes` are not this model's.
         """
-        _require_spaces(widths_of_model(world_model.sizes), spaces)
+        _require_spaces(world_model.sizes, spaces)
         if extrinsics is not None:
             require_numbers(extrinsics, EXTRINSICS, where="extrinsics")
         if world_model.sizes.predictor.use_extrinsics != (extrinsics is not None):
@@ -282,11 +281,11 @@ def _axes_of(world_model: WorldModel, config: PlanningConfig, spaces: Spaces) ->
     return Axes.read(config.axes, Fingerprints.of(world_model))
 
 
-def _require_spaces(widths: Widths, spaces: Spaces) -> None:
-    if widths != spaces.widths:
+def _require_spaces(sizes: ModelSizes, spaces: Spaces) -> None:
+    if heads_to_replace(sizes, spaces.widths):
         raise InputError(
             where="model",
-            found=f"states of {widths.state} and actions of {widths.action} numbers",
+            found=widths_as_text(sizes),
             needed=f"{spaces.widths.state} and {spaces.widths.action}, as the spaces say",
             fix="Give the spaces of the data that it was trained on",
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import pickle
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,7 @@ IGNORED = {"encoder": ("pos_embed",), "predictor": ()}  # may exist: a network w
 
 _NEEDED = "a checkpoint of V-JEPA 2-AC as Meta publishes it (vjepa2-ac-vitg.pt)"
 _FIX = "`vjepa2-ac download` fetches it, and goes on with a part of it"
+_NON_COMMERCIAL = "The weights that jepa-wms publishes so are CC-BY-NC 4.0: for non-commercial use only"
 _SPLIT = ("q", "k", "v")
 _DAMAGE = (  # errors of a damaged pickle, in addition to torch's own
     pickle.UnpicklingError, OSError, EOFError, RuntimeError, ValueError, LookupError, TypeError, AttributeError,
@@ -61,14 +62,75 @@ def load_official(path: str | Path, sizes: ModelSizes | None = None, dtype: torc
     return model
 
 
+def fill_predictor(network: nn.Module, path: str | Path, dtype: torch.dtype = torch.float32) -> None:
+    """Load the weights of a predictor from a checkpoint, which may hold nothing else.
+
+    Every tensor is matched. A warning is logged where a predictor without states stands alone, as jepa-wms publishes
+    its own: those weights must not be used commercially.
+
+    Args:
+        network: The predictor, on the meta device, of the sizes that `predictor_sizes` gives.
+        path: The `.pt` or `.pth.tar` file.
+        dtype: Type of the weights in memory.
+
+    Raises:
+        InputError: The file is missing, damaged, of another kind or another predictor's, or a weight is not finite.
+    """
+    path = Path(path)
+    _fill(network, path, "predictor", dtype)
+    if not has_states(network.state_dict()) and "encoder" not in _load(path):
+        logger.warning("%s: a predictor without states and without an encoder. %s", path, _NON_COMMERCIAL)
+
+
+def predictor_shapes(path: str | Path) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the predictor in a checkpoint, by Meta's names; reads no values.
+
+    Raises:
+        InputError: The file is missing, damaged, or holds no predictor.
+    """
+    return _shapes(_open(Path(path), ("predictor",))["predictor"])
+
+
+def predictor_sizes(shapes: Mapping[str, tuple[int, ...]], given: PredictorSizes) -> PredictorSizes:
+    """Return the sizes of a predictor; heads and extrinsics are those given.
+
+    Args:
+        shapes: Of its tensors, by Meta's names. Without a state encoder it is a predictor without states.
+        given: What tensors do not show.
+
+    Raises:
+        KeyError: A tensor is missing, or actions are of another width than Meta's.
+        ValidationError: The tensors do not go with the given heads.
+    """
+    width, action_width = shapes["action_encoder.weight"]
+    if action_width != ACTION_DIM:
+        raise KeyError(f"action_encoder.weight of {ACTION_DIM} columns (it has {action_width})")
+    return PredictorSizes(
+        width=width,
+        depth=_depth(shapes, "predictor_blocks"),
+        heads=given.heads,
+        mlp_ratio=mlp_ratio_of(width, shapes["predictor_blocks.0.mlp.fc1.weight"][0], given.mlp_ratio),
+        use_extrinsics=given.use_extrinsics,
+        use_states=has_states(shapes),
+    )
+
+
+def has_states(names: Iterable[str]) -> bool:
+    """Return whether the predictor with tensors of these names takes states."""
+    return any(name.startswith("state_encoder.") for name in names)
+
+
 def to_official(model: WorldModel) -> dict[str, Any]:
     """Return the weights by Meta's names, q, k and v fused: `torch.save` of it is an official checkpoint.
 
     Raises:
-        ValueError: There is an adapter: merge it first. Or states and actions differ in width from Meta's code.
+        ValueError: There is an adapter: merge it first. Or states and actions differ in width from Meta's code, which
+            has no predictor without states either.
     """
     if model.predictor is not model.base_predictor:
         raise ValueError("an adapter is on: merge_adapter first")
+    if not model.sizes.predictor.use_states:
+        raise ValueError("Meta's code has no predictor without states: save_pretrained writes it")
     if widths_of_model(model.sizes) != POSE_WIDTHS:
         raise ValueError(f"Meta's code takes {POSE_WIDTHS}, not {widths_of_model(model.sizes)}")
     encoder = _to_official(model.present_encoder.state_dict(), "encoder")
@@ -101,8 +163,22 @@ def official_name(name: str, part: str) -> tuple[str, int | None]:
     return fused, None if fused == name else _SPLIT.index(name.split(".attn.")[1][0])
 
 
-def _open(path: Path) -> dict[str, dict[str, Tensor]]:
-    """Map a checkpoint and return encoder and predictor by Meta's names without prefixes; reads no values."""
+def _open(path: Path, parts: Iterable[str] = ("encoder", "predictor")) -> dict[str, dict[str, Tensor]]:
+    """Map a checkpoint and return its parts by Meta's names without prefixes; reads no values."""
+    whole = _load(path)
+    found: dict[str, Any] = {
+        "encoder": whole.get("encoder", whole.get("target_encoder")),
+        "predictor": whole.get("predictor"),
+    }
+    for part in parts:
+        if not isinstance(found[part], dict) or not all(isinstance(value, Tensor) for value in found[part].values()):
+            raise _refused(path, f"no weights under {part!r} (keys: {', '.join(map(str, list(whole)[:8]))})")
+    prefixes = re.compile(r"^(?:(?:module|backbone)\.)+")
+    return {part: {prefixes.sub("", name): one for name, one in found[part].items()} for part in parts}
+
+
+def _load(path: Path) -> dict[str, Any]:
+    """Map a checkpoint; reads no values."""
     if not path.is_file():
         raise _refused(path, "no such file")
     try:
@@ -111,13 +187,7 @@ def _open(path: Path) -> dict[str, dict[str, Tensor]]:
         raise InputError(where=str(path), found=_foreign(path, error), needed=f"{_NEEDED}, 11.7 GB", fix=_FIX) from None
     if not isinstance(whole, dict):
         raise _refused(path, f"a {type(whole).__name__}")
-    encoder = whole.get("encoder", whole.get("target_encoder"))
-    parts: dict[str, Any] = {"encoder": encoder, "predictor": whole.get("predictor")}
-    for part, weights in parts.items():
-        if not isinstance(weights, dict) or not all(isinstance(value, Tensor) for value in weights.values()):
-            raise _refused(path, f"no weights under {part!r} (keys: {', '.join(map(str, list(whole)[:8]))})")
-    prefixes = re.compile(r"^(?:(?:module|backbone)\.)+")
-    return {part: {prefixes.sub("", name): one for name, one in weights.items()} for part, weights in parts.items()}
+    return whole
 
 
 def _refused(where: str | Path, found: str) -> InputError:
@@ -155,11 +225,7 @@ def _sizes(parts: dict[str, dict[str, tuple[int, ...]]], given: ModelSizes, *, w
 def _sizes_of_tensors(parts: dict[str, dict[str, tuple[int, ...]]], given: ModelSizes) -> ModelSizes:
     encoder, predictor = parts["encoder"], parts["predictor"]
     width, *_, patch_size = encoder["patch_embed.proj.weight"]
-    predictor_width, action_width = predictor["action_encoder.weight"]
-    if action_width != ACTION_DIM:
-        raise KeyError(f"action_encoder.weight of {ACTION_DIM} columns (it has {action_width})")
     hidden = encoder["blocks.0.mlp.fc1.weight"][0]
-    predictor_hidden = predictor["predictor_blocks.0.mlp.fc1.weight"][0]
     return ModelSizes(
         image_size=given.image_size,
         patch_size=patch_size,
@@ -169,13 +235,7 @@ def _sizes_of_tensors(parts: dict[str, dict[str, tuple[int, ...]]], given: Model
             heads=given.encoder.heads,
             mlp_ratio=mlp_ratio_of(width, hidden, given.encoder.mlp_ratio),
         ),
-        predictor=PredictorSizes(
-            width=predictor_width,
-            depth=_depth(predictor, "predictor_blocks"),
-            heads=given.predictor.heads,
-            mlp_ratio=mlp_ratio_of(predictor_width, predictor_hidden, given.predictor.mlp_ratio),
-            use_extrinsics=given.predictor.use_extrinsics,
-        ),
+        predictor=predictor_sizes(predictor, given.predictor),
     )
 
 
@@ -186,9 +246,9 @@ def _depth(names: Mapping[str, object], blocks: str) -> int:
 def _fill(network: nn.Module, path: Path, part: str, dtype: torch.dtype) -> None:
     """Load the weights of a network on the meta device in groups of tensors, releasing the mapped file in between."""
     needed = network.state_dict()
-    _check(_shapes(_open(path)[part]), _shapes(needed), part, where=str(path))
+    _check(_shapes(_open(path, (part,))[part]), _shapes(needed), part, where=str(path))
     for names in _groups(needed):
-        mapped = _open(path)[part]
+        mapped = _open(path, (part,))[part]
         group = {name: _take(mapped, name, part).to(dtype, copy=True) for name in names}
         require_finite(group, where=f"{path}: {part}", fix=_FIX)
         network.load_state_dict(group, strict=False, assign=True)
