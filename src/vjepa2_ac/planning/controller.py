@@ -202,7 +202,8 @@ class Controller:
 
         Args:
             frame: What the camera sees, of the goal image's size.
-            state: Measured: pose and gripper, or the vector.
+            state: Measured: pose and gripper, or the vector; a vector of any width where the model has no states and an
+                action is a change.
 
         Raises:
             InputError: The image or the state cannot be used.
@@ -211,13 +212,19 @@ class Controller:
         if self._goal is None:
             raise ValueError("no goal: call reset first")
         require_image(frame, where="frame", like=self._like)
-        state = np.asarray(state, dtype=np.float64)
+        state = self._known(np.asarray(state, dtype=np.float64))
         require_numbers(state, self.spaces.state, where="state")
         seen = [*self._seen, (self.encoded(frame), state)][-self.config.context :]
         before = self.decision
         decision = self._decided(self._goal, seen, None if before is None else before.plan)
         self._seen, self._done, self.decision = seen, self._done + 1, decision  # after an error nothing has changed
         return decision.action
+
+    def _known(self, state: np.ndarray) -> np.ndarray:
+        """Return the state; zeros for a vector of another width than an action's, if the model takes no states."""
+        is_needed = self._model.sizes.predictor.use_states or self.spaces.action.follows != "change"
+        width = len(self.spaces.state)
+        return state if is_needed or self.spaces.state.is_pose or state.shape == (width,) else np.zeros(width)
 
     def encoded(self, image: UInt8[np.ndarray, "height width 3"]) -> Float[Tensor, "tokens dim"]:
         """Return the latents of what the model sees of an image, on its device."""

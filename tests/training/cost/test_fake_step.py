@@ -45,6 +45,7 @@ KNOBS: dict[str, dict[str, Any]] = {  # of which every pair of values is tried t
         "wide, few tokens": model_sizes(latent=12, width=96, image=16, depth=4),
         "many heads, little MLP": model_sizes(latent=12, heads=8, mlp=0.25, depth=4),
         "wide latents, extrinsics": model_sizes(latent=960, width=12, depth=1, extrinsics=True),
+        "no states": model_sizes(depth=1, states=False),
     },
     "loss": {
         "L1": {},
