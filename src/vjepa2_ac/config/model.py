@@ -20,6 +20,7 @@ VectorWidth = Annotated[int, Field(ge=1, le=4_096)]
 _MOST_TOKENS = 65_536  # of a frame
 _MOST_WEIGHTS = 10**10  # 40 GB in float32
 _MOST_PATTERNS = 64  # that select layers by name
+_STATE_DIM = 7  # of a pose and a gripper
 _USUAL_ALPHA = 32.0  # of every config here, at any rank
 
 
@@ -58,10 +59,19 @@ class PredictorSizes(Section):
     """Hidden width of the MLP over the width."""
     use_extrinsics: bool = False
     """Whether the camera pose is one more input token per time step."""
+    use_states: bool = True
+    """Whether the state is an input token of each time step. false: the model never sees the states, for a robot whose
+    states are not calibrated; those of the data may then have any width."""
     action_dim: VectorWidth = 7
     """Width of an action. Where the data's are others, its encoder is replaced by a fresh one."""
-    state_dim: VectorWidth = 7
+    state_dim: VectorWidth = _STATE_DIM
     """Width of a state, likewise."""
+
+    @model_validator(mode="after")
+    def _widths_are_used(self) -> PredictorSizes:
+        if not self.use_states and self.state_dim != _STATE_DIM:
+            raise ValueError(f"state_dim {self.state_dim} with use_states false: leave it out, states of any width fit")
+        return self
 
 
 class ModelSizes(Section):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +42,7 @@ logger = logging.getLogger(__name__)
 _NEEDED = "a checkpoint of V-JEPA 2-AC as Meta publishes it (vjepa2-ac-vitg.pt)"
 _NEEDED_WHOLE = f"{_NEEDED}, 11.7 GB"
 _FIX = "`vjepa2-ac download` fetches it, and goes on with a part of it"
+_NON_COMMERCIAL = "The weights that jepa-wms publishes so are CC-BY-NC 4.0: for non-commercial use only"
 _KEYS: tuple[EncoderKey, ...] = (
     "encoder",
     "target_encoder",
@@ -67,7 +68,7 @@ def load_official(path: str | Path, sizes: ModelSizes | None = None, dtype: torc
     key = next((one for one in _KEYS if one in whole), _KEYS[0])
     encoder = _tensors(path, whole, key)
     predictor = shapes_of(_predictor_in(path, whole))
-    found = encoder_in_file(path, whole, EncoderConfig(path=str(path), key=key, heads=_heads(encoder, given)))
+    found = encoder_in_file(path, whole, _asked(path, key, encoder, given))
     model = WorldModel.empty(_sizes(predictor, found, given, where=str(path)))
     del whole, encoder
     found.fill(model.present_encoder, dtype)
@@ -100,6 +101,8 @@ def load_predictor(path: Path, found: FoundEncoder, sizes: ModelSizes, dtype: to
     found.fill(model.present_encoder, dtype)
     _fill_predictor(model.predictor, path, dtype)
     model.encoder_origin = found.origin
+    if not model.sizes.predictor.use_states:
+        logger.warning("%s: a predictor without states and without an encoder. %s", path, _NON_COMMERCIAL)
     logger.warning(
         "%s does not say which encoder its predictor was trained on: on any other than %s it predicts noise. The first"
         " validation shows it (its error beside that of persistence).",
@@ -123,10 +126,13 @@ def to_official(model: WorldModel) -> dict[str, Any]:
     """Return the weights by Meta's names, q, k and v fused: `torch.save` of it is an official checkpoint.
 
     Raises:
-        ValueError: There is an adapter: merge it first. Or states and actions differ in width from Meta's code.
+        ValueError: There is an adapter: merge it first. Or states and actions differ in width from Meta's code, which
+            has no predictor without states either.
     """
     if model.predictor is not model.base_predictor:
         raise ValueError("an adapter is on: merge_adapter first")
+    if not model.sizes.predictor.use_states:
+        raise ValueError("Meta's code has no predictor without states: save_pretrained writes it")
     if widths_of_model(model.sizes) != POSE_WIDTHS:
         raise ValueError(f"Meta's code takes {POSE_WIDTHS}, not {widths_of_model(model.sizes)}")
     encoder = to_official_names(model.present_encoder.state_dict(), part_of(model.sizes.encoder.family))
@@ -159,10 +165,11 @@ def _predictor_in(path: Path, whole: Mapping[str, Any]) -> dict[str, Tensor]:
     return tensors
 
 
-def _heads(encoder: Mapping[str, Tensor], given: ModelSizes) -> int | None:
-    """Return the heads that model.sizes gives an encoder of a width that nobody has published."""
+def _asked(path: Path, key: EncoderKey, encoder: Mapping[str, Tensor], given: ModelSizes) -> EncoderConfig:
+    """Return what model.sizes says of the encoder; heads only of a width that nobody has published."""
     patches = encoder.get("patch_embed.proj.weight")
-    return None if patches is not None and patches.shape[0] in HEADS else given.encoder.heads
+    heads = None if patches is not None and patches.shape[0] in HEADS else given.encoder.heads
+    return EncoderConfig(path=str(path), key=key, frame=given.encoder.frame, heads=heads)
 
 
 def _refused(where: str | Path, found: str) -> InputError:
@@ -202,7 +209,13 @@ def _predictor_sizes(predictor: Shapes, given: PredictorSizes) -> PredictorSizes
         heads=given.heads,
         mlp_ratio=mlp_ratio_of(width, hidden, given.mlp_ratio),
         use_extrinsics=given.use_extrinsics,
+        use_states=_has_states(predictor),
     )
+
+
+def _has_states(names: Iterable[str]) -> bool:
+    """Return whether a predictor with tensors of these names takes states."""
+    return any(name.startswith("state_encoder.") for name in names)
 
 
 def _fill_predictor(network: nn.Module, path: Path, dtype: torch.dtype) -> None:

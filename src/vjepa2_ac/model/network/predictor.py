@@ -25,6 +25,7 @@ class PredictorConfig(PreTrainedConfig):  # type: ignore[misc]  # transformers h
     num_attention_heads: int = 16
     mlp_ratio: float = 4.0
     use_extrinsics: bool = False
+    use_states: bool = True
     action_dim: int = ACTION_DIM
     state_dim: int = STATE_DIM
 
