@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from rich import box
 from rich.table import Table
 
 from vjepa2_ac.model.checkpoints.published import Published
@@ -14,7 +15,7 @@ _COLUMNS = ("holds", "family", "encoder", "pixels", "file", "licence", "encoder'
 
 def published_table(published: Sequence[Published]) -> Table:
     """Return a table with a row for each published checkpoint; names are not divided, however narrow it is."""
-    table = Table(title="Published checkpoints", title_justify="left")
+    table = Table(box=box.SIMPLE_HEAD, title="Published checkpoints", title_justify="left")
     table.add_column("name", no_wrap=True, min_width=max(len(one.name) for one in published))
     for column in _COLUMNS:
         table.add_column(column, overflow="fold")
