@@ -79,6 +79,7 @@ def encoding_of(world_model: WorldModel, config: Config) -> Encoding:
         dim=world_model.latent_dim,
         weights=config.model.dtype,
         precision=config.training.precision,
+        beyond=world_model.encoder_beyond_tensors,
     )
 
 

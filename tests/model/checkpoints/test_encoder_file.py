@@ -21,7 +21,7 @@ from vjepa2_ac.config import EncoderSizes, ModelConfig
 from vjepa2_ac.errors import InputError, RefusedError, UnreachableError
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.checkpoints.official import load_official, to_official
-from vjepa2_ac.model.network.encoder_origin import identified
+from vjepa2_ac.model.network.encoder_origin import beyond_tensors, identified
 from vjepa2_ac.model.network.world_model import WorldModel, fingerprint
 
 FILES = GOLDEN / "encoders"
@@ -405,7 +405,9 @@ def test_two_encoders_of_the_same_tensors_and_other_latents_are_two() -> None:
     assert model_of(V21, heads=2).encoder_fingerprint() != usual
     plain = fingerprint(model_of(V21).encoder.state_dict())
     published = EncoderSizes(width=1024, depth=24, heads=16, mlp_ratio=4.0)
-    assert identified(plain, published, heads_are_told=True) == plain, "as of the AC file that holds it"
+    assert identified(plain, beyond_tensors(published, heads_are_told=True)) == plain, "as of the AC file that holds it"
+    untold = EncoderSizes(width=48, depth=1, heads=3)
+    assert not beyond_tensors(untold, heads_are_told=False), "of a model of before"
 
 
 def test_only_the_encoder_is_read_from_a_large_file(tmp_path: Path) -> None:

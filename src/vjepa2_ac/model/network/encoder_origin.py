@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from vjepa2_ac.config import EncoderSizes
@@ -22,19 +24,36 @@ class EncoderOrigin:
         return f"{self.file}{key}{f' ({self.licence})' if self.licence else ''}"
 
 
-def identified(fingerprint: str, sizes: EncoderSizes, *, heads_are_told: bool) -> str:
-    """Return the fingerprint of an encoder: that of its tensors, with what they do not show and latents depend on.
-
-    Of V-JEPA 2's tubelets with the published heads it is that of the tensors alone, whatever file they came from.
+def beyond_tensors(sizes: EncoderSizes, *, heads_are_told: bool) -> dict[str, str | int]:
+    """Return what latents depend on and tensors do not show; nothing of V-JEPA 2's tubelets with the published heads.
 
     Args:
-        fingerprint: Of the tensors.
         sizes: Of the encoder.
         heads_are_told: Whether the heads belong to it. Those of a model of before were not asked for: its caches stay.
     """
-    beyond = [] if sizes.family == "v2" else [f"family {sizes.family}"]
-    beyond += [] if sizes.frame == "tubelet" else [f"frame {sizes.frame}"]
-    beyond += [f"heads {sizes.heads}"] if heads_are_told and HEADS.get(sizes.width) != sizes.heads else []
+    found: dict[str, str | int] = {}
+    if sizes.family != "v2":
+        found |= {"encoder.family": sizes.family, "encoder.frame": sizes.frame}
+    if heads_are_told and HEADS.get(sizes.width) != sizes.heads:
+        found["encoder.heads"] = sizes.heads
+    return found
+
+
+def identified(fingerprint: str, beyond: Mapping[str, str | int]) -> str:
+    """Return the fingerprint of an encoder: that of its tensors, with what they do not show.
+
+    Args:
+        fingerprint: Of the tensors.
+        beyond: As `beyond_tensors` gives it; where there is nothing, the fingerprint stays that of the tensors,
+            whatever file they came from.
+    """
     if not beyond:
         return fingerprint
-    return hashlib.sha256("\n".join([fingerprint, *beyond]).encode()).hexdigest()
+    return hashlib.sha256(json.dumps([fingerprint, dict(beyond)], sort_keys=True).encode()).hexdigest()
+
+
+def described(sizes: EncoderSizes, origin: EncoderOrigin | None) -> str:
+    """Return an encoder in words, for cards."""
+    frame = "" if sizes.family == "v2" else f", each frame as {'a tubelet' if sizes.frame == 'tubelet' else 'an image'}"
+    text = f"V-JEPA {sizes.family[1:]}, {sizes.depth} blocks of {sizes.width}, {sizes.heads} heads{frame}"
+    return text if origin is None else f"{text}; from {origin}"

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.model.network.dynamics import LatentDynamics, normalise_latents
 from vjepa2_ac.model.network.encoder import Encoder
-from vjepa2_ac.model.network.encoder_origin import EncoderOrigin, identified
+from vjepa2_ac.model.network.encoder_origin import EncoderOrigin, beyond_tensors, described, identified
 from vjepa2_ac.model.network.predictor import ActionConditionedPredictor, PredictorConfig
 from vjepa2_ac.model.network.pretrained_folder import (
     ENCODER,
@@ -193,8 +193,17 @@ class WorldModel(LatentDynamics):
         """Return a hash of the encoder: part of the key of cached latents."""
         if isinstance(self.encoder, AbsentEncoder):
             return self.encoder.fingerprint
-        own, told = fingerprint(self.encoder.state_dict()), self.encoder_origin is not None
-        return identified(own, self.sizes.encoder, heads_are_told=told)
+        return identified(fingerprint(self.encoder.state_dict()), self.encoder_beyond_tensors)
+
+    @property
+    def encoder_beyond_tensors(self) -> dict[str, str | int]:
+        """What its latents depend on and its tensors do not show: family, frame path and heads, where they matter."""
+        return beyond_tensors(self.sizes.encoder, heads_are_told=self.encoder_origin is not None)
+
+    @property
+    def encoder_in_words(self) -> str:
+        """The encoder and where it came from, for cards."""
+        return described(self.sizes.encoder, self.encoder_origin)
 
     def predictor_fingerprint(self) -> str:
         """Return a hash of the predictor's own weights; independent of an adapter and of fresh heads."""
