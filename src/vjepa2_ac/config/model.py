@@ -171,6 +171,10 @@ class ModelConfig(Section):
             raise ValueError("give either base (a model to adapt) or random (sizes of a fresh one)")
         return self
 
+    def with_base(self, name: str) -> ModelConfig:
+        """Return the config of another model that is there, with the other settings of this one."""
+        return self.model_copy(update={"base": name, "random": None, "encoder": None})
+
 
 class AdapterConfig(Section):
     """What is trained: a LoRA adapter on the predictor, or the whole predictor."""

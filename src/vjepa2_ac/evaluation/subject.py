@@ -75,7 +75,7 @@ def load_subject(
 
 def load_model(name: str, config: Config) -> WorldModel:
     """Load a model by its name, with the config's other settings of a model."""
-    return load_base(config.model.model_copy(update={"base": name, "random": None}), seed=config.seed)
+    return load_base(config.model.with_base(name), seed=config.seed)
 
 
 def _contenders_of(

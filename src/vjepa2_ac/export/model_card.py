@@ -145,7 +145,12 @@ def _ratio(ratio: Mapping[str, Any]) -> str:
 def _base_arguments(config: Config) -> str:
     words = [repr(config.model.base), f"dtype={config.model.dtype!r}"]
     sizes = config.model.sizes.model_dump(mode="json", exclude_defaults=True)
-    return ", ".join([*words, f"sizes=ModelSizes.model_validate({sizes!r})"] if sizes else words)
+    words += [f"sizes=ModelSizes.model_validate({sizes!r})"] if sizes else []
+    if config.model.encoder is not None:
+        told = config.model.encoder.model_dump(mode="json", exclude_defaults=True)
+        only_path = told.keys() == {"path"}
+        words.append(f"encoder={told['path']!r}" if only_path else f"encoder=EncoderConfig.model_validate({told!r})")
+    return ", ".join(words)
 
 
 def _count(number: int, what: str) -> str:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import importlib.resources
 from pathlib import Path
 
+from vjepa2_ac.config import ModelConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.sizes import CONFIG
-from vjepa2_ac.places import BUILTIN
+from vjepa2_ac.places import BUILTIN, HUB
 
 ASSETS = Path(str(importlib.resources.files("vjepa2_ac"))) / "assets"
 
@@ -25,6 +26,34 @@ def find_base(name: str) -> Path:
         knob="model.base",
         needed=f"the official .pt, a folder written by `vjepa2-ac export`, or {_TINY}",
         fix="`vjepa2-ac download` fetches the official checkpoint to checkpoints/vjepa2-ac-vitg.pt",
+    )
+
+
+def require_model(config: ModelConfig) -> None:
+    """Refuse a model or an encoder of this machine that is not there.
+
+    Raises:
+        InputError: It is not.
+    """
+    if config.base is not None:
+        find_base(config.base)
+    if config.encoder is not None:
+        find_encoder_path(config.encoder.path)
+
+
+def find_encoder_path(name: str) -> Path | None:
+    """Return the file or folder that `model.encoder.path` names; None: it is on the Hub.
+
+    Raises:
+        InputError: There is none.
+    """
+    if name.startswith(HUB):
+        return None
+    return find_model(
+        name,
+        knob="model.encoder.path",
+        needed="an encoder of V-JEPA 2 or 2.1: Meta's .pt, a transformers folder, or a model of this project",
+        fix="`vjepa2-ac download --list` shows those that are published",
     )
 
 

@@ -10,13 +10,12 @@ from pydantic import ValidationError
 from vjepa2_ac.config import EncoderSizes, ModelSizes
 from vjepa2_ac.config.model import EncoderConfig
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.base_model import find_model
+from vjepa2_ac.model.base_model import find_encoder_path
 from vjepa2_ac.model.checkpoints.encoder_file import FoundEncoder, encoder_in_file, with_frame_path
 from vjepa2_ac.model.checkpoints.encoder_folder import encoder_in_folder
 from vjepa2_ac.model.checkpoints.meta_file import open_file
 from vjepa2_ac.model.checkpoints.published import published_as
 from vjepa2_ac.model.sizes import check_sizes
-from vjepa2_ac.places import HUB
 from vjepa2_ac.storage.remote.hub import from_hub
 from vjepa2_ac.storage.structured import message_of
 
@@ -34,10 +33,10 @@ def find_encoder(config: EncoderConfig) -> FoundEncoder:
         InputError: There is none, it is of another kind or damaged, or the config contradicts it.
         UnreachableError: The Hub cannot be reached, and the repository is not in its cache.
     """
-    if config.path.startswith(HUB):
+    path = find_encoder_path(config.path)
+    if path is None:
         folder = from_hub(config.path, _FILES, where=f"model.encoder.path: {config.path}")
         return encoder_in_folder(folder, config, name=config.path)
-    path = find_model(config.path, knob="model.encoder.path", needed=_NEEDED, fix=_FIX)
     if path.is_dir():
         return encoder_in_folder(path, config, name=path.name)
     return encoder_in_file(path, open_file(path, needed=_NEEDED, fix=_FIX), config)
