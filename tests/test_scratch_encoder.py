@@ -71,7 +71,7 @@ def test_it_is_evaluated_and_plans(workshop: Path, capsys: pytest.CaptureFixture
     assert main(["evaluate", str(run), "--clips", "4"]) == 0
     verdict = json.loads((run / "metrics.json").read_text())["verdict"]
     assert verdict in capsys.readouterr().out
-    small = ["planning.samples=8", "planning.iterations=1", "planning.horizon=1"]
+    small = ["planning.samples=16", "planning.iterations=1", "planning.horizon=1"]
     out = ["--out", str(workshop / "simulated"), "--films", "0"]
     assert main(["simulate", str(run), "--episodes", "1", "--steps", "1", *out, *small]) == 0
 
