@@ -104,7 +104,7 @@ HOMES = {
     "google": ["data/sources/rlds/tfrecord.py"],
     "google_crc32c": ["data/sources/rlds/tfrecord.py"],
     "h5py": ["data/sources/droid_raw/trajectory.py"],
-    "huggingface_hub": ["export/"],
+    "huggingface_hub": ["export/", "storage/remote/hub.py"],
     "jinja2": ["export/", "reports/"],
     "markupsafe": ["reports/html/"],
     "matplotlib": ["reports/"],

@@ -12,6 +12,9 @@ from pathlib import Path
 
 BUILTIN = "builtin:"  # models that come with the package
 
+HUB = "hf://"
+
+_REPOSITORY = re.compile(r"hf://[\w.-]+/[\w.-]+(@[\w./-]+)?")
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")  # with one slash, too: a Path turns a URL into that
 
 
@@ -58,6 +61,19 @@ def of_a_model(name: str) -> str:
         ValueError: As `on_this_machine`.
     """
     return name if name.startswith(BUILTIN) else on_this_machine(name)
+
+
+def of_an_encoder(name: str) -> str:
+    """Return the name of an encoder: a repository of the Hub unchanged, any other as `of_a_model` does.
+
+    Raises:
+        ValueError: As `on_this_machine`; or a repository without an owner and a name.
+    """
+    if not name.startswith(HUB):
+        return of_a_model(name)
+    if not _REPOSITORY.fullmatch(name):
+        raise ValueError(f"needs {HUB}owner/name, and @revision if it is not the newest")
+    return name
 
 
 def literal(path: Path) -> str:

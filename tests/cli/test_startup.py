@@ -42,7 +42,9 @@ simulate builtin:sim-tiny planning.horizonn=2
 simulate builtin:sim-tiny planning.axes=nope.json
 simulate record /proc/x --episodes 2
 simulate record out --episodes 2 --domain Q
-download --url foo x.pt
+download --url foo --to x.pt
+download x.pt
+download vjepa3
 """
 CODE = """
 import sys
@@ -60,6 +62,17 @@ def test_wrong_words_are_told_before_pytorch_is_imported(tmp_path: Path) -> None
     done = subprocess.run([sys.executable, "-c", CODE, words], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stderr.count("error: ") == len(words.strip().splitlines())
+
+
+def test_published_checkpoints_are_listed_without_pytorch() -> None:
+    listing = """
+import sys
+from vjepa2_ac.cli import main
+sys.exit(main(["download", "--list"]) or len({"torch", "transformers", "matplotlib", "mujoco"} & set(sys.modules)))
+"""
+    done = subprocess.run([sys.executable, "-c", listing], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert "vjepa2.1-vitG-2b-384" in done.stdout
 
 
 def test_libraries_say_nothing_when_they_are_imported() -> None:

@@ -11,7 +11,7 @@ from pydantic import BaseModel
 
 from copied_sets import WRITERS
 from run_fixtures import TINY
-from vjepa2_ac.config import Config, DataConfig, ModelSizes
+from vjepa2_ac.config import Config, DataConfig, EncoderConfig, ModelSizes
 from vjepa2_ac.config.effects import Affects, knobs_that_affect, mark_of, marks_of, names_that_affect
 from vjepa2_ac.config.loading import changed_keys, config_as_yaml, parse_config
 from vjepa2_ac.config.section import Section
@@ -27,6 +27,7 @@ from vjepa2_ac.planning.settings import planning_settings
 from vjepa2_ac.runs.folder import check_run_folder
 
 # What cannot be guessed from a knob's type, or must exist in the data set.
+SECTIONS = {"model.encoder": EncoderConfig(path="encoder.pt")}  # of knobs that are null: those without a default
 OTHERS = {
     "data.camera": {"npz": "pixels", "rlds": "wrist_left", "lerobot": "wrist_left", "droid_raw": "right"},
     "data.path": "elsewhere",
@@ -76,12 +77,17 @@ def another(value: Any, annotation: Any) -> Any:
     return options[-1] if options else "else"
 
 
+def absent(annotation: Any) -> Any:
+    """Return the section of a knob that is null."""
+    return next(one for one in get_args(annotation) if one)()
+
+
 def with_other(section: BaseModel, key: str, whole: str, source: str) -> BaseModel:
     """Return a section in which one knob has another value; what does not fit to it stays."""
     name, _, rest = key.partition(".")
     value, field = getattr(section, name), type(section).model_fields[name]
     if rest:
-        inner = value if value is not None else next(one for one in get_args(field.annotation) if one)()
+        inner = value if value is not None else SECTIONS.get(whole.rpartition(".")[0]) or absent(field.annotation)
         return section.model_copy(update={name: with_other(inner, rest, whole, source)})
     given = OTHERS.get(whole, another(value, field.annotation))
     return section.model_copy(update={name: given[source] if whole == "data.camera" else given})

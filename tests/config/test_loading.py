@@ -86,6 +86,17 @@ def test_the_config_for_a_few_demonstrations_holds_its_recipe(tmp_path: Path) ->
     assert asked.replay.share == 0.25
 
 
+@pytest.mark.parametrize("adapter", [{"modules_to_save": ["state_encoder"]}, {"targets": ["q", "state_encoder"]}])
+def test_an_adapter_on_the_states_of_a_model_without_states_is_refused(adapter: dict[str, object]) -> None:
+    model = {"base": "b.pt", "sizes": {"predictor": {"use_states": False}}}
+    with pytest.raises(
+        InputError, match=rf"adapter\.{next(iter(adapter))}: no state_encoder where predictor.use_states"
+    ):
+        parse_config({**MINIMAL, "model": model, "adapter": adapter}, where="here")
+    parse_config({**MINIMAL, "model": model, "adapter": {"modules_to_save": ["action_encoder"]}}, where="here")
+    parse_config({**MINIMAL, "adapter": adapter}, where="here")
+
+
 def test_a_resolved_config_reads_back_equal(tmp_path: Path) -> None:
     config = parse_config(MINIMAL, where="here")
     assert load_config(write(tmp_path, config_as_yaml(config))) == config

@@ -6,10 +6,12 @@ import torch
 
 from tiny_models import tiny_model
 from vjepa2_ac.config.planning import CemConfig, EnergyConfig, LimitsConfig, PlanningConfig
+from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.geometry import actions_from_states, apply_action
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.spaces import Spaces
 
 STATE = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2])
 QUICK = PlanningConfig(samples=12, iterations=2, horizon=2, cem=CemConfig(elites=4))
@@ -316,6 +318,34 @@ def test_images_are_cropped_as_in_training() -> None:
         run.act(images[1], STATE)
         energies.append(run.decision.energy_now)  # type: ignore[union-attr]
     assert energies[0] == energies[1] != energies[2]
+
+
+def test_a_model_without_states_decides_the_same_whatever_the_pose() -> None:
+    found = []
+    for state in (STATE, STATE + np.array([0.1, 0.1, 0.1, 0.5, 0.2, 0.1, 0.0])):
+        run = controller(tiny_model(states=False), context=2)
+        run.reset(image(100))
+        found.append([run.act(image(seed), state) for seed in range(2)])
+    np.testing.assert_array_equal(*found)
+    assert (np.abs(found[0]) > 0).any()
+
+
+@pytest.mark.parametrize("joined", ["difference", "sum", "last"])
+def test_a_model_without_states_plans_vectors_and_takes_states_of_any_width_for_changes(joined: str) -> None:
+    sizes = tiny_model(states=False).sizes
+    predictor = sizes.predictor.model_copy(update={"action_dim": 8})
+    model = WorldModel.random(sizes.model_copy(update={"predictor": predictor}), seed=0)
+    config = QUICK.model_copy(update={"context": 2, "limits": LimitsConfig(axes=(0.1,))})
+    run = Controller(model, config, spaces=Spaces.of_vectors(Widths(8, 8), joined))
+    found = []
+    for width in (8, 11, 3)[: 1 if joined == "last" else None]:
+        run.reset(image(100))
+        found.append([run.act(image(seed), np.full(width, 0.1)) for seed in range(2)])
+        np.testing.assert_array_equal(found[-1], found[0])
+    assert np.shape(found[0]) == (2, 8)
+    if joined == "last":
+        with pytest.raises(InputError, match="state"):
+            run.act(image(2), np.zeros(11))
 
 
 def test_a_model_whose_states_are_no_poses_is_refused() -> None:

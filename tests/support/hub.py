@@ -1,4 +1,4 @@
-"""What does the Hugging Face Hub answer? As much of its API as reading a data set needs, served from folders."""
+"""What does the Hugging Face Hub answer? As much of its API as reading data and models needs, served from folders."""
 
 from __future__ import annotations
 
@@ -19,14 +19,15 @@ import pytest
 from vjepa2_ac.storage.remote import filesystems
 
 _URL_TEMPLATE = "/{repo_id}/resolve/{revision}/{filename}"
-_API = re.compile(r"/api/datasets/(?P<name>[^/]+/[^/]+)(/revision/[^/]+)?")
-_TREE = re.compile(r"/api/datasets/(?P<name>[^/]+/[^/]+)/tree/[^/]+(/(?P<path>.*))?")
-_FILE = re.compile(r"/datasets/(?P<name>[^/]+/[^/]+)/resolve/[^/]+/(?P<path>.+)")
+_API = re.compile(r"/api/(datasets|models)/(?P<name>[^/]+/[^/]+)(/revision/(?P<revision>[^/]+))?")
+_TREE = re.compile(r"/api/(datasets|models)/(?P<name>[^/]+/[^/]+)/tree/[^/]+(/(?P<path>.*))?")
+_FILE = re.compile(r"(/datasets)?/(?P<name>[^/]+/[^/]+)/resolve/[^/]+/(?P<path>.+)")
+_COMMIT = "0" * 40
 
 
 @dataclass
 class Hub:
-    """A local Hub: data sets by name; some of them only for those with a token."""
+    """A local Hub: data sets and models by name; some of them only for those with a token."""
 
     datasets: Mapping[str, Path]
     gated: Mapping[str, str] = field(default_factory=dict)  # name -> the token that opens it
@@ -42,7 +43,7 @@ class Hub:
 
 @contextmanager
 def serve_hub(datasets: Mapping[str, Path], gated: Mapping[str, str] | None = None) -> Iterator[Hub]:
-    """Serve folders as data sets at a free port of this machine, where huggingface_hub finds them."""
+    """Serve folders as data sets or models at a free port of this machine, where huggingface_hub finds them."""
     hub = Hub(datasets, gated or {})
     server = ThreadingHTTPServer(("127.0.0.1", 0), type("Handler", (_Handler,), {"hub": hub}))
     hub.url = f"http://127.0.0.1:{server.server_port}"
@@ -79,18 +80,32 @@ class _Handler(BaseHTTPRequestHandler):
         elif found := _TREE.fullmatch(path):
             self._tree(found["name"], found["path"] or "")
         elif (found := _API.fullmatch(path)) and found["name"] in self.hub.datasets:
-            self._json(200, {"id": found["name"], "sha": "0" * 40, "siblings": []})
+            self._about(found["name"], found["revision"] or "main")
         else:
             self._json(401, {"error": "Invalid username or password."}, "RepoNotFound")
 
     do_HEAD = do_GET  # noqa: N815 - the name that http.server calls
+
+    def _about(self, name: str, revision: str) -> None:
+        if revision not in {"main", _COMMIT}:
+            self._json(404, {"error": f"Invalid rev id: {revision}"}, "RevisionNotFound")
+            return
+        root = self.hub.datasets[name]
+        files = [path.relative_to(root).as_posix() for path in sorted(root.rglob("*")) if path.is_file()]
+        self._json(200, {"id": name, "sha": _COMMIT, "siblings": [{"rfilename": path} for path in files]})
 
     def _tree(self, name: str, path: str) -> None:
         folder = self.hub.datasets[name] / path
         if not folder.is_dir():
             self._json(404, {"error": f"{path} does not exist on main"}, "EntryNotFound")
             return
-        self._json(200, [self._entry(name, entry) for entry in sorted(folder.iterdir())])
+        self._json(
+            200,
+            [
+                self._entry(name, entry)
+                for entry in sorted(folder.rglob("*") if "recursive=true" in self.path.lower() else folder.iterdir())
+            ],
+        )
 
     def _entry(self, name: str, entry: Path) -> dict[str, object]:
         path = entry.relative_to(self.hub.datasets[name]).as_posix()
@@ -123,6 +138,8 @@ class _Handler(BaseHTTPRequestHandler):
             return
         self.send_response(206 if asked else 200)
         self.send_header("Content-Range", f"bytes {start}-{end - 1}/{len(data)}")
+        self.send_header("ETag", f'"{hashlib.sha256(data).hexdigest()}"')
+        self.send_header("X-Repo-Commit", _COMMIT)
         self._body(data[start:end])
         if self.command == "GET":
             self.hub.ranges.append((path, start, end))

@@ -26,11 +26,12 @@ def run_config(adapter: dict[str, Any] | None = None, **changes: Any) -> Config:
 
 def model_sizes(
     latent: int = 48, width: int = 48, depth: int = 2, heads: int = 2, mlp: float = 4.0, image: int = 64,
-    *, extrinsics: bool = False,
+    *, extrinsics: bool = False, states: bool = True,
 ) -> ModelSizes:  # fmt: skip
     """Return sizes of a model of 16-pixel patches."""
     encoder = {"width": latent, "depth": 1, "heads": 2, "mlp_ratio": 2.0}
     predictor = {"width": width, "depth": depth, "heads": heads, "mlp_ratio": mlp, "use_extrinsics": extrinsics}
+    predictor["use_states"] = states
     return ModelSizes.model_validate({"image_size": image, "encoder": encoder, "predictor": predictor})
 
 

@@ -174,7 +174,7 @@ def test_a_model_of_one_robot_is_not_measured_on_another(make_robot: MakeConfig,
     changed = yaml.safe_load(path.read_text())
     changed["data"]["path"] = str(tmp_path / "other")
     path.write_text(yaml.safe_dump(changed))
-    with pytest.raises(InputError, match=r"states of 8 and actions of 8 numbers\. needed: 14 and 14") as caught:
+    with pytest.raises(InputError, match=r"states of 8 and actions of 8 numbers\. needed: states of 14") as caught:
         evaluate_subject(str(folder), QUICK)
     assert str(folder) in str(caught.value)
 

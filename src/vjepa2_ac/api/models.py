@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Literal
 
 import torch
+from pydantic import ValidationError
 
 from vjepa2_ac import places
-from vjepa2_ac.config import ModelConfig, ModelSizes
+from vjepa2_ac.config import EncoderConfig, ModelConfig, ModelSizes
 from vjepa2_ac.distributed.device import has_bf16, no_cuda, require_type_of_weights
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.adapter_file import ADAPTER_FILE
@@ -17,6 +18,7 @@ from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.runs import loading
 from vjepa2_ac.runs.folder import is_run
+from vjepa2_ac.storage.structured import message_of
 
 Device = str | torch.device
 WeightType = Literal["auto", "float32", "bfloat16"]
@@ -32,6 +34,7 @@ def load_model(
     device: Device = _AUTO,
     dtype: WeightType = "auto",
     sizes: ModelSizes | None = None,
+    encoder: str | Path | EncoderConfig | None = None,
 ) -> WorldModel:
     """Load a world model, in eval mode; no weight requires a gradient.
 
@@ -42,6 +45,7 @@ def load_model(
         dtype: Type of the weights; auto: bfloat16 on a GPU that computes in it, else float32. Trained weights of an
             adapter are float32, and so are latents.
         sizes: Of an official `.pt`, whose file has no image size and heads; None: the released ones.
+        encoder: Of a file that holds a predictor alone: what `model.encoder` or its path takes; None: the model's own.
 
     Raises:
         InputError: There is no such model, adapter or device, it cannot be read, or the adapter is of another base.
@@ -58,6 +62,8 @@ def load_model(
         needed = "a model: a .pt, a folder or builtin:sim-tiny"
         raise InputError(where="load_model", found=f"{str(name)!r} {error}", needed=needed) from None
     config = _config(base, dtype, sizes or ModelSizes(), place)
+    if encoder is not None:
+        config = config.model_copy(update={"encoder": _encoder(encoder)})
     model = load_base(config, seed=0)
     if adapter is not None:
         load_trained(model, adapter, trainable=False)
@@ -99,6 +105,19 @@ def _config(name: str, dtype: str, sizes: ModelSizes, device: torch.device) -> M
     config = ModelConfig.model_validate({"base": name, "dtype": dtype, "sizes": sizes})
     require_type_of_weights(config, device)
     return config
+
+
+def _encoder(encoder: str | Path | EncoderConfig) -> EncoderConfig:
+    if isinstance(encoder, EncoderConfig):
+        return encoder
+    try:
+        return EncoderConfig(path=str(encoder))
+    except ValidationError as error:
+        found, needed = (
+            f"encoder {str(encoder)!r}: {message_of(error.errors()[0])}",
+            "a file, a folder or hf://owner/name",
+        )
+        raise InputError(where="load_model", found=found, needed=needed) from None
 
 
 def _device(device: Device) -> torch.device:

@@ -48,7 +48,7 @@ def _report(options: argparse.Namespace, config: Config) -> int:
 
     from vjepa2_ac.console.memory import memory_lines, verdict
     from vjepa2_ac.console.progress import console
-    from vjepa2_ac.model.base_model import base_sizes
+    from vjepa2_ac.model.checkpoints.loading import base_sizes
     from vjepa2_ac.training.cost.memory import USUAL_GPU, estimate_memory, ways_to_fit
 
     sizes = base_sizes(config.model)

@@ -102,13 +102,13 @@ def read_config(path: str | Path, overrides: Sequence[str] = (), *, base: bool =
     Args:
         path: The YAML file.
         overrides: Such as training.steps=100.
-        base: Whether `model.base` has to be there, too.
+        base: Whether `model.base` and `model.encoder` have to be there, too.
 
     Raises:
         InputError: The config is wrong, or one of them is not there.
     """
     from vjepa2_ac.config.loading import load_config
-    from vjepa2_ac.model.base_model import find_base
+    from vjepa2_ac.model.base_model import require_model
 
     config = load_config(path, overrides)
     data = config.data.path
@@ -116,8 +116,8 @@ def read_config(path: str | Path, overrides: Sequence[str] = (), *, base: bool =
         found = f"no such file or folder, seen from {Path.cwd()}"
         fix = "Set data.path to the data set; docs/QUICKSTART.md says how to get DROID"
         raise InputError(where=f"data.path: {data}", found=found, needed="a data set", fix=fix)
-    if base and config.model.base is not None:
-        find_base(config.model.base)
+    if base:
+        require_model(config.model)
     return config
 
 

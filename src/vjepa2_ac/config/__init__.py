@@ -2,7 +2,7 @@
 
 from vjepa2_ac.config.data import AugmentConfig, DataConfig, DiskCacheConfig, IdleConfig
 from vjepa2_ac.config.decoder import DecoderConfig
-from vjepa2_ac.config.model import AdapterConfig, EncoderSizes, ModelConfig, ModelSizes, PredictorSizes
+from vjepa2_ac.config.model import AdapterConfig, EncoderConfig, EncoderSizes, ModelConfig, ModelSizes, PredictorSizes
 from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.config.replay import ReplayConfig
 from vjepa2_ac.config.run import Config
@@ -27,8 +27,9 @@ from vjepa2_ac.config.training import (
 
 __all__ = [
     "ActionContrastConfig", "AdapterConfig", "AugmentConfig", "CheckpointConfig", "Config", "DataConfig",
-    "DecoderConfig", "DiskCacheConfig", "EncoderSizes", "EnergyConfig", "IdleConfig", "LatentsData", "LeRobotData",
-    "LeRobotFields", "LimitsConfig", "ModelConfig", "ModelSizes", "NpzData", "PlanningConfig", "PredictorSizes",
+    "DecoderConfig", "DiskCacheConfig", "EncoderConfig", "EncoderSizes", "EnergyConfig", "IdleConfig", "LatentsData",
+    "LeRobotData", "LeRobotFields", "LimitsConfig", "ModelConfig", "ModelSizes", "NpzData", "PlanningConfig",
+    "PredictorSizes",
     "RawDroidData", "RawDroidOptions", "ReplayConfig", "RldsData", "RldsFields", "Section", "TrackingConfig",
     "TrainingConfig", "ValidationConfig",
 ]  # fmt: skip

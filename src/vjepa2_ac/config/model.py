@@ -20,11 +20,17 @@ VectorWidth = Annotated[int, Field(ge=1, le=4_096)]
 _MOST_TOKENS = 65_536  # of a frame
 _MOST_WEIGHTS = 10**10  # 40 GB in float32
 _MOST_PATTERNS = 64  # that select layers by name
+_STATE_DIM = 7  # of a pose and a gripper
 _USUAL_ALPHA = 32.0  # of every config here, at any rank
 
 
+Family = Literal["v2", "v2.1"]
+FramePath = Literal["tubelet", "image"]
+EncoderKey = Literal["ema_encoder", "target_encoder", "encoder"]
+
+
 class EncoderSizes(Section):
-    """Sizes of the frozen video encoder; the defaults are ViT-g/16's."""
+    """Sizes of the frozen video encoder; the defaults are those of V-JEPA 2's ViT-g/16."""
 
     width: Width = 1408
     """Width of a latent."""
@@ -34,6 +40,10 @@ class EncoderSizes(Section):
     """Attention heads; width / heads is the size of a head."""
     mlp_ratio: Ratio = 48 / 11
     """Hidden width of the MLP over the width."""
+    family: Family = "v2"
+    """V-JEPA 2, or 2.1: other rotary positions, and a learned vector for the kind of input."""
+    frame: FramePath = "tubelet"
+    """How a frame enters. tubelet: twice, as a video of two equal frames. image (2.1 only): as one image."""
 
 
 class PredictorSizes(Section):
@@ -49,10 +59,19 @@ class PredictorSizes(Section):
     """Hidden width of the MLP over the width."""
     use_extrinsics: bool = False
     """Whether the camera pose is one more input token per time step."""
+    use_states: bool = True
+    """Whether the state is an input token of each time step. false: the model never sees the states, for a robot whose
+    states are not calibrated; those of the data may then have any width."""
     action_dim: VectorWidth = 7
-    """VectorWidth of an action. Where the data's are others, its encoder is replaced by a fresh one."""
-    state_dim: VectorWidth = 7
-    """VectorWidth of a state, likewise."""
+    """Width of an action. Where the data's are others, its encoder is replaced by a fresh one."""
+    state_dim: VectorWidth = _STATE_DIM
+    """Width of a state, likewise."""
+
+    @model_validator(mode="after")
+    def _widths_are_used(self) -> PredictorSizes:
+        if not self.use_states and self.state_dim != _STATE_DIM:
+            raise ValueError(f"state_dim {self.state_dim} with use_states false: leave it out, states of any width fit")
+        return self
 
 
 class ModelSizes(Section):
@@ -85,6 +104,10 @@ class ModelSizes(Section):
                 )
             if not int(part.width * part.mlp_ratio):
                 raise ValueError(f"{name}.mlp_ratio {part.mlp_ratio} leaves nothing of {name}.width {part.width}")
+        if self.encoder.frame == "image" and self.encoder.family == "v2":
+            raise ValueError("encoder.frame image: V-JEPA 2 has no path for images, only 2.1 has; take tubelet")
+        if self.encoder.family == "v2.1" and self.image_size == self.patch_size:
+            raise ValueError("image_size of one patch: V-JEPA 2.1 scales positions to a grid of two patches or more")
         return self
 
     @model_validator(mode="after")
@@ -106,14 +129,33 @@ class ModelSizes(Section):
         return self
 
 
+class EncoderConfig(Section):
+    """An encoder of its own, under a predictor that does not bring one."""
+
+    path: Annotated[str, AfterValidator(places.of_an_encoder)]
+    """Meta's `.pt` of V-JEPA 2 or 2.1 (`vjepa2-ac download --list`), a transformers folder, the same from the Hub as
+    `hf://owner/name` or `hf://owner/name@revision`, or the folder of a model of this project."""
+    key: EncoderKey | None = None
+    """Which encoder of a `.pt`; null: the first of these that it has. A predictor knows the one it was trained on."""
+    frame: FramePath = "tubelet"
+    """How a frame enters. tubelet: twice, as a video of two equal frames, as all published predictors had it. image
+    (V-JEPA 2.1 only): as one image, through patches of its own."""
+    heads: Heads | None = None
+    """Attention heads of an encoder of a width that nobody has published; null: those of the published width."""
+
+
 class ModelConfig(Section):
     """Which world model to start from."""
 
     base: Annotated[Annotated[str, AfterValidator(places.of_a_model)] | None, Affects.RUN] = None
     """The model to adapt: the official `.pt`, a folder written by `save_pretrained`, or `builtin:sim-tiny` (the tiny
     model of the demo, which comes with the package)."""
+    encoder: Annotated[EncoderConfig | None, Affects.RUN] = None
+    """A pretrained encoder, for a fresh predictor (`random`) or one that comes without (a `base` that holds a predictor
+    alone); null: the base's own. Its family, width, depth, heads and MLP are the file's."""
     random: Annotated[ModelSizes | None, Affects.RUN] = None
-    """Instead of `base`: a fresh model of these sizes; with `adapter.kind: none` that is training from scratch."""
+    """Instead of `base`: a fresh predictor of these sizes, and, without `encoder`, a random encoder; with
+    `adapter.kind: none` that is training from scratch."""
     random_start: Annotated[Literal["persistence", "released"], Affects.RUN] = "persistence"
     """Initialisation of a `random` model: close to copying the last frame, or as in the released recipe."""
     sizes: Annotated[ModelSizes, Affects.RUN | Affects.PLAN] = ModelSizes()
@@ -128,6 +170,10 @@ class ModelConfig(Section):
         if (self.base is None) == (self.random is None):
             raise ValueError("give either base (a model to adapt) or random (sizes of a fresh one)")
         return self
+
+    def with_base(self, name: str) -> ModelConfig:
+        """Return the config of another model that is there, with the other settings of this one."""
+        return self.model_copy(update={"base": name, "random": None, "encoder": None})
 
 
 class AdapterConfig(Section):

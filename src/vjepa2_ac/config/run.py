@@ -83,6 +83,14 @@ class Config(Section):
         return self
 
     @model_validator(mode="after")
+    def _adapter_fits_the_predictor(self) -> Config:
+        if self.adapter.kind == "lora" and not (self.model.random or self.model.sizes).predictor.use_states:
+            for knob in ("targets", "modules_to_save"):
+                if "state_encoder" in getattr(self.adapter, knob):
+                    raise ValueError(f"adapter.{knob}: no state_encoder where predictor.use_states is false")
+        return self
+
+    @model_validator(mode="after")
     def _replay_fits(self) -> Config:
         if self.replay is not None and (misfits := self.replay.misfits(self.data)):
             raise ValueError("; ".join(misfits))

@@ -29,12 +29,12 @@ from vjepa2_ac.data.clips.transforms import input_to_pixels, pixels_to_input
 from vjepa2_ac.data.clips.windows import in_split, spread
 from vjepa2_ac.data.sources.latents.dtypes import CacheType, bytes_per_frame, pack_latents, unpack_latents
 from vjepa2_ac.encoding.cache_lookup import needed_frames
-from vjepa2_ac.encoding.disk_space import GIGABYTE, free_bytes
+from vjepa2_ac.encoding.disk_space import GIGABYTE
 from vjepa2_ac.encoding.pipeline import EncoderOnDevice
 from vjepa2_ac.encoding.prefetch import FramesToEncode, Unreadable, prefetched
 from vjepa2_ac.episode import Progress, StoredLatents
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage import user_can_write, write_atomically
+from vjepa2_ac.storage import free_bytes, user_can_write, write_atomically
 
 _LATENTS, _SCALES, _FRAMES = "latents", "scales", "frames"
 _NO_SMALL_FRAMES = 1  # pixel: they are not used

@@ -18,7 +18,7 @@ from vjepa2_ac.data.sources.latents.dtypes import unpack_latents
 from vjepa2_ac.encoding.cache_lookup import require_encoding
 from vjepa2_ac.episode import Batch, LatentBatch, Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.network.input_heads import widths_of_model
+from vjepa2_ac.model.network.input_heads import heads_to_replace, widths_as_text
 from vjepa2_ac.model.network.world_model import WorldModel
 
 
@@ -79,6 +79,7 @@ def encoding_of(world_model: WorldModel, config: Config) -> Encoding:
         dim=world_model.latent_dim,
         weights=config.model.dtype,
         precision=config.training.precision,
+        beyond=world_model.encoder_beyond_tensors,
     )
 
 
@@ -120,12 +121,11 @@ def require_widths(world_model: WorldModel, widths: Widths, *, where: str) -> No
     Raises:
         InputError: Names both.
     """
-    needed = widths_of_model(world_model.sizes)
-    if widths != needed:
+    if heads_to_replace(world_model.sizes, widths):
         raise InputError(
             where=where,
             found=f"data with states of {widths.state} and actions of {widths.action} numbers",
-            needed=f"{needed.state} and {needed.action}, which this model takes",
+            needed=f"{widths_as_text(world_model.sizes)}, which this model takes",
             fix="Choose other data, or train on these: `train` then replaces the model's input heads",
         )
 

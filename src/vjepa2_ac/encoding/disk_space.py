@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage import free_bytes
 
 GIGABYTE = 10**9
 FRAMES_AT_ONCE = 64  # decoded in one go: a run of a video, and 180 MB of 720p at most
@@ -45,11 +45,6 @@ def small_frame_side(image_size: int) -> int:
 def small_frame_bytes(image_size: int) -> int:
     """Return the approximate size of a small frame as JPEG, with a share of the states."""
     return 1000 + small_frame_side(image_size) ** 2 // 3
-
-
-def free_bytes(folder: Path) -> int:
-    """Return the free space on the disk of a folder, which need not exist yet."""
-    return shutil.disk_usage(next(there for there in [folder, *folder.parents] if there.exists())).free
 
 
 def require_space(room: CacheSize, folder: Path, config: DataConfig) -> None:

@@ -22,7 +22,7 @@ from vjepa2_ac.distributed.device import autocast, computing_device
 from vjepa2_ac.encoding.batch import encoding_of
 from vjepa2_ac.encoding.cache_lookup import folder_of, key_for
 from vjepa2_ac.encoding.cache_writer import CacheWriter
-from vjepa2_ac.encoding.disk_space import GIGABYTE, free_bytes, require_space
+from vjepa2_ac.encoding.disk_space import GIGABYTE, require_space
 from vjepa2_ac.encoding.pipeline import EncoderOnDevice, build
 from vjepa2_ac.encoding.repair import describe, missing_files, restart
 from vjepa2_ac.encoding.workload import Workload, claim_folder
@@ -30,6 +30,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
+from vjepa2_ac.storage import free_bytes
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
 from vjepa2_ac.encoding.batch import require_widths
+from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.decoded.record import NEIGHBOURS, TRUE_FRAMES
 from vjepa2_ac.evaluation.evaluate import Contender
@@ -21,6 +22,7 @@ from vjepa2_ac.evaluation.request import EvaluationOptions
 from vjepa2_ac.evaluation.result import Role
 from vjepa2_ac.model.adapter.merging import base_only, unadapted_copy
 from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.network.input_heads import heads_to_replace, widths_as_text
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.places import BUILTIN
 from vjepa2_ac.runs.folder import is_run
@@ -67,17 +69,22 @@ def load_subject(
     require_widths(world_model, dataset.widths, where=name)
     if decoder is not None:
         decoder.require_fit(world_model, config.data.crop, subject=name)
-    contenders, notes = _contenders_of(name, config, run, world_model, asked)
+    contenders, notes = _contenders_of(name, config, run, world_model, asked, dataset.widths)
     return Subject(run, world_model, tuple(contenders), notes)
 
 
 def load_model(name: str, config: Config) -> WorldModel:
     """Load a model by its name, with the config's other settings of a model."""
-    return load_base(config.model.model_copy(update={"base": name, "random": None}), seed=config.seed)
+    return load_base(config.model.with_base(name), seed=config.seed)
 
 
 def _contenders_of(
-    subject: str, config: Config, run: TrainedRun | None, world_model: WorldModel, asked: EvaluationOptions
+    subject: str,
+    config: Config,
+    run: TrainedRun | None,
+    world_model: WorldModel,
+    asked: EvaluationOptions,
+    widths: Widths,
 ) -> tuple[list[Contender], tuple[str, ...]]:
     """Return the models to measure, the base first and the subject last; and notes on them."""
     against = asked.against if asked.against is not None else (BASE,) * (run is not None)
@@ -93,13 +100,13 @@ def _contenders_of(
             raise InputError(
                 where="--against base", found="a config without model.base", needed="a base to compare with"
             )
-        found.append(Contender(BASE, "base", _like(world_model, config.model.base, config, subject)))
+        found.append(Contender(BASE, "base", _like(world_model, config.model.base, config, subject, widths)))
     name = "adapter" if world_model.adaptation is not None and world_model.adaptation.kind == "lora" else "model"
     for other in against:
         if other != BASE:
             taken = {each.name for each in found} | {name, BASE, "persistence", TRUE_FRAMES, *NEIGHBOURS}
             called = Path(other).name if Path(other).name not in taken else other
-            found.append(_contender(called, "other", _like(world_model, other, config, subject)))
+            found.append(_contender(called, "other", _like(world_model, other, config, subject, widths)))
     return [*found, _contender(name, "trained", world_model)], notes
 
 
@@ -112,8 +119,8 @@ def _contender(
     return Contender(name, role, model, switched, None if plans_as_it_is else partial(unadapted_copy, model))
 
 
-def _like(world_model: WorldModel, other: str, config: Config, subject: str) -> WorldModel:
-    """Load another run or model that can be measured on the same latents.
+def _like(world_model: WorldModel, other: str, config: Config, subject: str, widths: Widths) -> WorldModel:
+    """Load another run or model that can be measured on the same latents, and states and actions of these widths.
 
     Raises:
         InputError: It has another encoder, or takes other states or actions.
@@ -133,11 +140,10 @@ def _like(world_model: WorldModel, other: str, config: Config, subject: str) -> 
             needed="the same one: errors are compared on the same latents",
             fix="Evaluate each by itself, and put their ratios to persistence side by side with `vjepa2-ac compare`",
         )
-    ours, theirs = world_model.sizes.predictor, loaded.sizes.predictor
-    if (ours.state_dim, ours.action_dim) != (theirs.state_dim, theirs.action_dim):
+    if heads_to_replace(loaded.sizes, widths):
         raise InputError(
             where=f"--against {other}",
-            found=f"a model of states of {theirs.state_dim} and actions of {theirs.action_dim} numbers",
-            needed=f"{ours.state_dim} and {ours.action_dim}, as {subject} takes",
+            found=f"a model of {widths_as_text(loaded.sizes)}",
+            needed=f"{widths.state} and {widths.action}, as the data of {subject} has",
         )
     return loaded

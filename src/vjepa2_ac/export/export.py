@@ -10,8 +10,8 @@ from typing import Any, Literal
 
 from jinja2 import TemplateError
 
-from vjepa2_ac.config import Config
-from vjepa2_ac.episode import POSE_WIDTHS, Widths
+from vjepa2_ac.config import Config, ModelSizes
+from vjepa2_ac.episode import POSE_WIDTHS
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.export.model_card import model_card
 from vjepa2_ac.model.adapter.adapter_file import ADAPTER_FILE
@@ -57,8 +57,8 @@ def export_run(folder: Path, destination: Path, form: Form = "merged", checkpoin
 
     Raises:
         InputError: As `load_run`; the destination is occupied or cannot be written; official: the model is of another
-            width than Meta's code; hub: the run has no adapter, or its `metrics.json` is damaged; or a weight of the
-            merged model is not finite, whatever the form.
+            width than Meta's code, or without states; hub: the run has no adapter, or its `metrics.json` is damaged; or
+            a weight of the merged model is not finite, whatever the form.
     """
     _check_free(destination, form)
     config = read_run_config(folder)
@@ -70,7 +70,7 @@ def export_run(folder: Path, destination: Path, form: Form = "merged", checkpoin
         return Exported(destination, run.chosen)
     run = load_run(folder, checkpoint)
     if form == "official":
-        _check_widths(folder, widths_of_model(run.world_model.sizes))
+        _check_predictor(folder, run.world_model.sizes)
     _merge(run)
     if form == "merged":
         run.world_model.save_pretrained(destination)
@@ -114,13 +114,22 @@ def _check_adapter(folder: Path, config: Config) -> None:
         )
 
 
-def _check_widths(folder: Path, widths: Widths) -> None:
+def _check_predictor(folder: Path, sizes: ModelSizes) -> None:
+    """Check that Meta's code has such a predictor."""
+    fix, widths = "Export it with --to merged, which `model.base` takes", widths_of_model(sizes)
+    if not sizes.predictor.use_states:
+        raise InputError(
+            where=str(folder),
+            found="a predictor without states (predictor.use_states: false)",
+            needed="one with states: Meta's code has no other, and would miss the weights of its state encoder",
+            fix=fix,
+        )
     if widths != POSE_WIDTHS:
         raise InputError(
             where=str(folder),
             found=f"a model of states of {widths.state} and actions of {widths.action} numbers",
             needed="7 and 7: Meta's code has one width for both, and makes that of the camera's pose one less",
-            fix="Export it with --to merged, which `model.base` takes",
+            fix=fix,
         )
 
 

@@ -16,7 +16,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.model.adapter.adapter_folder import LORA_WEIGHTS
 from vjepa2_ac.model.adapter.lora import trainable_report
-from vjepa2_ac.model.network.input_heads import widths_of_model
+from vjepa2_ac.model.network.input_heads import widths_as_text, widths_of_model
 from vjepa2_ac.runs.checkpoint import ADAPTER, read_state
 from vjepa2_ac.runs.loading import TrainedRun
 
@@ -50,6 +50,7 @@ def model_card(run: TrainedRun, name: str, evaluation: Mapping[str, Any] | None,
         plot=plot,
         base=model.adaptation,
         heads=None if model.fresh_heads is None else widths_of_model(model.sizes),
+        takes=widths_as_text(model.sizes),
         steps=read_state(run.checkpoint).step,
         trained=_trained(run),
         version=__version__,
@@ -144,7 +145,12 @@ def _ratio(ratio: Mapping[str, Any]) -> str:
 def _base_arguments(config: Config) -> str:
     words = [repr(config.model.base), f"dtype={config.model.dtype!r}"]
     sizes = config.model.sizes.model_dump(mode="json", exclude_defaults=True)
-    return ", ".join([*words, f"sizes=ModelSizes.model_validate({sizes!r})"] if sizes else words)
+    words += [f"sizes=ModelSizes.model_validate({sizes!r})"] if sizes else []
+    if config.model.encoder is not None:
+        told = config.model.encoder.model_dump(mode="json", exclude_defaults=True)
+        only_path = told.keys() == {"path"}
+        words.append(f"encoder={told['path']!r}" if only_path else f"encoder=EncoderConfig.model_validate({told!r})")
+    return ", ".join(words)
 
 
 def _count(number: int, what: str) -> str:

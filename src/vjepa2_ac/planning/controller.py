@@ -12,14 +12,13 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from vjepa2_ac.config import Config
+from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.clips.transforms import Crop, view
 from vjepa2_ac.data.sources.configured_spaces import spaces_of
 from vjepa2_ac.encoding.batch import encode_frames
-from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.network.input_heads import widths_of_model
+from vjepa2_ac.model.network.input_heads import heads_to_replace, widths_as_text, widths_of_model
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.axes.axes_file import no_vertical_axis
 from vjepa2_ac.planning.axes.mapping import Axes
@@ -93,7 +92,7 @@ class Controller:
                 action; or it needs a camera pose and none is given, or the other way round; or its blocks cannot be
                 compiled or quantized to 8 bits; or vectors have no limits; or `planning.axes` are not this model's.
         """
-        _require_spaces(widths_of_model(world_model.sizes), spaces)
+        _require_spaces(world_model.sizes, spaces)
         if extrinsics is not None:
             require_numbers(extrinsics, EXTRINSICS, where="extrinsics")
         if world_model.sizes.predictor.use_extrinsics != (extrinsics is not None):
@@ -203,7 +202,8 @@ class Controller:
 
         Args:
             frame: What the camera sees, of the goal image's size.
-            state: Measured: pose and gripper, or the vector.
+            state: Measured: pose and gripper, or the vector; a vector of any width where the model has no states and an
+                action is a change.
 
         Raises:
             InputError: The image or the state cannot be used.
@@ -212,13 +212,19 @@ class Controller:
         if self._goal is None:
             raise ValueError("no goal: call reset first")
         require_image(frame, where="frame", like=self._like)
-        state = np.asarray(state, dtype=np.float64)
+        state = self._known(np.asarray(state, dtype=np.float64))
         require_numbers(state, self.spaces.state, where="state")
         seen = [*self._seen, (self.encoded(frame), state)][-self.config.context :]
         before = self.decision
         decision = self._decided(self._goal, seen, None if before is None else before.plan)
         self._seen, self._done, self.decision = seen, self._done + 1, decision  # after an error nothing has changed
         return decision.action
+
+    def _known(self, state: np.ndarray) -> np.ndarray:
+        """Return the state; zeros for a vector of another width than an action's, if the model takes no states."""
+        is_needed = self._model.sizes.predictor.use_states or self.spaces.action.follows != "change"
+        width = len(self.spaces.state)
+        return state if is_needed or self.spaces.state.is_pose or state.shape == (width,) else np.zeros(width)
 
     def encoded(self, image: UInt8[np.ndarray, "height width 3"]) -> Float[Tensor, "tokens dim"]:
         """Return the latents of what the model sees of an image, on its device."""
@@ -282,11 +288,11 @@ def _axes_of(world_model: WorldModel, config: PlanningConfig, spaces: Spaces) ->
     return Axes.read(config.axes, Fingerprints.of(world_model))
 
 
-def _require_spaces(widths: Widths, spaces: Spaces) -> None:
-    if widths != spaces.widths:
+def _require_spaces(sizes: ModelSizes, spaces: Spaces) -> None:
+    if heads_to_replace(sizes, spaces.widths):
         raise InputError(
             where="model",
-            found=f"states of {widths.state} and actions of {widths.action} numbers",
+            found=widths_as_text(sizes),
             needed=f"{spaces.widths.state} and {spaces.widths.action}, as the spaces say",
             fix="Give the spaces of the data that it was trained on",
         )

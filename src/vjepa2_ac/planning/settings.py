@@ -178,7 +178,7 @@ def _of_model(subject: str, config: str | Path | None, overrides: Sequence[str],
         plain = {"run_dir": "none", "data": {"path": "none"}, "model": {"base": subject, "dtype": dtype}}
         return config_from(plain, overrides, where="overrides")
     its = load_config(config, [*overrides, _ANY_TYPE])
-    return its.model_copy(update={"model": its.model.model_copy(update={"base": subject, "random": None})})
+    return its.model_copy(update={"model": its.model.with_base(subject)})
 
 
 def _require_relevant(overrides: Sequence[str]) -> None:

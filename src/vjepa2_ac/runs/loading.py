@@ -12,7 +12,7 @@ from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.runs.checkpoint import ADAPTER
 from vjepa2_ac.runs.checkpoint_selection import SELECTED, select_checkpoint
 from vjepa2_ac.runs.folder import read_run_config
-from vjepa2_ac.runs.relative_paths import BASE, with_paths_from_start
+from vjepa2_ac.runs.relative_paths import BASE, ENCODER, with_paths_from_start
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,9 @@ def load_run(folder: Path, checkpoint: str = SELECTED, config: Config | None = N
     Raises:
         InputError: Not the folder of a run, no such checkpoint, or its base cannot be loaded.
     """
-    config = with_paths_from_start(config or read_run_config(folder), folder, needed=[BASE])
+    config = config or read_run_config(folder)
+    needed = [BASE] if config.model.encoder is None else [BASE, ENCODER]
+    config = with_paths_from_start(config, folder, needed=needed)
     chosen = select_checkpoint(folder, checkpoint)
     world_model = load_base(config.model, seed=config.seed)
     load_trained(world_model, chosen.path / ADAPTER, trainable=False)

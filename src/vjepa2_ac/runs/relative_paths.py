@@ -14,9 +14,10 @@ from vjepa2_ac.places import BUILTIN, is_url
 from vjepa2_ac.runs.folder import start_folders
 
 DATA, BASE, RANGES = "data.path", "model.base", "data.idle.ranges"
+ENCODER = "model.encoder.path"
 REPLAYED, REPLAYED_RANGES = f"replay.{DATA}", f"replay.{RANGES}"
 _OF_DATA = (DATA, RANGES, "data.cache_dir", "data.disk_cache.dir")
-_PATHS = (*_OF_DATA, BASE, *(f"replay.{key}" for key in _OF_DATA))
+_PATHS = (*_OF_DATA, BASE, ENCODER, *(f"replay.{key}" for key in _OF_DATA))
 
 
 def with_paths_from_start(config: Config, run: Path, *, needed: Sequence[str]) -> Config:
@@ -57,7 +58,7 @@ def require_start_folder(config: Config, run: Path) -> None:
         InputError: Names the folder.
     """
     for key, path in _seen_from_start(config, run).items():
-        if key in {DATA, BASE, REPLAYED}:
+        if key in {DATA, BASE, ENCODER, REPLAYED}:
             found = f"{config_as_flat_dict(config)[key]}: a relative path that leads nowhere from {Path.cwd()}"
             needed = f"the folder in which the run was started: there it is {path}"
             fix = f"Go to that folder: vjepa2-ac train {run.absolute()} --resume"

@@ -24,6 +24,7 @@ from vjepa2_ac.storage.transfer import download, file_sizes, place, remove, remo
 from vjepa2_ac.storage.writing import (
     atomic_writer,
     folder_writer,
+    free_bytes,
     is_empty,
     require_new_folder,
     sync,

@@ -10,7 +10,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import stat
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -197,14 +197,20 @@ def _local_ranges(path: str | Path, ranges: Sequence[tuple[int, int]]) -> Iterat
             yield file.read(length)
 
 
-def sha256_of_file(path: str | Path) -> str:
+def sha256_of_file(path: str | Path, *, progress: Callable[[int], None] = lambda _: None) -> str:
     """Return the SHA-256 of a file as hexadecimal digits, read in chunks.
+
+    Args:
+        path: The file.
+        progress: Called after every chunk with the bytes read so far.
 
     Raises:
         OSError: There is no such file, or it cannot be read.
     """
-    digest = hashlib.sha256()
+    digest, done = hashlib.sha256(), 0
     with closing(open_to_read(path)) as file:
         while chunk := file.read(_HASH_CHUNK_BYTES):
             digest.update(chunk)
+            done += len(chunk)
+            progress(done)
     return digest.hexdigest()

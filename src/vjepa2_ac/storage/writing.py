@@ -117,6 +117,11 @@ def try_writing_at(path: Path) -> None:
         pass
 
 
+def free_bytes(folder: Path) -> int:
+    """Return the free bytes on the disk of a folder, which need not exist yet."""
+    return shutil.disk_usage(next(there for there in [folder, *folder.parents] if there.exists())).free
+
+
 @contextmanager
 def user_can_write(path: str | Path, errors: Set[int] = _UNWRITABLE) -> Iterator[None]:
     """Raise an error for the user if a local path cannot be written, or the disk is full.

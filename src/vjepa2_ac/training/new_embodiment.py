@@ -5,7 +5,7 @@ from __future__ import annotations
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.base_model import base_sizes
+from vjepa2_ac.model.checkpoints.loading import base_sizes
 from vjepa2_ac.model.network.input_heads import fit_heads, heads_to_replace, require_trained
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import Reporter
@@ -47,7 +47,7 @@ def fit_to_data(world_model: WorldModel, config: Config, dataset: Dataset, repor
     for line in fit_heads(world_model, dataset.widths, config.seed):
         reporter.note(line)
     trained = config.adapter.kind == "none" or config.model.random is not None
-    for name in ("state_encoder", "action_encoder"):
+    for name in ("state_encoder", "action_encoder") if world_model.sizes.predictor.use_states else ("action_encoder",):
         if config.data.states == "vector" and name not in {*heads, *config.adapter.modules_to_save} and not trained:
             reporter.note(
                 f"{name.replace('_', ' ')}: the base's own, as wide as the data. If its numbers mean something else"

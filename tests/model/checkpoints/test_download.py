@@ -3,19 +3,40 @@
 import re
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from hashlib import sha256
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
 
+from vjepa2_ac import storage
+from vjepa2_ac.cli import main
 from vjepa2_ac.errors import InputError, UnreachableError
-from vjepa2_ac.model.checkpoints import download as module
+from vjepa2_ac.model.checkpoints import published
 from vjepa2_ac.model.checkpoints.download import download
+from vjepa2_ac.model.checkpoints.published import VIT_B, Published
+from vjepa2_ac.model.checkpoints.published_names import OFFICIAL
 from vjepa2_ac.storage.remote.retries import RetryPolicy
 
+MADE_UP = Published(
+    "made-up", "elsewhere.pt", "encoder", "v2.1", VIT_B, 384, "ema_encoder", 0.0001,
+    bytes=102_400, sha256=sha256(bytes(range(256)) * 400).hexdigest(), licence="of the test",
+)  # fmt: skip
 twice, at_once = RetryPolicy(attempts=2, first_wait_s=0.0), RetryPolicy(first_wait_s=0.0)
 CONTENT = bytes(range(256)) * 400
+
+
+class Told:
+    """Keeps what is told of the progress."""
+
+    def __init__(self) -> None:
+        self.lines: list[tuple[str, int, int]] = []
+
+    def note(self, text: str) -> None: ...
+
+    def task(self, title: str, unit: str = "") -> Callable[[int, int], None]:  # noqa: ARG002
+        return lambda done, total: self.lines.append((title, done, total))
 
 
 @dataclass
@@ -76,12 +97,11 @@ def handler_for(behaviour: Behaviour) -> type[BaseHTTPRequestHandler]:
 
 
 def test_a_file_arrives_whole_and_progress_is_told(serve, tmp_path: Path) -> None:
-    told: list[tuple[int, int]] = []
-    path = download(
-        serve(Behaviour()), tmp_path / "new" / "model.pt", progress=lambda here, whole: told.append((here, whole))
-    )
-    assert path.read_bytes() == CONTENT
-    assert told[-1] == (len(CONTENT), len(CONTENT))
+    content = bytes(range(256)) * 2**13
+    told = Told()
+    path = download(serve(Behaviour(content=content)), tmp_path / "new" / "model.pt", reporter=told)
+    assert path.read_bytes() == content
+    assert told.lines[-1] == ("model.pt (MB)", 2, 2)
     assert [entry.name for entry in path.parent.iterdir()] == ["model.pt"]
 
 
@@ -154,35 +174,94 @@ def test_a_file_whose_size_is_not_said_is_refused(serve, tmp_path: Path) -> None
 
 
 @pytest.fixture
-def official(serve, monkeypatch: pytest.MonkeyPatch) -> Callable[[Behaviour], str]:
-    """Serve the official checkpoint, which is a little smaller than it ought to be."""
-
-    def start(behaviour: Behaviour) -> str:
-        url = serve(behaviour)
-        monkeypatch.setattr(module, "OFFICIAL_URL", url)
-        monkeypatch.setattr(module, "OFFICIAL_LEAST_BYTES", len(CONTENT))
-        return url
-
-    return start
+def table(monkeypatch: pytest.MonkeyPatch) -> Published:
+    """A table of one made-up file, of a known size and SHA-256."""
+    monkeypatch.setattr(published, "PUBLISHED", (MADE_UP,))
+    return MADE_UP
 
 
-def test_less_than_the_official_checkpoint_is_not_taken_for_it(official, tmp_path: Path) -> None:
-    part = tmp_path / "model.pt.part"
+def test_less_than_the_published_file_is_not_taken_for_it(serve, tmp_path: Path) -> None:
+    part = tmp_path / "made-up.pt.part"
     part.write_bytes(CONTENT[:1000])
+    url = serve(Behaviour(content=b"please wait", resumes=False))
     with pytest.raises(
-        InputError, match=r"a file of 11 bytes\. needed: the official checkpoint, of more than 102,400.*proxy"
+        InputError, match=r"a file of 11 bytes\. needed: made-up, of exactly 102,400 bytes.*proxy.*curl"
     ):
-        download(official(Behaviour(content=b"please wait", resumes=False)), tmp_path / "model.pt")
+        download(url, tmp_path / "made-up.pt", known=MADE_UP)
     assert part.read_bytes() == CONTENT[:1000]  # hours of a good line are not thrown away
-    assert download(official(Behaviour()), tmp_path / "model.pt").read_bytes() == CONTENT
+    assert download(serve(Behaviour()), tmp_path / "made-up.pt", known=MADE_UP).read_bytes() == CONTENT
 
 
-def test_a_file_that_is_here_and_cannot_be_the_official_checkpoint_is_named(official, tmp_path: Path) -> None:
-    (tmp_path / "model.pt").write_bytes(b"<html>")
-    with pytest.raises(InputError, match=r"model\.pt: a file of 6 bytes.*Delete it"):
-        download(official(Behaviour()), tmp_path / "model.pt")
+def test_a_size_that_is_estimated_is_a_range(serve, tmp_path: Path) -> None:
+    estimated = replace(MADE_UP, bytes=None, sha256=None, gigabytes=len(CONTENT) / 1.2e9)
+    assert download(serve(Behaviour()), tmp_path / "a.pt", known=estimated).read_bytes() == CONTENT
+    for wrong in (0.5e9, 2e9):
+        other = replace(estimated, gigabytes=len(CONTENT) / wrong)
+        with pytest.raises(InputError, match=r"a file of 102,400 bytes\. needed: made-up, of [\d,]+ to [\d,]+ bytes"):
+            download(serve(Behaviour()), tmp_path / "b.pt", known=other)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["a.pt"]
+
+
+def test_a_file_that_is_here_and_cannot_be_the_published_one_is_named(serve, tmp_path: Path) -> None:
+    behaviour = Behaviour()
+    path, url = tmp_path / "made-up.pt", serve(behaviour)
+    path.write_bytes(b"<html>")
+    with pytest.raises(InputError, match=r"made-up\.pt: a file of 6 bytes.*Delete it, or name another file with --to"):
+        download(url, path, known=MADE_UP)
     with pytest.raises(InputError, match=r"a folder\. needed: the name of a file"):
-        download(official(Behaviour()), tmp_path)
+        download(url, tmp_path, known=MADE_UP)
+    path.write_bytes(CONTENT[::-1])
+    with pytest.raises(InputError, match=r"made-up\.pt: SHA-256 .*Delete it and start again"):
+        download(url, path, known=MADE_UP)
+    assert path.read_bytes() == CONTENT[::-1]
+    assert behaviour.seen == []
+
+
+def test_a_file_of_another_hash_is_not_left_at_its_place(serve, tmp_path: Path) -> None:
+    wrong, told = CONTENT[::-1], Told()
+    with pytest.raises(InputError, match=rf"SHA-256 {sha256(wrong).hexdigest()}\. needed: {MADE_UP.sha256}.*deleted"):
+        download(serve(Behaviour(content=wrong)), tmp_path / "made-up.pt", known=MADE_UP, reporter=told)
+    assert list(tmp_path.iterdir()) == []
+    assert ("SHA-256 of made-up.pt (MB)", 0, 0) in told.lines
+    assert download(serve(Behaviour()), tmp_path / "made-up.pt", known=MADE_UP).read_bytes() == CONTENT
+
+
+def test_a_part_of_another_checkpoint_is_not_gone_on_with(serve, tmp_path: Path) -> None:
+    path, other = tmp_path / "model.pt", replace(MADE_UP, name="other", sha256=None)
+    behaviour = Behaviour(content=CONTENT[::-1], cut_after=[1000, 0, 0])
+    with pytest.raises(UnreachableError):
+        download(serve(behaviour), path, known=other, policy=twice)
+    assert download(serve(Behaviour()), path, known=MADE_UP).read_bytes() == CONTENT
+
+
+@pytest.mark.parametrize(("free", "fits"), [(99_399, False), (101_400, True), (101_399, False)])
+def test_disk_space_for_the_rest_is_checked_before_the_first_byte(
+    serve, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, free: int, fits: bool
+) -> None:
+    monkeypatch.setattr(storage, "free_bytes", lambda _: free)
+    part = tmp_path / "made-up.pt.part"
+    part.write_bytes(CONTENT[:1000])
+    if fits:
+        assert download(serve(Behaviour()), tmp_path / "made-up.pt", known=MADE_UP).read_bytes() == CONTENT
+        return
+    with pytest.raises(InputError, match=r"GB free on its disk\. needed: 0\.0001014 GB for the rest.*--to"):
+        download(serve(Behaviour()), tmp_path / "made-up.pt", known=MADE_UP)
+    assert part.read_bytes() == CONTENT[:1000]
+
+
+def test_the_command_says_what_the_file_is_and_which_knob_takes_it(
+    serve, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, table: Published, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["download", "Made_Up", "--url", serve(Behaviour())]) == 0
+    shown = capsys.readouterr().out
+    assert "made-up: encoder" in shown
+    assert "102,400 bytes, licence of the test" in shown
+    assert shown.endswith("model.encoder.path: checkpoints/made-up.pt\n")
+    assert Path("checkpoints", table.file).read_bytes() == CONTENT
+    monkeypatch.setattr(published, "PUBLISHED", (replace(table, name=OFFICIAL, holds="world model"),))
+    assert main(["download", "--to", "a.pt", "--url", serve(Behaviour())]) == 0
+    assert capsys.readouterr().out.endswith("model.base: a.pt\n")
 
 
 @pytest.mark.parametrize(

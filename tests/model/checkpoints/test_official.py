@@ -16,7 +16,8 @@ from torch import Tensor
 from paths import GOLDEN
 from vjepa2_ac.config import EncoderSizes, ModelSizes, PredictorSizes
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.checkpoints.official import load_official, official_name, to_official
+from vjepa2_ac.model.checkpoints.meta_file import official_name
+from vjepa2_ac.model.checkpoints.official import load_official, to_official
 from vjepa2_ac.model.network.world_model import WorldModel
 
 

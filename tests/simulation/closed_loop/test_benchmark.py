@@ -66,6 +66,13 @@ def test_a_robot_of_joints_is_steered_by_its_joints(
     assert "other numbers than the simulated arm measures" in capsys.readouterr().err
 
 
+def test_a_model_without_states_is_steered(tmp_path: Path) -> None:
+    tiny_model(states=False).save_pretrained(tmp_path / "model")
+    session = load_to_plan(str(tmp_path / "model"), overrides=SMALL)
+    run_benchmark(session, BenchmarkOptions(episodes=1, steps=2, films=0), tmp_path / "out")
+    assert metrics(tmp_path / "out")["policies"]["model"]["why_counts"] == {"planned": 2}
+
+
 def test_a_decoder_adds_what_was_imagined_to_the_film_and_changes_no_metric(model: str, tmp_path: Path) -> None:
     decoder = load_decoder(write_decoder(tmp_path / "decoder", tiny_model()))
     session = load_to_plan(model, overrides=SMALL)

@@ -55,6 +55,14 @@ KNOBS: dict[str, dict[str, Any]] = {  # of which every pair of values is tried t
 }
 
 
+ALSO = {"no states": model_sizes(states=False)}  # which has no layer of all ENDS
+WITHOUT_STATES = [
+    ("LoRA", "bf16", "no states", "smooth, long rollout"),
+    ("DoRA, dropout", "fp32", "no states", "L1"),
+    ("everything", "bf16", "no states", "contrast of actions"),
+]
+
+
 def pairwise(knobs: dict[str, dict[str, Any]]) -> list[tuple[str, ...]]:
     """Return few combinations in which each two values of different knobs meet."""
     every = list(itertools.product(*knobs.values()))
@@ -67,7 +75,8 @@ def pairwise(knobs: dict[str, dict[str, Any]]) -> list[tuple[str, ...]]:
 
 
 def case(names: tuple[str, ...], **changes: Any) -> tuple[Config, ModelSizes]:
-    adapter, arithmetic, sizes, loss = (values[name] for values, name in zip(KNOBS.values(), names, strict=True))
+    knobs = {**KNOBS, "sizes": KNOBS["sizes"] | ALSO}
+    adapter, arithmetic, sizes, loss = (values[name] for values, name in zip(knobs.values(), names, strict=True))
     return run_config(adapter, **arithmetic, **loss, **changes), sizes
 
 
@@ -130,7 +139,7 @@ def kept_by_pytorch(config: Config, sizes: ModelSizes, monkeypatch: pytest.Monke
     return kept
 
 
-@pytest.mark.parametrize("names", pairwise(KNOBS), ids=", ".join)
+@pytest.mark.parametrize("names", [*pairwise(KNOBS), *WITHOUT_STATES], ids=", ".join)
 def test_each_part_is_what_autograd_keeps_of_it(names: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
     config, sizes = case(names)
     step = measure_step(config, sizes, "cpu")

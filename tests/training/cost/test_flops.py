@@ -97,10 +97,10 @@ def test_the_default_run_has_the_flops_that_were_worked_out_by_hand() -> None:
     assert flops.total == pytest.approx(16e12, rel=0.02)
 
 
-@pytest.mark.parametrize("extrinsics", [False, True])
+@pytest.mark.parametrize(("extrinsics", "states"), [(False, True), (True, True), (False, False), (True, False)])
 @pytest.mark.parametrize(("steps", "before"), [(1, 0), (3, 0), (2, 2)])
-def test_a_plan_is_what_pytorch_counts(steps: int, before: int, extrinsics: bool) -> None:
-    predictor = SIZES.predictor.model_copy(update={"use_extrinsics": extrinsics})
+def test_a_plan_is_what_pytorch_counts(steps: int, before: int, extrinsics: bool, states: bool) -> None:
+    predictor = SIZES.predictor.model_copy(update={"use_extrinsics": extrinsics, "use_states": states})
     sizes = SIZES.model_copy(update={"predictor": predictor})
     model, samples = WorldModel.random(sizes, seed=0), 3
     latents = torch.randn(before + 1, model.num_tokens, model.latent_dim)

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from sized_runs import LORA, built, model_sizes, run_config
-from vjepa2_ac.config import ModelSizes
+from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.model.adapter.lora import trainable_report
 from vjepa2_ac.model.adapter.targets import adapter_ranks
 from vjepa2_ac.training.cost.fake_model import meta_network
@@ -40,7 +40,16 @@ SHAPES = {
 @pytest.mark.parametrize("adapter", ADAPTERS)
 @pytest.mark.parametrize("shape", SHAPES)
 def test_parameters_are_those_of_a_model_that_was_built(shape: str, adapter: str) -> None:
-    config, sizes = run_config(ADAPTERS[adapter]), SHAPES[shape]
+    assert_parameters_are_counted(run_config(ADAPTERS[adapter]), SHAPES[shape])
+
+
+@pytest.mark.parametrize("extrinsics", [False, True])
+@pytest.mark.parametrize("adapter", ["all", "one head whole", "dora everywhere", "a pattern for a head", "none"])
+def test_parameters_of_a_model_without_states_are_those_of_one_that_was_built(adapter: str, extrinsics: bool) -> None:
+    assert_parameters_are_counted(run_config(ADAPTERS[adapter]), model_sizes(states=False, extrinsics=extrinsics))
+
+
+def assert_parameters_are_counted(config: Config, sizes: ModelSizes) -> None:
     model = built(config, sizes)
     counts, report = count_parameters(config, sizes), trainable_report(model)
     assert (counts.predictor, counts.encoder) == (report.predictor, report.total - report.predictor)

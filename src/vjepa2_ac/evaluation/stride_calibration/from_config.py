@@ -54,6 +54,6 @@ def load_named(config: Config, model: str | None) -> WorldModel:
     """
     if model is not None and is_run(model):
         return load_run(Path(model)).world_model
-    chosen = config.model if model is None else config.model.model_copy(update={"base": model, "random": None})
+    chosen = config.model if model is None else config.model.with_base(model)
     require_learned(chosen)
     return load_base(chosen, seed=config.seed)

@@ -43,6 +43,7 @@ class Card:
     base_predictor: str
     encoder: str
     fresh_heads: Heads | None = None  # None: the base's own heads are used
+    encoder_in_words: str | None = None  # for people; the fingerprint decides. None: of a card from before
 
 
 def write_trained(
@@ -106,11 +107,14 @@ def _save(weights: dict[str, Tensor], path: Path) -> None:
 def _check_base(model: WorldModel, card: Card, *, where: str) -> None:
     own = model.adaptation.base if model.adaptation else model.predictor_fingerprint()
     encoder = model.adaptation.encoder if model.adaptation else model.encoder_fingerprint()
-    for part, found, needed in (("predictor", own, card.base_predictor), ("encoder", encoder, card.encoder)):
+    words = "" if card.encoder_in_words is None else f": {card.encoder_in_words}"
+    ours = "" if card.encoder_in_words is None else f": {model.encoder_in_words}"
+    parts = (("predictor", own, card.base_predictor, "", ""), ("encoder", encoder, card.encoder, words, ours))
+    for part, found, needed, trained_on, this in parts:
         if found != needed:
             raise InputError(
                 where=where,
-                found=f"an adapter trained on another {part} ({needed[:12]})",
-                needed=f"one trained on this model's {part} ({found[:12]})",
-                fix="Set model.base to the model it was trained on",
+                found=f"an adapter trained on another {part} ({needed[:12]}{trained_on})",
+                needed=f"one trained on this model's {part} ({found[:12]}{this})",
+                fix="Set model.base (or model.encoder) to what it was trained on",
             )

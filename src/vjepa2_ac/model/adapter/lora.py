@@ -185,7 +185,7 @@ def _card_of(model: WorldModel) -> Card:
     adaptation, sizes, heads = adaptation_of(model), model.sizes.predictor, None
     if model.fresh_heads is not None:
         heads = Heads(sizes.action_dim, sizes.state_dim, model.fresh_heads.seed)
-    return Card(adaptation.kind, adaptation.base, adaptation.encoder, heads)
+    return Card(adaptation.kind, adaptation.base, adaptation.encoder, heads, model.encoder_in_words)
 
 
 def _train_everything(model: WorldModel) -> None:

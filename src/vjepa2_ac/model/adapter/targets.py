@@ -38,13 +38,15 @@ def lora_arguments(predictor: PredictorNetwork, config: AdapterConfig) -> dict[s
         config: The knobs.
 
     Raises:
-        InputError: A target or pattern matches no layer, a layer is named twice, or a rank is too large for a layer.
+        InputError: A target, pattern or layer to train whole matches no layer, a layer is named twice, or a rank is too
+            large for a layer.
     """
     layers = {
         name: layer
         for name, layer in predictor.named_modules()
         if isinstance(layer, nn.Linear) and name not in predictor.unused_layers
     }
+    _check_saved(config, predictor)
     targets = chosen_targets(config, {_last(name) for name in layers})
     adapted = {name: layer for name, layer in layers.items() if _last(name) in targets}
     _check_patterns("rank_pattern", config.rank_pattern, adapted)
@@ -107,6 +109,17 @@ def adapter_ranks(predictor: PredictorNetwork, config: AdapterConfig) -> dict[st
 def rank_of(config: AdapterConfig, layer: str) -> int:
     """Return the rank that PEFT gives a layer: that of the first pattern that fits the end of its name."""
     return next((rank for key, rank in config.rank_pattern.items() if _matches(key, layer)), config.rank)
+
+
+def _check_saved(config: AdapterConfig, predictor: PredictorNetwork) -> None:
+    missing = [name for name in config.modules_to_save if not hasattr(predictor, name)]
+    if missing:
+        raise InputError(
+            where="adapter.modules_to_save",
+            found=f"{', '.join(missing)}, which this predictor does not have: it was made without states",
+            needed="layers of the predictor",
+            fix="Leave it out, and set model.sizes.predictor.use_states=false: both are then checked before loading",
+        )
 
 
 def _check_patterns(knob: str, patterns: Mapping[str, object], adapted: Iterable[str]) -> None:

@@ -1,4 +1,4 @@
-"""Download of a large file over an unstable connection: resumed where it stopped, its size checked, then renamed."""
+"""Download of a large file over an unstable connection: resumed where it stopped, checked, then renamed."""
 
 from __future__ import annotations
 
@@ -8,57 +8,75 @@ import math
 import re
 import urllib.error
 import urllib.request
-from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 from vjepa2_ac import storage
 from vjepa2_ac.errors import InputError, RefusedError, UnreachableError
+from vjepa2_ac.model.checkpoints.published import Published
+from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.storage.remote.retries import RetryPolicy, with_retries
 
 logger = logging.getLogger(__name__)
 
-OFFICIAL_URL = "https://dl.fbaipublicfiles.com/vjepa2/vjepa2-ac-vitg.pt"
-OFFICIAL_LEAST_BYTES = 10 * 10**9  # it has 11.7 GB; what a proxy answers in its place has not
 CHUNK_BYTES = 2**20
 _POLICY = RetryPolicy(attempts=5, first_wait_s=2.0, total_s=math.inf)
+_MEGABYTE, _GIGABYTE = 10**6, 10**9
 
-Progress = Callable[[int, int], None]
-"""Called with the bytes that are here and the bytes of the whole file."""
+
+@dataclass(frozen=True)
+class _Download:
+    """What is fetched, from where, and to where."""
+
+    url: str
+    path: Path
+    known: Published | None  # what is known of the file
+    reporter: Reporter
+
+    @property
+    def part(self) -> Path:
+        """Where the file grows. The part of one checkpoint is not gone on with as that of another."""
+        middle = "" if self.known is None or self.path.name == self.known.file else f".{self.known.name}"
+        return self.path.with_name(f"{self.path.name}{middle}.part")
 
 
 def download(
     url: str,
     path: str | Path,
     *,
-    progress: Progress | None = None,
+    known: Published | None = None,
+    reporter: Reporter = SILENT,
     policy: RetryPolicy = _POLICY,
 ) -> Path:
-    """Fetch a file to `path`; a part that an earlier call left in `path.part` is gone on with.
+    """Fetch a file to `path`; a part that an earlier call left beside it is gone on with.
 
     Args:
         url: What to fetch.
-        path: Where the whole file goes; it appears there only when it is whole. One that is there is kept, if it can
-            be the file.
-        progress: Is told how far it is.
+        path: Where the whole file goes; it appears there only when it is whole and checked. One that is there is
+            kept, if it can be the file.
+        known: The published checkpoint that it has to be, whose size and SHA-256 are checked; None: any file.
+        reporter: Is told how far it is, in megabytes.
         policy: How often in a row the line may break without a byte having come, and the waits.
 
     Raises:
-        InputError: The server refuses, cannot be reached, does not say how large the file is, or sends another size
-            than that or than the official file can have; the address is none; the path cannot be written.
+        InputError: The server does not say how large the file is, or sends another size than that or than the
+            published file can have; its SHA-256 is another one; the disk has too little space; the address is none;
+            the path cannot be written.
+        UnreachableError: The server refuses, or cannot be reached.
     """
-    path = Path(path)
+    what = _Download(url, Path(path), known, reporter)
+    path, part = what.path, what.part
     if not re.match(r"https?://[^/?#]", url, re.IGNORECASE):
         raise _no_address(url)
     with storage.user_can_write(path):
         if path.exists():
-            _require_file(url, path)
+            _require_file(what)
             return path
         path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
     try:
         whole = with_retries(
             url,
-            lambda timeout_s: _fetch(url, part, progress, timeout_s),
+            lambda timeout_s: _fetch(what, timeout_s),
             policy=policy,
             access="Check the URL",
             progress=lambda: _size(part),
@@ -73,11 +91,13 @@ def download(
     if size != whole:
         part.unlink()
         raise InputError(where=url, found=f"{size} bytes", needed=f"{whole} bytes", fix="Start the download again")
+    _require_hash(what, part)
     return part.replace(path)
 
 
-def _fetch(url: str, part: Path, progress: Progress | None, timeout_s: float) -> int:
+def _fetch(what: _Download, timeout_s: float) -> int:
     """Bring the rest of a file and return the size of the whole."""
+    url, part = what.url, what.part
     start = _size(part)
     try:
         request = urllib.request.Request(url, headers={"Range": f"bytes={start}-"} if start else {})  # noqa: S310  # the user's
@@ -86,6 +106,7 @@ def _fetch(url: str, part: Path, progress: Progress | None, timeout_s: float) ->
         raise _no_address(url) from None
     except urllib.error.HTTPError as error:
         if error.code == 416 and error.headers.get("Content-Range", "").endswith(f"/{start}"):  # nothing is left
+            _require_size(what, start, where=url)
             return start
         if error.code == 416:
             part.unlink()  # the part is not of this file
@@ -105,31 +126,75 @@ def _fetch(url: str, part: Path, progress: Progress | None, timeout_s: float) ->
                 fix="Check the URL, and whether a proxy answers in its place",
             )
         whole = start + int(promised)
-        _require_size(url, whole, where=url)
+        _require_size(what, whole, where=url)
+        _require_space(what, whole)
+        show = what.reporter.task(f"{what.path.name} (MB)")
         with storage.user_can_write(part), part.open("ab" if start else "wb") as file:
             here = start
             while block := answer.read(CHUNK_BYTES):
                 file.write(block)
                 here += len(block)
-                if progress:
-                    progress(here, whole)
+                show(here // _MEGABYTE, whole // _MEGABYTE)
         if here < whole:
             raise http.client.IncompleteRead(b"", whole - here)
     return whole
 
 
-def _require_file(url: str, path: Path) -> None:
-    if not path.is_file():
-        raise InputError(where=str(path), found="a folder", needed="the name of a file", fix="Name a file in it")
-    _require_size(url, path.stat().st_size, where=str(path))
+def _require_file(what: _Download) -> None:
+    """Refuse what is at the destination, if it cannot be the file."""
+    if not what.path.is_file():
+        raise InputError(where=str(what.path), found="a folder", needed="the name of a file", fix="Name a file in it")
+    _require_size(what, what.path.stat().st_size, where=str(what.path))
+    _require_hash(what, what.path)
 
 
-def _require_size(url: str, size: int, *, where: str) -> None:
-    if url == OFFICIAL_URL and size < OFFICIAL_LEAST_BYTES:
-        needed = f"the official checkpoint, of more than {OFFICIAL_LEAST_BYTES:,}"
-        proxy, file = "Check whether a proxy answers in the server's place", "Delete it, or name another file"
-        fix = proxy if where == url else file
-        raise InputError(where=where, found=f"a file of {size:,} bytes", needed=needed, fix=fix)
+def _require_size(what: _Download, size: int, *, where: str) -> None:
+    if what.known is None:
+        return
+    least, most = what.known.bytes_range
+    if least <= size <= most:
+        return
+    exactly = f"exactly {least:,}" if least == most else f"{least:,} to {most:,}"
+    if where == what.url:
+        fix = (
+            "Check whether a proxy answers in the server's place. If the publisher has replaced the file, fetch it by"
+            f" other means, such as `curl -L -C - -o {what.path} {what.url}`"
+        )
+    else:
+        fix = "Delete it, or name another file with --to"
+    needed = f"{what.known.name}, of {exactly} bytes"
+    raise InputError(where=where, found=f"a file of {size:,} bytes", needed=needed, fix=fix)
+
+
+def _require_space(what: _Download, whole: int) -> None:
+    """Refuse to begin if the rest of the file does not fit on the disk."""
+    left, free = whole - _size(what.part), storage.free_bytes(what.path.parent.absolute())
+    if left > free:
+        here = f"; {_size(what.part) / _GIGABYTE:.4g} GB are here" if _size(what.part) else ""
+        raise InputError(
+            where=str(what.path),
+            found=f"{free / _GIGABYTE:.4g} GB free on its disk",
+            needed=f"{left / _GIGABYTE:.4g} GB for the rest of {whole / _GIGABYTE:.4g} GB{here}",
+            fix="Free some space, or name a file on a larger disk with --to",
+        )
+
+
+def _require_hash(what: _Download, file: Path) -> None:
+    """Refuse a whole file of another SHA-256 than the published one; one that was fetched is deleted."""
+    if what.known is None or what.known.sha256 is None:
+        return
+    show, whole = what.reporter.task(f"SHA-256 of {what.path.name} (MB)"), _size(file)
+    found = storage.sha256_of_file(file, progress=lambda done: show(done // _MEGABYTE, whole // _MEGABYTE))
+    if found == what.known.sha256:
+        return
+    if file == what.path:
+        fix = "Delete it and start again, or name another file with --to"
+    else:
+        file.unlink()
+        fix = f"It was deleted. Start the download again; if it ends so again, {what.url} holds another file"
+    raise InputError(
+        where=str(file), found=f"SHA-256 {found}", needed=f"{what.known.sha256} ({what.known.name})", fix=fix
+    )
 
 
 def _size(path: Path) -> int:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import logging
-import pickle
-import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,33 +11,46 @@ import torch
 from pydantic import ValidationError
 from torch import Tensor, nn
 
-from vjepa2_ac.config import EncoderSizes, ModelSizes, PredictorSizes
+from vjepa2_ac.config import ModelSizes, PredictorSizes
+from vjepa2_ac.config.model import EncoderConfig, EncoderKey
 from vjepa2_ac.episode import ACTION_DIM, POSE_WIDTHS
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.checkpoints.foreign_file import foreign_kind
+from vjepa2_ac.model.checkpoints.encoder_file import FoundEncoder, encoder_in_file
+from vjepa2_ac.model.checkpoints.meta_file import (
+    ENCODER_KEYS,
+    Shapes,
+    depth_of,
+    in_groups,
+    official_shapes,
+    open_file,
+    part_of,
+    shapes_of,
+    take,
+    tensors_of,
+    to_official_names,
+)
 from vjepa2_ac.model.finite import require_finite
 from vjepa2_ac.model.network.blocks import mlp_ratio_of
 from vjepa2_ac.model.network.input_heads import widths_of_model
 from vjepa2_ac.model.network.pretrained_folder import check_tensors
+from vjepa2_ac.model.network.published_sizes import HEADS
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.model.sizes import check_sizes
 
 logger = logging.getLogger(__name__)
 
-GROUP_BYTES = 2**29  # of the file in memory at once, in addition to the weights
-IGNORED = {"encoder": ("pos_embed",), "predictor": ()}  # may exist: a network with rotary positions does not use it
-
 _NEEDED = "a checkpoint of V-JEPA 2-AC as Meta publishes it (vjepa2-ac-vitg.pt)"
+_NEEDED_WHOLE = f"{_NEEDED}, 11.7 GB"
 _FIX = "`vjepa2-ac download` fetches it, and goes on with a part of it"
-_SPLIT = ("q", "k", "v")
-_DAMAGE = (  # errors of a damaged pickle, in addition to torch's own
-    pickle.UnpicklingError, OSError, EOFError, RuntimeError, ValueError, LookupError, TypeError, AttributeError,
-    AssertionError, ArithmeticError, MemoryError,
-)  # fmt: skip
+_NON_COMMERCIAL = "The weights that jepa-wms publishes so are CC-BY-NC 4.0: for non-commercial use only"
+_KEYS: tuple[EncoderKey, ...] = (
+    "encoder",
+    "target_encoder",
+)  # the two are the same: the encoder of an AC file is frozen
 
 
 def load_official(path: str | Path, sizes: ModelSizes | None = None, dtype: torch.dtype = torch.float32) -> WorldModel:
-    """Read Meta's checkpoint. Every tensor is matched; only those in `IGNORED` may remain.
+    """Read Meta's checkpoint. Every tensor is matched; only a `pos_embed` of the encoder may remain.
 
     The file is mapped and read in groups: the peak is the weights in `dtype` plus about 1 GB.
 
@@ -52,93 +63,128 @@ def load_official(path: str | Path, sizes: ModelSizes | None = None, dtype: torc
     Raises:
         InputError: The file is missing, truncated, of another kind, contradicts the sizes, or a weight is not finite.
     """
-    path = Path(path)
-    parts = {part: _shapes(weights) for part, weights in _open(path).items()}
-    model = WorldModel.empty(_sizes(parts, sizes or ModelSizes(), where=str(path)))
-    for part, network in (("encoder", model.encoder), ("predictor", model.predictor)):
-        _fill(network, path, part, dtype)
+    path, given = Path(path), sizes or ModelSizes()
+    whole = open_file(path, needed=_NEEDED_WHOLE, fix=_FIX)
+    key = next((one for one in _KEYS if one in whole), _KEYS[0])
+    encoder = _tensors(path, whole, key)
+    predictor = shapes_of(_predictor_in(path, whole))
+    found = encoder_in_file(path, whole, _asked(path, key, encoder, given))
+    model = WorldModel.empty(_sizes(predictor, found, given, where=str(path)))
+    del whole, encoder
+    found.fill(model.present_encoder, dtype)
+    _fill_predictor(model.predictor, path, dtype)
     logger.info("read %s: %s", path, model.sizes.model_dump())
     return model
+
+
+def load_predictor(path: Path, found: FoundEncoder, sizes: ModelSizes, dtype: torch.dtype) -> WorldModel:
+    """Read a file that holds a predictor alone, and put an encoder from elsewhere under it.
+
+    Raises:
+        InputError: As `load_official`; the file has an encoder of its own; or the predictor takes latents of another
+            width than the encoder's.
+    """
+    whole = open_file(path, needed=_NEEDED_WHOLE, fix=_FIX)
+    if any(key in whole for key in ENCODER_KEYS):
+        raise own_encoder(str(path), found)
+    predictor = shapes_of(_predictor_in(path, whole))
+    latent = predictor.get("predictor_embed.weight", (0, 0))[-1]
+    if latent != found.sizes.width:
+        raise InputError(
+            where=f"model.base: {path}",
+            found=f"a predictor of latents of width {latent}",
+            needed=f"one of width {found.sizes.width}, as {found.where} makes them",
+            fix="Set model.encoder to the encoder that the predictor was trained on",
+        )
+    model = WorldModel.empty(_sizes(predictor, found, sizes, where=str(path)))
+    del whole
+    found.fill(model.present_encoder, dtype)
+    _fill_predictor(model.predictor, path, dtype)
+    model.encoder_origin = found.origin
+    if not model.sizes.predictor.use_states:
+        logger.warning("%s: a predictor without states and without an encoder. %s", path, _NON_COMMERCIAL)
+    logger.warning(
+        "%s does not say which encoder its predictor was trained on: on any other than %s it predicts noise. The first"
+        " validation shows it (its error beside that of persistence).",
+        path,
+        found.origin,
+    )
+    return model
+
+
+def own_encoder(base: str, found: FoundEncoder) -> InputError:
+    """Return the error of a base that has an encoder, where the config names another."""
+    return InputError(
+        where=f"model.base: {base}",
+        found=f"an encoder of its own, and model.encoder names another ({found.where})",
+        needed="the encoder that the predictor was trained on: on other latents it predicts noise",
+        fix="Leave out model.encoder; or train a fresh predictor on it, with model.random in place of model.base",
+    )
 
 
 def to_official(model: WorldModel) -> dict[str, Any]:
     """Return the weights by Meta's names, q, k and v fused: `torch.save` of it is an official checkpoint.
 
     Raises:
-        ValueError: There is an adapter: merge it first. Or states and actions differ in width from Meta's code.
+        ValueError: There is an adapter: merge it first. Or states and actions differ in width from Meta's code, which
+            has no predictor without states either.
     """
     if model.predictor is not model.base_predictor:
         raise ValueError("an adapter is on: merge_adapter first")
+    if not model.sizes.predictor.use_states:
+        raise ValueError("Meta's code has no predictor without states: save_pretrained writes it")
     if widths_of_model(model.sizes) != POSE_WIDTHS:
         raise ValueError(f"Meta's code takes {POSE_WIDTHS}, not {widths_of_model(model.sizes)}")
-    encoder = _to_official(model.present_encoder.state_dict(), "encoder")
+    encoder = to_official_names(model.present_encoder.state_dict(), part_of(model.sizes.encoder.family))
     return {
         "encoder": encoder,
         "target_encoder": dict(encoder),
-        "predictor": _to_official(model.predictor.state_dict(), "predictor"),
+        "predictor": to_official_names(model.predictor.state_dict(), "predictor"),
         "epoch": 0,
     }
 
 
-# Ours -> Meta's, as (pattern, replacement), applied in turn.
-_NAMES: dict[str, list[tuple[str, str]]] = {
-    "encoder": [
-        (r"^vit\.embeddings\.patch_embeddings\.", "patch_embed."),
-        (r"^vit\.layernorm\.", "norm."),
-        (r"^vit\.layer\.", "blocks."),
-        (r"\.attention\.(q|k|v)(?:uery|ey|alue)\.", r".attn.\1."),
-        (r"\.attention\.proj\.", ".attn.proj."),
-    ],
-    "predictor": [(r"^blocks\.", "predictor_blocks."), (r"\.attn\.o\.", ".attn.proj.")],
-}
+def _tensors(path: Path, whole: Mapping[str, Any], key: str) -> dict[str, Tensor]:
+    tensors = tensors_of(whole.get(key))
+    if tensors is None:
+        raise _refused(path, f"no weights under {key!r} (keys: {', '.join(list(whole)[:8])})")
+    return tensors
 
 
-def official_name(name: str, part: str) -> tuple[str, int | None]:
-    """Return Meta's name of one of our tensors, and which third of a fused one it is (None: all of it)."""
-    for pattern, replacement in _NAMES[part]:
-        name = re.sub(pattern, replacement, name)
-    fused = re.sub(r"\.attn\.[qkv]\.", ".attn.qkv.", name)
-    return fused, None if fused == name else _SPLIT.index(name.split(".attn.")[1][0])
+def _predictor_in(path: Path, whole: Mapping[str, Any]) -> dict[str, Tensor]:
+    """Return the tensors of an action-conditioned predictor; of pretraining's masked one nothing can be used."""
+    tensors = _tensors(path, whole, "predictor")
+    if any(name.startswith("mask_tokens") for name in tensors) and "action_encoder.weight" not in tensors:
+        raise InputError(
+            where=f"model.base: {path}",
+            found="a checkpoint of pretraining: its predictor fills in masked patches, and knows no actions",
+            needed=_NEEDED,
+            fix="Its encoder can be used: set model.encoder.path to this file, and model.random in place of model.base"
+            " for a fresh predictor (configs/scratch_vitb.yaml)",
+        )
+    return tensors
 
 
-def _open(path: Path) -> dict[str, dict[str, Tensor]]:
-    """Map a checkpoint and return encoder and predictor by Meta's names without prefixes; reads no values."""
-    if not path.is_file():
-        raise _refused(path, "no such file")
-    try:
-        whole = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except _DAMAGE as error:
-        raise InputError(where=str(path), found=_foreign(path, error), needed=f"{_NEEDED}, 11.7 GB", fix=_FIX) from None
-    if not isinstance(whole, dict):
-        raise _refused(path, f"a {type(whole).__name__}")
-    encoder = whole.get("encoder", whole.get("target_encoder"))
-    parts: dict[str, Any] = {"encoder": encoder, "predictor": whole.get("predictor")}
-    for part, weights in parts.items():
-        if not isinstance(weights, dict) or not all(isinstance(value, Tensor) for value in weights.values()):
-            raise _refused(path, f"no weights under {part!r} (keys: {', '.join(map(str, list(whole)[:8]))})")
-    prefixes = re.compile(r"^(?:(?:module|backbone)\.)+")
-    return {part: {prefixes.sub("", name): one for name, one in weights.items()} for part, weights in parts.items()}
+def _asked(path: Path, key: EncoderKey, encoder: Mapping[str, Tensor], given: ModelSizes) -> EncoderConfig:
+    """Return what model.sizes says of the encoder; heads only of a width that nobody has published."""
+    patches = encoder.get("patch_embed.proj.weight")
+    heads = None if patches is not None and patches.shape[0] in HEADS else given.encoder.heads
+    return EncoderConfig(path=str(path), key=key, frame=given.encoder.frame, heads=heads)
 
 
 def _refused(where: str | Path, found: str) -> InputError:
     return InputError(where=str(where), found=found, needed=_NEEDED, fix=_FIX)
 
 
-def _foreign(path: Path, error: Exception) -> str:
-    if (kind := foreign_kind(path, error)) is not None:
-        return kind
-    size, reason = path.stat().st_size / 1e9, str(error).splitlines()[0][:120]
-    return f"{size:.2f} GB that torch cannot read ({reason}): truncated, or of another kind"
-
-
-def _shapes(weights: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
-    return {name: tuple(value.shape) for name, value in weights.items()}
-
-
-def _sizes(parts: dict[str, dict[str, tuple[int, ...]]], given: ModelSizes, *, where: str) -> ModelSizes:
+def _sizes(predictor: Shapes, encoder: FoundEncoder, given: ModelSizes, *, where: str) -> ModelSizes:
     """Return the sizes of the tensors; heads, image size and extrinsics are those given."""
     try:
-        found = _sizes_of_tensors(parts, given)
+        found = ModelSizes(
+            image_size=given.image_size,
+            patch_size=encoder.patch_size,
+            encoder=encoder.sizes,
+            predictor=_predictor_sizes(predictor, given.predictor),
+        )
     except KeyError as missing:
         raise _refused(where, f"no tensor {missing} in it") from None
     except ValidationError as error:
@@ -152,81 +198,38 @@ def _sizes(parts: dict[str, dict[str, tuple[int, ...]]], given: ModelSizes, *, w
     return found
 
 
-def _sizes_of_tensors(parts: dict[str, dict[str, tuple[int, ...]]], given: ModelSizes) -> ModelSizes:
-    encoder, predictor = parts["encoder"], parts["predictor"]
-    width, *_, patch_size = encoder["patch_embed.proj.weight"]
-    predictor_width, action_width = predictor["action_encoder.weight"]
+def _predictor_sizes(predictor: Shapes, given: PredictorSizes) -> PredictorSizes:
+    width, action_width = predictor["action_encoder.weight"]
     if action_width != ACTION_DIM:
         raise KeyError(f"action_encoder.weight of {ACTION_DIM} columns (it has {action_width})")
-    hidden = encoder["blocks.0.mlp.fc1.weight"][0]
-    predictor_hidden = predictor["predictor_blocks.0.mlp.fc1.weight"][0]
-    return ModelSizes(
-        image_size=given.image_size,
-        patch_size=patch_size,
-        encoder=EncoderSizes(
-            width=width,
-            depth=_depth(encoder, "blocks"),
-            heads=given.encoder.heads,
-            mlp_ratio=mlp_ratio_of(width, hidden, given.encoder.mlp_ratio),
-        ),
-        predictor=PredictorSizes(
-            width=predictor_width,
-            depth=_depth(predictor, "predictor_blocks"),
-            heads=given.predictor.heads,
-            mlp_ratio=mlp_ratio_of(predictor_width, predictor_hidden, given.predictor.mlp_ratio),
-            use_extrinsics=given.predictor.use_extrinsics,
-        ),
+    hidden = predictor["predictor_blocks.0.mlp.fc1.weight"][0]
+    return PredictorSizes(
+        width=width,
+        depth=depth_of(predictor, "predictor_blocks"),
+        heads=given.heads,
+        mlp_ratio=mlp_ratio_of(width, hidden, given.mlp_ratio),
+        use_extrinsics=given.use_extrinsics,
+        use_states=_has_states(predictor),
     )
 
 
-def _depth(names: Mapping[str, object], blocks: str) -> int:
-    return 1 + max(int(name.split(".")[1]) for name in names if name.startswith(f"{blocks}."))
+def _has_states(names: Iterable[str]) -> bool:
+    """Return whether a predictor with tensors of these names takes states."""
+    return any(name.startswith("state_encoder.") for name in names)
 
 
-def _fill(network: nn.Module, path: Path, part: str, dtype: torch.dtype) -> None:
-    """Load the weights of a network on the meta device in groups of tensors, releasing the mapped file in between."""
-    needed = network.state_dict()
-    _check(_shapes(_open(path)[part]), _shapes(needed), part, where=str(path))
-    for names in _groups(needed):
-        mapped = _open(path)[part]
-        group = {name: _take(mapped, name, part).to(dtype, copy=True) for name in names}
+def _fill_predictor(network: nn.Module, path: Path, dtype: torch.dtype) -> None:
+    """Load the weights of a predictor on the meta device in groups of tensors, releasing the mapped file in between."""
+    needed, part = network.state_dict(), "predictor"
+    whole = open_file(path, needed=_NEEDED_WHOLE, fix=_FIX)
+    check_tensors(
+        shapes_of(_tensors(path, whole, part)), official_shapes(shapes_of(needed), "predictor"), where=f"{path}: {part}"
+    )
+    del whole
+    for names in in_groups(needed):
+        mapped = _tensors(path, open_file(path, needed=_NEEDED_WHOLE, fix=_FIX), part)
+        group = {name: take(mapped, name, "predictor").to(dtype, copy=True) for name in names}
         require_finite(group, where=f"{path}: {part}", fix=_FIX)
         network.load_state_dict(group, strict=False, assign=True)
         del mapped
     network.requires_grad_(False)
-
-
-def _check(found: dict[str, tuple[int, ...]], ours: dict[str, tuple[int, ...]], part: str, *, where: str) -> None:
-    needed: dict[str, tuple[int, ...]] = {}
-    for name, shape in ours.items():
-        official, third = official_name(name, part)
-        needed[official] = shape if third is None else (3 * shape[0], *shape[1:])
-    used = {name: shape for name, shape in found.items() if name not in IGNORED[part]}
-    check_tensors(used, needed, where=f"{where}: {part}")
-
-
-def _take(official: Mapping[str, Tensor], name: str, part: str) -> Tensor:
-    fused, third = official_name(name, part)
-    return official[fused] if third is None else official[fused].chunk(3)[third]
-
-
-def _groups(weights: Mapping[str, Tensor]) -> Iterator[list[str]]:
-    group, size = list[str](), 0
-    for name, value in weights.items():
-        group.append(name)
-        size += value.numel() * 4
-        if size >= GROUP_BYTES:
-            yield group
-            group, size = [], 0
-    yield group
-
-
-def _to_official(weights: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
-    pieces: dict[str, dict[int | None, Tensor]] = {}
-    for name, value in weights.items():
-        fused, third = official_name(name, part)
-        pieces.setdefault(fused, {})[third] = value.detach()
-    return {
-        f"module.{name}": thirds[None] if None in thirds else torch.cat([thirds[index] for index in range(3)])
-        for name, thirds in pieces.items()
-    }

@@ -1,4 +1,4 @@
-"""The frozen V-JEPA 2 encoder: features of one frame at a time, or of a whole video."""
+"""The frozen encoder of V-JEPA 2 or 2.1: features of one frame at a time, or of a whole video."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from torch import Generator, Tensor, nn
 from torch.nn.functional import layer_norm, linear
 
 from vjepa2_ac.config import ModelSizes
+from vjepa2_ac.config.model import FramePath
 from vjepa2_ac.model.network.blocks import NORM_EPSILON, initialise, output_std, without_needless_autocast
 from vjepa2_ac.model.network.rotary import TokenLayout, rotary_tables, rotate
 from vjepa2_ac.model.quiet_imports import quiet_imports
@@ -21,6 +22,8 @@ with quiet_imports():
     from transformers.models.vjepa2.modeling_vjepa2 import VJEPA2Encoder, VJEPA2RopeAttention
 
 TUBELET = 2  # frames per tubelet: of a still the same one twice, of a video two
+_GRID_OF_POSITIONS = 16  # V-JEPA 2.1 scales the positions of any grid to those of 256 px
+_LEVELS = 4  # of V-JEPA 2.1, each with a norm of its own; the last one's is the last norm
 
 
 class Encoder(nn.Module):
@@ -28,16 +31,25 @@ class Encoder(nn.Module):
 
     The network is the encoder of transformers' `VJEPA2Model` (its masked predictor is never built), with rotary
     tables computed once and in float32 (transformers computes angles in the type of the weights), and with patches
-    embedded by one matrix product.
+    embedded by one matrix product. V-JEPA 2.1 has other rotary positions, and adds a learned vector for the kind of
+    input, a video's or an image's, to every patch; its weights that no output here depends on (norms of lower levels,
+    the patches of the other kind) are kept, so that a file can be written again.
     """
 
     def __init__(self, sizes: ModelSizes) -> None:
         super().__init__()
         self.image_size = sizes.image_size
         self.vit = VJEPA2Encoder(_config(sizes))
-        self.vit.embeddings.patch_embeddings.proj = _FramePatches(sizes.encoder.width, sizes.patch_size)
-        _share_exact_tables(self.vit, TokenLayout(1, sizes.image_size // sizes.patch_size))
-        self.vit.layernorm = _PreciseNorm(sizes.encoder.width, eps=NORM_EPSILON)
+        width, grid = sizes.encoder.width, sizes.image_size // sizes.patch_size
+        if sizes.encoder.family == "v2":
+            patches, layout = _FramePatches(width, sizes.patch_size), TokenLayout(1, grid)
+        else:
+            patches = _PatchesByKind(width, sizes.patch_size, sizes.encoder.frame)
+            layout = TokenLayout(1, grid, interleaved=True, scaled_to=_GRID_OF_POSITIONS)
+            self.vit.level_norms = nn.ModuleList(nn.LayerNorm(width, eps=NORM_EPSILON) for _ in range(_LEVELS - 1))
+        self.vit.embeddings.patch_embeddings.proj = patches
+        _share_exact_tables(self.vit, layout)
+        self.vit.layernorm = _PreciseNorm(width, eps=NORM_EPSILON)
         self.requires_grad_(False)
         self.eval()
 
@@ -89,6 +101,9 @@ class Encoder(nn.Module):
         """
         for module in self.modules():
             initialise(module, generator)
+            if isinstance(module, _PatchesByKind):
+                nn.init.zeros_(module.video_kind)
+                nn.init.zeros_(module.image_kind)
         for index, block in enumerate(self.vit.layer):
             for output in (block.attention.proj, block.mlp.fc2):
                 nn.init.trunc_normal_(output.weight, std=output_std(index + 1), generator=generator)
@@ -133,10 +148,14 @@ class _FramePatches(nn.Conv3d):
         self, tubelets: Float[Tensor, "frames 3 time height width"]
     ) -> Float[Tensor, "frames dim 1 rows columns"]:
         """Return the result of the convolution for tubelets of identical frames."""
+        return self._embedded(tubelets[:, :, 0], self)
+
+    def _embedded(
+        self, frames: Float[Tensor, "frames 3 height width"], layer: nn.Conv3d
+    ) -> Float[Tensor, "frames dim 1 rows columns"]:
         side = self.kernel_size[-1]
-        frames = tubelets[:, :, 0]
         patches = rearrange(frames, "n c (rows p) (columns q) -> n (rows columns) (c p q)", p=side, q=side)
-        embedded = linear(patches, self.weight.sum(dim=2).flatten(1), self.bias)
+        embedded = linear(patches, layer.weight.sum(dim=2).flatten(1), layer.bias)
         rows = frames.shape[-2] // side
         return rearrange(embedded, "n (time rows columns) dim -> n dim time rows columns", time=1, rows=rows)
 
@@ -145,6 +164,37 @@ class _FramePatches(nn.Conv3d):
         form = "n c (time t) (rows p) (columns q) -> n (time rows columns) (c t p q)"
         patches = rearrange(videos, form, t=TUBELET, p=self.kernel_size[-1], q=self.kernel_size[-1])
         return linear(patches, self.weight.flatten(1), self.bias)
+
+
+class _PatchesByKind(_FramePatches):
+    """The patch embeddings of V-JEPA 2.1: of tubelets and of images, each with a vector that says which they are.
+
+    Source: facebookresearch/vjepa2 @ 204698b, app/vjepa_2_1/models/vision_transformer.py.
+    """
+
+    def __init__(self, width: int, patch_size: int, frame: FramePath) -> None:
+        super().__init__(width, patch_size)
+        kernel = (1, patch_size, patch_size)
+        self.frame = frame
+        self.of_images = nn.Conv3d(3, width, kernel_size=kernel, stride=kernel)
+        self.video_kind = nn.Parameter(torch.zeros(1, 1, width))
+        self.image_kind = nn.Parameter(torch.zeros(1, 1, width))
+
+    def forward(
+        self, tubelets: Float[Tensor, "frames 3 time height width"]
+    ) -> Float[Tensor, "frames dim 1 rows columns"]:
+        """Return the patches of frames: as tubelets of identical frames, or as images."""
+        if self.frame == "tubelet":
+            return super().forward(tubelets) + _as_channels(self.video_kind)
+        return self._embedded(tubelets[:, :, 0], self.of_images) + _as_channels(self.image_kind)
+
+    def of_videos(self, videos: Float[Tensor, "batch 3 time height width"]) -> Float[Tensor, "batch tokens dim"]:
+        """Return the patches of tubelets of two real frames, as tokens."""
+        return super().of_videos(videos) + self.video_kind
+
+
+def _as_channels(vector: Float[Tensor, "1 1 dim"]) -> Float[Tensor, "1 dim 1 1 1"]:
+    return vector.flatten()[None, :, None, None, None]
 
 
 class _ExactAttention(VJEPA2RopeAttention):  # type: ignore[misc]  # transformers has no types

@@ -15,9 +15,15 @@ from vjepa2_ac.model.network.world_model import FreshHeads, WorldModel
 
 
 def heads_to_replace(sizes: ModelSizes, widths: Widths) -> tuple[str, ...]:
-    """Return the input heads of a model of these sizes that do not fit states and actions of these widths."""
-    own = widths_of_model(sizes)
-    fits = {"action_encoder": own.action == widths.action, "state_encoder": own.state == widths.state}
+    """Return the input heads of a model of these sizes that do not fit states and actions of these widths.
+
+    States of any width fit a model without states.
+    """
+    own = sizes.predictor
+    fits = {
+        "action_encoder": own.action_dim == widths.action,
+        "state_encoder": not own.use_states or own.state_dim == widths.state,
+    }
     return tuple(name for name, does in fits.items() if not does)
 
 
@@ -66,7 +72,8 @@ def fit_heads(model: WorldModel, widths: Widths, seed: int) -> list[str]:
         initialise(head, _generator(seed, name))
         setattr(predictor, name, head.to(own.weight.device, own.weight.dtype).requires_grad_(False))
         lines.append(f"{_as_text([name])}: {width} numbers instead of the base's {own.in_features}: initialised anew")
-    dims = {"action_dim": widths.action, "state_dim": widths.state}
+    dims = {"action_dim": widths.action}
+    dims |= {"state_dim": widths.state} if model.sizes.predictor.use_states else {}
     predictor.config.update(dims)
     model.sizes = model.sizes.model_copy(update={"predictor": model.sizes.predictor.model_copy(update=dims)})
     model.fresh_heads = FreshHeads(replaced, seed)
@@ -74,8 +81,19 @@ def fit_heads(model: WorldModel, widths: Widths, seed: int) -> list[str]:
 
 
 def widths_of_model(sizes: ModelSizes) -> Widths:
-    """Return the widths of a model's states and actions."""
-    return Widths(state=sizes.predictor.state_dim, action=sizes.predictor.action_dim)
+    """Return the widths of a model's states and actions; without states, that of its actions for both.
+
+    A plan changes states by actions: where the model does not tell the width of a state, it is that of an action.
+    """
+    own = sizes.predictor
+    return Widths(state=own.state_dim if own.use_states else own.action_dim, action=own.action_dim)
+
+
+def widths_as_text(sizes: ModelSizes) -> str:
+    """Return which states and actions a model takes, for messages."""
+    own = sizes.predictor
+    states = f"states of {own.state_dim}" if own.use_states else "any states"
+    return f"{states} and actions of {own.action_dim} numbers"
 
 
 def _generator(seed: int, name: str) -> Generator:

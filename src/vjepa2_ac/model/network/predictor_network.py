@@ -21,7 +21,7 @@ from vjepa2_ac.model.network.rotary import TokenLayout, rotary_tables
 class PredictorNetwork(nn.Module):
     """Predicts, for every step, the latents of the next one from the latents, states and actions up to it.
 
-    The tokens of a step, in order: action, state, (extrinsics), patches. Output: patches only, not normalised.
+    The tokens of a step, in order: action, (state), (extrinsics), patches. Output: patches only, not normalised.
 
     Source: facebookresearch/vjepa2 @ c2963a4, src/models/ac_predictor.py, VisionTransformerPredictorAC.
     """
@@ -37,8 +37,10 @@ class PredictorNetwork(nn.Module):
         hidden = hidden_width(width, config.mlp_ratio)
         self.predictor_embed = nn.Linear(config.latent_dim, width)
         self.action_encoder = nn.Linear(config.action_dim, width)
-        self.state_encoder = nn.Linear(config.state_dim, width)
-        self.extrinsics_encoder = nn.Linear(EXTRINSICS_DIM, width)  # always exists, as in the official checkpoint
+        if config.use_states:
+            self.state_encoder = nn.Linear(config.state_dim, width)
+        if config.use_states or config.use_extrinsics:  # with states always, as in the official checkpoint
+            self.extrinsics_encoder = nn.Linear(EXTRINSICS_DIM, width)
         self.blocks = nn.ModuleList(
             Block(width, config.num_attention_heads, hidden, layer=index + 1)
             for index in range(config.num_hidden_layers)
@@ -57,7 +59,7 @@ class PredictorNetwork(nn.Module):
     @property
     def unused_layers(self) -> tuple[str, ...]:
         """Layers without input."""
-        return () if self.config.use_extrinsics else ("extrinsics_encoder",)
+        return ("extrinsics_encoder",) if self.config.use_states and not self.config.use_extrinsics else ()
 
     def forward(
         self,
@@ -75,7 +77,7 @@ class PredictorNetwork(nn.Module):
         Args:
             latents: Latents of consecutive steps.
             actions: The action of each.
-            states: The state of each.
+            states: The state of each; not used, and of any width, where the model has no states.
             extrinsics: The camera of each, where the model uses it.
             cache: The steps come after those in the cache, and see them; then they are added to it.
             keep: How many of the steps are added, from the first; None: all.
@@ -108,7 +110,8 @@ class PredictorNetwork(nn.Module):
             raise ValueError(
                 f"use_extrinsics is {self.config.use_extrinsics}, extrinsics given: {extrinsics is not None}"
             )
-        given = [(self.action_encoder, actions), (self.state_encoder, states)]
+        given = [(self.action_encoder, actions)]
+        given += [(self.state_encoder, states)] if self.config.use_states else []
         given += [] if extrinsics is None else [(self.extrinsics_encoder, extrinsics)]
         conditions = [_in_own_type(layer, values, self._dtype) for layer, values in given]
         patches = _in_own_type(self.predictor_embed, latents, self._dtype)
@@ -155,6 +158,7 @@ def predictor_fields(sizes: ModelSizes) -> dict[str, Any]:
         "num_attention_heads": sizes.predictor.heads,
         "mlp_ratio": sizes.predictor.mlp_ratio,
         "use_extrinsics": sizes.predictor.use_extrinsics,
+        "use_states": sizes.predictor.use_states,
         "action_dim": sizes.predictor.action_dim,
         "state_dim": sizes.predictor.state_dim,
     }

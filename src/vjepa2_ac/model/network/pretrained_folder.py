@@ -13,20 +13,21 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from vjepa2_ac import storage
-from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.finite import require_finite
+from vjepa2_ac.model.network.encoder_origin import EncoderOrigin
 from vjepa2_ac.model.sizes import CONFIG, FORMAT
+from vjepa2_ac.storage.structured import read_json_object, record_of
 
 ENCODER, PREDICTOR = "encoder.safetensors", "predictor/model.safetensors"
 
 
-def write_folder(folder: Path, sizes: ModelSizes, encoder: nn.Module, predictor: Any) -> None:
+def write_folder(folder: Path, card: dict[str, Any], encoder: nn.Module, predictor: Any) -> None:
     """Write a model to a temporary folder, then move it, config.json last: a folder that has one is complete.
 
     Args:
         folder: Where the model goes; an existing one is replaced.
-        sizes: Sizes of the model.
+        card: Sizes of the model, and the origin of its encoder where that is known.
         encoder: The encoder.
         predictor: The predictor: a transformers model.
 
@@ -42,8 +43,20 @@ def write_folder(folder: Path, sizes: ModelSizes, encoder: nn.Module, predictor:
             raise InputError(where=str(folder), found=f"cannot be written: {error}") from None
         predictor.config.architectures = [type(predictor).__name__]
         predictor.config.save_pretrained(fresh / "predictor")
-        card = {"format": FORMAT, "sizes": sizes.model_dump(mode="json")}
-        (fresh / CONFIG).write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
+        (fresh / CONFIG).write_text(json.dumps({"format": FORMAT, **card}, indent=1) + "\n", encoding="utf-8")
+
+
+def read_encoder_origin(folder: Path) -> EncoderOrigin | None:
+    """Return where the encoder of a model in a folder came from; None: nobody knows, or it belongs to the model.
+
+    Raises:
+        InputError: The folder says it in a way that nobody understands.
+    """
+    told = read_json_object(folder / CONFIG, needed="the config of a world model").get("encoder_origin")
+    if told is None:
+        return None
+    where, needed = f"{folder / CONFIG}: encoder_origin", "file, key and licence of an encoder"
+    return record_of(EncoderOrigin, told if isinstance(told, dict) else {}, where=where, needed=needed)
 
 
 def load_safetensors(module: nn.Module, path: Path, dtype: torch.dtype | None) -> None:

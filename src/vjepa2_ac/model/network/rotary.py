@@ -22,6 +22,8 @@ class TokenLayout:
     grid: int
     conditioning: int = 0
     start: int = 0  # the first step's position in time
+    interleaved: bool = False  # V-JEPA 2.1: the two of a pair have one frequency
+    scaled_to: int | None = None  # V-JEPA 2.1: rows and columns of any grid are at the places of one of so many
 
     @property
     def tokens_per_step(self) -> int:
@@ -46,13 +48,15 @@ def rotary_tables(layout: TokenLayout, head_dim: int, device: torch.device) -> R
     """Return the rotary tables of a sequence; the same tables for the same shape.
 
     The head is cut into three equal parts of 2*((head_dim//3)//2) for time, height and width; the rest is not rotated.
-    Conditioning tokens are rotated in the time part only. Pairs are neighbours (2i, 2i+1), yet the frequencies are
-    tiled ([w0..w9, w0..w9]), not interleaved: the released weights were trained so.
+    Conditioning tokens are rotated in the time part only. Pairs are neighbours (2i, 2i+1), yet in V-JEPA 2 and every
+    predictor the frequencies are tiled ([w0..w9, w0..w9]): the released weights were trained so. In V-JEPA 2.1 they are
+    interleaved ([w0, w0, w1, w1, ..]).
 
     Raises:
         ValueError: The head has no pairs to rotate: its size is odd.
 
-    Source: facebookresearch/vjepa2 @ c2963a4, src/models/utils/modules.py, rotate_queries_or_keys and ACRoPEAttention.
+    Source: facebookresearch/vjepa2 @ c2963a4, src/models/utils/modules.py, rotate_queries_or_keys and ACRoPEAttention;
+    of V-JEPA 2.1 @ 204698b, app/vjepa_2_1/models/utils/modules.py.
     """
     if head_dim % 2:
         raise ValueError(f"a head of {head_dim} cannot be rotated in pairs: width / heads must be even")
@@ -61,7 +65,8 @@ def rotary_tables(layout: TokenLayout, head_dim: int, device: torch.device) -> R
     with torch.inference_mode(False), torch.no_grad():
         places = _places(layout, device)
         frequencies = 1.0 / THETA ** (torch.arange(part // 2, dtype=torch.float32, device=device) / (part / 2))
-        angles = (places[..., None] * frequencies).repeat(1, 1, 2).flatten(1)
+        pairs = frequencies.repeat_interleave(2) if layout.interleaved else frequencies.repeat(2)
+        angles = (places[..., None] * pairs).flatten(1)
         angles = torch.nn.functional.pad(angles, (0, head_dim - 3 * part))
         sign = torch.tensor([-1.0, 1.0], device=device).repeat((head_dim + 1) // 2)[:head_dim]
         return RotaryTables(angles.cos()[:, None], (angles.sin() * sign)[:, None])
@@ -108,6 +113,8 @@ def _swapped(tokens: Tensor) -> Tensor:
 def _places(layout: TokenLayout, device: torch.device) -> Float32[Tensor, "sequence 3"]:
     """Return time, height and width of every token; conditioning tokens have only a time."""
     grid = torch.arange(layout.grid, dtype=torch.float32, device=device)
+    if layout.scaled_to is not None:
+        grid = grid * (layout.scaled_to - 1) / (layout.grid - 1)
     patches = torch.cartesian_prod(grid, grid)
     space = torch.cat([torch.zeros(layout.conditioning, 2, device=device), patches]).repeat(layout.steps, 1)
     steps = torch.arange(layout.start, layout.start + layout.steps, dtype=torch.float32, device=device)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -16,8 +16,15 @@ from torch import Tensor, nn
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.model.network.dynamics import LatentDynamics, normalise_latents
 from vjepa2_ac.model.network.encoder import Encoder
+from vjepa2_ac.model.network.encoder_origin import EncoderOrigin, beyond_tensors, described, identified
 from vjepa2_ac.model.network.predictor import ActionConditionedPredictor, PredictorConfig
-from vjepa2_ac.model.network.pretrained_folder import ENCODER, PREDICTOR, load_safetensors, write_folder
+from vjepa2_ac.model.network.pretrained_folder import (
+    ENCODER,
+    PREDICTOR,
+    load_safetensors,
+    read_encoder_origin,
+    write_folder,
+)
 from vjepa2_ac.model.sizes import read_sizes
 
 
@@ -66,6 +73,7 @@ class WorldModel(LatentDynamics):
         self.adaptation: Adaptation | None = None
         self.fresh_heads: FreshHeads | None = None
         self.merged_from: tuple[str, str, str] | None = None  # fingerprints of encoder, base and adapted predictor
+        self.encoder_origin: EncoderOrigin | None = None  # of an encoder that was read by itself
 
     @classmethod
     def random(
@@ -90,6 +98,15 @@ class WorldModel(LatentDynamics):
             model.base_predictor.start_at_persistence(generator)
         return model.to(dtype)
 
+    def draw_predictor(self, seed: int, dtype: torch.dtype, *, at_persistence: bool = False) -> None:
+        """Initialise the predictor, which may be without weights: the encoder is one that was read."""
+        predictor = self.base_predictor.to_empty(device="cpu")
+        generator = torch.Generator().manual_seed(seed)
+        predictor.initialise(generator)
+        if at_persistence:
+            predictor.start_at_persistence(generator)
+        predictor.to(dtype)
+
     @classmethod
     def empty(cls, sizes: ModelSizes) -> WorldModel:
         """Return a model without weights (on the meta device), for loaders to fill; in eval mode."""
@@ -105,6 +122,7 @@ class WorldModel(LatentDynamics):
         """
         folder = Path(folder)
         model = cls.empty(read_sizes(folder))
+        model.encoder_origin = read_encoder_origin(folder)
         load_safetensors(model.encoder, folder / ENCODER, dtype)
         load_safetensors(model.predictor, folder / PREDICTOR, dtype)
         return model
@@ -119,7 +137,10 @@ class WorldModel(LatentDynamics):
         """
         if self.predictor is not self.base_predictor:
             raise ValueError("an adapter is on: merge_adapter makes it part of the model, save_trained saves it alone")
-        write_folder(Path(folder), self.sizes, self.present_encoder, self.predictor)
+        card = {"sizes": self.sizes.model_dump(mode="json")}
+        if self.encoder_origin is not None:
+            card["encoder_origin"] = asdict(self.encoder_origin)
+        write_folder(Path(folder), card, self.present_encoder, self.predictor)
 
     @property
     def image_size(self) -> int:
@@ -172,7 +193,17 @@ class WorldModel(LatentDynamics):
         """Return a hash of the encoder: part of the key of cached latents."""
         if isinstance(self.encoder, AbsentEncoder):
             return self.encoder.fingerprint
-        return fingerprint(self.encoder.state_dict())
+        return identified(fingerprint(self.encoder.state_dict()), self.encoder_beyond_tensors)
+
+    @property
+    def encoder_beyond_tensors(self) -> dict[str, str | int]:
+        """What its latents depend on and its tensors do not show: family, frame path and heads, where they matter."""
+        return beyond_tensors(self.sizes.encoder, heads_are_told=self.encoder_origin is not None)
+
+    @property
+    def encoder_in_words(self) -> str:
+        """The encoder and where it came from, for cards."""
+        return described(self.sizes.encoder, self.encoder_origin)
 
     def predictor_fingerprint(self) -> str:
         """Return a hash of the predictor's own weights; independent of an adapter and of fresh heads."""

@@ -44,7 +44,7 @@ def clip_flops(config: Config, sizes: ModelSizes) -> ClipFlops:
 
     Args:
         config: What is trained, frames and rollout.
-        sizes: Sizes of its model, such as `model.base_model.base_sizes` gives.
+        sizes: Sizes of its model, such as `model.checkpoints.loading.base_sizes` gives.
     """
     passes = _Passes(sizes, config)
     frames, training = config.data.frames, config.training
@@ -104,7 +104,7 @@ class _Passes:
         elif config is not None:
             self._ranks, self._whole = adapter_ranks(network, config.adapter), set(config.adapter.modules_to_save)
         conditions = ("action_encoder", "state_encoder", "extrinsics_encoder")
-        self._conditions = [name for name in conditions if name not in network.unused_layers]
+        self._conditions = [name for name in conditions if name in self._layers and name not in network.unused_layers]
 
     def over(self, steps: int, *, keys: range, fed_back: bool) -> _Work:
         """Return the work of a pass.

@@ -66,7 +66,7 @@ def estimate_memory(config: Config, sizes: ModelSizes, device: Kind = "cuda") ->
 
     Args:
         config: The run.
-        sizes: Sizes of its model, such as `model.base_model.base_sizes` gives.
+        sizes: Sizes of its model, such as `model.checkpoints.loading.base_sizes` gives.
         device: The device type whose rules for saved tensors apply.
 
     Raises:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from vjepa2_ac.config import DataConfig
@@ -17,7 +17,10 @@ from vjepa2_ac.storage.structured import shown
 NORMALISATION = 1  # of pixels, in `transforms.pixels_to_input`, and of features: increase it when one of them changes
 
 _OF_THE_FRAMES = {"source", "camera", "pose_frame", "cache_dtype"}  # the other knobs are of clips
-OF_ENCODING = ("encoder", "image_size", "patch_size", "normalisation", "model.dtype", "training.precision")
+OF_ENCODING = (
+    "encoder", "image_size", "patch_size", "normalisation", "model.dtype", "training.precision",
+    "encoder.family", "encoder.frame", "encoder.heads",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,7 @@ class Encoding:
     dim: int
     weights: str  # model.dtype
     precision: str  # training.precision
+    beyond: Mapping[str, str | int] = field(default_factory=dict)  # WorldModel.encoder_beyond_tensors
 
     @property
     def parts(self) -> dict[str, Any]:
@@ -46,6 +50,7 @@ class Encoding:
             "normalisation": NORMALISATION,
             "model.dtype": self.weights,
             "training.precision": self.precision,
+            **self.beyond,
         }
 
 

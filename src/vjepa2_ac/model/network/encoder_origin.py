@@ -1,0 +1,59 @@
+"""Where an encoder came from, and what identifies it beyond its tensors."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from vjepa2_ac.config import EncoderSizes
+from vjepa2_ac.model.network.published_sizes import HEADS
+
+
+@dataclass(frozen=True)
+class EncoderOrigin:
+    """The file or repository that an encoder was read from."""
+
+    file: str  # its name
+    key: str = ""  # of the weights in it; "" of a folder
+    licence: str = ""  # where it is known
+
+    def __str__(self) -> str:
+        key = f", {self.key}" if self.key else ""
+        return f"{self.file}{key}{f' ({self.licence})' if self.licence else ''}"
+
+
+def beyond_tensors(sizes: EncoderSizes, *, heads_are_told: bool) -> dict[str, str | int]:
+    """Return what latents depend on and tensors do not show; nothing of V-JEPA 2's tubelets with the published heads.
+
+    Args:
+        sizes: Of the encoder.
+        heads_are_told: Whether the heads belong to it. Those of a model of before were not asked for: its caches stay.
+    """
+    found: dict[str, str | int] = {}
+    if sizes.family != "v2":
+        found |= {"encoder.family": sizes.family, "encoder.frame": sizes.frame}
+    if heads_are_told and HEADS.get(sizes.width) != sizes.heads:
+        found["encoder.heads"] = sizes.heads
+    return found
+
+
+def identified(fingerprint: str, beyond: Mapping[str, str | int]) -> str:
+    """Return the fingerprint of an encoder: that of its tensors, with what they do not show.
+
+    Args:
+        fingerprint: Of the tensors.
+        beyond: As `beyond_tensors` gives it; where there is nothing, the fingerprint stays that of the tensors,
+            whatever file they came from.
+    """
+    if not beyond:
+        return fingerprint
+    return hashlib.sha256(json.dumps([fingerprint, dict(beyond)], sort_keys=True).encode()).hexdigest()
+
+
+def described(sizes: EncoderSizes, origin: EncoderOrigin | None) -> str:
+    """Return an encoder in words, for cards."""
+    frame = "" if sizes.family == "v2" else f", each frame as {'a tubelet' if sizes.frame == 'tubelet' else 'an image'}"
+    text = f"V-JEPA {sizes.family[1:]}, {sizes.depth} blocks of {sizes.width}, {sizes.heads} heads{frame}"
+    return text if origin is None else f"{text}; from {origin}"

@@ -1,0 +1,429 @@
+"""Encoders of both families: the official code's own numbers, every form of file, and what is never silently wrong."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from hub import serve_hub
+from paths import GOLDEN
+from vjepa2_ac.config import EncoderSizes, ModelConfig
+from vjepa2_ac.errors import InputError, RefusedError, UnreachableError
+from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.checkpoints.official import load_official, to_official
+from vjepa2_ac.model.network.encoder_origin import beyond_tensors, identified
+from vjepa2_ac.model.network.world_model import WorldModel, fingerprint
+
+FILES = GOLDEN / "encoders"
+V2, V21 = FILES / "vjepa2_pretrained.pt", FILES / "vjepa2_1_distilled.pt"
+HEADS = {V2: 3, V21: 4}
+
+
+class Golden(NamedTuple):
+    path: Path
+    facts: dict[str, Any]
+    io: dict[str, Tensor]
+    is_newer: bool
+
+
+@pytest.fixture(scope="module", params=[V2, V21], ids=["2", "2.1"])
+def golden(request: pytest.FixtureRequest) -> Golden:
+    path: Path = request.param
+    facts = json.loads(path.with_suffix(".json").read_text())
+    return Golden(path, facts, load_file(path.with_suffix(".io.safetensors")), path == V21)
+
+
+def model_of(path: Path | str, size: int = 96, dtype: str = "float32", **encoder: Any) -> WorldModel:
+    """Return a model with the encoder of a file, and a small fresh predictor."""
+    known = {"heads": HEADS[path]} if path in HEADS else {}
+    predictor = {"width": 24, "depth": 1, "heads": 2}
+    config = {
+        "encoder": {"path": str(path), **known, **encoder},
+        "random": {"image_size": size, "predictor": predictor},
+        "dtype": dtype,
+    }
+    return load_base(ModelConfig.model_validate(config), seed=0)
+
+
+def assert_equal_to_rounding(found: Tensor, expected: Tensor) -> None:
+    """Within 1e-5 of the largest value: fp32 rounding of sums in another order."""
+    assert found.shape == expected.shape
+    assert (found - expected).abs().max() <= 1e-5 * expected.abs().max()
+
+
+def test_features_and_latents_equal_the_official_ones_at_every_size(golden: Golden) -> None:
+    for size in map(int, golden.facts["sizes_px"]):
+        model, io = model_of(golden.path, size), golden.io
+        assert_equal_to_rounding(model.present_encoder(io[f"frames.{size}"]), io[f"tubelet.{size}"])
+        assert_equal_to_rounding(model.encode(io[f"frames.{size}"][None])[0], io[f"latents.{size}"])
+
+
+def test_the_image_path_equals_the_official_one_at_every_size() -> None:
+    io = load_file(V21.with_suffix(".io.safetensors"))
+    for size in (96, 80, 256):
+        model = model_of(V21, size, frame="image")
+        assert_equal_to_rounding(model.present_encoder(io[f"frames.{size}"]), io[f"image.{size}"])
+
+
+@pytest.mark.parametrize("frame", ["tubelet", "image"])
+def test_a_video_equals_the_official_one(golden: Golden, frame: str) -> None:
+    size = golden.facts["video_px"]
+    if frame == "image" and not golden.is_newer:
+        return
+    video = golden.io[f"video.{size}"].transpose(1, 2)
+    found = model_of(golden.path, size, frame=frame).present_encoder.encode_videos(video)
+    assert_equal_to_rounding(found, golden.io[f"video_features.{size}"])
+
+
+def test_another_key_is_another_encoder(golden: Golden) -> None:
+    name = next(name for name in golden.io if name.startswith("other_key_tubelet."))
+    size = int(name.rpartition(".")[2])
+    model = model_of(golden.path, size, key="encoder")
+    assert_equal_to_rounding(model.present_encoder(golden.io[f"frames.{size}"]), golden.io[name])
+    usual = model_of(golden.path, size)
+    assert model.encoder_fingerprint() != usual.encoder_fingerprint()
+    assert usual.encoder_origin is not None
+    assert usual.encoder_origin.key == golden.facts["checkpoint"]["encoder_key"]
+
+
+def test_norms_of_lower_levels_are_where_they_belong() -> None:
+    """No output of ours depends on them; an export must not mix them up."""
+    io, encoder = load_file(V21.with_suffix(".io.safetensors")), model_of(V21).present_encoder
+    levels: list[Tensor] = []
+    hooks = [
+        encoder.vit.layer[index].register_forward_hook(
+            lambda _, __, out: levels.append(out[0] if isinstance(out, tuple) else out)
+        )
+        for index in (2, 5, 8, 11)
+    ]
+    name = next(name for name in io if name.startswith("hierarchical."))
+    encoder(io[name.replace("hierarchical", "frames")])
+    for hook in hooks:
+        hook.remove()
+    norms = [*encoder.vit.level_norms, encoder.vit.layernorm]
+    found = torch.cat([norm(level) for norm, level in zip(norms, levels, strict=True)], dim=-1)
+    assert_equal_to_rounding(found, io[name])
+
+
+def test_the_file_says_what_it_is(golden: Golden) -> None:
+    sizes, constructor = model_of(golden.path).sizes.encoder, golden.facts["constructor"]
+    assert (sizes.width, sizes.depth, sizes.heads) == tuple(
+        constructor[name] for name in ("embed_dim", "depth", "num_heads")
+    )
+    assert sizes.family == ("v2.1" if golden.is_newer else "v2")
+    assert round(sizes.width * sizes.mlp_ratio) == golden.facts["mlp_hidden"]
+
+
+def test_in_bfloat16_the_weights_are_rounded(golden: Golden) -> None:
+    exact, rounded = model_of(golden.path).encoder, model_of(golden.path, dtype="bfloat16").encoder
+    for name, value in rounded.state_dict().items():
+        assert torch.equal(value, exact.state_dict()[name].bfloat16()), name
+
+
+def test_a_fresh_predictor_is_the_same_for_the_same_seed_and_the_encoder_is_the_files(golden: Golden) -> None:
+    first, again = model_of(golden.path), model_of(golden.path)
+    assert first.predictor_fingerprint() == again.predictor_fingerprint()
+    assert first.encoder_fingerprint() == again.encoder_fingerprint()
+    assert not any(value.requires_grad for value in first.parameters())
+
+
+# Every other form of file gives the same latents.
+
+
+def as_plain(weights: dict[str, Tensor]) -> dict[str, Tensor]:
+    masked = {"predictor.embeddings.mask_tokens": torch.zeros(2, 3)}
+    return only_encoder(weights) | masked
+
+
+def only_encoder(weights: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {name.replace("vit.", "encoder.", 1): value for name, value in weights.items()}
+
+
+def as_classifier(weights: dict[str, Tensor]) -> dict[str, Tensor]:
+    head = {"classifier.weight": torch.zeros(5, 48), "pooler.query_tokens": torch.zeros(1, 1, 48)}
+    return {f"vjepa2.{name}": value for name, value in as_plain(weights).items()} | head
+
+
+CARD = {
+    "model_type": "vjepa2", "hidden_size": 48, "num_hidden_layers": 6, "num_attention_heads": 3, "mlp_ratio": 4.0,
+    "crop_size": 96, "patch_size": 16, "tubelet_size": 2, "hidden_act": "gelu", "qkv_bias": True,
+    "layer_norm_eps": 1e-06, "frames_per_clip": 64, "architectures": ["VJEPA2Model"],
+}  # fmt: skip
+Named = Callable[[dict[str, Tensor]], dict[str, Tensor]]
+
+
+def write_transformers(folder: Path, named: Named = as_plain, shards: int = 1, **card: Any) -> Path:
+    """Write the golden of V-JEPA 2 as transformers does."""
+    folder.mkdir()
+    (folder / "config.json").write_text(json.dumps(CARD | card))
+    weights = {name: value.clone() for name, value in named(dict(model_of(V2).encoder.state_dict())).items()}
+    if shards == 1:
+        save_file(weights, folder / "model.safetensors", metadata={"format": "pt"})
+        return folder
+    index = {}
+    for shard in range(shards):
+        file = f"model-{shard + 1:05}-of-{shards:05}.safetensors"
+        own = dict(list(weights.items())[shard::shards])
+        save_file(own, folder / file, metadata={"format": "pt"})
+        index |= dict.fromkeys(own, file)
+    (folder / "model.safetensors.index.json").write_text(json.dumps({"metadata": {}, "weight_map": index}))
+    return folder
+
+
+@pytest.mark.parametrize(("named", "shards"), [(as_plain, 1), (as_plain, 3), (as_classifier, 1)])
+def test_a_transformers_folder_is_the_same_encoder(tmp_path: Path, named: Named, shards: int) -> None:
+    model, original = model_of(write_transformers(tmp_path / "hf", named, shards)), model_of(V2)
+    assert model.sizes == original.sizes
+    assert model.encoder_fingerprint() == original.encoder_fingerprint()
+    frames = load_file(V2.with_suffix(".io.safetensors"))["frames.96"][None]
+    assert torch.equal(model.encode(frames), original.encode(frames))
+
+
+def test_transformers_own_class_reads_and_computes_the_same(tmp_path: Path) -> None:
+    """So the folder of these tests is in the true format."""
+    from transformers import VJEPA2Model
+
+    folder = write_transformers(tmp_path / "hf", only_encoder)
+    theirs = VJEPA2Model.from_pretrained(folder).eval()
+    frames = load_file(V2.with_suffix(".io.safetensors"))["frames.96"]
+    with torch.no_grad():
+        found = theirs(frames[:, None].expand(-1, 2, -1, -1, -1), skip_predictor=True).last_hidden_state
+    assert_equal_to_rounding(model_of(folder).present_encoder(frames), found)
+
+
+def test_the_same_from_the_hub_and_then_without_a_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from huggingface_hub import constants
+
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
+    with serve_hub({"facebook/tiny": write_transformers(tmp_path / "hf")}):
+        model = model_of("hf://facebook/tiny")
+        assert model.encoder_fingerprint() == model_of(V2).encoder_fingerprint()
+        assert str(model.encoder_origin) == "hf://facebook/tiny"
+        for wrong, said in (("facebook/none", "no such model"), ("facebook/tiny@v9", "no such revision")):
+            with pytest.raises(RefusedError, match=said):
+                model_of(f"hf://{wrong}")
+    again = model_of("hf://facebook/tiny")  # out of the cache
+    assert again.encoder_fingerprint() == model.encoder_fingerprint()
+    with pytest.raises(UnreachableError, match="the Hub cannot be reached"):
+        model_of("hf://facebook/other")
+
+
+@pytest.mark.parametrize("frame", ["tubelet", "image"])
+def test_a_folder_of_this_project_and_an_official_file_bring_it_back(
+    golden: Golden, tmp_path: Path, frame: str
+) -> None:
+    if frame == "image" and not golden.is_newer:
+        return
+    model = model_of(golden.path, frame=frame)
+    model.save_pretrained(tmp_path / "model")
+    again = WorldModel.from_pretrained(tmp_path / "model")
+    assert again.sizes == model.sizes
+    assert again.encoder_origin == model.encoder_origin
+    assert again.encoder_fingerprint() == model.encoder_fingerprint()
+    under_another = model_of(tmp_path / "model", frame=frame)
+    assert under_another.encoder_fingerprint() == model.encoder_fingerprint()
+    frames = golden.io["frames.96"][None]
+    assert torch.equal(under_another.encode(frames), model.encode(frames))
+    torch.save(to_official(model), tmp_path / "official.pt")
+    official = load_official(tmp_path / "official.pt", model.sizes)
+    assert official.sizes == model.sizes
+    for name, value in official.state_dict().items():
+        assert torch.equal(value, model.state_dict()[name]), name
+
+
+def test_an_official_file_has_metas_names_for_every_tensor(golden: Golden) -> None:
+    whole = torch.load(golden.path, weights_only=True)
+    theirs = whole[golden.facts["checkpoint"]["encoder_key"]]
+    ours = to_official(model_of(golden.path))["encoder"]
+    assert {name.removeprefix("module.") for name in ours} == {name.removeprefix("module.backbone.") for name in theirs}
+    for name, value in ours.items():
+        assert torch.equal(value, theirs[name.replace("module.", "module.backbone.", 1)]), name
+
+
+# What would be wrong without an error is refused, with the way out.
+
+
+@pytest.fixture
+def rewritten(tmp_path: Path) -> Callable[[Path, Callable[[dict[str, Any]], Any], str], Path]:
+    """Write a golden file again, changed by a function of what is in it."""
+
+    def rewrite(path: Path, change: Callable[[dict[str, Any]], Any], name: str = "changed.pt") -> Path:
+        whole = torch.load(path, weights_only=True)
+        changed = change(whole)
+        torch.save(whole if changed is None else changed, tmp_path / name)
+        HEADS[tmp_path / name] = HEADS[path]
+        return tmp_path / name
+
+    return rewrite
+
+
+P = "module.backbone."
+
+
+def without_last_norm(whole: dict[str, Any]) -> None:
+    for kind in ("weight", "bias"):
+        del whole["ema_encoder"][f"{P}norms_block.3.{kind}"]
+
+
+def of_both(whole: dict[str, Any]) -> None:
+    whole["ema_encoder"][f"{P}norm.weight"] = torch.zeros(64)
+
+
+def with_another_tensor(whole: dict[str, Any]) -> None:
+    whole["ema_encoder"][f"{P}cls_token"] = torch.zeros(1, 1, 64)
+
+
+def without_a_block(whole: dict[str, Any]) -> None:
+    for name in [name for name in whole["ema_encoder"] if ".blocks.7." in name]:
+        del whole["ema_encoder"][name]
+
+
+def not_finite(whole: dict[str, Any]) -> None:
+    whole["ema_encoder"][f"{P}blocks.3.mlp.fc1.weight"][0, 0] = float("inf")
+
+
+def only_predictor(whole: dict[str, Any]) -> dict[str, Any]:
+    return {"predictor": whole["predictor"]}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (without_last_norm, r"without norms_block\.3, its last norm.*get the original"),
+        (of_both, r"tensors of V-JEPA 2\.1 \(img_mod_embed\) and of V-JEPA 2 \(norm\.weight\) together"),
+        (with_another_tensor, r"ema_encoder: 1 tensors do not fit \(unknown: cls_token\)"),
+        (without_a_block, r"12 tensors do not fit \(missing: blocks\.7\."),
+        (not_finite, r"blocks\.3|layer\.3\.mlp\.fc1\.weight holds NaN or infinity"),
+        (only_predictor, r"no encoder \(keys: predictor\).*download --list"),
+        (lambda _: [1], "a list. needed: an encoder of V-JEPA 2 or 2.1"),
+        (lambda _: {"encoder": {"a": 1}}, "encoder: no weights"),
+        (lambda _: {"encoder": {"a": torch.zeros(1)}}, "no last norm"),
+    ],
+)
+def test_a_file_that_is_not_a_whole_encoder_is_refused(rewritten, change: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        model_of(rewritten(V21, change))
+
+
+@pytest.mark.parametrize(
+    ("path", "encoder", "message"),
+    [
+        (V21, {"heads": None}, "width 64, whose attention heads the tensors do not show.*Set model.encoder.heads"),
+        (V21, {"heads": 5}, "64 is not a multiple of encoder.heads 5"),
+        (V2, {"frame": "image"}, "an encoder of V-JEPA 2. needed: one of V-JEPA 2.1: only it has a path for single"),
+        (V2, {"key": "ema_encoder"}, r"no ema_encoder \(encoders: target_encoder, encoder\).*Set model.encoder.key"),
+    ],
+)
+def test_a_config_that_contradicts_the_file_is_refused(path: Path, encoder: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        model_of(path, **encoder)
+
+
+@pytest.mark.parametrize(
+    ("card", "message"),
+    [
+        ({"model_type": "vit"}, "a model of type 'vit'"),
+        ({"num_attention_heads": 4}, "48"),
+        ({"hidden_size": 96}, "do not fit"),
+        ({"tubelet_size": 4}, "tubelet_size"),
+        ({"hidden_act": "silu"}, "hidden_act"),
+        ({"layer_norm_eps": 1e-5}, "layer_norm_eps"),
+        ({"hidden_size": 10**9}, "hidden_size"),
+    ],
+)
+def test_a_transformers_folder_that_says_something_else_is_refused(
+    tmp_path: Path, card: dict[str, Any], message: str
+) -> None:
+    folder = write_transformers(tmp_path / "hf", **card)
+    if card == {"num_attention_heads": 4}:  # which the tensors do not contradict: so it is another fingerprint
+        assert model_of(folder).encoder_fingerprint() != model_of(V2).encoder_fingerprint()
+        return
+    with pytest.raises(InputError, match=message):
+        model_of(folder)
+
+
+def test_a_folder_that_is_damaged_or_hostile_is_refused(tmp_path: Path) -> None:
+    folder = write_transformers(tmp_path / "hf", shards=2)
+    index = folder / "model.safetensors.index.json"
+    told = index.read_text()
+    index.write_text(told.replace("model-00001", "../model-00001"))
+    with pytest.raises(InputError, match="no list of files beside it"):
+        model_of(folder)
+    index.write_text(told)
+    shard = folder / "model-00002-of-00002.safetensors"
+    shard.write_bytes(shard.read_bytes()[:2000])
+    with pytest.raises(InputError, match="not a whole safetensors file"):
+        model_of(folder)
+    shard.unlink()
+    with pytest.raises(InputError, match="no such file"):
+        model_of(folder)
+    with pytest.raises(InputError, match="Leave it out"):
+        model_of(folder, key="encoder")
+
+
+def test_a_truncated_file_and_one_that_would_run_code_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "cut.pt").write_bytes(V2.read_bytes()[:100_000])
+    with pytest.raises(InputError, match="truncated, or of another kind"):
+        model_of(tmp_path / "cut.pt")
+    with pytest.raises(InputError, match=r"no such file or folder.*download --list"):
+        model_of(tmp_path / "none.pt")
+
+
+def test_a_published_name_on_another_encoder_is_refused(tmp_path: Path) -> None:
+    """Vitg (1 B) and vitG (2 B) differ by the case of a letter, which a disk may be blind to."""
+    for name in ("vjepa2_1_vitG_384.pt", "vjepa2.1-vitg-1b-384.pt", "vitl.pt"):
+        shutil.copyfile(V21, tmp_path / name)
+        with pytest.raises(InputError, match=r"as the name says.*(Rename it|give this file another name)"):
+            model_of(tmp_path / name, heads=4)
+
+
+def test_pretrainings_masked_predictor_is_not_taken_for_one_of_actions() -> None:
+    with pytest.raises(InputError, match=r"knows no actions.*set model\.encoder\.path to this file"):
+        load_base(ModelConfig(base=str(V21)), seed=0)
+
+
+def test_sizes_that_are_no_multiple_of_a_patch_are_refused() -> None:
+    with pytest.raises(ValueError, match="image_size 90 is not a multiple of patch_size 16"):
+        model_of(V21, 90)
+    with pytest.raises(InputError, match="one patch"):
+        model_of(V21, 16)
+
+
+def test_two_encoders_of_the_same_tensors_and_other_latents_are_two() -> None:
+    usual = model_of(V21).encoder_fingerprint()
+    assert model_of(V21, frame="image").encoder_fingerprint() != usual
+    assert model_of(V21, heads=2).encoder_fingerprint() != usual
+    plain = fingerprint(model_of(V21).encoder.state_dict())
+    published = EncoderSizes(width=1024, depth=24, heads=16, mlp_ratio=4.0)
+    assert identified(plain, beyond_tensors(published, heads_are_told=True)) == plain, "as of the AC file that holds it"
+    untold = EncoderSizes(width=48, depth=1, heads=3)
+    assert not beyond_tensors(untold, heads_are_told=False), "of a model of before"
+
+
+def test_only_the_encoder_is_read_from_a_large_file(tmp_path: Path) -> None:
+    """Peak memory is the encoder and a group of tensors, whatever the optimizer's part of the file is."""
+    whole = torch.load(V21, weights_only=True)
+    whole["opt"] = {"state": {0: {"exp_avg": torch.zeros(200_000_000)}}}  # 0.8 GB
+    torch.save(whole, tmp_path / "large.pt")
+    code = f"""
+import resource, torch
+from vjepa2_ac.config import ModelConfig
+from vjepa2_ac.model.checkpoints.loading import load_base
+model = {{"encoder": {{"path": {str(tmp_path / "large.pt")!r}, "heads": 4}}, "dtype": "float32",
+         "random": {{"image_size": 96, "predictor": {{"width": 24, "depth": 1, "heads": 2}}}}}}
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+load_base(ModelConfig.model_validate(model), seed=0)
+print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
+    assert int(done.stdout) < 200e6

@@ -1,0 +1,180 @@
+"""A predictor without states: the one with states whose state tokens are cut out."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn.functional import layer_norm
+
+from tiny_models import DIM, draw, tiny_model
+from vjepa2_ac.config import AdapterConfig, ModelConfig, ModelSizes
+from vjepa2_ac.episode import Widths
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.adapter.lora import add_adapter, load_trained, save_trained, trainable_report
+from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.checkpoints.official import to_official
+from vjepa2_ac.model.network.input_heads import fit_heads, heads_to_replace, widths_of_model
+from vjepa2_ac.model.network.predictor import ActionConditionedPredictor
+from vjepa2_ac.model.network.rotary import TokenLayout, rotary_tables
+from vjepa2_ac.model.network.world_model import WorldModel
+
+STEPS, GRID = 4, 3
+LORA = AdapterConfig(rank=2, alpha=4.0)
+both = pytest.mark.parametrize("extrinsics", [False, True])
+
+
+def pair(*, extrinsics: bool = False) -> tuple[WorldModel, WorldModel]:
+    """Return a model with states and one without, which has all weights of the other that it needs."""
+    full, cut = (tiny_model(extrinsics=extrinsics, states=states) for states in (True, False))
+    shared = {name: full.predictor.state_dict()[name] for name in cut.predictor.state_dict()}
+    cut.predictor.load_state_dict(shared)
+    return full, cut
+
+
+def inputs(*, extrinsics: bool = False, state_width: int = 7) -> list[Tensor]:
+    latents = layer_norm(draw(2, STEPS, GRID**2, DIM), (DIM,))
+    given = [latents, draw(2, STEPS, 7, seed=2), draw(2, STEPS, state_width, seed=3)]
+    return [*given, draw(2, STEPS, 6, seed=4)] if extrinsics else given
+
+
+def predicted_by_hand(full: WorldModel, latents: Tensor, actions: Tensor, cameras: list[Tensor]) -> Tensor:
+    """Send tokens through the blocks of a model with states, whose state tokens were never made."""
+    own, steps = full.predictor, latents.shape[1]
+    heads = [own.action_encoder(actions), *(own.extrinsics_encoder(camera) for camera in cameras)]
+    tokens = torch.cat([*(head[:, :, None] for head in heads), own.predictor_embed(latents)], dim=2)
+    per_step = tokens.shape[2]
+    tables = rotary_tables(TokenLayout(steps, GRID, len(heads)), 12, tokens.device)
+    tokens = tokens.flatten(1, 2)
+    for block in own.blocks:
+        tokens, _ = block(tokens, tables, per_step, "dense", 0)
+    patches = tokens.unflatten(1, (steps, per_step))[:, :, len(heads) :]
+    return layer_norm(own.predictor_proj(own.predictor_norm(patches)), (DIM,))
+
+
+@both
+@pytest.mark.parametrize("attention", ["dense", "per_step"])
+@torch.no_grad()
+def test_predictions_are_those_of_the_model_with_states_whose_state_tokens_are_cut_out(
+    extrinsics: bool, attention: str
+) -> None:
+    full, cut = pair(extrinsics=extrinsics)
+    cut.set_attention(attention)
+    latents, actions, states, *cameras = inputs(extrinsics=extrinsics)
+    expected = predicted_by_hand(full, latents, actions, cameras)
+    torch.testing.assert_close(cut.predict(latents, actions, states, *cameras), expected, atol=1e-5, rtol=1e-5)
+    assert (full.predict(latents, actions, states, *cameras) - expected).abs().max() > 1e-3, "a state matters to it"
+
+
+@both
+@torch.no_grad()
+def test_rollouts_with_cached_keys_are_those_with_the_state_tokens_cut_out(extrinsics: bool) -> None:
+    full, cut = pair(extrinsics=extrinsics)
+    latents, actions, states, *cameras = inputs(extrinsics=extrinsics)
+    seen = latents[:, :2]
+    for end in range(2, STEPS + 1):
+        following = predicted_by_hand(full, seen, actions[:, :end], [camera[:, :end] for camera in cameras])
+        seen = torch.cat([seen, following[:, -1:]], dim=1)
+    found = cut.rollout(latents[:, :2], actions, states, *cameras)
+    torch.testing.assert_close(found, seen[:, 2:], atol=1e-5, rtol=1e-5)
+
+
+@both
+@torch.no_grad()
+def test_other_states_of_any_width_change_no_bit(extrinsics: bool) -> None:
+    cut = pair(extrinsics=extrinsics)[1]
+    latents, actions, states, *cameras = inputs(extrinsics=extrinsics)
+    expected = cut.predict(latents, actions, states, *cameras)
+    rolled = cut.rollout(latents[:, :1], actions, states, *cameras)
+    for other in (states + 1, draw(2, STEPS, 14), draw(2, STEPS, 1) * 1e9, states * float("nan")):
+        assert torch.equal(cut.predict(latents, actions, other, *cameras), expected)
+        assert torch.equal(cut.rollout(latents[:, :1], actions, other, *cameras), rolled)
+    assert not torch.equal(cut.predict(latents, actions + 1, states, *cameras), expected)
+
+
+def test_it_has_no_layer_that_only_states_would_need() -> None:
+    full, cut = pair()
+    missing = full.predictor.state_dict().keys() - cut.predictor.state_dict().keys()
+    assert {name.split(".")[0] for name in missing} == {"state_encoder", "extrinsics_encoder"}
+    assert hasattr(pair(extrinsics=True)[1].predictor, "extrinsics_encoder")
+    assert cut.base_predictor.unused_layers == ()
+
+
+def test_every_weight_of_it_is_trained_and_reported() -> None:
+    model = tiny_model(states=False)
+    add_adapter(model, AdapterConfig(kind="none"), seed=0)
+    report = trainable_report(model)
+    assert report.trained == report.predictor
+    model.predict(*inputs()).sum().backward()
+    assert all(value.grad is not None for value in model.predictor.parameters())
+
+
+def test_an_adapter_on_all_layers_trains_saves_and_comes_back(tmp_path: Path) -> None:
+    heads = ("predictor_embed", "action_encoder")
+    model = tiny_model(states=False)
+    add_adapter(model, LORA.model_copy(update={"targets": ("all",), "modules_to_save": heads}), seed=0)
+    for value in model.parameters():
+        value.data += 0.01 if value.requires_grad else 0
+    save_trained(model, tmp_path)
+    loaded = tiny_model(states=False)
+    load_trained(loaded, tmp_path)
+    assert torch.equal(loaded.predict(*inputs()), model.predict(*inputs()))
+
+
+def test_an_adapter_on_the_missing_layer_is_refused() -> None:
+    with pytest.raises(InputError, match=r"modules_to_save: state_encoder, which this predictor does not have.*Leave"):
+        add_adapter(tiny_model(states=False), LORA.model_copy(update={"modules_to_save": ("state_encoder",)}), seed=0)
+    with pytest.raises(InputError, match="state_encoder matches no layer"):
+        add_adapter(tiny_model(states=False), LORA.model_copy(update={"targets": ("q", "state_encoder")}), seed=0)
+
+
+@pytest.mark.parametrize("width", [1, 7, 14])
+def test_states_of_any_width_fit_and_other_actions_get_a_fresh_head(width: int, tmp_path: Path) -> None:
+    model = tiny_model(states=False)
+    assert heads_to_replace(model.sizes, Widths(width, 7)) == ()
+    assert fit_heads(model, Widths(width, 7), seed=0) == []
+    assert len(fit_heads(model, Widths(width, 14), seed=0)) == 1
+    assert widths_of_model(model.sizes) == Widths(14, 14)
+    add_adapter(model, LORA.model_copy(update={"modules_to_save": ("action_encoder",)}), seed=0)
+    save_trained(model, tmp_path / "adapter")
+    load_trained(tiny_model(states=False), tmp_path / "adapter")
+
+
+def test_a_folder_keeps_it_and_contradictions_are_refused(tmp_path: Path) -> None:
+    model = tiny_model(states=False)
+    model.save_pretrained(tmp_path)
+    loaded = load_base(ModelConfig(base=str(tmp_path), dtype="float32"), seed=0)
+    assert loaded.sizes == model.sizes
+    assert torch.equal(loaded.predict(*inputs()), model.predict(*inputs()))
+    alone = ActionConditionedPredictor.from_pretrained(tmp_path / "predictor")
+    assert torch.equal(alone(*inputs()), model.predictor(*inputs()))
+    told = {"base": str(tmp_path), "dtype": "float32", "sizes": {"predictor": {"use_states": False}}}
+    load_base(ModelConfig.model_validate(told), seed=0)
+    tiny_model().save_pretrained(tmp_path / "full")
+    with pytest.raises(InputError, match=r"predictor\.use_states True\. needed: predictor\.use_states False"):
+        load_base(ModelConfig.model_validate(told | {"base": str(tmp_path / "full")}), seed=0)
+
+
+def test_a_folder_from_before_there_were_such_models_has_states(tmp_path: Path) -> None:
+    tiny_model().save_pretrained(tmp_path)
+    for path in (tmp_path / "config.json", tmp_path / "predictor/config.json"):
+        old = json.loads(path.read_text())
+        for part in (old, old.get("sizes", {}).get("predictor", {})):
+            part.pop("use_states", None)
+        assert "use_states" not in json.dumps(old)
+        path.write_text(json.dumps(old))
+    loaded = WorldModel.from_pretrained(tmp_path)
+    assert loaded.sizes == tiny_model().sizes
+    assert torch.equal(loaded.predict(*inputs()), tiny_model().predict(*inputs()))
+    assert ActionConditionedPredictor.from_pretrained(tmp_path / "predictor").config.use_states
+
+
+def test_sizes_with_a_width_of_states_that_are_not_used_are_refused() -> None:
+    with pytest.raises(ValueError, match="state_dim 14 with use_states false"):
+        ModelSizes.model_validate({"predictor": {"use_states": False, "state_dim": 14}})
+
+
+def test_meta_has_no_such_predictor() -> None:
+    with pytest.raises(ValueError, match="no predictor without states"):
+        to_official(tiny_model(states=False))

@@ -1,0 +1,135 @@
+"""A predictor without states, end to end: trained, resumed, evaluated, exported and planned with."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from run_fixtures import TINY
+from same_run import assert_same_run, metrics
+from vector_sets import write_vectors
+from vjepa2_ac.config import Config, LimitsConfig, ModelConfig, ModelSizes, PlanningConfig
+from vjepa2_ac.config.planning import CemConfig
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
+from vjepa2_ac.export.export import export_run
+from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.planning.session import load_to_plan
+from vjepa2_ac.reports.write import evaluate_subject
+from vjepa2_ac.runs.loading import load_run
+from vjepa2_ac.training.loop import train
+
+MakeConfig = Callable[..., Config]
+SIZES = {**TINY, "predictor": {**TINY["predictor"], "use_states": False}}  # type: ignore[dict-item]
+PROBES = ProbeOptions(sensitivity_clips=2, samples=4, landscape_clips=1, nodes=3, examples=1)
+QUICK = EvaluationOptions(split="validation", clips=4, probes=PROBES)
+SEARCH = PlanningConfig(samples=6, iterations=2, cem=CemConfig(elites=3))
+STATE = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2])
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("base") / "model"
+    WorldModel.random(ModelSizes.model_validate(SIZES), seed=3).save_pretrained(folder)
+    return folder
+
+
+def start_of(kind: str, base: Path) -> dict[str, Any]:
+    """Return the knobs of a run of an adapter on a base, or from scratch."""
+    if kind == "lora":
+        return {"model__base": str(base), "adapter__modules_to_save": ["action_encoder"]}
+    return {"model__base": None, "model__random": SIZES, "adapter__kind": "none"}
+
+
+def with_states(base: Path, width: int) -> WorldModel:
+    """Return a model of the same encoder that takes states of a width."""
+    predictor = {**TINY["predictor"], "state_dim": width}  # type: ignore[dict-item]
+    model = WorldModel.random(ModelSizes.model_validate({**TINY, "predictor": predictor}), seed=4)
+    model.encoder = WorldModel.from_pretrained(base).encoder
+    return model
+
+
+def image(seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (36, 64, 3), dtype=np.uint8)
+
+
+def drive(controller: Controller, state: np.ndarray) -> np.ndarray:
+    """Return the actions of two steps, each seen in the state that the last one led to."""
+    controller.reset(image(9))
+    actions = []
+    for step in range(2):
+        actions.append(controller.act(image(step), state))
+        assert controller.decision is not None
+        assert controller.decision.why == "planned"
+        state = state + np.resize(actions[-1], state.shape)
+    return np.stack(actions)
+
+
+@pytest.mark.parametrize("kind", ["lora", "none"])
+def test_from_training_to_a_plan(make_config: MakeConfig, reporter: Any, tmp_path: Path, base: Path, kind: str) -> None:
+    folder = train(make_config(**start_of(kind, base)), reporter)
+    losses = [row["loss"] for row in metrics(folder) if row["kind"] == "train"]
+    assert len(losses) == 6
+    assert np.isfinite(losses).all()
+    run = load_run(folder)
+    assert not run.world_model.sizes.predictor.use_states
+
+    evaluation = evaluate_subject(str(folder), QUICK).evaluation
+    assert list(evaluation.models) == (["base", "adapter"] if kind == "lora" else ["model"])
+
+    assert drive(Controller.of_run(run, SEARCH), STATE).shape == (2, 7)
+    merged = export_run(folder, tmp_path / "merged").path
+    loaded = load_base(ModelConfig(base=str(merged), dtype="float32"), seed=5)
+    assert loaded.sizes == run.world_model.sizes
+    generator = torch.Generator().manual_seed(1)
+    latents, actions, states = (torch.randn(1, 2, *shape, generator=generator) for shape in ((4, 24), (7,), (7,)))
+    with torch.no_grad():
+        expected = run.world_model.eval().predict(latents, actions, states)
+        torch.testing.assert_close(loaded.predict(latents, actions, states), expected, atol=1e-5, rtol=1e-5)
+    drive(load_to_plan(str(merged), overrides=["planning.samples=6", "planning.cem.elites=3"]).controller(), STATE)
+    with pytest.raises(InputError, match=r"predictor without states .*Meta's code has no other.* --to merged"):
+        export_run(folder, tmp_path / "official.pt", "official")
+
+
+@pytest.mark.parametrize("kind", ["lora", "none"])
+def test_a_resumed_run_equals_the_one_that_was_not_stopped(
+    make_config: MakeConfig, reporter: Any, tmp_path: Path, base: Path, kind: str
+) -> None:
+    whole, stopped = ({**start_of(kind, base), "run_dir": str(tmp_path / name)} for name in ("whole", "stopped"))
+    train(make_config(**whole), type(reporter)())
+
+    class Interrupts(type(reporter)):  # type: ignore[misc]
+        def stepped(self, step: int, metrics: object) -> None:
+            super().stepped(step, metrics)
+            if step == 3:
+                raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(make_config(**stopped), Interrupts())
+    train(make_config(**stopped), reporter)
+    assert any(note.startswith("Going on from") for note in reporter.notes)
+    assert_same_run(tmp_path / "whole", tmp_path / "stopped")
+
+
+def test_states_of_any_width_need_no_new_head(
+    make_config: MakeConfig, reporter: Any, tmp_path: Path, base: Path
+) -> None:
+    write_vectors(tmp_path / "set", width=11, action_width=7)
+    recorded = {"data__actions": "recorded", "data__join_actions": "sum"}
+    data = {"data__source": "npz", "data__path": str(tmp_path / "set"), "data__states": "vector", **recorded}
+    folder = train(make_config(model__base=str(base), training__steps=2, **data), reporter)
+    assert not any("initialised anew" in note or "state encoder" in note for note in reporter.notes)
+    for width in (11, 7):
+        with_states(base, width).save_pretrained(tmp_path / f"of {width}")
+    asked = replace(QUICK, against=("base", str(tmp_path / "of 11")))
+    assert list(evaluate_subject(str(folder), asked).evaluation.models) == ["base", "of 11", "adapter"]
+    with pytest.raises(InputError, match=r"a model of states of 7 and actions of 7 numbers\. needed: 11 and 7"):
+        evaluate_subject(str(folder), replace(QUICK, against=(str(tmp_path / "of 7"),)))
+    planning = SEARCH.model_copy(update={"limits": LimitsConfig(axes=(0.1,))})
+    assert drive(Controller.of_run(load_run(folder), planning), np.zeros(11)).shape == (2, 7)
