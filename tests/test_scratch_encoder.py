@@ -56,6 +56,16 @@ def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def test_a_predictor_that_cannot_start_near_copying_is_said_to(
+    workshop: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for width, is_narrow in ((64, False), (32, True)):
+        config = write_config(workshop, "narrow")
+        assert main(["train", config, "--check", f"model.random.predictor.width={width}"]) == 0
+        printed = " ".join(capsys.readouterr().out.split())
+        assert (f"a predictor of width {width} cannot copy latents of width 64" in printed) == is_narrow
+
+
 def test_a_run_that_was_killed_ends_in_the_same_bits(workshop: Path, nursery: Nursery) -> None:
     config, run = write_config(workshop, "killed"), workshop / "killed"
     child = nursery.start("train", config, folder=run, die_at=40)

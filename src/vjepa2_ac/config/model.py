@@ -91,6 +91,17 @@ class ModelSizes(Section):
         """Patches of one frame."""
         return (self.image_size // self.patch_size) ** 2
 
+    @property
+    def too_narrow_to_copy(self) -> str | None:
+        """What a run from scratch is warned of: a predictor that cannot start near copying; None: it can."""
+        if self.predictor.width >= self.encoder.width:
+            return None
+        return (
+            f"model.random_start persistence: a predictor of width {self.predictor.width} cannot copy latents of width"
+            f" {self.encoder.width}; it starts from a random part of them and learns the rest. With predictor.width"
+            f" {self.encoder.width} or more it starts near copying"
+        )
+
     @model_validator(mode="after")
     def _sizes_divide(self) -> ModelSizes:
         if self.image_size % self.patch_size:
@@ -157,7 +168,8 @@ class ModelConfig(Section):
     """Instead of `base`: a fresh predictor of these sizes, and, without `encoder`, a random encoder; with
     `adapter.kind: none` that is training from scratch."""
     random_start: Annotated[Literal["persistence", "released"], Affects.RUN] = "persistence"
-    """Initialisation of a `random` model: close to copying the last frame, or as in the released recipe."""
+    """Initialisation of a `random` model: close to copying the last frame, which needs a predictor as wide as a latent,
+    or as in the released recipe."""
     sizes: Annotated[ModelSizes, Affects.RUN | Affects.PLAN] = ModelSizes()
     """What an official `.pt` does not contain: image size and heads. Everything else is read from its tensors."""
     dtype: Annotated[Literal["float32", "bfloat16"], Affects.LATENTS | Affects.RUN | Affects.PLAN] = "bfloat16"

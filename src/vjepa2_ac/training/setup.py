@@ -194,6 +194,9 @@ def open_model(data: RunData, reporter: Reporter = SILENT, *, check_only: bool =
     reporter.note(str(trainable_report(world_model)))
     if unusual := config.adapter.out_of_line:
         reporter.note(f"Warning: {unusual}.")
+    copies = config.model.random is not None and config.model.random_start == "persistence"
+    if copies and (narrow := world_model.sizes.too_narrow_to_copy):
+        reporter.note(f"Warning: {narrow}.")
     world_model.set_gradient_checkpointing(training.gradient_checkpointing)
     world_model.set_attention(training.attention)
     world_model.set_compiled("with gradients" if training.compile == "blocks" else "never")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-
 import torch
 from torch import Generator, nn
 from transformers import PreTrainedConfig, PreTrainedModel
@@ -12,8 +10,6 @@ from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.episode import ACTION_DIM, STATE_DIM
 from vjepa2_ac.model.network.blocks import initialise
 from vjepa2_ac.model.network.predictor_network import PredictorNetwork, predictor_fields
-
-logger = logging.getLogger(__name__)
 
 
 class PredictorConfig(PreTrainedConfig):  # type: ignore[misc]  # transformers has no types
@@ -63,15 +59,9 @@ class ActionConditionedPredictor(PredictorNetwork, PreTrainedModel):  # type: ig
 
         These two layers are the network's only path from input to output; a tiny one that starts at random
         spends most of its training on learning to copy. Close where the predictor is at least as wide as a latent; a
-        narrower one passes on a random part of it, and a warning says so.
+        narrower one passes on a random part of it (`ModelSizes.too_narrow_to_copy`).
         """
         shape = self.predictor_embed.weight.shape
-        if shape[0] < shape[1]:
-            logger.warning(
-                "model.random_start: persistence: a predictor of width %d cannot copy latents of width %d: it starts at"
-                " a part of them, and learns the rest. With predictor.width %d or more it starts near copying.",
-                shape[0], shape[1], shape[1],
-            )  # fmt: skip
         drawn = torch.randn(max(shape), min(shape), generator=generator, device=generator.device)
         drawn = drawn.double()  # threads would change the last bits
         rotation, triangle = torch.linalg.qr(drawn)
