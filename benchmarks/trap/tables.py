@@ -19,6 +19,8 @@ from vjepa2_ac.storage import write_atomically
 
 Figures = dict[str, Any]
 REACHED_CM = 5.0
+GONE = {"contrast": "a loss term, `training.action_contrast`: measured at commit 6117de8, the last with the term"}
+"""Cures that no longer can be run, whose measurements stay."""
 _SHOWN = ("rollout_over_persistence_last", "action_rank")
 
 
@@ -56,7 +58,7 @@ def write_tables(out: Path, picture: Path | None) -> None:
     cells = [one for run in by_run(list(found)) if len(run) == len(cells_of(_run_of(run))) for one in run]
     if not cells:
         return
-    text = "\n".join([*_rules(cells), "", *_correlations(cells), "", *_of_evidence(out)])
+    text = "\n".join([*_rules(cells), "", *_notes(cells), *_correlations(cells), "", *_of_evidence(out)])
     (out / "trap.md").write_text(text + "\n")
     print(text)
     if picture is not None:
@@ -104,6 +106,12 @@ def _rules(cells: Sequence[Figures]) -> Iterator[str]:
                 f"{np.mean([left_cm(one) for one in chosen]):.1f} ({_list([left_cm(one) for one in chosen], '.1f')})",
             ]
             yield f"| {' | '.join(row)} |"
+
+
+def _notes(cells: Sequence[Figures]) -> Iterator[str]:
+    """Yield a line, and an empty one, for each cure in the table that is gone."""
+    for cure in sorted({one["cell"]["cure"] for one in cells} & GONE.keys()):
+        yield from (f"The cure `{cure}` is gone. It was {GONE[cure]}.", "")
 
 
 def _list(values: Sequence[float], form: str) -> str:

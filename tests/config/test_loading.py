@@ -18,7 +18,9 @@ from vjepa2_ac.config.loading import (
     config_as_dict,
     config_as_yaml,
     config_schema,
+    gone_in_use,
     load_config,
+    load_config_of_run,
     parse_config,
 )
 from vjepa2_ac.errors import InputError
@@ -80,9 +82,8 @@ def test_the_config_for_a_few_demonstrations_holds_its_recipe(tmp_path: Path) ->
     assert config.validation.every * 10 == training.steps
     assert (config.data.cache, config.checkpoint.keep_best) == ("auto", CheckpointConfig().keep_best)
     text = (ROOT / "configs/own_robot.yaml").read_text()
-    offered = re.sub(r"^( *)# (?=action_contrast|replay:|  share|  data)", r"\1", text, flags=re.MULTILINE)
+    offered = re.sub(r"^( *)# (?=replay:|  share|  data)", r"\1", text, flags=re.MULTILINE)
     asked = load_config(write(tmp_path, offered))  # with what it offers in comments
-    assert asked.training.action_contrast.weight == 1.0
     assert asked.replay.share == 0.25
 
 
@@ -297,3 +298,34 @@ def test_a_config_is_of_bounded_size_and_may_come_through_a_pipe(tmp_path: Path)
 def test_values_of_the_command_line_that_lie_too_deep_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="too deep"):
         load_config(write(tmp_path, yaml.safe_dump(MINIMAL)), [".".join("a" * 5_000) + "=1"])
+
+
+# ---- knobs that are gone ----
+
+
+def with_contrast(value: object) -> dict[str, object]:
+    return {**MINIMAL, "training": {"steps": 2_000, "action_contrast": value}}
+
+
+@pytest.mark.parametrize("off", [None, {}, {"weight": 0.0, "margin": 0.1}], ids=str)
+def test_a_config_of_before_loads_where_a_knob_that_is_gone_was_off(tmp_path: Path, off: object) -> None:
+    values = with_contrast(off)
+    path = write(tmp_path, yaml.safe_dump(values))
+    expected = parse_config({**MINIMAL, "training": {"steps": 2_000}}, where="here")
+    assert load_config(path) == load_config(values) == load_config_of_run(path) == expected
+    assert not gone_in_use(path)
+    assert values == with_contrast(off)
+
+
+def test_where_it_was_on_the_config_is_refused_beside_all_other_errors_and_only_a_run_that_was_made_loads(
+    tmp_path: Path,
+) -> None:
+    on = {"weight": 1.0, "margin": 0.3}
+    path = write(tmp_path, yaml.safe_dump(with_contrast(on)))
+    with pytest.raises(InputError, match=r"training\.action_contrast: a loss term that .* is gone") as caught:
+        load_config(path, ["training.step=3"])
+    assert "training.step: unknown key; did you mean steps?" in str(caught.value)
+    assert load_config_of_run(path).training.steps == 2_000
+    assert gone_in_use(path) == {"training.action_contrast": on}
+    with pytest.raises(InputError, match="is gone"):
+        load_config_of_run(path, ["training.action_contrast.weight=1"])

@@ -239,13 +239,13 @@ def test_the_card_describes_base_data_and_training(
 
 def test_the_card_describes_unusual_adapter_settings(trained, tmp_path: Path, data_folder: Path) -> None:
     heads = {"adapter__modules_to_save": ["action_encoder"]}
-    loss = {"training__loss": "l2", "training__rollout_weight": 2, "training__action_contrast": {"weight": 0.5}}
+    loss = {"training__loss": "l2", "training__rollout_weight": 2}
     second = {"path": str(data_folder), "frames": 4, "stride": 2}
     given = {**heads, **loss, "replay": {"share": 0.5, "data": second}}
     export_run(trained(adapter__init="pissa", adapter__dora=True, **given), tmp_path / "hub", "hub")
     card = (tmp_path / "hub" / CARD).read_text()
     assert "rsLoRA, DoRA, started as pissa, `action_encoder` trained whole" in card
-    assert "loss: l2, teacher forcing + 2 x rollout of 2 steps + 0.5 x contrast of actions (margin 0.1)" in card
+    assert "loss: l2, teacher forcing + 2 x rollout of 2 steps" in card
     assert f"replay: 50% of the training clips from rlds, `{data_folder}`" in card
     assert "warm-up: 1 step\n" in card
     assert "PEFT alone cannot use it" in card, "it would cut another part out of the base"

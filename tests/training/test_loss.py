@@ -1,7 +1,6 @@
 """The loss equals the official one; other distances and weights equal their definitions."""
 
 import json
-from dataclasses import replace
 
 import pytest
 import torch
@@ -13,7 +12,7 @@ from vjepa2_ac.config import ModelSizes, TrainingConfig
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.model.checkpoints.official import load_official
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.training.loss import Objective, action_contrast_loss, others_actions, prediction_losses
+from vjepa2_ac.training.loss import Objective, prediction_losses
 
 
 @pytest.mark.parametrize("name", ["tiny", "tiny_extrinsics"])
@@ -120,74 +119,8 @@ def test_every_distance_and_weight_equals_a_plain_computation(knobs: dict[str, o
         ({"rollout_weight": -1.0}, "greater than or equal to 0"),
         ({"loss": "huber"}, "'l1', 'l2' or 'smooth_l1'"),
         ({"smooth_l1_beta": 0.5}, "belongs to loss smooth_l1, not l1"),
-        ({"action_contrast": {"weight": 1.0}, "batch_size": 1}, "needs a batch_size of at least 2"),
-        ({"action_contrast": {"margin": 0.0}}, "greater than 0"),
     ],
 )
 def test_a_loss_that_makes_no_sense_is_refused(knobs: dict[str, object], complaint: str) -> None:
     with pytest.raises(ValidationError, match=complaint):
         TrainingConfig.model_validate(knobs)
-
-
-# ---- action contrast ----
-
-
-@pytest.mark.parametrize("loss", ["l1", "l2"])
-def test_the_action_contrast_equals_a_plain_computation(loss: str) -> None:
-    model, batch = reference()
-    training = TrainingConfig.model_validate({"loss": loss, "action_contrast": {"margin": 0.3, "weight": 2.0}})
-    with torch.no_grad():
-        found = Objective(model, training)(batch)
-        missing = []
-        for clip, other in ((0, 1), (1, 0)):
-            latents, states = batch.latents[clip : clip + 1], batch.states[clip : clip + 1, :-1]
-            right, wrong = (
-                plain_distance(
-                    training, model.predict(latents[:, :-1], batch.actions[k : k + 1], states), latents[:, 1:]
-                )
-                for k in (clip, other)
-            )
-            missing.append(max(0.0, right - wrong + 0.3 * plain_distance(training, latents[:, :-1], latents[:, 1:])))
-        plain = Objective(model, TrainingConfig.model_validate({"loss": loss}))(batch)
-    assert sum(missing) > 0
-    assert found[2].item() == pytest.approx(2.0 * sum(missing) / 2, rel=1e-5)
-    assert [one.item() for one in found[:2]] == [one.item() for one in plain]  # to the last bit
-    assert len(plain) == 2
-
-
-def errors(*clips: float) -> torch.Tensor:
-    return torch.tensor(clips).reshape(-1, 1, 1, 1).expand(-1, 3, 4, 5).clone().requires_grad_()
-
-
-def test_a_clip_beyond_the_margin_asks_for_nothing_and_one_within_it_moves_both_predictions() -> None:
-    right, wrong, copied = errors(0.2, 0.5), errors(0.9, 0.55), errors(1.0, 1.0).detach()
-    loss = action_contrast_loss(right, wrong, copied, margin=0.1)
-    assert loss.item() == pytest.approx((0.0 + 0.05) / 2)
-    loss.backward()
-    sums = [one.grad.sum((1, 2, 3)).tolist() for one in (right, wrong)]
-    assert sums == [[0.0, pytest.approx(0.5)], [0.0, pytest.approx(-0.5)]]
-
-
-def test_the_margin_is_a_share_of_what_changes_so_units_cancel_and_a_still_clip_asks_for_nothing() -> None:
-    loss = action_contrast_loss(errors(0.5, 0.0), errors(0.5, 0.0), errors(1.0, 0.0), margin=0.1)
-    assert loss.item() == pytest.approx(0.05)
-    tenfold = action_contrast_loss(errors(5.0, 0.0), errors(5.0, 0.0), errors(10.0, 0.0), margin=0.1)
-    assert tenfold.item() == pytest.approx(10 * loss.item())  # as every other part of the loss grows
-
-
-def test_clips_with_the_same_actions_have_no_gradient() -> None:
-    model, batch = reference()
-    model.predictor.requires_grad_(True)
-    same = replace(batch, actions=batch.actions[:1].expand(2, -1, -1).clone())
-    *_, contrast = Objective(model, TrainingConfig.model_validate({"action_contrast": {"weight": 1.0}}))(same)
-    assert contrast.item() > 0
-    contrast.backward()
-    gradients = [one.grad for one in model.parameters() if one.grad is not None]
-    assert gradients
-    assert max(one.abs().max().item() for one in gradients) < 1e-7
-
-
-def test_wrong_actions_are_those_of_the_clip_before_or_of_one_that_is_alone_its_own_backwards() -> None:
-    actions = torch.arange(12.0).reshape(3, 2, 2)
-    assert others_actions(actions).tolist() == [actions[k].tolist() for k in (2, 0, 1)]
-    assert others_actions(actions[:1]).tolist() == [[[2.0, 3.0], [0.0, 1.0]]]

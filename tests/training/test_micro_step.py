@@ -84,14 +84,6 @@ def captured(run: Run) -> Recorder:
     return recorder
 
 
-def test_a_captured_micro_step_has_the_contrast_of_actions_too(make_run) -> None:
-    plain, other = (make_run(training__action_contrast={"weight": 1.0, "margin": 0.5}) for _ in range(2))
-    metrics = training_step(plain, batches_from(plain), 1)
-    captured(other)
-    assert training_step(other, batches_from(other), 1) == metrics
-    assert metrics["loss_action_contrast"] > 0
-
-
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])
 @pytest.mark.parametrize("order", [lambda batches: batches, uneven], ids=["even", "uneven"])
 def test_a_captured_micro_step_learns_what_the_plain_one_learns(make_run, order, precision: str) -> None:

@@ -94,7 +94,7 @@ def test_a_run_that_replays_died_and_went_on_equals_the_one_that_did_not(
     replaying, reporter, tmp_path, monkeypatch, cache: str
 ) -> None:
     changes = {
-        "training__steps": 4, "training__action_contrast": {"weight": 0.5}, "data__cache": cache,
+        "training__steps": 4, "data__cache": cache,
         "replay__data__cache": cache, "data__cache_dir": str(tmp_path / "a"),
         "replay__data__cache_dir": str(tmp_path / "b"),
     }  # fmt: skip

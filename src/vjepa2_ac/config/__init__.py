@@ -17,19 +17,12 @@ from vjepa2_ac.config.sources import (
     RldsData,
     RldsFields,
 )
-from vjepa2_ac.config.training import (
-    ActionContrastConfig,
-    CheckpointConfig,
-    TrackingConfig,
-    TrainingConfig,
-    ValidationConfig,
-)
+from vjepa2_ac.config.training import CheckpointConfig, TrackingConfig, TrainingConfig, ValidationConfig
 
 __all__ = [
-    "ActionContrastConfig", "AdapterConfig", "AugmentConfig", "CheckpointConfig", "Config", "DataConfig",
-    "DecoderConfig", "DiskCacheConfig", "EncoderConfig", "EncoderSizes", "EnergyConfig", "IdleConfig", "LatentsData",
-    "LeRobotData", "LeRobotFields", "LimitsConfig", "ModelConfig", "ModelSizes", "NpzData", "PlanningConfig",
-    "PredictorSizes",
+    "AdapterConfig", "AugmentConfig", "CheckpointConfig", "Config", "DataConfig", "DecoderConfig", "DiskCacheConfig",
+    "EncoderConfig", "EncoderSizes", "EnergyConfig", "IdleConfig", "LatentsData", "LeRobotData", "LeRobotFields",
+    "LimitsConfig", "ModelConfig", "ModelSizes", "NpzData", "PlanningConfig", "PredictorSizes",
     "RawDroidData", "RawDroidOptions", "ReplayConfig", "RldsData", "RldsFields", "Section", "TrackingConfig",
     "TrainingConfig", "ValidationConfig",
 ]  # fmt: skip

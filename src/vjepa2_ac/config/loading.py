@@ -15,6 +15,7 @@ from pydantic import ValidationError
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.data import without_sections_of_others
 from vjepa2_ac.config.diagnostics import wrong_values
+from vjepa2_ac.config.gone import GONE, take_gone
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage.structured import parse_yaml, require_shallow
 
@@ -36,6 +37,26 @@ def load_config(config: str | Path | Mapping[str, Any], overrides: Iterable[str]
     return parse_config(_overridden(_read_yaml(Path(config)), overrides), where=str(config))
 
 
+def load_config_of_run(path: Path, overrides: Iterable[str] = ()) -> Config:
+    """Read the config of a run that was made: knobs that are gone since then are passed over, in use or not.
+
+    Raises:
+        InputError: As `load_config`.
+    """
+    values = _read_yaml(path)
+    take_gone(values)
+    return parse_config(_overridden(values, overrides), where=str(path))
+
+
+def gone_in_use(path: Path) -> dict[str, Any]:
+    """Return the knobs that are gone and that the run of a config was made with, by dotted key.
+
+    Raises:
+        InputError: The file cannot be read.
+    """
+    return take_gone(_read_yaml(path))
+
+
 def config_from(values: Mapping[str, Any], overrides: Iterable[str] = (), *, where: str) -> Config:
     """Return a config of plain values with `key.sub=value` overrides, without a file.
 
@@ -46,7 +67,7 @@ def config_from(values: Mapping[str, Any], overrides: Iterable[str] = (), *, whe
 
 
 def parse_config(values: Mapping[str, Any], *, where: str) -> Config:
-    """Validate plain values, as YAML or JSON gives them.
+    """Validate plain values, as YAML or JSON gives them; a knob that is gone may stand there where it is off.
 
     Raises:
         InputError: Names every key that is wrong, all at once.
@@ -54,13 +75,16 @@ def parse_config(values: Mapping[str, Any], *, where: str) -> Config:
     plain = json.loads(_as_json(values, where))
     if "data" in plain:
         plain["data"] = without_sections_of_others(plain["data"])
+    lines = [f"{key}: {GONE[key]}; leave it out" for key in take_gone(plain)]
     try:
-        return Config.model_validate_json(json.dumps(plain))
+        config = Config.model_validate_json(json.dumps(plain))
     except ValidationError as error:
-        lines = wrong_values(plain, error)
-        found = f"{len(lines)} value{'s are' if len(lines) > 1 else ' is'} wrong\n  " + "\n  ".join(lines) + "\n"
-        fix = "`vjepa2-ac config schema` lists every key with its range"
-        raise InputError(where=where, found=found, fix=fix) from None
+        lines += wrong_values(plain, error)
+    else:
+        if not lines:
+            return config
+    found = f"{len(lines)} value{'s are' if len(lines) > 1 else ' is'} wrong\n  " + "\n  ".join(lines) + "\n"
+    raise InputError(where=where, found=found, fix="`vjepa2-ac config schema` lists every key with its range")
 
 
 def config_as_dict(config: Config) -> dict[str, Any]:

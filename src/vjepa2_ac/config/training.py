@@ -25,16 +25,6 @@ def _earlier_keep_best(value: object) -> object:
     return {True: "error", False: "off"}[value] if isinstance(value, bool) else value
 
 
-class ActionContrastConfig(Section):
-    """A loss where another clip's actions fit about as well as the true ones: a model that ignores its actions."""
-
-    margin: Annotated[float, Field(gt=0.0, le=10.0)] = 0.1
-    """How much lower the one-step error has to be with the true actions than with those of another clip of the
-    micro-batch, in errors of persistence (copying the last frame)."""
-    weight: Annotated[float, Field(ge=0.0)] = 0.0
-    """Factor of this loss, in the sum and in metrics.jsonl; 0: off, and saves its computation."""
-
-
 class TrainingConfig(Section):
     """How the weights change."""
 
@@ -55,8 +45,6 @@ class TrainingConfig(Section):
     """Factor of the teacher-forced loss, in the sum and in metrics.jsonl."""
     rollout_weight: NonNegative = 1.0
     """Factor of the rollout loss, in the sum and in metrics.jsonl; 0 saves its computation."""
-    action_contrast: ActionContrastConfig = ActionContrastConfig()
-    """A loss against ignoring the actions; off by default. Costs a second teacher-forced prediction."""
     learning_rate: Annotated[float, Field(gt=0.0, le=1.0)] = 1e-4
     """Peak learning rate."""
     schedule: Literal["cosine", "warmup_stable_decay", "linear", "constant"] = "cosine"
@@ -119,8 +107,6 @@ class TrainingConfig(Section):
             raise ValueError("teacher_forcing_weight and rollout_weight are both 0: nothing would be learned")
         if self.loss != "smooth_l1" and self.smooth_l1_beta != 1.0:
             raise ValueError(f"smooth_l1_beta belongs to loss smooth_l1, not {self.loss}")
-        if self.action_contrast.weight and self.batch_size == 1:
-            raise ValueError("action_contrast compares the clips of a micro-batch: it needs a batch_size of at least 2")
         return self
 
 

@@ -36,7 +36,6 @@ def memory_lines(config: Config, estimate: MemoryEstimate) -> list[str]:
         ("encoder, at work", estimate.encoding, f"{config.model.encode_chunk} frames at once; before the predictor"),
         ("predictor, teacher forcing", stored.teacher_forcing, "kept for the backward pass, without checkpointing"),
         ("predictor, rollout", stored.rollout, f"{fed_back} x one step more, without checkpointing"),
-        *([("predictor, wrong actions", stored.contrast, "training.action_contrast")] if stored.contrast else []),
         ("losses", stored.losses, "without checkpointing"),
         ("temporaries", stored.peak - stored.saved, "beside all three where most lives at once"),
         ("all four, checkpointed", again.peak, "instead: inputs of blocks, and one block computed again"),

@@ -115,7 +115,6 @@ def _loss(config: Config) -> str:
     training = config.training
     parts = {"teacher forcing": training.teacher_forcing_weight}
     parts[f"rollout of {_count(training.rollout_steps, 'step')}"] = training.rollout_weight
-    parts[f"contrast of actions (margin {training.action_contrast.margin:g})"] = training.action_contrast.weight
     words = [name if weight == 1 else f"{weight:g} x {name}" for name, weight in parts.items() if weight]
     return f"{training.loss}, {' + '.join(words)}"
 

@@ -31,22 +31,17 @@ class MicroStep:
     def __init__(self, objective: Objective, accelerator: Accelerator, scaler: torch.amp.GradScaler) -> None:
         self._objective, self._accelerator, self._scaler = objective, accelerator, scaler
 
-    def __call__(self, latents: LatentBatch, parts: float) -> Float[Tensor, " losses"]:
-        """Return the parts of the loss (`Objective.names`), means over these clips; add the gradient of their sum.
+    def __call__(self, latents: LatentBatch, parts: float) -> Float[Tensor, 2]:
+        """Return (teacher forcing, rollout), each a mean over these clips; add the gradient of their sum.
 
         Args:
             latents: The clips, on the device.
             parts: Number of micro-steps of this size in the step: the gradient is divided by it.
         """
         with self._accelerator.autocast():
-            first, *rest = self._objective(latents)
-        self._scaler.scale(sum(rest, first) / parts).backward()
-        return torch.stack([loss.detach() for loss in (first, *rest)])
-
-    @property
-    def losses(self) -> int:
-        """The number of parts of the loss."""
-        return len(self._objective.names)
+            forced, rollout = self._objective(latents)
+        self._scaler.scale((forced + rollout) / parts).backward()
+        return torch.stack([forced.detach(), rollout.detach()])
 
 
 class CapturedMicroStep:
@@ -66,7 +61,7 @@ class CapturedMicroStep:
         self._losses: Tensor | None = None  # output of the graph
         self._replay: Body | None = None
 
-    def __call__(self, latents: LatentBatch, parts: float) -> Float[Tensor, " losses"]:
+    def __call__(self, latents: LatentBatch, parts: float) -> Float[Tensor, 2]:
         """Do the same as `MicroStep`."""
         if self._replay is None or self._losses is None or self._given is None:
             self._record(latents, parts)
@@ -83,7 +78,7 @@ class CapturedMicroStep:
         """Capture a micro-step on copies of these clips; gradients are restored afterwards."""
         copies: dict[str, Any] = {name: one.clone() for name, one in _tensors(latents).items()}
         given = replace(latents, **copies)
-        losses = torch.zeros(self._plain.losses, device=latents.latents.device)
+        losses = torch.zeros(2, device=latents.latents.device)
 
         def body() -> None:
             losses.copy_(self._plain(given, parts))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,15 +33,9 @@ class Gradients:
 
     forced_loss: float  # mean over the clips; NaN where there is none
     rollout_loss: float
-    contrast_loss: float | None  # None: training.action_contrast is off
     norm: float  # before clipping; not finite after an overflow in fp16, which the loss scale handles
     clips: int  # that were read
     bytes_fetched: int
-
-    @property
-    def loss(self) -> float:
-        """The sum of all parts."""
-        return self.forced_loss + self.rollout_loss + (self.contrast_loss or 0.0)
 
 
 def training_step(run: Run, batches: Iterator[Batch], step: int, *, measure_update: bool = False) -> dict[str, float]:
@@ -66,10 +60,9 @@ def training_step(run: Run, batches: Iterator[Batch], step: int, *, measure_upda
         run.scaler.update()
     run.optimizer.zero_grad(set_to_none=not run.config.training.cuda_graph)  # a graph adds to the same tensors
     return {
-        "loss": taken.loss,
+        "loss": taken.forced_loss + taken.rollout_loss,
         "loss_teacher_forcing": taken.forced_loss,
         "loss_rollout": taken.rollout_loss,
-        **({} if taken.contrast_loss is None else {"loss_action_contrast": taken.contrast_loss}),
         "grad_norm": taken.norm,
         "learning_rate": learning_rate,
         **({"update_to_weight": update.to_weight()} if update else {}),
@@ -104,21 +97,16 @@ def gradients(
         prefetch_next(batches)
     *losses, clips, fetched_by_all = all_reduce_sum(run.accelerator, [*totals.tolist(), len(seen), fetched])
     if not clips:
-        return _gradients([math.nan] * len(losses), 0.0, 0, fetched_by_all)
+        return Gradients(math.nan, math.nan, 0.0, clips=0, bytes_fetched=int(fetched_by_all))
+    forced_loss, rollout_loss = (loss * (expected / clips) for loss in losses)
     norm = _finish_gradients(run, factor=expected / clips)
-    taken = _gradients([loss * (expected / clips) for loss in losses], norm, clips, fetched_by_all)
-    _refuse_not_finite(run, taken.loss, norm, seen, look_back)
-    return taken
-
-
-def _gradients(losses: Sequence[float], norm: float, clips: float, fetched: float) -> Gradients:
-    forced, rollout, *contrast = losses
-    return Gradients(forced, rollout, contrast[0] if contrast else None, norm, int(clips), int(fetched))
+    _refuse_not_finite(run, forced_loss + rollout_loss, norm, seen, look_back)
+    return Gradients(forced_loss, rollout_loss, norm, int(clips), int(fetched_by_all))
 
 
 def _accumulate(run: Run, batches: Iterator[Batch], look_back: ClipRecorder | None) -> tuple[Tensor, list[str], int]:
     """Return the losses of this process's clips, as parts of the step's; names of the clips; and bytes fetched."""
-    totals = torch.zeros(len(run.objective.names), device=run.accelerator.device)
+    totals = torch.zeros(2, device=run.accelerator.device)
     seen: list[str] = []
     fetched = 0
     for _ in range(run.micro_batches):

@@ -65,14 +65,6 @@ def test_a_clip_is_what_pytorch_counts(adapter: str, rollout_steps: int) -> None
     assert (flops.forward, flops.backward) == counted(config)
 
 
-@pytest.mark.parametrize("adapter", ["lora", "late", "none"])
-def test_a_contrast_of_actions_costs_one_more_prediction(adapter: str) -> None:
-    config = run_config(ADAPTERS[adapter], rollout_steps=2, action_contrast={"weight": 1.0})
-    flops = clip_flops(config, SIZES)
-    assert (flops.forward, flops.backward) == counted(config)
-    assert flops.forward > 1.5 * clip_flops(run_config(ADAPTERS[adapter], rollout_steps=2), SIZES).forward
-
-
 def test_a_frame_is_what_pytorch_counts() -> None:
     model = WorldModel.random(SIZES, seed=0)
     with sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:

@@ -40,14 +40,13 @@ class PassBytes(NamedTuple):
 
     teacher_forcing: int  # saved for the backward pass
     rollout: int
-    contrast: int  # a prediction after wrong actions; 0: off
     losses: int
     peaks: tuple[int, ...]  # live at once: in each prediction, until the losses, on the way back of each prediction
 
     @property
     def saved(self) -> int:
         """What is saved when the losses are computed."""
-        return self.teacher_forcing + self.rollout + self.contrast + self.losses
+        return self.teacher_forcing + self.rollout + self.losses
 
     @property
     def peak(self) -> int:
@@ -151,14 +150,14 @@ class _Measuring:
         storages.forget()
         self._model.after_prediction = after_prediction
         with autocast(self._config), saved_tensors_hooks(storages.save, lambda kept: kept):
-            first, *rest = objective(batch)
-            loss = sum(rest, first)
-        forced, rolled, last, losses = saved[0], saved[objective.rollout_steps - 1], saved[-1], storages.saved
+            forced, rollout = objective(batch)
+            loss = forced + rollout
+        losses = storages.saved
         end_phase()
         self._model.after_prediction = None
         loss.backward()
         end_phase()
-        return PassBytes(forced, rolled - forced, last - rolled, losses - last, tuple(peaks))
+        return PassBytes(saved[0], saved[-1] - saved[0], losses - saved[-1], tuple(peaks))
 
     def _prediction(self) -> tuple[int, int]:
         """Return what a prediction without gradients caches, and what lives beside it."""

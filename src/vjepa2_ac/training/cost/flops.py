@@ -25,7 +25,7 @@ class ClipFlops:
     """Floating-point operations of training on one clip."""
 
     encoder: int  # the frozen encoder, forward, on every frame
-    forward: int  # of the predictor: teacher forcing, once more with wrong actions if asked for, rest of the rollout
+    forward: int  # of the predictor: teacher forcing and the further predictions of the rollout
     backward: int  # of the predictor
 
     @property
@@ -53,7 +53,7 @@ def clip_flops(config: Config, sizes: ModelSizes) -> ClipFlops:
         passes.over(1, keys=range(step, step + 1), fed_back=True)
         for step in range(2, 1 + (training.rollout_steps if training.rollout_weight else 1))
     ]
-    total = sum(fed_back, forced + forced if training.action_contrast.weight else forced)
+    total = sum(fed_back, forced)
     return ClipFlops(frames * frame_flops(sizes), total.forward, total.backward)
 
 

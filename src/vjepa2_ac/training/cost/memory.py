@@ -117,11 +117,7 @@ _KNOBS: tuple[tuple[str, Callable[[Config], Config]], ...] = (
     ("training.gradient_checkpointing=true", lambda run: _with(run, "training", gradient_checkpointing=True)),
     (
         "training.batch_size=1 (and as much more accumulation)",
-        lambda run: run if run.training.action_contrast.weight else _with(run, "training", batch_size=1),
-    ),
-    (
-        "training.batch_size=2 (and as much more accumulation)",  # the least that action_contrast takes
-        lambda run: _with(run, "training", batch_size=min(2, run.training.batch_size)),
+        lambda run: _with(run, "training", batch_size=1),
     ),
     (
         "model.dtype=bfloat16 with training.precision=bf16",
