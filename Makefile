@@ -1,10 +1,10 @@
-# make demo · make evidence · make trap · make test · make test-oldest · make lint · make soak · make bench · make base: each creates the environment it needs.
+# make demo · make evidence · make trap · make encoders · make test · make test-oldest · make lint · make soak · make bench · make base: each creates the environment it needs.
 PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/installed
 OLDEST := .venv-oldest
 
-.PHONY: demo demo-seeds base evidence trap test test-oldest soak lint format bench clean
+.PHONY: demo demo-seeds base evidence trap encoders test test-oldest soak lint format bench clean
 
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed; set PYTHON=...")'
@@ -37,6 +37,9 @@ evidence: $(INSTALLED)  ## does LoRA help? every method side by side; goes on wh
 
 trap: $(INSTALLED)  ## does a lower error plan better? narrow and varied demonstrations, every checkpoint in closed loop
 	$(BIN)/python benchmarks/trap --picture docs/ranking.png
+
+encoders: $(INSTALLED)  ## what each published encoder costs, by doctor's arithmetic; replaces the table, docs/encoders.md copies it
+	$(BIN)/python benchmarks/encoders.py
 
 test: $(INSTALLED)  ## the whole test suite, on all cores (8 at most); a folder in one process: .venv/bin/pytest tests/data
 	$(BIN)/pytest -q -n logical --maxprocesses 8 --dist loadfile --durations 10

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from sized_runs import LORA, built, model_sizes, run_config
-from vjepa2_ac.config import Config, ModelSizes
+from vjepa2_ac.config import Config, EncoderSizes, ModelSizes
 from vjepa2_ac.model.adapter.lora import trainable_report
 from vjepa2_ac.model.adapter.targets import adapter_ranks
 from vjepa2_ac.training.cost.fake_model import meta_network
@@ -34,6 +34,7 @@ SHAPES = {
     "small": model_sizes(),
     "wider": model_sizes(latent=96, width=128, depth=3, heads=4, mlp=3.3, image=96),
     "extrinsics": model_sizes(extrinsics=True),
+    "V-JEPA 2.1": model_sizes().model_copy(update={"encoder": EncoderSizes(width=48, depth=1, heads=2, family="v2.1")}),
 }
 
 

@@ -8,6 +8,7 @@ from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.training.cost.fake_model import meta_predictor
 
 _TUBELET = 2  # frames that the encoder's first layer takes at once
+_LEVELS = 4  # of V-JEPA 2.1, each with a norm
 
 
 @dataclass(frozen=True)
@@ -32,9 +33,17 @@ def count_parameters(config: Config, sizes: ModelSizes) -> Parameters:
     """
     width, hidden = sizes.encoder.width, int(sizes.encoder.width * sizes.encoder.mlp_ratio)
     block = 4 * (width + 1) * width + 4 * width + (width + 1) * hidden + (hidden + 1) * width
-    patches = (3 * _TUBELET * sizes.patch_size**2 + 1) * width
     every = list(meta_predictor(config, sizes).parameters())
     trained = tuple(one.numel() for one in every if one.requires_grad)
     total = sum(one.numel() for one in every)
     own = total if config.adapter.kind == "none" else total - sum(trained)
-    return Parameters(patches + 2 * width + sizes.encoder.depth * block, own, trained)
+    return Parameters(sizes.encoder.depth * block + _beside_blocks(sizes), own, trained)
+
+
+def _beside_blocks(sizes: ModelSizes) -> int:
+    """Return the encoder's parameters outside of its blocks; of V-JEPA 2.1 those of both frame paths are there."""
+    width, of_a_frame = sizes.encoder.width, 3 * sizes.patch_size**2
+    video, norm = (_TUBELET * of_a_frame + 1) * width, 2 * width
+    if sizes.encoder.family == "v2":
+        return video + norm
+    return video + (of_a_frame + 1) * width + 2 * width + _LEVELS * norm

@@ -1,0 +1,143 @@
+"""Which encoder should I take? What each published one costs, by the arithmetic of `vjepa2-ac doctor`.
+
+    python benchmarks/encoders.py               # all of them (make encoders)
+    python benchmarks/encoders.py --only ViT-B  # those whose name has this in it; writes nothing
+
+Nothing is loaded: parameters and operations are counted, memory is measured on tensors without numbers. No row has been
+compared with a GPU. OUT/encoders.json has the numbers, OUT/encoders.md the table.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from vjepa2_ac.config import Config, EncoderSizes, ModelSizes, PredictorSizes
+from vjepa2_ac.config.loading import parse_config
+from vjepa2_ac.data.sources.latents.dtypes import bytes_per_frame
+from vjepa2_ac.encoding.disk_space import small_frame_bytes
+from vjepa2_ac.model.checkpoints.published import PUBLISHED
+from vjepa2_ac.storage import write_atomically
+from vjepa2_ac.training.cost.flops import frame_flops
+from vjepa2_ac.training.cost.memory import GIGABYTE, estimate_memory
+from vjepa2_ac.training.cost.parameters import count_parameters
+
+IMAGE_SIZES = (256, 384)  # pixels
+FRAMES_PER_HOUR = 15 * 3600  # of DROID's rate
+PREDICTORS = {
+    "24x1024": PredictorSizes(width=1024, depth=24, heads=16),
+    "12x768": PredictorSizes(width=768, depth=12, heads=12),
+    "12x384": PredictorSizes(width=384, depth=12, heads=6),
+}
+RUN = {  # a predictor that is trained whole, from frames
+    "run_dir": "run",
+    "data": {"path": "set", "frames": 8},
+    "model": {"random": {}},
+    "adapter": {"kind": "none"},
+    "training": {"batch_size": 2, "gradient_checkpointing": True},
+}
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What an encoder costs."""
+
+    encoder: str
+    downloads: tuple[str, ...]  # names of `vjepa2-ac download`
+    width: int  # of a latent
+    parameters: int
+    gflop_per_frame: dict[str, float]  # by image size in pixels
+    latents_gb_per_hour: float  # of 15 Hz video, every frame, bfloat16, at the first image size
+    peak_gb: dict[str, dict[str, float]]  # of training, by image size and predictor
+
+
+def main(given: Sequence[str] | None = None) -> None:
+    """Measure, print the table and write it."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("benchmarks/results"), help="where table and numbers go")
+    parser.add_argument("--only", default="", help="encoders whose name has this in it; writes nothing")
+    options = parser.parse_args(given)
+    costs = [cost_of(name, *about) for name, about in published().items() if options.only in name]
+    text = table(costs)
+    print(text)
+    if not options.only:
+        options.out.mkdir(parents=True, exist_ok=True)
+        rows = json.dumps([asdict(one) for one in costs], indent=1)
+        write_atomically(options.out / "encoders.json", (rows + "\n").encode())
+        write_atomically(options.out / "encoders.md", (text + "\n").encode())
+
+
+def published() -> dict[str, tuple[EncoderSizes, tuple[str, ...]]]:
+    """Return the published encoders by name: sizes, and the downloads that have them, whatever they were trained at."""
+    found: dict[str, tuple[EncoderSizes, tuple[str, ...]]] = {}
+    for one in sorted(PUBLISHED, key=lambda one: one.encoder.width):
+        if one.holds != "encoder":
+            continue
+        shape = one.encoder
+        sizes = EncoderSizes(
+            width=shape.width, depth=shape.depth, heads=shape.heads, mlp_ratio=shape.mlp_ratio, family=one.family
+        )
+        name = f"{'2.1' if one.family == 'v2.1' else '2.0'} {shape.name}"
+        found[name] = (sizes, (*found.get(name, (sizes, ()))[1], one.name))
+    return found
+
+
+def cost_of(
+    name: str,
+    encoder: EncoderSizes,
+    downloads: tuple[str, ...] = (),
+    predictors: Mapping[str, PredictorSizes] = PREDICTORS,
+    image_sizes: Sequence[int] = IMAGE_SIZES,
+) -> Cost:
+    """Return what an encoder costs."""
+    run = parse_config(RUN, where="benchmarks/encoders.py")
+    by_size = {
+        str(side): {key: ModelSizes(image_size=side, encoder=encoder, predictor=one) for key, one in predictors.items()}
+        for side in image_sizes
+    }
+    any_of = {side: next(iter(by_predictor.values())) for side, by_predictor in by_size.items()}
+    first = any_of[str(image_sizes[0])]
+    per_frame = bytes_per_frame(first.tokens_per_frame, encoder.width, "bf16") + small_frame_bytes(first.image_size)
+    return Cost(
+        encoder=name,
+        downloads=downloads,
+        width=encoder.width,
+        parameters=count_parameters(run, first).encoder,
+        gflop_per_frame={side: frame_flops(sizes) / 1e9 for side, sizes in any_of.items()},
+        latents_gb_per_hour=FRAMES_PER_HOUR * per_frame / GIGABYTE,
+        peak_gb={
+            side: {key: peak_gb(run, sizes) for key, sizes in by_predictor.items()}
+            for side, by_predictor in by_size.items()
+        },
+    )
+
+
+def peak_gb(run: Config, sizes: ModelSizes) -> float:
+    """Return what `vjepa2-ac doctor` says of a run on such a model, in 10^9 bytes."""
+    estimate = estimate_memory(run, sizes)
+    return estimate.total(checkpointing=estimate.checkpointing) / GIGABYTE
+
+
+def table(costs: Sequence[Cost]) -> str:
+    """Return the table in Markdown."""
+    predictors = list(costs[0].peak_gb[next(iter(costs[0].peak_gb))])
+    sides = list(costs[0].gflop_per_frame)
+    titles = ["encoder", "`vjepa2-ac download`", "latent", "million weights", f"GFLOP a frame, {' / '.join(sides)} px"]
+    titles += [
+        f"latents at {sides[0]} px, GB per hour",
+        *(f"{one}, GB at {' / '.join(sides)} px" for one in predictors),
+    ]
+    lines = [f"| {' | '.join(titles)} |", "|---|---|" + "---:|" * (len(titles) - 2)]
+    for one in costs:
+        cells = [one.encoder, ", ".join(one.downloads), str(one.width), f"{one.parameters / 1e6:,.1f}"]
+        cells += [" / ".join(f"{one.gflop_per_frame[side]:,.0f}" for side in sides), f"{one.latents_gb_per_hour:.1f}"]
+        cells += [" / ".join(f"{one.peak_gb[side][key]:.1f}" for side in sides) for key in predictors]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()
