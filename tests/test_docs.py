@@ -32,7 +32,8 @@ DOCS = [ROOT / "README.md", ROOT / "SECURITY.md", *sorted((ROOT / "docs").glob("
 SOURCES = sorted((ROOT / "src").rglob("*.py"))
 TODAY = [path for path in [*DOCS, *SOURCES] if path.name != "log.md"]  # the log tells of how things were
 PACKAGE = ROOT / "src/vjepa2_ac"
-OURS = {path.name for root in (ROOT, PACKAGE, ROOT / "tests") for path in root.iterdir() if path.is_dir()} - {"src"}
+OURS = {path.name for root in (ROOT, PACKAGE, ROOT / "tests") for path in root.iterdir() if path.is_dir()}
+OURS -= {"src", "demo"}  # the second is made by commands
 
 FILES = ("json", "md", "npz", "png", "pt", "safetensors", "yaml")
 

@@ -17,7 +17,14 @@ from vjepa2_ac.data.index.index_cache import cache_folder
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.runs.folder import read_run_config
 
-ON_THIS_MACHINE = ("run_dir", "data.cache_dir", "data.disk_cache.dir", "model.base", "model.encoder.path", "decoder.folder")
+ON_THIS_MACHINE = (
+    "run_dir",
+    "data.cache_dir",
+    "data.disk_cache.dir",
+    "model.base",
+    "model.encoder.path",
+    "decoder.folder",
+)
 ANYWHERE = ("data.path", "data.idle.ranges", "checkpoint.remote")
 LOOK_LIKE_PATHS = ("dir", "path", "folder", "base", "remote", "ranges")  # last part of a key
 

@@ -33,7 +33,7 @@ def test_every_name_of_a_file_leads_to_it() -> None:
         ("vjepa21-vitb-384", "vjepa2.1-vitb-384"),
         ("vjepa2_1_vit_base_384", "vjepa2.1-vitb-384"),
         ("vitl.pt", "vjepa2-vitl"),
-        ("VITG-384.pt", "vjepa2-vitg-384"),
+        ("vitg-384.PT", "vjepa2-vitg-384"),
     ],
 )
 def test_other_spellings_are_understood(text: str, name: str) -> None:
@@ -44,6 +44,8 @@ def test_other_spellings_are_understood(text: str, name: str) -> None:
     ("text", "message"),
     [
         ("VJEPA2_1_VITG_384", r"2 published files.*Write vjepa2\.1-vitg-1b-384 or vjepa2\.1-vitG-2b-384"),
+        ("vitG", r"2 published files.*Write vjepa2-vitg or vjepa2\.1-vitG-2b-384"),
+        ("VITG-384.pt", r"2 published files.*Write vjepa2-vitg-384 or vjepa2\.1-vitG-2b-384"),
         ("vjepa2-vitx", r"Did you mean vjepa2-vit.*download --list"),
         ("facebook/vjepa2-vitl-fpc64-256", r"Did you mean vjepa2-vitl or .*--list"),
         ("dinov3", r"no published checkpoint of this name.*--list"),

@@ -10,6 +10,7 @@ from pathlib import PurePath
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.checkpoints import published
 from vjepa2_ac.model.checkpoints.published import Published
+from vjepa2_ac.model.network.published_sizes import VIT_G, VIT_g
 
 OFFICIAL = "vjepa2-ac-vitg"  # Meta's world model, which `download` fetches without a name
 
@@ -30,10 +31,12 @@ def find_published(text: str) -> Published:
     """
     for spelling in _SPELLINGS:
         meant = _spelt(text, spelling)
+        if len(meant) == 1 and _is_other_letter(text, meant[0]):
+            meant += [one for one in published.PUBLISHED if one.encoder is VIT_G]
         if len(meant) == 1:
             return meant[0]
         if meant:
-            found = f"{len(meant)} published files have this name when case is ignored"
+            found = f"{len(meant)} published files can be meant: vitg (1 B) and vitG (2 B) are two"
             fix = f"Write {' or '.join(one.name for one in meant)}"
             raise InputError(where=f"download {text}", found=found, needed="one of them", fix=fix)
     if text.endswith(".pt") or text.startswith(("/", "./", "../", "~")):
@@ -58,6 +61,11 @@ _SPELLINGS: tuple[Callable[[str], str], ...] = (_exactly, _without_separators, _
 
 def _names(one: Published) -> tuple[str, ...]:
     return one.name, one.remote, *one.aliases
+
+
+def _is_other_letter(text: str, one: Published) -> bool:
+    """Return whether a name says ViT-G, of 2 B, where the file is ViT-g, of 1 B."""
+    return re.search(r"(?i:vit)[-_]?G", text) is not None and one.encoder is VIT_g
 
 
 def _spelt(text: str, spelling: Callable[[str], str]) -> list[Published]:
