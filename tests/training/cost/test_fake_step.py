@@ -58,7 +58,7 @@ ALSO = {"no states": model_sizes(states=False)}  # which has no layer of all END
 WITHOUT_STATES = [
     ("LoRA", "bf16", "no states", "smooth, long rollout"),
     ("DoRA, dropout", "fp32", "no states", "L1"),
-    ("everything", "bf16", "no states", "contrast of actions"),
+    ("everything", "bf16", "no states", "L1"),
 ]
 
 

@@ -43,10 +43,7 @@ _NEEDED = "a checkpoint of V-JEPA 2-AC as Meta publishes it (vjepa2-ac-vitg.pt)"
 _NEEDED_WHOLE = f"{_NEEDED}, 11.7 GB"
 _FIX = "`vjepa2-ac download` fetches it, and goes on with a part of it"
 _NON_COMMERCIAL = "The weights that jepa-wms publishes so are CC-BY-NC 4.0: for non-commercial use only"
-_KEYS: tuple[EncoderKey, ...] = (
-    "encoder",
-    "target_encoder",
-)  # the two are the same: the encoder of an AC file is frozen
+_KEYS: tuple[EncoderKey, ...] = ("encoder", "target_encoder")  # one encoder twice: it was frozen
 
 
 def load_official(path: str | Path, sizes: ModelSizes | None = None, dtype: torch.dtype = torch.float32) -> WorldModel:
