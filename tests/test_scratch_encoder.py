@@ -102,7 +102,8 @@ def test_an_export_is_a_base_with_its_encoder(workshop: Path, tmp_path: Path) ->
         assert torch.equal(model.encode(frames), latents)
         assert torch.allclose(model.predict(latents, numbers, numbers), expected, atol=1e-6)
     card = json.loads((tmp_path / "merged" / "config.json").read_text())
-    assert card["encoder_origin"] == {"file": "vjepa2_1_distilled.pt", "key": "ema_encoder", "licence": ""}
+    origin = {"file": "vjepa2_1_distilled.pt", "key": "ema_encoder", "licence": "", "heads_are_told": True}
+    assert card["encoder_origin"] == origin
     lora = write_config(workshop, "lora", {"base": str(tmp_path / "merged"), "dtype": "float32"}, adapter={"rank": 2})
     assert main(["train", lora, "training.steps=1"]) == 0  # on the same latents: the cache is required
     assert main(["export", str(workshop / "lora"), str(tmp_path / "hub"), "--to", "hub"]) == 0

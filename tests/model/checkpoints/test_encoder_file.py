@@ -19,6 +19,7 @@ from hub import serve_hub
 from paths import GOLDEN
 from vjepa2_ac.config import EncoderSizes, ModelConfig
 from vjepa2_ac.errors import InputError, RefusedError, UnreachableError
+from vjepa2_ac.model.base_model import find_base
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.checkpoints.official import load_official, to_official
 from vjepa2_ac.model.network.encoder_origin import beyond_tensors, identified
@@ -408,6 +409,12 @@ def test_two_encoders_of_the_same_tensors_and_other_latents_are_two() -> None:
     assert identified(plain, beyond_tensors(published, heads_are_told=True)) == plain, "as of the AC file that holds it"
     untold = EncoderSizes(width=48, depth=1, heads=3)
     assert not beyond_tensors(untold, heads_are_told=False), "of a model of before"
+
+
+def test_the_encoder_of_a_model_stays_the_same_encoder_under_another_predictor() -> None:
+    """So its decoder and its caches fit."""
+    own = WorldModel.from_pretrained(find_base("builtin:sim-tiny"))
+    assert model_of("builtin:sim-tiny").encoder_fingerprint() == own.encoder_fingerprint()
 
 
 def test_only_the_encoder_is_read_from_a_large_file(tmp_path: Path) -> None:

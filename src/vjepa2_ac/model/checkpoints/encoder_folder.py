@@ -78,7 +78,7 @@ def _of_this_project(folder: Path, config: EncoderConfig, name: str) -> FoundEnc
         sizes=with_frame_path(model.encoder, config.frame, where=where),
         patch_size=model.patch_size,
         image_size=model.image_size,
-        origin=read_encoder_origin(folder) or EncoderOrigin(name),
+        origin=read_encoder_origin(folder) or EncoderOrigin(name, heads_are_told=False),  # so it stays the same encoder
         shapes=stored.shapes,
         needed=dict,
         read=lambda names: stored.read({one: one for one in names}),

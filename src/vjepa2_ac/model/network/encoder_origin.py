@@ -18,6 +18,7 @@ class EncoderOrigin:
     file: str  # its name
     key: str = ""  # of the weights in it; "" of a folder
     licence: str = ""  # where it is known
+    heads_are_told: bool = True  # False: of a model whose own fingerprint does not know them
 
     def __str__(self) -> str:
         key = f", {self.key}" if self.key else ""

@@ -198,7 +198,8 @@ class WorldModel(LatentDynamics):
     @property
     def encoder_beyond_tensors(self) -> dict[str, str | int]:
         """What its latents depend on and its tensors do not show: family, frame path and heads, where they matter."""
-        return beyond_tensors(self.sizes.encoder, heads_are_told=self.encoder_origin is not None)
+        told = self.encoder_origin is not None and self.encoder_origin.heads_are_told
+        return beyond_tensors(self.sizes.encoder, heads_are_told=told)
 
     @property
     def encoder_in_words(self) -> str:
