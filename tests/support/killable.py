@@ -14,6 +14,7 @@ import runpy
 import signal
 import subprocess
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Callable
@@ -165,6 +166,8 @@ def _become(wish: dict, main: Callable[[list[str]], int]) -> None:
             os.chdir(wish["cwd"])
         status = _script(wish) if "script" in wish else main(wish["arguments"])
     finally:
+        threading._shutdown()
+        atexit._run_exitfuncs()  # as at the end of any process; otherwise semaphores stay, and their tracker says so
         os._exit(status)
 
 
