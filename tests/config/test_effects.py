@@ -29,6 +29,7 @@ from vjepa2_ac.runs.folder import check_run_folder
 # What cannot be guessed from a knob's type, or must exist in the data set.
 SECTIONS = {"model.encoder": EncoderConfig(path="encoder.pt")}  # of knobs that are null: those without a default
 OTHERS = {
+    "planning.limits.workspace": ((0.3, -0.3, 0.1), (0.6, 0.3, 0.5)),
     "data.camera": {"npz": "pixels", "rlds": "wrist_left", "lerobot": "wrist_left", "droid_raw": "right"},
     "data.path": "elsewhere",
     "data.augment.crop_scale": (0.5, 1.0),

@@ -10,6 +10,8 @@ from pydantic import Field, model_validator
 from vjepa2_ac.config.section import OFF, Count, Local, NonNegative, Positive, PositiveInt, Section, Share, ZeroToOne
 from vjepa2_ac.errors import InputError
 
+Place = Annotated[float, Field(ge=-5.0, le=5.0)]  # along an axis of the base frame, in metres; no arm reaches farther
+Corner = tuple[Place, Place, Place]
 Metre = ZeroToOne  # no arm moves farther in a model step: more would be millimetres
 
 
@@ -23,6 +25,10 @@ class LimitsConfig(Section):
     """Whether (dx, dy, dz) is also limited to a ball: sum of absolute values (l1) or length (l2)."""
     radius: Positive = 0.05
     """Of the ball, in metres."""
+    workspace: tuple[Corner, Corner] | None = None
+    """Corners (lowest and highest x, y, z, in metres, base frame) of the box in which every target of the flange lies.
+    An action that would leave it is cut; a robot that is outside by more than one step does not move. Of poses in the
+    base frame."""
     rotation: Annotated[float, Field(ge=0.0, le=math.pi)] = 0.0
     """Largest turn about each axis, in radians; 0: the rotation is held, as upstream does."""
     axes: Literal["data"] | Annotated[tuple[NonNegative, ...], Field(min_length=1)] = "data"
@@ -53,6 +59,13 @@ class LimitsConfig(Section):
             needed="the largest dx, dy, dz in metres, such as planning.limits.xyz=[0.05,0.05,0.05]",
             fix="`vjepa2-ac data inspect CONFIG` shows how far 99 % of the steps in your data go (line `axes`)",
         )
+
+    @model_validator(mode="after")
+    def _workspace_has_room(self) -> LimitsConfig:
+        if self.workspace is not None and any(low >= high for low, high in zip(*self.workspace, strict=True)):
+            low, high = self.workspace
+            raise ValueError(f"workspace: the corner {low} is not below {high} on every axis")
+        return self
 
     @model_validator(mode="after")
     def _something_is_free(self) -> LimitsConfig:

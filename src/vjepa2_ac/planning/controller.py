@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -27,15 +27,16 @@ from vjepa2_ac.planning.goal import Goal, patch_weights
 from vjepa2_ac.planning.input_checks import require_image, require_mask, require_numbers
 from vjepa2_ac.planning.interfaces import Plan
 from vjepa2_ac.planning.model_setup import Fingerprints, prepare_for_planning
-from vjepa2_ac.planning.planner import Planner
+from vjepa2_ac.planning.planner import Cancelled, Planner
 from vjepa2_ac.planning.search_space import SearchSpace, search_space
 from vjepa2_ac.planning.settings import warn_beyond_taught, with_taught_limits
 from vjepa2_ac.planning.state_integration import states_along
+from vjepa2_ac.planning.workspace import Workspace
 from vjepa2_ac.runs.loading import TrainedRun
 from vjepa2_ac.spaces import EXTRINSICS, POSES, Spaces
 
 Seen = tuple[Tensor, np.ndarray]  # latents of an image, and the state
-Why = Literal["planned", "out of time", "at the goal", "no finite energy"]
+Why = Literal["planned", "out of time", "at the goal", "no finite energy", "outside the workspace"]
 
 _REACHED = 1e-6  # the energy of an image equal to the goal image, up to rounding
 
@@ -45,11 +46,11 @@ class Decision:
     """The decision, and its reason."""
 
     action: Float[np.ndarray, " dim"]  # for the next model step; nothing changes for some values of `why`
-    why: Why  # out of time: the best plan so far. at the goal, no finite energy: do nothing
+    why: Why  # out of time: the best plan so far. at the goal, no finite energy, outside the workspace: do nothing
     energy_now: float  # of the current image, if nothing changed: to compare with the plan's
     goal: int  # index of the goal that applies now
     goals: tuple[int, ...]  # and after each model step of a plan
-    plan: Plan | None  # None if the goal is reached
+    plan: Plan | None  # None if the goal is reached, or the robot is outside the workspace
     states: Float[np.ndarray, "time dim"] | None  # states predicted along the plan, the current state first
     cost: WorldModelCost | None  # to evaluate other actions
 
@@ -90,7 +91,8 @@ class Controller:
         Raises:
             InputError: The model's states and actions are of other spaces, or nobody knows which state follows from an
                 action; or it needs a camera pose and none is given, or the other way round; or its blocks cannot be
-                compiled or quantized to 8 bits; or vectors have no limits; or `planning.axes` are not this model's.
+                compiled or quantized to 8 bits; or vectors have no limits, or a workspace; or `planning.axes` are not
+                this model's.
         """
         _require_spaces(world_model.sizes, spaces)
         if extrinsics is not None:
@@ -106,6 +108,7 @@ class Controller:
         self._camera = None if extrinsics is None else torch.from_numpy(extrinsics.astype(np.float32))
         self.spaces, self._axes = spaces, _axes_of(world_model, self.config, spaces)
         self.planner = Planner(self.config, search_space(self.config, spaces.state))
+        self._workspace = Workspace.of(self.config.limits, spaces.state)
         self._goal: Goal | None = None
         self._like = np.zeros(0)
         self._seen: list[Seen] = []  # the newest `planning.context`
@@ -192,7 +195,9 @@ class Controller:
         self._like, self._done, self.decision = goals[0], 0, None
         self._seen = []
 
-    def act(self, frame: np.ndarray, state: np.ndarray) -> Float[np.ndarray, " dim"]:
+    def act(
+        self, frame: np.ndarray, state: np.ndarray, *, cancelled: Cancelled = lambda: False
+    ) -> Float[np.ndarray, " dim"]:
         """Return the action of the next model step: dx, dy, dz, three rotations, gripper (legend: `vjepa2_ac.episode`).
 
         Of vectors: as many numbers as the state, what each of them changes by; targets where the model was trained on
@@ -204,9 +209,11 @@ class Controller:
             frame: What the camera sees, of the goal image's size.
             state: Measured: pose and gripper, or the vector; a vector of any width where the model has no states and an
                 action is a change.
+            cancelled: Asked before every iteration: whether nobody waits for the action any more.
 
         Raises:
             InputError: The image or the state cannot be used.
+            SearchCancelledError: It was cancelled. After any error nothing has changed.
             ValueError: No goal was set.
         """
         if self._goal is None:
@@ -215,8 +222,7 @@ class Controller:
         state = self._known(np.asarray(state, dtype=np.float64))
         require_numbers(state, self.spaces.state, where="state")
         seen = [*self._seen, (self.encoded(frame), state)][-self.config.context :]
-        before = self.decision
-        decision = self._decided(self._goal, seen, None if before is None else before.plan)
+        decision = self._decided(self._goal, seen, cancelled)
         self._seen, self._done, self.decision = seen, self._done + 1, decision  # after an error nothing has changed
         return decision.action
 
@@ -230,25 +236,40 @@ class Controller:
         """Return the latents of what the model sees of an image, on its device."""
         return encode_frames(self._model, image[None], self.crop)[0]
 
-    def _decided(self, goal: Goal, seen: Sequence[Seen], before: Plan | None) -> Decision:
+    def _decided(self, goal: Goal, seen: Sequence[Seen], cancelled: Cancelled) -> Decision:
         latents, state = seen[-1]
         places = tuple(goal.place(self._done + step) for step in range(self.config.horizon))
         wanted = goal.ahead(self._done, self.config.horizon)
         still = distance(latents.expand_as(wanted), wanted, self.config.energy.distance, goal.weights)
         energy = float(still[-1] if self.config.energy.steps == "last" else still.sum())
-        if float(still.max()) <= _REACHED:
+        reason: Why | None = "at the goal" if float(still.max()) <= _REACHED else None
+        if reason is None and self._workspace is not None and not self._workspace.is_near(state, self.config.limits):
+            reason = "outside the workspace"
+        if reason is not None:
             still_here = self._command(state, np.zeros(len(state)))
-            return Decision(still_here, "at the goal", energy, places[0], places, None, None, None)
+            return Decision(still_here, reason, energy, places[0], places, None, None, None)
         cost = WorldModelCost(
             self._model, self._scene(seen), goal, self.config.energy, done=self._done, spaces=self.spaces
         )
         generator = torch.Generator().manual_seed(self.seed + self._done)
+        before = None if self.decision is None else self.decision.plan
         start = before.start_after(1) if before is not None and self.config.warm_start else None
-        plan = self.planner.plan(cost, generator, start)
+        plan = self._planned(state, lambda planner: planner.plan(cost, generator, start, cancelled))
         why: Why = "planned" if plan.stopped == "finished" else plan.stopped
         states = states_along(torch.from_numpy(state), plan.actions.double()[None], self.spaces.state)[0]
         action = self._command(state, plan.actions[0].double().numpy())
         return Decision(action, why, energy, places[0], places, plan, states.numpy(), cost)
+
+    def _planned(self, state: np.ndarray, search: Callable[[Planner], Plan]) -> Plan:
+        """Return what a search finds, inside the workspace if there is one."""
+        planner, box = self.planner, self._workspace
+        if box is None:
+            return search(planner)
+        plan = search(Planner(planner.config, box.narrowed(planner.space, state), planner.clock, planner.progress))
+        if plan.stopped == "no finite energy":
+            return plan
+        kept = box.kept(state, plan.actions.double().numpy(), self.config.limits)
+        return replace(plan, actions=torch.from_numpy(kept).to(plan.actions))
 
     def _command(self, state: np.ndarray, change: np.ndarray) -> Float[np.ndarray, " action_dim"]:
         """Return the action that changes the state so: the change itself, or the state that it leads to."""

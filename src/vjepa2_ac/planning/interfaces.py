@@ -17,6 +17,10 @@ from torch import Tensor
 Stopped = Literal["finished", "out of time", "no finite energy"]
 
 
+class SearchCancelledError(Exception):
+    """A search was ended from outside before it was done; there is no plan."""
+
+
 @runtime_checkable
 class Cost(Protocol):
     """A planner's only view of a model: the cost of action sequences. Lower is better; NaN is not allowed."""

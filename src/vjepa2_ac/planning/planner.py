@@ -13,7 +13,7 @@ from torch import Generator, Tensor
 
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.episode import Progress, no_progress
-from vjepa2_ac.planning.interfaces import Cost, Iteration, Plan, PlanStart, Stopped
+from vjepa2_ac.planning.interfaces import Cost, Iteration, Plan, PlanStart, SearchCancelledError, Stopped
 from vjepa2_ac.planning.search_space import SearchSpace, pose_space
 from vjepa2_ac.planning.solvers.base import EvaluatedPlans, Solver
 from vjepa2_ac.planning.solvers.cem import CemSolver
@@ -22,6 +22,7 @@ from vjepa2_ac.planning.solvers.icem import IcemSolver
 from vjepa2_ac.planning.solvers.mppi import MppiSolver
 
 Clock = Callable[[], float]  # seconds, from anywhere
+Cancelled = Callable[[], bool]  # whether nobody waits for the plan any more
 MakeSolver = Callable[[SearchSpace, PlanningConfig, Generator, PlanStart | None], Solver]
 
 SOLVERS: dict[str, MakeSolver] = {  # what `planning.planner` names
@@ -57,15 +58,19 @@ class Planner:
         self.space = pose_space(config) if space is None else space
         self.clock, self.progress = clock, progress
 
-    def plan(self, cost: Cost, generator: Generator, start: PlanStart | None = None) -> Plan:
+    def plan(
+        self, cost: Cost, generator: Generator, start: PlanStart | None = None, cancelled: Cancelled = lambda: False
+    ) -> Plan:
         """Return the best plan found.
 
         Args:
             cost: The cost of action sequences. Called without gradients except by planner gradient.
             generator: On the CPU; the same seed gives the same plan. Its initial seed is recorded.
             start: Left by an earlier plan (`Plan.start_after`).
+            cancelled: Asked before every iteration.
 
         Raises:
+            SearchCancelledError: It was cancelled.
             ValueError: The cost does not return one number per sample, or `start` is of another shape.
         """
         began = self.clock()
@@ -75,6 +80,8 @@ class Planner:
         record: list[Iteration] = []
         best = _Best()
         while len(record) < self.config.iterations and self._has_time(began, record):
+            if cancelled():
+                raise SearchCancelledError
             record.append(self._iterate(search, cost, best))
             self.progress(len(record), self.config.iterations)
         stopped: Stopped = "finished" if len(record) == self.config.iterations else "out of time"

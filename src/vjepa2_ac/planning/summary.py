@@ -13,6 +13,11 @@ _AT_LIMIT = 0.98  # share of a limit from which an action is said to be at it
 def summarize(answer: PlanResult) -> str:
     """Return the decision as one or more sentences."""
     plan, why = answer.decision.plan, answer.decision.why
+    if why == "outside the workspace":
+        return (
+            "Does nothing: the robot is farther outside planning.limits.workspace than an action leads. Move it back by"
+            " hand, or correct the box."
+        )
     if why == "at the goal" or plan is None:
         return "Does nothing: what the model sees now is what it sees in the goal image."
     if why == "no finite energy":

@@ -1,0 +1,132 @@
+"""The workspace: targets are inside the box, whatever the model says, or nothing moves."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from tiny_models import tiny_model
+from vjepa2_ac.config.planning import CemConfig, LimitsConfig, PlanningConfig
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.planning.search_space import pose_space
+from vjepa2_ac.planning.workspace import Workspace
+from vjepa2_ac.spaces import CAMERA_POSE, POSE, vector_states
+
+CORNERS = ((0.3, -0.2, 0.1), (0.6, 0.2, 0.5))
+BALLS = ("none", "l1", "l2")
+SLACK = 2e-8  # metres
+
+
+def limits_of(ball: str = "none") -> LimitsConfig:
+    return LimitsConfig(workspace=CORNERS, xyz=(0.05, 0.05, 0.03), ball=ball, radius=0.04)
+
+
+def box() -> Workspace:
+    found = Workspace.of(limits_of(), POSE)
+    assert found is not None
+    return found
+
+
+def image(seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (48, 48, 3), dtype=np.uint8)
+
+
+def position(*numbers: float) -> np.ndarray:
+    return np.array([*numbers, math.pi, 0.0, 0.0, 0.5])
+
+
+NEAR = st.tuples(st.floats(0.27, 0.63), st.floats(-0.23, 0.23), st.floats(0.08, 0.52))
+
+
+@given(NEAR, arrays(np.float64, (3, 7), elements=st.floats(-1, 1)), st.sampled_from(BALLS))
+def test_every_target_is_inside_and_every_action_allowed(where, wild, ball) -> None:
+    limits, state = limits_of(ball), position(*where)
+    space = pose_space(PlanningConfig(limits=limits, horizon=3))
+    actions = space.allowed(torch.from_numpy(wild).float()).double().numpy()
+    if not box().is_near(state, limits):
+        with pytest.raises(ValueError, match="farther from the workspace"):
+            box().kept(state, actions, limits)
+        return
+    kept = box().kept(state, actions, limits)
+    targets = state[:3] + np.cumsum(kept[:, :3], axis=0)
+    assert (targets >= np.array(CORNERS[0]) - SLACK).all()
+    assert (targets <= np.array(CORNERS[1]) + SLACK).all()
+    assert (abs(kept[:, :3]) <= np.array(limits.xyz_m) + SLACK).all()
+    if ball != "none":
+        assert (np.linalg.norm(kept[:, :3], ord=1 if ball == "l1" else 2, axis=1) <= 0.04 + SLACK).all()
+    np.testing.assert_array_equal(kept[:, 3:], actions[:, 3:])
+
+
+def test_actions_that_stay_inside_are_not_touched() -> None:
+    actions = np.full((3, 7), 0.01)
+    np.testing.assert_array_equal(box().kept(position(0.45, 0, 0.3), actions, limits_of()), actions)
+
+
+@given(NEAR)
+def test_the_search_does_not_leave_the_box_with_its_first_decision(where) -> None:
+    config, state = PlanningConfig(limits=limits_of(), horizon=4, action_repeat=2), position(*where)
+    wide, narrow = pose_space(config), box().narrowed(pose_space(config), state)
+    for bound, outwards in ((narrow.upper, 1), (narrow.lower, -1)):
+        ahead = state[:3] + 2 * bound[0, :3].double().numpy()
+        edge = np.array(CORNERS[1] if outwards > 0 else CORNERS[0])
+        assert (outwards * (ahead - np.where(outwards * (state[:3] - edge) > 0, state[:3], edge)) <= SLACK).all()
+    assert (narrow.lower >= wide.lower).all()
+    assert (narrow.upper <= wide.upper).all()
+    assert narrow.upper[1:].equal(wide.upper[1:]), "where later decisions begin is not known"
+
+
+def controller(**limits: object) -> Controller:
+    config = PlanningConfig(samples=12, iterations=2, horizon=2, cem=CemConfig(elites=4), limits=LimitsConfig(**limits))
+    made = Controller(tiny_model(), config)
+    made.reset(image(100))
+    return made
+
+
+@pytest.mark.parametrize("ball", BALLS)
+def test_a_controller_at_the_edge_stays_inside_and_still_moves(ball: str) -> None:
+    run, state = controller(workspace=CORNERS, xyz=(0.05, 0.05, 0.03), ball=ball, radius=0.04), position(0.6, 0.2, 0.1)
+    for seed in range(4):
+        action = run.act(image(seed), state)
+        target = state[:3] + action[:3]
+        assert (target >= np.array(CORNERS[0]) - SLACK).all()
+        assert (target <= np.array(CORNERS[1]) + SLACK).all()
+        assert action[:3].any()
+        assert run.decision.why == "planned"
+        np.testing.assert_allclose(run.decision.states[1, :3], target, atol=1e-7)
+
+
+def test_a_robot_slightly_outside_goes_back_and_one_far_outside_goes_nowhere() -> None:
+    run = controller(workspace=CORNERS)
+    action = run.act(image(0), position(0.63, 0.0, 0.3))
+    assert action[0] <= -0.03 + SLACK
+    action = run.act(image(0), position(0.7, 0.0, 0.3))
+    assert not action.any()
+    assert run.decision.why == "outside the workspace"
+    assert run.decision.plan is None
+
+
+def test_without_a_model_that_answers_nobody_moves_even_outside() -> None:
+    run = controller(workspace=CORNERS)
+    with torch.no_grad():
+        for weight in run._model.predictor.parameters():
+            weight.fill_(torch.nan)
+    assert not run.act(image(0), position(0.63, 0.0, 0.3)).any()
+    assert run.decision.why == "no finite energy"
+
+
+@pytest.mark.parametrize("space", [CAMERA_POSE, vector_states(8)])
+def test_a_box_is_of_poses_in_the_base_frame(space) -> None:
+    with pytest.raises(InputError, match="workspace: a model whose states are not poses"):
+        Workspace.of(limits_of(), space)
+    assert Workspace.of(LimitsConfig(), space) is None
+
+
+@pytest.mark.parametrize("corners", [((0, 0, 0), (1, 1, 0)), ((0, 0, 0), (1, 1, math.nan)), ((0, 0, 0), (1, 1, 600))])
+def test_a_box_without_room_or_in_millimetres_is_refused(corners) -> None:
+    with pytest.raises(ValueError, match="workspace"):
+        LimitsConfig(workspace=corners)
