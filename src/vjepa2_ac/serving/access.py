@@ -1,0 +1,115 @@
+"""Access: who may reach the server. Decided from headers alone, before a message is read."""
+
+from __future__ import annotations
+
+import hmac
+import ipaddress
+import logging
+import stat
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+
+from vjepa2_ac.errors import InputError
+
+logger = logging.getLogger(__name__)
+
+LEAST_KEY = 16  # characters
+_SCHEMES = ("api-key", "bearer")  # openpi's clients send the first one
+
+
+@dataclass(frozen=True)
+class Access:
+    """The rules of one server.
+
+    Raises:
+        InputError: The address can be reached from elsewhere, and there is neither a key nor an explicit choice.
+    """
+
+    host: str  # which it listens on
+    key: str | None = None  # that a client must send
+    is_insecure: bool = False  # whether another address than this machine's own needs no key
+    names: Collection[str] = ()  # under which it is reached besides: of a proxy
+
+    def __post_init__(self) -> None:
+        if not is_loopback(self.host) and self.key is None and not self.is_insecure:
+            raise InputError(
+                where=f"--host {self.host}",
+                found="an address that other machines can reach, and no key: whoever reaches it moves the robot",
+                needed="--key-file FILE with a key that clients send; or --host 127.0.0.1",
+                fix="--insecure serves without a key, in a network where everybody may move the robot",
+            )
+
+    def why_not(self, host: str | None, authorization: str | None) -> tuple[int, str] | None:
+        """Return the HTTP status and the reason why a request is refused; None: it may come in.
+
+        Args:
+            host: Its header `Host`: a page in a browser may know this machine by a name of its own.
+            authorization: Its header `Authorization`.
+        """
+        if not self._is_known(host):
+            return 403, "this server is not known by that name (--allow-host NAME)"
+        if self.key is not None and not self._has_key(authorization):
+            return 401, "this server needs the key of its --key-file, as `Authorization: Api-Key KEY`"
+        return None
+
+    def _is_known(self, host: str | None) -> bool:
+        """Return whether a request names this server by an address, or by a name that is its own."""
+        if host is None:
+            return False
+        name = _without_port(host)
+        return _is_address(name) or name in {"localhost", self.host.lower(), *(one.lower() for one in self.names)}
+
+    def _has_key(self, authorization: str | None) -> bool:
+        scheme, _, given = (authorization or "").partition(" ")
+        expected = (self.key or "").encode()
+        is_same = hmac.compare_digest(given.strip().encode(errors="surrogateescape"), expected)
+        return is_same and scheme.lower() in _SCHEMES
+
+
+def read_key(path: Path) -> str:
+    """Return the key in a file: its first line.
+
+    Raises:
+        InputError: The file cannot be read, or the key is short or not plain text.
+    """
+    try:
+        text = path.read_text(encoding="ascii")
+        mode = path.stat().st_mode
+    except (OSError, UnicodeDecodeError) as error:
+        found = error.strerror if isinstance(error, OSError) else "characters that are not ASCII"
+        raise InputError(where=f"--key-file {path}", found=str(found), needed="a file with a key") from None
+    key = text.partition("\n")[0].strip()
+    if len(key) < LEAST_KEY or not key.isprintable() or " " in key:
+        found = f"a first line of {len(key)} characters"
+        fix = f"Make one: python -c 'import secrets; print(secrets.token_urlsafe())' > {path}"
+        needed = f"a key of {LEAST_KEY} characters or more, without spaces"
+        raise InputError(where=f"--key-file {path}", found=found, needed=needed, fix=fix)
+    if mode & (stat.S_IRWXG | stat.S_IRWXO):
+        logger.warning("%s can be read by other users of this machine: chmod 600 %s", path, path)
+    return key
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether only this machine reaches an address; a name but `localhost` may be any machine's."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def _without_port(host: str) -> str:
+    name = host.strip().lower()
+    if name.startswith("["):
+        return name[1:].partition("]")[0]
+    return name.partition(":")[0] if name.count(":") == 1 else name
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True

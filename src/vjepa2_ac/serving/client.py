@@ -1,0 +1,73 @@
+"""A client of the server, for tests and for the simulated arm; openpi's sends and takes the same."""
+
+from __future__ import annotations
+
+from types import TracebackType
+from typing import Any, Self
+
+from vjepa2_ac.errors import InputError, UnreachableError
+from vjepa2_ac.serving.wire import MOST_BYTES, pack, unpack
+from vjepa2_ac.storage.libraries import require_library
+
+
+class PlanningClient:
+    """A connection to a server.
+
+    Example:
+        >>> with PlanningClient("ws://127.0.0.1:8000") as client:
+        >>>     answer = client.infer({"observation/image": image, "observation/state": state, "goal/image": goal})
+    """
+
+    def __init__(self, url: str, key: str | None = None) -> None:
+        """Connect, and wait until the server is ready.
+
+        Args:
+            url: ws://HOST:PORT, or wss://.
+            key: Of the server, if it needs one.
+
+        Raises:
+            UnreachableError: There is no server, or it refuses.
+        """
+        self.url = url
+        library = require_library("websockets.sync.client", where=url, called="websockets", extra="serve")
+        headers = {} if key is None else {"Authorization": f"Api-Key {key}"}
+        try:
+            self._connection = library.connect(
+                url, compression=None, max_size=MOST_BYTES, additional_headers=headers, proxy=None
+            )
+            self.metadata = unpack(self._connection.recv())
+        except Exception as error:
+            raise UnreachableError(where=url, found=_reason(error), needed="a server (`vjepa2-ac serve`)") from None
+
+    def infer(self, request: dict[str, Any]) -> dict[str, Any]:
+        """Return the answer to a request (docs/serving.md).
+
+        Raises:
+            InputError: The server refuses it.
+            UnreachableError: The connection is lost.
+        """
+        try:
+            self._connection.send(pack(request))
+            answer = self._connection.recv()
+        except Exception as error:
+            raise UnreachableError(where=self.url, found=f"the connection is lost: {_reason(error)}") from None
+        if isinstance(answer, str):
+            raise InputError(where=self.url, found=answer)
+        return unpack(answer)
+
+    def close(self) -> None:
+        """End the connection."""
+        self._connection.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+
+def _reason(error: Exception) -> str:
+    """Return why, with the server's own words where it refused the connection."""
+    response = getattr(error, "response", None)
+    body = getattr(response, "body", None)
+    return f"{error}: {body.decode(errors='replace').strip()}" if body else f"{error or type(error).__name__}"

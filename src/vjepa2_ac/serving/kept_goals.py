@@ -1,0 +1,53 @@
+"""Goals that a server keeps, by their names: pictures, and folders with an order of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.media.image_file import read_image
+from vjepa2_ac.planning.goals.folder import GOALS, read_goals
+from vjepa2_ac.planning.goals.sub_goals import SubGoal
+from vjepa2_ac.planning.input_checks import require_image
+
+KeptGoals = Mapping[str, tuple[SubGoal, ...]]
+
+_PICTURES = {".png", ".jpg", ".jpeg"}
+
+
+def read_kept_goals(folder: Path) -> KeptGoals:
+    """Return the goals of a folder: itself an order of goals; or pictures, and folders with such an order.
+
+    A picture `cup.png` is a goal of the name `cup`; an order of goals has its folder's name.
+
+    Raises:
+        InputError: There is no goal, two have one name, or a file cannot be used.
+    """
+    if not folder.is_dir():
+        found = "a file" if folder.exists() else "no such folder"
+        raise InputError(where=f"--goals {folder}", found=found, needed="a folder with goal images")
+    if (folder / GOALS).is_file():
+        return {folder.resolve().name: read_goals(folder)}
+    kept: dict[str, tuple[SubGoal, ...]] = {}
+    for path in sorted(folder.iterdir()):
+        goals = _goals_at(path)
+        if goals and path.stem in kept:
+            found = f"two goals named {path.stem!r}"
+            raise InputError(where=str(path), found=found, needed="another name for one of them")
+        kept |= {path.stem: goals} if goals else {}
+    if not kept:
+        found, needed = "no goal", f"pictures (PNG or JPEG), or folders with a {GOALS} (`vjepa2-ac goals` makes them)"
+        raise InputError(where=f"--goals {folder}", found=found, needed=needed)
+    return kept
+
+
+def _goals_at(path: Path) -> tuple[SubGoal, ...]:
+    """Return the goals that a file or folder is; none: it is something else."""
+    if path.is_dir():
+        return read_goals(path) if (path / GOALS).is_file() else ()
+    if path.suffix.lower() not in _PICTURES:
+        return ()
+    image = read_image(path)
+    require_image(image, where=str(path))
+    return (SubGoal(image, name=path.stem),)

@@ -1,0 +1,139 @@
+"""Recording: every decision as a line of JSON with its pictures, enough to make it again with `vjepa2-ac plan`."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.media.image_file import encode_png
+from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.planning.goals.sub_goals import SubGoal
+from vjepa2_ac.storage import user_can_write, write_atomically
+from vjepa2_ac.storage.structured import finite_or_none, json_text, utc_now
+
+logger = logging.getLogger(__name__)
+
+ABOUT, DECISIONS, IMAGES = "server.json", "decisions.jsonl", "images"
+FORMAT = 1  # incremented when a reader would have to change
+
+
+class Recorder:
+    """Writes decisions to a folder until it has its size. A disk that fails ends the record, never a decision.
+
+    Raises:
+        InputError: The folder holds something already, or cannot be written.
+    """
+
+    def __init__(self, folder: Path, about: Mapping[str, Any], most_bytes: int) -> None:
+        """Make the folder.
+
+        Args:
+            folder: A new one.
+            about: The server: model, settings, options.
+            most_bytes: Of the folder.
+        """
+        self.folder, self._left = folder, most_bytes
+        self._goals: tuple[SubGoal, ...] = ()
+        self._mask: np.ndarray | None = None
+        self._episode, self._done = 0, 0
+        self._is_on = True
+        if folder.exists() and any(folder.iterdir()):
+            raise InputError(where=f"--record {folder}", found="a folder that is not empty", needed="a new folder")
+        with user_can_write(folder):
+            (folder / IMAGES).mkdir(parents=True, exist_ok=True)
+            self._write(folder / ABOUT, json_text({"format": FORMAT, **about}))
+
+    def goal(self, goals: Sequence[SubGoal], mask: np.ndarray | None) -> None:
+        """Take note of a goal, with which an episode begins."""
+        self._goals, self._mask = tuple(goals), mask
+        self._episode, self._done = self._episode + 1, 0
+
+    def decision(self, controller: Controller, frame: np.ndarray, state: np.ndarray, answer: Mapping[str, Any]) -> None:
+        """Write down a decision that was made.
+
+        Args:
+            controller: With its `decision`.
+            frame: What it saw.
+            state: What was measured.
+            answer: What was sent.
+        """
+        number, self._done = self._done, self._done + 1
+        if not self._is_on:
+            return
+        try:
+            line = {
+                "time": utc_now(),
+                "episode": self._episode,
+                "decision": number,
+                "answer": _plain(answer),
+                "plan": self._words(controller, frame, state, number),
+            }
+            self._append(json.dumps(line, allow_nan=False) + "\n")
+        except OSError as error:
+            self._end(f"cannot be written ({error.strerror})")
+
+    def _words(self, controller: Controller, frame: np.ndarray, state: np.ndarray, number: int) -> list[str]:
+        """Return the arguments of `vjepa2-ac plan`, behind the model, that make this decision again in this folder."""
+        decision = controller.decision
+        if decision is None:
+            raise ValueError("nothing was decided")
+        present = self._goals[decision.goal]
+        ahead, durations = [present], []
+        left = number - decision.since
+        for goal in self._goals[decision.goal + 1 :]:
+            most = ahead[-1].at_most
+            if most is None:
+                break
+            durations.append(max(1, most - left))
+            ahead, left = [*ahead, goal], 0
+        words = ["--start", self._image(frame), "--state=" + ",".join(repr(float(one)) for one in state)]
+        for goal in ahead:
+            words += ["--goal", self._image(goal.image)]
+        words += ["--durations", ",".join(map(str, durations))] if durations else []
+        if self._mask is not None:
+            seen = (self._mask > 0).astype(np.uint8)[..., None] * np.uint8(255)
+            words += ["--mask", self._image(np.repeat(seen, 3, axis=-1))]
+        words += ["--seed", str(controller.seed + number)]
+        return words + ([f"planning.limits.gripper_mode={present.gripper}"] if present.gripper else [])
+
+    def _image(self, pixels: np.ndarray) -> str:
+        """Write an image, once however often it comes; return its name in the folder."""
+        digest = hashlib.sha256(repr(pixels.shape).encode() + np.ascontiguousarray(pixels).tobytes()).hexdigest()[:24]
+        name = f"{IMAGES}/{digest}.png"
+        if not (self.folder / name).exists():
+            self._write(self.folder / name, encode_png(pixels))
+        return name
+
+    def _append(self, line: str) -> None:
+        self._left -= len(line.encode())
+        if self._left < 0:
+            self._end("has reached its size (--record-gb)")
+            return
+        with (self.folder / DECISIONS).open("a") as file:
+            file.write(line)
+
+    def _write(self, path: Path, data: str | bytes) -> None:
+        data = data.encode() if isinstance(data, str) else data
+        self._left -= len(data)
+        write_atomically(path, data)
+
+    def _end(self, why: str) -> None:
+        self._is_on = False
+        logger.warning("the record in %s %s: it ends here, the server goes on", self.folder, why)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, Mapping):
+        return {key: _plain(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    return finite_or_none(value) if isinstance(value, float) else value

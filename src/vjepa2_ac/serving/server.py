@@ -1,0 +1,242 @@
+"""The server: websockets, health and figures over HTTP, and one robot at a time. Planning runs in a thread of its own."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import http
+import signal
+import ssl
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.serving.access import Access
+from vjepa2_ac.serving.prometheus import Histogram, counter, plain, text
+from vjepa2_ac.serving.session import GoneError, Session
+from vjepa2_ac.serving.wire import MOST_BYTES, pack
+from vjepa2_ac.serving.worker import Worker
+from vjepa2_ac.storage.libraries import require_library
+
+_END_S = 3.0  # that a decision may still take when the server ends: an iteration of its search
+_OPEN_S = 10.0  # that a handshake may take
+_WAITING = 2  # messages of a client that are read before they are answered
+
+
+@dataclass(frozen=True)
+class ServerOptions:
+    """Where and for whom a server listens."""
+
+    access: Access
+    port: int = 8000  # 0: a free one
+    certificate: ssl.SSLContext | None = None  # None: no TLS
+    ping_s: float = 20.0  # between pings; a client that does not answer one for as long is gone
+
+
+@dataclass(frozen=True)
+class Served:
+    """What is served, once it is loaded."""
+
+    session: Session
+    metadata: Mapping[str, Any]
+
+
+class PlanningServer:
+    """Serves a planner to one robot at a time."""
+
+    def __init__(
+        self,
+        load: Callable[[], Served],
+        options: ServerOptions,
+        tell: Callable[[str], None],
+    ) -> None:
+        """Prepare; nothing is loaded yet.
+
+        Args:
+            load: Loads the model and makes a first decision; runs in the planning thread while the server listens.
+            options: Where it listens, and for whom.
+            tell: Takes a line for whoever started it.
+        """
+        self._load, self._options, self._tell = load, options, tell
+        self._worker = Worker()
+        self._served: Served | None = None
+        self._ready: asyncio.Event = asyncio.Event()
+        self._robot: str | None = None  # the address of the one that is served
+        self._seconds = Histogram()
+        self._turned_away: dict[str, int] = {}
+
+    async def run(self, stop: asyncio.Event) -> bool:
+        """Listen until `stop`; return whether the planning thread has ended, too.
+
+        Raises:
+            InputError: What is to be served cannot be loaded, or the address cannot be listened on.
+        """
+        library = require_library("websockets.asyncio.server", where="serve", called="websockets", extra="serve")
+        options = self._options
+        try:
+            server = await library.serve(
+                self._robot_came,
+                options.access.host,
+                options.port,
+                process_request=self._asked,
+                origins=[None],  # a page in a browser sends one
+                compression=None,
+                max_size=MOST_BYTES,
+                max_queue=_WAITING,
+                open_timeout=_OPEN_S,
+                ping_interval=options.ping_s,
+                ping_timeout=options.ping_s,
+                server_header=None,
+                ssl=options.certificate,
+            )
+        except OSError as error:
+            where = f"{options.access.host}:{options.port}"
+            fix = "Choose another --host or --port; 0 takes a free one"
+            raise InputError(where=where, found=f"cannot be listened on: {error.strerror or error}", fix=fix) from None
+        try:
+            self._tell(f"listening on {_url(options, server.sockets[0].getsockname())}")
+            await self._serve(stop)
+        finally:
+            server.close()
+            await server.wait_closed()
+            ended = await asyncio.to_thread(self._worker.end, _END_S)
+        return ended
+
+    async def _serve(self, stop: asyncio.Event) -> None:
+        loading = asyncio.wrap_future(self._worker.submit(self._load))
+        stopping = asyncio.ensure_future(stop.wait())
+        await asyncio.wait({loading, stopping}, return_when=asyncio.FIRST_COMPLETED)
+        if stop.is_set():
+            return
+        self._served = loading.result()
+        self._ready.set()
+        self._tell("ready")
+        await stopping
+
+    def _asked(self, connection: Any, request: Any) -> Any:
+        """Answer what comes over HTTP, and refuse who may not come in; None: a robot may begin."""
+        path = request.path.partition("?")[0]
+        host, authorization = (_only(request.headers.get_all(name)) for name in ("Host", "Authorization"))
+        if path == "/healthz":
+            return connection.respond(http.HTTPStatus.OK, "OK\n")
+        if path == "/readyz":
+            status = http.HTTPStatus.OK if self._ready.is_set() else http.HTTPStatus.SERVICE_UNAVAILABLE
+            return connection.respond(status, "ready\n" if self._ready.is_set() else "loading\n")
+        refused = self._options.access.why_not(host, authorization)
+        if refused is None and path == "/metrics":
+            return connection.respond(http.HTTPStatus.OK, self._figures())
+        if refused is None and path != "/":
+            return connection.respond(http.HTTPStatus.NOT_FOUND, "no such page\n")
+        if refused is None and self._robot is not None and request.headers.get_all("Upgrade"):
+            refused = 503, _busy(self._robot)
+        if refused is None:
+            return None
+        status, reason = refused
+        self._turned_away[str(status)] = self._turned_away.get(str(status), 0) + 1
+        return connection.respond(http.HTTPStatus(status), f"{reason}\n")
+
+    async def _robot_came(self, connection: Any) -> None:
+        """Serve a robot until it leaves; one that comes before the model is loaded waits."""
+        if self._robot is not None:  # both came at once
+            await connection.close(1013, _busy(self._robot)[:100])
+            return
+        self._robot = _name(connection)
+        left = asyncio.ensure_future(connection.wait_closed())
+        try:
+            await asyncio.wait(
+                {left, ready := asyncio.ensure_future(self._ready.wait())}, return_when=asyncio.FIRST_COMPLETED
+            )
+            ready.cancel()
+            if self._served is not None and not left.done():
+                await self._serve_robot(connection, left, self._served)
+        finally:
+            self._robot = None
+            left.cancel()
+
+    async def _serve_robot(self, connection: Any, left: asyncio.Future[None], served: Served) -> None:
+        self._tell(f"{self._robot} is here")
+        await asyncio.wrap_future(self._worker.submit(served.session.begin))
+        closed = require_library("websockets.exceptions", where="serve", called="websockets", extra="serve")
+        with contextlib.suppress(closed.ConnectionClosed):
+            await connection.send(pack(served.metadata))
+            async for message in connection:
+                if isinstance(message, str):
+                    await connection.send("a request is a binary message, in msgpack")
+                    continue
+                answer = await self._answer(message, left, served.session)
+                if answer is None:
+                    break
+                await connection.send(answer)
+        self._tell(f"{self._robot} has left")
+
+    async def _answer(self, message: bytes, left: asyncio.Future[None], session: Session) -> bytes | str | None:
+        """Return the answer to a message; None: the robot has left, and its search ends within an iteration."""
+        gone = threading.Event()
+        answering = asyncio.wrap_future(self._worker.submit(lambda: session.answer(message, gone.is_set)))
+        try:
+            await asyncio.wait({answering, left}, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            if not answering.done():
+                gone.set()
+        try:
+            return await answering
+        except GoneError:
+            return None
+
+    def _figures(self) -> str:
+        counts = None if self._served is None else self._served.session.counts
+        if counts is not None:
+            seconds, counts.seconds = counts.seconds, []
+            for one in seconds:
+                self._seconds.add(one)
+        decisions = {} if counts is None else dict(counts.decisions)
+        refused, failed, episodes = (0, 0, 0) if counts is None else (counts.refused, counts.failed, counts.episodes)
+        return text([
+            plain("ready", "1 once requests are answered.", float(self._ready.is_set())),
+            plain("robots", "Robots that are connected.", float(self._robot is not None)),
+            counter("decisions_total", "Decisions, by their reason.", decisions, "why"),
+            plain("requests_refused_total", "Requests that could not be used.", refused, "counter"),
+            plain("requests_failed_total", "Requests at which the server failed.", failed, "counter"),
+            plain("episodes_total", "Episodes that were begun.", episodes, "counter"),
+            counter("connections_refused_total", "Connections, by HTTP status.", self._turned_away, "status"),
+            self._seconds.lines("decision_seconds", "Duration of a decision."),
+        ])  # fmt: skip
+
+
+def serve(load: Callable[[], Served], options: ServerOptions, tell: Callable[[str], None]) -> bool:
+    """Serve until SIGTERM or SIGINT; return whether the planning thread has ended, too.
+
+    Raises:
+        InputError: As `PlanningServer.run`.
+    """
+
+    async def until_signalled() -> bool:
+        stop = asyncio.Event()
+        loop = asyncio.get_running_loop()
+        numbers = (signal.SIGTERM, signal.SIGINT) if threading.current_thread() is threading.main_thread() else ()
+        for number in numbers:
+            loop.add_signal_handler(number, stop.set)
+        return await PlanningServer(load, options, tell).run(stop)
+
+    return asyncio.run(until_signalled())
+
+
+def _busy(robot: str) -> str:
+    return f"busy: a robot at {robot} is being served, and one server moves one robot"
+
+
+def _name(connection: Any) -> str:
+    address = connection.remote_address
+    return f"{address[0]}:{address[1]}" if isinstance(address, tuple) else "an unknown address"
+
+
+def _url(options: ServerOptions, address: tuple[Any, ...]) -> str:
+    host = f"[{address[0]}]" if ":" in str(address[0]) else address[0]
+    return f"{'ws' if options.certificate is None else 'wss'}://{host}:{address[1]}"
+
+
+def _only(values: list[str]) -> str | None:
+    """Return the value of a header that comes once."""
+    return values[0] if len(values) == 1 else None
