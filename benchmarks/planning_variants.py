@@ -23,7 +23,7 @@ from vjepa2_ac.model.adapter.lora import add_adapter, lora_layers
 from vjepa2_ac.model.checkpoints.official import to_official
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.energy import Scene, WorldModelCost, distance
-from vjepa2_ac.planning.goal import Goal
+from vjepa2_ac.planning.goals.goal import Goal
 from vjepa2_ac.planning.interfaces import Cost, Plan
 from vjepa2_ac.planning.model_setup import prepare_for_planning
 from vjepa2_ac.planning.planner import Planner

@@ -36,6 +36,8 @@ OTHERS = {
     "data.stride_candidates": (2, 3),
     "planning.budget_s": 1.0,
     "planning.limits.axes": (0.1,),
+    "planning.goals.share": 0.3,
+    "planning.goals.stop_share": 0.3,
     "data.idle.ranges": "ranges.json",
     "data.fields.cameras": {"exterior_1_left": "steps/observation/exterior_image_2_left"},
     "data.lerobot.state": ("observation.state.gripper_position", "observation.state.cartesian_position"),

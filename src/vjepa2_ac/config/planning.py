@@ -12,6 +12,7 @@ from vjepa2_ac.errors import InputError
 
 Place = Annotated[float, Field(ge=-5.0, le=5.0)]  # along an axis of the base frame, in metres; no arm reaches farther
 Corner = tuple[Place, Place, Place]
+Fraction = Annotated[float, Field(gt=0.0, lt=1.0)]
 Metre = ZeroToOne  # no arm moves farther in a model step: more would be millimetres
 
 
@@ -84,6 +85,17 @@ class EnergyConfig(Section):
     """last: of the plan's last step (upstream). sum: over all its steps."""
     samples_at_once: PositiveInt = 64
     """Action sequences that go through the predictor at once: bounds its memory."""
+
+
+class GoalsConfig(Section):
+    """When the next of several goals takes its turn, and when the last one is reached."""
+
+    share: Fraction | None = None
+    """Of all goals but the last, instead of what each says: the next one follows once the energy is below this share of
+    what it was when the goal began, within its bounds on the number of steps. null: each goal's own share, if any."""
+    stop_share: Fraction | None = None
+    """Of the last goal, or the only one, instead of its own: below this share of its first energy it is reached, and
+    nothing is done until the next reset. null: its own share, if any; else it is reached by an equal image only."""
 
 
 class CemConfig(Section):
@@ -180,6 +192,8 @@ class PlanningConfig(Section):
     """Limits of every action."""
     energy: EnergyConfig = EnergyConfig()
     """Distance of a prediction from the goal."""
+    goals: GoalsConfig = GoalsConfig()
+    """Several goals one after another, and the end of the last one."""
     cem: CemConfig = CemConfig()
     """Of planner cem only."""
     icem: IcemConfig = IcemConfig()

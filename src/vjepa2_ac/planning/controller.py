@@ -23,7 +23,9 @@ from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.axes.axes_file import no_vertical_axis
 from vjepa2_ac.planning.axes.mapping import Axes
 from vjepa2_ac.planning.energy import Scene, WorldModelCost, distance
-from vjepa2_ac.planning.goal import Goal, patch_weights
+from vjepa2_ac.planning.goals.goal import GoalSequence, patch_weights
+from vjepa2_ac.planning.goals.progress import REACHED, AdvanceRule, GoalProgress
+from vjepa2_ac.planning.goals.sub_goals import GripperMode, SubGoal
 from vjepa2_ac.planning.input_checks import require_image, require_mask, require_numbers
 from vjepa2_ac.planning.interfaces import Plan
 from vjepa2_ac.planning.model_setup import Fingerprints, prepare_for_planning
@@ -38,8 +40,6 @@ from vjepa2_ac.spaces import EXTRINSICS, POSES, Spaces
 Seen = tuple[Tensor, np.ndarray]  # latents of an image, and the state
 Why = Literal["planned", "out of time", "at the goal", "no finite energy", "outside the workspace"]
 
-_REACHED = 1e-6  # the energy of an image equal to the goal image, up to rounding
-
 
 @dataclass(frozen=True)
 class Decision:
@@ -53,6 +53,10 @@ class Decision:
     plan: Plan | None  # None if the goal is reached, or the robot is outside the workspace
     states: Float[np.ndarray, "time dim"] | None  # states predicted along the plan, the current state first
     cost: WorldModelCost | None  # to evaluate other actions
+    since: int = 0  # model step, counted from the reset, at which the present goal began
+    began: float = np.nan  # energy of the image to it at that time
+    changed: str = ""  # why the goal changed just before this decision, a sentence; empty: it did not
+    done: bool = False  # the last goal is reached: no motion
 
 
 class Controller:
@@ -109,7 +113,9 @@ class Controller:
         self.spaces, self._axes = spaces, _axes_of(world_model, self.config, spaces)
         self.planner = Planner(self.config, search_space(self.config, spaces.state))
         self._workspace = Workspace.of(self.config.limits, spaces.state)
-        self._goal: Goal | None = None
+        self._searched: dict[GripperMode | None, SearchSpace] = {None: self.planner.space}
+        self._goal: GoalSequence | None = None
+        self._progress: GoalProgress | None = None  # at the last decision
         self._like = np.zeros(0)
         self._seen: list[Seen] = []  # the newest `planning.context`
         self._done = 0
@@ -184,15 +190,44 @@ class Controller:
 
         Raises:
             InputError: An image is invalid, sizes differ, or the mask is empty.
-            ValueError: The number of durations is not the number of goals minus one.
+            ValueError: No goals, or the number of durations is not the number of goals minus one, or one is below 1.
         """
-        for place, image in enumerate(goals):
-            require_image(image, where=f"goal {place}", like=goals[0] if place else None)
         if not goals:
             raise ValueError("no goal")
-        latents = torch.stack([self.encoded(image) for image in goals])
-        self._goal = Goal(latents, durations, self._weights(mask, goals[0]))
-        self._like, self._done, self.decision = goals[0], 0, None
+        if len(durations) != len(goals) - 1 or min(durations, default=1) < 1:
+            raise ValueError(f"{len(goals)} goals with durations {durations}: one for each but the last")
+        timed = [SubGoal(one, at_least=steps, at_most=steps) for one, steps in zip(goals, durations, strict=False)]
+        self.follow([*timed, SubGoal(goals[-1])], mask=mask)
+
+    def follow(self, goals: Sequence[SubGoal], *, mask: np.ndarray | None = None) -> None:
+        """Set goals that take their turns by their own rules, and forget all observations.
+
+        A goal gives way to the next one after its `at_least` steps at the earliest and its `at_most` at the latest, in
+        between as soon as the energy of the current image is below its share of what that was when the goal began.
+        There is no way back. The last one is reached by the same rule of energy: then nothing is done until the next
+        reset. `planning.goals` overrides their shares.
+
+        Args:
+            goals: In order; images of one size.
+            mask: As of `reset`.
+
+        Raises:
+            InputError: An image is invalid, sizes differ, the mask is empty, a goal would never end, the last one has a
+                bound, or a gripper mode is given for a robot whose states are vectors, or leaves nothing to plan.
+            ValueError: No goals.
+        """
+        if not goals:
+            raise ValueError("no goal")
+        for place, goal in enumerate(goals):
+            require_image(goal.image, where=f"goal {place}", like=goals[0].image if place else None)
+        rules = _rules(goals, self.config)
+        searched = {goal.gripper: self._space_with(goal.gripper) for goal in goals} | {None: self._searched[None]}
+        latents = torch.stack([self.encoded(goal.image) for goal in goals])
+        weights = self._weights(mask, goals[0].image)
+        self._goal = GoalSequence(latents, rules, tuple(goal.gripper for goal in goals), weights)
+        self._searched, self._progress = searched, None
+        self._use(None)
+        self._like, self._done, self.decision = goals[0].image, 0, None
         self._seen = []
 
     def act(
@@ -222,8 +257,18 @@ class Controller:
         state = self._known(np.asarray(state, dtype=np.float64))
         require_numbers(state, self.spaces.state, where="state")
         seen = [*self._seen, (self.encoded(frame), state)][-self.config.context :]
-        decision = self._decided(self._goal, seen, cancelled)
+        progress = self._progressed(self._goal, seen[-1][0])
+        decision = self._decided(self._goal, seen, progress, cancelled)
+        is_last = progress.place == len(self._goal.rules) - 1
+        decision = replace(
+            decision,
+            since=progress.since,
+            began=progress.began,
+            changed=progress.changed,
+            done=is_last and decision.why == "at the goal",
+        )
         self._seen, self._done, self.decision = seen, self._done + 1, decision  # after an error nothing has changed
+        self._progress = progress
         return decision.action
 
     def _known(self, state: np.ndarray) -> np.ndarray:
@@ -236,21 +281,33 @@ class Controller:
         """Return the latents of what the model sees of an image, on its device."""
         return encode_frames(self._model, image[None], self.crop)[0]
 
-    def _decided(self, goal: Goal, seen: Sequence[Seen], cancelled: Cancelled) -> Decision:
+    def _progressed(self, goal: GoalSequence, latents: Float[Tensor, "tokens dim"]) -> GoalProgress:
+        """Return which goal applies to the current image."""
+
+        def energy(place: int) -> float:
+            return float(distance(latents, goal.latents[place], self.config.energy.distance, goal.weights))
+
+        if self._progress is None:
+            return GoalProgress.first(energy)
+        return self._progress.after(goal.rules, self._done, energy)
+
+    def _decided(
+        self, goals: GoalSequence, seen: Sequence[Seen], progress: GoalProgress, cancelled: Cancelled
+    ) -> Decision:
         latents, state = seen[-1]
-        places = tuple(goal.place(self._done + step) for step in range(self.config.horizon))
-        wanted = goal.ahead(self._done, self.config.horizon)
+        goal, done = goals.rest(progress.place), self._done - progress.since
+        places = tuple(progress.place + goal.place(done + step) for step in range(self.config.horizon))
+        wanted = goal.ahead(done, self.config.horizon)
         still = distance(latents.expand_as(wanted), wanted, self.config.energy.distance, goal.weights)
         energy = float(still[-1] if self.config.energy.steps == "last" else still.sum())
-        reason: Why | None = "at the goal" if float(still.max()) <= _REACHED else None
+        reason: Why | None = "at the goal" if progress.done or float(still.max()) <= REACHED else None
         if reason is None and self._workspace is not None and not self._workspace.is_near(state, self.config.limits):
             reason = "outside the workspace"
         if reason is not None:
             still_here = self._command(state, np.zeros(len(state)))
             return Decision(still_here, reason, energy, places[0], places, None, None, None)
-        cost = WorldModelCost(
-            self._model, self._scene(seen), goal, self.config.energy, done=self._done, spaces=self.spaces
-        )
+        self._use(goals.grippers[progress.place])
+        cost = WorldModelCost(self._model, self._scene(seen), goal, self.config.energy, done=done, spaces=self.spaces)
         generator = torch.Generator().manual_seed(self.seed + self._done)
         before = None if self.decision is None else self.decision.plan
         start = before.start_after(1) if before is not None and self.config.warm_start else None
@@ -270,6 +327,31 @@ class Controller:
             return plan
         kept = box.kept(state, plan.actions.double().numpy(), self.config.limits)
         return replace(plan, actions=torch.from_numpy(kept).to(plan.actions))
+
+    def _use(self, gripper: GripperMode | None) -> None:
+        """Let the planner search what a gripper mode allows."""
+        space = self._searched[gripper]
+        if self.planner.space is not space:
+            self.planner = Planner(self.config, space, self.planner.clock, self.planner.progress)
+
+    def _space_with(self, gripper: GripperMode | None) -> SearchSpace:
+        """Return what a gripper mode allows.
+
+        Raises:
+            InputError: Nothing, or the robot has no gripper of its own.
+        """
+        if gripper is None:
+            return self._searched[None]
+        where, fix = f"gripper mode {gripper!r} of a goal", "Leave the goal's gripper mode out"
+        if not self.spaces.state.is_pose:
+            found = "a model whose states are vectors, in which no number is known to be the gripper"
+            raise InputError(where=where, found=found, needed="a pose and gripper", fix=fix)
+        limits = self.config.limits.model_copy(update={"gripper_mode": gripper})
+        space = search_space(self.config.model_copy(update={"limits": limits}), self.spaces.state)
+        if not len(space.free):
+            found = "nothing that is left to plan: planning.limits hold position and rotation"
+            raise InputError(where=where, found=found, fix=fix)
+        return space
 
     def _command(self, state: np.ndarray, change: np.ndarray) -> Float[np.ndarray, " action_dim"]:
         """Return the action that changes the state so: the change itself, or the state that it leads to."""
@@ -298,6 +380,27 @@ class Controller:
             return patch_weights(seen > 0, grid).to(self._model.device)
         except ValueError:
             raise InputError(where="mask", found="nothing of what the model sees counts") from None
+
+
+def _rules(goals: Sequence[SubGoal], config: PlanningConfig) -> tuple[AdvanceRule, ...]:
+    """Return the rule of each goal, with the shares of `planning.goals` where they are given.
+
+    Raises:
+        InputError: One would never end, or the last one has a bound.
+    """
+    rules = []
+    for place, goal in enumerate(goals):
+        is_last = place == len(goals) - 1
+        share = (config.goals.stop_share if is_last else config.goals.share) or goal.share
+        rule = AdvanceRule(goal.name, goal.at_least, goal.at_most, share, goal.floor)
+        if is_last and rule.at_most is not None:
+            found = f"at_most {rule.at_most} of the last goal, after which there is none"
+            raise InputError(where=f"goal {place}", found=found, needed="null: no bound")
+        if not is_last and rule.at_most is None and share is None:
+            found, needed = "a goal that would never end", "at_most or share, or planning.goals.share"
+            raise InputError(where=f"goal {place}", found=found, needed=needed)
+        rules.append(rule)
+    return tuple(rules)
 
 
 def _axes_of(world_model: WorldModel, config: PlanningConfig, spaces: Spaces) -> Axes | None:

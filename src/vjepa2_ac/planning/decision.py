@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from jaxtyping import Float, UInt8
 
 from vjepa2_ac.planning.controller import Controller, Decision
 from vjepa2_ac.planning.energy_slices import EnergySlice, energy_slices
+from vjepa2_ac.planning.goals.sub_goals import SubGoal
 from vjepa2_ac.planning.search_space import SearchSpace
 from vjepa2_ac.spaces import StateSpace
 
@@ -24,6 +26,14 @@ class PlanRequest:
     goals: tuple[np.ndarray, ...]
     durations: tuple[int, ...] = ()  # model steps of each goal but the last
     mask: np.ndarray | None = None  # region of the image that counts: height x width
+    sub_goals: tuple[SubGoal, ...] = ()  # of these images, with rules instead of durations; empty: durations apply
+
+    @classmethod
+    def of_sub_goals(
+        cls, start: np.ndarray, state: np.ndarray, goals: Sequence[SubGoal], mask: np.ndarray | None = None
+    ) -> PlanRequest:
+        """Return the request to plan towards goals with rules of their own; the first one applies."""
+        return cls(start, state, tuple(goal.image for goal in goals), mask=mask, sub_goals=tuple(goals))
 
     def with_equal_durations(self, horizon: int) -> PlanRequest:
         """Return the same request with the steps divided equally among the goals, the last one taking the rest."""
@@ -88,7 +98,10 @@ def decide(controller: Controller, question: PlanRequest, *, nodes: int = 0) -> 
         ValueError: The number of durations is not the number of goals minus one.
     """
     began = time.perf_counter()
-    controller.reset(*question.goals, durations=question.durations, mask=question.mask)
+    if question.sub_goals:
+        controller.follow(question.sub_goals, mask=question.mask)
+    else:
+        controller.reset(*question.goals, durations=question.durations, mask=question.mask)
     ready = time.perf_counter()
     controller.act(question.start, question.state)
     decided = time.perf_counter()

@@ -16,7 +16,7 @@ from vjepa2_ac.distances import absolute_difference, squared_difference
 from vjepa2_ac.model.network.kv_cache import KeyValueCache
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.axes.mapping import Axes
-from vjepa2_ac.planning.goal import Goal
+from vjepa2_ac.planning.goals.goal import Goal
 from vjepa2_ac.planning.state_integration import states_along
 from vjepa2_ac.spaces import POSES, Spaces
 

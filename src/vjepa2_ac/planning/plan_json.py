@@ -10,6 +10,7 @@ import numpy as np
 
 from vjepa2_ac.planning.decision import PlanResult
 from vjepa2_ac.planning.energy_slices import EnergySlice
+from vjepa2_ac.planning.goals.sub_goals import SubGoal
 from vjepa2_ac.planning.interfaces import Iteration
 from vjepa2_ac.planning.summary import summarize
 from vjepa2_ac.storage import write_atomically
@@ -47,8 +48,13 @@ def plan_as_dict(answer: PlanResult, about: Mapping[str, Any]) -> dict[str, Any]
         "actions": _plain(answer.actions),
         "states": _plain(answer.states),
         "goal_of_each_step": list(decision.goals),
+        "sub_goals": [_sub_goal(one) for one in answer.question.sub_goals],
+        "since": decision.since,
+        "changed": decision.changed,
+        "done": decision.done,
         "energy": {
             "now": finite_or_none(decision.energy_now),
+            "began": finite_or_none(decision.began),
             "doing_nothing": finite_or_none(answer.doing_nothing),
             "plan": None if plan is None else finite_or_none(plan.energy),
         },
@@ -62,6 +68,10 @@ def plan_as_dict(answer: PlanResult, about: Mapping[str, Any]) -> dict[str, Any]
             "slices": answer.seconds.slices,
         },
     }
+
+
+def _sub_goal(one: SubGoal) -> dict[str, Any]:
+    return {name: getattr(one, name) for name in ("name", "at_least", "at_most", "share", "gripper", "floor")}
 
 
 def _iteration(one: Iteration) -> dict[str, Any]:

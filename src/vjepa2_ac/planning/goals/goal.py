@@ -1,4 +1,4 @@
-"""Goals: one goal image or a sequence of them, optionally limited to a region of the image."""
+"""Latents of goals: one goal image or a sequence of them, optionally limited to a region of the image."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
+
+from vjepa2_ac.planning.goals.progress import AdvanceRule
+from vjepa2_ac.planning.goals.sub_goals import GripperMode
 
 _EVERYWHERE = 1e-12
 
@@ -48,6 +51,25 @@ class Goal:
         """
         places = [self.place(done + step) for step in range(steps)]
         return torch.stack([self.latents[place] for place in places])  # a list as an index would wait for the device
+
+
+@dataclass(frozen=True)
+class GoalSequence:
+    """Latents of goals in order, with the rule of each."""
+
+    latents: Float[Tensor, "goals tokens dim"]
+    rules: tuple[AdvanceRule, ...]
+    grippers: tuple[GripperMode | None, ...]  # None: planning.limits.gripper_mode
+    weights: Float[Tensor, " tokens"] | None = None  # as of `Goal`
+
+    def rest(self, place: int) -> Goal:
+        """Return a goal and what follows it by count at the latest, for plans of several steps."""
+        durations: list[int] = []
+        for rule in self.rules[place:-1]:
+            if rule.at_most is None:
+                break
+            durations.append(rule.at_most)
+        return Goal(self.latents[place : place + len(durations) + 1], tuple(durations), self.weights)
 
 
 def patch_weights(
