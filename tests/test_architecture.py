@@ -26,6 +26,7 @@ ORDERS: dict[str, list[str]] = {
         "runs",
         "encoding",
         "planning",
+        "serving",
         "decoding",
         "evaluation",
         "reports",
@@ -36,6 +37,12 @@ ORDERS: dict[str, list[str]] = {
     ],
     "data": ["picture_file", "index", "cache filters", "sources", "clips", "inspection"],
     "data.sources": ["listing configured_spaces indexed_source", "rlds droid_raw lerobot npz latents", "registry"],
+    "serving": [
+        "wire worker prometheus access client",
+        "request waypoints bounds kept_goals recording",
+        "session",
+        "about server",
+    ],
     "model": [
         "finite sizes quiet_imports",
         "base_model",
@@ -108,6 +115,7 @@ HOMES = {
     "jinja2": ["export/", "reports/"],
     "markupsafe": ["reports/html/"],
     "matplotlib": ["reports/"],
+    "msgpack": ["serving/wire.py"],
     "mujoco": ["simulation/world/"],
     "peft": ["model/adapter/"],
     "pyarrow": ["data/sources/lerobot/"],
@@ -117,6 +125,7 @@ HOMES = {
     "torchao": ["model/quantization.py"],
     "torchvision": [],
     "transformers": ["model/network/"],
+    "websockets": ["serving/"],
 }  # fmt: skip
 
 MOST_PARAMETERS = 6  # of a function, without self and cls: more are a record

@@ -19,6 +19,7 @@ from vjepa2_ac.cli import (
     evaluate,
     export,
     plan,
+    serve,
     simulate,
     train,
 )
@@ -104,6 +105,20 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=__version__)
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for one in (train, evaluate, imagine, data, encode, decoder, doctor, plan, export, config, download, simulate):
+    for one in (
+        train,
+        evaluate,
+        imagine,
+        data,
+        encode,
+        decoder,
+        doctor,
+        plan,
+        serve,
+        export,
+        config,
+        download,
+        simulate,
+    ):
         one.add_to(commands)
     return parser

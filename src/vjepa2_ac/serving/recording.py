@@ -7,16 +7,18 @@ import json
 import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.image_file import encode_png
-from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.goals.sub_goals import SubGoal
 from vjepa2_ac.storage import user_can_write, write_atomically
 from vjepa2_ac.storage.structured import finite_or_none, json_text, utc_now
+
+if TYPE_CHECKING:
+    from vjepa2_ac.planning.controller import Controller
 
 logger = logging.getLogger(__name__)
 
@@ -44,8 +46,7 @@ class Recorder:
         self._mask: np.ndarray | None = None
         self._episode, self._done = 0, 0
         self._is_on = True
-        if folder.exists() and any(folder.iterdir()):
-            raise InputError(where=f"--record {folder}", found="a folder that is not empty", needed="a new folder")
+        require_new_record(folder)
         with user_can_write(folder):
             (folder / IMAGES).mkdir(parents=True, exist_ok=True)
             self._write(folder / ABOUT, json_text({"format": FORMAT, **about}))
@@ -79,11 +80,13 @@ class Recorder:
         except OSError as error:
             self._end(f"cannot be written ({error.strerror})")
 
-    def _words(self, controller: Controller, frame: np.ndarray, state: np.ndarray, number: int) -> list[str]:
-        """Return the arguments of `vjepa2-ac plan`, behind the model, that make this decision again in this folder."""
-        decision = controller.decision
+    def _words(self, controller: Controller, frame: np.ndarray, state: np.ndarray, number: int) -> list[str] | None:
+        """Return the words of `vjepa2-ac plan MODEL` that make this decision again in this folder; None: none do."""
+        decision, config = controller.decision, controller.config
         if decision is None:
             raise ValueError("nothing was decided")
+        if decision.why == "out of time" or (number and (config.context > 1 or config.warm_start)):
+            return None  # it depends on the clock, or on decisions before it
         present = self._goals[decision.goal]
         ahead, durations = [present], []
         left = number - decision.since
@@ -127,6 +130,16 @@ class Recorder:
     def _end(self, why: str) -> None:
         self._is_on = False
         logger.warning("the record in %s %s: it ends here, the server goes on", self.folder, why)
+
+
+def require_new_record(folder: Path) -> None:
+    """Refuse a place where something is.
+
+    Raises:
+        InputError: It is a file, or a folder that is not empty.
+    """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(where=f"--record {folder}", found="something that is there already", needed="a new folder")
 
 
 def _plain(value: Any) -> Any:

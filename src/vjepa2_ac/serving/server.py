@@ -1,4 +1,4 @@
-"""The server: websockets, health and figures over HTTP, and one robot at a time. Planning runs in a thread of its own."""
+"""The server: a websocket for one robot at a time, health and figures over HTTP. It plans in a thread of its own."""
 
 from __future__ import annotations
 
@@ -10,15 +10,17 @@ import ssl
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.serving.access import Access
 from vjepa2_ac.serving.prometheus import Histogram, counter, plain, text
-from vjepa2_ac.serving.session import GoneError, Session
 from vjepa2_ac.serving.wire import MOST_BYTES, pack
-from vjepa2_ac.serving.worker import Worker
+from vjepa2_ac.serving.worker import GoneError, Worker
 from vjepa2_ac.storage.libraries import require_library
+
+if TYPE_CHECKING:  # PyTorch is imported with the model, when the server listens
+    from vjepa2_ac.serving.session import Session
 
 _END_S = 3.0  # that a decision may still take when the server ends: an iteration of its search
 _OPEN_S = 10.0  # that a handshake may take
@@ -107,7 +109,7 @@ class PlanningServer:
     async def _serve(self, stop: asyncio.Event) -> None:
         loading = asyncio.wrap_future(self._worker.submit(self._load))
         stopping = asyncio.ensure_future(stop.wait())
-        await asyncio.wait({loading, stopping}, return_when=asyncio.FIRST_COMPLETED)
+        await _first_of(loading, stopping)
         if stop.is_set():
             return
         self._served = loading.result()
@@ -122,15 +124,16 @@ class PlanningServer:
         if path == "/healthz":
             return connection.respond(http.HTTPStatus.OK, "OK\n")
         if path == "/readyz":
-            status = http.HTTPStatus.OK if self._ready.is_set() else http.HTTPStatus.SERVICE_UNAVAILABLE
-            return connection.respond(status, "ready\n" if self._ready.is_set() else "loading\n")
-        refused = self._options.access.why_not(host, authorization)
+            is_ready = self._ready.is_set()
+            ready = http.HTTPStatus.OK if is_ready else http.HTTPStatus.SERVICE_UNAVAILABLE
+            return connection.respond(ready, "ready\n" if is_ready else "loading\n")
+        refused: tuple[int, str] | None = self._options.access.why_not(host, authorization)
         if refused is None and path == "/metrics":
             return connection.respond(http.HTTPStatus.OK, self._figures())
         if refused is None and path != "/":
             return connection.respond(http.HTTPStatus.NOT_FOUND, "no such page\n")
         if refused is None and self._robot is not None and request.headers.get_all("Upgrade"):
-            refused = 503, _busy(self._robot)
+            refused = http.HTTPStatus.SERVICE_UNAVAILABLE.value, _busy(self._robot)
         if refused is None:
             return None
         status, reason = refused
@@ -145,9 +148,7 @@ class PlanningServer:
         self._robot = _name(connection)
         left = asyncio.ensure_future(connection.wait_closed())
         try:
-            await asyncio.wait(
-                {left, ready := asyncio.ensure_future(self._ready.wait())}, return_when=asyncio.FIRST_COMPLETED
-            )
+            await _first_of(left, ready := asyncio.ensure_future(self._ready.wait()))
             ready.cancel()
             if self._served is not None and not left.done():
                 await self._serve_robot(connection, left, self._served)
@@ -176,7 +177,7 @@ class PlanningServer:
         gone = threading.Event()
         answering = asyncio.wrap_future(self._worker.submit(lambda: session.answer(message, gone.is_set)))
         try:
-            await asyncio.wait({answering, left}, return_when=asyncio.FIRST_COMPLETED)
+            await _first_of(answering, left)
         finally:
             if not answering.done():
                 gone.set()
@@ -221,6 +222,10 @@ def serve(load: Callable[[], Served], options: ServerOptions, tell: Callable[[st
         return await PlanningServer(load, options, tell).run(stop)
 
     return asyncio.run(until_signalled())
+
+
+async def _first_of(*futures: asyncio.Future[Any]) -> None:
+    await asyncio.wait(futures, return_when=asyncio.FIRST_COMPLETED)
 
 
 def _busy(robot: str) -> str:

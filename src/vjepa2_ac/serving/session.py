@@ -25,6 +25,7 @@ from vjepa2_ac.serving.recording import Recorder
 from vjepa2_ac.serving.request import IMAGE_KEYS, GivenGoal, NamedGoal, Request, read_request
 from vjepa2_ac.serving.waypoints import waypoints
 from vjepa2_ac.serving.wire import WireError, pack, unpack
+from vjepa2_ac.serving.worker import GoneError
 from vjepa2_ac.storage.structured import finite_or_none
 
 logger = logging.getLogger(__name__)
@@ -34,10 +35,6 @@ Clock = Callable[[], float]  # seconds, from anywhere
 
 _MOST_NAMES = 20  # of goals in a message
 _BAR = 0.05  # share of an image's height, black at the top and at the bottom: a padded image
-
-
-class GoneError(Exception):
-    """Nobody waits for the answer any more."""
 
 
 @dataclass(frozen=True)
@@ -74,8 +71,6 @@ class Session:
         controller: Controller,
         goals: KeptGoals | None = None,
         options: SessionOptions | None = None,
-        *,
-        recorder: Recorder | None = None,
         clock: Clock = time.monotonic,
     ) -> None:
         """Begin without a robot.
@@ -84,13 +79,13 @@ class Session:
             controller: Plans.
             goals: That a client may name.
             options: How it answers.
-            recorder: Writes every decision down.
             clock: Measures the deadline.
         """
         self.controller, self.options = controller, options or SessionOptions()
         self.goals: Mapping[str, tuple[SubGoal, ...]] = goals or {}
         self.counts = Counts()
-        self._recorder, self._clock = recorder, clock
+        self.recorder: Recorder | None = None  # writes every decision down
+        self._clock = clock
         self._episode: str | None = None
         self._goal: str | None = None  # fingerprint of the present one
         self._names: tuple[str, ...] = ()  # of its parts
@@ -162,8 +157,8 @@ class Session:
         found = self._message(decision, state, changes, why)
         found["policy_timing"] = {"infer_ms": 1e3 * (self._clock() - planning_began)}
         found = self._finished(found, why, began)
-        if self._recorder is not None:
-            self._recorder.decision(self.controller, frame, state, found)
+        if self.recorder is not None:
+            self.recorder.decision(self.controller, frame, state, found)
         return found
 
     def _checked(self, decision: Decision, state: np.ndarray) -> tuple[Float[np.ndarray, "steps dim"], str]:
@@ -180,7 +175,7 @@ class Session:
     def _message(
         self, decision: Decision, state: np.ndarray, changes: Float[np.ndarray, "steps dim"], why: str
     ) -> dict[str, Any]:
-        """Return an answer. Arrays have an action's place as first axis, all else is plain: clients cut arrays there."""
+        """Return an answer. Its arrays have one row an action, and all else is plain: clients take rows of arrays."""
         sent = np.zeros_like(changes) if self.options.dry_run else changes
         actions = self._actions(state, sent)
         found: dict[str, Any] = {
@@ -231,7 +226,7 @@ class Session:
         if self.options.actions == "pose":
             return waypoints(state, changes[0], self.options.control_steps)
         if self.controller.spaces.action.follows == "target":
-            return state + np.cumsum(changes, axis=0)
+            return np.asarray(state + np.cumsum(changes, axis=0))
         return changes
 
     def _forget(self, episode: str | None) -> None:
@@ -243,8 +238,8 @@ class Session:
         goals, mask = self._sub_goals(goal)
         self.controller.follow(goals, mask=mask)
         self._names = tuple(one.name for one in goals)
-        if self._recorder is not None:
-            self._recorder.goal(goals, mask)
+        if self.recorder is not None:
+            self.recorder.goal(goals, mask)
         self._goal = goal.fingerprint
 
     def _sub_goals(self, goal: GivenGoal | NamedGoal) -> tuple[tuple[SubGoal, ...], np.ndarray | None]:

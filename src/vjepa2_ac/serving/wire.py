@@ -17,7 +17,7 @@ MOST_BYTES = 32 << 20  # of a message: eight pictures of 1280 x 720 pixels
 MOST_PARTS = 256  # maps and lists of a message, arrays included
 MOST_ENTRIES = 64  # of a map or a list
 MOST_CHARACTERS = 4096  # of a text
-MOST_DEPTH = 4
+MOST_DEPTH = 6
 MOST_AXES = 4  # of an array
 
 _ARRAY, _SCALAR, _DATA, _DTYPE, _SHAPE = b"__ndarray__", b"__npgeneric__", b"data", b"dtype", b"shape"

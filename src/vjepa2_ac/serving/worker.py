@@ -11,6 +11,10 @@ from typing import Any, TypeVar
 _Found = TypeVar("_Found")
 
 
+class GoneError(Exception):
+    """Nobody waits for the answer any more."""
+
+
 class Worker:
     """One thread that does one thing after another. It does not keep the process alive."""
 

@@ -1,0 +1,114 @@
+"""About a server: what it tells on connect, and its first decision, before a robot is let in."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from vjepa2_ac import __version__
+from vjepa2_ac.config import Config
+from vjepa2_ac.data.clips.windows import require_stride
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.planning.session import PlanningSession
+from vjepa2_ac.serving.session import Session
+
+PROTOCOL = 1  # incremented when a client would have to change
+_MOST_NAMES = 60  # of goals that are told
+_SIZE = 180, 320  # of the picture of the first decision
+_SOMEWHERE = np.array([0.4, 0.0, 0.4, np.pi, 0.0, 0.0, 0.0])
+
+
+def require_steps(config: Config) -> int:
+    """Return the control steps of a model step.
+
+    Raises:
+        InputError: Nobody knows.
+    """
+    return require_stride(config.data, to="say how long an action lasts", fix="Say which, as data.stride=4")
+
+
+def metadata_of(loaded: PlanningSession, session: Session) -> dict[str, Any]:
+    """Return what a client may know of the server: plain values, without a path of this machine."""
+    planning, limits, model = loaded.config.planning, loaded.config.planning.limits, loaded.as_dict()["model"]
+    steps, rate = session.options.control_steps, _control_rate(loaded.config)
+    space = session.controller.spaces.state
+    return {
+        "policy": "vjepa2-ac",
+        "protocol": PROTOCOL,
+        "version": __version__,
+        "predictor": model["predictor"],
+        "encoder": model["encoder"],
+        "state": list(space.names),
+        "frame_of_states": loaded.config.data.pose_frame,
+        "control_steps": steps,
+        "seconds_per_step": None if rate is None else steps / rate,
+        "horizon": planning.horizon,
+        "limits": limits.model_dump(mode="json"),
+        "samples": planning.samples,
+        "iterations": planning.iterations,
+        "deadline_s": session.options.deadline_s,
+        "image_keys": list(session.options.image_keys),
+        "goals": sorted(session.goals)[:_MOST_NAMES],
+        "warnings": list(loaded.warnings),
+        "dry_run": session.options.dry_run,
+        **roboarena_metadata(session),
+    }
+
+
+def roboarena_metadata(session: Session) -> dict[str, Any]:
+    """Return the six keys of RoboArena's clients, which take no others."""
+    return {
+        "image_resolution": None,
+        "needs_wrist_camera": False,
+        "n_external_cameras": 1,
+        "needs_stereo_camera": False,
+        "needs_session_id": True,
+        "action_space": _action_space(session),
+    }
+
+
+def in_words(about: Mapping[str, Any], subject: str) -> str:
+    """Return a line for whoever started the server."""
+    limits = about["limits"]
+    box = "no workspace box" if limits["workspace"] is None else f"workspace {limits['workspace']}"
+    goals = f"goals: {', '.join(about['goals'])}" if about["goals"] else "no goals of its own"
+    dry = "; DRY RUN: every action is zero" if about["dry_run"] else ""
+    return f"{subject}: {about['action_space']}, xyz within {limits['xyz']} m a step, {box}; {goals}{dry}"
+
+
+def warm_up(controller: Controller) -> float:
+    """Make a decision about two pictures of noise; return how many seconds it took. Libraries and caches are then warm.
+
+    Raises:
+        InputError: The model gives no finite energy: it is broken.
+    """
+    began, rng = time.perf_counter(), np.random.default_rng(0)
+    goal, frame = rng.integers(0, 256, (2, *_SIZE, 3), dtype=np.uint8)
+    space, box = controller.spaces.state, controller.config.limits.workspace
+    state = _SOMEWHERE.copy() if space.is_pose else np.zeros(len(space))
+    if space.is_base_pose and box is not None:
+        state[:3] = np.mean(box, axis=0)
+    controller.reset(goal)
+    controller.act(frame, state)
+    if controller.decision is None or controller.decision.why == "no finite energy":
+        found = "no finite energy for any action: the model is broken"
+        raise InputError(where="serve", found=found, fix="Another checkpoint may not be: --checkpoint")
+    return time.perf_counter() - began
+
+
+def _control_rate(config: Config) -> float | None:
+    """Return the control steps a second; None: only the data set knows."""
+    sections = (getattr(config.data, name) for name in type(config.data).own_sections())
+    found = [getattr(one, "control_rate_hz", None) for one in sections]
+    return next((rate for rate in found if rate is not None), None)
+
+
+def _action_space(session: Session) -> str:
+    space = session.controller.spaces
+    if session.options.actions == "pose":
+        return "cartesian_position"
+    return "cartesian_delta" if space.state.is_pose else f"vector_{space.action.follows}"
