@@ -26,7 +26,7 @@ from vjepa2_ac.cli.options import (
 from vjepa2_ac.errors import InputError
 
 _OF_RECORD = ("cameras", "workers")
-_OF_A_MODEL = ("films", "decoder", "checkpoint", "config", "out")
+_OF_A_MODEL = ("sub_goals", "films", "decoder", "checkpoint", "config", "out")
 
 
 def add_to(commands: Commands) -> None:
@@ -52,6 +52,11 @@ def add_to(commands: Commands) -> None:
     group = parser.add_argument_group("of a model that steers")
     add_checkpoint(group, default=None)
     argument(group, "--config CONFIG", "of a model: a config whose `planning` is used", as_local)
+    text = (
+        "goals on the way: demonstration takes them from the oracle's solution of the same problem, where the gripper"
+        " changes or the arm stops (none)"
+    )
+    argument(group, "--sub-goals", text, choices=["none", "demonstration"])
     argument(group, "--films N", "episodes in the video; 0: none (6)", whole_number(0))
     add_decoder(group, "in the video what the model imagined of each frame, one step ago")
     text = "where figures and video go (closed_loop/TASK-DOMAIN, in the run's)"
@@ -66,7 +71,7 @@ def _simulate(options: argparse.Namespace) -> int:
     needed = "a model that steers" if records else "`simulate record FOLDER`"
     for name in _OF_A_MODEL if records else _OF_RECORD:
         if getattr(options, name) is not None:
-            raise InputError(where=f"--{name}", found=f"simulate {options.subject}", needed=needed)
+            raise InputError(where=f"--{name.replace('_', '-')}", found=f"simulate {options.subject}", needed=needed)
     return (_record if records else _run_benchmark)(options)
 
 

@@ -192,6 +192,7 @@ def test_what_was_unusual_is_noted(model: str, tmp_path: Path) -> None:
         (["record", "{here}/x", "{here}/y"], "one folder"),
         (["record", "{here}/x", "--films", "1"], "--films"),
         (["record", "{here}/x", "--decoder", "x"], "--decoder"),
+        (["record", "{here}/x", "--sub-goals", "demonstration"], "--sub-goals"),
         (["builtin:sim-tiny", "--decoder", "x", "--films", "0"], "--films 0"),
         (["builtin:sim-tiny", "--decoder", "no/such"], "no decoder.json"),
     ],
@@ -229,6 +230,32 @@ def test_a_task_with_a_block_has_its_own_number_of_steps(model: str, tmp_path: P
     benchmark, _ = run_benchmark(load_to_plan(model, overrides=SMALL), asked, tmp_path)
     assert metrics(tmp_path)["about"]["steps"] == benchmark.results[0].steps == 12
     assert metrics(tmp_path)["policies"]["oracle"]["success"]["value"] == 1.0
+
+
+def test_goals_on_the_way_come_from_one_demonstration_of_the_same_problem(model: str, tmp_path: Path) -> None:
+    given = ["simulate", model, "--task", "reach", "--episodes", "2", "--films", "0", *SMALL]
+    found = {}
+    for name, more in (("single", []), ("demonstrated", ["--sub-goals", "demonstration"])):
+        assert main([*given, *more, "--out", str(tmp_path / name)]) == 0
+        found[name] = metrics(tmp_path / name)
+    assert found["demonstrated"]["about"]["sub_goals"] == "demonstration"
+    assert found["single"]["about"]["sub_goals"] == "none"
+    ways = [one["policies"]["tiny"]["by_episode"]["distance_cm"] for one in found.values()]
+    assert ways[0] != ways[1]
+    for name in ("do nothing", "oracle"):
+        one, other = (run["policies"][name]["by_episode"]["distance_cm"] for run in found.values())
+        assert one == other, "only the model has goals on the way"
+
+
+def test_a_problem_that_cannot_be_demonstrated_is_told_before_any_is_worked_on(
+    model: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = ["simulate", model, "--task", "pick", "--episodes", "2", "--films", "0", "--sub-goals", "demonstration"]
+    assert main([*given, "--out", str(tmp_path), *SMALL[:-1], "planning.limits.xyz=[0.05,0.05,0]"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: demonstration of problem 0 (pick): the oracle ends ")
+    assert "planning.limits.xyz" in error
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_stride_that_is_to_be_found_out_is_no_stride(model: str, tmp_path: Path) -> None:

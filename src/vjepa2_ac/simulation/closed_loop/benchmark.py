@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -21,10 +21,11 @@ from vjepa2_ac.media.video_writer import video_library
 from vjepa2_ac.planning.session import PlanningSession
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.simulation.closed_loop.oracles import oracle_for
-from vjepa2_ac.simulation.closed_loop.policies import DoNothing, Oracle, Planning, Policy, RandomActions
+from vjepa2_ac.simulation.closed_loop.policies import DoNothing, GoalsOf, Oracle, Planning, Policy, RandomActions
 from vjepa2_ac.simulation.closed_loop.result import ClosedLoopResult
 from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, run_task
-from vjepa2_ac.simulation.closed_loop.tasks import SUCCESS_M, TaskName, arm_for
+from vjepa2_ac.simulation.closed_loop.sub_goals import DemonstratedGoals, DemonstrationSpec
+from vjepa2_ac.simulation.closed_loop.tasks import STEPS, SUCCESS_M, TaskName, TaskProblem, arm_for, make_problem
 from vjepa2_ac.simulation.closed_loop.video import write_film
 from vjepa2_ac.simulation.world.arm import Renderer, SimulatedArm
 from vjepa2_ac.simulation.world.domains import named_domain
@@ -33,6 +34,7 @@ from vjepa2_ac.storage import user_can_write, write_atomically
 from vjepa2_ac.storage.structured import utc_now
 
 FILE, FILM = "closed_loop.json", "closed_loop.mp4"
+SubGoalsFrom = Literal["none", "demonstration"]
 JOINT_FIELDS = ("steps/observation/joint_position", "steps/observation/gripper_position")
 FORMAT = 1  # incremented when a reader of the file would have to change
 
@@ -48,6 +50,13 @@ class BenchmarkOptions:
     seed: int = 0  # of the problems
     films: int = 6  # episodes in the video; 0: no video
     renderer: Renderer = "rays"
+    sub_goals: SubGoalsFrom = "none"  # demonstration: key frames of the oracle's solution of the same problem
+
+    @property
+    def problems(self) -> Iterator[TaskProblem]:
+        """The problems that every policy solves."""
+        domain = named_domain(self.domain)
+        return (make_problem(self.task, domain, self.seed, index) for index in range(self.episodes))
 
 
 @dataclass(frozen=True)
@@ -97,8 +106,9 @@ def run_benchmark(
     with user_can_write(folder):
         folder.mkdir(parents=True, exist_ok=True)
     arm = arm_for(options.task, named_domain(options.domain), renderer=options.renderer)
+    goals_of = _goals_of(session, options, stride)
     results = []
-    for policy in _policies(session, options, arm, decoder):
+    for policy in _policies(session, options, arm, decoder, goals_of):
         films = options.films if isinstance(policy, Planning) else 0
         spec = RolloutSpec(options.task, arm.domain, options.episodes, options.seed, options.steps, stride, films)
         results.append(run_task(spec, policy, arm, reporter.task(f"{options.task}: {policy.name}")))
@@ -159,15 +169,30 @@ def benchmark_as_dict(benchmark: ClosedLoopBenchmark) -> dict[str, Any]:
     }
 
 
+def _goals_of(session: PlanningSession, options: BenchmarkOptions, stride: int) -> GoalsOf | None:
+    """Return what makes the goals on the way; each problem has been demonstrated once when this returns."""
+    if options.sub_goals == "none":
+        return None
+    steps = max(options.steps or 0, STEPS[options.task])
+    spec = DemonstrationSpec(session.config.planning.limits, steps, stride)
+    goals_of = DemonstratedGoals(options.task, named_domain(options.domain), spec, renderer=options.renderer)
+    goals_of.require(options.problems)
+    return goals_of
+
+
 def _policies(
-    session: PlanningSession, options: BenchmarkOptions, arm: SimulatedArm, decoder: TrainedDecoder | None
+    session: PlanningSession,
+    options: BenchmarkOptions,
+    arm: SimulatedArm,
+    decoder: TrainedDecoder | None,
+    goals_of: GoalsOf | None,
 ) -> Sequence[Policy]:
     limits = session.config.planning.limits
     uses_camera = session.world_model.sizes.predictor.use_extrinsics
     controller = session.controller(extrinsics=arm.extrinsics() if uses_camera else None)
     name = Path(session.subject).name or session.subject
     taken = {DoNothing.name, RandomActions.name, Oracle.name}
-    model = Planning(controller, name if name not in taken else f"model {name}", decoder)
+    model = Planning(controller, name if name not in taken else f"model {name}", decoder, goals_of)
     return model, DoNothing(), RandomActions(limits, seed=options.seed), oracle_for(options.task, limits, arm)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from enum import Enum
 from typing import Protocol, runtime_checkable
 
@@ -13,7 +15,10 @@ from vjepa2_ac.data.clips.transforms import frame_of_seen
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
 from vjepa2_ac.decoding.imagined_plan import imagined_next
 from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.planning.goals.sub_goals import SubGoal
 from vjepa2_ac.simulation.closed_loop.tasks import TaskProblem
+
+GoalsOf = Callable[[TaskProblem], Sequence[SubGoal]]
 
 _ALMOST = 1 - 1e-9  # of a limit: rounding must not exceed it
 
@@ -134,17 +139,29 @@ class Planning:
         controller: Plans with the model; its last `decision` can be read after every action.
         name: Of the model, as shown in tables.
         decoder: Shows what it imagines, on the model's device; None: nothing does.
+        goals_of: Returns the goals on the way of a problem, with the last one; None: the problem's goal image only.
+            Their gripper modes are left out for a robot of joints, whose gripper is a number like the others.
     """
 
-    def __init__(self, controller: Controller, name: str = "model", decoder: TrainedDecoder | None = None) -> None:
-        self.controller, self.name, self.why = controller, name, ""
+    def __init__(
+        self,
+        controller: Controller,
+        name: str = "model",
+        decoder: TrainedDecoder | None = None,
+        goals_of: GoalsOf | None = None,
+    ) -> None:
+        self.controller, self.name, self.why, self._goals_of = controller, name, "", goals_of
         self._decoder = None if decoder is None else decoder.to(controller.device)
         self._size = (0, 0)  # of the last image
         self.moves = Moves.FLANGE if controller.spaces.state.position is not None else Moves.JOINTS
 
-    def reset(self, problem: TaskProblem, goal_image: UInt8[np.ndarray, "height width 3"]) -> None:  # noqa: ARG002
-        """Give the planner the goal image."""
-        self.controller.reset(goal_image)
+    def reset(self, problem: TaskProblem, goal_image: UInt8[np.ndarray, "height width 3"]) -> None:
+        """Give the planner the goal image, or the goals on the way."""
+        if self._goals_of is None:
+            self.controller.reset(goal_image)
+            return
+        goals, has_gripper = self._goals_of(problem), self.controller.spaces.state.is_pose
+        self.controller.follow(goals if has_gripper else [replace(goal, gripper=None) for goal in goals])
 
     def act(
         self, image: UInt8[np.ndarray, "height width 3"], state: Float[np.ndarray, " dim"]

@@ -1,0 +1,174 @@
+"""Key frames of a demonstration: which of its frames are worth being goals on the way. Pure functions of arrays.
+
+A frame is a recorded moment: a control step of an episode, a frame of a film, or a model step.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from vjepa2_ac.geometry import actions_from_states
+
+GRIPPER = 6  # which number of a state
+GRIPS = 0.15  # of closedness: less is no change of the gripper
+_MOVES = 0.02  # of closedness, from one frame to the next: less is no motion of the fingers
+_PAUSE = 2  # frames that the fingers may rest within one change
+_STILL_M, _STILL_RAD = 0.002, 0.02  # from one frame to the next: less is a resting arm
+_SAME_M, _SAME_RAD = 0.005, 0.05  # less apart in all are two images of the same state
+
+
+@dataclass(frozen=True)
+class KeyFrame:
+    """A frame that becomes a goal."""
+
+    frame: int
+    name: str  # why it was taken, in a few words
+
+
+@dataclass(frozen=True)
+class StillRule:
+    """What is a stop of the arm, and how near one another goals may be; in frames."""
+
+    lasts: int = 4  # a shorter rest is no stop
+    apart: int = 4  # a stop nearer than this to another key frame is left out
+
+
+OF_MODEL_STEPS = StillRule(lasts=1, apart=1)
+"""Where a frame is a model step."""
+
+
+def gripper_key_frames(states: Float[np.ndarray, "frames 7"], rule: StillRule | None = None) -> tuple[KeyFrame, ...]:
+    """Return where the gripper begins to change and where it has changed, where the arm stops, and the end.
+
+    The start is none of them. Where the arm rests at the end, the end is the frame at which it came to rest.
+
+    Args:
+        states: Measured, with closedness last (legend: `vjepa2_ac.episode`).
+        rule: What counts as a stop.
+
+    Raises:
+        ValueError: Fewer than two frames.
+
+    Source of the idea: peract @ 02fb876, helpers/demo_loading_utils.py, keypoint_discovery. Theirs takes the frame
+    after a binary gripper has changed, and stops by joint velocities; here a change has a beginning and an end.
+    """
+    rule, last = rule or StillRule(), len(states) - 1
+    if last < 1:
+        raise ValueError(f"{len(states)} frames are no demonstration")
+    found: dict[int, str] = {}
+    changes = _gripper_changes(states[:, GRIPPER])
+    for begin, end in changes:
+        closes = states[end, GRIPPER] > states[begin, GRIPPER]
+        if begin >= rule.apart:
+            found.setdefault(begin, "before closing" if closes else "before opening")
+        found[end] = "closed" if closes else "opened"
+    for begin in _stops(states, rule.lasts):
+        near = [abs(begin - frame) < rule.apart for frame in (0, last, *found)]
+        if not any(near) and not any(first <= begin <= end for first, end in changes):
+            found[begin] = "stop"
+    if not found or not _is_same(states[max(found)], states[last]):
+        found[last] = "end"
+    elif found[max(found)] == "stop":
+        found[max(found)] = "end"
+    return tuple(KeyFrame(frame, found[frame]) for frame in sorted(found))
+
+
+def _gripper_changes(closedness: Float[np.ndarray, " frames"]) -> list[tuple[int, int]]:
+    """Return first and last frame of each change of the gripper in one direction."""
+    found: list[tuple[int, int, float]] = []
+    for frame, way in enumerate(np.diff(closedness)):
+        if abs(way) < _MOVES:
+            continue
+        if found and found[-1][2] == np.sign(way) and frame - found[-1][1] <= _PAUSE:
+            found[-1] = (found[-1][0], frame + 1, found[-1][2])
+        else:
+            found.append((frame, frame + 1, float(np.sign(way))))
+    return [(begin, end) for begin, end, _ in found if abs(closedness[end] - closedness[begin]) >= GRIPS]
+
+
+def _stops(states: Float[np.ndarray, "frames 7"], lasts: int) -> list[int]:
+    """Return where the arm comes to rest for at least so many frames; at the start it has not come to rest."""
+    still = resting(states)
+    begins = [frame for frame in range(1, len(still)) if still[frame] and not still[frame - 1]]
+    return [begin for begin in begins if still[begin : begin + lasts].all() and begin + lasts <= len(still)]
+
+
+def resting(states: Float[np.ndarray, "frames 7"]) -> Bool[np.ndarray, " pairs"]:
+    """Return of each frame but the last whether the arm and the fingers rest until the next one."""
+    return _are_below(actions_from_states(states), _STILL_M, _STILL_RAD, _MOVES)
+
+
+def _is_same(one: Float[np.ndarray, " 7"], other: Float[np.ndarray, " 7"]) -> bool:
+    return bool(_are_below(actions_from_states(np.stack([one, other])), _SAME_M, _SAME_RAD, GRIPS)[0])
+
+
+def _are_below(
+    changes: Float[np.ndarray, "pairs 7"], metres: float, radians: float, closedness: float
+) -> Bool[np.ndarray, " pairs"]:
+    moved, turned = (np.linalg.norm(changes[:, part], axis=1) for part in (slice(0, 3), slice(3, 6)))
+    return np.asarray((moved < metres) & (turned < radians) & (np.abs(changes[:, GRIPPER]) < closedness))
+
+
+def every_key_frame(frames: int, step: int) -> tuple[KeyFrame, ...]:
+    """Return every `step`-th frame but the first, and the last; one less than half a step before the last is left out.
+
+    Args:
+        frames: Of the demonstration.
+        step: From one key frame to the next.
+
+    Raises:
+        ValueError: Fewer than two frames, or a step below 1.
+    """
+    if frames < 2 or step < 1:
+        raise ValueError(f"every {step} of {frames} frames")
+    taken = [frame for frame in range(step, frames - 1, step) if 2 * (frames - 1 - frame) >= step]
+    return (*(KeyFrame(frame, f"frame {frame}") for frame in taken), KeyFrame(frames - 1, "end"))
+
+
+def latent_key_frames(
+    frames: int, distances: Callable[[int], Float[np.ndarray, " frames"]], least: int
+) -> tuple[KeyFrame, ...]:
+    """Return the frames at which images stop looking like the goal before: from the last one backwards.
+
+    Going back from a goal, the distance of images to it grows while the demonstration was approaching it; where it
+    stops growing (the nearest local maximum of the smoothed distance, at least `least` frames earlier), something else
+    was being done: this is the goal before.
+
+    Args:
+        frames: Of the demonstration.
+        distances: Of all frames to the one of an index, in latents.
+        least: Frames from one goal to the next, and from the start to the first.
+
+    Raises:
+        ValueError: Fewer than two frames, or `least` below 1.
+
+    Source of the rule: zcczhang/UVD @ e7d657a, uvd/decomp/decomp.py, embedding_decomp.
+    """
+    if frames < 2 or least < 1:
+        raise ValueError(f"{frames} frames, goals {least} apart")
+    found = [frames - 1]
+    while (before := _maximum_before(_smoothed(distances(found[-1])[: found[-1] + 1], least), least)) is not None:
+        found.append(before)
+    return tuple(KeyFrame(frame, "end" if frame == frames - 1 else f"frame {frame}") for frame in reversed(found))
+
+
+def _smoothed(values: Float[np.ndarray, " frames"], least: int) -> Float[np.ndarray, " frames"]:
+    """Return a moving average by a normal distribution that is a sixth of `least` wide."""
+    wide = max(least / 6, 0.5)
+    reach = np.arange(-math.ceil(3 * wide), math.ceil(3 * wide) + 1)
+    weights = np.exp(-0.5 * (reach / wide) ** 2)
+    padded = np.pad(values, len(reach) // 2, mode="edge")
+    return np.convolve(padded, weights / weights.sum(), mode="valid")
+
+
+def _maximum_before(values: Float[np.ndarray, " frames"], least: int) -> int | None:
+    """Return the last local maximum that has `least` frames before and after it; None: there is none."""
+    for frame in range(len(values) - 1 - least, least - 1, -1):
+        if values[frame] > values[frame - 1] and values[frame] >= values[frame + 1]:
+            return frame
+    return None

@@ -1,0 +1,101 @@
+"""Goals of a demonstration in the simulator: the grasp is among them, and the evaluated arm is left alone."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
+
+from decisions import QUICK
+from tiny_models import tiny_model
+from vjepa2_ac.config.planning import LimitsConfig
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.planning.goals.key_frames import gripper_key_frames
+from vjepa2_ac.simulation.closed_loop.policies import Planning
+from vjepa2_ac.simulation.closed_loop.rollout import put, run_episode
+from vjepa2_ac.simulation.closed_loop.sub_goals import (
+    DemonstratedGoals,
+    DemonstrationSpec,
+    demonstrate,
+    goals_of_demonstration,
+)
+from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, HOLDING, arm_for, make_problem
+from vjepa2_ac.simulation.recording.demonstration import RecordingSpec, arm_of, carry_out
+from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B
+
+SMALL = (36, 64)
+
+
+@pytest.mark.parametrize("domain", [DOMAIN_A, DOMAIN_B], ids=["A", "B"])
+def test_the_grasp_is_among_the_goals_of_a_pick(domain) -> None:
+    arm = arm_for("pick", domain, size=SMALL)
+    for index in range(3):
+        problem = make_problem("pick", domain, 4, index)
+        goals = goals_of_demonstration(problem, arm)
+        assert [goal.name for goal in goals] == ["before closing", "closed", "end"]
+        assert [goal.gripper for goal in goals] == ["held", "close", "held"]
+        shown = demonstrate(problem, arm, DemonstrationSpec())
+        frames = [int(np.argmax([np.array_equal(goal.image, frame) for frame in shown.frames])) for goal in goals]
+        at_block, closed, lifted = shown.states[frames]
+        np.testing.assert_allclose(at_block[:3], problem.block_start[:3] + np.array([0, 0, GRASP_M]), atol=0.015)
+        assert at_block[6] < 0.02
+        assert closed[6] == pytest.approx(HOLDING, abs=0.05)
+        assert np.linalg.norm(closed[:3] - at_block[:3]) < 0.01
+        assert np.linalg.norm(lifted[:3] - problem.goal[:3]) < 0.02
+        steps = np.diff([0, *frames])
+        assert [goal.at_least for goal in goals] == [max(1, step - 3) for step in steps]
+        assert [goal.at_most for goal in goals] == [*(step + 3 for step in steps[:-1]), None]
+
+
+def test_a_task_without_the_gripper_has_its_end_as_the_only_goal() -> None:
+    for task in ("reach", "push"):
+        arm = arm_for(task, DOMAIN_A, size=SMALL)
+        (goal,) = goals_of_demonstration(make_problem(task, DOMAIN_A, 0, 1), arm)
+        assert (goal.name, goal.gripper, goal.at_most) == ("end", "held", None)
+
+
+def test_the_gripper_of_who_demonstrates_is_free_whatever_the_planner_may_do() -> None:
+    arm, problem = arm_for("pick", DOMAIN_A, size=SMALL), make_problem("pick", DOMAIN_A, 0, 0)
+    held = DemonstrationSpec(LimitsConfig(gripper_mode="held"), slack=0)
+    assert [goal.at_most for goal in goals_of_demonstration(problem, arm, held)] == [3, 1, None]
+    with pytest.raises(InputError, match=r"problem 0 \(pick\): the oracle ends .* after 3 model steps"):
+        demonstrate(problem, arm, DemonstrationSpec(steps=3))
+
+
+def test_an_arm_that_is_steered_is_not_moved_by_the_demonstration() -> None:
+    arm, problem = arm_for("pick", DOMAIN_A, size=SMALL), make_problem("pick", DOMAIN_A, 0, 0)
+    before = put(arm, problem.start, problem.block_start).state
+    DemonstratedGoals("pick", DOMAIN_A)(problem)
+    np.testing.assert_array_equal(arm.state, before)
+
+
+def test_a_planner_is_given_the_goals_of_the_problem() -> None:
+    controller = Controller(tiny_model(), QUICK.model_copy(update={"horizon": 1}))
+    goals_of = DemonstratedGoals("pick", DOMAIN_A, DemonstrationSpec(slack=0))
+    policy = Planning(controller, goals_of=goals_of)
+    arm, problem = arm_for("pick", DOMAIN_A), make_problem("pick", DOMAIN_A, 0, 0)
+    episode = run_episode(arm, policy, problem, steps=5)
+    assert [bool(action) for action in episode.actions[:, 6]] == [False, False, False, True, False]
+    assert controller.decision is not None
+    assert (controller.decision.goal, controller.decision.since) == (2, 4)
+
+
+def test_recorded_demonstrations_have_their_grasp_among_their_key_frames() -> None:
+    """At every control step, with noise on the way and fingers that take some frames to close."""
+    spec = RecordingSpec("A", steps=41, seed=3, task="pick")
+    for index in (0, 2):
+        motion = carry_out(arm_of(index, spec), index, spec)
+        states = np.concatenate([motion.poses, motion.gripper[:, None]], axis=1)
+        keys = gripper_key_frames(states)
+        names = [key.name for key in keys]
+        assert names.index("closed") == names.index("before closing") + 1
+        frames = {key.name: key.frame for key in keys}
+        assert states[frames["before closing"], 6] < 0.05
+        assert states[frames["closed"], 6] == pytest.approx(HOLDING, abs=0.05)
+        assert frames["closed"] - frames["before closing"] <= 6
+        assert names[-1] == "end"
+        assert len(keys) <= 6
+    motion = carry_out(arm_of(4, spec), 4, spec)  # its first grasp fails, so it opens and closes again
+    names = [key.name for key in gripper_key_frames(np.concatenate([motion.poses, motion.gripper[:, None]], axis=1))]
+    assert names.count("closed") == 2
+    assert names.count("opened") == 1
