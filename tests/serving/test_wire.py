@@ -1,0 +1,163 @@
+"""The wire format: what is sent arrives, and nothing else does any harm."""
+
+import contextlib
+import math
+import tracemalloc
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import array_shapes, arrays
+
+from vjepa2_ac.serving import wire
+from vjepa2_ac.serving.wire import WireError, pack, unpack
+
+TYPES = ["u1", "i1", "<u2", "<u4", "<u8", "<i2", "<i4", "<i8", "<f2", "<f4", "<f8", "?"]
+ARRAYS = st.sampled_from(TYPES).flatmap(
+    lambda kind: arrays(np.dtype(kind), array_shapes(min_dims=0, max_dims=4, min_side=0, max_side=4))
+)
+PLAIN = (
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**63), 2**64 - 1)
+    | st.floats()
+    | st.text(max_size=20)
+    | st.binary(max_size=20)
+)
+VALUES = st.recursive(PLAIN | ARRAYS, lambda inner: st.lists(inner, max_size=4), max_leaves=8)
+MESSAGES = st.dictionaries(st.text(max_size=10), VALUES, max_size=6)
+
+
+def array_of(dtype: object = "<f4", shape: object = (2,), data: object = b"\0" * 8, **more: object) -> bytes:
+    return msgpack.packb({"a": {b"__ndarray__": True, b"data": data, b"dtype": dtype, b"shape": shape, **more}})
+
+
+@given(MESSAGES)
+def test_what_is_sent_arrives(message) -> None:
+    found = unpack(pack(message))
+    np.testing.assert_equal(found, dict(message))
+
+
+def test_arrays_are_of_the_same_type_and_can_be_written_to() -> None:
+    found = unpack(pack({"a": np.arange(6, dtype=np.float32).reshape(2, 3)[:, ::2], "n": np.float64(0.1)}))
+    assert found["a"].dtype == np.float32
+    assert found["a"].flags.writeable
+    np.testing.assert_array_equal(found["a"], [[0, 2], [3, 5]])
+    assert found["n"] == 0.1
+
+
+HOSTILE = {
+    "nothing": b"",
+    "a byte that means nothing": b"\xc1",
+    "a list": msgpack.packb([1, 2]),
+    "a number": b"\x01",
+    "an array alone": msgpack.packb({b"__ndarray__": True, b"data": b"\0", b"dtype": "|u1", b"shape": [1]}),
+    "two messages": pack({"a": 1}) + pack({"a": 1}),
+    "half a message": pack({"a": np.zeros(5)})[:-3],
+    "a number as key": msgpack.packb({1: 2}),
+    "bytes as key": msgpack.packb({b"a": 2}),
+    "a list as key": b"\x81\x90\x01",
+    "a key twice": b"\x82\xa1a\x01\xa1a\x02",
+    "an extension": msgpack.packb({"a": msgpack.ExtType(3, b"x")}),
+    "a time": msgpack.packb({"a": msgpack.Timestamp(3)}),
+    "no text": b"\x81\xa1\xff\x01",
+    "surrogates": b"\x81\xa1a\xa3\xed\xa0\x80",
+    "deep lists": b"\x81\xa1a" + b"\x91" * 500 + b"\x01",
+    "deeper lists": b"\x81\xa1a" + b"\x91" * 100_000 + b"\x01",
+    "deep maps": b"\x81\xa1a" * 900 + b"\x01",
+    "very many empty maps": b"\x81\xa1a\xdd\x00\x40\x00\x00" + b"\x80" * (4 << 20),
+    "maps in lists in lists": msgpack.packb({"a": [[{} for _ in range(60)] for _ in range(60)]}),
+    "a list that claims to be long": b"\x81\xa1a\xdd\xff\xff\xff\xff",
+    "a map that claims to be long": b"\xdf\xff\xff\xff\xff",
+    "bytes that claim to be long": b"\x81\xa1a\xc6\xff\xff\xff\xff",
+    "a long text": msgpack.packb({"a": "x" * 5000}),
+    "objects": array_of("|O"),
+    "objects of eight bytes": array_of("|O8"),
+    "nothing of a size": array_of("|V0", [2**40], b""),
+    "records": array_of("<f4,<f4"),
+    "a list of types": array_of([["a", "<f4"]]),
+    "other byte order": array_of(">f4"),
+    "texts": array_of("<U2"),
+    "dates": array_of("<M8[s]"),
+    "complex": array_of("<c8"),
+    "long floats": array_of("<f16", (1,), b"\0" * 16),
+    "no type": array_of(None),
+    "too few bytes": array_of(shape=(3,)),
+    "too many bytes": array_of(shape=(1,)),
+    "negative sides": array_of(shape=(-2, -1)),
+    "one negative side": array_of(shape=(-2,)),
+    "a side of no number": array_of(shape=(2.0,)),
+    "a side that is true": array_of("|u1", (True,), b"\0"),
+    "huge sides with nothing in them": array_of(shape=(2**62, 0), data=b""),
+    "many axes": array_of(shape=(1, 1, 1, 1, 2)),
+    "a shape of a number": array_of(shape=2),
+    "a shape of an array": array_of(shape={b"__ndarray__": True, b"data": b"\2", b"dtype": "|u1", b"shape": [1]}),
+    "data of text": array_of(data="12345678"),
+    "more keys": array_of(extra=1),
+    "a marker that is not true": msgpack.packb(
+        {"a": {b"__ndarray__": 1, b"data": b"", b"dtype": "|u1", b"shape": [0]}}
+    ),
+    "a number that is a list": msgpack.packb({"a": {b"__npgeneric__": True, b"data": [1], b"dtype": "<f4"}}),
+    "a number of objects": msgpack.packb({"a": {b"__npgeneric__": True, b"data": 1, b"dtype": "|O"}}),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_what_is_no_message_is_a_sentence_and_costs_nothing(name: str) -> None:
+    message = HOSTILE[name]
+    tracemalloc.start()
+    try:
+        with pytest.raises(WireError) as caught:
+            unpack(message)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    finally:
+        tracemalloc.stop()
+    assert len(str(caught.value)) < 200
+
+
+def test_a_message_that_is_too_large_is_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(wire, "MOST_BYTES", 1000)
+    with pytest.raises(WireError, match=r"a message of 1,0.. bytes; 1,000 at most"):
+        unpack(pack({"a": np.zeros(1000, dtype=np.uint8)}))
+
+
+GOOD = pack({
+    "observation/image": np.zeros((4, 4, 3), dtype=np.uint8), "observation/state": np.zeros(7), "prompt": "cup",
+    "reset": False, "goal/durations": [1, 2],
+})  # fmt: skip
+
+
+CHANGES = st.lists(st.tuples(st.integers(0, len(GOOD) - 1), st.integers(0, 255)), min_size=1, max_size=6)
+
+
+@settings(max_examples=2000)
+@given(
+    st.lists(st.tuples(st.integers(0, len(GOOD) - 1), st.integers(0, 255)), min_size=1, max_size=6),
+    st.integers(0, len(GOOD)),
+)
+def test_a_message_with_wrong_bytes_is_read_or_refused(changes, cut) -> None:
+    message = bytearray(GOOD)
+    for place, value in changes:
+        message[place] = value
+    for one in (bytes(message), bytes(message[:cut])):
+        try:
+            found = unpack(one)
+        except WireError:
+            continue
+        assert isinstance(found, dict)
+
+
+@settings(max_examples=1000)
+@given(st.binary(max_size=200))
+def test_any_bytes_are_read_or_refused(message) -> None:
+    with contextlib.suppress(WireError):
+        assert isinstance(unpack(message), dict)
+
+
+def test_what_cannot_be_sent_is_an_error_here() -> None:
+    for wrong in (np.array(["a"]), np.array([None]), object(), np.array([1j])):
+        with pytest.raises(TypeError, match="cannot be sent"):
+            pack({"a": wrong})
+    assert math.isnan(unpack(pack({"a": math.nan}))["a"])

@@ -1,0 +1,96 @@
+"""A planning server in a thread of the test, and the small model behind it."""
+
+import asyncio
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import numpy as np
+
+from tiny_models import tiny_model
+from vjepa2_ac.config.planning import CemConfig, LimitsConfig, PlanningConfig
+from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.serving.about import roboarena_metadata
+from vjepa2_ac.serving.access import Access
+from vjepa2_ac.serving.server import PlanningServer, Served, ServerOptions
+from vjepa2_ac.serving.session import Session, SessionOptions
+
+STATE = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2])
+QUICK = PlanningConfig(samples=12, iterations=2, horizon=2, cem=CemConfig(elites=4))
+
+
+def image(seed: int, height: int = 48, width: int = 60) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
+
+
+def controller(seed: int = 0, limits: LimitsConfig | None = None, **changes: object) -> Controller:
+    config = QUICK.model_copy(update={"limits": limits or LimitsConfig(), **changes})
+    return Controller(tiny_model(), config, seed=seed)
+
+
+def session(options: SessionOptions | None = None, goals: dict | None = None, **changes: object) -> Session:
+    return Session(controller(**changes), goals, options)
+
+
+def request(seed: int = 0, **more: object) -> dict:
+    """Return a request; `goal_image` is the key goal/image."""
+    keys = {key.replace("goal_", "goal/"): value for key, value in more.items()}
+    return {"observation/image": image(seed), "observation/state": STATE} | keys
+
+
+class Running:
+    """A server that listens."""
+
+    def __init__(self, url: str, server: PlanningServer) -> None:
+        self.url, self.server = url, server
+        self.http = url.replace("ws://", "http://")
+
+
+@contextmanager
+def serving(
+    load: Callable[[], Session], access: Access | None = None, *, ping_s: float = 20.0, wait: bool = True
+) -> Iterator[Running]:
+    """Serve in a thread as long as the context lasts; `wait` until it is ready."""
+    lines: list[str] = []
+    begun, ready, loop_of, failed = threading.Event(), threading.Event(), [], []
+
+    def tell(line: str) -> None:
+        lines.append(line)
+        if line.startswith("listening on "):
+            begun.set()
+        if line == "ready":
+            ready.set()
+
+    def loaded() -> Served:
+        made = load()
+        return Served(made, roboarena_metadata(made))
+
+    async def run() -> bool:
+        stop = asyncio.Event()
+        server = PlanningServer(loaded, ServerOptions(access or Access("127.0.0.1"), 0, None, ping_s), tell)
+        loop_of.extend((asyncio.get_running_loop(), stop, server))
+        return await server.run(stop)
+
+    def thread() -> None:
+        try:
+            asyncio.run(run())
+        except BaseException as error:
+            failed.append(error)
+        finally:
+            begun.set()
+            ready.set()
+
+    running = threading.Thread(target=thread)
+    running.start()
+    assert begun.wait(20)
+    assert not wait or ready.wait(20)
+    if failed:
+        running.join()
+        raise failed[0]
+    loop, stop, server = loop_of
+    try:
+        yield Running(lines[0].removeprefix("listening on "), server)
+    finally:
+        loop.call_soon_threadsafe(stop.set)
+        running.join(20)
+        assert not running.is_alive()
