@@ -7,7 +7,7 @@ from pathlib import Path
 
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.image_file import read_image
-from vjepa2_ac.planning.goals.folder import GOALS, read_goals
+from vjepa2_ac.planning.goals.folder import GOALS_FILE, read_goals
 from vjepa2_ac.planning.goals.sub_goals import SubGoal
 from vjepa2_ac.planning.input_checks import require_image
 
@@ -27,7 +27,7 @@ def read_kept_goals(folder: Path) -> KeptGoals:
     if not folder.is_dir():
         found = "a file" if folder.exists() else "no such folder"
         raise InputError(where=f"--goals {folder}", found=found, needed="a folder with goal images")
-    if (folder / GOALS).is_file():
+    if (folder / GOALS_FILE).is_file():
         return {folder.resolve().name: read_goals(folder)}
     kept: dict[str, tuple[SubGoal, ...]] = {}
     for path in sorted(folder.iterdir()):
@@ -37,7 +37,7 @@ def read_kept_goals(folder: Path) -> KeptGoals:
             raise InputError(where=str(path), found=found, needed="another name for one of them")
         kept |= {path.stem: goals} if goals else {}
     if not kept:
-        found, needed = "no goal", f"pictures (PNG or JPEG), or folders with a {GOALS} (`vjepa2-ac goals` makes them)"
+        found, needed = "no goal", f"pictures (PNG or JPEG), or folders with a {GOALS_FILE} (`vjepa2-ac goals` makes them)"
         raise InputError(where=f"--goals {folder}", found=found, needed=needed)
     return kept
 
@@ -45,7 +45,7 @@ def read_kept_goals(folder: Path) -> KeptGoals:
 def _goals_at(path: Path) -> tuple[SubGoal, ...]:
     """Return the goals that a file or folder is; none: it is something else."""
     if path.is_dir():
-        return read_goals(path) if (path / GOALS).is_file() else ()
+        return read_goals(path) if (path / GOALS_FILE).is_file() else ()
     if path.suffix.lower() not in _PICTURES:
         return ()
     image = read_image(path)

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from vjepa2_ac.geometry import actions_from_states
 
@@ -101,6 +101,20 @@ def _stops(states: Float[np.ndarray, "frames 7"], lasts: int) -> list[int]:
 def resting(states: Float[np.ndarray, "frames 7"]) -> Bool[np.ndarray, " pairs"]:
     """Return of each frame but the last whether the arm and the fingers rest until the next one."""
     return _are_below(actions_from_states(states), _STILL_M, _STILL_RAD, _MOVES)
+
+
+def resting_pairs(rests: Bool[np.ndarray, " neighbours"], gap: int) -> Int[np.ndarray, "pairs 2"]:
+    """Return pairs of frames between which the arm rests all the time, `gap` frames apart, or as many as there are.
+
+    Args:
+        rests: Of each frame but the last whether the arm rests until the next one.
+        gap: Frames apart: neighbours in a film share their noise.
+    """
+    for apart in range(gap, 0, -1):
+        whole = [frame for frame in range(len(rests) - apart + 1) if rests[frame : frame + apart].all()]
+        if whole:
+            return np.array([[frame, frame + apart] for frame in whole])
+    return np.zeros((0, 2), dtype=np.int64)
 
 
 def _is_same(one: Float[np.ndarray, " 7"], other: Float[np.ndarray, " 7"]) -> bool:
