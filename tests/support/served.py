@@ -9,11 +9,14 @@ import numpy as np
 
 from tiny_models import tiny_model
 from vjepa2_ac.config.planning import CemConfig, LimitsConfig, PlanningConfig
+from vjepa2_ac.episode import Widths
+from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.serving.about import roboarena_metadata
 from vjepa2_ac.serving.access import Access
 from vjepa2_ac.serving.server import PlanningServer, Served, ServerOptions
 from vjepa2_ac.serving.session import Session, SessionOptions
+from vjepa2_ac.spaces import Spaces
 
 STATE = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2])
 QUICK = PlanningConfig(samples=12, iterations=2, horizon=2, cem=CemConfig(elites=4))
@@ -26,6 +29,15 @@ def image(seed: int, height: int = 48, width: int = 60) -> np.ndarray:
 def controller(seed: int = 0, limits: LimitsConfig | None = None, **changes: object) -> Controller:
     config = QUICK.model_copy(update={"limits": limits or LimitsConfig(), **changes})
     return Controller(tiny_model(), config, seed=seed)
+
+
+def vector_controller(joined: str) -> Controller:
+    """Return a controller of eight joints, whose recorded commands were joined so."""
+    sizes = tiny_model().sizes
+    predictor = sizes.predictor.model_copy(update={"action_dim": 8, "state_dim": 8})
+    model = WorldModel.random(sizes.model_copy(update={"predictor": predictor}), seed=0)
+    config = QUICK.model_copy(update={"limits": LimitsConfig(axes=(0.1,))})
+    return Controller(model, config, spaces=Spaces.of_vectors(Widths(8, 8), joined))
 
 
 def session(options: SessionOptions | None = None, goals: dict | None = None, **changes: object) -> Session:

@@ -37,7 +37,10 @@ def read_kept_goals(folder: Path) -> KeptGoals:
             raise InputError(where=str(path), found=found, needed="another name for one of them")
         kept |= {path.stem: goals} if goals else {}
     if not kept:
-        found, needed = "no goal", f"pictures (PNG or JPEG), or folders with a {GOALS_FILE} (`vjepa2-ac goals` makes them)"
+        found, needed = (
+            "no goal",
+            f"pictures (PNG or JPEG), or folders with a {GOALS_FILE} (`vjepa2-ac goals` makes them)",
+        )
         raise InputError(where=f"--goals {folder}", found=found, needed=needed)
     return kept
 

@@ -77,7 +77,7 @@ def read_request(message: Mapping[str, Any], image_keys: Sequence[str] = IMAGE_K
         InputError: Something that is needed is missing, or of another kind.
     """
     endpoint = message.get("endpoint", "infer")
-    if endpoint not in _ENDPOINTS:
+    if not isinstance(endpoint, str) or endpoint not in _ENDPOINTS:
         raise InputError(where="endpoint", found=_shown(endpoint), needed=" or ".join(_ENDPOINTS))
     reset = message.get("reset", False)
     if not isinstance(reset, bool):

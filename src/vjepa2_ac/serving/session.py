@@ -33,6 +33,7 @@ logger = logging.getLogger(__name__)
 ActionForm = Literal["delta", "pose"]
 Clock = Callable[[], float]  # seconds, from anywhere
 
+_NOT_SENT = "not sent"
 _MOST_NAMES = 20  # of goals in a message
 _BAR = 0.05  # share of an image's height, black at the top and at the bottom: a padded image
 
@@ -169,7 +170,7 @@ class Session:
         wrong = why_not_sent(state, changes, self.controller.config.limits, self.controller.spaces.state)
         if wrong:
             logger.error("a planned action is not sent: %s", wrong)
-            return zeros, f"not sent: {wrong}"
+            return zeros, f"{_NOT_SENT}: {wrong}"
         return changes, decision.why
 
     def _message(
@@ -180,7 +181,7 @@ class Session:
         actions = self._actions(state, sent)
         found: dict[str, Any] = {
             "actions": actions,
-            "target": _rows(state if decision.states is None else decision.states[1:]),
+            "target": _rows(state if decision.states is None or why.startswith(_NOT_SENT) else decision.states[1:]),
             "why": why,
             "goal": {
                 "index": decision.goal,
