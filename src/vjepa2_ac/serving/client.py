@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from types import TracebackType
 from typing import Any, Self
 
@@ -31,12 +32,14 @@ class PlanningClient:
         self.url = url
         library = require_library("websockets.sync.client", where=url, called="websockets", extra="serve")
         headers = {} if key is None else {"Authorization": f"Api-Key {key}"}
+        self._open = ExitStack()
         try:
-            self._connection = library.connect(
-                url, compression=None, max_size=MOST_BYTES, additional_headers=headers, proxy=None
+            self._connection = self._open.enter_context(
+                library.connect(url, compression=None, max_size=MOST_BYTES, additional_headers=headers, proxy=None)
             )
             self.metadata = unpack(self._connection.recv())
         except Exception as error:
+            self._open.close()
             raise UnreachableError(where=url, found=_reason(error), needed="a server (`vjepa2-ac serve`)") from None
 
     def infer(self, request: dict[str, Any]) -> dict[str, Any]:
@@ -57,7 +60,7 @@ class PlanningClient:
 
     def close(self) -> None:
         """End the connection."""
-        self._connection.close()
+        self._open.close()
 
     def __enter__(self) -> Self:
         return self

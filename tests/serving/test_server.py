@@ -1,0 +1,247 @@
+"""The server: ready when it says so, one robot at a time, and never away while it plans."""
+
+import asyncio
+import contextlib
+import http.client
+import random
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+import websockets.asyncio.client
+import websockets.sync.client
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+from served import STATE, Running, controller, image, request, serving, session
+from vjepa2_ac.errors import InputError, UnreachableError
+from vjepa2_ac.serving.access import Access
+from vjepa2_ac.serving.client import PlanningClient
+from vjepa2_ac.serving.session import Session
+from vjepa2_ac.serving.wire import pack, unpack
+
+KEY = "correct-horse-battery-staple"
+
+
+def get(running: Running, path: str, **headers: str) -> tuple[int, str]:
+    host, port = running.http.removeprefix("http://").split(":")
+    connection = http.client.HTTPConnection(host, int(port), timeout=10)
+    try:
+        connection.request("GET", path, headers=headers)
+        answer = connection.getresponse()
+        return answer.status, answer.read().decode()
+    finally:
+        connection.close()
+
+
+@contextlib.contextmanager
+def connect(running: Running, **how: object) -> Iterator[websockets.sync.client.ClientConnection]:
+    with websockets.sync.client.connect(running.url, compression=None, max_size=None, proxy=None, **how) as connection:
+        yield connection
+
+
+def wait_for(is_so: Callable[[], bool]) -> None:
+    until = time.monotonic() + 10
+    while not is_so():
+        assert time.monotonic() < until
+        time.sleep(0.01)
+
+
+class SlowSession:
+    """A session whose decisions take as long as a test wants, and which sees when nobody waits."""
+
+    def __init__(self) -> None:
+        self.one, self.asked, self.go, self.left = session(), threading.Event(), threading.Event(), threading.Event()
+        plan, answer = self.one.controller.planner.plan, self.one.answer
+
+        def slow_plan(*args: object) -> object:
+            self.asked.set()
+            while not self.go.is_set():
+                if args[3]():
+                    self.left.set()
+                    break
+                time.sleep(0.005)
+            return plan(*args)
+
+        self.one.controller.planner.plan = slow_plan
+        self.answer = answer
+
+
+def test_actions_through_the_socket_are_the_controllers_bit_for_bit() -> None:
+    own = controller()
+    own.reset(image(100))
+    with serving(session) as running, PlanningClient(running.url) as client:
+        assert client.metadata["action_space"] == "cartesian_delta"
+        for step in range(3):
+            found = client.infer(request(step, goal_image=image(100)))
+            np.testing.assert_array_equal(found["actions"][0], own.act(image(step), STATE))
+        with pytest.raises(InputError, match="frame: 32 x 24 pixels"):
+            client.infer(request(3) | {"observation/image": image(3, 24, 32)})
+        np.testing.assert_array_equal(client.infer(request(3))["actions"][0], own.act(image(3), STATE))
+
+
+def test_it_is_alive_at_once_and_ready_when_it_is_loaded() -> None:
+    go = threading.Event()
+
+    def load() -> Session:
+        assert go.wait(20)
+        return session()
+
+    with serving(load, wait=False) as running:
+        assert get(running, "/healthz") == (200, "OK\n")
+        assert get(running, "/readyz") == (503, "loading\n")
+        assert "vjepa2_ac_ready 0" in get(running, "/metrics")[1]
+        with connect(running) as early:
+            with pytest.raises(TimeoutError):
+                early.recv(timeout=0.2)
+            go.set()
+            assert unpack(early.recv(timeout=20))["needs_session_id"] is True
+        assert get(running, "/readyz") == (200, "ready\n")
+
+
+def test_what_cannot_be_loaded_ends_the_server() -> None:
+    def load() -> Session:
+        raise InputError(where="here", found="nothing to load")
+
+    with pytest.raises(InputError, match="here: nothing to load"), serving(load):
+        pass
+
+
+def test_a_second_robot_is_refused_by_the_name_of_the_first_until_that_leaves() -> None:
+    with serving(session) as running:
+        first = PlanningClient(running.url)
+        port = first._connection.local_address[1]
+        with pytest.raises(UnreachableError, match=f"HTTP 503: busy: a robot at 127.0.0.1:{port} is being served"):
+            PlanningClient(running.url)
+        assert get(running, "/healzth")[0] == 404
+        assert get(running, "/healthz")[0] == 200
+        first.infer(request(0, goal_image=image(100)))
+        first.close()
+        wait_for(lambda: "vjepa2_ac_robots 0" in get(running, "/metrics")[1])
+        with PlanningClient(running.url) as second, pytest.raises(InputError, match="no goal in this episode"):
+            second.infer(request(1))
+
+
+def test_pings_are_answered_during_a_long_decision() -> None:
+    slow = SlowSession()
+
+    async def drive(url: str) -> float:
+        async with websockets.asyncio.client.connect(
+            url, compression=None, proxy=None, ping_interval=0.2, ping_timeout=0.4
+        ) as connection:
+            await connection.recv()
+            await connection.send(pack(request(0, goal_image=image(100))))
+            await asyncio.to_thread(slow.asked.wait, 20)
+            slowest = 0.0
+            for _ in range(6):
+                began = time.monotonic()
+                await asyncio.wait_for(await connection.ping(), 5)
+                slowest = max(slowest, time.monotonic() - began)
+                await asyncio.sleep(0.2)
+            slow.go.set()
+            assert unpack(await connection.recv())["why"] == "planned"
+            return slowest
+
+    with serving(lambda: slow.one, ping_s=0.5) as running:
+        assert asyncio.run(drive(running.url)) < 5
+
+
+def test_a_client_that_leaves_ends_its_search_and_the_next_one_is_served() -> None:
+    slow = SlowSession()
+    with serving(lambda: slow.one) as running:
+        with connect(running) as connection:
+            connection.recv()
+            connection.send(pack(request(0, goal_image=image(100))))
+            assert slow.asked.wait(20)
+        assert slow.left.wait(10)
+        slow.go.set()
+        wait_for(lambda: "vjepa2_ac_robots 0" in get(running, "/metrics")[1])
+        with PlanningClient(running.url) as client:
+            assert client.infer(request(1, goal_image=image(100)))["why"] == "planned"
+
+
+def test_a_server_that_ends_during_a_decision_does_not_wait_for_it() -> None:
+    slow = SlowSession()
+    with contextlib.ExitStack() as client:
+        with serving(lambda: slow.one) as running:
+            connection = client.enter_context(connect(running))
+            connection.recv()
+            connection.send(pack(request(0, goal_image=image(100))))
+            assert slow.asked.wait(20)
+            began = time.monotonic()
+        assert time.monotonic() - began < 5
+        assert slow.left.is_set()
+        with pytest.raises(ConnectionClosed):
+            connection.recv(timeout=5)
+
+
+def test_a_key_is_asked_of_robots_and_of_figures_and_of_nobody_who_asks_for_health() -> None:
+    with serving(session, Access("127.0.0.1", KEY)) as running:
+        for key in (None, KEY + "x"):
+            with pytest.raises(UnreachableError, match="HTTP 401: this server needs the key"):
+                PlanningClient(running.url, key)
+        assert get(running, "/metrics")[0] == 401
+        assert get(running, "/metrics", Authorization=f"Api-Key {KEY}")[0] == 200
+        assert get(running, "/healthz")[0] == 200
+        with PlanningClient(running.url, KEY) as client:
+            assert client.infer(request(0, goal_image=image(1)))["why"] == "planned"
+        assert (
+            'connections_refused_total{status="401"} 3' in get(running, "/metrics", Authorization=f"Api-Key {KEY}")[1]
+        )
+
+
+def test_pages_in_a_browser_are_refused() -> None:
+    with serving(session) as running:
+        for headers, status in (({"origin": "http://evil.example"}, 403), ({"origin": "null"}, 403)):
+            with pytest.raises(InvalidStatus) as caught, connect(running, **headers):
+                pass
+            assert caught.value.response.status_code == status
+        assert get(running, "/metrics", Host="evil.example")[0] == 403
+        with connect(running) as connection:
+            assert unpack(connection.recv())
+
+
+def test_what_is_no_request_is_answered_by_a_sentence_and_the_next_one_is_served() -> None:
+    good, rng = bytearray(pack(request(0, goal_image=image(100)))), random.Random(0)  # noqa: S311
+    with serving(session) as running, connect(running) as connection:
+        connection.recv()
+        connection.send("a text")
+        assert connection.recv(timeout=10) == "a request is a binary message, in msgpack"
+        for _ in range(300):
+            wrong = bytearray(good)
+            for _ in range(rng.randint(1, 4)):
+                wrong[rng.randrange(120)] = rng.randrange(256)
+            connection.send(bytes(wrong[: rng.choice([len(wrong), rng.randrange(len(wrong))])]))
+            answer = connection.recv(timeout=20)
+            assert isinstance(answer, bytes) or (len(answer) < 1000 and "Traceback" not in answer)
+        connection.send(bytes(good))
+        found = unpack(connection.recv(timeout=20))
+        assert found["why"] == "planned"
+        figures = get(running, "/metrics")[1]
+        assert "requests_failed_total 0" in figures
+        assert 'decision_seconds_bucket{le="+Inf"}' in figures
+
+
+def test_a_message_that_is_too_large_ends_the_connection_and_not_the_server() -> None:
+    with serving(session) as running:
+        with connect(running) as connection:
+            connection.recv()
+            with contextlib.suppress(ConnectionClosed, OSError):
+                connection.send(bytes(33 << 20))
+            with pytest.raises(ConnectionClosed) as caught:
+                connection.recv(timeout=10)
+        assert caught.value.rcvd is None or caught.value.rcvd.code == 1009
+        wait_for(lambda: "vjepa2_ac_robots 0" in get(running, "/metrics")[1])
+        with PlanningClient(running.url) as client:
+            assert client.infer(request(0, goal_image=image(1)))["why"] == "planned"
+
+
+def test_a_port_that_is_taken_is_told() -> None:
+    from vjepa2_ac.serving.server import PlanningServer, Served, ServerOptions
+
+    with serving(session) as running:
+        port = int(running.url.rpartition(":")[2])
+        server = PlanningServer(lambda: Served(session(), {}), ServerOptions(Access("127.0.0.1"), port), print)
+        with pytest.raises(InputError, match=f"127.0.0.1:{port}: cannot be listened on"):
+            asyncio.run(server.run(asyncio.Event()))
