@@ -38,8 +38,8 @@ ORDERS: dict[str, list[str]] = {
     "data": ["picture_file", "index", "cache filters", "sources", "clips", "inspection"],
     "data.sources": ["listing configured_spaces indexed_source", "rlds droid_raw lerobot npz latents", "registry"],
     "serving": [
-        "wire worker prometheus access client",
-        "request waypoints bounds kept_goals recording",
+        "wire worker prometheus access",
+        "client request waypoints bounds kept_goals recording",
         "session",
         "about server",
     ],

@@ -36,6 +36,10 @@ plan builtin:sim-tiny --start a.png --goal b.png --state 0.4,0,.3,3,0,0,0
 plan builtin:sim-tiny planning.horizonn=2 --start a.png --goal b.png --state 0.4,0,.3,3,0,0,0
 export nope out
 config show nope.yaml
+serve nope
+serve builtin:sim-tiny planning.horizonn=2
+serve builtin:sim-tiny --host 0.0.0.0
+serve builtin:sim-tiny --goals nope
 simulate nope
 simulate builtin:sim-tiny --domain Q
 simulate builtin:sim-tiny planning.horizonn=2

@@ -26,6 +26,10 @@ ABOUT, DECISIONS, IMAGES = "server.json", "decisions.jsonl", "images"
 FORMAT = 1  # incremented when a reader would have to change
 
 
+class _FullError(Exception):
+    """The record has its size."""
+
+
 class Recorder:
     """Writes decisions to a folder until it has its size. A disk that fails ends the record, never a decision.
 
@@ -49,7 +53,7 @@ class Recorder:
         require_new_record(folder)
         with user_can_write(folder):
             (folder / IMAGES).mkdir(parents=True, exist_ok=True)
-            self._write(folder / ABOUT, json_text({"format": FORMAT, **about}))
+            write_atomically(folder / ABOUT, json_text({"format": FORMAT, **about}))
 
     def goal(self, goals: Sequence[SubGoal], mask: np.ndarray | None) -> None:
         """Take note of a goal, with which an episode begins."""
@@ -77,6 +81,8 @@ class Recorder:
                 "plan": self._words(controller, frame, state, number),
             }
             self._append(json.dumps(line, allow_nan=False) + "\n")
+        except _FullError:
+            self._end("has reached its size (--record-gb)")
         except OSError as error:
             self._end(f"cannot be written ({error.strerror})")
 
@@ -115,17 +121,19 @@ class Recorder:
         return name
 
     def _append(self, line: str) -> None:
-        self._left -= len(line.encode())
-        if self._left < 0:
-            self._end("has reached its size (--record-gb)")
-            return
+        self._take(len(line.encode()))
         with (self.folder / DECISIONS).open("a") as file:
             file.write(line)
 
     def _write(self, path: Path, data: str | bytes) -> None:
         data = data.encode() if isinstance(data, str) else data
-        self._left -= len(data)
+        self._take(len(data))
         write_atomically(path, data)
+
+    def _take(self, size: int) -> None:
+        if size > self._left:
+            raise _FullError
+        self._left -= size
 
     def _end(self, why: str) -> None:
         self._is_on = False

@@ -1,0 +1,133 @@
+"""`vjepa2-ac serve`: a process that a robot drives, and wrong words that are told before it listens."""
+
+import json
+import os
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from ranks import Rank
+from served import STATE, image
+from tiny_models import tiny_model
+from vjepa2_ac.cli import main
+from vjepa2_ac.errors import UnreachableError
+from vjepa2_ac.serving.client import PlanningClient
+
+QUICK = ["planning.samples=8", "planning.iterations=2", "planning.horizon=2", "planning.cem.elites=4"]
+KEY = "correct-horse-battery-staple"
+
+
+@pytest.fixture(scope="module")
+def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a model and pictures of goals."""
+    here = tmp_path_factory.mktemp("workshop")
+    tiny_model().save_pretrained(here / "model")
+    (here / "goals").mkdir()
+    Image.fromarray(image(50)).save(here / "goals/cup.png")
+    (here / "key").write_text(KEY)
+    (here / "key").chmod(0o600)
+    return here
+
+
+def started(*words: str) -> tuple[Rank, str]:
+    """Start a server; return it and its address."""
+    process = Rank(["-m", "vjepa2_ac.cli", "serve", *words, "--port", "0"], dict(os.environ))
+    until = time.monotonic() + 60
+    while "ready" not in (said := process.written()[0]).splitlines():
+        assert process.poll() is None, process.written()
+        assert time.monotonic() < until
+        time.sleep(0.02)
+    address = next(line for line in said.splitlines() if line.startswith("listening on "))
+    return process, address.removeprefix("listening on ")
+
+
+def ended(process: Rank) -> str:
+    """End a server as its host does; return what it wrote."""
+    began = time.monotonic()
+    process.send_signal(signal.SIGTERM)
+    out, errors = process.communicate(timeout=20)
+    assert time.monotonic() - began < 5
+    assert process.returncode == 0, errors
+    return out + errors
+
+
+def test_a_robot_drives_it_and_every_decision_can_be_made_again(workshop: Path, tmp_path: Path, monkeypatch) -> None:
+    record = tmp_path / "record"
+    words = [str(workshop / "model"), "--goals", str(workshop / "goals"), "--key-file", str(workshop / "key")]
+    process, url = started(*words, "--record", str(record), *QUICK)
+    with pytest.raises(UnreachableError, match="401"):
+        PlanningClient(url)
+    answers = []
+    with PlanningClient(url, KEY) as client:
+        assert client.metadata["goals"] == ["cup"]
+        assert client.metadata["limits"]["workspace"] is None
+        assert str(workshop) not in json.dumps({**client.metadata})
+        for step in range(3):
+            message = {"observation/image": image(step), "observation/state": STATE + 0.01 * step, "prompt": "cup"}
+            answers.append(client.infer(message))
+    assert "has left" in ended(process)
+    lines = [json.loads(line) for line in (record / "decisions.jsonl").read_text().splitlines()]
+    assert len(lines) == 3
+    monkeypatch.chdir(record)
+    monkeypatch.setattr("vjepa2_ac.reports.figures.plan.plot_plan", lambda _, path, *__: path)
+    for number, (line, answer) in enumerate(zip(lines, answers, strict=True)):
+        assert (
+            main(["plan", str(workshop / "model"), *QUICK, *line["plan"], "--nodes", "0", "--out", f"again-{number}"])
+            == 0
+        )
+        again = json.loads(Path(f"again-{number}/plan.json").read_text())
+        np.testing.assert_array_equal(again["actions"], answer["actions"])
+        assert again["energy"]["plan"] == answer["energy"]["plan"] == line["answer"]["energy"]["plan"]
+
+
+def test_a_dry_run_and_poses_and_the_metadata_of_roboarena(workshop: Path) -> None:
+    words = ["--dry-run", "--actions", "pose", "--metadata", "roboarena", *QUICK, "data.stride=5"]
+    process, url = started(str(workshop / "model"), *words)
+    with PlanningClient(url) as client:
+        assert set(client.metadata) == {
+            "image_resolution", "needs_wrist_camera", "n_external_cameras", "needs_stereo_camera", "needs_session_id",
+            "action_space",
+        }  # fmt: skip
+        assert client.metadata["action_space"] == "cartesian_position"
+        found = client.infer({
+            "endpoint": "infer", "session_id": "one", "observation/exterior_image_0_left": image(0),
+            "observation/cartesian_position": STATE[:6], "observation/gripper_position": STATE[6:],
+            "goal/image": image(1), "prompt": "put it there",
+        })  # fmt: skip
+        np.testing.assert_allclose(found["actions"], np.tile(STATE, (5, 1)), atol=1e-9)
+        assert client.infer({"endpoint": "reset", "session_id": "two"}) == {"status": "reset"}
+    assert "DRY RUN" in ended(process)
+
+
+WRONG = {
+    "--host 0.0.0.0: an address that other machines can reach": ["--host", "0.0.0.0"],  # noqa: S104 - refused
+    "--key-file": ["--key-file", "none"],
+    "--metadata roboarena: --actions delta": ["--metadata", "roboarena"],
+    "--certificate none.pem": ["--certificate", "none.pem"],
+    "--certificate-key key.pem: no --certificate": ["--certificate-key", "key.pem"],
+    "--goals nowhere: no such folder": ["--goals", "nowhere"],
+    "--extrinsics": ["--extrinsics", "1,2"],
+    "training.steps=3: a setting that planning does not use": ["training.steps=3"],
+    "planning.limits: workspace: the corner": ["planning.limits.workspace=[[0,0,0],[0,1,1]]"],
+}
+
+
+@pytest.mark.parametrize("error", WRONG)
+def test_wrong_words_are_told_before_anything_listens(
+    error: str, workshop: Path, tmp_path: Path, capsys, monkeypatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["serve", str(workshop / "model"), *WRONG[error]]) == 2
+    found = capsys.readouterr()
+    assert error in found.err.replace("\n", " ")
+    assert "listening" not in found.out
+
+
+def test_a_model_that_cannot_serve_ends_it_with_a_sentence(workshop: Path, capsys) -> None:
+    tiny_model(extrinsics=True).save_pretrained(workshop / "camera")
+    assert main(["serve", str(workshop / "camera"), "--port", "0"]) == 2
+    assert "predictor.use_extrinsics" in capsys.readouterr().err
