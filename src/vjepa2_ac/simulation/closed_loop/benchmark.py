@@ -24,7 +24,7 @@ from vjepa2_ac.simulation.closed_loop.oracles import oracle_for
 from vjepa2_ac.simulation.closed_loop.policies import DoNothing, Oracle, Planning, Policy, RandomActions
 from vjepa2_ac.simulation.closed_loop.result import ClosedLoopResult
 from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, run_task
-from vjepa2_ac.simulation.closed_loop.tasks import SUCCESS_M, TaskName, arm_for
+from vjepa2_ac.simulation.closed_loop.tasks import ALSO, SUCCESS_M, TaskName, arm_for
 from vjepa2_ac.simulation.closed_loop.video import write_film
 from vjepa2_ac.simulation.world.arm import Renderer, SimulatedArm
 from vjepa2_ac.simulation.world.domains import named_domain
@@ -148,6 +148,7 @@ def benchmark_as_dict(benchmark: ClosedLoopBenchmark) -> dict[str, Any]:
             "stride": benchmark.results[0].stride,
             "seconds_per_step": benchmark.seconds_per_step,
             "success_below_cm": 100 * SUCCESS_M[benchmark.options.task],
+            "success_also": ALSO[benchmark.options.task],
             "planning": benchmark.planning,
             "warnings": list(benchmark.warnings),
             "planning_seed": benchmark.planning_seed,
