@@ -30,6 +30,7 @@ SPECS = {
     "random": RecordingSpec("random", STEPS, seed=2),
     "push": RecordingSpec("A", STEPS, seed=2, task="push"),
     "three cameras": RecordingSpec("B", 5, seed=2, cameras=3),
+    "place": RecordingSpec("B", STEPS, seed=2, task="place"),
     "random pick": RecordingSpec("random", STEPS, seed=2, task="pick"),
 }
 NAMES = [name for name, spec in SPECS.items() if spec.cameras == 1]

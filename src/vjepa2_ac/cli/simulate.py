@@ -44,11 +44,12 @@ def add_to(commands: Commands) -> None:
     text = "A or B; record: or random, another world in every episode (A)"
     argument(parser, "--domain", text, default="A")
     argument(parser, "--episodes N", "how many (50; record: 40)", count)
-    argument(parser, "--steps N", "of an episode: model steps (8); record: control steps, 15/s (41)", count)
+    text = "of an episode: model steps (8; pick: 12, place: 18); record: control steps, 15/s (41; place: 81)"
+    argument(parser, "--steps N", text, count)
     argument(parser, "--seed N", "which problems or demonstrations (0)", whole_number(0, 2**31 - 1))
     argument(parser, "--renderer", "opengl needs a working MUJOCO_GL (rays)", choices=["rays", "opengl"])
-    text = "what is to be done (reach); record: push or pick, with a block on the table (none: reaching around)"
-    argument(parser, "--task", text, choices=["reach", "push", "pick"])
+    text = "what is to be done (reach); record: push, pick or place, with a block on the table (none: reaching around)"
+    argument(parser, "--task", text, choices=["reach", "push", "pick", "place"])
     group = parser.add_argument_group("of a model that steers")
     add_checkpoint(group, default=None)
     argument(group, "--config CONFIG", "of a model: a config whose `planning` is used", as_local)
@@ -95,9 +96,11 @@ def _record(options: argparse.Namespace) -> int:
 
     from vjepa2_ac.console.progress import ConsoleReporter, console
     from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
+    from vjepa2_ac.simulation.recording.recorded_task import default_steps
 
     output.never_wait()
-    spec = record_of_options(RecordingSpec, options, task=None if options.task == "reach" else options.task)
+    task = None if options.task == "reach" else options.task
+    spec = record_of_options(RecordingSpec, options, task=task, steps=options.steps or default_steps(task))
     episodes, workers = options.episodes or 40, options.workers or 1
     with ConsoleReporter() as reporter:
         progress = reporter.task("recording")

@@ -6,7 +6,7 @@ from rich.table import Table
 
 from vjepa2_ac.console.progress import MetricsTable, with_interval
 from vjepa2_ac.simulation.closed_loop.benchmark import ClosedLoopBenchmark
-from vjepa2_ac.simulation.closed_loop.tasks import SUCCESS_M
+from vjepa2_ac.simulation.closed_loop.tasks import ALSO, SUCCESS_M
 
 _USUAL = {"planned", "nothing", "random", "scripted"}  # reasons of actions that are not mentioned
 
@@ -14,11 +14,12 @@ _USUAL = {"planned", "nothing", "random", "scripted"}  # reasons of actions that
 def benchmark_table(benchmark: ClosedLoopBenchmark) -> Table:
     """Return a table with a row for each policy; the intervals are 95 %, over episodes."""
     options = benchmark.options
-    threshold = f"{100 * SUCCESS_M[options.task]:g} cm"
+    also = f", {ALSO[options.task]}," if ALSO[options.task] else ""
+    criterion = f"within {100 * SUCCESS_M[options.task]:g} cm{also}"
     table = MetricsTable(
         f"{options.task} in domain {options.domain}: {options.episodes} problems of seed {options.seed},"
         f" {benchmark.results[0].steps} steps of {benchmark.seconds_per_step:.2f} s (95 % interval over episodes)",
-        ["", f"within {threshold} at the end", "once on the way", "left at the end, cm", "steps", "s per decision"],
+        ["", f"{criterion} at the end", "once on the way", "left at the end, cm", "steps", "s per decision"],
     )
     for result in benchmark.results:
         table.add_row(

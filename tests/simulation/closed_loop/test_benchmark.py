@@ -117,6 +117,7 @@ def test_the_command_prints_a_row_for_each_and_writes_figures_and_a_film(
     assert list(reported["policies"]) == list(rows)
     assert reported["about"]["planning"]["samples"] == 6
     assert reported["about"]["success_below_cm"] == 5
+    assert reported["about"]["success_also"] == ""
     for name, one in reported["policies"].items():
         distances = np.array(one["by_episode"]["distance_cm"])
         assert distances.shape == (2, 3)
@@ -256,6 +257,20 @@ def test_a_problem_that_cannot_be_demonstrated_is_told_before_any_is_worked_on(
     assert error.startswith("error: demonstration of problem 0 (pick): the oracle ends ")
     assert "planning.limits.xyz" in error
     assert not list(tmp_path.iterdir())
+
+
+def test_placing_is_filmed_and_its_criterion_is_told(
+    model: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = ["simulate", model, "--task", "place", "--episodes", "1", "--films", "1", "--out", str(tmp_path), *SMALL]
+    assert main(given) == 0
+    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "18 steps of 0.27 s" in shown
+    assert "released" in shown
+    about, policies = (metrics(tmp_path)[key] for key in ("about", "policies"))
+    assert (about["success_below_cm"], about["success_also"]) == (4, "released on the table")
+    assert [policies[name]["success"]["value"] for name in ("do nothing", "oracle")] == [0.0, 1.0]
+    assert count_frames(tmp_path / FILM, where="film") == 4 + 17 + 4
 
 
 def test_a_stride_that_is_to_be_found_out_is_no_stride(model: str, tmp_path: Path) -> None:

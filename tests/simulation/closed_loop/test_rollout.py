@@ -178,6 +178,7 @@ def fake(*distances_m: float, unreachable: int = 0) -> EpisodeResult:
         actions=np.zeros((count - 1, 7)),
         blocks=None,
         distances_m=np.array(distances_m),
+        reached=np.array(distances_m) < 0.05,
         seconds=np.arange(1.0, count),
         whys=("planned",) * (count - 2) + ("out of time",),
         unreachable=unreachable,

@@ -4,11 +4,21 @@ import numpy as np
 import pytest
 
 from vjepa2_ac.geometry import matrices_from_euler
-from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, HOLDING, LIFT_M, PUSH_WAY_M, SUCCESS_M, make_problem
+from vjepa2_ac.simulation.closed_loop.tasks import (
+    GRASP_M,
+    HOLDING,
+    LIFT_M,
+    PLACE_WAY_M,
+    PUSH_WAY_M,
+    RELEASED,
+    SUCCESS_M,
+    make_problem,
+)
+from vjepa2_ac.simulation.world.block_scene import MARK_M, WORK_AREA_M
 from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B, Domain
 from vjepa2_ac.simulation.world.kinematics import forward_kinematics, inverse_kinematics
 from vjepa2_ac.simulation.world.motion import MotionRecipe, rest_joints
-from vjepa2_ac.simulation.world.scene import BLOCK_M
+from vjepa2_ac.simulation.world.scene import BLOCK_M, FINGER_INSIDE_M, FINGER_TRAVEL_M, FINGERTIP_M
 
 RECIPE = MotionRecipe()
 
@@ -17,7 +27,10 @@ def in_world(state: np.ndarray, domain: Domain) -> np.ndarray:
     return domain.base_pose()[:3, :3] @ state[:3]
 
 
-@pytest.mark.parametrize("task", ["reach", "push", "pick"])
+TASKS = ["reach", "push", "pick", "place"]
+
+
+@pytest.mark.parametrize("task", TASKS)
 def test_a_problem_is_the_same_in_the_world_whatever_the_domain(task: str) -> None:
     turn_a, turn_b = (domain.base_pose()[:3, :3] for domain in (DOMAIN_A, DOMAIN_B))
     for index in range(6):
@@ -34,6 +47,26 @@ def test_a_problem_is_the_same_in_the_world_whatever_the_domain(task: str) -> No
             )
             assert np.abs(ours[:3] - theirs[:3]).max() > 0.05  # in the frames of bases that are turned
             assert ours[6] == theirs[6]
+
+
+@pytest.mark.parametrize(
+    ("task", "goal", "block_goal"),
+    [
+        ("reach", [0.4396847047196296, 0.01860544981563761, 0.45383170152955726], None),
+        ("push", [0.5114199059195207, -0.012427192193500351, 0.17], [0.5213982885988618, 0.04470801480800288, 0.03]),
+        (
+            "pick",
+            [0.5089670030929729, -0.12002530164497903, 0.2823322387197327],
+            [0.5089670030929729, -0.12002530164497903, 0.15233223871973267],
+        ),
+    ],
+)
+def test_results_of_earlier_versions_were_of_the_same_problems(task: str, goal: list, block_goal: list | None) -> None:
+    problem = make_problem(task, DOMAIN_A, 3, 1)
+    np.testing.assert_allclose(problem.goal[:3], goal, rtol=0, atol=1e-14)
+    assert (problem.block_goal is None) == (block_goal is None)
+    if block_goal is not None:
+        np.testing.assert_allclose(problem.block_goal[:3], block_goal, rtol=0, atol=1e-14)
 
 
 def test_problems_are_a_pure_function_of_seed_and_index() -> None:
@@ -59,7 +92,7 @@ def test_reach_is_in_the_box_and_12_to_25_cm_away_without_rotation() -> None:
     assert np.ptp([problem.start[5] for problem in problems]) > 1.0
 
 
-@pytest.mark.parametrize("task", ["reach", "push", "pick"])
+@pytest.mark.parametrize("task", TASKS)
 def test_every_start_and_goal_can_be_reached_in_both_domains(task: str) -> None:
     for domain in (DOMAIN_A, DOMAIN_B):
         rest = rest_joints(domain)
@@ -106,6 +139,56 @@ def test_a_pick_begins_over_the_block_and_ends_with_it_in_the_hand() -> None:
         sides = np.array([np.cos(block_turn), np.sin(block_turn)]), np.array([-np.sin(block_turn), np.cos(block_turn)])
         assert max(abs(across[:2] @ side) for side in sides) == pytest.approx(1.0, abs=1e-9)
     assert LIFT_M[0] > SUCCESS_M["pick"]
+
+
+def test_a_place_begins_as_a_pick_and_ends_with_the_block_on_the_mark_and_an_open_hand_over_it() -> None:
+    ways = []
+    for index in range(60):
+        problem = make_problem("place", DOMAIN_B, 0, index)
+        assert problem.start[6] == problem.goal[6] == 0.0
+        assert problem.block_start[2] == problem.block_goal[2] == BLOCK_M / 2
+        assert problem.start[2] - problem.block_start[2] > GRASP_M + 0.06
+        np.testing.assert_allclose(problem.goal[:2], problem.block_goal[:2], atol=1e-12)
+        assert problem.goal[2] - FINGERTIP_M > BLOCK_M + 0.005  # the fingers are over the block
+        np.testing.assert_array_equal(problem.mark, problem.block_goal[:2])
+        in_world = DOMAIN_B.base_pose()[:2, :2] @ problem.mark
+        assert all(low + MARK_M < at < high - MARK_M for at, (low, high) in zip(in_world, WORK_AREA_M, strict=True))
+        ways.append(problem.block_goal[:2] - problem.block_start[:2])
+        assert problem.distance_m(problem.start, problem.block_start) == pytest.approx(np.linalg.norm(ways[-1]))
+    lengths = np.linalg.norm(ways, axis=1)
+    assert PLACE_WAY_M[0] <= lengths.min() < 0.12
+    assert 0.17 < lengths.max() <= PLACE_WAY_M[1]
+    angles = np.rad2deg(np.arctan2(*np.array(ways).T[::-1]))
+    assert all((np.abs(angles - towards) < 45).any() for towards in (-135, -45, 45, 135))
+    assert PLACE_WAY_M[0] > 2 * SUCCESS_M["place"]
+    assert SUCCESS_M["place"] < MARK_M
+    assert all(make_problem(task, DOMAIN_A, 0, 0).mark is None for task in TASKS if task != "place")
+
+
+def test_a_block_is_placed_when_it_lies_on_the_mark_and_is_released() -> None:
+    problem = make_problem("place", DOMAIN_A, 0, 0)
+    beside, held, open_hand = np.array([0.03, 0.0, 0.0, 1.0]), problem.goal.copy(), problem.goal
+    held[6] = HOLDING
+    assert problem.succeeded(open_hand, problem.block_goal)
+    assert problem.succeeded(open_hand, problem.block_goal + beside)
+    assert not problem.succeeded(open_hand, problem.block_goal + 1.4 * beside)
+    assert not problem.succeeded(held, problem.block_goal)
+    for height, lies in ((0.005, True), (0.015, False)):
+        assert problem.succeeded(open_hand, problem.block_goal + height * np.eye(4)[2]) == lies
+    assert not problem.succeeded(open_hand, problem.block_start)
+    gap_m = FINGER_INSIDE_M + (1.0 - RELEASED) * FINGER_TRAVEL_M - BLOCK_M / 2
+    assert gap_m == pytest.approx(0.004)
+    with pytest.raises(ValueError, match="place is done by a block"):
+        problem.succeeded(open_hand)
+
+
+def test_other_tasks_succeed_by_distance_alone() -> None:
+    picked = make_problem("pick", DOMAIN_A, 0, 0)
+    for height, done in ((0.049, True), (0.051, False)):
+        assert picked.succeeded(picked.start, picked.block_goal - height * np.eye(4)[2]) == done
+    reached = make_problem("reach", DOMAIN_A, 0, 0)
+    assert reached.succeeded(reached.goal)
+    assert not reached.succeeded(reached.start)
 
 
 def test_the_distance_is_that_of_the_flange_in_metres() -> None:

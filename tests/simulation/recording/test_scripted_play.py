@@ -15,6 +15,7 @@ from vjepa2_ac.cli import main
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.rlds.source import RldsSource
 from vjepa2_ac.simulation.recording.record import RecordingSpec, record_episode
+from vjepa2_ac.simulation.recording.recorded_task import default_steps
 from vjepa2_ac.simulation.recording.scripted_play import play
 
 
@@ -36,6 +37,10 @@ def test_scripts_and_play_move_the_block() -> None:
     assert len(pushed) == 41
     assert np.linalg.norm(pushed[-1, :2] - pushed[0, :2]) > 0.08
     assert blocks_of("pick", 1, script=True)[-1, 2] > 0.10
+    placed = blocks_of("place", 1, script=True, steps=default_steps("place"))
+    assert placed[:, 2].max() > 0.08
+    assert placed[-1, 2] < 0.035
+    assert np.linalg.norm(placed[-1, :2] - placed[0, :2]) > 0.06
     played = [blocks_of("push", seed, script=False, steps=25) for seed in range(3)]
     ways = [np.linalg.norm(blocks[-1, :2] - blocks[0, :2]) for blocks in played]
     assert max(ways) > 0.05
@@ -70,6 +75,20 @@ def test_every_other_episode_is_scripted(monkeypatch: pytest.MonkeyPatch) -> Non
     for index in range(3):
         record_episode(index, RecordingSpec(DOMAIN_A, 2, 0, task="push"))
     assert asked == [True, False, True]
+
+
+def test_an_episode_of_place_is_long_enough_and_says_what_it_is(tmp_path: Path) -> None:
+    assert main(["simulate", "record", str(tmp_path / "data"), "--task", "place", "--episodes", "1"]) == 0
+    (info,) = RldsSource(DataConfig(path=str(tmp_path / "data"))).infos()
+    assert info.num_steps == 81
+    assert (
+        record_episode(0, RecordingSpec(DOMAIN_A, 2, task="place")).language_instruction == "put the block on the mark"
+    )
+
+
+def test_play_of_place_uses_the_gripper() -> None:
+    motion = play(arm_for("place", DOMAIN_A), "place", 41, np.random.default_rng(0), script=False)
+    assert np.ptp(motion.gripper) > 0.3
 
 
 def test_the_command_records_a_task(tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ SPECS = [
     RecordingSpec("A", 5, seed=3),
     RecordingSpec("random", 5, seed=4, cameras=3),
     RecordingSpec(replace(DOMAIN_B, lag_s=0.1 + 0.2, camera=CameraPlace(1 / 3, 20.0, 1.2)), 5, task="push"),
+    RecordingSpec("B", 5, task="place"),
     RecordingSpec(DomainRanges(lag_s=(0.05, 0.06)), 5, recipe=MotionRecipe(drift_m=(0.0, 0.01, 0.0))),
 ]
 
@@ -38,7 +39,7 @@ def written(folder: Path, spec: RecordingSpec, **changes: Any) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("spec", SPECS, ids=["A", "random", "task", "recipe"])
+@pytest.mark.parametrize("spec", SPECS, ids=["A", "random", "task", "place", "recipe"])
 def test_the_spec_that_is_read_is_the_one_that_was_recorded(tmp_path: Path, spec: RecordingSpec) -> None:
     read = read_simulation(written(tmp_path, spec))
     assert read.spec == replace(spec, domain=spec.worlds, recipe=spec.recipe or MotionRecipe())

@@ -7,10 +7,12 @@ from vjepa2_ac.geometry import matrices_from_euler
 from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, HOLDING
 from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B, Domain
 from vjepa2_ac.simulation.world.motion import downward_poses, poses_in_base
+from vjepa2_ac.simulation.world.projection import exterior_pose, pixels_of
 from vjepa2_ac.simulation.world.scene import BLOCK_M, FINGERTIP_M
 
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 
+from vjepa2_ac.simulation.closed_loop.rollout import put
 from vjepa2_ac.simulation.closed_loop.tasks import arm_for
 from vjepa2_ac.simulation.world.arm import SimulatedArm
 from vjepa2_ac.simulation.world.block_arm import ContactArm
@@ -127,4 +129,38 @@ def test_only_tasks_with_a_block_have_one() -> None:
     assert reaching.block is None
     with pytest.raises(ValueError, match="no block to be put"):
         reaching.place_block(np.zeros(4))
-    assert all(arm_for(task, DOMAIN_A).block is not None for task in ("push", "pick"))
+    assert all(arm_for(task, DOMAIN_A).block is not None for task in ("push", "pick", "place"))
+
+
+def test_only_place_has_a_mark_and_it_has_to_be_put_somewhere() -> None:
+    for task in ("reach", "push", "pick"):
+        other = arm_for(task, DOMAIN_A, size=(18, 32))
+        assert other.mark is None
+        with pytest.raises(ValueError, match="no mark to be put"):
+            put(other, other.state, None, np.array([0.5, 0.0]))
+    marked = arm_for("place", DOMAIN_A, size=(18, 32))
+    with pytest.raises(ValueError, match=r"give problem\.mark"):
+        put(marked, marked.state, None)
+
+
+def test_a_mark_is_seen_where_it_was_put_and_nothing_touches_it(arm: ContactArm) -> None:
+    marked = arm_for("place", DOMAIN_B)
+    found = []
+    for one in (arm, marked):  # grasp, lift and drop a block; with the mark under it, and without
+        start = state_over(DOMAIN_B, 0.5, -0.1, BLOCK_M / 2 + GRASP_M)
+        put(one, start, block_at(DOMAIN_B, 0.5, -0.1), None if one is arm else block_at(DOMAIN_B, 0.5, -0.1)[:2])
+        for way, closedness in ((0.0, 0.9), (0.05, 0.9), (0.05, 0.9), (0.0, 0.0), (0.0, 0.0)):
+            one.command(moved(one.state, 0.0, 0.0, way, closedness=closedness), 4)
+            found.append(np.append(one.block, one.state))
+    np.testing.assert_allclose(found[:5], found[5:], atol=1e-9)
+    assert max(seen[2] for seen in found) > BLOCK_M
+    place = block_at(DOMAIN_B, 0.45, 0.15)[:2]
+    marked.place_mark(place)
+    np.testing.assert_allclose(marked.mark, place, atol=1e-12)
+    marked.command(moved(marked.state, 0.0, 0.0, 0.1), 8)
+    seen = marked.image().astype(int)
+    rows, columns = np.nonzero(np.minimum(seen[..., 1], seen[..., 2]) > 2.5 * seen[..., 0])
+    assert len(rows) > 100
+    at = DOMAIN_B.base_pose()[:3, :3] @ np.append(place, 0.0)
+    expected = pixels_of(at[None], exterior_pose(DOMAIN_B), DOMAIN_B, seen.shape[:2])[0]
+    np.testing.assert_allclose([columns.mean(), rows.mean()], expected, atol=2.0)

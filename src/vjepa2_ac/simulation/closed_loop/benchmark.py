@@ -25,7 +25,7 @@ from vjepa2_ac.simulation.closed_loop.policies import DoNothing, GoalsOf, Oracle
 from vjepa2_ac.simulation.closed_loop.result import ClosedLoopResult
 from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, run_task
 from vjepa2_ac.simulation.closed_loop.sub_goals import DemonstratedGoals, DemonstrationSpec
-from vjepa2_ac.simulation.closed_loop.tasks import STEPS, SUCCESS_M, TaskName, TaskProblem, arm_for, make_problem
+from vjepa2_ac.simulation.closed_loop.tasks import ALSO, STEPS, SUCCESS_M, TaskName, TaskProblem, arm_for, make_problem
 from vjepa2_ac.simulation.closed_loop.video import write_film
 from vjepa2_ac.simulation.world.arm import Renderer, SimulatedArm
 from vjepa2_ac.simulation.world.domains import named_domain
@@ -158,6 +158,7 @@ def benchmark_as_dict(benchmark: ClosedLoopBenchmark) -> dict[str, Any]:
             "stride": benchmark.results[0].stride,
             "seconds_per_step": benchmark.seconds_per_step,
             "success_below_cm": 100 * SUCCESS_M[benchmark.options.task],
+            "success_also": ALSO[benchmark.options.task],
             "planning": benchmark.planning,
             "warnings": list(benchmark.warnings),
             "planning_seed": benchmark.planning_seed,

@@ -1,4 +1,4 @@
-"""Oracles: scripts that know the position of the block, push and pick. Upper bound and source of demonstrations."""
+"""Oracles: scripts that know where the block is, for push, pick and place. Upper bound, source of demonstrations."""
 
 from __future__ import annotations
 
@@ -7,13 +7,16 @@ from jaxtyping import Float
 
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.simulation.closed_loop.policies import Oracle, Policy, Reference
-from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, HOLDING, TaskName
+from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, RELEASED, TaskName
 from vjepa2_ac.simulation.world.arm import SimulatedArm
 
 _PUSH_M = 0.035  # per model step: a block that is hit faster slides on
 _NEAR_M = 0.006  # a block closer to its goal is not moved
 _OVER_M = 0.012  # closer to the place of the grasp than this, fingers can close
 _CLEAR_M = 0.065  # above the place of the grasp, fingers pass over the block
+_PLACED_M, _LOW_M = 0.02, 0.01  # a block that is closer to the mark's middle and to the table is let go
+_CARRY_M, _LIFTED_M = 0.08, 0.03  # height over the table of a carried block, and the least before it is carried
+_TO_MARK_M = 0.03  # a block that is closer to the mark's middle goes down
 
 
 class _BlockOracle(Reference):
@@ -51,11 +54,22 @@ class PickOracle(_BlockOracle):
     """Moves over the block, down, closes, and lifts. Does not rotate."""
 
     def _way(self, state: Float[np.ndarray, " 7"]) -> Float[np.ndarray, " 7"]:
-        place = _block(self._arm.block)[:3] + np.array([0.0, 0.0, GRASP_M])
-        way, to_place = np.zeros_like(state), place - state[:3]
-        if np.linalg.norm(to_place) < _OVER_M * 1.5 and state[6] > HOLDING - 0.1:
-            way[:3], way[6] = self._problem.goal[:3] - state[:3], 1.0 - state[6]  # it is held: lift, and keep closing
-        elif np.linalg.norm(to_place) < _OVER_M:
+        if not self._holds(state):
+            return self._grasp(state)
+        way = np.zeros_like(state)
+        way[:3], way[6] = self._problem.goal[:3] - state[:3], 1.0 - state[6]  # lift, and keep closing
+        return way
+
+    def _holds(self, state: Float[np.ndarray, " 7"]) -> bool:
+        return bool(np.linalg.norm(self._to_grasp(state)) < _OVER_M * 1.5 and state[6] > RELEASED)
+
+    def _to_grasp(self, state: Float[np.ndarray, " 7"]) -> Float[np.ndarray, " 3"]:
+        return np.asarray(_block(self._arm.block)[:3] + np.array([0.0, 0.0, GRASP_M]) - state[:3])
+
+    def _grasp(self, state: Float[np.ndarray, " 7"]) -> Float[np.ndarray, " 7"]:
+        """Return the way over the block, down, and closing."""
+        way, to_place = np.zeros_like(state), self._to_grasp(state)
+        if np.linalg.norm(to_place) < _OVER_M:
             way[6] = 1.0 - state[6]
         else:
             way[:3], way[6] = to_place, -state[6]
@@ -64,14 +78,33 @@ class PickOracle(_BlockOracle):
         return way
 
 
+class PlaceOracle(PickOracle):
+    """Picks the block up, carries it over the mark, puts it down, opens, and moves up. Does not rotate."""
+
+    def _way(self, state: Float[np.ndarray, " 7"]) -> Float[np.ndarray, " 7"]:
+        block, goal = _block(self._arm.block)[:3], _block(self._problem.block_goal)[:3]
+        to_goal, way = goal - block, np.zeros_like(state)
+        if np.linalg.norm(to_goal[:2]) < _PLACED_M and -to_goal[2] < _LOW_M:
+            way[6] = -state[6]
+            if state[6] < RELEASED:
+                way[:3] = self._problem.goal[:3] - state[:3]
+            return way
+        if not self._holds(state):
+            return self._grasp(state)
+        way[:3], way[6] = to_goal, 1.0 - state[6]
+        if np.linalg.norm(to_goal[:2]) > _TO_MARK_M:
+            way[2] += _CARRY_M
+            way[:2] *= float(block[2] - goal[2] > _LIFTED_M)  # first up
+        return way
+
+
 def oracle_for(task: TaskName, limits: LimitsConfig, arm: SimulatedArm) -> Policy:
     """Return the oracle of a task, for an arm from `arm_for`."""
-    if task == "push":
-        return PushOracle(limits, arm)
-    return PickOracle(limits, arm) if task == "pick" else Oracle(limits)
+    kinds: dict[TaskName, type[_BlockOracle]] = {"push": PushOracle, "pick": PickOracle, "place": PlaceOracle}
+    return kinds[task](limits, arm) if task in kinds else Oracle(limits)
 
 
 def _block(block: Float[np.ndarray, " 4"] | None) -> Float[np.ndarray, " 4"]:
     if block is None:
-        raise ValueError("no block to push or pick")
+        raise ValueError("no block to push, pick or place")
     return block

@@ -9,18 +9,19 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from vjepa2_ac.intervals import Estimate, mean_of, share_of
-from vjepa2_ac.simulation.closed_loop.tasks import SUCCESS_M, TaskName, TaskProblem
+from vjepa2_ac.simulation.closed_loop.tasks import TaskName, TaskProblem
 
 
 @dataclass(frozen=True)
 class EpisodeResult:
-    """The record of an episode. Index 0 of `states`, `distances_m` and `frames` is before the first action."""
+    """The record of an episode. Index 0 along `time` is before the first action."""
 
     problem: TaskProblem
     states: Float[np.ndarray, "time 7"]  # measured, in the robot base frame
     actions: Float[np.ndarray, "steps dim"]  # as returned by the policy
     blocks: Float[np.ndarray, "time 4"] | None  # pose of the block, as in `TaskProblem`; None: there is none
     distances_m: Float[np.ndarray, " time"]  # of what the task moves, to its goal
+    reached: Bool[np.ndarray, " time"]  # whether the task is done, see `TaskProblem.succeeded`
     seconds: Float[np.ndarray, " steps"]  # taken by the policy
     whys: tuple[str, ...]  # of each action
     unreachable: int  # commands that the arm could not follow completely
@@ -31,20 +32,20 @@ class EpisodeResult:
     @property
     def success(self) -> bool:
         """Whether the goal is reached at the end."""
-        return bool(self.distances_m[-1] < SUCCESS_M[self.problem.task])
+        return bool(self.reached[-1])
 
     @property
     def steps_needed(self) -> int | None:
         """Model steps after which it stays reached; None: it is not reached at the end."""
         if not self.success:
             return None
-        not_done = np.flatnonzero(self.distances_m >= SUCCESS_M[self.problem.task])
+        not_done = np.flatnonzero(~self.reached)
         return int(not_done[-1]) + 1 if len(not_done) else 0
 
     @property
     def success_ever(self) -> bool:
         """Whether the goal was reached after any of the steps, perhaps in passing."""
-        return bool(self.distances_m[1:].min() < SUCCESS_M[self.problem.task])
+        return bool(self.reached[1:].any())
 
 
 @dataclass(frozen=True)

@@ -96,8 +96,8 @@ def run_episode(
     """
     if min(steps, stride) < 1:
         raise ValueError(f"{steps} model steps of {stride} control steps")
-    goal_image = put(arm, problem.goal, problem.block_goal).image()
-    put(arm, problem.start, problem.block_start)
+    goal_image = put(arm, problem.goal, problem.block_goal, problem.mark).image()
+    put(arm, problem.start, problem.block_start, problem.mark)
     policy.reset(problem, goal_image)
     states, blocks, frames = [arm.state], [arm.block], [arm.image()]
     actions, seconds, whys, imagined, unreachable = [], [], [], [], 0
@@ -120,6 +120,7 @@ def run_episode(
         actions=np.stack(actions),
         blocks=None if problem.block_goal is None else np.stack([block for block in blocks if block is not None]),
         distances_m=np.array([problem.distance_m(*seen) for seen in zip(states, blocks, strict=True)]),
+        reached=np.array([problem.succeeded(*seen) for seen in zip(states, blocks, strict=True)]),
         seconds=np.array(seconds),
         whys=tuple(whys),
         unreachable=unreachable,
@@ -129,12 +130,25 @@ def run_episode(
     )
 
 
-def put(arm: SimulatedArm, state: Float[np.ndarray, " 7"], block: Float[np.ndarray, " 4"] | None) -> SimulatedArm:
-    """Put arm and block at a pose, via the arm's rest pose: its redundant joint must not depend on earlier motion."""
+def put(
+    arm: SimulatedArm,
+    state: Float[np.ndarray, " 7"],
+    block: Float[np.ndarray, " 4"] | None,
+    mark: Float[np.ndarray, " 2"] | None = None,
+) -> SimulatedArm:
+    """Put arm, block and mark somewhere, via the arm's rest pose: its redundant joint must not depend on the past.
+
+    Raises:
+        ValueError: There is a mark, and no place for it is given; or a block or a mark is to be put, and there is none.
+    """
+    if arm.mark is not None and mark is None:
+        raise ValueError("no place for the mark on the table: give problem.mark")
     arm.set_joints(rest_joints(arm.domain), 0.0)
     arm.set_state(state)
     if block is not None:
         arm.place_block(block)
+    if mark is not None:
+        arm.place_mark(mark)
     return arm
 
 

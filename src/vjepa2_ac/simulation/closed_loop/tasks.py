@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from vjepa2_ac.simulation.world.arm import Renderer, SimulatedArm
-from vjepa2_ac.simulation.world.block_arm import ContactArm
+from vjepa2_ac.simulation.world.block_arm import ContactArm, MarkedArm
 from vjepa2_ac.simulation.world.camera import FRAME_SIZE
 from vjepa2_ac.simulation.world.domains import Domain
 from vjepa2_ac.simulation.world.motion import MotionRecipe, downward_poses, poses_in_base
@@ -26,16 +26,23 @@ from vjepa2_ac.simulation.world.scene import (
     FINGERTIP_M,
 )
 
-TaskName = Literal["reach", "push", "pick"]
+TaskName = Literal["reach", "push", "pick", "place"]
 
-SUCCESS_M: dict[TaskName, float] = {"reach": 0.05, "push": 0.04, "pick": 0.05}
-"""Closer than this at the end is a success: the flange to its goal (reach), or the block's middle to its own."""
+SUCCESS_M: dict[TaskName, float] = {"reach": 0.05, "push": 0.04, "pick": 0.05, "place": 0.04}
+"""Closer than this at the end is a success: the flange to its goal (reach), or the block's middle to its own.
 
-STEPS: dict[TaskName, int] = {"reach": 8, "push": 8, "pick": 12}
-"""Default number of model steps of an episode."""
+place: as push, since the block lies on the table, too; its middle is on the mark then, with 1.5 cm to the edge. That is
+not all: `TaskProblem.succeeded`.
+"""
 
-REACH_WAY_M, PUSH_WAY_M, LIFT_M = (0.12, 0.25), (0.10, 0.16), (0.10, 0.14)
-"""Distance between start and goal: of the flange (reach), of the block (push), of the block upwards (pick)."""
+ALSO: dict[TaskName, str] = {"reach": "", "push": "", "pick": "", "place": "released on the table"}
+"""What success requires beside the distance, as text; "": nothing."""
+
+STEPS: dict[TaskName, int] = {"reach": 8, "push": 8, "pick": 12, "place": 18}
+"""Default number of model steps of an episode; place: the paper's 4 + 10 + 4 of pick-and-place."""
+
+REACH_WAY_M, PUSH_WAY_M, LIFT_M, PLACE_WAY_M = (0.12, 0.25), (0.10, 0.16), (0.10, 0.14), (0.10, 0.20)
+"""Distance between start and goal: of the flange (reach), of the block (push, place), of the block upwards (pick)."""
 
 GRASP_M = FINGERTIP_M - 0.02
 """Height of the flange over the middle of a block that is to be grasped."""
@@ -43,9 +50,14 @@ GRASP_M = FINGERTIP_M - 0.02
 HOLDING = 1.0 - (BLOCK_M / 2 - FINGER_INSIDE_M) / FINGER_TRAVEL_M
 """Closedness of a gripper that holds the block."""
 
+RELEASED = HOLDING - 0.1
+"""A gripper that is less closed than this holds no block: 4 mm are left on each side."""
+
 _FLANGE_AREA = np.array([[0.32, -0.26], [0.62, 0.26]])  # low and high (x, y) in the world
 _BLOCK_AREA = np.array([[0.36, -0.26], [0.64, 0.26]])
 _PUSHING_M = 0.17  # height of the flange while pushing: the fingertips are 2 cm over the table
+_GRASP_AREA = _FLANGE_AREA * 0.8 + 0.2 * _FLANGE_AREA.mean(axis=0)  # of a block that is to be picked up, or put down
+_LIES_M = 0.01  # a block whose middle is at most this far from the height of a lying one lies on the table
 _MOST_TURNED_RAD = 0.4  # of block and hand, from straight ahead
 
 
@@ -63,6 +75,11 @@ class TaskProblem:
     block_start: Float[np.ndarray, " 4"] | None = None  # None: there is no block
     block_goal: Float[np.ndarray, " 4"] | None = None
 
+    @property
+    def mark(self) -> Float[np.ndarray, " 2"] | None:
+        """Middle of the mark on the table, x and y: under the block's goal (place); None: there is none."""
+        return self.block_goal[:2] if self.task == "place" and self.block_goal is not None else None
+
     def distance_m(self, state: Float[np.ndarray, " 7"], block: Float[np.ndarray, " 4"] | None = None) -> float:
         """Return the distance of the moved object to its goal: of the block if there is one, else of the flange.
 
@@ -77,6 +94,19 @@ class TaskProblem:
             raise ValueError(f"{self.task} is done by a block, and there is none")
         return float(np.linalg.norm(block[:3] - self.block_goal[:3]))
 
+    def succeeded(self, state: Float[np.ndarray, " 7"], block: Float[np.ndarray, " 4"] | None = None) -> bool:
+        """Return whether the task is done in a state of arm and block.
+
+        The distance is below `SUCCESS_M`; place: and the block lies on the table, and the gripper has released it.
+
+        Raises:
+            ValueError: The problem has a block, and none is given.
+        """
+        near = self.distance_m(state, block) < SUCCESS_M[self.task]
+        if self.task != "place" or block is None or self.block_goal is None:
+            return near
+        return near and bool(abs(block[2] - self.block_goal[2]) < _LIES_M and state[6] < RELEASED)
+
 
 def make_problem(task: TaskName, domain: Domain, seed: int, index: int) -> TaskProblem:
     """Return a problem: a pure function of its arguments, and the same in the world in every domain.
@@ -84,6 +114,7 @@ def make_problem(task: TaskName, domain: Domain, seed: int, index: int) -> TaskP
     reach: both ends in the box of `MotionRecipe`, gripper pointing down, the same rotation and gripper at both.
     push: the closed gripper is behind the block, low; the goal is straight ahead, the gripper still behind the block.
     pick: the open gripper is over the block; at the goal it holds the block in the air.
+    place: the open gripper is over the block; at the goal the block lies on the mark, and the gripper is over it, open.
 
     Args:
         task: The task.
@@ -143,14 +174,32 @@ def _push(rng: np.random.Generator) -> _Drawn:
 
 def _pick(rng: np.random.Generator) -> _Drawn:
     turn = rng.uniform(-_MOST_TURNED_RAD, _MOST_TURNED_RAD)
-    block = np.append(rng.uniform(*(_FLANGE_AREA * 0.8 + 0.2 * _FLANGE_AREA.mean(axis=0))), BLOCK_M / 2)
+    block = np.append(rng.uniform(*_GRASP_AREA), BLOCK_M / 2)
     lifted = block + np.append(rng.uniform(-0.03, 0.03, size=2), rng.uniform(*LIFT_M))
     above = block + np.append(rng.uniform(-0.04, 0.04, size=2), GRASP_M + rng.uniform(0.07, 0.12))
     flange = np.stack([above, lifted + np.array([0.0, 0.0, GRASP_M])])
     return _Drawn(flange, turn, (0.0, HOLDING), _with(np.stack([block, lifted]), turn))
 
 
-_DRAWN: dict[TaskName, Callable[[np.random.Generator], _Drawn]] = {"reach": _reach, "push": _push, "pick": _pick}
+def _place(rng: np.random.Generator) -> _Drawn:
+    while True:
+        turn, angle = rng.uniform(-_MOST_TURNED_RAD, _MOST_TURNED_RAD), rng.uniform(-np.pi, np.pi)
+        block = rng.uniform(*_GRASP_AREA)
+        places = np.stack([block, block + rng.uniform(*PLACE_WAY_M) * np.array([np.cos(angle), np.sin(angle)])])
+        if _inside(places, _GRASP_AREA):
+            break
+    blocks = _with(places, BLOCK_M / 2)
+    above = np.append(rng.uniform(-0.04, 0.04, size=2), GRASP_M + rng.uniform(0.07, 0.12))
+    flange = blocks + np.stack([above, [0.0, 0.0, GRASP_M + rng.uniform(0.07, 0.10)]])
+    return _Drawn(flange, turn, (0.0, 0.0), _with(blocks, turn))
+
+
+_DRAWN: dict[TaskName, Callable[[np.random.Generator], _Drawn]] = {
+    "reach": _reach,
+    "push": _push,
+    "pick": _pick,
+    "place": _place,
+}
 """The functions that draw a problem; a task's place among them is the number of its random stream."""
 
 
@@ -172,9 +221,10 @@ def _states(drawn: _Drawn, domain: Domain) -> Float[np.ndarray, "2 7"]:
 def arm_for(
     task: TaskName, domain: Domain, *, renderer: Renderer = "rays", size: tuple[int, int] = FRAME_SIZE
 ) -> SimulatedArm:
-    """Return an arm for a task: `reach` needs no contacts.
+    """Return an arm for a task: `reach` needs no contacts, `place` a mark on the table.
 
     Raises:
         InputError: MuJoCo is not installed, or OpenGL does not work here.
     """
-    return (SimulatedArm if task == "reach" else ContactArm)(domain, renderer=renderer, size=size)
+    kinds: dict[TaskName, type[SimulatedArm]] = {"reach": SimulatedArm, "place": MarkedArm}
+    return kinds.get(task, ContactArm)(domain, renderer=renderer, size=size)

@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from vjepa2_ac.simulation.recording.recorded_task import RecordedTask
 from vjepa2_ac.simulation.world.arm import Renderer, SimulatedArm
 from vjepa2_ac.simulation.world.domains import Domain, DomainRanges, named_domain, sample_domain
 from vjepa2_ac.simulation.world.motion import Motion, MotionRecipe, random_reaching
@@ -22,12 +23,12 @@ class RecordingSpec:
     """What an episode of a simulated data set is."""
 
     domain: str | Domain | DomainRanges  # or its name; ranges, or `random`: another world in every episode
-    steps: int = 41  # control steps (15 per second)
+    steps: int = 41  # control steps (15 per second); see `default_steps`
     seed: int = 0  # determines motion, outcome and worlds
     cameras: Literal[1, 3] = 1  # 1: the three images of a step are the same one; 3: one image per camera
     renderer: Renderer = "rays"  # it works everywhere; `opengl` needs a working `MUJOCO_GL`
     recipe: MotionRecipe | None = None  # ranges of the motion, without a task
-    task: Literal["push", "pick"] | None = None  # with a block: half of the episodes by script, half at random
+    task: RecordedTask | None = None  # with a block: half of the episodes by script, half at random
 
     @property
     def worlds(self) -> Domain | DomainRanges:

@@ -24,6 +24,7 @@ from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.jpeg import encode_jpeg
 from vjepa2_ac.simulation.recording.demonstration import RecordingSpec, arm_of, carry_out, episode_folder
+from vjepa2_ac.simulation.recording.recorded_task import INSTRUCTIONS
 from vjepa2_ac.simulation.recording.simulation_file import SIMULATION_FILE, simulation_text
 from vjepa2_ac.simulation.world.arm import SimulatedArm
 from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ, Motion
@@ -32,7 +33,6 @@ from vjepa2_ac.simulation.world.scene import load_mujoco
 __all__ = ["RecordingSpec", "episode_folder", "record_dataset", "record_episode"]
 
 JPEG_QUALITY = 85  # some 11 KB an image, as in DROID
-_INSTRUCTIONS = {None: "reach around over the table", "push": "push the block", "pick": "pick up the block"}
 _SIMULATED_CAMERAS = dict(zip(CAMERAS, ("exterior_1", "exterior_2", "wrist"), strict=True))
 
 
@@ -98,7 +98,7 @@ def record_episode(index: int, spec: RecordingSpec) -> DroidEpisode:
             cartesian_position=motion.poses, gripper_position=motion.gripper[:, None], joint_position=motion.joints
         ),
         images={feature: images.get(feature, images[CAMERAS[0]]) for feature in CAMERAS},
-        language_instruction=_INSTRUCTIONS[spec.task],
+        language_instruction=INSTRUCTIONS[spec.task],
     )
 
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -19,6 +18,7 @@ from vjepa2_ac.simulation.closed_loop.oracles import oracle_for
 from vjepa2_ac.simulation.closed_loop.policies import shortened
 from vjepa2_ac.simulation.closed_loop.rollout import put, ways_along
 from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, TaskProblem, make_problem
+from vjepa2_ac.simulation.recording.recorded_task import RecordedTask
 from vjepa2_ac.simulation.world.arm import SimulatedArm
 from vjepa2_ac.simulation.world.kinematics import OutOfReachError
 from vjepa2_ac.simulation.world.motion import Motion, MotionRecipe
@@ -31,7 +31,7 @@ _AREA = np.array([[0.30, -0.28], [0.64, 0.28]])  # of the flange while playing, 
 
 def play(
     arm: SimulatedArm,
-    task: Literal["push", "pick"],
+    task: RecordedTask,
     steps: int,
     rng: np.random.Generator,
     *,
@@ -57,7 +57,7 @@ def play(
     problem = make_problem(task, arm.domain, int(rng.integers(2**31)), 0)
     limits = LimitsConfig(xyz=(recipe.reach_m,) * 3)
     oracle = oracle_for(task, limits, arm)
-    put(arm, problem.start, problem.block_start)
+    put(arm, problem.start, problem.block_start, problem.mark)
     unseen = np.zeros((1, 1, 3), dtype=np.uint8)
     oracle.reset(problem, unseen)
     rows: list[tuple[np.ndarray, float, np.ndarray, float]] = []
@@ -85,19 +85,19 @@ def play(
 
 
 def _play_action(arm: SimulatedArm, problem: TaskProblem, limits: LimitsConfig, rng: np.random.Generator) -> np.ndarray:
-    """Return a step to or through the block, or anywhere; for `pick`, sometimes the gripper opens or closes."""
+    """Return a step to or through the block, or anywhere; but for `push`, sometimes the gripper opens or closes."""
     state, block = arm.state, arm.block
     if block is None:
         raise ValueError("there is no block to play with")
     turn = arm.domain.base_pose()[:3, :3]
     way = np.zeros(ACTION_DIM)
     if rng.uniform() < _TO_BLOCK:
-        height = GRASP_M if problem.task == "pick" else problem.goal[2] - block[2]
+        height = GRASP_M if problem.task != "push" else problem.goal[2] - block[2]
         way[:3] = block[:3] - state[:3] + np.append(rng.normal(0.0, 0.03, size=2), height)
         way[:2] *= rng.uniform(0.6, 1.8)
     else:
         way[:3] = rng.uniform(-1.0, 1.0, size=3) * limits.xyz_m
-    if problem.task == "pick" and rng.uniform() < 0.25:
+    if problem.task != "push" and rng.uniform() < 0.25:
         way[6] = rng.choice([-1.0, 1.0]) * limits.gripper
     way = shortened(way, limits)
     place = turn @ (state[:3] + way[:3])

@@ -13,6 +13,7 @@ from pydantic import Field
 from vjepa2_ac import storage
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.simulation.recording.demonstration import RecordingSpec, episode_folder, world_of
+from vjepa2_ac.simulation.recording.recorded_task import RecordedTask
 from vjepa2_ac.simulation.world.arm import Renderer
 from vjepa2_ac.simulation.world.domains import Domain, DomainRanges
 from vjepa2_ac.simulation.world.motion import MotionRecipe
@@ -38,7 +39,7 @@ class _Content:
     cameras: Literal[1, 3]
     renderer: Renderer
     recipe: MotionRecipe
-    task: Literal["push", "pick"] | None
+    task: RecordedTask | None
     domain: Domain | None = None
     ranges: DomainRanges | None = None
 

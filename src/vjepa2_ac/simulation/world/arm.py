@@ -74,6 +74,19 @@ class SimulatedArm:
         """
         raise ValueError(f"no block to be put at {block.tolist()}: this arm touches nothing")
 
+    @property
+    def mark(self) -> Float[np.ndarray, " 2"] | None:
+        """Middle of the mark on the table, as in `TaskProblem`; None: there is none."""
+        return None
+
+    def place_mark(self, mark: Float[np.ndarray, " 2"]) -> None:
+        """Put the mark at a place on the table.
+
+        Raises:
+            ValueError: There is none.
+        """
+        raise ValueError(f"no mark to be put at {mark.tolist()}: this arm has none on its table")
+
     def set_joints(self, joints: Float[np.ndarray, " 7"], closedness: float) -> None:
         """Put the arm at joint angles at once."""
         self._closedness = closedness

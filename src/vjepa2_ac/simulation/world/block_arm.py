@@ -36,6 +36,8 @@ class ContactArm(SimulatedArm):
         InputError: MuJoCo is not installed, or OpenGL does not work here.
     """
 
+    _has_mark = False
+
     @property
     def closedness(self) -> float:
         """Measured closedness of the gripper, from the positions of its fingers."""
@@ -80,8 +82,34 @@ class ContactArm(SimulatedArm):
         return self.state
 
     def _compiled(self, domain: Domain) -> Any:
-        model = compile_contact_scene(domain)
+        model = compile_contact_scene(domain, mark=self._has_mark)
         lags = np.array([domain.lag_s] * 7 + [GRIPPER_LAG_S] * 2)
         self._share = 1.0 - np.exp(-model.opt.timestep / lags)
         self._ahead = -model.actuator_biasprm[:, 2] / model.actuator_gainprm[:, 0] / model.opt.timestep
         return model
+
+
+class MarkedArm(ContactArm):
+    """An arm with contacts and a mark on its table: a flat disc that is seen, and touched by nothing.
+
+    Args:
+        domain: Its world.
+        renderer: `rays` works everywhere; `opengl` needs a working `MUJOCO_GL`.
+        size: Height and width of the images.
+
+    Raises:
+        InputError: MuJoCo is not installed, or OpenGL does not work here.
+    """
+
+    _has_mark = True
+
+    @property
+    def mark(self) -> Float[np.ndarray, " 2"]:
+        """Middle of the mark in the robot base frame: x and y in metres."""
+        place = self.domain.base_pose()[:3, :3].T @ self._data.mocap_pos[0]
+        return np.asarray(place[:2])
+
+    def place_mark(self, mark: Float[np.ndarray, " 2"]) -> None:
+        """Put the mark at a place on the table at once."""
+        self._data.mocap_pos[0, :2] = self.domain.base_pose()[:2, :2] @ mark
+        self._mujoco.mj_kinematics(self._model, self._data)
