@@ -8,7 +8,7 @@ from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B
 
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 
-from vjepa2_ac.simulation.closed_loop.oracles import oracle_for
+from vjepa2_ac.simulation.closed_loop.oracles import PlaceOracle, oracle_for
 from vjepa2_ac.simulation.closed_loop.policies import DoNothing, RandomActions, farthest
 from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, put, run_episode, run_task
 from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, RELEASED, STEPS, arm_for, make_problem
@@ -76,6 +76,23 @@ def test_a_block_that_is_held_over_the_mark_is_near_and_not_placed() -> None:
     assert problem.distance_m(holding, arm.block) < 0.01
     assert not problem.succeeded(holding, arm.block)
     assert problem.succeeded(arm.command(arm.state - holding[6] * np.eye(7)[6], 8), arm.block)
+
+
+class NeverOpens(PlaceOracle):
+    """Carries the block to the mark and stays there."""
+
+    def act(self, image: np.ndarray, state: np.ndarray) -> np.ndarray:
+        action = super().act(image, state)
+        return np.append(action[:6], max(0.0, action[6]))
+
+
+def test_an_episode_that_ends_with_the_block_in_the_hand_is_none_of_the_successes() -> None:
+    arm = arm_for("place", DOMAIN_A, size=(18, 32))
+    result = run_task(RolloutSpec("place", DOMAIN_A, 1, seed=5), NeverOpens(LIMITS, arm), arm)
+    (episode,) = result.episodes
+    assert episode.distances_m[-1] < 0.03
+    assert (episode.success, episode.success_ever, episode.steps_needed) == (False, False, None)
+    assert result.success_rate.value == result.success_ever_rate.value == 0.0
 
 
 def test_the_goal_image_of_a_place_shows_the_block_on_the_mark() -> None:

@@ -5,9 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vjepa2_ac.simulation.closed_loop.tasks import arm_for
+from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, arm_for
 from vjepa2_ac.simulation.world.domains import DOMAIN_A
 from vjepa2_ac.simulation.world.kinematics import forward_kinematics
+from vjepa2_ac.simulation.world.scene import BLOCK_M
 
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 
@@ -86,9 +87,11 @@ def test_an_episode_of_place_is_long_enough_and_says_what_it_is(tmp_path: Path) 
     )
 
 
-def test_play_of_place_uses_the_gripper() -> None:
+def test_play_of_place_goes_down_to_the_block_and_uses_the_gripper() -> None:
     motion = play(arm_for("place", DOMAIN_A), "place", 41, np.random.default_rng(0), script=False)
-    assert np.ptp(motion.gripper) > 0.3
+    told = motion.commanded_gripper - motion.gripper  # at the first control step of each model step
+    assert (np.abs(told[::4]) > 0.4).any()
+    assert motion.poses[:, 2].min() < BLOCK_M / 2 + GRASP_M + 0.02  # at the height of a grasp
 
 
 def test_the_command_records_a_task(tmp_path: Path) -> None:
