@@ -82,6 +82,7 @@ BEHIND = {  # what each must be given, and an option with a value
     ("decoder",): (["c.yaml"], ["--check"]),
     ("doctor",): (["c.yaml"], []),
     ("plan",): (["run"], ["--start", "a.png", "--state", "-0.1,0,0,0,0,0,0", "--goal", "b.png"]),
+    ("serve",): (["run"], ["--port", "3"]),
     ("config",): (["show", "c.yaml"], []),
     ("simulate",): (["run"], ["--episodes", "3"]),
 }

@@ -5,6 +5,8 @@ import pytest
 
 from served import STATE, image
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.planning.goals.sub_goals import SubGoal
+from vjepa2_ac.serving.client import goal_keys
 from vjepa2_ac.serving.request import GivenGoal, NamedGoal, read_request
 
 OURS = {"observation/image": image(0), "observation/state": STATE}
@@ -39,13 +41,33 @@ def test_the_picture_may_have_another_key() -> None:
 def test_a_goal_is_a_picture_or_several_or_a_name_or_a_prompt() -> None:
     one = read_request({**OURS, "goal/image": image(1), "goal/mask": np.ones((48, 60), dtype=bool)}).goal
     assert isinstance(one, GivenGoal)
-    assert (len(one.images), one.durations, one.mask.shape) == (1, (), (48, 60))
+    assert ([rule(goal) for goal in one.goals], one.mask.shape) == ([(1, None, None, None)], (48, 60))
     several = read_request({**OURS, "goal/images": GOALS, "goal/durations": np.array([4])}).goal
-    assert (len(several.images), several.durations) == (2, (4,))
-    assert read_request({**OURS, "goal/images": list(GOALS), "goal/durations": [4]}).goal.durations == (4,)
+    exact = [(4, 4, None, None), (1, None, None, None)]
+    assert [rule(goal) for goal in several.goals] == exact
+    again = read_request({**OURS, "goal/images": list(GOALS), "goal/durations": [4]}).goal
+    assert [rule(goal) for goal in again.goals] == exact
     assert read_request({**OURS, "goal/name": "cup"}).goal == NamedGoal("cup")
     assert read_request({**OURS, "prompt": "cup"}).goal == NamedGoal("cup")
     assert isinstance(read_request({**OURS, "goal/image": image(1), "prompt": "put it there"}).goal, GivenGoal)
+
+
+def rule(goal: SubGoal) -> tuple:
+    return goal.at_least, goal.at_most, goal.share, goal.gripper
+
+
+def test_goals_in_order_may_have_rules_of_their_own() -> None:
+    keys = {
+        "goal/images": GOALS, "goal/durations": [9], "goal/at_least": [2, 3], "goal/shares": [0.25, 0.0],
+        "goal/grippers": ["held", ""],
+    }  # fmt: skip
+    found = read_request({**OURS, **keys}).goal
+    assert [rule(goal) for goal in found.goals] == [(2, 9, 0.25, "held"), (3, None, None, None)]
+    free = read_request({**OURS, "goal/images": GOALS, "goal/shares": np.array([0.25, 0.5])}).goal
+    assert [rule(goal) for goal in free.goals] == [(1, None, 0.25, None), (1, None, 0.5, None)]
+    assert rule(read_request({**OURS, "goal/image": image(1), "goal/shares": [0.5]}).goal.goals[0])[2] == 0.5
+    sent = read_request({**OURS, **goal_keys(found.goals)}).goal
+    assert sent.fingerprint == found.fingerprint
 
 
 def test_the_same_bytes_are_the_same_goal_and_others_are_another() -> None:
@@ -111,6 +133,14 @@ WRONG = {
     "goal/durations: \\[nan\\]": {**OURS, "goal/images": GOALS, "goal/durations": [np.nan]},
     "goal/durations: \\[1\\]. needed: 0 whole": {**OURS, "goal/image": image(1), "goal/durations": [1]},
     "goal/durations: 'x'": {**OURS, "goal/images": GOALS, "goal/durations": "x"},
+    "goal/at_least: \\[1\\]. needed: a whole number": {
+        **OURS, "goal/images": GOALS, "goal/durations": [1], "goal/at_least": [1],
+    },
+    "goal/shares: \\[1, 0\\]": {**OURS, "goal/images": GOALS, "goal/durations": [1], "goal/shares": [1, 0]},
+    "goal/durations: None": {**OURS, "goal/images": GOALS, "goal/shares": [0.0, 0.5]},
+    "goal/grippers: \\['up', ''\\]": {**OURS, "goal/images": GOALS, "goal/durations": [1], "goal/grippers": ["up", ""]},
+    "goal/grippers: 'held'": {**OURS, "goal/image": image(1), "goal/grippers": "held"},
+    "at least 3 and at most 2 steps": {**OURS, "goal/images": GOALS, "goal/durations": [2], "goal/at_least": [3, 1]},
     "goal/mask: an array of shape \\(48, 60, 3\\)": {**OURS, "goal/image": image(1), "goal/mask": image(1)},
 }  # fmt: skip
 

@@ -60,7 +60,12 @@ class Running:
 
 @contextmanager
 def serving(
-    load: Callable[[], Session], access: Access | None = None, *, ping_s: float = 20.0, wait: bool = True
+    load: Callable[[], Session],
+    access: Access | None = None,
+    *,
+    ping_s: float = 20.0,
+    wait: bool = True,
+    told: Callable[[Session], dict] = roboarena_metadata,
 ) -> Iterator[Running]:
     """Serve in a thread as long as the context lasts; `wait` until it is ready."""
     lines: list[str] = []
@@ -75,7 +80,7 @@ def serving(
 
     def loaded() -> Served:
         made = load()
-        return Served(made, roboarena_metadata(made))
+        return Served(made, told(made))
 
     async def run() -> bool:
         stop = asyncio.Event()

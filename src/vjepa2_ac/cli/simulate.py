@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from vjepa2_ac import output, places
 from vjepa2_ac.cli.options import (
@@ -25,6 +28,9 @@ from vjepa2_ac.cli.options import (
 )
 from vjepa2_ac.errors import InputError
 
+if TYPE_CHECKING:
+    from vjepa2_ac.simulation.closed_loop.steering import Steering
+
 _OF_RECORD = ("cameras", "workers")
 _OF_A_MODEL = ("sub_goals", "films", "decoder", "checkpoint", "config", "out")
 
@@ -37,8 +43,11 @@ def add_to(commands: Commands) -> None:
         " no finite energy in any decision."
     )
     parser = command(commands, "simulate", _simulate, text)
-    text = "who steers: the folder of a run, or what model.base takes, such as builtin:sim-tiny; or: record"
-    argument(parser, "subject RUN_OR_MODEL|record", text, as_model)
+    text = (
+        "who steers: the folder of a run, or what model.base takes, such as builtin:sim-tiny; or a server of one, as"
+        " ws://127.0.0.1:8000; or: record"
+    )
+    argument(parser, "subject RUN_OR_MODEL|ws://SERVER|record", text, _as_steerer)
     text = "how it plans, such as planning.samples=64; record: where the data set goes"
     argument(parser, "overrides key=value|FOLDER", text, nargs="*")
     text = "A or B; record: or random, another world in every episode (A)"
@@ -62,6 +71,7 @@ def add_to(commands: Commands) -> None:
     add_decoder(group, "in the video what the model imagined of each frame, one step ago")
     text = "where figures and video go (closed_loop/TASK-DOMAIN, in the run's)"
     argument(group, "--out FOLDER", text, as_path)
+    argument(group, "--key-file FILE", "of a server that needs a key: the file with it", as_path)
     group = parser.add_argument_group("of record")
     argument(group, "--cameras", "1: all three images are the same one (1)", whole_number(1, 3), choices=[1, 3])
     argument(group, "--workers N", "processes; the data are the same whatever their number (1)", count)
@@ -121,8 +131,12 @@ def _run_benchmark(options: argparse.Namespace) -> int:
     if options.decoder is not None and options.films == 0:
         found, fix = "--films 0: no video in which anything could be shown", "Leave out one of the two"
         raise InputError(where=f"--decoder {options.decoder}", found=found, needed="a video", fix=fix)
-    options.checkpoint = options.checkpoint or "selected"
-    require_to_plan(options)
+    if not _is_server(options.subject):
+        _refuse(options, ("key_file",), needed="a server: ws://HOST:PORT")
+        options.checkpoint = options.checkpoint or "selected"
+        require_to_plan(options)
+    else:
+        _refuse(options, ("checkpoint", "config", "decoder", "overrides"), needed="the model itself; not its server")
 
     from vjepa2_ac.console.closed_loop import benchmark_notes, benchmark_table
     from vjepa2_ac.console.progress import ConsoleReporter, console
@@ -133,20 +147,49 @@ def _run_benchmark(options: argparse.Namespace) -> int:
     load_mujoco()
     chosen = record_of_options(BenchmarkOptions, options)
     chosen = replace(chosen, films=min(chosen.films, chosen.episodes))
-    decoder = given_decoder(options)
-    session = load_planning_session(options)
     name = f"closed_loop/{chosen.task}-{chosen.domain}"
+    home = Path(options.subject) if is_run(options.subject) else Path()
     if options.out is None and is_run(options.subject):
         refuse_links_out(Path(options.subject), [name])
-    home = Path(options.subject) if is_run(options.subject) else Path()
-    folder = options.out or home / name
-    with ConsoleReporter() as reporter:
-        benchmark, files = run_benchmark(session, chosen, folder, reporter, decoder)
-    if session.checkpoint:
-        console.print(f"{options.subject}: checkpoint {session.checkpoint}")
+    with _steering(options) as steering, ConsoleReporter() as reporter:
+        benchmark, files = run_benchmark(steering, chosen, options.out or home / name, reporter)
+    if benchmark.checkpoint:
+        console.print(f"{options.subject}: checkpoint {benchmark.checkpoint}")
     console.print(benchmark_table(benchmark))
     for note in benchmark_notes(benchmark):
         console.print(note)
     for path in files:
         console.print(f"  {path}")
     return int(any(set(result.why_counts) == {"no finite energy"} for result in benchmark.results))
+
+
+@contextmanager
+def _steering(options: argparse.Namespace) -> Iterator[Steering]:
+    """Return who steers; a server as long as the context lasts."""
+    from vjepa2_ac.serving.access import read_key
+    from vjepa2_ac.serving.client import PlanningClient
+    from vjepa2_ac.simulation.closed_loop.steering import of_server, of_session
+
+    if not _is_server(options.subject):
+        decoder = given_decoder(options)
+        yield of_session(load_planning_session(options), decoder)
+        return
+    key = None if options.key_file is None else read_key(options.key_file)
+    with PlanningClient(options.subject, key) as client:
+        yield of_server(client)
+
+
+def _is_server(subject: str) -> bool:
+    return subject.startswith(("ws://", "wss://"))
+
+
+def _as_steerer(text: str) -> str:
+    return text if _is_server(text) else as_model(text)
+
+
+def _refuse(options: argparse.Namespace, names: Sequence[str], *, needed: str) -> None:
+    """Refuse options that mean nothing to this subject."""
+    for name in names:
+        if getattr(options, name):
+            shown = "overrides" if name == "overrides" else f"--{name.replace('_', '-')}"
+            raise InputError(where=shown, found=f"simulate {options.subject}", needed=needed)

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.planning.goals.sub_goals import GripperMode, SubGoal
 
 IMAGE_KEYS = ("observation/exterior_image_1_left", "observation/exterior_image_0_left", "observation/image")
 """Where the picture of the camera is looked for: the first that is there. DROID's, RoboArena's, everybody's."""
@@ -20,7 +21,10 @@ MOST_STEPS = 10_000  # of one goal
 
 _STATE, _POSE, _GRIPPER = "observation/state", "observation/cartesian_position", "observation/gripper_position"
 _GOAL = "goal/"
-_GOAL_KEYS = frozenset({"goal/image", "goal/images", "goal/durations", "goal/mask", "goal/name"})
+_WAYS = ("goal/image", "goal/images", "goal/name")
+_IN_ORDER = ("goal/durations", "goal/at_least", "goal/shares", "goal/grippers")
+_GOAL_KEYS = frozenset({*_WAYS, *_IN_ORDER, "goal/mask"})
+_MODES = get_args(GripperMode)
 _ENDPOINTS = ("infer", "reset")
 
 
@@ -28,15 +32,16 @@ _ENDPOINTS = ("infer", "reset")
 class GivenGoal:
     """A goal whose pictures came with the request."""
 
-    images: tuple[UInt8[np.ndarray, "height width 3"], ...]
-    durations: tuple[int, ...]  # model steps of each but the last
-    mask: np.ndarray | None  # height x width, true or 1 where it counts
+    goals: tuple[SubGoal, ...]
+    mask: np.ndarray | None = None  # height x width, true or 1 where it counts
 
     @property
     def fingerprint(self) -> str:
         """The same for the same bytes: a client may send its goal with every request."""
-        digest = hashlib.sha256(repr(self.durations).encode())
-        for one in (*self.images, *(() if self.mask is None else (self.mask,))):
+        digest = hashlib.sha256()
+        for goal in self.goals:
+            digest.update(repr((goal.at_least, goal.at_most, goal.share, goal.gripper)).encode())
+        for one in (*(goal.image for goal in self.goals), *(() if self.mask is None else (self.mask,))):
             digest.update(repr((one.shape, one.dtype.str)).encode())
             digest.update(np.ascontiguousarray(one).tobytes())
         return digest.hexdigest()
@@ -136,7 +141,7 @@ def _goal(message: Mapping[str, Any]) -> GivenGoal | NamedGoal | None:
     unknown = [key for key in given if key not in _GOAL_KEYS]
     if unknown:
         raise InputError(where="request", found=_shown(unknown[0]), needed=", ".join(sorted(_GOAL_KEYS)))
-    ways = [key for key in ("goal/image", "goal/images", "goal/name") if key in message]
+    ways = [key for key in _WAYS if key in message]
     if len(ways) > 1 or (given and not ways):
         raise InputError(where="goal", found=", ".join(given), needed="one of goal/image, goal/images, goal/name")
     if not ways:
@@ -148,7 +153,55 @@ def _goal(message: Mapping[str, Any]) -> GivenGoal | NamedGoal | None:
             raise InputError(where="goal", found=found, needed="goal/name alone: the server knows the rest")
         return NamedGoal(_name(message["goal/name"], "goal/name"))
     images = _images(message, ways[0])
-    return GivenGoal(images, _durations(message.get("goal/durations"), len(images)), _mask(message.get("goal/mask")))
+    return GivenGoal(_in_order(images, message), _mask(message.get("goal/mask")))
+
+
+def _in_order(images: Sequence[np.ndarray], message: Mapping[str, Any]) -> tuple[SubGoal, ...]:
+    """Return goals with their rules: bounds on their steps, shares of energy, gripper modes.
+
+    Durations alone are exact; where shares or least steps are given, they are the most.
+    """
+    many = len(images)
+    shares = _row(message, "goal/shares", many, lambda one: 0 <= one < 1, "a number below 1 for each goal; 0: none")
+    needed = f"a whole number from 1 to {MOST_STEPS:,} for each goal: its fewest model steps"
+    least = _row(message, "goal/at_least", many, _is_steps, needed)
+    is_bounded = shares is not None and all(shares[:-1])
+    most = _durations(message.get("goal/durations"), many, is_bounded=is_bounded)
+    if least is None:
+        least = [1.0] * many if shares or not most else [*most, 1]
+    grippers = _grippers(message.get("goal/grippers"), many)
+    bounds: list[int | None] = [*most] if most else [None] * (many - 1)
+    rows = zip(images, least, [*bounds, None], shares or [0.0] * many, grippers, strict=True)
+    return tuple(
+        SubGoal(image, str(place), int(fewest), bound, share or None, gripper)
+        for place, (image, fewest, bound, share, gripper) in enumerate(rows)
+    )
+
+
+def _row(
+    message: Mapping[str, Any], key: str, many: int, is_right: Callable[[float], bool], needed: str
+) -> list[float] | None:
+    found = message.get(key)
+    if found is None:
+        return None
+    numbers: list[float] = _numbers(found, key).tolist()
+    if len(numbers) != many or not all(map(is_right, numbers)):
+        raise InputError(where=key, found=_shown(found), needed=needed)
+    return numbers
+
+
+def _is_steps(number: float) -> bool:
+    return number.is_integer() and 1 <= number <= MOST_STEPS
+
+
+def _grippers(found: Any, many: int) -> list[GripperMode | None]:
+    if found is None:
+        return [None] * many
+    is_row = isinstance(found, list) and len(found) == many and all(isinstance(one, str) for one in found)
+    if not is_row or not all(one in {"", *_MODES} for one in found):
+        needed = f"for each goal one of {', '.join(_MODES)}; an empty text: planning.limits.gripper_mode"
+        raise InputError(where="goal/grippers", found=_shown(found), needed=needed)
+    return [one or None for one in found]
 
 
 def _images(message: Mapping[str, Any], key: str) -> tuple[np.ndarray, ...]:
@@ -162,14 +215,15 @@ def _images(message: Mapping[str, Any], key: str) -> tuple[np.ndarray, ...]:
     return tuple(_image(image, f"{key}[{place}]") for place, image in enumerate(rows))
 
 
-def _durations(found: Any, goals: int) -> tuple[int, ...]:
-    if found is None and goals == 1:
-        return ()
+def _durations(found: Any, goals: int, *, is_bounded: bool) -> list[int]:
+    """Return the model steps of each goal but the last; none where they may be left out, and are."""
+    if found is None and (goals == 1 or is_bounded):
+        return []
     numbers = [] if found is None or len(np.atleast_1d(found)) == 0 else _numbers(found, "goal/durations").tolist()
-    if len(numbers) != goals - 1 or not all(one.is_integer() and 1 <= one <= MOST_STEPS for one in numbers):
+    if len(numbers) != goals - 1 or not all(map(_is_steps, numbers)):
         needed = f"{goals - 1} whole numbers from 1 to {MOST_STEPS:,}: model steps of each goal but the last"
         raise InputError(where="goal/durations", found=_shown(found), needed=needed)
-    return tuple(map(int, numbers))
+    return list(map(int, numbers))
 
 
 def _mask(found: Any) -> np.ndarray | None:

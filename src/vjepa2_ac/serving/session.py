@@ -245,11 +245,7 @@ class Session:
 
     def _sub_goals(self, goal: GivenGoal | NamedGoal) -> tuple[tuple[SubGoal, ...], np.ndarray | None]:
         if isinstance(goal, GivenGoal):
-            steps = (*goal.durations, None)
-            numbered = enumerate(zip(goal.images, steps, strict=True))
-            return tuple(
-                SubGoal(image, str(n), at_least=most or 1, at_most=most) for n, (image, most) in numbered
-            ), goal.mask
+            return goal.goals, goal.mask
         if goal.name not in self.goals:
             found = f"{goal.name!r}, which names no goal"
             raise InputError(where="goal", found=found, needed=f"the name of one{self._known_names()}")

@@ -3,6 +3,7 @@
 import json
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 pytest.importorskip("av", reason="the extra `video` is not installed")
 
 from random_decoder import write_decoder
+from served import serving
 from tiny_models import tiny_model
 from vjepa2_ac.cli import main
 from vjepa2_ac.console.closed_loop import benchmark_notes
@@ -22,7 +24,10 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.video_reader import count_frames
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.session import load_to_plan
-from vjepa2_ac.simulation.closed_loop.benchmark import FILE, FILM, JOINT_FIELDS, BenchmarkOptions, run_benchmark
+from vjepa2_ac.serving.about import metadata_of
+from vjepa2_ac.serving.session import Session, SessionOptions
+from vjepa2_ac.simulation.closed_loop.benchmark import FILE, FILM, BenchmarkOptions, run_benchmark
+from vjepa2_ac.simulation.closed_loop.steering import JOINT_FIELDS, of_session
 from vjepa2_ac.simulation.closed_loop.video import _about_imagined, _imagined, film_frames
 
 SMALL = ["planning.samples=6", "planning.iterations=2", "planning.cem.elites=3", "planning.limits.xyz=[0.03,0.03,0.03]"]
@@ -69,7 +74,7 @@ def test_a_robot_of_joints_is_steered_by_its_joints(
 def test_a_model_without_states_is_steered(tmp_path: Path) -> None:
     tiny_model(states=False).save_pretrained(tmp_path / "model")
     session = load_to_plan(str(tmp_path / "model"), overrides=SMALL)
-    run_benchmark(session, BenchmarkOptions(episodes=1, steps=2, films=0), tmp_path / "out")
+    run_benchmark(of_session(session), BenchmarkOptions(episodes=1, steps=2, films=0), tmp_path / "out")
     assert metrics(tmp_path / "out")["policies"]["model"]["why_counts"] == {"planned": 2}
 
 
@@ -78,7 +83,8 @@ def test_a_decoder_adds_what_was_imagined_to_the_film_and_changes_no_metric(mode
     session = load_to_plan(model, overrides=SMALL)
     wanted = BenchmarkOptions(episodes=2, steps=2, films=1)
     (plain, _), (shown, _) = (
-        run_benchmark(session, wanted, tmp_path / name, decoder=one) for name, one in {"p": None, "d": decoder}.items()
+        run_benchmark(of_session(session, one), wanted, tmp_path / name)
+        for name, one in {"p": None, "d": decoder}.items()
     )
     filmed, other = shown.results[0].episodes
     frames, plain_frames = list(film_frames(shown.results[0])), list(film_frames(plain.results[0]))
@@ -91,7 +97,9 @@ def test_a_decoder_adds_what_was_imagined_to_the_film_and_changes_no_metric(mode
 
 
 def test_where_nothing_was_imagined_the_film_says_why(model: str, tmp_path: Path) -> None:
-    result = run_benchmark(load_to_plan(model, overrides=SMALL), BenchmarkOptions(episodes=1, steps=2), tmp_path)[0]
+    result = run_benchmark(
+        of_session(load_to_plan(model, overrides=SMALL)), BenchmarkOptions(episodes=1, steps=2), tmp_path
+    )[0]
     (episode,) = result.results[0].episodes
     known = replace(episode, imagined=(episode.goal_image, None), whys=("planned", "at the goal"))
     assert [_about_imagined(known, step) for step in range(3)] == [
@@ -156,7 +164,7 @@ def test_a_broken_model_does_nothing_says_so_and_ends_with_status_1(
 
 def test_the_film_shows_what_the_model_saw_beside_the_goal(model: str, tmp_path: Path) -> None:
     asked = BenchmarkOptions(episodes=2, steps=1, films=1)
-    benchmark, files = run_benchmark(load_to_plan(model, overrides=SMALL), asked, tmp_path)
+    benchmark, files = run_benchmark(of_session(load_to_plan(model, overrides=SMALL)), asked, tmp_path)
     assert [file.name for file in files] == [FILE, FILM]
     steered = benchmark.results[0]
     frames = list(film_frames(steered))
@@ -169,13 +177,13 @@ def test_the_film_shows_what_the_model_saw_beside_the_goal(model: str, tmp_path:
 
 def test_the_warnings_of_a_session_are_kept_with_its_results(model: str, tmp_path: Path) -> None:
     session = replace(load_to_plan(model, overrides=SMALL), warnings=("limits leave what was taught",))
-    run_benchmark(session, BenchmarkOptions(episodes=1, steps=1, films=0), tmp_path)
+    run_benchmark(of_session(session), BenchmarkOptions(episodes=1, steps=1, films=0), tmp_path)
     assert metrics(tmp_path)["about"]["warnings"] == ["limits leave what was taught"]
 
 
 def test_what_was_unusual_is_noted(model: str, tmp_path: Path) -> None:
     steering = load_to_plan(model, overrides=[*SMALL, "planning.budget_s=0.000001"])
-    benchmark, _ = run_benchmark(steering, BenchmarkOptions(episodes=1, steps=2, films=0), tmp_path)
+    benchmark, _ = run_benchmark(of_session(steering), BenchmarkOptions(episodes=1, steps=2, films=0), tmp_path)
     assert benchmark_notes(benchmark) == ("tiny: of 2 decisions out of time 2",)
 
 
@@ -214,7 +222,7 @@ def test_a_missing_library_is_reported_before_anything_is_done(
 ) -> None:
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(InputError, match="PyAV"):
-        run_benchmark(load_to_plan(model), BenchmarkOptions(), tmp_path / "out")
+        run_benchmark(of_session(load_to_plan(model)), BenchmarkOptions(), tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -223,12 +231,12 @@ def test_a_model_of_states_in_the_cameras_frame_is_refused(model: str, tmp_path:
     data = steering.config.data.model_copy(update={"pose_frame": "camera"})
     steering = replace(steering, config=steering.config.model_copy(update={"data": data}))
     with pytest.raises(InputError, match=r"data\.pose_frame: camera"):
-        run_benchmark(steering, BenchmarkOptions(), tmp_path)
+        run_benchmark(of_session(steering), BenchmarkOptions(), tmp_path)
 
 
 def test_a_task_with_a_block_has_its_own_number_of_steps(model: str, tmp_path: Path) -> None:
     asked = BenchmarkOptions(task="pick", episodes=1, films=0)
-    benchmark, _ = run_benchmark(load_to_plan(model, overrides=SMALL), asked, tmp_path)
+    benchmark, _ = run_benchmark(of_session(load_to_plan(model, overrides=SMALL)), asked, tmp_path)
     assert metrics(tmp_path)["about"]["steps"] == benchmark.results[0].steps == 12
     assert metrics(tmp_path)["policies"]["oracle"]["success"]["value"] == 1.0
 
@@ -275,4 +283,43 @@ def test_placing_is_filmed_and_its_criterion_is_told(
 
 def test_a_stride_that_is_to_be_found_out_is_no_stride(model: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"data\.stride"):
-        run_benchmark(load_to_plan(model, overrides=["data.stride=auto"]), BenchmarkOptions(), tmp_path)
+        run_benchmark(of_session(load_to_plan(model, overrides=["data.stride=auto"])), BenchmarkOptions(), tmp_path)
+
+
+@pytest.mark.parametrize("way", ["none", "demonstration"])
+def test_through_a_server_the_same_problems_are_solved_in_the_same_way(
+    way: str, model: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = ["--task", "reach", "--episodes", "2", "--steps", "3", "--films", "1"]
+    if way == "demonstration":
+        given += ["--sub-goals", "demonstration"]
+    assert main(["simulate", model, *given, *SMALL, "--out", str(tmp_path / "here")]) == 0
+    loaded = load_to_plan(model, overrides=SMALL)
+    with serving(lambda: Session(loaded.controller()), told=partial(metadata_of, loaded)) as running:
+        assert main(["simulate", running.url, *given, "--out", str(tmp_path / "there")]) == 0
+        capsys.readouterr()
+        for wrong in (["planning.samples=9"], ["--checkpoint", "newest"]):
+            assert main(["simulate", running.url, *given, *wrong]) == 2
+            assert "needed: the model itself; not its server" in capsys.readouterr().err
+    here, there = (metrics(tmp_path / name) for name in ("here", "there"))
+    same = ("task", "domain", "episodes", "steps", "stride", "planning", "planning_seed", "warnings", "sub_goals")
+    assert {key: here["about"][key] for key in same} == {key: there["about"][key] for key in same}
+    assert there["about"]["subject"] == running.url
+    for one, other in zip(here["policies"].values(), there["policies"].values(), strict=True):
+        assert one["why_counts"] == other["why_counts"]
+        assert one["by_episode"]["distance_cm"] == other["by_episode"]["distance_cm"]
+    assert (tmp_path / "there" / FILM).stat().st_size
+
+
+def test_a_server_that_sends_something_else_is_refused(model: str, capsys: pytest.CaptureFixture[str]) -> None:
+    loaded = load_to_plan(model, overrides=SMALL)
+    for options in (SessionOptions("pose"), SessionOptions(dry_run=True)):
+        with serving(
+            lambda how=options: Session(loaded.controller(), None, how), told=partial(metadata_of, loaded)
+        ) as at:
+            assert main(["simulate", at.url, "--episodes", "1"]) == 2
+            assert "needed: changes of a pose in the frame of the base" in capsys.readouterr().err
+    assert main(["simulate", at.url, "--episodes", "1"]) == 2
+    assert "needed: a server (`vjepa2-ac serve`)" in capsys.readouterr().err
+    assert main(["simulate", model, "--key-file", "key"]) == 2
+    assert "--key-file: simulate" in capsys.readouterr().err

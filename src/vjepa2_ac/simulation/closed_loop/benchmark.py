@@ -13,17 +13,14 @@ import numpy as np
 from jaxtyping import Float
 
 from vjepa2_ac import __version__
-from vjepa2_ac.config import RldsData
-from vjepa2_ac.data.clips.windows import require_stride
-from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.media.video_writer import video_library
-from vjepa2_ac.planning.session import PlanningSession
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.simulation.closed_loop.oracles import oracle_for
-from vjepa2_ac.simulation.closed_loop.policies import DoNothing, GoalsOf, Oracle, Planning, Policy, RandomActions
+from vjepa2_ac.simulation.closed_loop.policies import DoNothing, GoalsOf, Policy, RandomActions
 from vjepa2_ac.simulation.closed_loop.result import ClosedLoopResult
 from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, run_task
+from vjepa2_ac.simulation.closed_loop.steering import Steering
 from vjepa2_ac.simulation.closed_loop.sub_goals import DemonstratedGoals, DemonstrationSpec
 from vjepa2_ac.simulation.closed_loop.tasks import ALSO, STEPS, SUCCESS_M, TaskName, TaskProblem, arm_for, make_problem
 from vjepa2_ac.simulation.closed_loop.video import write_film
@@ -35,7 +32,6 @@ from vjepa2_ac.storage.structured import utc_now
 
 FILE, FILM = "closed_loop.json", "closed_loop.mp4"
 SubGoalsFrom = Literal["none", "demonstration"]
-JOINT_FIELDS = ("steps/observation/joint_position", "steps/observation/gripper_position")
 FORMAT = 1  # incremented when a reader of the file would have to change
 
 
@@ -79,71 +75,45 @@ class ClosedLoopBenchmark:
 
 
 def run_benchmark(
-    session: PlanningSession,
-    options: BenchmarkOptions,
-    folder: Path,
-    reporter: Reporter = SILENT,
-    decoder: TrainedDecoder | None = None,
+    steering: Steering, options: BenchmarkOptions, folder: Path, reporter: Reporter = SILENT
 ) -> tuple[ClosedLoopBenchmark, tuple[Path, ...]]:
     """Let all four solve the same problems; write closed_loop.json and the video. Cheap failures first.
 
     Args:
-        session: The model and its planning settings; its `data.stride` is the length of a model step.
+        steering: The model and its planning settings: `steering.of_session`, or `of_server`.
         options: The options.
         folder: The output folder; created if it is missing.
         reporter: Shows the progress of each policy.
-        decoder: Shows in the video, if there is one, what the model imagined; it does not affect the metrics.
 
     Raises:
-        InputError: MuJoCo or PyAV is missing, no such domain, no stride, another frame, a folder that is not
-            writable, or a decoder of another encoder.
+        InputError: MuJoCo or PyAV is missing, no such domain, or a folder that is not writable.
     """
-    stride = _require_steerable(session)
-    if decoder is not None:
-        decoder.require_fit(session.world_model, session.config.data.crop, subject=session.subject)
     if options.films:
         video_library()
     with user_can_write(folder):
         folder.mkdir(parents=True, exist_ok=True)
     arm = arm_for(options.task, named_domain(options.domain), renderer=options.renderer)
-    goals_of = _goals_of(session, options, stride)
+    model = steering.policy(arm, _goals_of(steering, options))
     results = []
-    for policy in _policies(session, options, arm, decoder, goals_of):
-        films = options.films if isinstance(policy, Planning) else 0
-        spec = RolloutSpec(options.task, arm.domain, options.episodes, options.seed, options.steps, stride, films)
+    for policy in (model, *_references(steering.limits, options, arm)):
+        films = options.films if policy is model else 0
+        spec = RolloutSpec(
+            options.task, arm.domain, options.episodes, options.seed, options.steps, steering.stride, films
+        )
         results.append(run_task(spec, policy, arm, reporter.task(f"{options.task}: {policy.name}")))
     benchmark = ClosedLoopBenchmark(
-        session.subject,
-        session.checkpoint,
+        steering.subject,
+        steering.checkpoint,
         options,
-        session.config.planning.model_dump(mode="json"),
-        session.config.seed,
+        steering.planning.model_dump(mode="json"),
+        steering.seed,
         tuple(results),
-        session.warnings,
-        None if decoder is None else decoder.name,
+        steering.warnings,
+        steering.decoder,
     )
     path = folder / FILE
     write_atomically(path, json.dumps(benchmark_as_dict(benchmark), indent=1, allow_nan=False) + "\n")
     return benchmark, (path, write_film(folder / FILM, results[0])) if options.films else (path,)
-
-
-def _require_steerable(session: PlanningSession) -> int:
-    """Return the control steps of a model step; refuse a model of what the simulated arm does not measure."""
-    data = session.config.data
-    stride = require_stride(data, to="steer", fix="Say which, as data.stride=4")
-    if data.pose_frame != "base":
-        raise InputError(
-            where=f"data.pose_frame: {data.pose_frame}",
-            found="a model of states in another frame",
-            needed="base: the simulated arm is steered in the frame of its base",
-        )
-    if data.states == "vector" and not (isinstance(data, RldsData) and data.fields.state == JOINT_FIELDS):
-        raise InputError(
-            where="data.states: vector",
-            found="a model of other numbers than the simulated arm measures",
-            needed=f"poses; or seven joint angles and the gripper: data.fields.state: [{', '.join(JOINT_FIELDS)}]",
-        )
-    return stride
 
 
 def benchmark_as_dict(benchmark: ClosedLoopBenchmark) -> dict[str, Any]:
@@ -170,31 +140,19 @@ def benchmark_as_dict(benchmark: ClosedLoopBenchmark) -> dict[str, Any]:
     }
 
 
-def _goals_of(session: PlanningSession, options: BenchmarkOptions, stride: int) -> GoalsOf | None:
+def _goals_of(steering: Steering, options: BenchmarkOptions) -> GoalsOf | None:
     """Return what makes the goals on the way; each problem has been demonstrated once when this returns."""
     if options.sub_goals == "none":
         return None
     steps = max(options.steps or 0, STEPS[options.task])
-    spec = DemonstrationSpec(session.config.planning.limits, steps, stride)
+    spec = DemonstrationSpec(steering.limits, steps, steering.stride)
     goals_of = DemonstratedGoals(options.task, named_domain(options.domain), spec, renderer=options.renderer)
     goals_of.require(options.problems)
     return goals_of
 
 
-def _policies(
-    session: PlanningSession,
-    options: BenchmarkOptions,
-    arm: SimulatedArm,
-    decoder: TrainedDecoder | None,
-    goals_of: GoalsOf | None,
-) -> Sequence[Policy]:
-    limits = session.config.planning.limits
-    uses_camera = session.world_model.sizes.predictor.use_extrinsics
-    controller = session.controller(extrinsics=arm.extrinsics() if uses_camera else None)
-    name = Path(session.subject).name or session.subject
-    taken = {DoNothing.name, RandomActions.name, Oracle.name}
-    model = Planning(controller, name if name not in taken else f"model {name}", decoder, goals_of)
-    return model, DoNothing(), RandomActions(limits, seed=options.seed), oracle_for(options.task, limits, arm)
+def _references(limits: LimitsConfig, options: BenchmarkOptions, arm: SimulatedArm) -> Sequence[Policy]:
+    return DoNothing(), RandomActions(limits, seed=options.seed), oracle_for(options.task, limits, arm)
 
 
 def _metrics(result: ClosedLoopResult) -> dict[str, Any]:
