@@ -18,6 +18,7 @@ from vjepa2_ac.cli import (
     encode,
     evaluate,
     export,
+    goals,
     plan,
     simulate,
     train,
@@ -104,6 +105,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=__version__)
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for one in (train, evaluate, imagine, data, encode, decoder, doctor, plan, export, config, download, simulate):
+    rooms = (train, evaluate, imagine, data, encode, decoder, doctor, plan, goals, export, config, download, simulate)
+    for one in rooms:
         one.add_to(commands)
     return parser

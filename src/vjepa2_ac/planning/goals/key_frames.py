@@ -19,6 +19,7 @@ GRIPS = 0.15  # of closedness: less is no change of the gripper
 _MOVES = 0.02  # of closedness, from one frame to the next: less is no motion of the fingers
 _PAUSE = 2  # frames that the fingers may rest within one change
 _STILL_M, _STILL_RAD = 0.002, 0.02  # from one frame to the next: less is a resting arm
+_REST = (0.0005, 0.005, 0.005)  # metres, radians, closedness, likewise: less is noise of the sensors
 _SAME_M, _SAME_RAD = 0.005, 0.05  # less apart in all are two images of the same state
 
 
@@ -93,14 +94,14 @@ def _gripper_changes(closedness: Float[np.ndarray, " frames"]) -> list[tuple[int
 
 def _stops(states: Float[np.ndarray, "frames 7"], lasts: int) -> list[int]:
     """Return where the arm comes to rest for at least so many frames; at the start it has not come to rest."""
-    still = resting(states)
+    still = _are_below(actions_from_states(states), _STILL_M, _STILL_RAD, _MOVES)
     begins = [frame for frame in range(1, len(still)) if still[frame] and not still[frame - 1]]
     return [begin for begin in begins if still[begin : begin + lasts].all() and begin + lasts <= len(still)]
 
 
-def resting(states: Float[np.ndarray, "frames 7"]) -> Bool[np.ndarray, " pairs"]:
-    """Return of each frame but the last whether the arm and the fingers rest until the next one."""
-    return _are_below(actions_from_states(states), _STILL_M, _STILL_RAD, _MOVES)
+def resting(states: Float[np.ndarray, "frames 7"]) -> Bool[np.ndarray, " neighbours"]:
+    """Return of each frame but the last whether arm and fingers rest until the next one, up to what sensors measure."""
+    return _are_below(actions_from_states(states), *_REST)
 
 
 def resting_pairs(rests: Bool[np.ndarray, " neighbours"], gap: int) -> Int[np.ndarray, "pairs 2"]:

@@ -18,6 +18,7 @@ from vjepa2_ac.data.clips.windows import require_stride
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.video_writer import video_library
+from vjepa2_ac.planning.goals.folder import read_goal_folder
 from vjepa2_ac.planning.session import PlanningSession
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.simulation.closed_loop.oracles import oracle_for
@@ -51,6 +52,7 @@ class BenchmarkOptions:
     films: int = 6  # episodes in the video; 0: no video
     renderer: Renderer = "rays"
     sub_goals: SubGoalsFrom = "none"  # demonstration: key frames of the oracle's solution of the same problem
+    goals: str | None = None  # a folder of goals, the same in every problem
 
     @property
     def problems(self) -> Iterator[TaskProblem]:
@@ -96,7 +98,8 @@ def run_benchmark(
 
     Raises:
         InputError: MuJoCo or PyAV is missing, no such domain, no stride, another frame, a folder that is not
-            writable, or a decoder of another encoder.
+            writable, a decoder of another encoder, goals that cannot be used, or a problem that the oracle does not
+            solve where its demonstration is wanted.
     """
     stride = _require_steerable(session)
     if decoder is not None:
@@ -171,6 +174,9 @@ def benchmark_as_dict(benchmark: ClosedLoopBenchmark) -> dict[str, Any]:
 
 def _goals_of(session: PlanningSession, options: BenchmarkOptions, stride: int) -> GoalsOf | None:
     """Return what makes the goals on the way; each problem has been demonstrated once when this returns."""
+    if options.goals is not None:
+        goals = session.goals_of(read_goal_folder(Path(options.goals)))
+        return lambda _: goals
     if options.sub_goals == "none":
         return None
     steps = max(options.steps or 0, STEPS[options.task])
