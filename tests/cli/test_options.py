@@ -81,6 +81,7 @@ BEHIND = {  # what each must be given, and an option with a value
     ("encode",): (["c.yaml"], ["--out", "folder"]),
     ("decoder",): (["c.yaml"], ["--check"]),
     ("doctor",): (["c.yaml"], []),
+    ("goals",): (["c.yaml"], ["--out", "folder"]),
     ("plan",): (["run"], ["--start", "a.png", "--state", "-0.1,0,0,0,0,0,0", "--goal", "b.png"]),
     ("serve",): (["run"], ["--port", "3"]),
     ("config",): (["show", "c.yaml"], []),

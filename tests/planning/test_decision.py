@@ -48,7 +48,8 @@ def test_the_file_holds_the_decision(tmp_path: Path) -> None:
     np.testing.assert_allclose(file["states"], found.states)
     np.testing.assert_allclose(file["state"], STATE)
     assert file["energy"] == {
-        "now": found.decision.energy_now, "doing_nothing": found.doing_nothing, "plan": plan.energy
+        "now": found.decision.energy_now, "began": found.decision.began, "doing_nothing": found.doing_nothing,
+        "plan": plan.energy,
     }  # fmt: skip
     assert [one["lowest"] for one in file["iterations"]] == [one.lowest for one in plan.iterations]
     np.testing.assert_allclose(file["iterations"][2]["std"], plan.iterations[2].std)

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from vjepa2_ac.config import Config
+    from vjepa2_ac.planning.goals.folder import GoalFolder
 
 
 def add_to(commands: Commands) -> None:
@@ -50,7 +51,10 @@ def add_to(commands: Commands) -> None:
     )
     argument(parser, "--state NUMBERS", text, required=True)
     text = "what it shall see; again for goals that follow one another"
-    argument(parser, "--goal IMAGE", text, as_local, required=True, action="append")
+    goals = parser.add_mutually_exclusive_group(required=True)
+    argument(goals, "--goal IMAGE", text, as_local, action="append")
+    text = "goals with rules of their own, that `vjepa2-ac goals` made; the first one applies"
+    argument(goals, "--goals FOLDER", text, as_path)
     text = "model steps of each goal but the last, as 2,1; default: equal shares of planning.horizon"
     argument(parser, "--durations STEPS", text)
     text = "what of the image counts: of the goal's size, black where it does not"
@@ -73,7 +77,7 @@ def _plan(options: argparse.Namespace) -> int:
     # Wrong words are told before what takes seconds is imported.
     require_overrides(options.overrides, fix="Numbers of --state or --extrinsics go in one word: --state 0.4,0,0.3,...")
     state, extrinsics = as_numbers(options.state, "--state"), camera_pose(options.extrinsics)
-    durations = _durations(options.durations, len(options.goal)) if options.durations else ()
+    durations = _durations(options)
     _require_state(state, require_to_plan(options))
     with user_can_write(options.out):
         options.out.mkdir(parents=True, exist_ok=True)
@@ -87,19 +91,24 @@ def _plan(options: argparse.Namespace) -> int:
     from vjepa2_ac.planning.summary import summarize
     from vjepa2_ac.reports.figures.plan import PLAN_IMAGE, plot_plan
 
-    request = PlanRequest(start, state, goals, durations, mask)
     say_places_elsewhere(options.subject)
     decoder = given_decoder(options)
     session = load_planning_session(options)
     if decoder is not None:
         decoder.require_fit(session.world_model, session.config.data.crop, subject=options.subject)
-    if not options.durations:
+    if isinstance(goals, tuple):
+        request = PlanRequest(start, state, goals, durations, mask)
+        names = options.goal
+    else:
+        request = PlanRequest.of_sub_goals(start, state, session.goals_of(goals), mask)
+        names = [str(options.goals)]
+    if not options.durations and isinstance(goals, tuple):
         request = request.with_equal_durations(session.config.planning.horizon)
     with ConsoleReporter() as reporter:
         progress = reporter.task("planning, iterations")
         controller = session.controller(seed=options.seed, extrinsics=extrinsics, progress=progress)
         found = decide(controller, request, nodes=options.nodes)
-    about = session.as_dict() | {"start": options.start, "goals": options.goal, "mask": options.mask}
+    about = session.as_dict() | {"start": options.start, "goals": names, "mask": options.mask}
     about["decoder"] = None if decoder is None else decoder.as_dict()
     imagined = None if decoder is None else imagine_plan(found, decoder)
     with user_can_write(options.out):
@@ -122,23 +131,36 @@ def _require_state(state: np.ndarray, config: Config) -> None:
     require_numbers(state, measured_space(config.data, len(state)), where="--state")
 
 
-def _images(options: argparse.Namespace) -> tuple[np.ndarray, tuple[np.ndarray, ...], np.ndarray | None]:
+def _images(
+    options: argparse.Namespace,
+) -> tuple[np.ndarray, tuple[np.ndarray, ...] | GoalFolder, np.ndarray | None]:
     """Return start, goals and mask; refuse what cannot be planned with, before a model is loaded."""
     from vjepa2_ac.media.image_file import read_image
+    from vjepa2_ac.planning.goals.folder import read_goal_folder
     from vjepa2_ac.planning.input_checks import require_image, require_mask
 
-    goals = tuple(read_image(path) for path in options.goal)
-    for path, image in zip(options.goal, goals, strict=True):
-        require_image(image, where=f"--goal {path}", like=goals[0])
+    folder = None if options.goals is None else read_goal_folder(options.goals)
+    if folder is None:
+        images = tuple(read_image(path) for path in options.goal)
+        for path, image in zip(options.goal, images, strict=True):
+            require_image(image, where=f"--goal {path}", like=images[0])
+    else:
+        images = tuple(goal.image for goal in folder.goals)
     start = read_image(options.start)
-    require_image(start, where=f"--start {options.start}", like=goals[0])
+    require_image(start, where=f"--start {options.start}", like=images[0])
     mask = None if options.mask is None else read_image(options.mask).max(axis=-1)
     if mask is not None:
-        require_mask(mask, where=f"--mask {options.mask}", like=goals[0])
-    return start, goals, mask
+        require_mask(mask, where=f"--mask {options.mask}", like=images[0])
+    return start, images if folder is None else folder, mask
 
 
-def _durations(text: str, goals: int) -> tuple[int, ...]:
+def _durations(options: argparse.Namespace) -> tuple[int, ...]:
+    if not options.durations:
+        return ()
+    if options.goals is not None:
+        found, needed = f"--goals {options.goals}", "--goal: a folder says how long its goals apply"
+        raise InputError(where="--durations", found=found, needed=needed)
+    text, goals = options.durations, len(options.goal)
     words = text.replace(",", " ").split()
     if len(words) != goals - 1 or not all(word.isdecimal() and int(word) for word in words):
         found = f"{text!r} for {goals} goal{'s' * (goals > 1)}"

@@ -18,6 +18,7 @@ from vjepa2_ac.cli import (
     encode,
     evaluate,
     export,
+    goals,
     plan,
     serve,
     simulate,
@@ -105,20 +106,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=__version__)
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for one in (
-        train,
-        evaluate,
-        imagine,
-        data,
-        encode,
-        decoder,
-        doctor,
-        plan,
-        serve,
-        export,
-        config,
-        download,
-        simulate,
-    ):
+    first, then = (train, evaluate, imagine, data, encode, decoder, doctor), (plan, goals, serve, export, config)
+    for one in (*first, *then, download, simulate):
         one.add_to(commands)
     return parser

@@ -168,7 +168,8 @@ def _loaded(
         dry_run=options.dry_run,
     )
     controller = loaded.controller(extrinsics=extrinsics)
-    session = Session(controller, goals, session_options)
+    kept = {name: loaded.goals_of(folder) for name, folder in (goals or {}).items()}
+    session = Session(controller, kept, session_options)
     about = metadata_of(loaded, session)
     told = about if options.metadata == "full" else roboarena_metadata(session)
     tell(in_words(about, options.subject))

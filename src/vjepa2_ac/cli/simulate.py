@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from vjepa2_ac.simulation.closed_loop.steering import Steering
 
 _OF_RECORD = ("cameras", "workers")
-_OF_A_MODEL = ("sub_goals", "films", "decoder", "checkpoint", "config", "out")
+_OF_A_MODEL = ("sub_goals", "goals", "films", "decoder", "checkpoint", "config", "out")
 
 
 def add_to(commands: Commands) -> None:
@@ -67,6 +67,8 @@ def add_to(commands: Commands) -> None:
         " changes or the arm stops (none)"
     )
     argument(group, "--sub-goals", text, choices=["none", "demonstration"])
+    text = "a folder of goals on the way, that `vjepa2-ac goals` made: the same in every problem, of a fixed scene"
+    argument(group, "--goals FOLDER", text, as_local)
     argument(group, "--films N", "episodes in the video; 0: none (6)", whole_number(0))
     add_decoder(group, "in the video what the model imagined of each frame, one step ago")
     text = "where figures and video go (closed_loop/TASK-DOMAIN, in the run's)"
@@ -131,6 +133,9 @@ def _run_benchmark(options: argparse.Namespace) -> int:
     if options.decoder is not None and options.films == 0:
         found, fix = "--films 0: no video in which anything could be shown", "Leave out one of the two"
         raise InputError(where=f"--decoder {options.decoder}", found=found, needed="a video", fix=fix)
+    if options.goals is not None and options.sub_goals is not None:
+        found = f"--sub-goals {options.sub_goals}, too"
+        raise InputError(where=f"--goals {options.goals}", found=found, needed="one of the two")
     if not _is_server(options.subject):
         _refuse(options, ("key_file",), needed="a server: ws://HOST:PORT")
         options.checkpoint = options.checkpoint or "selected"

@@ -220,7 +220,7 @@ class Controller:
             raise ValueError("no goal")
         for place, goal in enumerate(goals):
             require_image(goal.image, where=f"goal {place}", like=goals[0].image if place else None)
-        rules = _rules(goals, self.config)
+        rules = rules_of(goals, self.config)
         searched = {goal.gripper: self._space_with(goal.gripper) for goal in goals} | {None: self._searched[None]}
         latents = torch.stack([self.encoded(goal.image) for goal in goals])
         weights = self._weights(mask, goals[0].image)
@@ -382,8 +382,13 @@ class Controller:
             raise InputError(where="mask", found="nothing of what the model sees counts") from None
 
 
-def _rules(goals: Sequence[SubGoal], config: PlanningConfig) -> tuple[AdvanceRule, ...]:
+def rules_of(goals: Sequence[SubGoal], config: PlanningConfig, *, first: int = 0) -> tuple[AdvanceRule, ...]:
     """Return the rule of each goal, with the shares of `planning.goals` where they are given.
+
+    Args:
+        goals: In order.
+        config: Whose `goals` count.
+        first: Number of the first goal in messages.
 
     Raises:
         InputError: One would never end, or the last one has a bound.
@@ -395,10 +400,10 @@ def _rules(goals: Sequence[SubGoal], config: PlanningConfig) -> tuple[AdvanceRul
         rule = AdvanceRule(goal.name, goal.at_least, goal.at_most, share, goal.floor)
         if is_last and rule.at_most is not None:
             found = f"at_most {rule.at_most} of the last goal, after which there is none"
-            raise InputError(where=f"goal {place}", found=found, needed="null: no bound")
+            raise InputError(where=f"goal {place + first}", found=found, needed="null: no bound")
         if not is_last and rule.at_most is None and share is None:
             found, needed = "a goal that would never end", "at_most or share, or planning.goals.share"
-            raise InputError(where=f"goal {place}", found=found, needed=needed)
+            raise InputError(where=f"goal {place + first}", found=found, needed=needed)
         rules.append(rule)
     return tuple(rules)
 

@@ -20,7 +20,9 @@ from vjepa2_ac.model.adapter.merging import merge_adapter
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.model.quantization import require_8_bits
-from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.planning.controller import Controller, rules_of
+from vjepa2_ac.planning.goals.folder import GoalFolder
+from vjepa2_ac.planning.goals.sub_goals import SubGoal
 from vjepa2_ac.planning.model_setup import Fingerprints
 from vjepa2_ac.planning.settings import planning_settings, warn_beyond_taught
 from vjepa2_ac.runs.checkpoint_selection import SELECTED
@@ -60,6 +62,21 @@ class PlanningSession:
         controller = Controller.of_config(self.world_model, self.config, seed=seed, extrinsics=extrinsics)
         controller.planner.progress = progress
         return controller
+
+    @property
+    def encoder(self) -> str:
+        """The hash of the encoder's weights."""
+        return (self.fingerprints or Fingerprints.of(self.world_model)).encoder
+
+    def goals_of(self, folder: GoalFolder) -> tuple[SubGoal, ...]:
+        """Return the goals of a folder for this model, with their noise floor; what is changed is logged as a warning.
+
+        Raises:
+            InputError: A goal would never end, or the last one has a bound.
+        """
+        goals = folder.for_model(self.encoder, self.config.planning.energy.distance)
+        rules_of(goals, self.config.planning, first=1)
+        return goals
 
     def as_dict(self) -> dict[str, Any]:
         """Return the identity of the model as plain values: its name, and hashes of the weights."""

@@ -70,7 +70,7 @@ def _warnings(answer: PlanResult, plan: Plan) -> list[str]:
     if at_limit := axes_at_limit(answer):
         knob = f"planning.limits.{'xyz' if answer.state_space.is_pose else 'axes'}"
         found.append(f"The first action is at its limit along {', '.join(at_limit)} ({knob}).")
-    if answer.unused_goals:
+    if answer.unused_goals and not answer.question.sub_goals:  # of these everybody knows that the others come later
         unused = ", ".join(str(place + 1) for place in answer.unused_goals)
         found.append(f"No part in this plan has goal {unused}: see durations, planning.horizon, planning.energy.steps.")
     return found

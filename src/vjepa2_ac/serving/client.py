@@ -77,18 +77,16 @@ def goal_keys(goals: Sequence[SubGoal]) -> dict[str, Any]:
     """Return the keys of a request for goals in order, with their rules.
 
     Raises:
-        ValueError: Of the goals before the last some have a bound on their steps, and some have none; or one has a
-            noise floor.
+        ValueError: Of the goals before the last some have a bound on their steps, and some have none.
     """
     bounds = [goal.at_most for goal in goals[:-1]]
     if None in bounds and any(bounds):
         raise ValueError(f"bounds {bounds}: for each goal but the last, or for none")
-    if any(goal.floor for goal in goals):
-        raise ValueError("a noise floor cannot be sent: let the server keep these goals")
     keys: dict[str, Any] = {
         "goal/images": np.stack([goal.image for goal in goals]),
         "goal/at_least": [goal.at_least for goal in goals],
         "goal/shares": [goal.share or 0.0 for goal in goals],
+        "goal/floors": [goal.floor for goal in goals],
         "goal/grippers": [goal.gripper or "" for goal in goals],
     }
     return keys if None in bounds else {**keys, "goal/durations": bounds}

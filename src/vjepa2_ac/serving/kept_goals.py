@@ -7,11 +7,11 @@ from pathlib import Path
 
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.image_file import read_image
-from vjepa2_ac.planning.goals.folder import GOALS_FILE, read_goals
+from vjepa2_ac.planning.goals.folder import GOALS_FILE, GoalFolder, read_goal_folder
 from vjepa2_ac.planning.goals.sub_goals import SubGoal
 from vjepa2_ac.planning.input_checks import require_image
 
-KeptGoals = Mapping[str, tuple[SubGoal, ...]]
+KeptGoals = Mapping[str, GoalFolder]
 
 _PICTURES = {".png", ".jpg", ".jpeg"}
 
@@ -28,14 +28,14 @@ def read_kept_goals(folder: Path) -> KeptGoals:
         found = "a file" if folder.exists() else "no such folder"
         raise InputError(where=f"--goals {folder}", found=found, needed="a folder with goal images")
     if (folder / GOALS_FILE).is_file():
-        return {folder.resolve().name: read_goals(folder)}
-    kept: dict[str, tuple[SubGoal, ...]] = {}
+        return {folder.resolve().name: read_goal_folder(folder)}
+    kept: dict[str, GoalFolder] = {}
     for path in sorted(folder.iterdir()):
         goals = _goals_at(path)
-        if goals and path.stem in kept:
+        if goals is not None and path.stem in kept:
             found = f"two goals named {path.stem!r}"
             raise InputError(where=str(path), found=found, needed="another name for one of them")
-        kept |= {path.stem: goals} if goals else {}
+        kept |= {} if goals is None else {path.stem: goals}
     if not kept:
         found, needed = (
             "no goal",
@@ -45,12 +45,12 @@ def read_kept_goals(folder: Path) -> KeptGoals:
     return kept
 
 
-def _goals_at(path: Path) -> tuple[SubGoal, ...]:
-    """Return the goals that a file or folder is; none: it is something else."""
+def _goals_at(path: Path) -> GoalFolder | None:
+    """Return the goals that a file or folder is; None: it is something else."""
     if path.is_dir():
-        return read_goals(path) if (path / GOALS_FILE).is_file() else ()
+        return read_goal_folder(path) if (path / GOALS_FILE).is_file() else None
     if path.suffix.lower() not in _PICTURES:
-        return ()
+        return None
     image = read_image(path)
     require_image(image, where=str(path))
-    return (SubGoal(image, name=path.stem),)
+    return GoalFolder((SubGoal(image, name=path.stem),), (None,), (None,))

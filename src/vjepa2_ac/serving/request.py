@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, get_args
@@ -22,7 +23,7 @@ MOST_STEPS = 10_000  # of one goal
 _STATE, _POSE, _GRIPPER = "observation/state", "observation/cartesian_position", "observation/gripper_position"
 _GOAL = "goal/"
 _WAYS = ("goal/image", "goal/images", "goal/name")
-_IN_ORDER = ("goal/durations", "goal/at_least", "goal/shares", "goal/grippers")
+_IN_ORDER = ("goal/durations", "goal/at_least", "goal/shares", "goal/floors", "goal/grippers")
 _GOAL_KEYS = frozenset({*_WAYS, *_IN_ORDER, "goal/mask"})
 _MODES = get_args(GripperMode)
 _ENDPOINTS = ("infer", "reset")
@@ -40,7 +41,7 @@ class GivenGoal:
         """The same for the same bytes: a client may send its goal with every request."""
         digest = hashlib.sha256()
         for goal in self.goals:
-            digest.update(repr((goal.at_least, goal.at_most, goal.share, goal.gripper)).encode())
+            digest.update(repr((goal.at_least, goal.at_most, goal.share, goal.gripper, goal.floor)).encode())
         for one in (*(goal.image for goal in self.goals), *(() if self.mask is None else (self.mask,))):
             digest.update(repr((one.shape, one.dtype.str)).encode())
             digest.update(np.ascontiguousarray(one).tobytes())
@@ -170,11 +171,13 @@ def _in_order(images: Sequence[np.ndarray], message: Mapping[str, Any]) -> tuple
     if least is None:
         least = [1.0] * many if shares or not most else [*most, 1]
     grippers = _grippers(message.get("goal/grippers"), many)
+    needed = "an energy of 0 or more for each goal: the noise of camera and encoder"
+    floors = _row(message, "goal/floors", many, lambda one: 0 <= one < math.inf, needed) or [0.0] * many
     bounds: list[int | None] = [*most] if most else [None] * (many - 1)
-    rows = zip(images, least, [*bounds, None], shares or [0.0] * many, grippers, strict=True)
+    rows = zip(images, least, [*bounds, None], shares or [0.0] * many, grippers, floors, strict=True)
     return tuple(
-        SubGoal(image, str(place), int(fewest), bound, share or None, gripper)
-        for place, (image, fewest, bound, share, gripper) in enumerate(rows)
+        SubGoal(image, str(place), int(fewest), bound, share or None, gripper, floor)
+        for place, (image, fewest, bound, share, gripper, floor) in enumerate(rows)
     )
 
 

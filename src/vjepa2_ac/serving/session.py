@@ -20,7 +20,6 @@ from vjepa2_ac.planning.controller import Controller, Decision
 from vjepa2_ac.planning.goals.sub_goals import SubGoal
 from vjepa2_ac.planning.interfaces import SearchCancelledError
 from vjepa2_ac.serving.bounds import why_not_sent
-from vjepa2_ac.serving.kept_goals import KeptGoals
 from vjepa2_ac.serving.recording import Recorder
 from vjepa2_ac.serving.request import IMAGE_KEYS, GivenGoal, NamedGoal, Request, read_request
 from vjepa2_ac.serving.waypoints import waypoints
@@ -70,7 +69,7 @@ class Session:
     def __init__(
         self,
         controller: Controller,
-        goals: KeptGoals | None = None,
+        goals: Mapping[str, tuple[SubGoal, ...]] | None = None,
         options: SessionOptions | None = None,
         clock: Clock = time.monotonic,
     ) -> None:
@@ -83,7 +82,7 @@ class Session:
             clock: Measures the deadline.
         """
         self.controller, self.options = controller, options or SessionOptions()
-        self.goals: Mapping[str, tuple[SubGoal, ...]] = goals or {}
+        self.goals = goals or {}
         self.counts = Counts()
         self.recorder: Recorder | None = None  # writes every decision down
         self._clock = clock

@@ -70,6 +70,13 @@ def test_a_grip_at_the_very_start_has_no_goal_before_it() -> None:
     assert named(way((5, 0, 0.5), (10, 0.2, 0))) == [(5, "closed"), (15, "end")]
 
 
+def test_an_arm_that_leaves_while_the_fingers_still_close_has_gripped_before() -> None:
+    parts = (10, 0.2, 0), (4, 0, 0.25), (2, 0.04, 0.1), (9, 0.2, 0)
+    assert named(way(*parts)) == [(10, "before closing"), (14, "closed"), (25, "end")]
+    on_the_way = (10, 0.2, 0), (6, 0.12, 0.6), (9, 0.2, 0)
+    assert named(way(*on_the_way)) == [(10, "before closing"), (16, "closed"), (25, "end")], "it never stood still"
+
+
 def test_a_pause_of_the_fingers_does_not_divide_a_grip() -> None:
     assert named(way((9, 0.2, 0), (2, 0, 0.2), (2, 0, 0), (2, 0, 0.2), (9, 0.2, 0)))[:2] == [
         (9, "before closing"), (15, "closed"),

@@ -19,6 +19,8 @@ GRIPS = 0.15  # of closedness: less is no change of the gripper
 _MOVES = 0.02  # of closedness, from one frame to the next: less is no motion of the fingers
 _PAUSE = 2  # frames that the fingers may rest within one change
 _STILL_M, _STILL_RAD = 0.002, 0.02  # from one frame to the next: less is a resting arm
+_REST = (0.0005, 0.005, 0.005)  # metres, radians, closedness, likewise: less is noise of the sensors
+_LEFT_M = 0.01  # farther from where it gripped, an arm has left
 _SAME_M, _SAME_RAD = 0.005, 0.05  # less apart in all are two images of the same state
 
 
@@ -45,7 +47,9 @@ OF_MODEL_STEPS = StillRule(lasts=1, apart=1)
 def gripper_key_frames(states: Float[np.ndarray, "frames 7"], rule: StillRule | None = None) -> tuple[KeyFrame, ...]:
     """Return where the gripper begins to change and where it has changed, where the arm stops, and the end.
 
-    The start is none of them. Where the arm rests at the end, the end is the frame at which it came to rest.
+    Where the arm leaves before the fingers have come to rest, the gripper has changed at the last frame before that, if
+    half of the change is done by then. The start is no key frame. Where the arm rests at the end, the end is the frame
+    at which it came to rest.
 
     Args:
         states: Measured, with closedness last (legend: `vjepa2_ac.episode`).
@@ -66,7 +70,7 @@ def gripper_key_frames(states: Float[np.ndarray, "frames 7"], rule: StillRule | 
         closes = states[end, GRIPPER] > states[begin, GRIPPER]
         if begin >= rule.apart:
             found.setdefault(begin, "before closing" if closes else "before opening")
-        found[end] = "closed" if closes else "opened"
+        found[_before_leaving(states, begin, end)] = "closed" if closes else "opened"
     for begin in _stops(states, rule.lasts):
         near = [abs(begin - frame) < rule.apart for frame in (0, last, *found)]
         if not any(near) and not any(first <= begin <= end for first, end in changes):
@@ -91,16 +95,24 @@ def _gripper_changes(closedness: Float[np.ndarray, " frames"]) -> list[tuple[int
     return [(begin, end) for begin, end, _ in found if abs(closedness[end] - closedness[begin]) >= GRIPS]
 
 
+def _before_leaving(states: Float[np.ndarray, "frames 7"], begin: int, end: int) -> int:
+    """Return the last frame of a change of the gripper at which the arm is where it began, or the end of the change."""
+    changed = np.abs(states[begin : end + 1, GRIPPER] - states[begin, GRIPPER])
+    moved = np.linalg.norm(states[begin : end + 1, :3] - states[begin, :3], axis=1)
+    there = np.flatnonzero((moved < _LEFT_M) & (changed >= max(GRIPS, changed[-1] / 2)))
+    return begin + int(there[-1]) if len(there) else end
+
+
 def _stops(states: Float[np.ndarray, "frames 7"], lasts: int) -> list[int]:
     """Return where the arm comes to rest for at least so many frames; at the start it has not come to rest."""
-    still = resting(states)
+    still = _are_below(actions_from_states(states), _STILL_M, _STILL_RAD, _MOVES)
     begins = [frame for frame in range(1, len(still)) if still[frame] and not still[frame - 1]]
     return [begin for begin in begins if still[begin : begin + lasts].all() and begin + lasts <= len(still)]
 
 
-def resting(states: Float[np.ndarray, "frames 7"]) -> Bool[np.ndarray, " pairs"]:
-    """Return of each frame but the last whether the arm and the fingers rest until the next one."""
-    return _are_below(actions_from_states(states), _STILL_M, _STILL_RAD, _MOVES)
+def resting(states: Float[np.ndarray, "frames 7"]) -> Bool[np.ndarray, " neighbours"]:
+    """Return of each frame but the last whether arm and fingers rest until the next one, up to what sensors measure."""
+    return _are_below(actions_from_states(states), *_REST)
 
 
 def resting_pairs(rests: Bool[np.ndarray, " neighbours"], gap: int) -> Int[np.ndarray, "pairs 2"]:

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from vjepa2_ac import __version__
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.media.video_writer import video_library
+from vjepa2_ac.planning.goals.folder import read_goal_folder
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.simulation.closed_loop.oracles import oracle_for
 from vjepa2_ac.simulation.closed_loop.policies import DoNothing, GoalsOf, Policy, RandomActions
@@ -47,6 +48,7 @@ class BenchmarkOptions:
     films: int = 6  # episodes in the video; 0: no video
     renderer: Renderer = "rays"
     sub_goals: SubGoalsFrom = "none"  # demonstration: key frames of the oracle's solution of the same problem
+    goals: str | None = None  # a folder of goals, the same in every problem
 
     @property
     def problems(self) -> Iterator[TaskProblem]:
@@ -86,7 +88,8 @@ def run_benchmark(
         reporter: Shows the progress of each policy.
 
     Raises:
-        InputError: MuJoCo or PyAV is missing, no such domain, or a folder that is not writable.
+        InputError: MuJoCo or PyAV is missing, no such domain, a folder that is not writable, goals that cannot be used,
+            or a problem that the oracle does not solve where its demonstration is wanted.
     """
     if options.films:
         video_library()
@@ -142,6 +145,9 @@ def benchmark_as_dict(benchmark: ClosedLoopBenchmark) -> dict[str, Any]:
 
 def _goals_of(steering: Steering, options: BenchmarkOptions) -> GoalsOf | None:
     """Return what makes the goals on the way; each problem has been demonstrated once when this returns."""
+    if options.goals is not None:
+        goals = steering.goals_of(read_goal_folder(Path(options.goals)))
+        return lambda _: goals
     if options.sub_goals == "none":
         return None
     steps = max(options.steps or 0, STEPS[options.task])

@@ -17,6 +17,8 @@ from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
 from vjepa2_ac.data.clips.windows import require_stride
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.planning.goals.folder import GoalFolder
+from vjepa2_ac.planning.goals.sub_goals import SubGoal
 from vjepa2_ac.planning.session import PlanningSession
 from vjepa2_ac.serving.client import PlanningClient, goal_keys
 from vjepa2_ac.simulation.closed_loop.policies import (
@@ -45,6 +47,7 @@ class Steering:
     stride: int  # control steps of a model step
     warnings: tuple[str, ...]
     policy: Callable[[SimulatedArm, GoalsOf | None], Policy]
+    goals_of: Callable[[GoalFolder], tuple[SubGoal, ...]]  # of a folder, for this model
     decoder: str | None = None  # by which videos show what was imagined
 
     @property
@@ -106,6 +109,7 @@ def of_session(session: PlanningSession, decoder: TrainedDecoder | None = None) 
         stride,
         session.warnings,
         policy,
+        session.goals_of,
         None if decoder is None else decoder.name,
     )
 
@@ -135,6 +139,7 @@ def of_server(client: PlanningClient) -> Steering:
         steps,
         tuple(map(str, told.get("warnings", ()))),
         lambda _, goals_of: ServedPlanner(client, client.url, goals_of),
+        lambda folder: folder.for_model(str(told.get("encoder", "")), planning.energy.distance),
     )
 
 

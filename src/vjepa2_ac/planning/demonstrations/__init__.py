@@ -1,0 +1,1 @@
+"""Goals from a demonstration: an episode of a data set, or a film."""
