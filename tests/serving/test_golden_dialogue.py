@@ -1,0 +1,59 @@
+"""What openpi's client sends, as it was recorded (tests/golden/openpi/make.py), is answered as our own client is."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from paths import ROOT
+from served import STATE, session
+from vjepa2_ac.planning.goals.sub_goals import SubGoal
+from vjepa2_ac.serving.session import Session
+from vjepa2_ac.serving.wire import pack, unpack
+
+FOLDER = ROOT / "tests/golden/openpi"
+FRAMES = sorted(FOLDER.glob("*.bin"))
+
+
+def picture(number: int) -> np.ndarray:
+    y, x, c = np.mgrid[:48, :60, :3]
+    return ((x * (number + 3) + y * (2 * number + 5) + 40 * c) % 256).astype(np.uint8)
+
+
+OURS = [
+    {"observation/image": picture(0), "observation/state": STATE, "goal/image": picture(9)},
+    {"observation/image": picture(1), "observation/state": STATE.astype(np.float32)},
+    {"observation/image": picture(1), "observation/state": STATE * [1, 1, 1, 60, 1, 1, 1]},
+    {"observation/image": picture(2), "observation/state": STATE, "goal/name": "cup", "reset": True},
+    {"observation/image": picture(3), "observation/state": STATE, "goal/name": "cup", "session_id": "7d7c6c0e"},
+    {"reset": True, "endpoint": "reset"},
+]
+
+
+def answers(messages: list[bytes]) -> list[dict | str]:
+    one: Session = session(goals={"cup": (SubGoal(picture(20), "cup"),)})
+    found = [one.answer(message) for message in messages]
+    return [unpack(answer) if isinstance(answer, bytes) else answer for answer in found]
+
+
+def test_the_recorded_dialogue_is_answered_as_ours_is() -> None:
+    assert len(FRAMES) == len(OURS)
+    theirs, ours = answers([path.read_bytes() for path in FRAMES]), answers([pack(message) for message in OURS])
+    for path, one, other in zip(FRAMES, theirs, ours, strict=True):
+        if isinstance(other, str):
+            assert one == other, path.name
+            assert "degrees" in one
+        elif "actions" in other:
+            np.testing.assert_array_equal(one["actions"], other["actions"])
+            assert (one["why"], one["goal"], one["energy"]) == (other["why"], other["goal"], other["energy"]), path.name
+            assert one["why"] == "planned"
+        else:
+            assert one == other == {"status": "reset"}
+
+
+@pytest.mark.parametrize("path", FRAMES, ids=lambda path: path.stem)
+def test_a_recorded_message_that_was_cut_or_spoiled_is_refused_and_does_no_harm(path: Path) -> None:
+    message, one = path.read_bytes(), session(goals={"cup": (SubGoal(picture(20), "cup"),)})
+    for cut in range(0, len(message), max(1, len(message) // 40)):
+        assert isinstance(one.answer(message[:cut]), str)
+    assert one.counts.failed == 0

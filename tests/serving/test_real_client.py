@@ -1,0 +1,78 @@
+"""The real, unmodified openpi-client of PyPI drives the server, from an environment of its own."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from served import STATE, controller, image, serving, session
+from vjepa2_ac.geometry import apply_action
+from vjepa2_ac.planning.goals.sub_goals import SubGoal
+from vjepa2_ac.serving.about import roboarena_metadata
+from vjepa2_ac.serving.access import Access
+from vjepa2_ac.serving.session import SessionOptions
+
+CLIENT = "openpi-client==0.1.2"
+KEY = "correct-horse-battery-staple"
+SCRIPT = Path(__file__).with_name("openpi_dialogue.py")
+CUP = {"cup": (SubGoal(image(50), "cup"),)}
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the Python of an environment with the client and what it asks for, which is not ours."""
+    here = tmp_path_factory.mktemp("robot")
+    subprocess.run([sys.executable, "-m", "venv", here], check=True, capture_output=True)
+    python = here / "bin/python"
+    # typing_extensions: the client imports it and does not ask for it.
+    install = [python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", CLIENT, "typing_extensions"]
+    done = subprocess.run(install, capture_output=True, text=True, timeout=300)
+    if done.returncode:
+        pytest.skip(f"{CLIENT} cannot be installed here: {done.stderr.strip().splitlines()[-1:]}")
+    return python
+
+
+def driven(robot: Path, what: str, url: str, key: str = "") -> dict:
+    host, port = url.removeprefix("ws://").split(":")
+    done = subprocess.run([robot, SCRIPT, what, host, port, key], capture_output=True, text=True, timeout=120, cwd="/")
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_it_gets_the_controllers_actions_errors_and_a_new_episode(robot: Path) -> None:
+    own = controller()
+    own.reset(image(100))
+    expected = []
+    for seed in range(3):
+        own.act(image(seed), STATE)
+        expected.append(own.decision.plan.actions.double().tolist())
+
+    def told(_: object) -> dict:
+        return {"policy": "vjepa2-ac"}
+
+    with serving(lambda: session(goals=CUP), Access("127.0.0.1", KEY), told=told) as running:
+        found = driven(robot, "openpi", running.url, KEY)
+    assert found["metadata"] == "vjepa2-ac"
+    assert found["actions"] == [*expected, expected[0]]
+    assert found["why"] == ["planned"] * 4
+    assert found["error"].startswith("Error in inference server:\nstate: 3 numbers")
+    own.reset(image(50))
+    own.act(image(3), STATE)
+    assert found["one_by_one"] == own.decision.plan.actions.double().tolist()
+
+
+def test_roboarenas_dialect(robot: Path) -> None:
+    options = SessionOptions("pose", control_steps=4)
+    with serving(lambda: session(options, CUP), told=roboarena_metadata) as running:
+        found = driven(robot, "roboarena", running.url)
+    own = controller()
+    own.reset(image(50))
+    target = apply_action(STATE, own.act(image(0), STATE))
+    assert found["action_space"] == "cartesian_position"
+    assert found["actions"][0] == found["actions"][1], "another session is another episode"
+    np.testing.assert_array_equal(found["actions"][0][-1], [*target[:6], np.clip(target[6], 0, 1)])
+    assert np.shape(found["actions"][0]) == (4, 7)
+    assert found["reset"] == {"status": "reset"}
