@@ -127,11 +127,15 @@ def test_fixed_durations_are_a_special_case_of_goals_with_rules() -> None:
 
 
 def test_a_plan_looks_ahead_to_what_follows_at_the_latest() -> None:
-    run = controller(horizon=4)
-    run.follow([SubGoal(image(100), at_most=2, share=0.01), SubGoal(image(101), share=0.01), SubGoal(image(102))])
-    run.act(image(0), STATE)
-    assert run.decision is not None
-    assert run.decision.goals == (0, 0, 1, 1), "nobody knows when the second one ends"
+    run = controller(horizon=6)
+    bounded, unbounded = SubGoal(image(100), at_most=2, share=0.01), SubGoal(image(101), share=0.01)
+    run.follow([bounded, unbounded, SubGoal(image(102), at_most=1), SubGoal(image(103))])
+    found = []
+    for seed in range(3):
+        run.act(image(seed), STATE)
+        assert run.decision is not None
+        found.append(run.decision.goals)
+    assert found == [(0, 0, 1, 1, 1, 1), (0, 1, 1, 1, 1, 1), (1,) * 6], "nobody knows when the second one ends"
 
 
 def test_a_share_in_the_config_stands_for_that_of_every_goal_but_the_last() -> None:
