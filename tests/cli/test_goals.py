@@ -207,3 +207,16 @@ def test_a_folder_that_holds_something_is_left_as_it_is(
     assert goals(workshop, tmp_path)[0] == 2
     assert "already there and not empty" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_of_a_long_film_every_so_many_frames_are_looked_at(
+    workshop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("vjepa2_ac.planning.demonstrations.make_goals._MOST_ENCODED", 10)
+    given = ["--model", str(workshop / "model"), "--stride", "2", "--apart", "6"]
+    status, file = goals(workshop, tmp_path / "goals", *given, source="film.mp4")
+    assert status == 0
+    assert "encoding frames 9/9" in capsys.readouterr().out, "24 frames, every third, and the last"
+    frames = [goal["frame"] for goal in file["goals"]]
+    assert frames[-1] == 23
+    assert all(frame % 3 == 0 for frame in frames[:-1])

@@ -88,6 +88,7 @@ def first(**changes: object) -> Any:
     [
         (first(file="../goal_1.png"), r"goal 1: '\.\./goal_1.png'"),
         (first(file="/etc/passwd"), r"goal 1: '/etc/passwd'"),
+        (first(file="sub/goal_1.png"), "goal 1: 'sub/goal_1.png'"),
         (first(file="goals.json"), "needed: the name of a PNG or JPEG"), (first(file=".x.png"), "goal 1: '.x.png'"),
         (first(file="..\\x.png"), "goal 1"), (first(file="none.png"), "none.png: cannot be read"),
         (first(file=3), "goal 1: file: "), (first(at_least=0), "goal 1: at_least"), (first(at_least=9), "at least 9"),

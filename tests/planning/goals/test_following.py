@@ -1,9 +1,13 @@
 """A controller that follows goals: which one applies, what the gripper may do, and when it is done."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from decisions import QUICK, STATE, asked, image
+from paths import ROOT
 from tiny_models import tiny_model
 from vjepa2_ac.config.planning import GoalsConfig, LimitsConfig
 from vjepa2_ac.episode import Widths
@@ -11,6 +15,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.decision import PlanRequest, decide
+from vjepa2_ac.planning.goals.folder import write_goals
 from vjepa2_ac.planning.goals.sub_goals import GripperMode, SubGoal
 from vjepa2_ac.planning.plan_json import plan_as_dict
 from vjepa2_ac.spaces import Spaces
@@ -122,11 +127,15 @@ def test_fixed_durations_are_a_special_case_of_goals_with_rules() -> None:
 
 
 def test_a_plan_looks_ahead_to_what_follows_at_the_latest() -> None:
-    run = controller(horizon=4)
-    run.follow([SubGoal(image(100), at_most=2, share=0.01), SubGoal(image(101), share=0.01), SubGoal(image(102))])
-    run.act(image(0), STATE)
-    assert run.decision is not None
-    assert run.decision.goals == (0, 0, 1, 1), "nobody knows when the second one ends"
+    run = controller(horizon=6)
+    bounded, unbounded = SubGoal(image(100), at_most=2, share=0.01), SubGoal(image(101), share=0.01)
+    run.follow([bounded, unbounded, SubGoal(image(102), at_most=1), SubGoal(image(103))])
+    found = []
+    for seed in range(3):
+        run.act(image(seed), STATE)
+        assert run.decision is not None
+        found.append(run.decision.goals)
+    assert found == [(0, 0, 1, 1, 1, 1), (0, 1, 1, 1, 1, 1), (1,) * 6], "nobody knows when the second one ends"
 
 
 def test_a_share_in_the_config_stands_for_that_of_every_goal_but_the_last() -> None:
@@ -168,6 +177,18 @@ def test_goals_that_cannot_be_followed_are_refused_and_change_nothing(goals: lis
 def test_numbers_that_contradict_each_other_are_refused(numbers: dict, wrong: str) -> None:
     with pytest.raises(InputError, match=rf"goal 'grasp': .*{wrong}"):
         SubGoal(image(0), "grasp", **numbers)
+
+
+def test_the_pages_example_runs(tmp_path: Path) -> None:
+    examples = re.findall(r"```py\n(.*?)```", (ROOT / "docs/planning.md").read_text(), flags=re.DOTALL)
+    (example,) = (one for one in examples if "read_goals" in one)
+    write_goals(tmp_path, [SubGoal(image(100), "grasped", at_most=3), SubGoal(image(101))])
+    run = controller()
+    exec(  # noqa: S102 - our own page
+        example.replace("goals/pick", str(tmp_path)), {"controller": run, "grasped": image(100), "placed": image(101)}
+    )
+    assert decided(run, image(0)) == (0, 0, False, False)
+    assert decided(run, image(100)) == (1, 1, True, False), "by the share that the example gives"
 
 
 def test_a_gripper_mode_needs_a_gripper_and_something_to_plan() -> None:

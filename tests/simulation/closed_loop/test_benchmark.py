@@ -27,6 +27,7 @@ from vjepa2_ac.planning.session import load_to_plan
 from vjepa2_ac.serving.about import metadata_of
 from vjepa2_ac.serving.session import Session, SessionOptions
 from vjepa2_ac.simulation.closed_loop.benchmark import FILE, FILM, BenchmarkOptions, run_benchmark
+from vjepa2_ac.simulation.closed_loop.policies import Planning
 from vjepa2_ac.simulation.closed_loop.steering import JOINT_FIELDS, of_session
 from vjepa2_ac.simulation.closed_loop.video import _about_imagined, _imagined, film_frames
 
@@ -257,8 +258,9 @@ def test_goals_on_the_way_come_from_one_demonstration_of_the_same_problem(model:
 
 
 def test_a_problem_that_cannot_be_demonstrated_is_told_before_any_is_worked_on(
-    model: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    model: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(Planning, "reset", lambda *_: pytest.fail("a problem was begun"))
     given = ["simulate", model, "--task", "pick", "--episodes", "2", "--films", "0", "--sub-goals", "demonstration"]
     assert main([*given, "--out", str(tmp_path), *SMALL[:-1], "planning.limits.xyz=[0.05,0.05,0]"]) == 2
     error = capsys.readouterr().err
