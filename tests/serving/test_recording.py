@@ -130,4 +130,4 @@ def test_a_dry_run_records_what_would_have_been_done(tmp_path: Path) -> None:
     dry = Session(controller(), None, SessionOptions(dry_run=True))
     (line,) = recorded(tmp_path / "record", dry, [request(0, goal_image=image(100))])
     assert not np.any(line["answer"]["actions"])
-    assert line["answer"]["target"][0][:3] != STATE[:3].tolist()
+    assert line["answer"]["planned"][0][:3] != STATE[:3].tolist()

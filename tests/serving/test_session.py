@@ -166,7 +166,8 @@ def test_a_dry_run_plans_and_sends_zeros() -> None:
     dry = ask(session(SessionOptions(dry_run=True)), **request(0, goal_image=image(100)))
     assert dry["dry_run"] is True
     assert not dry["actions"].any()
-    assert dry["target"] == wet["target"]
+    assert dry["target"] == [STATE.tolist()]
+    assert dry["planned"] == wet["target"]
     poses = ask(session(SessionOptions("pose", dry_run=True)), **request(0, goal_image=image(100)))
     np.testing.assert_allclose(poses["actions"], np.tile(STATE, (4, 1)), atol=1e-12)
 

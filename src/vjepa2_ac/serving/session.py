@@ -178,9 +178,11 @@ class Session:
         """Return an answer. Its arrays have one row an action, and all else is plain: clients take rows of arrays."""
         sent = np.zeros_like(changes) if self.options.dry_run else changes
         actions = self._actions(state, sent)
+        states = None if why.startswith(_NOT_SENT) else decision.states
+        planned = _rows(state if states is None else states[1:])
         found: dict[str, Any] = {
             "actions": actions,
-            "target": _rows(state if decision.states is None or why.startswith(_NOT_SENT) else decision.states[1:]),
+            "target": _rows(state) if self.options.dry_run else planned,
             "why": why,
             "goal": {
                 "index": decision.goal,
@@ -195,7 +197,7 @@ class Session:
             },
             "notes": list(self._notes),
         }
-        return found | ({"dry_run": True} if self.options.dry_run else {})
+        return found | ({"dry_run": True, "planned": planned} if self.options.dry_run else {})
 
     def _nothing(self, state: np.ndarray, why: str, began: float, planning_began: float) -> dict[str, Any]:
         """Return the answer of no decision: nobody moves."""

@@ -1,0 +1,217 @@
+"""The example clients move stubs of the robots, which have the signatures of the real libraries."""
+# ruff: noqa: ARG002 - so have they
+
+import runpy
+import sys
+import types
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from paths import ROOT
+from served import controller, image
+from vjepa2_ac.config.planning import LimitsConfig
+from vjepa2_ac.planning.goals.sub_goals import SubGoal
+from vjepa2_ac.serving.session import Session, SessionOptions
+from vjepa2_ac.serving.wire import pack, unpack
+
+BOX = ((0.3, -0.2, 0.1), (0.6, 0.2, 0.5))
+HAND = np.block(
+    [[Rotation.from_euler("z", -45, degrees=True).as_matrix(), np.array([[0], [0], [0.1034]])], [0, 0, 0, 1]]
+)
+
+
+class Policy:
+    """openpi's WebsocketClientPolicy, without the socket; keeps what was answered."""
+
+    def __init__(self, **options: Any) -> None:
+        limits = LimitsConfig(workspace=BOX, xyz=(0.03, 0.03, 0.03), rotation=0.1, gripper_mode="free")
+        self.session = Session(
+            controller(limits=limits), {"cup": (SubGoal(image(50), "cup"),)}, SessionOptions("pose", **options)
+        )
+        self.answers: list[dict] = []
+
+    def infer(self, obs: dict) -> dict:
+        answer = self.session.answer(pack(obs))
+        if isinstance(answer, str):
+            raise RuntimeError(f"Error in inference server:\n{answer}")  # noqa: TRY004 - as theirs
+        self.answers.append(unpack(answer))
+        return self.answers[-1]
+
+
+class Gripper:
+    """franky's and libfranka's: `width`, `max_width`, `move`, `grasp`, `read_once`."""
+
+    max_width = 0.08
+
+    def __init__(self) -> None:
+        self.width, self.calls = 0.06, []
+
+    def read_once(self) -> "Gripper":
+        return self
+
+    def move(self, width: float, speed: float) -> bool:
+        self.calls.append("move")
+        self.width = width
+        return True
+
+    def grasp(
+        self, width: float, speed: float, force: float, epsilon_inner: float = 0.005, epsilon_outer: float = 0.005
+    ) -> bool:
+        assert epsilon_outer == 1.0, "whatever is there may be grasped"
+        self.calls.append("grasp")
+        self.width = 0.03
+        return True
+
+
+class Affine:
+    """franky's: from a matrix, or a translation and a quaternion (x, y, z, w)."""
+
+    def __init__(self, first: Any, quaternion: Any = None) -> None:
+        self.matrix = np.asarray(first, dtype=float)
+        if quaternion is not None:
+            self.matrix = np.eye(4)
+            self.matrix[:3, :3], self.matrix[:3, 3] = Rotation.from_quat(quaternion).as_matrix(), first
+
+    def __mul__(self, other: "Affine") -> "Affine":
+        return Affine(self.matrix @ other.matrix)
+
+    @property
+    def inverse(self) -> "Affine":
+        return Affine(np.linalg.inv(self.matrix))
+
+    @property
+    def translation(self) -> np.ndarray:
+        return self.matrix[:3, 3]
+
+    @property
+    def quaternion(self) -> np.ndarray:
+        return Rotation.from_matrix(self.matrix[:3, :3]).as_quat()
+
+
+class Franka:
+    """An arm that goes where it is told: franky's `Robot` and panda-py's `Panda` at once."""
+
+    def __init__(self) -> None:
+        self.flange, self.ways = np.eye(4), []
+        self.flange[:3, :3] = Rotation.from_euler("xyz", [3.1, 0, 0.1]).as_matrix()
+        self.flange[:3, 3] = 0.45, 0.0, 0.3
+
+    def _go(self, tool: np.ndarray) -> None:
+        self.flange = tool @ np.linalg.inv(HAND)
+        self.ways.append(self.flange[:3, 3].copy())
+
+    @property
+    def state(self) -> Any:
+        return types.SimpleNamespace(F_T_EE=Affine(HAND), O_T_EE=Affine(self.flange @ HAND))
+
+    def move(self, motion: Any, asynchronous: bool = False) -> None:
+        self._go(motion.target.matrix)
+
+    def get_state(self) -> Any:
+        return types.SimpleNamespace(F_T_EE=HAND.flatten(order="F").tolist())
+
+    def get_pose(self) -> np.ndarray:
+        return self.flange @ HAND
+
+    def move_to_pose(self, pose: np.ndarray, speed_factor: float = 0.2) -> bool:
+        self._go(pose)
+        return True
+
+
+class CartesianMotion:
+    def __init__(self, target: Affine) -> None:
+        self.target = target
+
+
+class RobotEnv:
+    """DROID's, as far as the client uses it."""
+
+    def __init__(self) -> None:
+        self.state, self.ways = np.array([0.45, 0.0, 0.3, 3.1, 0.0, 0.1, 0.25]), []
+
+    def get_observation(self) -> dict[str, Any]:
+        bgra = np.concatenate([camera()[..., ::-1], np.full((48, 60, 1), 255, dtype=np.uint8)], axis=-1)
+        pose = {"cartesian_position": self.state[:6].tolist(), "gripper_position": float(self.state[6])}
+        return {"robot_state": pose, "image": {"left": bgra}}
+
+    def update_robot(
+        self,
+        action: np.ndarray,
+        action_space: str = "cartesian_velocity",
+        gripper_action_space: str | None = None,
+        blocking: bool = False,
+    ) -> None:
+        assert (action_space, gripper_action_space, blocking) == ("cartesian_position", "position", True)
+        self.state = np.asarray(action)
+        self.ways.append(self.state[:3])
+
+
+def camera() -> np.ndarray:
+    return image(3)
+
+
+@pytest.fixture
+def _franky() -> Iterator[None]:
+    module = types.ModuleType("franky")
+    module.Affine, module.CartesianMotion = Affine, CartesianMotion
+    before = sys.modules.get("franky")
+    sys.modules["franky"] = module
+    yield
+    sys.modules.pop("franky") if before is None else sys.modules.update(franky=before)
+
+
+def drive(name: str) -> Callable[..., None]:
+    return runpy.run_path(str(ROOT / f"examples/serve/{name}_client.py"))["drive"]
+
+
+def driven(name: str, policy: Policy, goal: str = "cup", steps: int = 4) -> tuple[list[np.ndarray], Gripper]:
+    """Drive a stub; return where its flange went, and its gripper."""
+    gripper = Gripper()
+    if name == "droid":
+        env = RobotEnv()
+        drive(name)(env, policy, "left", goal, steps)
+        return env.ways, gripper
+    arm = Franka()
+    drive(name)(arm, gripper, policy, camera, goal, steps)
+    return arm.ways, gripper
+
+
+CLIENTS = ["franky", "panda_py", "droid"]
+
+
+@pytest.mark.usefixtures("_franky")
+@pytest.mark.parametrize("name", CLIENTS)
+def test_a_client_sends_what_is_measured_and_goes_where_it_is_told(name: str) -> None:
+    policy = Policy()
+    ways, gripper = driven(name, policy)
+    assert len(ways) == len(policy.answers) == 4
+    targets = np.array([answer["actions"][-1] for answer in policy.answers])
+    np.testing.assert_allclose(ways, targets[:, :3], atol=1e-7)
+    assert (abs(np.diff([[0.45, 0.0, 0.3], *ways], axis=0)) <= 0.03 + 1e-6).all()
+    assert [answer["goal"]["name"] for answer in policy.answers] == ["cup"] * 4
+    assert policy.session.counts.episodes == 1
+    moved = abs(np.diff([0.25, *targets[:, 6]])) > 0.05
+    assert name == "droid" or bool(gripper.calls) == bool(moved.any())
+
+
+@pytest.mark.usefixtures("_franky")
+@pytest.mark.parametrize("name", CLIENTS)
+def test_nobody_moves_after_an_error_or_in_a_dry_run(name: str) -> None:
+    policy = Policy()
+    with pytest.raises(RuntimeError, match="names no goal"):
+        driven(name, policy, goal="plate")
+    assert not policy.answers
+    ways, gripper = driven(name, Policy(dry_run=True))
+    np.testing.assert_allclose(ways, np.tile([0.45, 0.0, 0.3], (4, 1)), atol=1e-9)
+    assert not gripper.calls
+
+
+@pytest.mark.parametrize("name", CLIENTS)
+def test_a_loop_has_fifteen_lines_at_most(name: str) -> None:
+    text = (ROOT / f"examples/serve/{name}_client.py").read_text()
+    body = text.split("def drive(")[1].split("\ndef ")[0].splitlines()[1:]
+    assert len([line for line in body if line.strip() and not line.strip().startswith('"""')]) <= 15
