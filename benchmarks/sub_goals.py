@@ -1,4 +1,4 @@
-"""Which goals does a planner need to pick up a block? One model, the same problems, five ways to give it its goals.
+"""Which goals does a planner need to pick up a block? One model, the same problems, six ways to give it its goals.
 
     vjepa2-ac simulate record demo/pick-data --task pick --episodes 300 --seed 1
     vjepa2-ac train configs/pick.yaml
@@ -10,8 +10,9 @@ demonstration`). A way that is done stands in --folder as JSON and is not run ag
 
 *single goal*: the image of the end. *durations*: each key frame applies for as many model steps as in the
 demonstration. *slack*: for three more. *advance*: the next one follows when the energy has fallen below a share of its
-first value, at the earliest three steps sooner and at the latest three later. *gripper planned*: the planner opens and
-closes; else it is scripted: each key frame says what the gripper does.
+first value, at the earliest three steps sooner and at the latest three later. *every step*: each model step of the
+demonstration is a goal, for one step more than it took there (`--sub-goals every-step`). *gripper planned*: the planner
+opens and closes; else it is scripted: each goal says what the gripper does.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from vjepa2_ac.simulation.closed_loop.policies import GoalsOf, Policy
 from vjepa2_ac.simulation.closed_loop.result import ClosedLoopResult
 from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, run_task
 from vjepa2_ac.simulation.closed_loop.steering import Steering, of_session
-from vjepa2_ac.simulation.closed_loop.sub_goals import DemonstratedGoals, DemonstrationSpec
+from vjepa2_ac.simulation.closed_loop.sub_goals import DemonstratedGoals, DemonstrationSpec, every_step
 from vjepa2_ac.simulation.closed_loop.tasks import STEPS, TaskProblem, arm_for
 from vjepa2_ac.simulation.world.domains import named_domain
 from vjepa2_ac.storage import write_atomically
@@ -41,7 +42,8 @@ from vjepa2_ac.storage import write_atomically
 SLACK, SHARE = 3, 0.2  # model steps; UVD's share
 MORE = 6  # model steps that an episode may take beyond the task's default
 WAYS = (
-    "single goal", "durations, gripper planned", "durations", "slack", f"advance at {SHARE:.0%}", "oracle",
+    "single goal", "durations, gripper planned", "durations", "slack", f"advance at {SHARE:.0%}", "every step",
+    "oracle",
 )  # fmt: skip
 
 
@@ -93,6 +95,8 @@ def goals_of(way: str, steering: Steering, options: argparse.Namespace) -> Goals
     share = SHARE if way.startswith("advance") else None
     slack = 0 if way.startswith("durations") else SLACK
     spec = DemonstrationSpec(steering.limits, None, steering.stride, slack, share)
+    if way == "every step":
+        spec = every_step(spec)
     demonstrated = DemonstratedGoals(options.task, named_domain(options.domain), spec)
     return without_grippers(demonstrated) if way.endswith("planned") else demonstrated
 

@@ -64,9 +64,9 @@ def add_to(commands: Commands) -> None:
     argument(group, "--config CONFIG", "of a model: a config whose `planning` is used", as_local)
     text = (
         "goals on the way: demonstration takes them from the oracle's solution of the same problem, where the gripper"
-        " changes or the arm stops (none)"
+        " changes or the arm stops; every-step: each model step of it (none)"
     )
-    argument(group, "--sub-goals", text, choices=["none", "demonstration"])
+    argument(group, "--sub-goals", text, choices=["none", "demonstration", "every-step"])
     text = "a folder of goals on the way, that `vjepa2-ac goals` made: the same in every problem, of a fixed scene"
     argument(group, "--goals FOLDER", text, as_local)
     argument(group, "--films N", "episodes in the video; 0: none (6)", whole_number(0))

@@ -16,6 +16,7 @@ from vjepa2_ac.planning.goals.key_frames import (
     latent_key_frames,
     resting,
     resting_pairs,
+    with_frames_between,
 )
 
 
@@ -111,6 +112,21 @@ def test_every_so_many_frames_end_with_the_last(frames: int, step: int) -> None:
     assert found[-1] == frames - 1
     assert (gaps[:-1] == step).all()
     assert step / 2 <= gaps[-1] < 1.5 * step or len(found) == 1
+
+
+@given(st.lists(st.integers(1, 9), min_size=1, max_size=5), st.integers(1, 6))
+def test_frames_between_keep_the_key_frames_and_are_so_far_apart(gaps: list[int], step: int) -> None:
+    keys = [KeyFrame(int(frame), f"key {frame}") for frame in np.cumsum(gaps)]
+    found = with_frames_between(keys, step)
+    assert [key for key in found if key.name != "on the way"] == keys
+    ways = np.diff([0, *(key.frame for key in found)])
+    assert (ways >= 1).all()
+    assert (ways < 1.5 * step).all() if step > 1 else (ways == 1).all()
+
+
+def test_frames_between_are_one_apart_at_least() -> None:
+    with pytest.raises(ValueError, match="every 0 frames"):
+        with_frames_between([KeyFrame(3, "end")], 0)
 
 
 def embedded(*corners: float, frames: int = 20) -> np.ndarray:

@@ -245,16 +245,16 @@ def test_a_task_with_a_block_has_its_own_number_of_steps(model: str, tmp_path: P
 def test_goals_on_the_way_come_from_one_demonstration_of_the_same_problem(model: str, tmp_path: Path) -> None:
     given = ["simulate", model, "--task", "reach", "--episodes", "2", "--films", "0", *SMALL]
     found = {}
-    for name, more in (("single", []), ("demonstrated", ["--sub-goals", "demonstration"])):
+    ways_to_give = {name: ["--sub-goals", name] for name in ("demonstration", "every-step")}
+    for name, more in {"single": [], **ways_to_give}.items():
         assert main([*given, *more, "--out", str(tmp_path / name)]) == 0
         found[name] = metrics(tmp_path / name)
-    assert found["demonstrated"]["about"]["sub_goals"] == "demonstration"
-    assert found["single"]["about"]["sub_goals"] == "none"
+    assert [one["about"]["sub_goals"] for one in found.values()] == ["none", *ways_to_give]
     ways = [one["policies"]["tiny"]["by_episode"]["distance_cm"] for one in found.values()]
-    assert ways[0] != ways[1]
+    assert ways[0] != ways[1] != ways[2] != ways[0]
     for name in ("do nothing", "oracle"):
-        one, other = (run["policies"][name]["by_episode"]["distance_cm"] for run in found.values())
-        assert one == other, "only the model has goals on the way"
+        one, *others = (run["policies"][name]["by_episode"]["distance_cm"] for run in found.values())
+        assert others == [one, one], "only the model has goals on the way"
 
 
 def test_a_problem_that_cannot_be_demonstrated_is_told_before_any_is_worked_on(

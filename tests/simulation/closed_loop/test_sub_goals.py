@@ -17,6 +17,7 @@ from vjepa2_ac.simulation.closed_loop.sub_goals import (
     DemonstratedGoals,
     DemonstrationSpec,
     demonstrate,
+    every_step,
     goals_of_demonstration,
 )
 from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, HOLDING, arm_for, make_problem
@@ -60,6 +61,20 @@ def test_the_gripper_of_who_demonstrates_is_free_whatever_the_planner_may_do() -
     assert [goal.at_most for goal in goals_of_demonstration(problem, arm, held)] == [3, 1, None]
     with pytest.raises(InputError, match=r"problem 0 \(pick\): the oracle ends .* after 3 model steps"):
         demonstrate(problem, arm, DemonstrationSpec(steps=3))
+
+
+def test_every_step_of_a_demonstration_is_a_goal_up_to_where_it_rests() -> None:
+    arm, problem = arm_for("pick", DOMAIN_A, size=SMALL), make_problem("pick", DOMAIN_A, 4, 0)
+    key_goals, goals = (goals_of_demonstration(problem, arm, one) for one in (None, every_step(DemonstrationSpec())))
+    shown = demonstrate(problem, arm, DemonstrationSpec())
+    for goal, frame in zip(goals, shown.frames[1:], strict=False):
+        np.testing.assert_array_equal(goal.image, frame)
+    np.testing.assert_array_equal(goals[-1].image, key_goals[-1].image)
+    assert [goal.name for goal in goals if goal.name != "on the way"] == [goal.name for goal in key_goals]
+    assert [goal.gripper for goal in goals].count("close") == 1
+    assert [goal.at_most for goal in goals] == [*[2] * (len(goals) - 1), None]
+    hand = np.linalg.norm(np.diff(shown.states[: len(goals) + 1, :3], axis=0), axis=1)
+    assert hand.max() < 0.08, "each goal is within a step of the one before"
 
 
 def test_an_arm_that_is_steered_is_not_moved_by_the_demonstration() -> None:

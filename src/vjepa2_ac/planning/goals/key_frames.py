@@ -5,8 +5,9 @@ A frame is a recorded moment: a control step of an episode, a frame of a film, o
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -138,6 +139,28 @@ def _are_below(
 ) -> Bool[np.ndarray, " pairs"]:
     moved, turned = (np.linalg.norm(changes[:, part], axis=1) for part in (slice(0, 3), slice(3, 6)))
     return np.asarray((moved < metres) & (turned < radians) & (np.abs(changes[:, GRIPPER]) < closedness))
+
+
+def with_frames_between(keys: Sequence[KeyFrame], step: int) -> tuple[KeyFrame, ...]:
+    """Return key frames, and on the way to each of them every `step`-th frame from the one before, or from the start.
+
+    A planner that sees one step ahead goes straight for a distant goal, with every axis at its limit. Near goals show
+    it the way. A frame less than half a step before a key frame is left out.
+
+    Args:
+        keys: In order.
+        step: Frames from one goal to the next.
+
+    Raises:
+        ValueError: A step below 1.
+    """
+    if step < 1:
+        raise ValueError(f"every {step} frames")
+    found: list[KeyFrame] = []
+    for before, key in itertools.pairwise((KeyFrame(0, "start"), *keys)):
+        ways = [one for one in range(before.frame + step, key.frame, step) if 2 * (key.frame - one) >= step]
+        found += [*(KeyFrame(one, "on the way") for one in ways), key]
+    return tuple(found)
 
 
 def every_key_frame(frames: int, step: int) -> tuple[KeyFrame, ...]:

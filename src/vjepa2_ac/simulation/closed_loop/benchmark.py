@@ -22,7 +22,7 @@ from vjepa2_ac.simulation.closed_loop.policies import DoNothing, GoalsOf, Policy
 from vjepa2_ac.simulation.closed_loop.result import ClosedLoopResult
 from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, run_task
 from vjepa2_ac.simulation.closed_loop.steering import Steering
-from vjepa2_ac.simulation.closed_loop.sub_goals import DemonstratedGoals, DemonstrationSpec
+from vjepa2_ac.simulation.closed_loop.sub_goals import DemonstratedGoals, DemonstrationSpec, every_step
 from vjepa2_ac.simulation.closed_loop.tasks import ALSO, STEPS, SUCCESS_M, TaskName, TaskProblem, arm_for, make_problem
 from vjepa2_ac.simulation.closed_loop.video import write_film
 from vjepa2_ac.simulation.world.arm import Renderer, SimulatedArm
@@ -32,7 +32,7 @@ from vjepa2_ac.storage import user_can_write, write_atomically
 from vjepa2_ac.storage.structured import utc_now
 
 FILE, FILM = "closed_loop.json", "closed_loop.mp4"
-SubGoalsFrom = Literal["none", "demonstration"]
+SubGoalsFrom = Literal["none", "demonstration", "every-step"]
 FORMAT = 1  # incremented when a reader of the file would have to change
 
 
@@ -47,7 +47,7 @@ class BenchmarkOptions:
     seed: int = 0  # of the problems
     films: int = 6  # episodes in the video; 0: no video
     renderer: Renderer = "rays"
-    sub_goals: SubGoalsFrom = "none"  # demonstration: key frames of the oracle's solution of the same problem
+    sub_goals: SubGoalsFrom = "none"  # demonstration: key frames of the oracle's solution; every-step: all of it
     goals: str | None = None  # a folder of goals, the same in every problem
 
     @property
@@ -152,6 +152,8 @@ def _goals_of(steering: Steering, options: BenchmarkOptions) -> GoalsOf | None:
         return None
     steps = max(options.steps or 0, STEPS[options.task])
     spec = DemonstrationSpec(steering.limits, steps, steering.stride)
+    if options.sub_goals == "every-step":
+        spec = every_step(spec)
     goals_of = DemonstratedGoals(options.task, named_domain(options.domain), spec, renderer=options.renderer)
     goals_of.require(options.problems)
     return goals_of

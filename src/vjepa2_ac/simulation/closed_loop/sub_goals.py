@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt8
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.goals.from_demonstration import Timing, sub_goals_of
-from vjepa2_ac.planning.goals.key_frames import OF_MODEL_STEPS, gripper_key_frames
+from vjepa2_ac.planning.goals.key_frames import OF_MODEL_STEPS, gripper_key_frames, with_frames_between
 from vjepa2_ac.planning.goals.sub_goals import SubGoal
 from vjepa2_ac.simulation.closed_loop.oracles import oracle_for
 from vjepa2_ac.simulation.closed_loop.rollout import run_episode
@@ -31,6 +31,7 @@ class DemonstrationSpec:
     stride: int = 4  # control steps of a model step
     slack: int = 3  # model steps that a goal may take fewer or more than it took here
     share: float | None = None  # of each goal but the last; None: by count only
+    every: int | None = None  # model steps between goals on the way to a key frame; None: only key frames are goals
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +40,11 @@ class Demonstration:
 
     frames: UInt8[np.ndarray, "time height width 3"]
     states: Float[np.ndarray, "time 7"]
+
+
+def every_step(spec: DemonstrationSpec) -> DemonstrationSpec:
+    """Return a spec with a goal for each model step of the demonstration, each for one step more than it took there."""
+    return replace(spec, every=1, slack=1)
 
 
 class DemonstratedGoals:
@@ -109,6 +115,8 @@ def goals_of_demonstration(
 ) -> tuple[SubGoal, ...]:
     """Return the key frames of one demonstration of a problem: where the gripper changes, the arm stops, and the end.
 
+    With `every` in the spec, also frames on the way to them.
+
     Args:
         problem: The problem.
         arm: As of `demonstrate`: never the one that is about to be steered.
@@ -120,5 +128,7 @@ def goals_of_demonstration(
     spec = spec or DemonstrationSpec()
     shown = demonstrate(problem, arm, spec)
     keys = gripper_key_frames(shown.states, OF_MODEL_STEPS)
+    if spec.every is not None:
+        keys = with_frames_between(keys, spec.every)
     images: Sequence[np.ndarray] = [shown.frames[key.frame] for key in keys]
     return sub_goals_of(images, keys, Timing(1, spec.slack, spec.share), shown.states)
