@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from vjepa2_ac import places
-from vjepa2_ac.cli.options import as_local, as_model, as_path, as_subject
+from vjepa2_ac.cli.options import as_local, as_model, as_path, as_planner, as_subject
 from vjepa2_ac.cli.program import _parser, main
 from vjepa2_ac.config import DiskCacheConfig
 from vjepa2_ac.config.diagnostics import all_keys
@@ -114,8 +114,16 @@ def test_every_path_on_the_command_line_is_read_alike() -> None:
         is_path = words & set(str(action.metavar).replace("|", " ").split())
         if is_path and action.dest != "overrides":
             found += 1
-            assert action.type in {as_path, as_local, as_model, as_subject}, f"{command}: {action.dest}"
+            assert action.type in {as_path, as_local, as_model, as_planner, as_subject}, f"{command}: {action.dest}"
     assert found > 20
+
+
+def test_what_plans_is_a_model_or_the_address_of_a_server(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", "/home/of/mine")
+    assert as_planner("ws://127.0.0.1:8000") == "ws://127.0.0.1:8000"
+    assert as_planner("~/run") == as_model("~/run") == "/home/of/mine/run"
+    with pytest.raises(argparse.ArgumentTypeError):
+        as_planner("http://127.0.0.1:8000")
 
 
 def test_an_option_knows_the_users_home_and_refuses_urls(monkeypatch: pytest.MonkeyPatch, capsys) -> None:

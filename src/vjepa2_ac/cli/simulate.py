@@ -16,11 +16,12 @@ from vjepa2_ac.cli.options import (
     add_decoder,
     argument,
     as_local,
-    as_model,
     as_path,
+    as_planner,
     command,
     count,
     given_decoder,
+    is_server,
     load_planning_session,
     record_of_options,
     require_to_plan,
@@ -47,7 +48,7 @@ def add_to(commands: Commands) -> None:
         "who steers: the folder of a run, or what model.base takes, such as builtin:sim-tiny; or a server of one, as"
         " ws://127.0.0.1:8000; or: record"
     )
-    argument(parser, "subject RUN_OR_MODEL|ws://SERVER|record", text, _as_steerer)
+    argument(parser, "subject RUN_OR_MODEL|ws://SERVER|record", text, as_planner)
     text = "how it plans, such as planning.samples=64; record: where the data set goes"
     argument(parser, "overrides key=value|FOLDER", text, nargs="*")
     text = "A or B; record: or random, another world in every episode (A)"
@@ -136,7 +137,7 @@ def _run_benchmark(options: argparse.Namespace) -> int:
     if options.goals is not None and options.sub_goals is not None:
         found = f"--sub-goals {options.sub_goals}, too"
         raise InputError(where=f"--goals {options.goals}", found=found, needed="one of the two")
-    if not _is_server(options.subject):
+    if not is_server(options.subject):
         _refuse(options, ("key_file",), needed="a server: ws://HOST:PORT")
         options.checkpoint = options.checkpoint or "selected"
         require_to_plan(options)
@@ -175,21 +176,13 @@ def _steering(options: argparse.Namespace) -> Iterator[Steering]:
     from vjepa2_ac.serving.client import PlanningClient
     from vjepa2_ac.simulation.closed_loop.steering import of_server, of_session
 
-    if not _is_server(options.subject):
+    if not is_server(options.subject):
         decoder = given_decoder(options)
         yield of_session(load_planning_session(options), decoder)
         return
     key = None if options.key_file is None else read_key(options.key_file)
     with PlanningClient(options.subject, key) as client:
         yield of_server(client)
-
-
-def _is_server(subject: str) -> bool:
-    return subject.startswith(("ws://", "wss://"))
-
-
-def _as_steerer(text: str) -> str:
-    return text if _is_server(text) else as_model(text)
 
 
 def _refuse(options: argparse.Namespace, names: Sequence[str], *, needed: str) -> None:

@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -56,6 +56,14 @@ class Steering:
         return self.planning.limits
 
 
+class Client(Protocol):
+    """A client that is connected to a server: ours, or openpi's."""
+
+    def infer(self, request: dict[str, Any], /) -> dict[str, Any]:
+        """Return the answer to a request."""
+        ...
+
+
 class ServedPlanner:
     """A planner behind a server: images and measured states go through its socket.
 
@@ -67,7 +75,7 @@ class ServedPlanner:
 
     moves = Moves.FLANGE
 
-    def __init__(self, client: PlanningClient, name: str, goals_of: GoalsOf | None = None) -> None:
+    def __init__(self, client: Client, name: str, goals_of: GoalsOf | None = None) -> None:
         self.client, self.name, self.why, self._goals_of = client, name, "", goals_of
         self._goal: dict[str, Any] = {}
 
