@@ -4,7 +4,7 @@
     pip install --no-deps openpi-client==0.1.2 && pip install typing_extensions  # in an environment with vjepa2-ac[sim]
     python examples/serve/simulated_arm_client.py ws://127.0.0.1:8000 served.gif
 
-The goals on the way are key frames of one demonstration of the same problem. For tables use `vjepa2-ac simulate ws://…`.
+Each model step of one demonstration of the same problem is a goal on the way. For tables use `vjepa2-ac simulate ws://…`.
 """
 
 import sys
@@ -14,14 +14,15 @@ from openpi_client.websocket_client_policy import WebsocketClientPolicy
 from vjepa2_ac.media.gif_writer import write_gif
 from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, run_task
 from vjepa2_ac.simulation.closed_loop.steering import ServedPlanner
-from vjepa2_ac.simulation.closed_loop.sub_goals import DemonstratedGoals
+from vjepa2_ac.simulation.closed_loop.sub_goals import DemonstratedGoals, DemonstrationSpec, every_step
 from vjepa2_ac.simulation.closed_loop.video import film_frames
 from vjepa2_ac.simulation.world.domains import named_domain
 
 
 def main(url: str, film: str, episodes: str = "4", seed: str = "3") -> None:
     """Let the server solve some problems, and draw what the camera saw."""
-    policy = ServedPlanner(WebsocketClientPolicy(url), "openpi-client", DemonstratedGoals("pick", named_domain("A")))
+    shown = DemonstratedGoals("pick", named_domain("A"), every_step(DemonstrationSpec()))
+    policy = ServedPlanner(WebsocketClientPolicy(url), "openpi-client", shown)
     count = int(episodes)
     result = run_task(RolloutSpec("pick", "A", count, int(seed), steps=18, keep_frames=count), policy)
     for number, episode in enumerate(result.episodes, start=1):

@@ -33,8 +33,11 @@ class Policy:
             controller(limits=limits), {"cup": (SubGoal(image(50), "cup"),)}, SessionOptions("pose", **options)
         )
         self.answers: list[dict] = []
+        self.lasts = 100  # answers until the connection is lost
 
     def infer(self, obs: dict) -> dict:
+        if len(self.answers) == self.lasts:
+            raise RuntimeError("lost")
         answer = self.session.answer(pack(obs))
         if isinstance(answer, str):
             raise RuntimeError(f"Error in inference server:\n{answer}")  # noqa: TRY004 - as theirs
@@ -168,14 +171,18 @@ def drive(name: str) -> Callable[..., None]:
     return runpy.run_path(str(ROOT / f"examples/serve/{name}_client.py"))["drive"]
 
 
-def driven(name: str, policy: Policy, goal: str = "cup", steps: int = 4) -> tuple[list[np.ndarray], Gripper]:
+def driven(
+    name: str, policy: Policy, goal: str = "cup", steps: int = 4, ways: list | None = None
+) -> tuple[list[np.ndarray], Gripper]:
     """Drive a stub; return where its flange went, and its gripper."""
-    gripper = Gripper()
+    gripper, ways = Gripper(), [] if ways is None else ways
     if name == "droid":
         env = RobotEnv()
+        ways.append(env.ways)
         drive(name)(env, policy, "left", goal, steps)
         return env.ways, gripper
     arm = Franka()
+    ways.append(arm.ways)
     drive(name)(arm, gripper, policy, camera, goal, steps)
     return arm.ways, gripper
 
@@ -205,6 +212,15 @@ def test_nobody_moves_after_an_error_or_in_a_dry_run(name: str) -> None:
     with pytest.raises(RuntimeError, match="names no goal"):
         driven(name, policy, goal="plate")
     assert not policy.answers
+    lost = Policy()
+    infer, lost.infer = (
+        lost.infer,
+        lambda obs: (_ for _ in ()).throw(RuntimeError("lost")) if lost.answers else infer(obs),
+    )
+    arms: list[list] = []
+    with pytest.raises(RuntimeError, match="lost"):
+        driven(name, lost, ways=arms)
+    assert len(arms[0]) == 1, "one step, and none after the error"
     ways, gripper = driven(name, Policy(dry_run=True))
     np.testing.assert_allclose(ways, np.tile([0.45, 0.0, 0.3], (4, 1)), atol=1e-9)
     assert not gripper.calls
