@@ -15,15 +15,7 @@ from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.planning.goals.sub_goals import SubGoal
 from vjepa2_ac.serving.session import Session, SessionOptions
 
-PACKAGES = [
-    "franky-control==2.0.0",
-    "franky-sim==1.0.4",
-    "typing_extensions",
-    "scipy",
-    "msgpack",
-    "websockets",
-    "dm-tree",
-]
+ARM = ["franky-control==2.0.0", "franky-sim==1.0.4", "scipy"]
 BESIDE = ["typing_extensions", "msgpack", "websockets", "dm-tree"]
 CLIENT = ["--no-deps", "openpi-client==0.1.2"]  # it asks for numpy<2, with which franky-sim does not work
 BOX = ((0.2, -0.3, 0.1), (0.8, 0.3, 0.9))
