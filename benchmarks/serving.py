@@ -34,12 +34,11 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="file for the figures")
     options = parser.parse_args()
     command = [sys.executable, "-m", "vjepa2_ac.cli", "serve", "builtin:sim-tiny", "--port", "0", *SETTINGS]
-    server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)  # noqa: S603 - our own command
-    try:
-        cost, whole = measure(address_of(server), options.decisions, tuple(options.size))
-    finally:
-        server.terminate()
-        server.wait(timeout=20)
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:  # noqa: S603 - our own command
+        try:
+            cost, whole = measure(address_of(server), options.decisions, tuple(options.size))
+        finally:
+            server.terminate()
     rows = Rows(options.json, size=list(options.size), decisions=options.decisions)
     row = {f"cost_ms_p{p}": round(float(np.percentile(cost, p)), 2) for p in (50, 95, 99)}
     row["round_trip_ms_p50"] = round(float(np.percentile(whole, 50)), 2)
