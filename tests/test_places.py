@@ -114,7 +114,9 @@ def test_every_path_on_the_command_line_is_read_alike() -> None:
         is_path = words & set(str(action.metavar).replace("|", " ").split())
         if is_path and action.dest != "overrides":
             found += 1
-            assert action.type in {as_path, as_local, as_model, as_planner, as_subject}, f"{command}: {action.dest}"
+            assert action.type in {as_path, as_local, as_model, as_place, as_planner, as_subject}, (
+                f"{command}: {action.dest}"
+            )
     assert found > 20
 
 
