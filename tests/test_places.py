@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from vjepa2_ac import places
-from vjepa2_ac.cli.options import as_local, as_model, as_path, as_planner, as_subject
+from vjepa2_ac.cli.options import as_local, as_model, as_path, as_place, as_planner, as_subject
 from vjepa2_ac.cli.program import _parser, main
 from vjepa2_ac.config import DiskCacheConfig
 from vjepa2_ac.config.diagnostics import all_keys
