@@ -1,10 +1,10 @@
-# make demo · make evidence · make trap · make encoders · make test · make test-oldest · make lint · make soak · make bench · make base: each creates the environment it needs.
+# make demo · make evidence · make trap · make encoders · make test · make test-oldest · make lint · make docs · make soak · make bench · make base: each creates the environment it needs.
 PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/installed
 OLDEST := .venv-oldest
 
-.PHONY: demo demo-seeds base evidence trap encoders test test-oldest soak lint format bench clean
+.PHONY: demo demo-seeds base evidence trap encoders test test-oldest docs soak lint format bench clean
 
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed; set PYTHON=...")'
@@ -51,6 +51,10 @@ $(OLDEST)/installed: pyproject.toml constraints.txt
 test-oldest: $(OLDEST)/installed  ## model, runs, training and planning on the oldest PyTorch and transformers allowed
 	$(OLDEST)/bin/pytest -q -n logical --maxprocesses 8 --dist loadfile \
 		tests/model tests/distributed tests/runs tests/encoding tests/planning tests/training tests/export
+
+docs: $(INSTALLED)  ## the site, into build/site: offline, searchable; a link that leads nowhere is an error
+	$(BIN)/sphinx-build -q -W --keep-going -b html docs build/site
+	@echo "build/site/index.html"
 
 soak: $(INSTALLED)  ## runs that are killed 20 times each (0 and 2 loader workers, with and without a best checkpoint)
 	VJEPA2_AC_SOAK=20 $(BIN)/pytest -q --log-cli-level=INFO tests/training/test_soak.py

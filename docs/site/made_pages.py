@@ -1,0 +1,202 @@
+"""The pages that are made of the code: commands, config keys, the public names, configs and results."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import shutil
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import vjepa2_ac
+from site_links import ROOT, on_site
+from vjepa2_ac.cli.program import _parser
+from vjepa2_ac.config.loading import config_schema
+from vjepa2_ac.config.packaged import config_path, packaged_configs
+
+_COLUMNS = "88"  # of a help text
+_BOUNDS = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
+
+
+def write_pages(folder: Path) -> None:
+    """Write all pages that are made, in place of those that are there; files that stay the same are not touched."""
+    pages = {
+        "commands.md": commands_page(),
+        "config_keys.md": keys_page(),
+        "api.md": api_page(),
+        "configs.md": configs_page(),
+        "examples.md": examples_page(),
+        **dict(results_pages()),
+        "readme.txt": on_site((ROOT / "README.md").read_text(encoding="utf-8"), "README.md", "index.md"),
+        **{f"{name.lower()}.md": _of_the_root(f"{name}.md") for name in ("CHANGELOG", "CONTRIBUTING", "SECURITY")},
+    }
+    folder.mkdir(exist_ok=True)
+    for old in folder.rglob("*.md"):
+        if str(old.relative_to(folder)) not in pages:
+            old.unlink()  # of an earlier build
+    for name, text in pages.items():
+        path = folder / name
+        path.parent.mkdir(exist_ok=True)
+        if not path.exists() or path.read_text(encoding="utf-8") != text:
+            path.write_text(text, encoding="utf-8")
+    for image in (ROOT / "benchmarks/results").glob("*.png"):
+        shutil.copyfile(image, folder / "results" / image.name)
+
+
+def commands_page() -> str:
+    """Return a section for each command, with what `--help` prints."""
+    os.environ["COLUMNS"] = _COLUMNS
+    lines = ["# Commands", "", "As `vjepa2-ac COMMAND --help` prints them.", ""]
+    for words, parser in _leaves(_parser(), ()):
+        lines += [f"## {' '.join(words)}", "", "```text", parser.format_help().strip(), "```", ""]
+    return "\n".join(lines)
+
+
+def keys_page() -> str:
+    """Return a table for each section of a config: key, type and range, default, and what it does."""
+    schema = config_schema()
+    kinds = schema["properties"]["data"].get("oneOf", [])
+    lines = [
+        "# Config keys", "",
+        "Every key with its type, range and default, from the schema (`vjepa2-ac config schema`).", "",
+    ]  # fmt: skip
+    lines += _section("", schema, schema, depth=2)
+    for kind in kinds:
+        lines += _own_sections(_resolved(kind, schema), schema)
+    return "\n".join(lines)
+
+
+def api_page() -> str:
+    """Return the public names, each described by its docstring."""
+    lines = ["# Public names", "", "`from vjepa2_ac import …`; [shapes and units](../python.md).", ""]
+    for name in vjepa2_ac.__all__:
+        kind = "autoclass" if name[0].isupper() else "autofunction"
+        members = ["   :members:"] if name == "Controller" else []
+        lines += [f"## {name}", "", "```{eval-rst}", f".. {kind}:: vjepa2_ac.{name}", *members, "```", ""]
+    return "\n".join(lines)
+
+
+def configs_page() -> str:
+    """Return the configs that come with the package, whole."""
+    lines = [
+        "# Configs of the package",
+        "",
+        "`vjepa2-ac config text builtin:NAME > my.yaml` begins one of your own.",
+        "",
+    ]
+    for name, about in packaged_configs().items():
+        text = config_path(f"builtin:{name}").read_text(encoding="utf-8")
+        lines += [f"## {name}", "", f"{about}.", "", "```yaml", text.strip(), "```", ""]
+    return "\n".join(lines)
+
+
+def examples_page() -> str:
+    """Return the scripts in `examples/`, whole."""
+    lines = ["# Examples", "", "They run on a fresh clone, without a download, unless they say otherwise.", ""]
+    for path in sorted((ROOT / "examples").rglob("*.py")):
+        name = path.relative_to(ROOT)
+        lines += [f"## {name}", "", "```python", path.read_text(encoding="utf-8").strip(), "```", ""]
+    return "\n".join(lines)
+
+
+def results_pages() -> Iterator[tuple[str, str]]:
+    """Yield the pages of measured results, and one that lists them."""
+    names = []
+    for path in sorted((ROOT / "benchmarks/results").glob("*.md")):
+        text = path.read_text(encoding="utf-8")
+        names.append(path.stem)
+        heading = "" if text.startswith("# ") else f"# {path.stem.replace('_', ' ').capitalize()}\n\n"
+        yield (
+            f"results/{path.name}",
+            heading + on_site(text, f"benchmarks/results/{path.name}", f"made/results/{path.name}"),
+        )
+    entries = "\n".join(f"results/{name}" for name in names)
+    text = "Tables that commands of the repository write; the log says with which one, and when."
+    yield "results.md", f"# Results\n\n{text}\n\n```{{toctree}}\n{entries}\n```\n"
+
+
+def _of_the_root(name: str) -> str:
+    """Return a page that is a file of the repository's root."""
+    return on_site((ROOT / name).read_text(encoding="utf-8"), name, f"made/{name.lower()}")
+
+
+def _leaves(
+    parser: argparse.ArgumentParser, words: tuple[str, ...]
+) -> Iterator[tuple[tuple[str, ...], argparse.ArgumentParser]]:
+    inner = [one for one in parser._actions if isinstance(one, argparse._SubParsersAction)]
+    if not inner:
+        yield words, parser
+    for one in inner:
+        for name, below in one.choices.items():
+            yield from _leaves(below, (*words, name))
+
+
+def _resolved(one: Mapping[str, Any], schema: Mapping[str, Any]) -> Mapping[str, Any]:
+    name = one.get("$ref", "").rpartition("/")[2]
+    return schema["$defs"][name] if name else one
+
+
+def _section(prefix: str, section: Mapping[str, Any], schema: Mapping[str, Any], *, depth: int) -> list[str]:
+    """Return the table of a section, then those of the sections within."""
+    rows, inner = [], []
+    for name, one in section.get("properties", {}).items():
+        found = _section_of(one, schema)
+        if found is None:
+            rows.append(f"| `{prefix}{name}` | {_kind(one, schema)} | {_default(one)} | {_about(one)} |")
+        else:
+            inner.append((f"{prefix}{name}", found, _about(one)))
+    lines = []
+    if rows:
+        lines += ["| key | values | default | |", "|---|---|---|---|", *rows, ""]
+    for key, found, about in inner:
+        lines += [f"{'#' * min(depth, 4)} {key}", "", about, "", *_section(f"{key}.", found, schema, depth=depth + 1)]
+    return lines
+
+
+def _section_of(one: Mapping[str, Any], schema: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """Return the section that a key holds, None for a value; of several forms of data the first one."""
+    for option in [one, *one.get("anyOf", []), *one.get("allOf", []), *one.get("oneOf", [])]:
+        found = _resolved(option, schema)
+        if "properties" in found:
+            return found
+    return None
+
+
+def _own_sections(kind: Mapping[str, Any], schema: Mapping[str, Any]) -> list[str]:
+    """Return the sections that one form of data has and the first has not."""
+    source = kind["properties"]["source"].get("const") or kind["properties"]["source"].get("default")
+    first = _resolved(schema["properties"]["data"]["oneOf"][0], schema)["properties"]
+    lines = []
+    for name, one in kind["properties"].items():
+        if name not in first and (found := _section_of(one, schema)):
+            lines += [f"## data.{name} (source: {source})", "", *_section(f"data.{name}.", found, schema, depth=3)]
+    return lines
+
+
+def _kind(one: Mapping[str, Any], schema: Mapping[str, Any]) -> str:
+    one = _resolved(one, schema)
+    if "enum" in one:
+        return ", ".join(f"`{value}`" for value in one["enum"])
+    if "const" in one:
+        return f"`{one['const']}`"
+    if options := one.get("anyOf"):
+        return " or ".join(dict.fromkeys(_kind(option, schema) for option in options))
+    bounds = "".join(f" {sign} {one[name]:,}" for name, sign in _BOUNDS.items() if name in one)
+    if one.get("type") == "array":
+        parts = one.get("prefixItems") or [one.get("items", {})]
+        return f"list of {', '.join(dict.fromkeys(_kind(part, schema) for part in parts))}"
+    return {"null": "null", "object": "mapping"}.get(one.get("type", ""), one.get("type", "any")) + bounds
+
+
+def _default(one: Mapping[str, Any]) -> str:
+    if "default" not in one:
+        return ""
+    text = json.dumps(one["default"])
+    return f"`{text if len(text) < 80 else text[:76] + ' …'}`"
+
+
+def _about(one: Mapping[str, Any]) -> str:
+    return re.sub(r"\s+", " ", one.get("description", "")).replace("|", "\\|")

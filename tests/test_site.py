@@ -1,0 +1,70 @@
+"""The site: built strictly, complete, searchable without a network, and its links lead to its pages."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from browser import open_page
+from made_pages import commands_page, keys_page
+from paths import ROOT
+from site_links import on_site
+from vjepa2_ac.config.diagnostics import all_keys
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Build as `make docs` does: a warning, such as a link that leads nowhere, is an error."""
+    pytest.importorskip("sphinx", reason="sphinx is not installed: the site is not built")
+    folder = tmp_path_factory.mktemp("site")
+    words = ["-q", "-W", "--keep-going", "-b", "html", "-d", folder / "doctrees", ROOT / "docs", folder / "html"]
+    done = subprocess.run([sys.executable, "-m", "sphinx", *words], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return folder / "html"
+
+
+def test_the_pages_ask_nobody_for_anything_and_search_works_from_a_file(site: Path, tmp_path: Path) -> None:
+    page = tmp_path / "search.html"
+    page.write_text(f'<meta http-equiv="refresh" content="0; url={(site / "search.html").as_uri()}?q=warmup">')
+    seen = open_page(page, tmp_path)
+    assert seen.requests == ()
+    assert "pages matching the search query" in seen.dom
+    assert (site / "made/api.html").read_text().count('<dt class="sig') > 11
+
+
+def test_every_command_is_on_its_page_as_help_prints_it() -> None:
+    page = commands_page()
+    for words in ("train", "init", "demo", "data check", "data calibrate", "simulate", "serve", "config"):
+        assert f"## {words}\n\n```text\nusage: vjepa2-ac {words} [-h]" in page, words
+
+
+def test_every_key_is_on_its_page_with_its_range() -> None:
+    page = keys_page()
+    sections = {key.rpartition(".")[0] for key in all_keys()}
+    missing = [key for key in all_keys() if key not in sections and f"| `{key}` |" not in page]
+    assert not missing
+    assert "| `training.learning_rate` | number > 0.0 ≤ 1.0 | `0.0001` | Peak learning rate. |" in page
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("[a](docs/data.md)", "[a](data.md)"),
+        ("[a](docs/data.md#clips)", "[a](data.md#clips)"),
+        ("![a](docs/demo.png)", "![a](demo.png)"),
+        ("[a](SECURITY.md)", "[a](made/security.md)"),
+        ("[a](configs/own_robot.yaml)", "[a](made/configs.md#own-robot)"),
+        ("[a](benchmarks/results/evidence.md)", "[a](made/results/evidence.md)"),
+        ("[a](https://x.org/y) and [b](#here)", "[a](https://x.org/y) and [b](#here)"),
+        ("the [b](NOTICE) file", "the b file"),
+        ("[a](nothing/there.md)", "[a](nothing/there.md)"),  # the build complains
+    ],
+)
+def test_links_lead_to_pages(text: str, expected: str) -> None:
+    assert on_site(text, "README.md", "index.md") == expected
+
+
+def test_links_of_pages_further_down() -> None:
+    assert on_site("[a](../README.md)", "docs/data.md", "data.md") == "[a](index.md)"
+    assert on_site("[a](docs/data.md)", "CONTRIBUTING.md", "made/contributing.md") == "[a](../data.md)"
