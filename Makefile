@@ -13,11 +13,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	touch $(INSTALLED)
 
 demo: $(INSTALLED)  ## a simulated arm, a tiny world model, a LoRA adapter, and whether it helped
-	test -e demo/data || $(BIN)/vjepa2-ac simulate record demo/data --domain B --episodes 60 --seed 5
-	$(BIN)/vjepa2-ac train configs/demo.yaml
-	$(BIN)/vjepa2-ac decoder configs/demo.yaml
-	$(BIN)/vjepa2-ac evaluate demo/run
-	$(BIN)/vjepa2-ac imagine demo/run --decoder demo/decoder --actions true,left,close
+	$(BIN)/vjepa2-ac demo
 
 demo-seeds: demo  ## the spread of the demo's result over three seeds
 	for seed in 1 2; do $(BIN)/vjepa2-ac train configs/demo.yaml seed=$$seed run_dir=demo/run-$$seed || exit 1; done

@@ -1,10 +1,11 @@
 """Errors: they read as sentences, and can be sent between processes."""
 
 import pickle
+from importlib.metadata import PathDistribution
 
 import pytest
 
-from vjepa2_ac.errors import InputError, printable
+from vjepa2_ac.errors import InputError, pip_install, printable
 
 
 @pytest.mark.parametrize(
@@ -54,3 +55,20 @@ def test_what_is_quoted_does_not_flood_the_terminal() -> None:
 )
 def test_a_name_has_no_say_over_a_terminal(text: str, shown: str) -> None:
     assert printable(text) == shown
+
+
+@pytest.mark.parametrize(
+    ("origin", "extra", "command"),
+    [
+        ('{"url": "file:///x", "dir_info": {"editable": true}}', "sim", 'pip install -c constraints.txt -e ".[sim]"'),
+        ('{"url": "file:///x", "dir_info": {"editable": true}}', "", "pip install -c constraints.txt -e ."),
+        ('{"url": "file:///x.whl", "archive_info": {}}', "sim", 'pip install "vjepa2-ac[sim]"'),
+        (None, "sim", 'pip install "vjepa2-ac[sim]"'),  # from an index
+        (None, "", "pip install vjepa2-ac"),
+    ],
+)
+def test_the_line_that_installs_an_extra_fits_the_installation(
+    monkeypatch: pytest.MonkeyPatch, origin: str | None, extra: str, command: str
+) -> None:
+    monkeypatch.setattr(PathDistribution, "read_text", lambda _self, _name: origin)
+    assert pip_install(extra) == command

@@ -10,7 +10,6 @@ from cells import SHIFTS, TRAINING, Base, Shift
 from vjepa2_ac.config import Config, DataConfig, ModelConfig
 from vjepa2_ac.config.loading import load_config
 from vjepa2_ac.data.clips.dataset import open_dataset
-from vjepa2_ac.data.clips.windows import in_split
 from vjepa2_ac.encoding.encode_dataset import encode_config
 from vjepa2_ac.export.export import export_run
 from vjepa2_ac.model.checkpoints.loading import load_base
@@ -81,8 +80,8 @@ def training_episodes(data: DataConfig, count: int, seed: int) -> tuple[str, ...
     Raises:
         ValueError: There are not as many.
     """
-    table = open_dataset(data).table
-    names = [table.identity(int(number)) for number in np.flatnonzero(in_split(table.id_hash, data, "train"))]
+    dataset = open_dataset(data)
+    names = [dataset.table.identity(int(number)) for number in np.flatnonzero(dataset.members("train"))]
     if len(names) < count:
         raise ValueError(f"{data.path} has {len(names)} training episodes, not {count}")
     order = np.random.default_rng([seed, 77]).permutation(len(names))

@@ -1,10 +1,13 @@
 """Error types, and their messages for the user: unusable input, or a machine that lacks what is needed."""
 
 import errno
+import json
 import resource
 import unicodedata
 from functools import partial
+from importlib.metadata import PackageNotFoundError, distribution
 
+_PACKAGE = "vjepa2-ac"
 _MOST_CHARACTERS = 8_000  # of a part of a message: quoted input may have any length
 _CONTROL = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})  # some control terminals; lone surrogates cannot be encoded
 
@@ -85,9 +88,22 @@ def in_words(error: BaseException) -> str:
     return str(error)
 
 
-def pip_install(extra: str) -> str:
-    """Return the command that installs an extra of this package."""
-    return f'pip install -c constraints.txt -e ".[{extra}]"'
+def pip_install(extra: str = "") -> str:
+    """Return the command that installs this package, or an extra of it, as it was installed: a checkout, or a wheel."""
+    start, package = ("pip install -c constraints.txt -e ", ".") if _is_checkout() else ("pip install ", _PACKAGE)
+    return f'{start}"{package}[{extra}]"' if extra else start + package
+
+
+def _is_checkout() -> bool:
+    """Return whether this package runs from a folder of sources: installed by `pip install -e`, or not at all.
+
+    Source: PEP 610, direct_url.json.
+    """
+    try:
+        origin = json.loads(distribution(_PACKAGE).read_text("direct_url.json") or "{}")
+    except (PackageNotFoundError, ValueError):
+        return True
+    return bool(origin.get("dir_info", {}).get("editable"))
 
 
 def too_few_files(where: str = "") -> InputError:

@@ -10,7 +10,7 @@ import os
 import re
 from pathlib import Path
 
-BUILTIN = "builtin:"  # models that come with the package
+BUILTIN = "builtin:"  # models and configs that come with the package
 
 HUB = "hf://"
 

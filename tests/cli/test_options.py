@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from vjepa2_ac.cli import config as config_command
 from vjepa2_ac.cli import main, program
 from vjepa2_ac.cli.options import parsed
+from vjepa2_ac.cli.setup import config as config_command
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 from vjepa2_ac.simulation.closed_loop.benchmark import BenchmarkOptions
 from vjepa2_ac.simulation.recording.record import RecordingSpec
@@ -70,7 +70,7 @@ def leaves(
 
 
 COMMANDS = leaves(program._parser())
-WITHOUT_SETTINGS = {("compare",), ("export",), ("download",), ("imagine",)}
+WITHOUT_SETTINGS = {("compare",), ("demo",), ("init",), ("export",), ("download",), ("imagine",)}
 BEHIND = {  # what each must be given, and an option with a value
     ("train",): (["c.yaml"], ["--check"]),
     ("evaluate",): (["run"], ["--clips", "3"]),

@@ -32,8 +32,8 @@ def complaints(*overrides: str, values: dict[str, Any] | None = None) -> list[st
         (["training.betas=[2, 0.9]", "data.join_actions=sum"], ["training.betas.0: ", "join_actions belongs"]),
         (["data.stride=100000000000", "training.batch_size=100000000000"], ["data.stride", "training.batch_size: "]),
         (["data.fields.state=[]", "data.fields.cameras={}"], ["data.fields.state: ", "data.fields.cameras: "]),
-        (["data.stride=fast", "training.steps=3"], ["data.stride: ", "exceed steps 3"]),
-        (["adapter=null", "training.steps=3"], ["adapter: ", "exceed steps 3"]),
+        (["data.stride=fast", "training.warmup_steps=999999"], ["data.stride: ", "exceed steps 100000"]),
+        (["adapter=null", "training.decay_steps=999999"], ["adapter: ", "exceed steps 100000"]),
         (["model.random.image_size=50", "model.random.patch_size=0"], ["patch_size: ", "give either base"]),
     ],
 )  # fmt: skip

@@ -198,7 +198,7 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
 
 def test_changed_keys_names_the_dotted_keys() -> None:
     old = parse_config(MINIMAL, where="")
-    new = parse_config({**MINIMAL, "seed": 3, "training": {"steps": 5000}}, where="")
+    new = parse_config({**MINIMAL, "seed": 3, "training": {"steps": 50_000}}, where="")
     assert changed_keys(old, new) == ["seed", "training.steps"]
 
 
@@ -329,3 +329,9 @@ def test_where_it_was_on_the_config_is_refused_beside_all_other_errors_and_only_
     assert gone_in_use(path) == {"training.action_contrast": on}
     with pytest.raises(InputError, match="is gone"):
         load_config_of_run(path, ["training.action_contrast.weight=1"])
+
+
+@pytest.mark.parametrize(("steps", "warmup"), [(100_000, 1_000), (10_000, 1_000), (100, 10), (3, 0)])
+def test_a_short_run_warms_up_for_a_tenth_of_its_steps(steps: int, warmup: int) -> None:
+    training = load_config(ROOT / "configs/default.yaml", [f"training.steps={steps}"]).training
+    assert training.warmup_steps == warmup

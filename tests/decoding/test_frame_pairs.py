@@ -13,7 +13,6 @@ from run_fixtures import MakeConfig
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.clips.dataset import open_dataset
 from vjepa2_ac.data.clips.transforms import input_to_pixels, pixels_to_input, view
-from vjepa2_ac.data.clips.windows import in_split
 from vjepa2_ac.decoding import frame_pairs
 from vjepa2_ac.decoding.frame_pairs import as_images, as_pixels, require_space_for_pairs, wanted_frames
 from vjepa2_ac.encoding.cache_lookup import needed_frames
@@ -95,7 +94,7 @@ def test_frames_are_of_the_split_at_most_as_many_as_asked_and_spread(
 ) -> None:
     config = make_config(data__camera=["wrist_left", "exterior_1_left"])
     dataset = open_dataset(config.data)
-    members = in_split(dataset.split_hash, dataset.config, split)  # type: ignore[arg-type]
+    members = dataset.members(split)  # type: ignore[arg-type]
     wanted = wanted_frames(dataset, split, frames=frames)  # type: ignore[arg-type]
     needed = {one.episode: set(one.steps.tolist()) for one in needed_frames(dataset)}
     there = 2 * sum(len(steps) for episode, steps in needed.items() if members[episode])

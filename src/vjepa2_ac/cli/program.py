@@ -11,10 +11,7 @@ from pathlib import Path
 
 from vjepa2_ac import __version__, output
 from vjepa2_ac.cli import (
-    config,
     data,
-    doctor,
-    download,
     encode,
     evaluate,
     export,
@@ -26,8 +23,9 @@ from vjepa2_ac.cli import (
 )
 from vjepa2_ac.cli.decoding import decoder, imagine
 from vjepa2_ac.cli.options import Handler, Parser, parsed
+from vjepa2_ac.cli.setup import config, demo, doctor, download
 from vjepa2_ac.distributed.ending import tidy_end
-from vjepa2_ac.errors import InputError, UserError, in_words, is_out_of_memory, printable
+from vjepa2_ac.errors import InputError, UserError, in_words, is_out_of_memory, pip_install, printable
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -58,7 +56,7 @@ def _run(arguments: Sequence[str] | None) -> int:
         library = (error.name or "vjepa2_ac").partition(".")[0]
         if library == "vjepa2_ac":
             raise
-        _complain(f"{library}: it is not installed. Run pip install -c constraints.txt -e .")
+        _complain(f"{library}: it is not installed. Run {pip_install()}")
         return 2
     except RuntimeError as error:
         if not is_out_of_memory(error):
@@ -106,7 +104,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=__version__)
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    first, then = (train, evaluate, imagine, data, encode, decoder, doctor), (plan, goals, serve, export, config)
+    first, then = (demo, train, evaluate, imagine, data, encode, decoder, doctor), (plan, goals, serve, export, config)
     for one in (*first, *then, download, simulate):
         one.add_to(commands)
     return parser

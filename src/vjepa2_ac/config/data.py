@@ -155,7 +155,8 @@ class DataConfig(Section):
     """Strides that `auto` and `data calibrate` evaluate; null: 4, 8, 15 at 15 control steps per second, scaled to
     others."""
     validation_share: Annotated[Share, Affects.RUN] = 0.05
-    """Share of the episodes held out for validation, chosen by a hash of the episode's identity."""
+    """Share of the episodes held out for validation, chosen by a hash of the episode's identity; at least one of three
+    or more, unless this is 0."""
     test_share: Annotated[Share, Affects.RUN] = 0.05
     """Share of the episodes held out for `evaluate`, likewise; never seen in training nor in validation."""
     split_by: Annotated[Annotated[str, Field(max_length=500), AfterValidator(_split_by)] | None, Affects.RUN] = None

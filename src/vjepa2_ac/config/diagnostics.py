@@ -60,7 +60,7 @@ def wrong_values(values: Mapping[str, Any], error: ValidationError) -> list[str]
     Rules about several values are only checked when each single value is valid. Invalid values are therefore removed,
     and the rest is checked again; messages about removed values are then ignored.
     """
-    left, found, taken = json.loads(json.dumps(values)), error.errors(include_url=False)[:_MOST_LINES], set[str]()
+    left, found, taken = json.loads(json.dumps(values)), _errors_in(error), set[str]()
     lines: list[str] = []
     for _ in range(_ROUNDS):
         messages = _messages_of([one for one in found if not _is_about(one, taken)])
@@ -77,8 +77,14 @@ def wrong_values(values: Mapping[str, Any], error: ValidationError) -> list[str]
             Config.model_validate_json(json.dumps(left))
             break
         except ValidationError as again:
-            found = again.errors(include_url=False)[:_MOST_LINES]
+            found = _errors_in(again)
     return lines
+
+
+def _errors_in(error: ValidationError) -> list[Any]:
+    """Return the errors but those of defaults that follow from another value, which is wrong."""
+    found = error.errors(include_url=False)
+    return [one for one in found if one["type"] != "default_factory_not_called"][:_MOST_LINES]
 
 
 def all_keys() -> list[str]:

@@ -16,6 +16,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.config.data import without_sections_of_others
 from vjepa2_ac.config.diagnostics import wrong_values
 from vjepa2_ac.config.gone import GONE, take_gone
+from vjepa2_ac.config.packaged import config_path
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage.structured import parse_yaml, require_shallow
 
@@ -25,16 +26,20 @@ _MOST_BYTES = 4 << 20  # of a config: data.exclude may name thousands of episode
 def load_config(config: str | Path | Mapping[str, Any], overrides: Iterable[str] = ()) -> Config:
     """Read a config, from a file or from plain values, and apply `key.sub=value` overrides.
 
+    Args:
+        config: A file, `builtin:NAME` of the package, or plain values.
+        overrides: Such as training.steps=100.
+
     Raises:
         InputError: The file cannot be read or is not a valid config; names every key that is wrong.
 
     Example:
-        >>> config = load_config("configs/demo.yaml", ["training.steps=100"])
+        >>> config = load_config("builtin:demo", ["training.steps=100"])  # or a file, such as configs/demo.yaml
         >>> config = load_config({"run_dir": "run", "data": {"path": "data"}, "model": {"base": "builtin:sim-tiny"}})
     """
     if isinstance(config, Mapping):
         return config_from(config, overrides, where="load_config")
-    return parse_config(_overridden(_read_yaml(Path(config)), overrides), where=str(config))
+    return parse_config(_overridden(_read_yaml(config_path(config)), overrides), where=str(config))
 
 
 def load_config_of_run(path: Path, overrides: Iterable[str] = ()) -> Config:
@@ -134,7 +139,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
             data = file.read(_MOST_BYTES + 1)
         text = data.decode()
     except FileNotFoundError:
-        fix = "See configs/ for examples"
+        fix = "`vjepa2-ac init` writes one for your data; `vjepa2-ac config list` shows those of the package"
         raise InputError(where=str(path), found="no such file", needed="a config", fix=fix) from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(where=str(path), found=f"cannot be read ({error})", needed="a YAML file") from None

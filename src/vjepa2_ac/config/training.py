@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
@@ -23,6 +23,10 @@ from vjepa2_ac.config.section import (
 def _earlier_keep_best(value: object) -> object:
     """Accept what earlier versions wrote: true was by error. YAML reads off as false."""
     return {True: "error", False: "off"}[value] if isinstance(value, bool) else value
+
+
+def _usual_warmup(values: dict[str, Any]) -> int:
+    return min(1_000, int(values.get("steps", 0)) // 10)
 
 
 class TrainingConfig(Section):
@@ -50,8 +54,8 @@ class TrainingConfig(Section):
     schedule: Literal["cosine", "warmup_stable_decay", "linear", "constant"] = "cosine"
     """All begin with a linear warm-up. Then cosine: half a cosine to the end. linear: a straight line to the end.
     warmup_stable_decay: constant, and a linear decay at the end. constant: the peak throughout."""
-    warmup_steps: Count = 1_000
-    """Optimizer steps of the linear warm-up."""
+    warmup_steps: Count = Field(default_factory=_usual_warmup)
+    """Optimizer steps of the linear warm-up; unless given 1,000, or a tenth of the steps where that is less."""
     decay_steps: Count = 0
     """Optimizer steps of the final decay; warmup_stable_decay only."""
     start_learning_rate: ZeroToOne = 0.0

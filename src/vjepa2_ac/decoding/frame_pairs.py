@@ -26,7 +26,7 @@ from torch import Tensor
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.data.clips.transforms import input_to_pixels, pixels_to_input
-from vjepa2_ac.data.clips.windows import in_split, spread
+from vjepa2_ac.data.clips.windows import spread
 from vjepa2_ac.data.sources.latents.dtypes import CacheType, bytes_per_frame, pack_latents, unpack_latents
 from vjepa2_ac.encoding.cache_lookup import needed_frames
 from vjepa2_ac.encoding.disk_space import GIGABYTE
@@ -105,7 +105,7 @@ def wanted_frames(dataset: Dataset, split: Split, *, frames: int) -> list[Frames
 
     They are among those that clips use: the decoder is to show clips. None, if the split has no clips.
     """
-    members = in_split(dataset.split_hash, dataset.config, split)
+    members = dataset.members(split)
     needed = [one for one in needed_frames(dataset) if members[one.episode]]
     cameras = dataset.config.cameras
     total = sum(len(one.steps) for one in needed) * len(cameras)

@@ -16,7 +16,6 @@ from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
 from vjepa2_ac.data.clips.loader import batches_of, validation_windows
 from vjepa2_ac.data.clips.transforms import frames_as_seen, view
-from vjepa2_ac.data.clips.windows import in_split
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
 from vjepa2_ac.decoding.imagine import (
     AS_RECORDED,
@@ -185,7 +184,7 @@ def _window(dataset: Dataset, asked: ImagineOptions) -> tuple[int, int]:
                 fix="Lower --steps or --start",
             )
         return episode, start
-    members = in_split(dataset.split_hash, dataset.config, asked.split)[dataset.episodes]
+    members = dataset.members(asked.split)[dataset.episodes]
     longest = int(dataset.table.num_steps[dataset.episodes[members]].max(initial=0))
     if 0 < longest < dataset.config.clip_steps:
         most = (longest - 1) // dataset.config.model_stride

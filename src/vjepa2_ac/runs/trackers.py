@@ -69,7 +69,7 @@ def require_installed(tracking: TrackingConfig) -> None:
         InputError: A requested one is not installed.
     """
     asked = {
-        "tensorboard": (tracking.tensorboard, "pip install -c constraints.txt -e .", "false"),
+        "tensorboard": (tracking.tensorboard, pip_install(), "false"),
         "wandb": (tracking.wandb != "disabled", pip_install("wandb"), "disabled"),
         "trackio": (tracking.trackio, pip_install("trackio"), "false"),
     }

@@ -8,7 +8,6 @@ import numpy as np
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
-from vjepa2_ac.data.clips.windows import in_split
 from vjepa2_ac.data.filters.exclusion import named
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError
@@ -99,10 +98,8 @@ def _require_same_step(dataset: Dataset, replayed: Dataset) -> None:
 
 def _held_out(dataset: Dataset, replayed: Dataset) -> list[str]:
     """Return the replayed training episodes that the first data set, by their identity, validates or tests on."""
-    first, second = (
-        one.table.id_hash[one.kept.taking_part & (in_split(one.split_hash, one.config, "train") == trains)]
-        for one, trains in ((dataset, False), (replayed, True))
-    )
+    held_out = dataset.kept.taking_part & ~dataset.members("train")
+    first, second = dataset.table.id_hash[held_out], replayed.table.id_hash[replayed.members("train")]
     return sorted(replayed.table.identity(int(place)) for place in _places(replayed, np.intersect1d(first, second)))
 
 

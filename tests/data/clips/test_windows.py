@@ -16,7 +16,8 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.loading import load_config
 from vjepa2_ac.data.clips.permutation import permuted
-from vjepa2_ac.data.clips.windows import ClipOrder, Windows, far_neighbours, in_split, spread
+from vjepa2_ac.data.clips.splits import in_split
+from vjepa2_ac.data.clips.windows import ClipOrder, Windows, far_neighbours, spread
 from vjepa2_ac.data.clips.windows import windows_of as windows_of_starts
 from vjepa2_ac.data.filters.exclusion import included
 from vjepa2_ac.data.filters.step_ranges import StepSelection, clip_starts
@@ -155,7 +156,7 @@ def test_all_episodes_are_split_at_once_as_each_alone() -> None:
     config = settings_of(validation_share=0.23, test_share=0.31)
     for split in ("train", "validation", "test"):
         expected = [split_of(info.id, config) == split for info in infos]
-        assert in_split(EpisodeTable.of(infos).id_hash, config, split).tolist() == expected
+        assert in_split(EpisodeTable.of(infos).id_hash, np.ones(300, bool), config, split).tolist() == expected
 
 
 def test_the_split_never_changes_between_versions() -> None:

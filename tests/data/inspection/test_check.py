@@ -98,9 +98,15 @@ def test_training_that_could_not_begin_is_an_error_line(droid: Path) -> None:
 
 
 def test_an_empty_test_split_is_an_error_line_where_one_is_asked_for_as_training_refuses_it(droid: Path) -> None:
+    in_one_group = {"split_by": "(episode|.)"}
     for share, level in ((0.001, "error"), (0.0, "ok")):
-        findings = check_data(knobs(droid, test_share=share), clips=2)
+        findings = check_data(knobs(droid, test_share=share, validation_share=0.0, **in_one_group), clips=2)
         assert {finding.about: finding.level for finding in findings}["test"] == level
+
+
+def test_a_small_share_of_few_episodes_still_holds_one_out(droid: Path) -> None:
+    findings = check_data(knobs(droid, test_share=0.001), clips=2)
+    assert {finding.about: finding.level for finding in findings}["test"] == "ok"
 
 
 def test_a_reason_that_names_many_episodes_is_cut_between_words_and_says_so(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Int, UInt64
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.clips.actions import widths_of
+from vjepa2_ac.data.clips.splits import in_split
 from vjepa2_ac.data.clips.windows import Windows, windows_of
 from vjepa2_ac.data.filters.broken_episodes import BrokenEpisodes
 from vjepa2_ac.data.filters.exclusion import included, with_way_out
@@ -63,6 +64,10 @@ class Dataset:
     def split_hash(self) -> UInt64[np.ndarray, " episodes"]:
         """The hashes that determine the split of each episode."""
         return self.table.id_hash if self.groups is None else self.groups
+
+    def members(self, split: Split) -> Bool[np.ndarray, " episodes"]:
+        """Return which episodes are used and belong to a split."""
+        return in_split(self.split_hash, self.kept.taking_part, self.config, split)
 
     def windows(self, split: Split) -> Windows:
         """Return the clips of a split.

@@ -18,6 +18,7 @@ from jaxtyping import Bool, Int32, Int64, UInt64
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.clips.permutation import permuted
+from vjepa2_ac.data.clips.splits import in_split
 from vjepa2_ac.data.filters.exclusion import NAMED, named
 from vjepa2_ac.data.filters.step_ranges import ClipStarts
 from vjepa2_ac.data.index.episode_table import EpisodeTable
@@ -72,22 +73,6 @@ class ClipOrder:
         return int.from_bytes(digest, "big") % count
 
 
-def in_split(
-    split_hash: UInt64[np.ndarray, " episodes"], config: DataConfig, split: Split
-) -> Bool[np.ndarray, " episodes"]:
-    """Return which episodes belong to a split: a hash, as a number in [0, 1), is compared with the shares.
-
-    Args:
-        split_hash: Of each episode's identity; with `data.split_by`, of the name of its group.
-        config: The shares.
-        split: Which split.
-    """
-    number = split_hash.astype(np.float64) / 2**64
-    test, held_out = config.test_share, config.test_share + config.validation_share
-    low, high = {"test": (0.0, test), "validation": (test, held_out), "train": (held_out, 2.0)}[split]
-    return np.asarray((number >= low) & (number < high))
-
-
 def windows_of(
     table: EpisodeTable,
     taking_part: Bool[np.ndarray, " episodes"],
@@ -110,7 +95,7 @@ def windows_of(
         InputError: The split has no episodes, or only short ones, or none with a clip's length of kept steps, or
             `data.short_episodes` forbids short ones.
     """
-    members = taking_part & in_split(split_hash, config, split)
+    members = in_split(split_hash, taking_part, config, split)
     if not members.any():
         groups = None if config.split_by is None else len(np.unique(split_hash[taking_part]))
         raise _empty_split(int(taking_part.sum()), groups, config, split)
@@ -176,12 +161,11 @@ def _warn_of_short(path: str, split: Split, clip_steps: int, members: int, short
 
 def _empty_split(episodes: int, groups: int | None, config: DataConfig, split: Split) -> InputError:
     shares = f"validation_share {config.validation_share:g}, test_share {config.test_share:g}"
+    members = "episodes" if groups is None else "groups"
     fix = (
         "Lower data.validation_share or data.test_share"
         if split == "train"
-        else f"Raise data.{split}_share: a hash of its identity draws an episode, so few episodes need a large share"
-        if groups is None
-        else f"Raise data.{split}_share: a hash of its name draws a group, so few groups need a large share"
+        else f"Raise data.{split}_share: above 0, three {members} or more always have one"
     )
     together = "" if groups is None else f" in {groups} groups (data.split_by)"
     return InputError(

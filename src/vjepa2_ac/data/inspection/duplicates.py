@@ -10,7 +10,6 @@ from jaxtyping import Bool, Int
 
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.clips.dataset import Dataset
-from vjepa2_ac.data.clips.windows import in_split
 from vjepa2_ac.data.index.state_hash import UNKNOWN
 
 _SPLITS: tuple[Split, ...] = ("train", "validation", "test")
@@ -77,8 +76,7 @@ def find_duplicates(dataset: Dataset) -> Duplicates:
 
 def _splits(dataset: Dataset, members: Int[np.ndarray, " members"]) -> Int[np.ndarray, " members"]:
     """Return the split of each, as an index into `_SPLITS`."""
-    hashes = dataset.split_hash[members]
-    return np.asarray(np.argmax([in_split(hashes, dataset.config, split) for split in _SPLITS], axis=0))
+    return np.asarray(np.argmax([dataset.members(split)[members] for split in _SPLITS], axis=0))
 
 
 def _is_across(splits: Int[np.ndarray, " members"], group: Int[np.ndarray, " members"]) -> Bool[np.ndarray, " members"]:

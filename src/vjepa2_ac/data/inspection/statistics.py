@@ -16,7 +16,7 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.clips.dataset import Dataset, Removed
-from vjepa2_ac.data.clips.windows import in_split, spread
+from vjepa2_ac.data.clips.windows import spread
 from vjepa2_ac.data.filters.idle_rules import idle_by_motion
 from vjepa2_ac.data.inspection.coverage import Coverage, coverage_of
 from vjepa2_ac.data.inspection.duplicates import Duplicates, find_duplicates
@@ -299,7 +299,7 @@ def _read(dataset: Dataset, episodes: Sequence[int], progress: Progress | None) 
 
 
 def _episodes(dataset: Dataset, split: Split) -> int:
-    return int((in_split(dataset.split_hash, dataset.config, split) & dataset.kept.taking_part).sum())
+    return int(dataset.members(split).sum())
 
 
 def _windows(dataset: Dataset, split: Split) -> int:

@@ -7,7 +7,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, pip_install
 
 GOOGLE = frozenset({"gs", "gcs"})
 
@@ -161,7 +161,7 @@ def _kind(url: str, protocol: str) -> Any:
         return fsspec.get_filesystem_class(protocol)
     except ImportError as error:
         extra = _EXTRAS.get(protocol)
-        fix = f'Install it: pip install -c constraints.txt -e ".[{extra}]"' if extra else str(error)
+        fix = f"Install it: {pip_install(extra)}" if extra else str(error)
         raise InputError(where=url, found=f"the library for {protocol}:// is not installed", fix=fix) from None
     except ValueError:
         raise InputError(where=url, found=f"nothing reads {protocol}://", needed=_KNOWN) from None

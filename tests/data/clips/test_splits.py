@@ -1,0 +1,63 @@
+"""Few episodes have all three splits; many are split by the hash alone."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vjepa2_ac.config.data import DataConfig, Split
+from vjepa2_ac.data.clips.splits import in_split
+
+SPLITS: tuple[Split, ...] = ("train", "validation", "test")
+HASHES = st.lists(st.integers(0, 2**64 - 1), min_size=1, max_size=40)
+
+
+def counts(hashes: list[int], taking_part: list[bool] | None = None, **shares: float) -> dict[str, int]:
+    part = np.ones(len(hashes), bool) if taking_part is None else np.array(taking_part)
+    config = DataConfig(path="nowhere", **shares)
+    return {split: int(in_split(np.array(hashes, np.uint64), part, config, split).sum()) for split in SPLITS}
+
+
+@given(hashes=HASHES, validation=st.floats(0, 0.4), test=st.floats(0, 0.4))
+def test_each_episode_is_in_one_split_and_none_that_has_a_share_is_empty(
+    hashes: list[int], validation: float, test: float
+) -> None:
+    found = counts(hashes, validation_share=validation, test_share=test)
+    assert sum(found.values()) == len(hashes)
+    groups = len(np.unique(np.array(hashes, np.uint64).astype(np.float64)))
+    if groups >= 20:
+        assert (found["validation"] > 0) == (validation > 0) or found["train"] < 2
+        assert found["test"] > 0 or test == 0
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_twenty_demonstrations_with_the_default_shares_have_all_three(seed: int) -> None:
+    hashes = np.random.default_rng(seed).integers(0, 2**64, 20, dtype=np.uint64).tolist()
+    found = counts(hashes)
+    assert found["validation"] >= 1
+    assert found["test"] >= 1
+    assert found["train"] >= 10
+
+
+def test_those_whose_number_comes_next_move_and_nobody_else() -> None:
+    hashes = [int(share * 2**64) for share in (0.9, 0.5, 0.3, 0.7)]
+    config = DataConfig(path="nowhere", validation_share=0.05, test_share=0.05)
+    everyone = np.ones(4, bool)
+    assert in_split(np.array(hashes, np.uint64), everyone, config, "test").tolist() == [False, False, True, False]
+    assert in_split(np.array(hashes, np.uint64), everyone, config, "validation").tolist() == [False, True, False, False]
+
+
+def test_a_group_moves_as_a_whole() -> None:
+    hashes = [int(share * 2**64) for share in (0.3, 0.3, 0.5, 0.5, 0.9)]
+    assert counts(hashes) == {"train": 1, "validation": 2, "test": 2}
+
+
+def test_those_that_are_left_out_count_for_nothing() -> None:
+    hashes = [int(share * 2**64) for share in (0.01, 0.07, 0.3, 0.5, 0.9)]
+    assert counts(hashes) == {"train": 3, "validation": 1, "test": 1}
+    assert counts(hashes, [False, False, True, True, True]) == {"train": 1, "validation": 1, "test": 1}
+
+
+def test_one_or_two_episodes_and_shares_of_zero_stay_as_the_hash_says() -> None:
+    assert counts([2**63, 2**63 + 2**60]) == {"train": 2, "validation": 0, "test": 0}
+    assert counts([2**63] * 9, validation_share=0.0, test_share=0.0) == {"train": 9, "validation": 0, "test": 0}
