@@ -31,7 +31,7 @@ ORDERS: dict[str, list[str]] = {
         "evaluation",
         "reports",
         "training export",
-        "simulation api",
+        "simulation api init",
         "console",
         "cli",
     ],

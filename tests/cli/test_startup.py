@@ -49,6 +49,15 @@ simulate record out --episodes 2 --domain Q
 download --url foo --to x.pt
 download x.pt
 download vjepa3
+init
+init npz
+init nowhere
+init nowhere somewhere
+init lerobot .
+init sim --model nope
+init sim --out /proc/nope/x.yaml
+config show builtin:nope
+config list builtin:demo
 """
 CODE = """
 import sys

@@ -83,6 +83,14 @@ def _check(options: argparse.Namespace) -> int:
     if options.model is not None:
         require_subject(options.model)
 
+    status = check_and_print(config, clips=options.limit)
+    if options.model is not None:
+        _probe(config, options.model, clips=2 * options.limit)
+    return status
+
+
+def check_and_print(config: Config, *, clips: int = 32) -> int:
+    """Look at the data of a config and print what is found; return 1 where training would learn nothing."""
     from vjepa2_ac.console.data import print_finding
     from vjepa2_ac.console.progress import ConsoleReporter
     from vjepa2_ac.data.inspection.check import check_data
@@ -94,14 +102,12 @@ def _check(options: argparse.Namespace) -> int:
             config.data,
             seed=config.seed,
             batch_size=config.training.batch_size,
-            clips=options.limit,
+            clips=clips,
             progress=reporter.task(INDEXING),
         )
         for finding in findings:
             print_finding(finding)
             wrong += finding.level == "error"
-    if options.model is not None:
-        _probe(config, options.model, clips=2 * options.limit)
     return 1 if wrong else 0
 
 

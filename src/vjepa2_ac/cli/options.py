@@ -234,6 +234,11 @@ def as_local(text: str) -> str:
     return _meant(places.on_this_machine, text)
 
 
+def as_place(text: str) -> str:
+    """Parse a path of this machine, or a URL."""
+    return _meant(places.anywhere, text)
+
+
 def as_model(text: str) -> str:
     """Parse the name of a run or a model: a path of this machine, or a model that comes with the package."""
     return _meant(places.of_a_model, text)

@@ -23,7 +23,7 @@ from vjepa2_ac.cli import (
 )
 from vjepa2_ac.cli.decoding import decoder, imagine
 from vjepa2_ac.cli.options import Handler, Parser, parsed
-from vjepa2_ac.cli.setup import config, demo, doctor, download
+from vjepa2_ac.cli.setup import config, demo, doctor, download, init
 from vjepa2_ac.distributed.ending import tidy_end
 from vjepa2_ac.errors import InputError, UserError, in_words, is_out_of_memory, pip_install, printable
 
@@ -104,7 +104,10 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=__version__)
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    first, then = (demo, train, evaluate, imagine, data, encode, decoder, doctor), (plan, goals, serve, export, config)
+    first, then = (
+        (demo, init, train, evaluate, imagine, data, encode, decoder, doctor),
+        (plan, goals, serve, export, config),
+    )
     for one in (*first, *then, download, simulate):
         one.add_to(commands)
     return parser

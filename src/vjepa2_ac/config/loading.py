@@ -115,6 +115,13 @@ def config_as_yaml(config: Config) -> str:
     return str(yaml.dump(config_as_dict(config), Dumper=_Dumper, sort_keys=False))
 
 
+def yaml_line(key: str, value: Any) -> str:
+    """Return a key and its value as one line of YAML, which reads back as they are."""
+    style = None if isinstance(value, dict | list) else False  # None: what has nothing nested within is on one line
+    text = yaml.dump({key: value}, Dumper=_Dumper, sort_keys=False, default_flow_style=style, width=10**6)
+    return str(text).rstrip("\n")
+
+
 def config_schema() -> dict[str, Any]:
     """Return the JSON schema of a config file, for editors."""
     return Config.model_json_schema()

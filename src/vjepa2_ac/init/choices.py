@@ -1,0 +1,178 @@
+"""The sections of a config, each value with its reason: from what was found in the data, and what the machine has."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from vjepa2_ac.init.found import FoundData
+from vjepa2_ac.init.knob import Knob, Knobs
+from vjepa2_ac.init.machine import Machine
+from vjepa2_ac.places import BUILTIN
+from vjepa2_ac.training.cost.memory import GIGABYTE
+
+CLIPS_A_STEP = 32  # of every config here
+_MODEL_STEP_S = 4 / 15  # DROID's four control steps
+_FEW_EPISODES = 500  # to which the advice for few demonstrations applies
+_SHARES = ((5_000, 0.02), (500, 0.05), (100, 0.1), (0, 0.15))  # held out, by the number of episodes
+_LEAST_FRAMES = 3  # two rollout steps and the frame before them
+_PASSES = 3  # over the starts of clips
+_LEAST_STEPS, _MOST_STEPS = 200, 100_000
+_SHORT = 100  # control steps of an episode that has no pauses to spare
+_CACHE_SHARE = 1 / 3  # of the free disk
+_IN_AND_OUT = ["predictor_embed", "predictor_proj", "action_encoder", "state_encoder"]
+
+
+@dataclass(frozen=True)
+class ModelChoice:
+    """The model that is trained."""
+
+    kind: str  # released, tiny, scratch
+    path: str
+    bytes_a_frame: int  # of its latents, in bfloat16
+
+    @property
+    def is_tiny(self) -> bool:
+        """Whether it is the one that comes with the package."""
+        return self.path.startswith(BUILTIN)
+
+
+def data_knobs(found: FoundData, machine: Machine, model: ModelChoice) -> Knobs:
+    """Return the section of the data."""
+    stride = max(1, round(found.rate_hz.value * _MODEL_STEP_S))
+    seconds = stride / found.rate_hz.value
+    frames, why_frames = _frames(found, model, stride)
+    share, why_share = _share(found)
+    cached = _cache(found, machine, model)
+    why_stride = f"a model step of {seconds:.2f} s, as DROID's; 0.53 and 1 s are to be tried, too: data calibrate"
+    is_guess = found.rate_hz.is_guess
+    if is_guess:
+        why_stride = f"if the rate is {found.rate_hz.value:g} a second: {why_stride}"
+    workers = max(1, min(4 if "cache" in cached else 8, machine.cores - 1))
+    vector: dict[str, Knob] = {"states": Knob("vector", "the robot's own numbers: its actions are their differences")}
+    return {
+        "source": Knob(found.source),
+        "path": Knob(found.path),
+        **({} if found.states == "pose" else vector),
+        **found.knobs,
+        "frames": Knob(frames, why_frames),
+        "stride": Knob(stride, why_stride, is_guess),
+        "validation_share": Knob(share, why_share),
+        "test_share": Knob(share, "for `evaluate`; never seen in training"),
+        **({"idle": found.idle} if found.idle and (found.usual_steps or _SHORT) >= _SHORT else {}),
+        **cached,
+        "workers": Knob(workers, f"of {machine.cores} cores"),
+    }
+
+
+def model_knobs(model: ModelChoice, machine: Machine) -> Knobs:
+    """Return the section of the model."""
+    dtype = Knob("float32" if model.is_tiny or not machine.has_bf16 else "bfloat16")
+    if model.kind == "scratch":
+        return {
+            "encoder": {"path": Knob(model.path), **({} if model.is_tiny else {"frame": Knob("tubelet")})},
+            "random": _fresh_predictor(model),
+            "random_start": Knob("persistence", "the first steps are not spent on learning to copy"),
+            "dtype": dtype,
+        }
+    why = "has seen a simulated arm only: to try the way, not a result" if model.is_tiny else "vjepa2-ac download"
+    return {"base": Knob(model.path, why), "dtype": dtype}
+
+
+def adapter_knobs(model: ModelChoice, found: FoundData) -> Knobs:
+    """Return the section of the adapter."""
+    if model.kind == "scratch":
+        return {"kind": Knob("none", "a fresh predictor has nothing to adapt: all of it is trained")}
+    whole = ["state_encoder", "action_encoder"] if found.states == "vector" else _IN_AND_OUT
+    why = "fresh: other numbers than a pose" if found.states == "vector" else "whole: helps at every rank (sim)"
+    return {
+        "kind": Knob("lora"),
+        "rank": Knob(32, "with in/out whole as good as full fine-tuning; 4 to 16 less (sim)"),
+        "alpha": Knob(32, "at any rank"),
+        "rslora": Knob(True),
+        "targets": Knob(["q", "k", "v", "o", "fc1", "fc2"]),
+        "modules_to_save": Knob(whole, why),
+    }
+
+
+def training_knobs(found: FoundData, machine: Machine, model: ModelChoice) -> Knobs:
+    """Return the section of training; the batch is what `fit` changes."""
+    steps, why = _steps(found)
+    batch = 8 if model.is_tiny else 4
+    rates = {"tiny": 3e-3, "scratch": 3e-3 if model.is_tiny else 1.5e-4}
+    weak = "it is weak, knowingly: it has never seen a real image"
+    return {
+        "steps": Knob(steps, why),
+        "batch_size": Knob(batch),
+        "accumulation": Knob(1 if model.is_tiny else CLIPS_A_STEP // batch),
+        "rollout_steps": Knob(2),
+        "learning_rate": Knob(rates.get(model.kind, 1e-4), "" if model.is_tiny else "3e-4 is the other one to try"),
+        "precision": Knob("bf16" if machine.has_bf16 else "fp16", "" if machine.has_bf16 else "this GPU has no bf16"),
+        "gradient_checkpointing": Knob(False),
+        **({"allow_weak_base": Knob(True, weak)} if model.is_tiny and model.kind == "tiny" else {}),
+    }
+
+
+def following_knobs(steps: int) -> dict[str, Knobs]:
+    """Return the sections of validation and checkpoints."""
+    every = max(20, min(1_000, steps // 10))
+    return {
+        "validation": {"every": Knob(every, "the best checkpoint is rarely the last"), "clips": Knob(64)},
+        "checkpoint": {
+            "every": Knob(every),
+            "keep": Knob(3, "and the best one"),
+            "keep_best": Knob("ranking", "not by error: it may fall while planning gets worse (docs/training.md)"),
+        },
+    }
+
+
+def _frames(found: FoundData, model: ModelChoice, stride: int) -> tuple[int, str]:
+    wanted = 4 if model.is_tiny else 16 if (found.episodes or 0) > _FEW_EPISODES else 8
+    if found.usual_steps is None or found.short_steps is None:
+        return wanted, "of a clip, one per model step"
+    most = 1 + (min(found.usual_steps // 2, found.short_steps) - 1) // stride
+    frames = max(_LEAST_FRAMES, min(most, wanted))
+    lengths = f"half of the episodes have {found.usual_steps} or more, one of ten at most {found.short_steps}"
+    return frames, f"a clip spans {(frames - 1) * stride + 1} steps; {lengths}"
+
+
+def _share(found: FoundData) -> tuple[float, str]:
+    if found.episodes is None:
+        return 0.05, "of the episodes, drawn by a hash, at least one"
+    share = next(share for least, share in _SHARES if found.episodes > least or least == 0)
+    count = max(1, round(share * found.episodes))
+    few = ": an interval over so few says little" if count < 5 else ""
+    return share, f"about {count:,} of {found.episodes:,} episodes, drawn by a hash{few}"
+
+
+def _cache(found: FoundData, machine: Machine, model: ModelChoice) -> dict[str, Knob]:
+    """Return the knobs of the latent cache, where it fits on the disk."""
+    if found.steps is None:
+        return {}
+    room = machine.free_bytes * _CACHE_SHARE
+    size = found.steps * model.bytes_a_frame
+    if size > room:
+        return {}
+    why = f"each frame is encoded once: {max(0.1, size / GIGABYTE):,.1f} GB at most; the encoder leaves the GPU"
+    return {"cache": Knob("auto", why)}
+
+
+def _steps(found: FoundData) -> tuple[int, str]:
+    if found.steps is None:
+        return _LEAST_STEPS, "a first run; docs/training.md says how many"
+    wanted = math.ceil(_PASSES * found.steps / CLIPS_A_STEP / 100) * 100  # a clip begins at every step
+    steps = max(_LEAST_STEPS, min(_MOST_STEPS, wanted))
+    passes = steps * CLIPS_A_STEP / found.steps
+    return steps, f"{passes:.2g} passes over the starts of clips; the error falls for longer, planning may get worse"
+
+
+def _fresh_predictor(model: ModelChoice) -> dict[str, Any]:
+    if model.is_tiny:
+        return {"image_size": Knob(96), "predictor": {"width": Knob(128), "depth": Knob(4), "heads": Knob(4)}}
+    sizes = {
+        "width": Knob(768, "as wide as the latents: it can begin at copying"),
+        "depth": Knob(12),
+        "heads": Knob(12),
+    }
+    return {"image_size": Knob(256, "256 tokens a frame"), "predictor": sizes}

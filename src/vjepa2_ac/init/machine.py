@@ -1,0 +1,75 @@
+"""What this machine has: GPU, memory, disk, cores, and how fast a file of the data comes."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from vjepa2_ac import storage
+from vjepa2_ac.errors import UserError
+from vjepa2_ac.training.cost.memory import GIGABYTE, USUAL_GPU
+
+_SAMPLE_BYTES = 8 << 20
+_BF16_SINCE = (8, 0)  # compute capability, Ampere
+
+# Dense bfloat16 or float16 products with sums in float32, TFLOP/s, by the vendor's data sheets. The longest name wins.
+_PEAKS = {
+    "RTX 3090": 71, "RTX 4090": 165, "RTX 5090": 210, "RTX A5000": 111, "RTX A6000": 155, "RTX 6000 Ada": 364,
+    "A10": 125, "A10G": 70, "L4": 121, "L40S": 362, "A100": 312, "H100": 989, "H200": 989, "T4": 65, "V100": 125,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What a run may use."""
+
+    gpu: str | None
+    gpu_bytes: int  # of a usual one, where there is none
+    has_bf16: bool
+    cores: int
+    free_bytes: int  # of the disk where runs and caches go
+    read_bytes_per_s: float | None = None  # of one file of the data, behind a URL
+
+    @property
+    def peak_flops(self) -> float | None:
+        """Operations per second at best, where the card is known."""
+        known = [name for name in _PEAKS if name in (self.gpu or "")]
+        return 1e12 * _PEAKS[max(known, key=len)] if known else None
+
+    @property
+    def about(self) -> str:
+        """It in a line."""
+        size = f"{self.gpu_bytes / GIGABYTE:.1f} GB"
+        gpu = f"{self.gpu}, {size}" if self.gpu else f"no GPU (the config is for one of {size})"
+        network = f"; network: {self.read_bytes_per_s / 1e6:.1f} MB/s" if self.read_bytes_per_s else ""
+        return f"{gpu}; {self.cores} cores; {self.free_bytes / GIGABYTE:.0f} GB of disk free{network}"
+
+
+def this_machine(sample: str | None = None) -> Machine:
+    """Return what this machine has.
+
+    Args:
+        sample: A file behind a URL, of which some megabytes are read to see how fast it comes.
+    """
+    import torch
+
+    cores, free = len(os.sched_getaffinity(0)), storage.free_bytes(Path.cwd())
+    speed = None if sample is None else _speed_of(sample)
+    if not torch.cuda.is_available():
+        return Machine(None, USUAL_GPU, True, cores, free, speed)
+    device = torch.cuda.get_device_properties(torch.cuda.current_device())
+    has_bf16 = (device.major, device.minor) >= _BF16_SINCE
+    return Machine(device.name, device.total_memory, has_bf16, cores, free, speed)
+
+
+def _speed_of(sample: str) -> float | None:
+    """Return bytes per second of one read; None, where that fails: the check of the data says why."""
+    try:
+        size = min(_SAMPLE_BYTES, storage.file_size(sample))
+        started = time.perf_counter()
+        storage.read_range(sample, 0, size)
+    except (OSError, UserError):
+        return None
+    return size / max(1e-6, time.perf_counter() - started)

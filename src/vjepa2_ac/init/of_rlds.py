@@ -1,0 +1,163 @@
+"""An RLDS data set: its episodes by dataset_info.json, its features by features.json."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from math import prod
+from typing import Any
+
+from vjepa2_ac import storage
+from vjepa2_ac.data.sources.rlds.dataset_info import find_shards
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.init.found import FoundData
+from vjepa2_ac.init.knob import Knob, Knobs
+from vjepa2_ac.init.names import Column, find_pose, pick_camera, short_name
+from vjepa2_ac.storage.structured import read_json_object
+
+DROID = "gs://gresearch/robotics/droid/1.0.1"
+RANGES = "gs://openpi-assets/droid/droid_sample_ranges_v1_0_1.json"
+_DROID_EPISODES, _DROID_STEPS = 95_658, 27_600_000
+_DROID_CAMERA = "exterior_1_left"
+_DROID_FEATURE = "steps/observation/exterior_image_1_left"
+_RATES_HZ = {"droid": 15.0, "r2d2_faceblur": 15.0, "bridge": 5.0}  # by a part of the name: RLDS does not say
+_UNKNOWN_RATE_HZ = 10.0
+_VELOCITIES = "steps/action_dict/joint_velocity"
+
+
+@dataclass(frozen=True)
+class _Feature:
+    kind: str  # image, text, tensor
+    dtype: str = ""
+    width: int = 1
+
+
+def droid() -> FoundData:
+    """Return what is known of DROID 1.0.1 without a look at it."""
+    return FoundData(
+        source="rlds",
+        path=DROID,
+        knobs={"camera": Knob(_DROID_CAMERA, "what the released weights saw")},
+        rate_hz=Knob(15.0, "DROID's"),
+        episodes=_DROID_EPISODES,
+        steps=_DROID_STEPS,
+        idle={
+            "rule": Knob("published", "openpi's ranges; they are valid for 1.0.1 only"),
+            "ranges": Knob(RANGES),
+        },
+        about=(f"DROID 1.0.1, {_DROID_EPISODES:,} episodes, 1.7 TB, fetched from Google Cloud as they are needed",),
+        extra="gcs",
+    )
+
+
+def look_at_rlds(path: str) -> FoundData:
+    """Look at an RLDS data set.
+
+    Raises:
+        InputError: It cannot be used, or has no images or no pose that could be recognized.
+    """
+    shards = find_shards(path)
+    features = dict(_features(path))
+    episodes = sum(shard.episodes for shard in shards)
+    if _DROID_FEATURE in features:
+        return like_droid(path, episodes)
+    images = [name for name, one in features.items() if one.kind == "image" and name.startswith("steps/")]
+    if not images:
+        where = storage.join(path, "features.json")
+        raise InputError(where=where, found="no images among its features", needed="images of the robot at each step")
+    rate = next((rate for name, rate in _RATES_HZ.items() if name in path.lower()), None)
+    first = pick_camera(images)
+    return FoundData(
+        source="rlds",
+        path=path,
+        knobs={
+            "camera": Knob(short_name(first), f"of {', '.join(map(short_name, images))}", is_guess=len(images) > 1),
+            "fields": {
+                **_state(path, features),
+                "identity": Knob(_identity(features), "what tells episodes apart", is_guess=True),
+                "cameras": Knob({short_name(name): name for name in images}),
+                "language": Knob(next((name for name, one in features.items() if _is_language(name, one)), None)),
+                "joint_velocity": Knob(_VELOCITIES if _VELOCITIES in features else None),
+                "control_rate_hz": Knob(rate or _UNKNOWN_RATE_HZ, "RLDS does not say", is_guess=rate is None),
+            },
+        },
+        rate_hz=Knob(rate or _UNKNOWN_RATE_HZ, is_guess=rate is None),
+        episodes=episodes,
+        idle={"rule": Knob("motion", "pauses teach nothing")},
+        about=(f"RLDS, {episodes:,} episodes in {len(shards):,} shards",),
+        extra="gcs" if path.startswith("gs://") else "",
+    )
+
+
+def like_droid(path: str, episodes: int) -> FoundData:
+    """Return what is known of a data set in DROID's schema."""
+    return FoundData(
+        source="rlds",
+        path=path,
+        knobs={"camera": Knob(_DROID_CAMERA, "what the released weights saw")},
+        rate_hz=Knob(15.0, "DROID's"),
+        episodes=episodes,
+        idle={"rule": Knob("commands", "openpi's rule; the published ranges are of DROID 1.0.1")},
+        about=(f"RLDS in DROID's schema, {episodes:,} episodes",),
+        extra="gcs" if path.startswith("gs://") else "",
+    )
+
+
+def _features(path: str) -> Iterator[tuple[str, _Feature]]:
+    """Yield the features by their names in a record."""
+    where = storage.join(path, "features.json")
+    try:
+        content = read_json_object(where, needed="a description as TFDS writes it", allow_nan=True)
+    except FileNotFoundError:
+        fix = "Name the features in the config by hand: `vjepa2-ac config text builtin:bridge` is an example"
+        raise InputError(
+            where=where, found="no such file", needed="the features, as TFDS writes them", fix=fix
+        ) from None
+    except OSError as error:
+        raise storage.unreadable(where, error) from None
+    yield from _inside(content, "")
+
+
+def _inside(content: Any, name: str) -> Iterator[tuple[str, _Feature]]:
+    if not isinstance(content, Mapping):
+        return
+    if "featuresDict" in content:
+        for key, one in dict(content["featuresDict"].get("features", {})).items():
+            yield from _inside(one, f"{name}/{key}" if name else key)
+    elif "sequence" in content:
+        yield from _inside(content["sequence"].get("feature"), name)
+    else:
+        kind = next((one for one in ("image", "text", "tensor") if one in content), "")
+        about = content.get(kind) or {}
+        sizes = [int(size) for size in about.get("shape", {}).get("dimensions", [])]
+        yield name, _Feature(kind, str(about.get("dtype", "")), prod(sizes))
+
+
+def _state(path: str, features: Mapping[str, _Feature]) -> Knobs:
+    columns = {
+        name: Column(one.width)
+        for name, one in features.items()
+        if name.startswith("steps/") and one.kind == "tensor" and one.dtype.startswith("float")
+    }
+    pose = find_pose(columns)
+    if pose is None or pose.rotation != "euler_xyz":
+        found = ", ".join(f"{name} [{one.width}]" for name, one in columns.items()) or "no numbers"
+        fix = "If others are the robot's numbers, name them in a config with `states: vector` (builtin:joints)"
+        needed = "x, y, z, three angles and the gripper, measured"
+        raise InputError(where=storage.join(path, "features.json"), found=found, needed=needed, fix=fix)
+    inverted = "bridge" in path.lower()
+    why = "1 is open in BridgeData" if inverted else "of the last number; `data check CONFIG --model` tells"
+    return {
+        "state": Knob(list(pose.columns), pose.why, pose.is_guess),
+        "gripper": Knob("openness" if inverted else "closedness", why, is_guess=not inverted),
+    }
+
+
+def _identity(features: Mapping[str, _Feature]) -> list[str]:
+    found = [name for name, one in features.items() if name.startswith("episode_metadata/") and one.kind != "image"]
+    paths = [name for name in found if name.rsplit("/", 1)[-1] in {"file_path", "episode_id", "recording_folderpath"}]
+    return paths or found or ["episode_metadata/file_path"]
+
+
+def _is_language(name: str, one: _Feature) -> bool:
+    return one.kind == "text" and "instruction" in name

@@ -1,0 +1,136 @@
+"""Every form is recognized and described; what is not read is named, with the way to what is."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from copied_sets import WRITERS, write_lerobot, write_npz
+from vjepa2_ac.config.loading import config_from
+from vjepa2_ac.data.clips.dataset import open_dataset
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.init.draft import choose_model, make_draft
+from vjepa2_ac.init.knob import guesses, plain
+from vjepa2_ac.init.look import look_at
+from vjepa2_ac.init.machine import Machine
+from vjepa2_ac.init.measure import measured
+
+LAPTOP = Machine(None, 24 * 10**9, has_bf16=True, cores=2, free_bytes=10**11)
+STATES = ["x", "y", "z", "roll", "pitch", "yaw", "gripper"]
+
+
+@pytest.mark.parametrize("form", WRITERS)
+def test_each_form_gives_a_config_that_opens_it(form: str, tmp_path: Path) -> None:
+    folder = WRITERS[form](tmp_path / "set", range(8))
+    found = measured(look_at(str(folder)))
+    assert (found.source, found.episodes, found.steps, found.usual_steps) == (form, 8, 8 * 14, 14)
+    config = make_draft(found, LAPTOP, choose_model("released", "builtin:sim-tiny"), run_dir="run").config
+    dataset = open_dataset(config.data)
+    assert len(dataset.windows("train")) > 0
+    assert len(dataset.windows("validation")) > 0
+    assert config.data.stride == 4
+
+
+def test_a_description_is_found_some_folders_down(tmp_path: Path) -> None:
+    WRITERS["rlds"](tmp_path / "set/name/1.0.0", range(3))
+    assert look_at(str(tmp_path / "set")).path == str(tmp_path / "set/name/1.0.0")
+    assert look_at(str(tmp_path / "set"), "rlds").path == str(tmp_path / "set/name/1.0.0")
+
+
+def test_numbers_that_are_no_pose_become_a_vector(tmp_path: Path) -> None:
+    folder = write_lerobot(tmp_path / "set", range(3))
+    info = json.loads((folder / "meta/info.json").read_text())
+    joints = {"dtype": "float32", "shape": [6], "names": [f"joint_{number}" for number in range(6)]}
+    cameras = {name: one for name, one in info["features"].items() if one["dtype"] == "video"}
+    info["features"] = cameras | {"observation.state": joints}
+    (folder / "meta/info.json").write_text(json.dumps(info))
+    found = look_at(str(folder))
+    assert found.states == "vector"
+    assert plain(found.knobs)["lerobot"]["state"] == ["observation.state"]
+    assert "data.lerobot.state" in guesses({"data": found.knobs})
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "expected"),
+    [(0.0, 1.0, (0.0, 1.0)), (0.0, 0.08, (0.08, 0.0)), (2.0, 99.5, (99.5, 2.0))],
+    ids=["share", "metres", "percent"],
+)
+@pytest.mark.parametrize("name", ["meta/stats.json", "meta/episodes_stats.jsonl"])
+def test_the_grippers_range_is_read_from_the_statistics(
+    low: float, high: float, expected: tuple[float, float], name: str, tmp_path: Path
+) -> None:
+    folder = write_lerobot(tmp_path / "set", range(3))
+    info = json.loads((folder / "meta/info.json").read_text())
+    info["features"]["observation.state"] = {"dtype": "float32", "shape": [7], "names": STATES}
+    for column in ("cartesian_position", "gripper_position"):
+        del info["features"][f"observation.state.{column}"]
+    (folder / "meta/info.json").write_text(json.dumps(info))
+    of_column = {"observation.state": {"min": [0.0] * 6 + [low], "max": [0.0] * 6 + [high]}}
+    lines = [of_column] if name.endswith(".json") else [{"episode_index": 0, "stats": of_column}] * 2
+    (folder / name).write_text("\n".join(map(json.dumps, lines)))
+    knobs = plain(look_at(str(folder)).knobs)["lerobot"]
+    assert (knobs["gripper_open"], knobs["gripper_closed"]) == expected
+
+
+def test_a_rate_that_nothing_says_is_a_guess(tmp_path: Path) -> None:
+    folder = WRITERS["rlds"](tmp_path / "mine", range(3))
+    features = json.loads((folder / "features.json").read_text())
+    inner = features["featuresDict"]["features"]["steps"]["sequence"]["feature"]["featuresDict"]["features"]
+    observed = inner["observation"]["featuresDict"]["features"]
+    observed["front"] = observed.pop("exterior_image_1_left")
+    (folder / "features.json").write_text(json.dumps(features))
+    found = look_at(str(folder))
+    knobs = {"data": found.knobs}
+    assert plain(found.knobs)["camera"] in {"front", "exterior_image_2_left"}
+    assert plain(found.knobs)["fields"]["state"][0] == "steps/observation/cartesian_position"
+    assert found.rate_hz.is_guess
+    assert "data.fields.control_rate_hz" in guesses(knobs)
+
+
+def test_more_cameras_of_npz_are_listed(tmp_path: Path) -> None:
+    folder = write_npz(tmp_path / "set", [0])
+    arrays = dict(np.load(folder / "000.npz"))
+    frames = arrays.pop("frames")
+    np.savez(folder / "000.npz", **arrays, wrist=frames, side=frames)
+    assert plain(look_at(str(folder)).knobs)["camera"] == "side"
+
+
+@pytest.mark.parametrize(
+    ("files", "needed"),
+    [
+        (["run_0.mcap"], "ros2_bag.py"),
+        (["one/two/bag_0.db3"], "ros2_bag.py"),
+        (["demo.mp4", "poses.csv"], "mp4_and_csv.py"),
+        (["episode_0.hdf5"], "one .npz for each episode"),
+        ([], "an empty folder"),
+        (["notes.txt"], "notes.txt"),
+    ],
+)
+def test_what_is_not_read_is_named_with_the_way_out(files: list[str], needed: str, tmp_path: Path) -> None:
+    for name in files:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    with pytest.raises(InputError, match=needed.replace(".", r"\.")) as raised:
+        look_at(str(tmp_path))
+    assert "meta/info.json" in raised.value.needed
+
+
+def test_a_name_of_the_hub_is_recognized(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=r"hf://datasets/someone/their_set"):
+        look_at("someone/their_set")
+
+
+def test_an_npz_without_states_says_what_it_has(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", poses=np.zeros((4, 7)), frames=np.zeros((4, 8, 8, 3), np.uint8))
+    with pytest.raises(InputError, match=r"poses \[4, 7\] float64, frames \[4, 8, 8, 3\] uint8.*states \[steps, 7\]"):
+        look_at(str(tmp_path))
+
+
+def test_droid_needs_no_look() -> None:
+    found = look_at("gs://gresearch/robotics/droid/1.0.1")
+    assert found.episodes == 95_658
+    values = {"run_dir": "run", "model": {"base": "builtin:sim-tiny"}}
+    data = {"path": found.path, **plain(found.knobs), "idle": plain(found.idle or {})}
+    assert config_from({**values, "data": data}, where="here").data.idle.rule == "published"

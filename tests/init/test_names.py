@@ -1,0 +1,97 @@
+"""Where pose, gripper and camera probably are: told by names, guessed by widths, and joints are no pose."""
+
+import pytest
+
+from vjepa2_ac.init.names import Column, find_pose, pick_camera, short_name
+
+JOINTS = Column(
+    7, ("shoulder_pan.pos", "shoulder_lift.pos", "elbow_flex.pos", "wrist_flex.pos", "a.pos", "b.pos", "g.pos")
+)
+
+
+def test_droids_columns_are_known() -> None:
+    columns = {
+        "action.cartesian_position": Column(6),
+        "observation.state.joint_position": Column(7),
+        "observation.state.cartesian_position": Column(6),
+        "observation.state.gripper_position": Column(1),
+    }
+    pose = find_pose(columns)
+    assert pose is not None
+    assert pose.columns == ("observation.state.cartesian_position", "observation.state.gripper_position")
+    assert (pose.rotation, pose.is_guess, pose.select) == ("euler_xyz", False, None)
+
+
+@pytest.mark.parametrize(
+    ("names", "rotation", "select"),
+    [
+        ("x y z roll pitch yaw gripper", "euler_xyz", None),
+        ("gripper x y z roll pitch yaw", "euler_xyz", (1, 2, 3, 4, 5, 6, 0)),
+        ("eef.x eef.y eef.z eef.qw eef.qx eef.qy eef.qz gripper.pos", "quaternion_wxyz", (0, 1, 2, 4, 5, 6, 3, 7)),
+        ("x y z qx qy qz qw gripper", "quaternion_xyzw", None),
+        ("j0 j1 x y z qx qy qz qw finger_joint", "quaternion_xyzw", (2, 3, 4, 5, 6, 7, 8, 9)),
+    ],
+)
+def test_numbers_that_have_names_are_chosen_by_them(names: str, rotation: str, select: tuple[int, ...] | None) -> None:
+    named = tuple(names.split())
+    pose = find_pose({"action": Column(len(named), named), "observation.state": Column(len(named), named)})
+    assert pose is not None
+    assert pose.columns == ("observation.state",)
+    if rotation == "quaternion_wxyz":
+        rotation, select = "quaternion_xyzw", (0, 1, 2, 4, 5, 6, 3, 7)  # in the order that is asked for first
+    assert (pose.rotation, pose.select, pose.is_guess) == (rotation, select, False)
+
+
+def test_three_numbers_of_an_axis_times_an_angle_are_a_guess() -> None:
+    names = ("x", "y", "z", "rx", "ry", "rz", "gripper")
+    pose = find_pose({"observation.state": Column(7, names)})
+    assert pose is not None
+    assert pose.is_guess
+
+
+@pytest.mark.parametrize(
+    ("columns", "rotation", "found"),
+    [
+        ({"observation.ee_pose": 6, "observation.gripper": 1}, "euler_xyz", 2),
+        ({"observation.tcp_pose": 7, "observation.gripper_width": 1}, "quaternion_xyzw", 2),
+        ({"observation.state": 7}, "euler_xyz", 1),
+        ({"observation.state": 8}, "quaternion_xyzw", 1),
+    ],
+)
+def test_widths_are_a_guess(columns: dict[str, int], rotation: str, found: int) -> None:
+    pose = find_pose({name: Column(width) for name, width in columns.items()})
+    assert pose is not None
+    assert (pose.rotation, len(pose.columns), pose.is_guess) == (rotation, found, True)
+
+
+@pytest.mark.parametrize(
+    "columns",
+    [
+        {},
+        {"observation.state": JOINTS},
+        {"observation.state": Column(14)},
+        {"observation.joint_position": Column(7), "observation.gripper_position": Column(1)},
+        {"action": Column(7, ("x", "y", "z", "roll", "pitch", "yaw", "gripper"))},
+    ],
+)
+def test_joints_and_commands_are_no_pose(columns: dict[str, Column]) -> None:
+    assert find_pose(columns) is None
+
+
+@pytest.mark.parametrize(
+    ("cameras", "chosen"),
+    [
+        (["wrist", "front"], "front"),
+        (["observation.images.wrist_left", "observation.images.exterior_2_left"], "observation.images.exterior_2_left"),
+        (["cam_a", "cam_b"], "cam_a"),
+        (["hand"], "hand"),
+        (["image_3", "image_0"], "image_0"),
+    ],
+)
+def test_a_camera_that_looks_on_is_preferred(cameras: list[str], chosen: str) -> None:
+    assert pick_camera(cameras) == chosen
+
+
+def test_short_names_are_words() -> None:
+    assert short_name("observation.images.front left") == "front_left"
+    assert short_name("steps/observation/image_0") == "image_0"
