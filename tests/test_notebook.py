@@ -73,7 +73,7 @@ def test_it_runs_with_a_file_of_official_form(tmp_path: Path, simulated: Path) -
     shutil.copyfile(GOLDEN / "model/tiny.pt", tmp_path / "official.pt")
     config: dict[str, Any] = yaml.safe_load((ROOT / "configs/debug.yaml").read_text())
     config["data"] |= {"path": str(simulated), "frames": 3, "validation_share": 0.3, "test_share": 0.3}
-    config["data"] |= {"idle": {"rule": "none"}}  # its commands are not recorded
+    config["data"] |= {"workers": 0, "idle": {"rule": "none"}}  # its commands are not recorded
     config["model"] |= {"sizes": SIZES, "dtype": "float32"}
     config["training"] |= {"steps": 2, "warmup_steps": 0, "precision": "fp32", "device": "cpu"}
     config["training"] |= {"allow_weak_base": True}  # random weights
