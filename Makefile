@@ -1,10 +1,11 @@
-# make demo · make evidence · make trap · make encoders · make test · make test-oldest · make lint · make docs · make soak · make bench · make base: each creates the environment it needs.
+# make demo · make evidence · make trap · make encoders · make test · make test-oldest · make lint · make docs · make links · make audit · make soak · make bench · make base: each creates the environment it needs.
 PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/installed
 OLDEST := .venv-oldest
+AUDIT := .venv-audit
 
-.PHONY: demo demo-seeds base evidence trap encoders test test-oldest docs soak lint format bench clean
+.PHONY: demo demo-seeds base evidence trap encoders test test-oldest docs soak lint links audit format bench clean
 
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed; set PYTHON=...")'
@@ -59,10 +60,23 @@ docs: $(INSTALLED)  ## the site, into build/site: offline, searchable; a link th
 soak: $(INSTALLED)  ## runs that are killed 20 times each (0 and 2 loader workers, with and without a best checkpoint)
 	VJEPA2_AC_SOAK=20 $(BIN)/pytest -q --log-cli-level=INFO tests/training/test_soak.py
 
-lint: $(INSTALLED)  ## style and types
+lint: $(INSTALLED)  ## style, types, spelling, and links within the project; needs no network
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	git ls-files -z -co --exclude-standard | xargs -0 $(BIN)/codespell
+	$(BIN)/python scripts/check_links.py
+
+links: $(INSTALLED)  ## links to other sites; needs the network
+	$(BIN)/python scripts/check_links.py --external
+
+$(AUDIT)/installed: constraints.txt
+	$(PYTHON) -m venv $(AUDIT)
+	$(AUDIT)/bin/pip install --quiet --disable-pip-version-check -c constraints.txt pip-audit
+	touch $@
+
+audit: $(AUDIT)/installed  ## known vulnerabilities of every pin; needs the network. --strict: a pin that was not looked up is a failure
+	$(AUDIT)/bin/pip-audit --strict --no-deps --disable-pip -r constraints.txt
 
 format: $(INSTALLED)
 	$(BIN)/ruff check --fix .
@@ -75,4 +89,4 @@ bench: $(INSTALLED)  ## figures of this machine; each prints a ratio against a n
 	$(BIN)/python benchmarks/planning.py
 
 clean:
-	rm -rf .venv .venv-oldest demo
+	rm -rf .venv .venv-oldest .venv-audit demo

@@ -28,7 +28,7 @@ def test_every_form_of_data_has_its_config() -> None:
 
 # Names in docs and docstrings: files, modules, knobs.
 
-DOCS = [ROOT / "README.md", ROOT / "SECURITY.md", *sorted((ROOT / "docs").glob("*.md"))]
+DOCS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "SECURITY.md", *sorted((ROOT / "docs").glob("*.md"))]
 SOURCES = sorted((ROOT / "src").rglob("*.py"))
 TODAY = [path for path in [*DOCS, *SOURCES] if path.name != "log.md"]  # the log tells of how things were
 PACKAGE = ROOT / "src/vjepa2_ac"

@@ -152,6 +152,9 @@ def _section(prefix: str, section: Mapping[str, Any], schema: Mapping[str, Any],
     if rows:
         lines += ["| key | values | default | |", "|---|---|---|---|", *rows, ""]
     for key, found, about in inner:
+        if key == "replay.data":
+            lines += [f"{'#' * min(depth, 4)} {key}", "", f"{about} Its keys are those of [data](#data).", ""]
+            continue
         lines += [f"{'#' * min(depth, 4)} {key}", "", about, "", *_section(f"{key}.", found, schema, depth=depth + 1)]
     return lines
 

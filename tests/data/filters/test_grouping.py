@@ -115,7 +115,7 @@ def test_a_pattern_that_would_run_for_ever_is_ended(monkeypatch: pytest.MonkeyPa
 
 
 def test_matching_takes_the_group_or_none_of_any_text() -> None:
-    texts = ["küche/1", 'quo"te/2', "none", "line\nbreak/3"]
+    texts = ["küche/1", 'quo"te/2', "none", "line\nbreak/3"]  # codespell:ignore te
     assert bounded_match.first_groups(r"/(\d)$", texts, where="here") == ["1", "2", None, "3"]
 
 

@@ -1,0 +1,152 @@
+"""The habits of the project: one version, pins, notices, hooks, workflows and links that say what is there."""
+
+import re
+import runpy
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import nbformat
+import pytest
+import yaml
+
+from paths import ROOT
+
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+TARGETS = set(re.findall(r"^([a-z][\w-]*):", (ROOT / "Makefile").read_text(), flags=re.MULTILINE))
+CHECKS = runpy.run_path(str(ROOT / "scripts/check_links.py"))
+FORMS = sorted((ROOT / ".github/ISSUE_TEMPLATE").glob("[!c]*.yml"))
+WORKFLOWS = sorted((ROOT / ".github/workflows").glob("*.yml"))
+
+LIBRARIES = "bitsandbytes|Franka|PEFT|PEP 610|protobuf.dev|PyTorch|TFDS|torchmetrics|torchvision|WCAG"
+SOURCE = re.compile(r"Source: (.*?)(?=\n\s*\n|\"\"\"|\Z)", flags=re.DOTALL)
+REPOSITORY = r"[\w-]+/[\w-]+(?= @ )|^[\w-]+/[\w-]+"
+AUTHOR = r"[A-Z]\w+(?= et al| \(\d{4}\))|^[A-Z]\w+(?=,| and )"
+NAMED = re.compile(rf"{REPOSITORY}|\d{{4}}\.\d{{5}}|{AUTHOR}|\b(?:{LIBRARIES})\b")
+
+
+def canonical(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def loaded(path: Path) -> Any:
+    return yaml.safe_load(path.read_text())
+
+
+# Version and pins.
+
+
+def test_one_version_and_those_who_repeat_it_agree() -> None:
+    cited = loaded(ROOT / "CITATION.cff")["version"]
+    newest = re.search(r"^## \[([\d.]+)\] - ", (ROOT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)
+    assert newest
+    assert {str(cited), newest[1]} == {PROJECT["version"]}
+    assert '__version__ = version("vjepa2-ac")' in (ROOT / "src/vjepa2_ac/__init__.py").read_text()
+
+
+def test_every_dependency_has_one_pin() -> None:
+    lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if line and line[0] != "#"]
+    pins = [canonical(line.split("==")[0]) for line in lines]
+    assert all(re.fullmatch(r"[\w.-]+==[\w.]+", line) for line in lines)
+    assert len(pins) == len(set(pins))
+    asked = [*PROJECT["dependencies"], *(one for extra in PROJECT["optional-dependencies"].values() for one in extra)]
+    names = {canonical(re.split(r"[\[<>=]", one)[0]) for one in asked} - {"vjepa2-ac"}
+    assert not (names | {"pip-audit", "build", "twine"}) - set(pins)
+
+
+# Notices.
+
+
+def test_everything_that_is_ported_stands_in_the_notice() -> None:
+    notice, wrong = (ROOT / "NOTICE").read_text(), []
+    for path in sorted((ROOT / "src").rglob("*.py")):
+        for block in SOURCE.findall(path.read_text()):
+            text = re.sub(r"\s+", " ", block)
+            names = [found[0] for found in NAMED.finditer(text)]
+            missing = [name for name in names if name not in notice] if names else ["names nobody"]
+            wrong += [f"{path.relative_to(ROOT)}: {name}: {text}" for name in missing]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_nothing_is_vendored() -> None:
+    """NOTICE says so: all code is in our package, and the package holds no library of others."""
+    assert not [path for path in (ROOT / "src").rglob("*") if re.search(r"vendor|third.party|extern$", path.name)]
+    kinds = {path.suffix for path in (ROOT / "src").rglob("*") if path.is_file() and "__pycache__" not in path.parts}
+    kinds -= {part.suffix for folder in (ROOT / "src").glob("*.egg-info") for part in folder.iterdir()}
+    assert kinds <= {".py", ".typed", "", ".jinja", ".css", ".json", ".yaml", ".safetensors"}
+
+
+# Pages, forms, workflows, hooks.
+
+
+def test_every_target_that_is_named_is_there() -> None:
+    pages = [ROOT / "CONTRIBUTING.md", ROOT / "SECURITY.md", ROOT / "docs/releasing.md", *WORKFLOWS]
+    for page in pages:
+        lines = re.findall(r"(?:^|`|run: )make ([a-z][a-z -]*)", page.read_text(), flags=re.MULTILINE)
+        assert {word for line in lines for word in line.split()} <= TARGETS, page.name
+
+
+def test_contributing_is_short_and_leads_to_each_of_the_five() -> None:
+    page = (ROOT / "CONTRIBUTING.md").read_text()
+    assert len(page.splitlines()) <= 90
+    extending = re.findall(r"^## (A .+)$", (ROOT / "docs/extending.md").read_text(), flags=re.MULTILINE)
+    assert len(extending) == 5
+    assert all(f"docs/extending.md#{title.lower().replace(' ', '-')}" in page for title in extending)
+
+
+@pytest.mark.parametrize("path", FORMS, ids=lambda path: path.stem)
+def test_an_issue_form_can_be_filled_in(path: Path) -> None:
+    form = loaded(path)
+    assert {"name", "description", "body"} <= set(form)
+    fields = [field for field in form["body"] if field["type"] != "markdown"]
+    assert {field["type"] for field in fields} <= {"input", "textarea", "dropdown", "checkboxes"}
+    assert len({field["id"] for field in fields}) == len(fields)
+    assert all(field["attributes"]["label"] for field in fields)
+
+
+@pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.stem)
+def test_a_workflow_may_only_read_and_pins_its_actions(path: Path) -> None:
+    text = path.read_text()
+    if path.name in {"ci.yml", "weekly.yml"}:
+        assert loaded(path)["permissions"] == {"contents": "read"}
+    assert all(re.fullmatch(r"[\w-]+/[\w-]+@v\d+", used) for used in re.findall(r"uses: (\S+)", text))
+
+
+def test_hooks_are_the_tools_of_make_lint() -> None:
+    """From the environment that `make` creates: their versions are those of constraints.txt."""
+    repositories = loaded(ROOT / ".pre-commit-config.yaml")["repos"]
+    assert [one["repo"] for one in repositories] == ["local"]
+    entries = {hook["entry"].removesuffix(" --force-exclude") for hook in repositories[0]["hooks"]}
+    recipe = re.search(r"^lint:.*\n((?:\t.*\n)+)", (ROOT / "Makefile").read_text(), flags=re.MULTILINE)
+    assert recipe
+    tools = {re.search(r"\$\(BIN\)/(.*)", line)[1] for line in recipe[1].splitlines()}  # type: ignore[index]
+    expected = {f".venv/bin/{tool.removesuffix(' .').removesuffix(' --check')}" for tool in tools}
+    assert entries == expected | {".venv/bin/python scripts/strip_notebooks.py"}
+
+
+# Links and notebooks.
+
+
+def test_no_link_is_dead() -> None:
+    assert not CHECKS["dead_links"](ROOT)
+
+
+def test_dead_links_are_found(tmp_path: Path) -> None:
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "docs/a.md").write_text("# One `thing`, two\n\n## Twice\n\n## Twice\n\n```sh\n# no heading\n```\n")
+    good = "[a](docs/a.md) [b](docs/a.md#one-thing-two) [c](docs/a.md#twice-1) [d](#here) `[e](not.md)`\n\n# Here\n"
+    (tmp_path / "README.md").write_text(good + "\n```md\n[f](not.md)\n```\n")
+    assert CHECKS["dead_links"](tmp_path) == []
+    bad = ("docs/b.md", "docs/a.md#twice-2", "docs/a.md#no-heading", "#there")
+    (tmp_path / "README.md").write_text("\n".join(f"[x]({link})" for link in bad) + '\n<img src="docs/a.png">\n')
+    assert CHECKS["dead_links"](tmp_path) == [f"README.md: {link}" for link in (*bad, "docs/a.png")]
+
+
+def test_outputs_are_stripped(tmp_path: Path) -> None:
+    strip, path = runpy.run_path(str(ROOT / "scripts/strip_notebooks.py"))["strip"], tmp_path / "a.ipynb"
+    output = nbformat.v4.new_output("stream", text="hello")
+    cell = nbformat.v4.new_code_cell("print('hello')", outputs=[output], execution_count=3)
+    nbformat.write(nbformat.v4.new_notebook(cells=[cell]), path)
+    assert strip(str(path))
+    assert not strip(str(path))
+    assert nbformat.read(path, as_version=4).cells[0].outputs == []
