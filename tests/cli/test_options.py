@@ -70,7 +70,7 @@ def leaves(
 
 
 COMMANDS = leaves(program._parser())
-WITHOUT_SETTINGS = {("compare",), ("demo",), ("init",), ("export",), ("download",), ("imagine",)}
+WITHOUT_SETTINGS = {("compare",), ("data", "converter"), ("demo",), ("init",), ("export",), ("download",), ("imagine",)}
 BEHIND = {  # what each must be given, and an option with a value
     ("train",): (["c.yaml"], ["--check"]),
     ("evaluate",): (["run"], ["--clips", "3"]),

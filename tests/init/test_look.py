@@ -51,6 +51,21 @@ def test_numbers_that_are_no_pose_become_a_vector(tmp_path: Path) -> None:
     assert "data.lerobot.state" in guesses({"data": found.knobs})
 
 
+def test_depth_maps_are_not_offered_as_cameras(tmp_path: Path) -> None:
+    folder = write_lerobot(tmp_path / "set", range(3))
+    info = json.loads((folder / "meta/info.json").read_text())
+    keys = [name for name, one in info["features"].items() if one["dtype"] == "video"]
+    for number, key in enumerate(keys):
+        info["features"][key]["info"] = {"is_depth_map": True}
+        (folder / "meta/info.json").write_text(json.dumps(info))
+        if number < len(keys) - 1:
+            found = look_at(str(folder))
+            assert key in found.about[1]
+            assert key not in plain(found.knobs)["lerobot"]["cameras"].values()
+    with pytest.raises(InputError, match="no camera, only depth maps"):
+        look_at(str(folder))
+
+
 @pytest.mark.parametrize(
     ("low", "high", "expected"),
     [(0.0, 1.0, (0.0, 1.0)), (0.0, 0.08, (0.08, 0.0)), (2.0, 99.5, (99.5, 2.0))],

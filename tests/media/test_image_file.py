@@ -97,6 +97,13 @@ def test_a_jpeg_that_goes_over_its_pixels_again_and_again_is_refused() -> None:
     assert decode_image(progressive.getvalue(), "goal").shape == PIXELS.shape
 
 
+def test_a_tiff_is_taken_for_depth() -> None:
+    file = io.BytesIO()
+    Image.fromarray(np.full((8, 8), 900, np.uint16)).save(file, "TIFF")
+    with pytest.raises(InputError, match=r"goal: a TIFF, as depth is stored\. needed: a camera's image"):
+        decode_image(file.getvalue(), "goal")
+
+
 def test_images_that_are_too_many_of_their_size_are_not_decoded_together() -> None:
     require_bounded(720, 1280, "clip", count=256)
     with pytest.raises(InputError, match="clip: 64 images of 10000 x 10000 pixels at once"):

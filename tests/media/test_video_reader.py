@@ -54,6 +54,21 @@ def test_av1_is_decoded(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> No
     np.testing.assert_array_equal(read_frames(path, [19, 4, 3], where="a"), every_frame(path)[[19, 4, 3]])
 
 
+@pytest.mark.parametrize(("codec", "pixels"), [("libx265", "gray12le"), ("ffv1", "gray16le")])
+def test_depth_is_refused_by_its_pixels(
+    codec: str, pixels: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "a.mp4"
+    with av.open(str(path), "w") as file:
+        stream = file.add_stream(codec, rate=15, width=64, height=64, pix_fmt=pixels)
+        for _ in range(3):
+            file.mux(stream.encode(av.VideoFrame.from_ndarray(np.full((64, 64), 900, np.uint16), format=pixels)))
+        file.mux(stream.encode(None))
+    capfd.readouterr()  # what the encoder says
+    with pytest.raises(InputError, match=f"a: frames of {pixels}: one channel of more than 8 bits, as depth is stored"):
+        read_frames(path, [0], where="a")
+
+
 @pytest.mark.parametrize("rate", [15, 30, 60])
 @pytest.mark.parametrize("b_frames", [0, 3])
 def test_the_headers_rate_does_not_matter(tmp_path: Path, rate: int, b_frames: int) -> None:

@@ -77,6 +77,20 @@ def add_to(commands: Commands) -> None:
     argument(parser, "--frames N", "of a clip (the config's, 8 at most)", whole_number(2, 256))
     argument(parser, "--out DIR", "where to (inspection)", as_path, default=out)
 
+    text = "Print a script that makes a readable data set of another form, such as ROS bags; without NAME, list them."
+    parser = command(inner, "converter", _converter, text)
+    argument(parser, "name NAME", "which one", nargs="?")
+
+
+def _converter(options: argparse.Namespace) -> None:
+    from vjepa2_ac.init.converters import converter_text, converters
+
+    if options.name is not None:
+        print(converter_text(options.name), end="")
+        return
+    for name, about in converters().items():
+        print(f"{name:<16}{about}")
+
 
 def _check(options: argparse.Namespace) -> int:
     config = read_config(options.config, options.overrides)

@@ -10,6 +10,7 @@ from pathlib import Path
 from vjepa2_ac import storage
 from vjepa2_ac.data.sources.lerobot.info import INFO
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.init.converters import way_by
 from vjepa2_ac.init.found import FoundData
 from vjepa2_ac.init.of_lerobot import look_at_lerobot
 from vjepa2_ac.init.of_npz import look_at_npz
@@ -22,14 +23,16 @@ LOOKS: dict[str, Callable[[str], FoundData]] = {
     "npz": look_at_npz,
     "raw": look_at_raw,
 }
+_BY_HAND = "write one .npz for each episode (docs/data.md)"
 _WAYS = {  # to what is read, by the end of a file's name
-    ".mcap": "a ROS 2 bag: examples/convert/ros2_bag.py makes .npz of it",
-    ".db3": "a ROS 2 bag: examples/convert/ros2_bag.py makes .npz of it",
-    ".mp4": "videos alone: examples/convert/mp4_and_csv.py makes .npz of videos and poses",
-    ".hdf5": "HDF5: write one .npz for each episode (docs/data.md)",
-    ".h5": "HDF5: write one .npz for each episode (docs/data.md)",
-    ".zarr": "Zarr: write one .npz for each episode (docs/data.md)",
-    ".bag": "a ROS 1 bag: write one .npz for each episode (docs/data.md)",
+    ".mcap": f"a ROS 2 bag. {way_by('ros2_bag')} makes .npz of it",
+    ".db3": f"a ROS 2 bag. {way_by('ros2_bag')} makes .npz of it",
+    ".bag": f"a ROS 1 bag. {way_by('ros2_bag')} makes .npz of it",
+    ".lance": f"LeRobot's tables in Lance. {way_by('lance_to_files')} makes files of them",
+    ".mp4": f"videos alone. {way_by('mp4_and_csv')} makes .npz of videos and poses",
+    ".hdf5": f"HDF5: {_BY_HAND}",
+    ".h5": f"HDF5: {_BY_HAND}",
+    ".zarr": f"Zarr: {_BY_HAND}",
 }
 _HUB_NAME = re.compile(r"[\w.-]+/[\w.-]+")
 _DEEPEST = 2  # folders down, where a description may be

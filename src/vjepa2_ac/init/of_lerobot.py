@@ -29,8 +29,10 @@ def look_at_lerobot(path: str) -> FoundData:
     """
     info = read_info(path)
     cameras = {name: one for name, one in info.features.items() if one.is_camera}
+    depth = [name for name, one in info.features.items() if one.is_depth]
     if not cameras:
-        raise InputError(where=info.where, found="no camera", needed="videos or images of the robot")
+        found = f"no camera, only depth maps ({', '.join(depth)})" if depth else "no camera"
+        raise InputError(where=info.where, found=found, needed="videos or images of the robot")
     columns = {
         name: Column(one.width, one.names)
         for name, one in info.features.items()
@@ -61,7 +63,8 @@ def look_at_lerobot(path: str) -> FoundData:
         episodes=info.episodes,
         steps=frames if type(frames) is int else None,
         idle={"rule": Knob("commands" if velocity else "motion", "pauses teach nothing")} if pose else None,
-        about=(f"LeRobot {info.version}, {info.episodes:,} episodes at {info.fps:g} a second",),
+        about=(f"LeRobot {info.version}, {info.episodes:,} episodes at {info.fps:g} a second",)
+        + ((f"depth maps are not used: {', '.join(depth)}",) if depth else ()),
         extra="lerobot",
     )
 

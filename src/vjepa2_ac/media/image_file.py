@@ -18,6 +18,7 @@ from vjepa2_ac.media.image_size import require_bounded, require_few_scans
 from vjepa2_ac.storage import read_bytes, unreadable
 
 _JPEG = b"\xff\xd8"
+_TIFF = (b"II*\0", b"MM\0*")
 _EIGHT_BIT = {"1", "L", "LA", "P", "RGB", "RGBA"}  # Pillow's modes of at most 8 bits a channel
 
 
@@ -43,6 +44,8 @@ def decode_image(data: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]
     try:
         if data.startswith(_JPEG):
             return _jpeg(data, where)
+        if data.startswith(_TIFF):
+            raise InputError(where=where, found="a TIFF, as depth is stored", needed="a camera's image: PNG or JPEG")
         with PngImageFile(io.BytesIO(data)) as image:  # reads the header only
             require_bounded(image.height, image.width, where)
             return _as_rgb(image)

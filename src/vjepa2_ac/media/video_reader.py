@@ -6,6 +6,7 @@ A frame is identified by its presentation time, never by counting at the rate in
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -35,6 +36,7 @@ _STRICT = {
     "max_pixels": str(MOST_PIXELS),
 }
 _START = -(1 << 40)  # before every frame
+_DEEP_GREY = re.compile(r"gray(9|1\d|f)")
 _FIX = "Copy the file again, or leave the episode out"
 
 
@@ -86,6 +88,11 @@ def count_frames(file: str | Path | ByteReader, *, where: str) -> int:
         return len(video.stored_times() if video.is_indexed else video.shown_times())
 
 
+def is_deep_grey(pixel_format: str) -> bool:
+    """Return whether a pixel format has one channel of more than 8 bits, such as gray12le: a depth map's."""
+    return _DEEP_GREY.match(pixel_format) is not None
+
+
 @contextmanager
 def _opened(file: str | Path | ByteReader, where: str) -> Iterator[_Video]:
     """Open a video for decoding in one thread: the loader's workers are the parallelism."""
@@ -130,9 +137,13 @@ def _video_of(container: InputContainer, converter: VideoReformatter, where: str
             needed="H.264, H.265 or AV1",
             fix="Install PyAV from PyPI, or convert the video",
         )
+    video = cast("VideoStream", stream)
+    if is_deep_grey(str(video.pix_fmt)):
+        found = f"frames of {video.pix_fmt}: one channel of more than 8 bits, as depth is stored"
+        raise InputError(where=where, found=found, needed="what a camera saw", fix="Name another camera")
     stream.codec_context.thread_count = 1
     stream.codec_context.options = _STRICT
-    return _Video(container, cast("VideoStream", stream), converter, where)
+    return _Video(container, video, converter, where)
 
 
 @dataclass(frozen=True)

@@ -339,11 +339,70 @@ def test_a_camera_that_the_config_does_not_name_cannot_be_read(v30: Path) -> Non
         source_of(v30).read(0, camera="exterior_3_left")
 
 
-@pytest.mark.parametrize("version", ["v1.6", "v2.0", "v3.1", 3, None])
-def test_other_versions_are_refused(version: object, copy: Path) -> None:
+@pytest.mark.parametrize(
+    ("version", "way"),
+    [
+        ("v1.6", r"lerobot 0\.3\.3's .*convert_dataset_v1_to_v2\.py"),
+        ("v2.0", r"lerobot 0\.3\.3's .*convert_dataset_v20_to_v21\.py"),
+        ("v3.1", "newer than this program: update vjepa2-ac"),
+        ("v4.0", "newer than this program: update vjepa2-ac"),
+        (3, "Convert the data set with the lerobot package"),
+        (None, "Convert the data set with the lerobot package"),
+    ],
+)
+def test_other_versions_are_refused_with_the_way_from_each(version: object, way: str, copy: Path) -> None:
     change_info(copy, codebase_version=version)
-    with pytest.raises(InputError, match=r"meta/info\.json: codebase_version .*needed: v2\.1 or v3\.0"):
+    with pytest.raises(InputError, match=rf"meta/info\.json: codebase_version .*needed: v2\.1 or v3\.0\. .*{way}"):
         source_of(copy).infos()
+
+
+@pytest.mark.parametrize(("stored_as", "way"), [("lance", "data converter lance_to_files"), ("zarr", "lerobot")])
+def test_other_storage_is_refused_by_name(stored_as: str, way: str, copy: Path) -> None:
+    change_info(copy, storage_format="parquet")
+    assert len(source_of(copy).infos()) == len(LENGTHS)
+    change_info(copy, storage_format=stored_as)
+    with pytest.raises(InputError, match=rf"storage_format '{stored_as}'\. needed: Parquet files and MP4.*{way}"):
+        source_of(copy).infos()
+
+
+def change_feature(root: Path, name: str, **changes: object) -> None:
+    features = json.loads((root / "meta/info.json").read_text())["features"]
+    features[name] = features.get(name, {"shape": [1], "names": None}) | changes
+    change_info(root, features=features)
+
+
+@pytest.mark.parametrize(
+    "mark",
+    [
+        {"info": {"is_depth_map": True}},
+        {"info": {"video.is_depth_map": True}},
+        {"video_info": {"video.is_depth_map": True}},
+        {"info": {"video.pix_fmt": "gray12le"}},
+    ],
+    ids=["today", "before", "long before", "unmarked"],
+)
+def test_a_depth_map_is_no_camera(mark: dict[str, object], copy: Path) -> None:
+    change_feature(copy, KEY, info={"is_depth_map": False, "video.pix_fmt": "gray"})
+    assert len(source_of(copy).infos()) == len(LENGTHS)
+    change_feature(copy, KEY, **({"info": {}} | mark))
+    with pytest.raises(InputError, match=rf"{KEY}, which is a depth map in .*needed: images of a camera\. It has: obs"):
+        source_of(copy).infos()
+    assert len(source_of(copy, camera="wrist_left").infos()) == len(LENGTHS)
+
+
+def test_language_columns_are_left_alone_and_are_no_numbers(copy: Path) -> None:
+    names = ("language_persistent", "language_events")
+    for name in names:
+        change_feature(copy, name, dtype="language")
+    row = [{"role": "user", "content": "grasp it", "style": "subtask", "timestamp": 0.0}]
+    for path in (copy / "data").rglob("*.parquet"):
+        table = pq.read_table(path)
+        for name in names:
+            table = table.append_column(name, pa.array([row] * len(table)))
+        pq.write_table(table, path)
+    assert len(source_of(copy).read(0).states) == LENGTHS[0]
+    with pytest.raises(InputError, match=r"language_events, which is a column of language .*needed: a column of num"):
+        source_of(copy, lerobot={"state": ["language_events"]}).infos()
 
 
 @pytest.mark.parametrize(

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import difflib
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import LeRobotData, LeRobotFields
+from vjepa2_ac.data.sources.lerobot.features import Feature, feature_of
+from vjepa2_ac.data.sources.lerobot.other_forms import FILES, way_from_storage, way_from_version
 from vjepa2_ac.data.sources.lerobot.path_templates import require_template
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage.structured import read_json_object
@@ -21,25 +22,6 @@ _QUATERNION = (8, "a quaternion's 4")
 _STATE_NUMBERS = {"euler_xyz": (7, "3 Euler angles"), "quaternion_wxyz": _QUATERNION, "quaternion_xyzw": _QUATERNION}
 _FIX = "Get meta/info.json again"
 _WAY_TO_HUB = "Check the name in hf://datasets/owner/name; for a private data set, `hf auth login` or set HF_TOKEN"
-
-
-@dataclass(frozen=True)
-class Feature:
-    """One column, or one camera."""
-
-    dtype: str
-    shape: tuple[int, ...]
-    names: tuple[str, ...] = ()
-
-    @property
-    def width(self) -> int:
-        """Its width: numbers per step."""
-        return math.prod(self.shape)
-
-    @property
-    def is_camera(self) -> bool:
-        """Whether it contains frames."""
-        return self.dtype in {"video", "image"}
 
 
 @dataclass(frozen=True)
@@ -67,12 +49,12 @@ class DatasetInfo:
             InputError: A column or camera is missing (lists the existing ones), or they do not form a state.
         """
         fields = config.lerobot
-        columns = [name for name, feature in self.features.items() if not feature.is_camera]
+        columns = [name for name, feature in self.features.items() if feature.is_numbers]
         wanted = {"state": fields.state, "action": fields.action if config.actions == "recorded" else ()}
         for knob, names in wanted.items():
             for name in names:
                 if name not in columns:
-                    raise missing(f"data.lerobot.{knob}", "column", name, self.where, columns)
+                    raise self._missing(f"data.lerobot.{knob}", "column", name, columns)
         _require_state(self, config)
         for camera in config.cameras:
             self.camera_key(fields, camera)
@@ -88,10 +70,21 @@ class DatasetInfo:
         key = fields.cameras[camera]
         cameras = [name for name, feature in self.features.items() if feature.is_camera]
         if key not in cameras:
-            raise missing(f"data.lerobot.cameras.{camera}", "camera", key, self.where, cameras)
+            raise self._missing(f"data.lerobot.cameras.{camera}", "camera", key, cameras)
         if self.features[key].dtype == "video" and self.video_path is None:
             raise InputError(where=self.where, found=f"no video_path, and {key} is a video", needed="one", fix=_FIX)
         return key
+
+    def _missing(self, where: str, kind: str, name: str, known: Iterable[str]) -> InputError:
+        """Return the error of a name that the data set has not, or has for something else."""
+        if name not in self.features:
+            return missing(where, kind, name, self.where, known)
+        return InputError(
+            where=where,
+            found=f"{name}, which is {self.features[name].kind} in {self.where}",
+            needed="images of a camera" if kind == "camera" else "a column of numbers",
+            fix=f"It has: {', '.join(known) or 'none'}",
+        )
 
 
 def missing(where: str, kind: str, name: str, place: str, known: Iterable[str]) -> InputError:
@@ -120,8 +113,11 @@ def read_info(root: str) -> DatasetInfo:
     except OSError as error:
         raise storage.unreadable(where, error) from None
     if (version := content.get("codebase_version")) not in VERSIONS:
-        fix = "Convert the data set with the lerobot package, which has a script for each step from older versions"
-        raise InputError(where=where, found=f"codebase_version {version!r}", needed=" or ".join(VERSIONS), fix=fix)
+        found, fix = f"codebase_version {version!r}", way_from_version(version)
+        raise InputError(where=where, found=found, needed=" or ".join(VERSIONS), fix=fix)
+    if (stored_as := content.get("storage_format") or FILES) != FILES:
+        found, fix = f"storage_format {stored_as!r}", way_from_storage(stored_as)
+        raise InputError(where=where, found=found, needed="Parquet files and MP4 videos", fix=fix)
     try:
         return _parsed(root, where, content)
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
@@ -142,17 +138,8 @@ def _parsed(root: str, where: str, content: Mapping[str, Any]) -> DatasetInfo:
         chunk_episodes=chunk,
         data_path=require_template(content["data_path"], f"{where}: data_path"),
         video_path=None if video_path is None else require_template(video_path, f"{where}: video_path"),
-        features={name: _feature(feature) for name, feature in content["features"].items()},
+        features={name: feature_of(feature) for name, feature in content["features"].items()},
     )
-
-
-def _feature(content: Mapping[str, Any]) -> Feature:
-    dtype, shape, names = content["dtype"], tuple(content["shape"]), content.get("names")
-    if not isinstance(dtype, str) or not all(type(size) is int and size > 0 for size in shape):
-        raise TypeError(f"a feature of dtype {dtype!r} and shape {shape!r}")
-    if isinstance(names, dict) and len(names) == 1:  # {"motors": ["x", "y", ...]}, as in older ports
-        names = next(iter(names.values()))
-    return Feature(dtype, shape, tuple(map(str, names)) if isinstance(names, list) else ())
 
 
 def _require_state(info: DatasetInfo, config: LeRobotData) -> None:
