@@ -30,7 +30,7 @@ base:  $(INSTALLED)  ## make the demo's base model again (about an hour); replac
 	cp base/decoder/decoder.json base/decoder/decoder.safetensors base/decoder/linear.safetensors src/vjepa2_ac/assets/sim-tiny/decoder
 
 evidence: $(INSTALLED)  ## does LoRA help? every method side by side; goes on where it stopped; replaces table and plot
-	$(BIN)/python benchmarks/evidence --readme README.md
+	$(BIN)/python benchmarks/evidence --page docs/evidence.md
 
 trap: $(INSTALLED)  ## does a lower error plan better? narrow and varied demonstrations, every checkpoint in closed loop
 	$(BIN)/python benchmarks/trap --picture docs/ranking.png

@@ -18,7 +18,7 @@ exclude_patterns = ["site"]
 
 myst_heading_anchors = 4  # as GitHub makes them
 myst_enable_extensions = ["colon_fence"]
-suppress_warnings = ["myst.header"]  # results begin at the heading that README has for them
+suppress_warnings = ["myst.header"]  # results begin at the heading that docs/evidence.md has for them
 
 html_theme = "furo"
 html_title = f"vjepa2-ac {version}"

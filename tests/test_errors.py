@@ -62,7 +62,7 @@ def test_a_name_has_no_say_over_a_terminal(text: str, shown: str) -> None:
     [
         ('{"url": "file:///x", "dir_info": {"editable": true}}', "sim", 'pip install -c constraints.txt -e ".[sim]"'),
         ('{"url": "file:///x", "dir_info": {"editable": true}}', "", "pip install -c constraints.txt -e ."),
-        ('{"url": "file:///x.whl", "archive_info": {}}', "sim", 'pip install "vjepa2-ac[sim]"'),
+        ('{"url": "file:///x.whl", "archive_info": {}}', "sim", 'pip install "vjepa2-ac[sim] @ file:///x.whl"'),
         (None, "sim", 'pip install "vjepa2-ac[sim]"'),  # from an index
         (None, "", "pip install vjepa2-ac"),
     ],

@@ -26,11 +26,11 @@ def main() -> int:
     from table import place_in, write_tables
 
     folder, results = options.folder, options.folder / ("choosing" if options.choose else "results")
-    if options.readme:
-        place_in(options.readme)  # before the hours, not after them
+    if options.page:
+        place_in(options.page)  # before the hours, not after them
     results.mkdir(parents=True, exist_ok=True)
     if options.table:
-        write_tables(folder, options.out, options.readme)
+        write_tables(folder, options.out, options.page)
         return 0
     prepare(folder, options.seeds)
     cells = list(candidate_cells() if options.choose else all_cells(options.seeds))
@@ -39,7 +39,7 @@ def main() -> int:
     print(f"{len(cells)} cells, {len(cells) - len(missing)} of them done", flush=True)
     failed = _run(missing, results, options)
     if not options.choose:
-        write_tables(folder, options.out, options.readme)
+        write_tables(folder, options.out, options.page)
     return 1 if failed else 0
 
 
@@ -47,7 +47,7 @@ def _parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--folder", type=Path, default=Path("evidence"), help="data, bases, runs, results")
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results"), help="where table and plot go")
-    parser.add_argument("--readme", type=Path, help="a README whose short table is to be made anew")
+    parser.add_argument("--page", type=Path, help="a page whose short table is to be made anew")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--goals", type=int, default=20, help="of each run; a row pools its seeds")
     parser.add_argument("--workers", type=int, default=2, help="cells at once, one thread each")

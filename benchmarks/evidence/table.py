@@ -35,11 +35,11 @@ NOTES = """Read it so:
   32 with in/out; all else inherits them."""
 
 
-def write_tables(folder: Path, out: Path, readme: Path | None = None) -> None:
-    """Write evidence.md and evidence.png of what is there, print the table, and put the short one into a README.
+def write_tables(folder: Path, out: Path, page: Path | None = None) -> None:
+    """Write evidence.md and evidence.png of what is there, print the table, and put the short one into a page.
 
     Raises:
-        ValueError: The README has no place for it.
+        ValueError: The page has no place for it.
     """
     results = read_results(folder)
     if not results:
@@ -56,31 +56,31 @@ def write_tables(folder: Path, out: Path, readme: Path | None = None) -> None:
     (out / "evidence.json").write_text(json.dumps([_slim(one) for one in results], indent=None) + "\n")
     print(text)
     draw(results, out / PLOT)
-    if readme is not None:
-        write_summary(results, readme)
+    if page is not None:
+        write_summary(results, page)
     print(f"\n{out / TABLE}\n{out / PLOT}")
 
 
-def write_summary(results: Sequence[Figures], readme: Path) -> None:
-    """Put the short table between the marks in a README, which stays as it is otherwise.
+def write_summary(results: Sequence[Figures], page: Path) -> None:
+    """Put the short table between the marks in a page, which stays as it is otherwise.
 
     Raises:
         ValueError: The marks are not there.
     """
-    before, begin, end, after = place_in(readme)
-    readme.write_text(f"{before}{begin}\n{summary(results)}\n{end}{after}")
+    before, begin, end, after = place_in(page)
+    page.write_text(f"{before}{begin}\n{summary(results)}\n{end}{after}")
 
 
-def place_in(readme: Path) -> tuple[str, str, str, str]:
-    """Return what stands before the short table in a README, the marks around it, and what stands after it.
+def place_in(page: Path) -> tuple[str, str, str, str]:
+    """Return what stands before the short table in a page, the marks around it, and what stands after it.
 
     Raises:
         ValueError: The marks are not there.
     """
-    before, begin, rest = readme.read_text().partition(_BEGIN)
+    before, begin, rest = page.read_text().partition(_BEGIN)
     _, end, after = rest.partition(_END)
     if not (begin and end):
-        raise ValueError(f"{readme} has no {_BEGIN} ... {_END}")
+        raise ValueError(f"{page} has no {_BEGIN} ... {_END}")
     return before, begin, end, after
 
 

@@ -49,7 +49,7 @@ def write_pages(folder: Path) -> None:
 def commands_page() -> str:
     """Return a section for each command, with what `--help` prints."""
     os.environ["COLUMNS"] = _COLUMNS
-    lines = ["# Commands", "", "As `vjepa2-ac COMMAND --help` prints them.", ""]
+    lines = ["# Every command", "", "As `vjepa2-ac COMMAND --help` prints them.", ""]
     for words, parser in _leaves(_parser(), ()):
         lines += [f"## {' '.join(words)}", "", "```text", parser.format_help().strip(), "```", ""]
     return "\n".join(lines)

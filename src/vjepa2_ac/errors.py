@@ -89,21 +89,20 @@ def in_words(error: BaseException) -> str:
 
 
 def pip_install(extra: str = "") -> str:
-    """Return the command that installs this package, or an extra of it, as it was installed: a checkout, or a wheel."""
-    start, package = ("pip install -c constraints.txt -e ", ".") if _is_checkout() else ("pip install ", _PACKAGE)
-    return f'{start}"{package}[{extra}]"' if extra else start + package
-
-
-def _is_checkout() -> bool:
-    """Return whether this package runs from a folder of sources: installed by `pip install -e`, or not at all.
+    """Return the command that installs this package, or an extra of it, as it was installed: a checkout, or a wheel.
 
     Source: PEP 610, direct_url.json.
     """
     try:
         origin = json.loads(distribution(_PACKAGE).read_text("direct_url.json") or "{}")
     except (PackageNotFoundError, ValueError):
-        return True
-    return bool(origin.get("dir_info", {}).get("editable"))
+        origin = {"dir_info": {"editable": True}}
+    wanted = f"[{extra}]" if extra else ""
+    if origin.get("dir_info", {}).get("editable"):
+        return f'pip install -c constraints.txt -e ".{wanted}"' if extra else "pip install -c constraints.txt -e ."
+    if "archive_info" in origin:  # a wheel's file
+        return f'pip install "{_PACKAGE}{wanted} @ {origin["url"]}"'
+    return f'pip install "{_PACKAGE}{wanted}"' if extra else f"pip install {_PACKAGE}"
 
 
 def too_few_files(where: str = "") -> InputError:

@@ -148,9 +148,9 @@ def test_a_cell_is_trained_and_measured_and_its_base_comes_back(small: Any, tmp_
     for one in (figures, before, turned):
         one["cell"]["episodes"] = one["cell"]["episodes"] and 20
         (results / f"{one['cell']['name']}.json").write_text(json.dumps(one))
-    readme = tmp_path / "README.md"
-    readme.write_text(f"before\n{small.table._BEGIN}\nold\n{small.table._END}\nafter\n")
-    small.table.write_tables(tmp_path, tmp_path / "out", readme)
+    page = tmp_path / "evidence.md"
+    page.write_text(f"before\n{small.table._BEGIN}\nold\n{small.table._END}\nafter\n")
+    small.table.write_tables(tmp_path, tmp_path / "out", page)
     text = (tmp_path / "out" / "evidence.md").read_text()
     assert "LoRA r4 + in/out" in text
     assert "the base's, bit for bit" in text
@@ -159,7 +159,7 @@ def test_a_cell_is_trained_and_measured_and_its_base_comes_back(small: Any, tmp_
     assert "Made with not recorded (3 cells)" in text
     assert "oracle" in text
     assert (tmp_path / "out" / "evidence.png").stat().st_size > 5_000
-    new = readme.read_text()
+    new = page.read_text()
     assert new.startswith("before\n")
     assert new.endswith("\nafter\n")
     assert "old" not in new
@@ -177,9 +177,9 @@ def test_exactly_so_many_demonstrations_are_trained_on_and_seeds_draw_others(sma
     assert drawn[0] != drawn[1]
 
 
-def test_a_readme_without_a_place_for_the_table_is_left_alone(small: Any, tmp_path: Path) -> None:
-    readme = tmp_path / "README.md"
-    readme.write_text("nothing")
+def test_a_page_without_a_place_for_the_table_is_left_alone(small: Any, tmp_path: Path) -> None:
+    page = tmp_path / "evidence.md"
+    page.write_text("nothing")
     with pytest.raises(ValueError, match="made by"):
-        small.table.write_summary([], readme)
-    assert readme.read_text() == "nothing"
+        small.table.write_summary([], page)
+    assert page.read_text() == "nothing"

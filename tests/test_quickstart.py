@@ -1,0 +1,69 @@
+"""docs/QUICKSTART.md, walked through line by line: what runs here runs, the rest is what the program takes."""
+
+import re
+import shlex
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from paths import ROOT
+from vjepa2_ac.cli import main, program
+from vjepa2_ac.config.packaged import packaged_configs
+
+PAGE = (ROOT / "docs/QUICKSTART.md").read_text()
+SECTIONS = {
+    int(number): text for number, text in re.findall(r"^## (\d)\. .*?\n(.*?)(?=^## |\Z)", PAGE, re.DOTALL | re.M)
+}
+HERE = (2, 3, 4)
+SHORTER = {  # the same commands on less: they are walked, not measured
+    "train": ["training.steps=2", "validation.every=1", "checkpoint.every=1", "validation.clips=4", "data.workers=0"],
+    "evaluate": [
+        *("--clips", "4", "--sensitivity-clips", "2", "--samples", "8", "--examples", "1"),
+        *("--landscapes", "1", "--nodes", "3", "--axes", "2"),
+    ],
+    "simulate": ["--steps", "1", "planning.samples=16", "planning.iterations=1"],
+}
+
+
+def commands_of(section: int) -> list[list[str]]:
+    """Return the words of every line of a section that is run."""
+    lines = [
+        line for block in re.findall(r"```sh\n(.*?)```", SECTIONS[section], re.DOTALL) for line in block.splitlines()
+    ]
+    return [shlex.split(line, comments=True) for line in lines]
+
+
+def test_the_page_has_its_sections() -> None:
+    assert list(SECTIONS) == [1, 2, 3, 4, 5, 6]
+    assert all(words[0] == "vjepa2-ac" for section in (*HERE, 5) for words in commands_of(section))
+
+
+def test_from_data_to_a_number_and_a_plan(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    printed: dict[str, str] = {}
+    for words in [words for section in HERE for words in commands_of(section)]:
+        less = SHORTER.get(words[1], []) if "record" not in words else ["--steps", "33"]
+        assert main([*words[1:], *less]) == 0, words
+        printed[" ".join(words)] = capsys.readouterr().out
+    told = printed["vjepa2-ac init data/my_robot --model builtin:sim-tiny"]
+    walked = {" ".join(words) for words in commands_of(3)}
+    for line in re.findall(r"^  (vjepa2-ac .*?)   #", told, re.M):
+        assert line in walked, "init prints the page's commands"
+    assert "of doing nothing" in printed["vjepa2-ac evaluate runs/my_robot"]
+    for made in ("my_robot.yaml", "inspection", "runs/my_robot/report.html", "runs/my_robot/metrics.json", "merged"):
+        assert (tmp_path / made).exists(), made
+
+
+def test_what_does_not_run_here_is_what_the_program_takes() -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    for words in commands_of(5):
+        options = program._parser().parse_args(words[1:])
+        config = str(getattr(options, "config", getattr(options, "subject", "")))
+        if config.startswith("builtin:"):
+            assert config.removeprefix("builtin:") in packaged_configs()
+    asked = [name for found in re.findall(r"\[([\w,]+)\]\"", SECTIONS[1]) for name in found.split(",")]
+    assert asked
+    assert set(asked) <= set(extras)

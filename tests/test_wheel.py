@@ -1,0 +1,75 @@
+"""The wheel: built as docs/releasing.md says, whole, and enough on its own outside of the checkout."""
+
+import os
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from copied_sets import write_npz
+from paths import ROOT
+
+NEEDED = ("pyproject.toml", "README.md", "LICENSE", "NOTICE", "src/vjepa2_ac", "examples/convert")
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Build from a copy: building leaves folders beside the sources."""
+    copy = tmp_path_factory.mktemp("checkout")
+    for name in NEEDED:
+        source, target = ROOT / name, copy / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if source.is_dir():
+            shutil.copytree(source, target, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            shutil.copy(source, target)
+    run(sys.executable, "-m", "build", "--wheel", "--no-isolation", at=copy)
+    (built,) = (copy / "dist").glob("*.whl")
+    run(sys.executable, "-m", "twine", "check", "--strict", built, at=copy)
+    return built
+
+
+@pytest.fixture(scope="module")
+def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("installed")
+    run(sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", folder, wheel, at=folder)
+    return folder
+
+
+def run(*words: object, at: Path, path: Path | None = None) -> str:
+    environment = os.environ | {
+        "PYTHONPATH": str(path or ""),
+        "PYTHONSAFEPATH": "1",
+        "PIP_DISABLE_PIP_VERSION_CHECK": "1",
+    }
+    done = subprocess.run(list(map(str, words)), cwd=at, env=environment, text=True, capture_output=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_it_has_every_file_of_the_package_and_no_other(wheel: Path) -> None:
+    package = ROOT / "src/vjepa2_ac"
+    inside = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
+    files = [Path(folder) / name for folder, _, names in os.walk(package, followlinks=True) for name in names]
+    expected = {path.relative_to(package.parent).as_posix() for path in files if path.suffix != ".pyc"}
+    assert inside == expected
+    assert {"vjepa2_ac/assets/configs/demo.yaml", "vjepa2_ac/assets/convert/ros2_bag.py"} < inside
+    assert any(name.endswith("licenses/NOTICE") for name in zipfile.ZipFile(wheel).namelist())
+
+
+def test_it_is_enough_outside_of_the_checkout(installed: Path, tmp_path: Path) -> None:
+    def command(*words: object) -> str:
+        return run(sys.executable, "-m", "vjepa2_ac.cli", *words, at=tmp_path, path=installed)
+
+    where = run(sys.executable, "-c", "import vjepa2_ac; print(vjepa2_ac.__file__)", at=tmp_path, path=installed)
+    assert Path(where.strip()).is_relative_to(installed)
+    write_npz(tmp_path / "own", range(8))
+    said = command("init", "own", "--model", "builtin:sim-tiny", "--out", "own.yaml")
+    assert "vjepa2-ac train own.yaml --check" in said
+    assert "builtin:demo" in command("config", "list")
+    (tmp_path / "ros2_bag.py").write_text(command("data", "converter", "ros2_bag"))
+    assert (tmp_path / "ros2_bag.py").read_text() == (ROOT / "examples/convert/ros2_bag.py").read_text()
+    command("train", "own.yaml", "--check", "training.allow_weak_base=true")
