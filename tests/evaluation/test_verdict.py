@@ -90,6 +90,13 @@ def test_a_difference_that_is_small_and_sure_is_not_called_0_percent() -> None:
     assert "0.20% better than the base (gain 95 % interval 0.20% to 0.20%)" in words
 
 
+@pytest.mark.parametrize("episodes", [8, 1])
+def test_a_run_whose_checkpoint_is_the_base_is_neither_better_nor_worse(episodes: int) -> None:
+    both = (model(name, 1.0, noise=0.0, episodes=episodes) for name in ("base", "adapter"))
+    words = verdict(evaluation(*both, episodes=episodes))
+    assert words.startswith("The adapter predicts exactly as the base does, on 24 clips of")
+
+
 def test_a_difference_within_the_noise_is_not_called_one() -> None:
     words = verdict(evaluation(model("base", 1.0, noise=0.3), model("adapter", 0.999, noise=0.3)))
     assert words.startswith("The adapter did not clearly help")

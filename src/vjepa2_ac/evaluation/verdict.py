@@ -69,6 +69,8 @@ def _compared(evaluation: Evaluation, ahead: str) -> str:
     gain = improvement(evaluation, evaluation.horizon)
     if gain is None:
         return f"The {evaluation.trained} was measured {where}"
+    if gain.value == gain.low == gain.high == 0 or (gain.value == 0 and not gain.has_interval):
+        return f"The {evaluation.trained} predicts exactly as the base does, {where}"
     direction, form = "better" if gain.value > 0 else "WORSE", _digits(gain)
     compared = f"{abs(gain.value):{form}} {direction} than the base (gain {interval(gain, form)}), {where}"
     if gain.side(of=0.0) == 0:

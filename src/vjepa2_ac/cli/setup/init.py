@@ -82,6 +82,8 @@ def _init(options: argparse.Namespace) -> int:
         write_atomically(out, draft.text(found, machine).encode())
     _say(draft, out, draft.costs(machine))
     status = 0 if is_missing else _check(draft, out)
+    if status:
+        console.print(f"\nMend this first, then: vjepa2-ac data check {out}", soft_wrap=True)
     for line in _next(draft, found, out, name, is_missing=is_missing):
         console.print(line, soft_wrap=True)
     return status
