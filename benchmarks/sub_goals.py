@@ -59,7 +59,7 @@ def main() -> None:
     parser.add_argument("--only", default="", help="ways whose name has this in it")
     parser.add_argument("--folder", type=Path, default=Path("sub_goals"))
     parser.add_argument("--out", type=Path, help="file for the table")
-    options = parser.parse_args()
+    options = parser.parse_intermixed_args()
     torch.set_num_threads(1)
     steering = of_session(load_to_plan(options.subject, overrides=options.overrides))
     for way in (one for one in WAYS if options.only in one):

@@ -31,7 +31,7 @@ def commands_of(section: int) -> list[list[str]]:
     lines = [
         line for block in re.findall(r"```sh\n(.*?)```", SECTIONS[section], re.DOTALL) for line in block.splitlines()
     ]
-    return [shlex.split(line, comments=True) for line in lines]
+    return [words for line in lines if (words := shlex.split(line, comments=True))]
 
 
 def test_the_page_has_its_sections() -> None:

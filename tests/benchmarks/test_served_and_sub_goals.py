@@ -52,7 +52,7 @@ def test_a_way_that_is_done_is_not_run_again(
     sub_goals: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = ["--episodes", "2", "--only", "oracle", "--folder", str(tmp_path), "--out", str(tmp_path / "table.md")]
-    monkeypatch.setattr("sys.argv", ["sub_goals.py", "builtin:sim-tiny", *SMALL, *out])
+    monkeypatch.setattr("sys.argv", ["sub_goals.py", "builtin:sim-tiny", *SMALL[:2], *out, *SMALL[2:]])
     sub_goals.main()
     assert "| oracle | 100% [34%, 100%] | 0." in capsys.readouterr().out
     monkeypatch.setattr(sub_goals, "measure", None)
@@ -71,3 +71,19 @@ def test_the_socket_costs_something_and_less_than_the_round_trip(
     assert 0 < float(figures["cost_ms_p50"]) < float(figures["round_trip_ms_p50"])
     assert np.isfinite(float(figures["cost_ms_p99"]))
     assert (tmp_path / "f").read_text().count("cost_ms_p95") == 1
+
+
+def test_a_near_goals_lowest_energy_by_true_images_is_on_the_way(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for first_step in imported("first_step", monkeypatch):
+        monkeypatch.setattr("sys.argv", ["first_step.py", "builtin:sim-tiny", "--episodes", "2"])
+        first_step.main()
+    rows = [line.strip("| ").split(" | ") for line in capsys.readouterr().out.splitlines()[2:]]
+    assert [row[:2] for row in rows] == [
+        [goal, step] for goal in ("far", "near") for step in ("way to it", "true images", "model")
+    ]
+    down = {(row[0], row[1]): float(row[3]) for row in rows}
+    assert down["far", "way to it"] > 5  # the grasp is below the hand
+    off = {row[1]: float(row[4]) for row in rows if row[0] == "near" and len(row) > 4}
+    assert off["true images"] < 2.5

@@ -1,17 +1,13 @@
 """`vjepa2-ac serve`: a process that a robot drives, and wrong words that are told before it listens."""
 
 import json
-import os
-import signal
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from ranks import Rank
-from served import STATE, image
+from served import STATE, ended, image, started
 from tiny_models import tiny_model
 from vjepa2_ac.cli import main
 from vjepa2_ac.errors import UnreachableError
@@ -31,28 +27,6 @@ def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (here / "key").write_text(KEY)
     (here / "key").chmod(0o600)
     return here
-
-
-def started(*words: str) -> tuple[Rank, str]:
-    """Start a server; return it and its address."""
-    process = Rank(["-m", "vjepa2_ac.cli", "serve", *words, "--port", "0"], dict(os.environ))
-    until = time.monotonic() + 60
-    while "ready" not in (said := process.written()[0]).splitlines():
-        assert process.poll() is None, process.written()
-        assert time.monotonic() < until
-        time.sleep(0.02)
-    address = next(line for line in said.splitlines() if line.startswith("listening on "))
-    return process, address.removeprefix("listening on ")
-
-
-def ended(process: Rank) -> str:
-    """End a server as its host does; return what it wrote."""
-    began = time.monotonic()
-    process.send_signal(signal.SIGTERM)
-    out, errors = process.communicate(timeout=20)
-    assert time.monotonic() - began < 5
-    assert process.returncode == 0, errors
-    return out + errors
 
 
 def test_a_robot_drives_it_and_every_decision_can_be_made_again(workshop: Path, tmp_path: Path, monkeypatch) -> None:

@@ -1,12 +1,16 @@
-"""A planning server in a thread of the test, and the small model behind it."""
+"""A planning server in a thread of the test, the command in a process, and the small model behind them."""
 
 import asyncio
+import os
+import signal
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import numpy as np
 
+from ranks import Rank
 from tiny_models import tiny_model
 from vjepa2_ac.config.planning import CemConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.episode import Widths
@@ -111,3 +115,25 @@ def serving(
         loop.call_soon_threadsafe(stop.set)
         running.join(20)
         assert not running.is_alive()
+
+
+def started(*words: str) -> tuple[Rank, str]:
+    """Start a server; return it and its address."""
+    process = Rank(["-m", "vjepa2_ac.cli", "serve", *words, "--port", "0"], dict(os.environ))
+    until = time.monotonic() + 60
+    while "ready" not in (said := process.written()[0]).splitlines():
+        assert process.poll() is None, process.written()
+        assert time.monotonic() < until
+        time.sleep(0.02)
+    address = next(line for line in said.splitlines() if line.startswith("listening on "))
+    return process, address.removeprefix("listening on ")
+
+
+def ended(process: Rank) -> str:
+    """End a server as its host does; return what it wrote."""
+    began = time.monotonic()
+    process.send_signal(signal.SIGTERM)
+    out, errors = process.communicate(timeout=20)
+    assert time.monotonic() - began < 5
+    assert process.returncode == 0, errors
+    return out + errors
