@@ -80,19 +80,35 @@ def opening_of(value: Any, where: str) -> float:
         raise SystemExit(f"{where}: {type(value).__name__} is no number; name the field with TOPIC:FIELD") from None
 
 
-def messages_of(reader: AnyReader, topic: str, bag: Path) -> Iterator[tuple[float, Any]]:
-    """Yield times in seconds and messages of a TOPIC or TOPIC:FIELD."""
-    name, _, field = topic.partition(":")
+def connections_of(reader: AnyReader, topic: str, bag: Path) -> list[Any]:
+    """Return where a bag has a TOPIC or TOPIC:FIELD."""
+    name = topic.partition(":")[0]
     connections = [one for one in reader.connections if one.topic == name]
     if not connections:
         raise SystemExit(f"{bag}: no topic {name}; it has {', '.join(sorted(reader.topics))}")
-    for connection, time_ns, data in reader.messages(connections):
+    return connections
+
+
+def times_of(reader: AnyReader, topic: str, bag: Path) -> np.ndarray:
+    """Return the times of a topic's messages in seconds."""
+    return np.array([time_ns / 1e9 for _, time_ns, _ in reader.messages(connections_of(reader, topic, bag))])
+
+
+def messages_of(reader: AnyReader, topic: str, bag: Path, places: np.ndarray) -> Iterator[Any]:
+    """Yield the messages of a TOPIC or TOPIC:FIELD at these places, which rise or repeat."""
+    wanted, field = iter(places.tolist()), topic.partition(":")[2]
+    following = next(wanted, None)
+    for place, (connection, _, data) in enumerate(reader.messages(connections_of(reader, topic, bag))):
+        if place != following:
+            continue
         value = reader.deserialize(data, connection.msgtype)
         for part in filter(None, field.split(".")):
             if not hasattr(value, part):
-                raise SystemExit(f"{bag}: {name}: {connection.msgtype} has no {part}; it has {', '.join(vars(value))}")
+                raise SystemExit(f"{bag}: {topic}: {connection.msgtype} has no {part}; it has {', '.join(vars(value))}")
             value = getattr(value, part)
-        yield time_ns / 1e9, value
+        while place == following:
+            yield value
+            following = next(wanted, None)
 
 
 def newest(times: np.ndarray, steps: np.ndarray, where: str) -> np.ndarray:
@@ -108,26 +124,24 @@ def episode_of(bag: Path, cameras: dict[str, str], args: argparse.Namespace) -> 
     """Return the arrays of one episode."""
     topics = [*cameras.values(), args.pose, args.gripper]
     with opened(bag) as reader:
-        times = [np.array([time for time, _ in messages_of(reader, topic, bag)]) for topic in topics]
+        times = [times_of(reader, topic, bag) for topic in topics]
         if short := [topic for topic, its in zip(topics, times, strict=True) if len(its) < 2]:
             raise SystemExit(f"{bag}: fewer than two messages of {', '.join(short)}")
         steps = np.arange(max(its[0] for its in times), min(its[-1] for its in times), 1 / args.rate)
         if len(steps) < 2:
             raise SystemExit(f"{bag}: the topics are together for less than two steps")
-        chosen = [newest(its, steps, f"{bag}: {topic}") for topic, its in zip(topics, times, strict=True)]
+        places = [newest(its, steps, f"{bag}: {topic}") for topic, its in zip(topics, times, strict=True)]
+        found = [messages_of(reader, topic, bag, its) for topic, its in zip(topics, places, strict=True)]
         arrays: dict[str, Any] = {"fps_hz": args.rate}
-        for (name, topic), places in zip(cameras.items(), chosen, strict=False):
-            wanted, at = set(places.tolist()), f"{bag}: {topic}"
-            read = enumerate(messages_of(reader, topic, bag))
-            images = {place: image_of(message, args.height, at) for place, (_, message) in read if place in wanted}
-            arrays[name] = np.stack([images[place] for place in places.tolist()])
-        poses = np.stack([pose_of(one, f"{bag}: {args.pose}") for _, one in messages_of(reader, args.pose, bag)])
-        grips = [opening_of(one, f"{bag}: {args.gripper}") for _, one in messages_of(reader, args.gripper, bag)]
+        for (name, topic), messages in zip(cameras.items(), found, strict=False):
+            arrays[name] = np.stack([image_of(one, args.height, f"{bag}: {topic}") for one in messages])
+        poses = np.stack([pose_of(one, f"{bag}: {args.pose}") for one in found[-2]])
+        grips = [opening_of(one, f"{bag}: {args.gripper}") for one in found[-1]]
     closedness = (np.array(grips) - args.gripper_open) / (args.gripper_closed - args.gripper_open)
     if closedness.min() < -0.1 or closedness.max() > 1.1:
         ends = f"{min(grips):.4g} to {max(grips):.4g}"
         raise SystemExit(f"{bag}: {args.gripper} goes from {ends}: set --gripper-open and --gripper-closed")
-    arrays["states"] = np.concatenate([poses[chosen[-2]], closedness.clip(0, 1)[chosen[-1], None]], axis=1)
+    arrays["states"] = np.concatenate([poses, closedness.clip(0, 1)[:, None]], axis=1)
     return arrays | ({"language": args.language} if args.language else {})
 
 

@@ -208,7 +208,7 @@ def test_without_out_it_lists_the_topics(tmp_path: Path, capsys: pytest.CaptureF
         (
             {},
             (*CHOSEN[:4], "--gripper-open", 0.001, "--gripper-closed", 0),
-            r"goes from 0\.02619 to 0\.07884: set --gripper-open",
+            r"goes from 0\.02957 to 0\.07884: set --gripper-open",
         ),
     ],
     ids=["depth", "silent", "topic", "no pose", "no number", "no field", "gripper"],
