@@ -39,6 +39,7 @@ def quiet(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the kernel find the program as the tests do, without the stack of a debugger."""
     monkeypatch.setenv("PYTHONPATH", str(ROOT / "src"))
     monkeypatch.setenv("PYDEVD_DISABLE_FILE_VALIDATION", "1")
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")  # other tests have the other cores
 
 
 def test_it_is_stored_without_outputs() -> None:
