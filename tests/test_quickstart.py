@@ -45,7 +45,7 @@ def test_from_data_to_a_number_and_a_plan(
     monkeypatch.chdir(tmp_path)
     printed: dict[str, str] = {}
     for words in [words for section in HERE for words in commands_of(section)]:
-        less = SHORTER.get(words[1], []) if "record" not in words else ["--steps", "33"]
+        less = SHORTER.get(words[1], []) if "record" not in words else ["--steps", "33", "--episodes", "10"]
         assert main([*words[1:], *less]) == 0, words
         printed[" ".join(words)] = capsys.readouterr().out
     told = printed["vjepa2-ac init data/my_robot --model builtin:sim-tiny"]
