@@ -25,4 +25,5 @@ def test_a_run_whose_clock_jumps_to_and_fro_is_the_same_run(
     assert_same_run(tmp_path / "whole", run)
     names = ["step-00000003", "step-00000004"]
     assert sorted(path.name for path in (run / "checkpoints").iterdir()) == names
-    assert sorted(path.name for path in (tmp_path / "disk/checkpoints").iterdir()) == names
+    mirrored = sorted(path.name for path in (tmp_path / "disk/checkpoints").iterdir())
+    assert mirrored in (names, names[1:])  # in the background: the first may be outdated before its turn comes
