@@ -44,7 +44,7 @@ test: $(INSTALLED)  ## the whole test suite, on all cores (8 at most), a thread 
 # There is no CPU wheel of PyTorch 2.11: this takes the one with CUDA, 5 GB in all, which runs without a GPU, too.
 $(OLDEST)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(OLDEST)
-	grep -v -e '^torch==' -e '^transformers==' -e '^tokenizers==' -e '^huggingface_hub==' constraints.txt > $(OLDEST)/constraints.txt
+	grep -v -e '^torch==' -e '^transformers==' -e '^tokenizers==' -e '^huggingface_hub==' -e '^setuptools==' constraints.txt > $(OLDEST)/constraints.txt
 	$(OLDEST)/bin/pip install --quiet --disable-pip-version-check -c $(OLDEST)/constraints.txt \
 		torch==2.11.0 transformers==5.17.0 -e ".[sim,dev]"
 	touch $@
