@@ -66,7 +66,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory, data_folder: Path, base_fo
 
     def make(**changes: object) -> Path:
         settings = {"training__steps": 2, "training__accumulation": 1, "training__learning_rate": 0.05}
-        settings |= {"validation__every": 2, **changes}
+        settings |= {"validation__every": 2, "checkpoint__keep_best": False, **changes}  # the base must not be selected
         if (name := json.dumps(settings, sort_keys=True)) not in runs:
             config = tiny_config(tmp_path_factory.mktemp("trained") / "run", data_folder, base_folder, **settings)
             with one_thread():
@@ -308,7 +308,7 @@ def test_what_was_measured_are_results_on_the_hub(copied, tmp_path: Path) -> Non
 def test_another_checkpoint_than_the_newest_is_measured_and_exported_where_it_is_asked_for(
     copied, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run = copied(training__steps=4, checkpoint__every=1)
+    run = copied(training__steps=4, checkpoint__every=1, checkpoint__keep_best="ranking")
     newest = load_run(run).checkpoint
     state = json.loads((newest / "state.json").read_text())
     (newest / "state.json").write_text(json.dumps({**state, "best_step": 2}))

@@ -14,6 +14,7 @@ from same_run import assert_same_run, metrics
 from vector_sets import write_vectors
 from vjepa2_ac.config import Config, LimitsConfig, ModelConfig, ModelSizes, PlanningConfig
 from vjepa2_ac.config.planning import CemConfig
+from vjepa2_ac.episode import STATE_DIM
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 from vjepa2_ac.export.export import export_run
@@ -68,6 +69,8 @@ def drive(controller: Controller, state: np.ndarray) -> np.ndarray:
         assert controller.decision is not None
         assert controller.decision.why == "planned"
         state = state + np.resize(actions[-1], state.shape)
+        if len(state) == STATE_DIM:
+            state[-1] = np.clip(state[-1], 0, 1)  # a gripper opens no farther
     return np.stack(actions)
 
 
