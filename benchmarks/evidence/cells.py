@@ -42,7 +42,7 @@ TRAINING = TrainingConfig(
     accumulation=1,
     rollout_steps=2,
     warmup_steps=20,
-    precision="bf16",
+    precision="fp32",
     device="cpu",
     log_every=50,
 )

@@ -135,8 +135,7 @@ def planner(model: WorldModel, distance: str, config: PlanningConfig = PLANNING,
 
 def reach(cell: Cell, policy: Policy, *, seed: int, goals: int) -> dict[str, Any]:
     """Return distances to the goal (cm) before the first step and after each, and seconds of a decision."""
-    with _bf16():
-        result = run_task(RolloutSpec("reach", SHIFTS[cell.shift], goals, seed), policy)
+    result = run_task(RolloutSpec("reach", SHIFTS[cell.shift], goals, seed), policy)
     return {
         "goals_seed": seed,
         "distance_cm": np.round(result.distance_cm, 3).tolist(),
@@ -153,9 +152,8 @@ def held_out(
     dataset = with_latents_if_there(config, open_dataset(config.data), model)
     batches = validation_batches(dataset, split, clips=clips, batch_size=32)
     model.eval()
-    with _bf16():
-        encoded = (encode_batch(model, batch, device=torch.device("cpu"), chunk=64) for batch in batches)
-        return prediction_errors(model, encoded if axes is None else (_turned(batch, axes) for batch in encoded))
+    encoded = (encode_batch(model, batch, device=torch.device("cpu"), chunk=64) for batch in batches)
+    return prediction_errors(model, encoded if axes is None else (_turned(batch, axes) for batch in encoded))
 
 
 def _turned(batch: LatentBatch, axes: Axes) -> LatentBatch:
@@ -210,7 +208,3 @@ def _as_dict(errors: PredictionErrors) -> dict[str, Any]:
         "clips": len(errors.episode_ids),
         "episodes": len(set(errors.episode_ids)),
     }
-
-
-def _bf16() -> Any:
-    return torch.autocast("cpu", dtype=torch.bfloat16)

@@ -153,6 +153,7 @@ def config_of(run: Run, folder: Path) -> Config:
             accumulation=1,
             warmup_steps=20,
             learning_rate=3e-3 if run.method == "LoRA" else 4e-3,
+            precision="fp32",
             device="cpu",
             log_every=50,
             allow_weak_base=True,
@@ -174,9 +175,8 @@ def measure_alone(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
     model = load_run(home, step).world_model
     if model.adaptation is not None:
         merge_adapter(model)
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        spec = RolloutSpec("reach", WORLD, goals, GOALS + cell.run.seed)
-        result = run_task(spec, Planning(Controller(model.eval(), PLANNING)))
+    spec = RolloutSpec("reach", WORLD, goals, GOALS + cell.run.seed)
+    result = run_task(spec, Planning(Controller(model.eval(), PLANNING)))
     evaluation = found.evaluation
     measured = metrics_as_dict(evaluation)["models"][evaluation.trained]
     return {
