@@ -1,6 +1,10 @@
-"""Unsupported arithmetic of a GPU: refused by every entry point, before anything is read or loaded."""
+"""Arithmetic that a GPU lacks is refused by every entry point, slow one of a CPU told, before anything is loaded."""
 
 import importlib.util
+import os
+import platform
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +17,7 @@ from PIL import Image
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import parse_config
+from vjepa2_ac.distributed import device
 from vjepa2_ac.distributed.device import computing_device, require_type_of_weights
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.session import load_to_plan
@@ -22,13 +27,14 @@ DOORS = {
     "encode": ["encode", "CONFIG"],
     "evaluate": ["evaluate", "no such model", "--data", "CONFIG", "--out", "out", "--planning"],
     "calibrate": ["data", "calibrate", "CONFIG"],
+    "decoder": ["decoder", "CONFIG"],
     "plan": [
         "plan", "no such model", "--config", "CONFIG", "--start", "seen.png", "--goal", "seen.png", "--state",
         "0.4,0,0.3,3.1,0,0.1,0.2",
     ],
     "simulate": ["simulate", "no such model", "--config", "CONFIG"],
 }  # fmt: skip
-UNDER_AUTOCAST = ("train", "encode", "evaluate", "calibrate")
+UNDER_AUTOCAST = ("train", "encode", "evaluate", "calibrate", "decoder")
 
 
 @pytest.fixture(params=[(7, 5)])
@@ -54,19 +60,33 @@ def parsed(**training: str) -> Config:
     return parse_config(values(**training), where="test")
 
 
+@pytest.fixture
+def products(monkeypatch: pytest.MonkeyPatch) -> dict[torch.dtype, float]:
+    """Milliseconds that a product takes on a CPU without a GPU."""
+    taken = {torch.bfloat16: 238.0, torch.float32: 4.0}
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(device, "_product_ms", taken.get)
+    device._warn.cache_clear()
+    return taken
+
+
+def through(door: str, monkeypatch: pytest.MonkeyPatch, folder: Path, **training: str) -> int:
+    if door == "simulate" and importlib.util.find_spec("mujoco") is None:
+        pytest.skip("MuJoCo (extra sim) is not installed")
+    monkeypatch.chdir(folder)
+    Path("config.yaml").write_text(yaml.safe_dump(values(**training)))
+    for name in ("no such data", "no such model"):  # of which the doors ask only whether it is there, before the device
+        Path(name).mkdir(exist_ok=True)
+    Image.fromarray(np.zeros((16, 16, 3), dtype=np.uint8)).save("seen.png")
+    return main([word.replace("CONFIG", "config.yaml") for word in DOORS[door]])
+
+
 @pytest.mark.usefixtures("gpu")
 @pytest.mark.parametrize("door", DOORS)
 def test_bfloat16_that_is_only_emulated_is_refused(
     door: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    if door == "simulate" and importlib.util.find_spec("mujoco") is None:
-        pytest.skip("MuJoCo (extra sim) is not installed")
-    monkeypatch.chdir(tmp_path)
-    Path("config.yaml").write_text(yaml.safe_dump(values()))
-    for name in ("no such data", "no such model"):  # of which the doors ask only whether it is there, before the device
-        Path(name).mkdir()
-    Image.fromarray(np.zeros((16, 16, 3), dtype=np.uint8)).save("seen.png")
-    assert main([word.replace("CONFIG", "config.yaml") for word in DOORS[door]]) == 2
+    assert through(door, monkeypatch, tmp_path) == 2
     said = " ".join(capsys.readouterr().err.split())
     assert "Tesla T4 of compute capability 7.5" in said
     assert "8.0 or more" in said
@@ -104,3 +124,37 @@ def test_the_gpu_of_this_process_is_the_one_that_counts(monkeypatch: pytest.Monk
 def test_a_model_without_a_config_is_planned_with_in_what_the_gpu_computes() -> None:
     with pytest.raises(InputError, match="no such model: no such file or folder"):  # and not its type
         load_to_plan("no such model")
+
+
+@pytest.mark.parametrize("door", DOORS)
+def test_a_slow_bfloat16_of_a_cpu_is_told_once_with_the_way_out(
+    door: str,
+    products: dict[torch.dtype, float],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    through(door, monkeypatch, tmp_path)
+    (told,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("warning: ")]
+    assert "a product of matrices takes 238 ms on this CPU, 4 ms in float32 (60 times)" in told
+    way_out = "training.precision=fp32 with model.dtype=float32" if door in UNDER_AUTOCAST else "model.dtype=float32"
+    assert told.endswith(f"Set {way_out}")
+    device._warn.cache_clear()
+    products[torch.bfloat16] = 4.0
+    through(door, monkeypatch, tmp_path)
+    assert "warning" not in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("products")
+def test_who_computes_in_float32_is_told_nothing(caplog: pytest.LogCaptureFixture) -> None:
+    config = parsed(precision="fp32", dtype="float32")
+    require_type_of_weights(config.model, computing_device(config.training))
+    assert not caplog.records
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="the variable is of x86")
+def test_a_cpu_that_is_held_to_avx2_is_found_slow() -> None:
+    program = "from vjepa2_ac.distributed.device import slow_bf16; print(slow_bf16())"
+    environment = os.environ | {"ONEDNN_MAX_CPU_ISA": "AVX2", "ATEN_CPU_CAPABILITY": "avx2"}
+    found = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
+    assert "a product of matrices takes" in found.stdout

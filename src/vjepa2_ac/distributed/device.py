@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import os
+import time
+from functools import cache
 
 import torch
 
@@ -10,8 +13,11 @@ from vjepa2_ac.config import ModelConfig, TrainingConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.compilation import require_compiler
 
+_log = logging.getLogger(__name__)
+
 PRECISIONS = {"bf16": torch.bfloat16, "fp16": torch.float16, "fp32": torch.float32}
-_BF16_FROM = (8, 0)  # compute capability; PyTorch's is_bf16_supported includes emulation, which is slower than fp32
+BF16_FROM = (8, 0)  # compute capability; PyTorch's is_bf16_supported includes emulation, which is slower than fp32
+_SLOW = 2.0  # times as long as in float32: of a CPU that computes bfloat16 without instructions for it
 
 
 def is_on_cpu(training: TrainingConfig) -> bool:
@@ -35,6 +41,8 @@ def no_cuda(*, where: str, asked: str, instead: str) -> InputError:
 def computing_device(training: TrainingConfig) -> torch.device:
     """Return the device of this process, after checking that it supports the config.
 
+    On a CPU without instructions for bfloat16 a config that asks for it is warned of.
+
     Raises:
         InputError: CUDA was requested and there is none, fp16 without CUDA, bfloat16 on a GPU that has none, or nothing
             to compile with.
@@ -42,7 +50,7 @@ def computing_device(training: TrainingConfig) -> torch.device:
     on_cpu = is_on_cpu(training)
     if training.precision == "fp16" and on_cpu:
         needed = "a CUDA device: only there are losses scaled so that small gradients do not vanish"
-        fix = "Set training.precision to bf16 or fp32"
+        fix = "Set training.precision=fp32"
         raise InputError(where="training.precision", found="fp16 on a CPU", needed=needed, fix=fix)
     if training.cuda_graph and on_cpu:
         where, fix = "training.cuda_graph", "Set it to false"
@@ -50,6 +58,8 @@ def computing_device(training: TrainingConfig) -> torch.device:
     device = torch.device("cpu") if on_cpu else torch.device("cuda", cuda_index())
     if training.precision == "bf16":  # fp32 is for float32 weights only, and fp16 casts any weights
         _require_bf16(device, where="training.precision", found="bf16", fix="Set training.precision=fp16")
+        if on_cpu:
+            _warn("training.precision: bf16", "training.precision=fp32 with model.dtype=float32")
     if training.compile == "blocks":
         require_compiler(device.type, where="training.compile")
     return device
@@ -58,16 +68,31 @@ def computing_device(training: TrainingConfig) -> torch.device:
 def require_type_of_weights(model: ModelConfig, device: torch.device) -> None:
     """Refuse a weight type that the device does not support: planning computes in it, without autocast.
 
+    On a CPU without instructions for bfloat16 it is warned of.
+
     Raises:
         InputError: They are bfloat16 on a GPU without it.
     """
     if model.dtype == "bfloat16":
         _require_bf16(device, where="model.dtype", found="bfloat16", fix="Set model.dtype=float32")
+        if device.type == "cpu":
+            _warn("model.dtype: bfloat16", "model.dtype=float32")
+
+
+def slow_bf16() -> str | None:
+    """Return what a product of matrices costs in bfloat16 on this CPU, if that is much slower than in float32.
+
+    Measured here: which instructions a CPU has, and which of them PyTorch uses, no list of names tells.
+    """
+    bf16, fp32 = _product_ms(torch.bfloat16), _product_ms(torch.float32)
+    if bf16 < _SLOW * fp32:
+        return None
+    return f"a product of matrices takes {bf16:.3g} ms on this CPU, {fp32:.3g} ms in float32 ({bf16 / fp32:.0f} times)"
 
 
 def has_bf16() -> bool:
     """Return whether the CUDA device of this process computes in bfloat16."""
-    return torch.cuda.get_device_capability(cuda_index()) >= _BF16_FROM
+    return torch.cuda.get_device_capability(cuda_index()) >= BF16_FROM
 
 
 def cuda_index() -> int:
@@ -88,3 +113,21 @@ def _require_bf16(device: torch.device, *, where: str, found: str, fix: str) -> 
     found += f", on {torch.cuda.get_device_name(cuda_index())} of compute capability {major}.{minor}"
     needed = "8.0 or more (Ampere or later): earlier GPUs only emulate bfloat16"
     raise InputError(where=where, found=found, needed=needed, fix=fix)
+
+
+@cache  # once
+def _warn(found: str, fix: str) -> None:
+    if slow := slow_bf16():
+        _log.warning("%s: %s. Set %s", found, slow, fix)
+
+
+@cache
+def _product_ms(dtype: torch.dtype) -> float:
+    """Return the milliseconds of one product of a small model's size: the best of a few."""
+    left, right = torch.ones(1024, 192, dtype=dtype), torch.ones(192, 768, dtype=dtype)
+    taken: list[float] = []
+    while len(taken) < 3 or (len(taken) < 20 and sum(taken) < 100):
+        started = time.perf_counter()
+        left @ right
+        taken.append(1e3 * (time.perf_counter() - started))
+    return min(taken)

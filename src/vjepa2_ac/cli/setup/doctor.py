@@ -48,6 +48,7 @@ def _report(options: argparse.Namespace, config: Config) -> int:
 
     from vjepa2_ac.console.memory import memory_lines, verdict
     from vjepa2_ac.console.progress import console
+    from vjepa2_ac.distributed.device import slow_bf16
     from vjepa2_ac.model.checkpoints.loading import base_sizes
     from vjepa2_ac.training.cost.memory import USUAL_GPU, estimate_memory, ways_to_fit
 
@@ -65,5 +66,7 @@ def _report(options: argparse.Namespace, config: Config) -> int:
     console.print(verdict(needed, available, gpu, knobs))
     if unusual := config.adapter.out_of_line:
         console.print(f"Warning: {unusual}.")
+    if not torch.cuda.is_available() and config.training.precision == "bf16" and (slow := slow_bf16()):
+        console.print(f"Without a GPU set training.precision=fp32 model.dtype=float32: in bfloat16 {slow}.")
     console.print(f"The data are looked at by: vjepa2-ac data check {options.config}")
     return 0 if needed <= available else 1
