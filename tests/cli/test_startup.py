@@ -1,5 +1,6 @@
 """Wrong words are told before PyTorch is imported, which takes seconds; libraries say nothing when imported."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -92,3 +93,13 @@ def test_libraries_say_nothing_when_they_are_imported() -> None:
     code = "import vjepa2_ac.model.adapter.lora"
     done = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout + done.stderr == ""
+
+
+def test_threads_of_pytorch_sleep_soon_where_they_have_nothing_to_do_unless_the_user_says_otherwise() -> None:
+    program = "import vjepa2_ac, torch; torch.ones(64, 64) @ torch.ones(64, 64)"
+    for given, expected in (({}, "1000"), ({"GOMP_SPINCOUNT": "7"}, "7")):
+        environment = {name: value for name, value in os.environ.items() if name != "GOMP_SPINCOUNT"}
+        environment |= {"OMP_DISPLAY_ENV": "verbose", **given}  # libgomp says what it has read
+        command = [sys.executable, "-c", program]
+        said = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stderr
+        assert f"GOMP_SPINCOUNT = '{expected}'" in said
