@@ -15,7 +15,7 @@ from vjepa2_ac.model.checkpoints.published_names import OFFICIAL
 from vjepa2_ac.places import BUILTIN
 from vjepa2_ac.training.cost.memory import GIGABYTE
 
-CLIPS_A_STEP = 32  # of every config here
+CLIPS_A_STEP = 32  # of every model but the tiny one
 _MODEL_STEP_S = 4 / 15  # the shortest of those that the released weights may know: 0.27, 0.53 and 1 s
 _FEW_EPISODES = 500  # to which the advice for few demonstrations applies
 _NEAR_S = 0.005

@@ -37,7 +37,7 @@ class Machine:
 
     @property
     def precision(self) -> Literal["bf16", "fp16", "fp32"]:
-        """In what it computes best: on a CPU bf16 may be a hundred times slower than fp32."""
+        """In what it computes best: on a CPU without instructions for it bf16 is many times slower than fp32."""
         if self.gpu is None:
             return "fp32"
         return "bf16" if self.has_bf16 else "fp16"
@@ -57,7 +57,7 @@ class Machine:
     def about(self) -> str:
         """It in a line."""
         size = f"{self.gpu_bytes / GIGABYTE:.1f} GB"
-        gpu = f"{self.gpu}, {size}" if self.gpu else f"no GPU (batch and memory are for one of {size})"
+        gpu = f"{self.gpu}, {size}" if self.gpu else "no GPU"
         network = f"; network: {self.read_bytes_per_s / 1e6:.1f} MB/s" if self.read_bytes_per_s else ""
         return f"{gpu}; {self.cores} cores; {self.free_bytes / GIGABYTE:.0f} GB of disk free{network}"
 

@@ -99,7 +99,7 @@ def look_at_rlds(path: str) -> FoundData:
 
 def like_droid(path: str, episodes: int, *, is_simulated: bool) -> FoundData:
     """Return what is known of DROID, or of the simulated arm, whose data sets are called as DROID's."""
-    camera = "DROID's, which the released weights saw, looks on from there, too" if is_simulated else _SEEN
+    camera = "a view from outside, as of DROID the released weights saw it" if is_simulated else _SEEN
     rule = "openpi's rule" + ("" if is_simulated else "; the published ranges are of DROID 1.0.1")
     title = "the simulated arm" if is_simulated else "DROID"
     return FoundData(

@@ -165,11 +165,11 @@ def _next(
         lines.append((fetch[0], f"the model, once: {fetch[1]}"))
     trial, steps = f"runs/{name}-trial", draft.config.training.steps
     short = f"training.steps={_TRIAL_STEPS} validation.every=50 checkpoint.every=50"
-    of_trial = f"{_TRIAL_STEPS} steps: does it learn, how long does a step take?"
+    of_trial = ", ".join(filter(None, (f"{_TRIAL_STEPS} steps", draft.time_of(_TRIAL_STEPS))))
     of_run = draft.time_of(steps) or f"time not known before the trial: its time a step, times {steps:,}"
     lines += [
         (f"vjepa2-ac train {out} --check", "everything that can fail, before the first step"),
-        (f"vjepa2-ac train {out} run_dir={trial} {short}", f"{of_trial} {draft.time_of(_TRIAL_STEPS) or ''}".rstrip()),
+        (f"vjepa2-ac train {out} run_dir={trial} {short}", f"{of_trial}: does it learn, how long does a step take?"),
         (f"vjepa2-ac evaluate {trial}", "against the base, on held-out episodes"),
         (f"vjepa2-ac train {out}", f"the real run, {of_run}; the same command goes on after a stop"),
     ]
