@@ -64,5 +64,7 @@ def test_simulated_data_are_recorded_first(form: str, here: Path, capsys: pytest
 @pytest.mark.usefixtures("here")
 def test_the_released_model_is_to_be_fetched_first(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["init", "data/my robot/v1.0", "--out", "sub/a.yaml"]) == 0
-    assert "vjepa2-ac download   #" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "vjepa2-ac download   # the model, once: 11.7 GB, about 16 minutes at 100 Mbit/s" in told
+    assert "# the real run, time not known before the trial: its time a step, times 200; the same" in told
     assert load_config("sub/a.yaml").model.base == "checkpoints/vjepa2-ac-vitg.pt"

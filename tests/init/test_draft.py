@@ -11,7 +11,7 @@ from vjepa2_ac.init import draft
 from vjepa2_ac.init.draft import choose_model, make_draft
 from vjepa2_ac.init.found import FoundData
 from vjepa2_ac.init.knob import Knob, plain
-from vjepa2_ac.init.machine import Machine
+from vjepa2_ac.init.machine import Machine, duration
 from vjepa2_ac.storage.structured import parse_yaml
 
 GB = 10**9
@@ -71,9 +71,78 @@ def test_hours_follow_from_the_card() -> None:
     assert of(machine=replace(MACHINE, gpu="Something else")).hours is None
 
 
-def test_a_card_without_bf16_computes_in_fp16() -> None:
-    config = of(machine=replace(MACHINE, has_bf16=False)).config
-    assert (config.training.precision, config.model.dtype) == ("fp16", "float32")
+@pytest.mark.parametrize("path", [None, "builtin:sim-tiny"], ids=["released", "tiny"])
+@pytest.mark.parametrize("kind", ["released", "scratch"])
+@pytest.mark.parametrize(
+    ("gpu", "has_bf16", "precision", "why"),
+    [("A100", True, "bf16", ""), ("T4", False, "fp16", "this GPU has no bf16"), (None, False, "fp32", "no GPU here")],
+)
+def test_precision_is_of_the_machine_and_the_type_of_the_weights_goes_with_it(
+    gpu: str | None, has_bf16: bool, precision: str, why: str, kind: str, path: str | None
+) -> None:
+    machine = replace(MACHINE, gpu=gpu, has_bf16=has_bf16)
+    made = make_draft(FOUND, machine, choose_model(kind, path), run_dir="runs/mine")
+    training = made.knobs["training"]
+    assert isinstance(training, dict)
+    dtype = "bfloat16" if precision == "bf16" and path is None else "float32"
+    assert (made.config.training.precision, made.config.model.dtype) == (precision, dtype)
+    assert training["precision"].why.startswith(why)
+    assert ("model.dtype" in training["precision"].why) == (precision == "fp32" and path is None)
+
+
+def test_a_batch_that_does_not_fit_is_not_said_to_fit() -> None:
+    assert "the largest tried that fits on 24.0 GB" in of().text(FOUND, MACHINE)
+    small = replace(MACHINE, gpu_bytes=4 * GB)
+    text = of(machine=small).text(FOUND, small)
+    assert "batch_size: 1                     # does not fit on 4.0 GB" in text
+
+
+def test_what_is_fetched_has_its_size_and_time_beside_its_command() -> None:
+    assert "# vjepa2-ac download: 11.7 GB, about 16 minutes at 100 Mbit/s" in of().text(FOUND, MACHINE)
+    fast = replace(MACHINE, read_bytes_per_s=50e6)
+    text = of(machine=fast, kind="scratch").text(FOUND, fast)
+    assert "# vjepa2-ac download vjepa2.1-vitb-384: 1.66 GB, about 1 minute at the data's 50.0 MB/s" in text
+    own = make_draft(FOUND, MACHINE, choose_model("released", "own/model.pt"), run_dir="run")
+    assert "vjepa2-ac download" not in own.text(FOUND, MACHINE)
+
+
+def test_a_trial_takes_its_share_of_the_steps_and_all_of_the_encoding() -> None:
+    made = of()
+    assert made.hours is not None
+    assert 0 < made.encoding_hours < made.hours
+    assert made.time_of(made.config.training.steps) == duration(made.hours)
+    assert made.time_of(0) == duration(made.encoding_hours)
+    assert of(machine=replace(MACHINE, gpu="Something else")).time_of(100) is None
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "kind", "path", "told", "not_told"),
+    [
+        (15.0, "released", None, ["step of 0.27 s; whether the released", "unsettled: data calibrate"], ["as near"]),
+        (5.0, "released", None, ["0.20 s, as near to 0.27 s as whole", "data calibrate"], ["trained"]),
+        (3.0, "scratch", None, ["0.33 s, as near", "data inspect"], ["released", "calibrate"]),
+        (15.0, "released", "builtin:sim-tiny", ["the model was trained at 0.27 s"], ["calibrate"]),
+    ],
+)
+def test_the_reason_of_the_stride_is_true_of_rate_and_model(
+    rate_hz: float, kind: str, path: str | None, told: list[str], not_told: list[str]
+) -> None:
+    found = replace(FOUND, rate_hz=Knob(rate_hz))
+    data = make_draft(found, MACHINE, choose_model(kind, path), run_dir="run").knobs["data"]
+    assert isinstance(data, dict)
+    why = data["stride"].why
+    assert all(words in why for words in told), why
+    assert not any(words in why for words in not_told), why
+
+
+@pytest.mark.parametrize("path", [None, "builtin:sim-tiny"], ids=["released", "tiny"])
+def test_the_passes_that_are_told_are_those_of_the_config(path: str | None) -> None:
+    made = make_draft(FOUND, MACHINE, choose_model("released", path), run_dir="run")
+    training = made.config.training
+    passes = training.steps * training.batch_size * training.accumulation / 6_000
+    knobs = made.knobs["training"]
+    assert isinstance(knobs, dict)
+    assert knobs["steps"].why.startswith(f"{passes:.2g} passes")
 
 
 def test_latents_are_cached_where_the_disk_has_room() -> None:

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,9 +16,40 @@ from vjepa2_ac.init.knob import guesses, plain
 from vjepa2_ac.init.look import look_at
 from vjepa2_ac.init.machine import Machine
 from vjepa2_ac.init.measure import measured
+from vjepa2_ac.simulation.recording.simulation_file import SIMULATION_FILE
 
-LAPTOP = Machine(None, 24 * 10**9, has_bf16=True, cores=2, free_bytes=10**11)
+LAPTOP = Machine(None, 24 * 10**9, has_bf16=False, cores=2, free_bytes=10**11)
 STATES = ["x", "y", "z", "roll", "pitch", "yaw", "gripper"]
+
+
+def rename(folder: Path, name: str) -> Path:
+    """Let an RLDS set call itself otherwise."""
+    info = json.loads((folder / "dataset_info.json").read_text())
+    for shard in folder.glob("*.tfrecord-*"):
+        shard.rename(folder / shard.name.replace(info["name"], name))
+    (folder / "dataset_info.json").write_text(json.dumps({**info, "name": name}))
+    return folder
+
+
+def write_like_bridge(folder: Path, name: str) -> Path:
+    """Write the descriptions of a set with BridgeData's features; its one shard is empty."""
+    folder.mkdir(parents=True)
+    observation = {"image_0": {"image": {}}, "state": {"tensor": {"dtype": "float32", "shape": {"dimensions": ["7"]}}}}
+    features: dict[str, object] = {"featuresDict": {"features": observation}}
+    for key in ("observation", "steps"):
+        features = {"featuresDict": {"features": {key: features}}}
+    (folder / "features.json").write_text(json.dumps(features))
+    split = {"name": "train", "shardLengths": ["25"]}
+    (folder / "dataset_info.json").write_text(json.dumps({"name": name, "splits": [split]}))
+    (folder / f"{name}-train.tfrecord-00000-of-00001").touch()
+    return folder
+
+
+def drafted(path: Path) -> tuple[dict[str, Any], dict[str, str], str]:
+    """Return the values of `data`, all guesses and the text of the config for a set."""
+    found = look_at(str(path))
+    made = make_draft(found, LAPTOP, choose_model("released", "builtin:sim-tiny"), run_dir="run")
+    return plain(made.knobs)["data"], guesses(made.knobs), made.text(found, LAPTOP)
 
 
 @pytest.mark.parametrize("form", WRITERS)
@@ -101,6 +133,53 @@ def test_a_rate_that_nothing_says_is_a_guess(tmp_path: Path) -> None:
     assert plain(found.knobs)["fields"]["state"][0] == "steps/observation/cartesian_position"
     assert found.rate_hz.is_guess
     assert "data.fields.control_rate_hz" in guesses(knobs)
+
+
+def test_a_set_is_known_by_its_own_name_and_not_by_its_folders(tmp_path: Path) -> None:
+    data, guessed, text = drafted(write_like_bridge(tmp_path / "x_droid/a/1.0.0", "bridge_dataset"))
+    assert (data["fields"]["control_rate_hz"], data["fields"]["gripper"], data["stride"]) == (5.0, "openness", 1)
+    assert not {"data.fields.control_rate_hz", "data.fields.gripper", "data.stride"} & set(guessed)
+    assert "5 steps a second" in text
+    assert "as DROID" not in text
+
+    data, guessed, text = drafted(write_like_bridge(tmp_path / "bridge_dataset/droid/1.0.0", "my_kitchen"))
+    assert (data["fields"]["control_rate_hz"], data["fields"]["gripper"]) == (10.0, "closedness")
+    assert {"data.fields.control_rate_hz", "data.fields.gripper", "data.stride"} <= set(guessed)
+    assert "10 steps a second (guessed)" in text
+
+
+def test_a_set_in_droids_schema_is_droid_if_it_says_so(tmp_path: Path) -> None:
+    folder = WRITERS["rlds"](tmp_path / "bridge/1.0.0", range(3))
+    for name in ("r2d2_faceblur", "droid_101"):
+        data, guessed, text = drafted(rename(folder, name))
+        assert (data["stride"], data["camera"], "fields" in data) == (4, "exterior_1_left", False)
+        assert guessed == {}
+        assert "DROID, 3 episodes, 15 steps a second" in text
+
+    data, guessed, text = drafted(rename(folder, "my_droid_like"))
+    assert (data["fields"]["control_rate_hz"], data["fields"]["gripper"], data["stride"]) == (15.0, "closedness", 4)
+    assert {"data.fields.control_rate_hz", "data.fields.gripper", "data.stride", "data.camera"} <= set(guessed)
+    assert data["idle"]["rule"] == "commands"
+    assert "the released weights saw" not in text
+
+
+def test_a_simulated_set_has_a_known_rate_and_is_not_called_droid(tmp_path: Path) -> None:
+    folder = WRITERS["rlds"](tmp_path / "set", range(3))
+    (folder / SIMULATION_FILE).write_text("{}")
+    data, guessed, text = drafted(folder)
+    assert (data["stride"], guessed) == (4, {})
+    assert "the simulated arm, 3 episodes, 15 steps a second" in text
+    assert "published ranges" not in text
+
+
+def test_a_gripper_of_lerobot_is_known_of_droids_ports_alone(tmp_path: Path) -> None:
+    folder = write_lerobot(tmp_path / "droid", range(3))
+    assert "data.lerobot.gripper_open" in drafted(folder)[1]
+    info = json.loads((folder / "meta/info.json").read_text())
+    text = {"dtype": "string", "shape": [1], "names": None}
+    info["features"] |= {"building": text, "collector_id": text}
+    (folder / "meta/info.json").write_text(json.dumps(info))
+    assert "data.lerobot.gripper_open" not in drafted(folder)[1]
 
 
 def test_more_cameras_of_npz_are_listed(tmp_path: Path) -> None:

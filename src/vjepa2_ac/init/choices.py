@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from vjepa2_ac.init.found import FoundData
 from vjepa2_ac.init.knob import Knob, Knobs
 from vjepa2_ac.init.machine import Machine
+from vjepa2_ac.model.checkpoints.published import PUBLISHED
+from vjepa2_ac.model.checkpoints.published_names import OFFICIAL
 from vjepa2_ac.places import BUILTIN
 from vjepa2_ac.training.cost.memory import GIGABYTE
 
-CLIPS_A_STEP = 32  # of every config here
-_MODEL_STEP_S = 4 / 15  # DROID's four control steps
+CLIPS_A_STEP = 32  # of every model but the tiny one
+_MODEL_STEP_S = 4 / 15  # the shortest of those that the released weights may know: 0.27, 0.53 and 1 s
 _FEW_EPISODES = 500  # to which the advice for few demonstrations applies
+_NEAR_S = 0.005
 _SHARES = ((5_000, 0.02), (500, 0.05), (100, 0.1), (0, 0.15))  # held out, by the number of episodes
 _LEAST_FRAMES = 3  # two rollout steps and the frame before them
 _PASSES = 3  # over the starts of clips
@@ -41,14 +45,9 @@ class ModelChoice:
 def data_knobs(found: FoundData, machine: Machine, model: ModelChoice) -> Knobs:
     """Return the section of the data."""
     stride = max(1, round(found.rate_hz.value * _MODEL_STEP_S))
-    seconds = stride / found.rate_hz.value
     frames, why_frames = _frames(found, model, stride)
     share, why_share = _share(found)
     cached = _cache(found, machine, model)
-    why_stride = f"a model step of {seconds:.2f} s, as DROID's; 0.53 and 1 s are to be tried, too: data calibrate"
-    is_guess = found.rate_hz.is_guess
-    if is_guess:
-        why_stride = f"if the rate is {found.rate_hz.value:g} a second: {why_stride}"
     workers = max(1, min(4 if "cache" in cached else 8, machine.cores - 1))
     vector: dict[str, Knob] = {"states": Knob("vector", "the robot's own numbers: its actions are their differences")}
     return {
@@ -57,7 +56,7 @@ def data_knobs(found: FoundData, machine: Machine, model: ModelChoice) -> Knobs:
         **({} if found.states == "pose" else vector),
         **found.knobs,
         "frames": Knob(frames, why_frames),
-        "stride": Knob(stride, why_stride, is_guess),
+        "stride": Knob(stride, _why_stride(found, model, stride), found.rate_hz.is_guess),
         "validation_share": Knob(share, why_share),
         "test_share": Knob(share, "for `evaluate`; never seen in training"),
         **({"idle": found.idle} if found.idle and (found.usual_steps or _SHORT) >= _SHORT else {}),
@@ -68,15 +67,19 @@ def data_knobs(found: FoundData, machine: Machine, model: ModelChoice) -> Knobs:
 
 def model_knobs(model: ModelChoice, machine: Machine) -> Knobs:
     """Return the section of the model."""
-    dtype = Knob("float32" if model.is_tiny or not machine.has_bf16 else "bfloat16")
+    dtype = Knob("float32" if model.is_tiny or machine.precision != "bf16" else "bfloat16")
     if model.kind == "scratch":
         return {
-            "encoder": {"path": Knob(model.path), **({} if model.is_tiny else {"frame": Knob("tubelet")})},
+            "encoder": {
+                "path": Knob(model.path, _way_to(model, machine)),
+                **({} if model.is_tiny else {"frame": Knob("tubelet")}),
+            },
             "random": _fresh_predictor(model),
             "random_start": Knob("persistence", "the first steps are not spent on learning to copy"),
             "dtype": dtype,
         }
-    why = "has seen a simulated arm only: to try the way, not a result" if model.is_tiny else "vjepa2-ac download"
+    tiny = "has seen a simulated arm only: to try the way, not a result"
+    why = tiny if model.is_tiny else _way_to(model, machine)
     return {"base": Knob(model.path, why), "dtype": dtype}
 
 
@@ -98,20 +101,28 @@ def adapter_knobs(model: ModelChoice, found: FoundData) -> Knobs:
 
 def training_knobs(found: FoundData, machine: Machine, model: ModelChoice) -> Knobs:
     """Return the section of training; the batch is what `fit` changes."""
-    steps, why = _steps(found)
-    batch = 8 if model.is_tiny else 4
-    rates = {"tiny": 3e-3, "scratch": 3e-3 if model.is_tiny else 1.5e-4}
+    batch, accumulation = (8, 1) if model.is_tiny else (4, CLIPS_A_STEP // 4)
+    steps, why = _steps(found, batch * accumulation)
     weak = "it is weak, knowingly: it has never seen a real image"
     return {
         "steps": Knob(steps, why),
         "batch_size": Knob(batch),
-        "accumulation": Knob(1 if model.is_tiny else CLIPS_A_STEP // batch),
+        "accumulation": Knob(accumulation),
         "rollout_steps": Knob(2),
-        "learning_rate": Knob(rates.get(model.kind, 1e-4), "" if model.is_tiny else "3e-4 is the other one to try"),
-        "precision": Knob("bf16" if machine.has_bf16 else "fp16", "" if machine.has_bf16 else "this GPU has no bf16"),
+        "learning_rate": _learning_rate(model),
+        "precision": Knob(machine.precision, _why_precision(machine, model)),
         "gradient_checkpointing": Knob(False),
         **({"allow_weak_base": Knob(True, weak)} if model.is_tiny and model.kind == "tiny" else {}),
     }
+
+
+def download_of(model: ModelChoice, machine: Machine) -> tuple[str, str] | None:
+    """Return the command that fetches the model and what that costs; None, where it is none that is published."""
+    one = next((one for one in PUBLISHED if Path(model.path) == Path("checkpoints", one.file)), None)
+    if one is None:
+        return None
+    name = "" if one.name == OFFICIAL else f" {one.name}"
+    return f"vjepa2-ac download{name}", f"{one.gigabytes:g} GB, {machine.time_to_fetch(one.gigabytes * GIGABYTE)}"
 
 
 def following_knobs(steps: int) -> dict[str, Knobs]:
@@ -125,6 +136,38 @@ def following_knobs(steps: int) -> dict[str, Knobs]:
             "keep_best": Knob("ranking", "not by error: it may fall while planning gets worse (docs/training.md)"),
         },
     }
+
+
+def _why_stride(found: FoundData, model: ModelChoice, stride: int) -> str:
+    seconds = stride / found.rate_hz.value
+    why = f"a model step of {seconds:.2f} s"
+    if abs(seconds - _MODEL_STEP_S) > _NEAR_S:
+        why += f", as near to {_MODEL_STEP_S:.2f} s as whole control steps come"
+    if found.rate_hz.is_guess:
+        why = f"if the rate is {found.rate_hz.value:g} a second, {why}"
+    if model.kind == "tiny":
+        return f"{why}; the model was trained at {_MODEL_STEP_S:.2f} s"
+    if model.kind == "released" and found.states == "pose":
+        return f"{why}; whether the released weights know 0.27, 0.53 or 1 s is unsettled: data calibrate"
+    return f"{why}; data inspect shows how far the robot goes in it, and in longer ones"
+
+
+def _way_to(model: ModelChoice, machine: Machine) -> str:
+    return ": ".join(download_of(model, machine) or ())
+
+
+def _learning_rate(model: ModelChoice) -> Knob:
+    if model.is_tiny:
+        return Knob(3e-3)
+    if model.kind == "scratch":
+        return Knob(1.5e-4, "the released 4.25e-4, of 256 clips a step, times the root of 32 / 256: not measured")
+    return Knob(1e-4, "3e-4 is the other one to try")
+
+
+def _why_precision(machine: Machine, model: ModelChoice) -> str:
+    if machine.precision == "fp32":
+        return "no GPU here; on one from Ampere on: bf16" + ("" if model.is_tiny else ", and model.dtype: bfloat16")
+    return "this GPU has no bf16" if machine.precision == "fp16" else ""
 
 
 def _frames(found: FoundData, model: ModelChoice, stride: int) -> tuple[int, str]:
@@ -154,16 +197,16 @@ def _cache(found: FoundData, machine: Machine, model: ModelChoice) -> dict[str, 
     size = found.steps * model.bytes_a_frame
     if size > room:
         return {}
-    why = f"each frame is encoded once: {max(0.1, size / GIGABYTE):,.1f} GB at most; the encoder leaves the GPU"
+    why = f"each frame is encoded once: {max(0.1, size / GIGABYTE):,.1f} GB at most; training then needs no encoder"
     return {"cache": Knob("auto", why)}
 
 
-def _steps(found: FoundData) -> tuple[int, str]:
+def _steps(found: FoundData, clips_a_step: int) -> tuple[int, str]:
     if found.steps is None:
         return _LEAST_STEPS, "a first run; docs/training.md says how many"
     wanted = math.ceil(_PASSES * found.steps / CLIPS_A_STEP / 100) * 100  # a clip begins at every step
     steps = max(_LEAST_STEPS, min(_MOST_STEPS, wanted))
-    passes = steps * CLIPS_A_STEP / found.steps
+    passes = steps * clips_a_step / found.steps
     return steps, f"{passes:.2g} passes over the starts of clips; the error falls for longer, planning may get worse"
 
 

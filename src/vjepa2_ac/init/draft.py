@@ -20,7 +20,7 @@ from vjepa2_ac.init.choices import (
 )
 from vjepa2_ac.init.found import FoundData
 from vjepa2_ac.init.knob import Knob, Knobs, as_yaml, guesses, plain
-from vjepa2_ac.init.machine import Machine
+from vjepa2_ac.init.machine import Machine, duration
 from vjepa2_ac.model.checkpoints.loading import base_sizes
 from vjepa2_ac.places import BUILTIN
 from vjepa2_ac.training.cost.flops import clip_flops, frame_flops
@@ -43,6 +43,7 @@ class Draft:
     memory_bytes: int | None  # at the peak; None: of the tiny model
     fits: bool
     hours: float | None  # None: the card's peak is not known
+    encoding_hours: float  # of them, before the first step
     cache_bytes: int | None
 
     def text(self, found: FoundData, machine: Machine) -> str:
@@ -62,21 +63,27 @@ class Draft:
         """Return what the run is expected to take, a line each."""
         lines = []
         if self.memory_bytes is not None:
-            room = machine.gpu_bytes / GIGABYTE
             word = "fits on" if self.fits else "does NOT fit on"
-            lines.append(
-                f"Memory, as `vjepa2-ac doctor` counts: {self.memory_bytes / GIGABYTE:.1f} GB; {word} {room:.1f} GB."
-            )
+            needed = f"{self.memory_bytes / GIGABYTE:.1f} GB"
+            lines.append(f"Memory, as `vjepa2-ac doctor` counts: {needed}; {word} {machine.room}.")
         if self.cache_bytes is not None:
             lines.append(f"Disk: at most {max(0.1, self.cache_bytes / GIGABYTE):,.1f} GB of cached latents.")
         if self.hours is not None:
-            hours = f"{self.hours:,.1f} hours" if self.hours >= 1 else f"{60 * self.hours:.0f} minutes"
-            lines.append(
-                f"Time: about {hours}, if the card reaches {_UTILIZATION:.0%} of its peak: assumed, not measured."
-            )
+            share = f"{_UTILIZATION:.0%} of its peak: assumed, not measured"
+            lines.append(f"Time: {duration(self.hours)}, if the card reaches {share}.")
         elif machine.gpu is None and self.memory_bytes is not None:
-            lines.append("Time: not known without the GPU; run `vjepa2-ac init` on the machine that has it.")
+            lines.append(
+                "Time: not known without the GPU; run `vjepa2-ac init` on the machine that has it: batch and precision"
+                " are then its own."
+            )
         return lines
+
+    def time_of(self, steps: int) -> str | None:
+        """Return about how long so many optimizer steps take, with encoding before the first; None: not known."""
+        if self.hours is None:
+            return None
+        share = steps / self.config.training.steps
+        return duration(self.encoding_hours + (self.hours - self.encoding_hours) * share)
 
 
 def choose_model(kind: str, path: str | None) -> ModelChoice:
@@ -117,14 +124,23 @@ def make_draft(found: FoundData, machine: Machine, model: ModelChoice, *, run_di
     }
     config = _config_of(knobs)
     if model.is_tiny:
-        return Draft(knobs, config, None, fits=True, hours=None, cache_bytes=_cache_bytes(config, found, model))
+        return Draft(
+            knobs,
+            config,
+            None,
+            fits=True,
+            hours=None,
+            encoding_hours=0.0,
+            cache_bytes=_cache_bytes(config, found, model),
+        )
     sizes = base_sizes(config.model)
     batch, checkpointing, needed = _fit(config, sizes, machine)
-    knobs = {**knobs, "training": {**training, **_batch_knobs(batch, machine, checkpointing=checkpointing)}}
-    config = _config_of(knobs)
-    hours = _hours(config, sizes, found, machine)
     fits = needed <= machine.gpu_bytes
-    return Draft(knobs, config, needed, fits, hours, _cache_bytes(config, found, model))
+    fitted = _batch_knobs(batch, machine, checkpointing=checkpointing, fits=fits)
+    knobs = {**knobs, "training": {**training, **fitted}}
+    config = _config_of(knobs)
+    hours, encoding = _hours(config, sizes, found, machine)
+    return Draft(knobs, config, needed, fits, hours, encoding, _cache_bytes(config, found, model))
 
 
 def _config_of(knobs: Knobs) -> Config:
@@ -152,25 +168,28 @@ def _fit(config: Config, sizes: ModelSizes, machine: Machine) -> tuple[int, bool
     return batch, True, needed(batch, checkpointing=True)
 
 
-def _batch_knobs(batch: int, machine: Machine, *, checkpointing: bool) -> Mapping[str, Knob]:
-    card = f"{machine.gpu_bytes / GIGABYTE:.0f} GB"
-    why = f"does not fit on {card} without" if checkpointing else f"fits on {card} without"
+def _batch_knobs(batch: int, machine: Machine, *, checkpointing: bool, fits: bool) -> Mapping[str, Knob]:
+    why = f"{'does not fit' if checkpointing else 'fits'} without on {machine.room}"
     return {
-        "batch_size": Knob(batch, f"the largest tried that fits on {card}"),
-        "accumulation": Knob(max(1, CLIPS_A_STEP // batch), f"{CLIPS_A_STEP} clips a step, as every config here"),
+        "batch_size": Knob(
+            batch, f"the largest tried that fits on {machine.room}" if fits else f"does not fit on {machine.room}"
+        ),
+        "accumulation": Knob(max(1, CLIPS_A_STEP // batch), f"{CLIPS_A_STEP} clips a step"),
         "gradient_checkpointing": Knob(checkpointing, why),
     }
 
 
-def _hours(config: Config, sizes: ModelSizes, found: FoundData, machine: Machine) -> float | None:
-    if machine.gpu is None or machine.peak_flops is None:
-        return None
+def _hours(config: Config, sizes: ModelSizes, found: FoundData, machine: Machine) -> tuple[float | None, float]:
+    """Return the hours of a run, and those of them that are for encoding before the first step."""
+    if machine.peak_flops is None:
+        return None, 0.0
     clip, training = clip_flops(config, sizes), config.training
     clips = training.steps * training.batch_size * training.accumulation
-    flops = clips * (clip.predictor if config.data.takes_latents else clip.total)
-    if config.data.takes_latents:
-        flops += (found.steps or 0) * frame_flops(sizes)
-    return flops / (machine.peak_flops * _UTILIZATION) / 3600
+    an_hour = machine.peak_flops * _UTILIZATION * 3600
+    if not config.data.takes_latents:
+        return clips * clip.total / an_hour, 0.0
+    encoding = (found.steps or 0) * frame_flops(sizes) / an_hour
+    return encoding + clips * clip.predictor / an_hour, encoding
 
 
 def _cache_bytes(config: Config, found: FoundData, model: ModelChoice) -> int | None:

@@ -64,7 +64,7 @@ def look_at(path: str, form: str | None = None) -> FoundData:
 def simulated(path: str) -> FoundData:
     """Return what `vjepa2-ac simulate record` will make."""
     return replace(
-        like_droid(path, episodes=60),
+        like_droid(path, episodes=60, is_simulated=True),
         steps=60 * 41,
         usual_steps=41,
         short_steps=41,

@@ -47,7 +47,7 @@ def find_pose(columns: Mapping[str, Column]) -> Pose | None:
     measured = {name: one for name, one in columns.items() if not _NO_STATE.search(name)}
     droid = [next((name for name in measured if re.split(r"[./]", name)[-1] == end), "") for end in DROID_STATE]
     if all(droid) and [columns[name].width for name in droid] == [6, 1]:
-        return Pose(tuple(droid), "euler_xyz", "DROID's columns", is_guess=False, gripper=(droid[1], 0))
+        return Pose(tuple(droid), "euler_xyz", "called as DROID's columns", is_guess=False, gripper=(droid[1], 0))
     named = (_by_names(name, one) for name, one in measured.items())
     return next((one for one in named if one), None) or _by_widths(measured)
 

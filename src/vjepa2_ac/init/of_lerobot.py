@@ -8,6 +8,7 @@ from typing import Any
 
 from vjepa2_ac import storage
 from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, read_info
+from vjepa2_ac.data.sources.lerobot.path_templates import filled
 from vjepa2_ac.errors import InputError, UserError
 from vjepa2_ac.init.found import FoundData
 from vjepa2_ac.init.knob import Knob, Knobs
@@ -18,6 +19,8 @@ _STATISTICS = ("meta/stats.json", "meta/episodes_stats.jsonl")
 _MOST_BYTES = 256 << 20  # of statistics
 _NUMBERS = ("float", "int", "uint")
 _OURS = frozenset({"timestamp", "frame_index", "episode_index", "index", "task_index", "subtask_index"})
+_DROID_GRIPPER = "observation.state.gripper_position"
+_OF_DROID = frozenset({"building", "collector_id"})  # columns of its ports to LeRobot
 _METRES, _UNIT = 0.15, 1.05  # largest values of a gripper's opening in metres, and of a share
 
 
@@ -66,11 +69,12 @@ def look_at_lerobot(path: str) -> FoundData:
         about=(f"LeRobot {info.version}, {info.episodes:,} episodes at {info.fps:g} a second",)
         + ((f"depth maps are not used: {', '.join(depth)}",) if depth else ()),
         extra="lerobot",
+        sample=storage.join(path, filled(info.data_path, 0, 0)),
     )
 
 
 def _camera_reason(names: list[str]) -> str:
-    return f"of {', '.join(names)}; the released weights saw the arm from the side" if len(names) > 1 else ""
+    return f"of {', '.join(names)}; the released weights saw DROID's exterior_1_left" if len(names) > 1 else ""
 
 
 def _distinct(cameras: Mapping[str, object]) -> dict[str, str]:
@@ -87,13 +91,15 @@ def _pose_fields(info: DatasetInfo, pose: Pose) -> Knobs:
         **({} if pose.select is None else {"select": Knob(list(pose.select))}),
         "rotation": Knob(pose.rotation, "the same guess" if pose.is_guess else "", pose.is_guess),
     }
-    return {**found, **_gripper(info.root, pose)}
+    return {**found, **_gripper(info, pose)}
 
 
-def _gripper(root: str, pose: Pose) -> Knobs:
+def _gripper(info: DatasetInfo, pose: Pose) -> Knobs:
     """Return which values are open and closed, by the range of the gripper's numbers."""
     column, number = pose.gripper
-    found = _range_of(root, column, number)
+    if column == _DROID_GRIPPER and info.features.keys() >= _OF_DROID:
+        return {"gripper_open": Knob(0.0, "DROID's"), "gripper_closed": Knob(1.0)}
+    found = _range_of(info.root, column, number)
     if found is None:
         opened, closed, why = 0.0, 1.0, "no statistics say its range"
     else:
@@ -105,8 +111,6 @@ def _gripper(root: str, pose: Pose) -> Knobs:
             opened, closed, why = round(high, 1), max(0.0, round(low, 1)), f"{why}: percent open?"
         else:
             opened, closed = 0.0, 1.0
-    if column.split(".")[-1] == "gripper_position" and (opened, closed) == (0.0, 1.0):
-        return {"gripper_open": Knob(0.0, "as DROID"), "gripper_closed": Knob(1.0)}
     why = f"{why}; `data check CONFIG --model` finds out whether it is inverted"
     return {"gripper_open": Knob(opened, why, is_guess=True), "gripper_closed": Knob(closed, "likewise", is_guess=True)}
 

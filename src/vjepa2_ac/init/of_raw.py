@@ -30,6 +30,6 @@ def look_at_raw(path: str) -> FoundData:
         rate_hz=Knob(15.0, "DROID's"),
         episodes=episodes,
         idle={"rule": Knob("commands", "openpi's rule, on the commanded joint velocities")},
-        about=("raw DROID, " + ("behind a URL" if episodes is None else f"{episodes:,} episodes"),),
+        about=(f"raw DROID, {'behind a URL' if is_remote else f'{episodes:,} episodes'}, 15 steps a second",),
         extra="gcs,raw" if is_remote else "raw",
     )

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import prod
 from typing import Any
 
 from vjepa2_ac import storage
-from vjepa2_ac.data.sources.rlds.dataset_info import find_shards
+from vjepa2_ac.data.sources.rlds.dataset_info import dataset_name, find_shards
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.init.found import FoundData
 from vjepa2_ac.init.knob import Knob, Knobs
@@ -18,10 +18,12 @@ from vjepa2_ac.storage.structured import read_json_object
 DROID = "gs://gresearch/robotics/droid/1.0.1"
 RANGES = "gs://openpi-assets/droid/droid_sample_ranges_v1_0_1.json"
 _DROID_EPISODES, _DROID_STEPS = 95_658, 27_600_000
-_DROID_CAMERA = "exterior_1_left"
-_DROID_FEATURE = "steps/observation/exterior_image_1_left"
-_RATES_HZ = {"droid": 15.0, "r2d2_faceblur": 15.0, "bridge": 5.0}  # by a part of the name: RLDS does not say
-_UNKNOWN_RATE_HZ = 10.0
+_DROID_CAMERA, _SEEN = "exterior_1_left", "what the released weights saw"
+_DROID_FEATURE, _BRIDGE_FEATURE = "steps/observation/exterior_image_1_left", "steps/observation/state"
+_DROID_NAMES = frozenset({"droid", "droid_100", "droid_101", "r2d2_faceblur"})  # as the sets call themselves
+_BRIDGE_NAMES = frozenset({"bridge", "bridge_dataset", "bridge_orig"})
+_DROID_RATE_HZ, _BRIDGE_RATE_HZ, _UNKNOWN_RATE_HZ = 15.0, 5.0, 10.0
+_SIMULATION = "simulation.json"  # beside the shards of `vjepa2-ac simulate record`
 _VELOCITIES = "steps/action_dict/joint_velocity"
 
 
@@ -37,8 +39,8 @@ def droid() -> FoundData:
     return FoundData(
         source="rlds",
         path=DROID,
-        knobs={"camera": Knob(_DROID_CAMERA, "what the released weights saw")},
-        rate_hz=Knob(15.0, "DROID's"),
+        knobs={"camera": Knob(_DROID_CAMERA, _SEEN)},
+        rate_hz=Knob(_DROID_RATE_HZ),
         episodes=_DROID_EPISODES,
         steps=_DROID_STEPS,
         idle={
@@ -47,6 +49,7 @@ def droid() -> FoundData:
         },
         about=(f"DROID 1.0.1, {_DROID_EPISODES:,} episodes, 1.7 TB, fetched from Google Cloud as they are needed",),
         extra="gcs",
+        sample=f"{DROID}/droid_101-train.tfrecord-00000-of-02048",
     )
 
 
@@ -59,13 +62,17 @@ def look_at_rlds(path: str) -> FoundData:
     shards = find_shards(path)
     features = dict(_features(path))
     episodes = sum(shard.episodes for shard in shards)
-    if _DROID_FEATURE in features:
-        return like_droid(path, episodes)
+    name = dataset_name(path)
+    if name in _DROID_NAMES and _DROID_FEATURE in features:
+        is_simulated = storage.exists(storage.join(path, _SIMULATION))
+        return replace(like_droid(path, episodes, is_simulated=is_simulated), sample=shards[0].path)
     images = [name for name, one in features.items() if one.kind == "image" and name.startswith("steps/")]
     if not images:
         where = storage.join(path, "features.json")
         raise InputError(where=where, found="no images among its features", needed="images of the robot at each step")
-    rate = next((rate for name, rate in _RATES_HZ.items() if name in path.lower()), None)
+    is_bridge = name in _BRIDGE_NAMES and _BRIDGE_FEATURE in features
+    rate = _rate(features, is_bridge=is_bridge)
+    has_velocities = _VELOCITIES in features
     first = pick_camera(images)
     return FoundData(
         source="rlds",
@@ -73,34 +80,48 @@ def look_at_rlds(path: str) -> FoundData:
         knobs={
             "camera": Knob(short_name(first), f"of {', '.join(map(short_name, images))}", is_guess=len(images) > 1),
             "fields": {
-                **_state(path, features),
+                **_state(path, features, is_bridge=is_bridge),
                 "identity": Knob(_identity(features), "what tells episodes apart", is_guess=True),
                 "cameras": Knob({short_name(name): name for name in images}),
                 "language": Knob(next((name for name, one in features.items() if _is_language(name, one)), None)),
-                "joint_velocity": Knob(_VELOCITIES if _VELOCITIES in features else None),
-                "control_rate_hz": Knob(rate or _UNKNOWN_RATE_HZ, "RLDS does not say", is_guess=rate is None),
+                "joint_velocity": Knob(_VELOCITIES if has_velocities else None),
+                "control_rate_hz": rate,
             },
         },
-        rate_hz=Knob(rate or _UNKNOWN_RATE_HZ, is_guess=rate is None),
+        rate_hz=rate,
         episodes=episodes,
-        idle={"rule": Knob("motion", "pauses teach nothing")},
-        about=(f"RLDS, {episodes:,} episodes in {len(shards):,} shards",),
+        idle={"rule": Knob("commands" if has_velocities else "motion", "pauses teach nothing")},
+        about=(f"RLDS {name}, {episodes:,} episodes, {rate.value:g} steps a second{' (guessed)' * rate.is_guess}",),
         extra="gcs" if path.startswith("gs://") else "",
+        sample=shards[0].path,
     )
 
 
-def like_droid(path: str, episodes: int) -> FoundData:
-    """Return what is known of a data set in DROID's schema."""
+def like_droid(path: str, episodes: int, *, is_simulated: bool) -> FoundData:
+    """Return what is known of DROID, or of the simulated arm, whose data sets are called as DROID's."""
+    camera = "a view from outside, as of DROID the released weights saw it" if is_simulated else _SEEN
+    rule = "openpi's rule" + ("" if is_simulated else "; the published ranges are of DROID 1.0.1")
+    title = "the simulated arm" if is_simulated else "DROID"
     return FoundData(
         source="rlds",
         path=path,
-        knobs={"camera": Knob(_DROID_CAMERA, "what the released weights saw")},
-        rate_hz=Knob(15.0, "DROID's"),
+        knobs={"camera": Knob(_DROID_CAMERA, camera)},
+        rate_hz=Knob(_DROID_RATE_HZ),
         episodes=episodes,
-        idle={"rule": Knob("commands", "openpi's rule; the published ranges are of DROID 1.0.1")},
-        about=(f"RLDS in DROID's schema, {episodes:,} episodes",),
+        idle={"rule": Knob("commands", rule)},
+        about=(f"RLDS, {title}, {episodes:,} episodes, {_DROID_RATE_HZ:g} steps a second",),
         extra="gcs" if path.startswith("gs://") else "",
     )
+
+
+def _rate(features: Mapping[str, _Feature], *, is_bridge: bool) -> Knob:
+    """Return the control rate: only the name of a known data set tells it."""
+    if is_bridge:
+        return Knob(_BRIDGE_RATE_HZ, "RLDS does not say; BridgeData's")
+    if _DROID_FEATURE in features:
+        why = "RLDS does not say; its cameras are called as DROID's, which has 15"
+        return Knob(_DROID_RATE_HZ, why, is_guess=True)
+    return Knob(_UNKNOWN_RATE_HZ, "RLDS does not say: your robot's control steps a second", is_guess=True)
 
 
 def _features(path: str) -> Iterator[tuple[str, _Feature]]:
@@ -133,7 +154,7 @@ def _inside(content: Any, name: str) -> Iterator[tuple[str, _Feature]]:
         yield name, _Feature(kind, str(about.get("dtype", "")), prod(sizes))
 
 
-def _state(path: str, features: Mapping[str, _Feature]) -> Knobs:
+def _state(path: str, features: Mapping[str, _Feature], *, is_bridge: bool) -> Knobs:
     columns = {
         name: Column(one.width)
         for name, one in features.items()
@@ -145,11 +166,13 @@ def _state(path: str, features: Mapping[str, _Feature]) -> Knobs:
         fix = "If others are the robot's numbers, name them in a config with `states: vector` (builtin:joints)"
         needed = "x, y, z, three angles and the gripper, measured"
         raise InputError(where=storage.join(path, "features.json"), found=found, needed=needed, fix=fix)
-    inverted = "bridge" in path.lower()
-    why = "1 is open in BridgeData" if inverted else "of the last number; `data check CONFIG --model` tells"
+    if is_bridge:
+        state = Knob(list(pose.columns), "x, y, z, three angles, the gripper")
+        return {"state": state, "gripper": Knob("openness", "1 is open in BridgeData")}
+    why = "whether 1 is closed or open: `data check CONFIG --model` tells"
     return {
         "state": Knob(list(pose.columns), pose.why, pose.is_guess),
-        "gripper": Knob("openness" if inverted else "closedness", why, is_guess=not inverted),
+        "gripper": Knob("closedness", why, is_guess=True),
     }
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli.options import Commands, argument, as_model, as_path, as_place, command
 from vjepa2_ac.errors import InputError, UserError
-from vjepa2_ac.storage import try_writing_at, user_can_write, write_atomically
+from vjepa2_ac.storage import is_url, try_writing_at, user_can_write, write_atomically
 
 if TYPE_CHECKING:
     from vjepa2_ac.init.draft import Draft
@@ -25,6 +25,7 @@ _WITHOUT_A_PATH = {
     "sim": _SIMULATED,
     "scratch": _SIMULATED,
 }
+_TRIAL_STEPS = 100
 _RECORD = "vjepa2-ac simulate record {path} --domain B --episodes 60 --seed 5"
 
 
@@ -66,6 +67,7 @@ def _init(options: argparse.Namespace) -> int:
     found = _found(form, path, is_missing=is_missing)
 
     from vjepa2_ac.console.progress import ConsoleReporter, console
+    from vjepa2_ac.init.choices import download_of
     from vjepa2_ac.init.draft import TINY, choose_model, make_draft
     from vjepa2_ac.init.machine import this_machine
     from vjepa2_ac.init.measure import measured
@@ -75,7 +77,7 @@ def _init(options: argparse.Namespace) -> int:
         found = found if is_missing else measured(found, reporter.task(INDEXING))
     model_path = options.model or (TINY if path == _SIMULATED or form == "sim" else None)
     model = choose_model("scratch" if form == "scratch" else "released", model_path)
-    machine = this_machine(_sample_of(found))
+    machine = this_machine(found.sample if is_url(found.path) else "")
     console.print(f"Data: {'; '.join(found.about)}.\nMachine: {machine.about}.")
     draft = make_draft(found, machine, model, run_dir=f"runs/{name}")
     with user_can_write(f"--out {out}"):
@@ -84,7 +86,8 @@ def _init(options: argparse.Namespace) -> int:
     status = 0 if is_missing else _check(draft, out)
     if status:
         console.print(f"\nMend this first, then: vjepa2-ac data check {out}", soft_wrap=True)
-    for line in _next(draft, found, out, name, is_missing=is_missing):
+    fetch = None if Path(model.path).exists() else download_of(model, machine)
+    for line in _next(draft, found, out, name, fetch, is_missing=is_missing):
         console.print(line, soft_wrap=True)
     return status
 
@@ -128,16 +131,6 @@ def _found(form: str | None, path: str, *, is_missing: bool) -> FoundData:
     return look_at(path, {"droid": "rlds", "sim": "rlds", "scratch": None}.get(form or "", form))
 
 
-def _sample_of(found: FoundData) -> str | None:
-    """Return a file behind a URL, to see how fast it comes."""
-    from vjepa2_ac import storage
-
-    if not storage.is_url(found.path):
-        return None
-    known = {"lerobot": "meta/stats.json", "rlds": "features.json"}
-    return storage.join(found.path, known[found.source]) if found.source in known else None
-
-
 def _say(draft: Draft, out: Path, costs: list[str]) -> None:
     from vjepa2_ac.console.progress import console
     from vjepa2_ac.init.knob import guesses
@@ -162,23 +155,22 @@ def _check(draft: Draft, out: Path) -> int:
         return 2
 
 
-def _next(draft: Draft, found: FoundData, out: Path, name: str, *, is_missing: bool) -> list[str]:
-    from vjepa2_ac.init.draft import RELEASED, SCRATCH_ENCODER
-
-    config = draft.config
-    model = config.model.base or (config.model.encoder.path if config.model.encoder else "")
-    fetched = {RELEASED: "vjepa2-ac download", SCRATCH_ENCODER: "vjepa2-ac download vjepa2.1-vitb-384"}
+def _next(
+    draft: Draft, found: FoundData, out: Path, name: str, fetch: tuple[str, str] | None, *, is_missing: bool
+) -> list[str]:
     lines = []
     if is_missing:
-        lines.append((_RECORD.format(path=found.path), "the data"))
-    if model in fetched and not Path(model).exists():
-        lines.append((fetched[model], "the model, once"))
-    trial = f"runs/{name}-trial"
-    short = "training.steps=100 validation.every=50 checkpoint.every=50"
+        lines.append((_RECORD.format(path=found.path), "the data; half a minute on a core of its own"))
+    if fetch:
+        lines.append((fetch[0], f"the model, once: {fetch[1]}"))
+    trial, steps = f"runs/{name}-trial", draft.config.training.steps
+    short = f"training.steps={_TRIAL_STEPS} validation.every=50 checkpoint.every=50"
+    of_trial = ", ".join(filter(None, (f"{_TRIAL_STEPS} steps", draft.time_of(_TRIAL_STEPS))))
+    of_run = draft.time_of(steps) or f"time not known before the trial: its time a step, times {steps:,}"
     lines += [
         (f"vjepa2-ac train {out} --check", "everything that can fail, before the first step"),
-        (f"vjepa2-ac train {out} run_dir={trial} {short}", "100 steps: does it learn, how long does a step take?"),
+        (f"vjepa2-ac train {out} run_dir={trial} {short}", f"{of_trial}: does it learn, how long does a step take?"),
         (f"vjepa2-ac evaluate {trial}", "against the base, on held-out episodes"),
-        (f"vjepa2-ac train {out}", "the real run; the same command goes on after a stop"),
+        (f"vjepa2-ac train {out}", f"the real run, {of_run}; the same command goes on after a stop"),
     ]
     return ["\nNext:", *(f"  {line}   # {about}" for line, about in lines)]

@@ -36,6 +36,15 @@ def find_shards(folder: str) -> list[Shard]:
     return _as_listed(folder, shards)
 
 
+def dataset_name(folder: str) -> str:
+    """Return the name that a data set gives itself, whatever its folder is called.
+
+    Raises:
+        InputError: As of `find_shards`.
+    """
+    return str(_read_info(folder, storage.join(folder, _INFO)).get("name", ""))
+
+
 def _read_info(folder: str, where: str) -> dict[str, Any]:
     try:
         return read_json_object(where, needed="a description as TFDS writes it", allow_nan=True)

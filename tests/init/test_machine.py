@@ -1,0 +1,36 @@
+"""What the machine has: in what its GPU computes, and how fast its network is, where a large file said so."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from vjepa2_ac.init import machine
+from vjepa2_ac.init.machine import this_machine
+
+
+@pytest.mark.parametrize(
+    ("capability", "precision"),
+    [((7, 5), "fp16"), ((8, 0), "bf16"), ((8, 9), "bf16"), ((12, 0), "bf16")],
+)
+def test_a_card_has_bf16_from_ampere_on(
+    capability: tuple[int, int], precision: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    card = SimpleNamespace(name="A card", total_memory=16 * 10**9, major=capability[0], minor=capability[1])
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda _device: card)
+    assert this_machine().precision == precision
+
+
+def test_a_cpu_computes_in_fp32(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert this_machine().precision == "fp32"
+
+
+def test_a_small_file_says_nothing_about_the_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").write_bytes(bytes(2_000_000))
+    assert this_machine(str(tmp_path / "file")).read_bytes_per_s is not None
+    monkeypatch.setattr(machine, "_LEAST_BYTES", 3_000_000)
+    assert this_machine(str(tmp_path / "file")).read_bytes_per_s is None
