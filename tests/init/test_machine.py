@@ -17,9 +17,11 @@ from vjepa2_ac.init.machine import this_machine
 def test_a_card_has_bf16_from_ampere_on(
     capability: tuple[int, int], precision: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    card = SimpleNamespace(name="A card", total_memory=16 * 10**9, major=capability[0], minor=capability[1])
+    card = SimpleNamespace(name="A card", total_memory=16 * 10**9)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda _device: capability)
     monkeypatch.setattr(torch.cuda, "get_device_properties", lambda _device: card)
     assert this_machine().precision == precision
 

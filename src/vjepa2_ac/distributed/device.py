@@ -16,7 +16,7 @@ from vjepa2_ac.model.network.compilation import require_compiler
 _log = logging.getLogger(__name__)
 
 PRECISIONS = {"bf16": torch.bfloat16, "fp16": torch.float16, "fp32": torch.float32}
-BF16_FROM = (8, 0)  # compute capability; PyTorch's is_bf16_supported includes emulation, which is slower than fp32
+_BF16_FROM = (8, 0)  # compute capability; PyTorch's is_bf16_supported includes emulation, which is slower than fp32
 _SLOW = 2.0  # times as long as in float32: of a CPU that computes bfloat16 without instructions for it
 
 
@@ -92,7 +92,7 @@ def slow_bf16() -> str | None:
 
 def has_bf16() -> bool:
     """Return whether the CUDA device of this process computes in bfloat16."""
-    return torch.cuda.get_device_capability(cuda_index()) >= BF16_FROM
+    return torch.cuda.get_device_capability(cuda_index()) >= _BF16_FROM
 
 
 def cuda_index() -> int:

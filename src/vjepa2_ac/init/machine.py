@@ -14,7 +14,6 @@ from vjepa2_ac.training.cost.memory import GIGABYTE, USUAL_GPU
 
 _SAMPLE_BYTES = 8 << 20
 _LEAST_BYTES = 1 << 20  # a smaller file says how long an answer takes, not how fast data come
-_BF16_SINCE = (8, 0)  # compute capability, Ampere
 _USUAL_BYTES_PER_S = 100e6 / 8  # 100 Mbit/s: assumed
 
 # Dense bfloat16 or float16 products with sums in float32, TFLOP/s, by the vendor's data sheets. The longest name wins.
@@ -84,13 +83,14 @@ def this_machine(sample: str = "") -> Machine:
     """
     import torch
 
+    from vjepa2_ac.distributed.device import has_bf16
+
     cores, free = len(os.sched_getaffinity(0)), storage.free_bytes(Path.cwd())
     speed = _speed_of(sample) if sample else None
     if not torch.cuda.is_available():
         return Machine(None, USUAL_GPU, False, cores, free, speed)
     device = torch.cuda.get_device_properties(torch.cuda.current_device())
-    has_bf16 = (device.major, device.minor) >= _BF16_SINCE
-    return Machine(device.name, device.total_memory, has_bf16, cores, free, speed)
+    return Machine(device.name, device.total_memory, has_bf16(), cores, free, speed)
 
 
 def _speed_of(sample: str) -> float | None:
