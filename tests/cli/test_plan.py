@@ -99,7 +99,7 @@ def test_what_is_quicker_and_why_there_are_no_maps_is_said(workshop: Path, capsy
     assert "No energy maps: they take 75 action sequences or more, the search 8." in reported
     (words,) = re.findall(r"Quick, for a CPU: (.*)", reported)
     status, file = plan(workshop, *words.split(), "--nodes", "0")
-    assert (status, file["settings"]["samples"], file["evaluations"]) == (0, 100, 301)
+    assert (status, file["settings"]["samples"], file["evaluations"]) == (0, 64, 257)
     assert "Quick" not in capsys.readouterr().out, "nothing is quicker"
 
 

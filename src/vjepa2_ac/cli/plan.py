@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from vjepa2_ac.config.planning import PlanningConfig
     from vjepa2_ac.planning.goals.folder import GoalFolder
 
-QUICK, _QUICK_SEQUENCES = "planning.samples=100 planning.iterations=3", 300
+_QUICK, _QUICK_SEQUENCES = "planning.samples=64 planning.iterations=4", 256  # docs/planning.md says how good it is
 
 
 def add_to(commands: Commands) -> None:
@@ -46,7 +46,7 @@ def add_to(commands: Commands) -> None:
     parser = command(commands, "plan", _plan, text)
     parser._negative_number_matcher = NEGATIVE_NUMBERS  # "-0.3,0.1,..." is a value, not an option
     argument(parser, "subject RUN_OR_MODEL", "folder of a run, or what model.base takes", as_model)
-    text = f"such as planning.horizon=2; quick, for a CPU: {QUICK}"
+    text = f"such as planning.horizon=2; quick, for a CPU: {_QUICK}"
     argument(parser, "overrides key=value", text, nargs="*")
     argument(parser, "--start IMAGE", "what the camera sees: PNG or JPEG", as_local, required=True)
     text = (
@@ -139,7 +139,7 @@ def _search_line(config: PlanningConfig, *, on_cpu: bool) -> str:
     if config.budget_s is not None:
         text += f", for {config.budget_s:g} s at most"
     is_long = on_cpu and config.planner != "gradient" and count > _QUICK_SEQUENCES
-    return text + f". Quick, for a CPU: {QUICK}" * is_long
+    return text + f". Quick, for a CPU: {_QUICK}" * is_long
 
 
 def _require_state(state: np.ndarray, config: Config) -> None:
