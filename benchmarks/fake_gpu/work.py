@@ -122,7 +122,8 @@ class _Decisions(planning_variants.Bench):
             return torch.rand(len(actions))
 
         def iterated(done: int, of: int) -> None:
-            self.count.times = 1.0 if done == of else float(self.options.iterations - 1)
+            if done:
+                self.count.times = 1.0 if done == of else float(self.options.iterations - 1)
 
         with _disable_current_modes():
             return Planner(config, progress=iterated).plan(energies, torch.Generator().manual_seed(0))

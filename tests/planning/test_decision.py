@@ -9,9 +9,10 @@ import torch
 
 from decisions import QUICK, STATE, asked, image
 from tiny_models import tiny_model
-from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig, PlanningConfig
+from vjepa2_ac.config.planning import EnergyConfig, GradientConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.decision import PlanRequest, PlanResult, decide
+from vjepa2_ac.planning.energy import WorldModelCost
 from vjepa2_ac.planning.plan_json import write_plan
 from vjepa2_ac.planning.summary import axes_at_limit, summarize
 
@@ -34,6 +35,34 @@ def test_an_answer_is_what_the_controller_decides() -> None:
     assert found.states.shape == (3, 7)
     assert len(found.slices) == 3
     assert asked(nodes=0).slices == asked(nodes=2).slices == ()
+
+
+@pytest.mark.parametrize("planner", ["cem", "gradient"])
+@pytest.mark.parametrize(("iterations", "nodes"), [(1, 0), (7, 5), (14, 7)])
+def test_maps_evaluate_no_more_than_the_search_and_without_them_nothing_is_but_no_motion(
+    monkeypatch: pytest.MonkeyPatch, planner: str, iterations: int, nodes: int
+) -> None:
+    evaluated: list[int] = []
+    once = WorldModelCost.__call__
+
+    def counted(cost: WorldModelCost, actions: torch.Tensor) -> torch.Tensor:
+        evaluated.append(len(actions))
+        return once(cost, actions)
+
+    monkeypatch.setattr(WorldModelCost, "__call__", counted)
+    settings = {"planner": planner, "iterations": iterations, "gradient": GradientConfig(starts=12)}
+    plain, mapped = asked(nodes=0, **settings), asked(nodes=None, **settings)
+    for found in (plain, mapped):
+        searched = found.decision.plan.evaluations
+        while searched > 0:
+            searched -= evaluated.pop(0)
+        assert searched == 0
+        assert evaluated.pop(0) == 1, "no motion"
+        assert sum(evaluated.pop(0) for _ in found.slices) <= 12 * iterations
+    assert evaluated == []
+    assert plain.slices == ()
+    assert [one.energy.shape for one in mapped.slices] == [(nodes, nodes)] * (3 if nodes else 0)
+    np.testing.assert_array_equal(plain.actions, mapped.actions)
 
 
 def test_the_file_holds_the_decision(tmp_path: Path) -> None:

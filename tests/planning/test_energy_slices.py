@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
-from vjepa2_ac.planning.energy_slices import energy_slices
+from vjepa2_ac.planning.energy_slices import energy_slices, fitting_nodes, sequences_of_slices
 from vjepa2_ac.planning.search_space import pose_space
 
 CHOSEN = torch.arange(28.0).reshape(4, 7) / 1000
@@ -49,3 +49,25 @@ def test_a_slice_reaches_beyond_the_limits_also_along_an_axis_that_is_held() -> 
 def test_fewer_than_three_nodes_show_nothing() -> None:
     with pytest.raises(ValueError, match="2 nodes"):
         energy_slices(weighted, CHOSEN, pose_space(PlanningConfig(horizon=4)), nodes=2)
+
+
+@pytest.mark.parametrize("axes", [2, 3])
+def test_chosen_nodes_are_the_most_that_cost_no_more_than_the_search(axes: int) -> None:
+    for searched in range(600):
+        nodes = fitting_nodes(searched, axes)
+        assert nodes in {0, 5, 7, 9, 11, 13}
+        assert sequences_of_slices(nodes, axes) <= searched
+        assert nodes == 13 or sequences_of_slices(max(nodes + 2, 5), axes) > searched
+
+
+def test_progress_of_slices_leads_to_all_that_is_evaluated() -> None:
+    evaluated, reported = [], []
+
+    def counted(actions: Tensor) -> Tensor:
+        evaluated.append(len(actions))
+        return weighted(actions)
+
+    space = pose_space(PlanningConfig(horizon=4, limits=LIMITS))
+    energy_slices(counted, CHOSEN, space, nodes=5, progress=lambda *seen: reported.append(seen))
+    assert sum(evaluated) == sequences_of_slices(5, 3) == 75
+    assert reported == [(0, 75), (25, 75), (50, 75), (75, 75)]

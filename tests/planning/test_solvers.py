@@ -11,6 +11,7 @@ from torch import Tensor
 from paths import GOLDEN
 from solver_problems import PLANNERS, config, parabola, rosenbrock, solve, space, two_basins
 from vjepa2_ac.config.planning import CemConfig, GradientConfig, IcemConfig, LimitsConfig, MppiConfig, PlanningConfig
+from vjepa2_ac.episode import no_progress
 from vjepa2_ac.evaluation.action_score.protocol import SCORED
 from vjepa2_ac.planning.interfaces import Plan, PlanStart
 from vjepa2_ac.planning.planner import Planner
@@ -199,11 +200,28 @@ def test_no_iteration_begins_that_would_end_after_the_time_budget(planner: str, 
     assert math.isfinite(plan.energy)
 
 
-def test_progress_is_reported_after_every_iteration() -> None:
-    reported: list[tuple[int, int]] = []
-    planner = Planner(config("cem", iterations=3), space(), progress=lambda done, total: reported.append((done, total)))
-    planner.plan(parabola(torch.zeros(1, 2)), torch.Generator())
-    assert reported == [(1, 3), (2, 3), (3, 3)]
+@pytest.mark.parametrize("planner", PLANNERS)
+def test_progress_leads_from_nothing_to_all_sequences_and_changes_no_plan(planner: str) -> None:
+    class InParts:
+        progress = staticmethod(no_progress)
+
+        def __call__(self, actions: Tensor) -> Tensor:
+            for done in (*range(5, len(actions), 5), len(actions)):
+                self.progress(done, len(actions))
+            return rosenbrock(actions)
+
+    settings, cost = config(planner, iterations=3, samples=44), InParts()
+    plans, reported = [], []
+    for one in (rosenbrock, cost):
+        reported.append([])
+        looking = Planner(settings, space(), progress=lambda *seen: reported[-1].append(seen))
+        plans.append(looking.plan(one, torch.Generator().manual_seed(0)))
+    ends = [(sum(settings.sequences[:done]), sum(settings.sequences)) for done in range(4)]
+    assert reported[0] == ends, "a cost that says nothing: after each iteration"
+    assert set(ends) < set(reported[1]), "one that evaluates in parts: in between, too"
+    assert reported[1] == sorted(set(reported[1])), "forwards, and nothing twice"
+    assert torch.equal(plans[0].actions, plans[1].actions)
+    assert cost.progress is no_progress, "who evaluates other actions later is not reported"
 
 
 @pytest.mark.parametrize("planner", PLANNERS)

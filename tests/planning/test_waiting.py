@@ -40,7 +40,10 @@ def operations_of(work: Callable[[], object]) -> set[str]:
 @pytest.mark.parametrize(("context", "steps", "kind"), [(1, "last", "l1"), (2, "sum", "cosine")])
 def test_energies_are_computed_without_asking_the_device(context: int, steps: str, kind: str) -> None:
     measure, tried = cost(tiny_model(), context, samples_at_once=4, steps=steps, distance=kind), actions(10, 3)
+    reported: list[tuple[int, int]] = []
+    measure.progress = lambda *progress: reported.append(progress)
     seen = operations_of(lambda: measure(tried))
+    assert reported == 2 * [(4, 10), (8, 10), (10, 10)]
     assert "addmm" in seen
     assert not seen & ASKING
 

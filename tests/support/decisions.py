@@ -16,7 +16,7 @@ def image(seed: int) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, (60, 48, 3), dtype=np.uint8)
 
 
-def asked(*goals: int, nodes: int = 3, broken: bool = False, start: int = 0, **changes: object) -> PlanResult:
+def asked(*goals: int, nodes: int | None = 3, broken: bool = False, start: int = 0, **changes: object) -> PlanResult:
     model = tiny_model()
     if broken:
         with torch.no_grad():

@@ -31,7 +31,10 @@ if TYPE_CHECKING:
     import numpy as np
 
     from vjepa2_ac.config import Config
+    from vjepa2_ac.config.planning import PlanningConfig
     from vjepa2_ac.planning.goals.folder import GoalFolder
+
+_QUICK, _QUICK_SEQUENCES = "planning.samples=64 planning.iterations=4", 256  # docs/planning.md says how good it is
 
 
 def add_to(commands: Commands) -> None:
@@ -43,7 +46,8 @@ def add_to(commands: Commands) -> None:
     parser = command(commands, "plan", _plan, text)
     parser._negative_number_matcher = NEGATIVE_NUMBERS  # "-0.3,0.1,..." is a value, not an option
     argument(parser, "subject RUN_OR_MODEL", "folder of a run, or what model.base takes", as_model)
-    argument(parser, "overrides key=value", "such as planning.horizon=2", nargs="*")
+    text = f"such as planning.horizon=2; quick, for a CPU: {_QUICK}"
+    argument(parser, "overrides key=value", text, nargs="*")
     argument(parser, "--start IMAGE", "what the camera sees: PNG or JPEG", as_local, required=True)
     text = (
         "measured x,y,z (m), roll,pitch,yaw (radians, extrinsic xyz), gripper (0 open .. 1 closed); or the numbers of a"
@@ -65,8 +69,11 @@ def add_to(commands: Commands) -> None:
     argument(parser, "--config CONFIG", text, as_local)
     add_checkpoint(parser)
     argument(parser, "--seed N", "default: the config's", whole_number(0, 2**31 - 1))
-    text = "of an energy slice along each axis (13); below 3: no slices"
-    argument(parser, "--nodes N", text, whole_number(0, 101), default=13)
+    text = (
+        "of the image's energy maps along each axis; 0: no maps; default: 13, or as many as evaluate no more action"
+        " sequences than the search"
+    )
+    argument(parser, "--nodes N", text, whole_number(0, 101))
     add_decoder(parser, "what the planner imagined, beside the goal, in the image")
     argument(parser, "--out FOLDER", "for both files (plan)", as_path, default=Path("plan"))
 
@@ -105,9 +112,10 @@ def _plan(options: argparse.Namespace) -> int:
     if not options.durations and isinstance(goals, tuple):
         request = request.with_equal_durations(session.config.planning.horizon)
     with ConsoleReporter() as reporter:
-        progress = reporter.task("planning, iterations")
+        reporter.note(_search_line(session.config.planning, on_cpu=session.world_model.device.type == "cpu"))
+        progress = reporter.task("planning", "action sequences")
         controller = session.controller(seed=options.seed, extrinsics=extrinsics, progress=progress)
-        found = decide(controller, request, nodes=options.nodes)
+        found = decide(controller, request, nodes=options.nodes, reporter=reporter)
     about = session.as_dict() | {"start": options.start, "goals": names, "mask": options.mask}
     about["decoder"] = None if decoder is None else decoder.as_dict()
     imagined = None if decoder is None else imagine_plan(found, decoder)
@@ -121,6 +129,17 @@ def _plan(options: argparse.Namespace) -> int:
     for path in written:
         console.print(f"  {path}")
     return int(found.decision.why == "no finite energy")
+
+
+def _search_line(config: PlanningConfig, *, on_cpu: bool) -> str:
+    """Return what a search predicts, and on a CPU what is quicker."""
+    count = sum(config.sequences)
+    text = f"Planning: {count:,} action sequences in {config.iterations} iteration{'s' * (config.iterations > 1)}"
+    text += f", {config.horizon} model step{'s' * (config.horizon > 1)} each"
+    if config.budget_s is not None:
+        text += f", for {config.budget_s:g} s at most"
+    is_long = on_cpu and config.planner != "gradient" and count > _QUICK_SEQUENCES
+    return text + f". Quick, for a CPU: {_QUICK}" * is_long
 
 
 def _require_state(state: np.ndarray, config: Config) -> None:

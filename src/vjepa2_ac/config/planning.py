@@ -131,6 +131,10 @@ class IcemConfig(Section):
     kept: ZeroToOne = 0.3
     """Share of the elites that are reused, in the next iteration and, with warm_start, in the next decision."""
 
+    def new_samples(self, samples: int, iteration: int) -> int:
+        """Return how many are drawn in an iteration (from 0), of so many in the first one."""
+        return max(int(samples * self.shrink**-iteration), 2 * self.elites)
+
 
 class MppiConfig(Section):
     """Model predictive path integral control."""
@@ -202,6 +206,13 @@ class PlanningConfig(Section):
     """Of planner mppi only."""
     gradient: GradientConfig = GradientConfig()
     """Of planner gradient only."""
+
+    @property
+    def sequences(self) -> tuple[int, ...]:
+        """The action sequences that each iteration evaluates; without those that icem reuses."""
+        if self.planner == "icem":
+            return tuple(self.icem.new_samples(self.samples, number) for number in range(self.iterations))
+        return (self.gradient.starts if self.planner == "gradient" else self.samples,) * self.iterations
 
     @model_validator(mode="after")
     def _numbers_fit(self) -> PlanningConfig:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TextColumn
 from rich.table import Column, Table
 from rich.text import Text
 
@@ -114,10 +114,10 @@ class ProgressBar:
             speed = done / max(now - self._began, 1e-9)
             words = f"{speed:.{1 if speed < 100 else 0}f} {self._unit}/s"
         if self._bar is not None:
-            self._bar.update(self._bar.task_ids[0], completed=done, words=words)
+            self._bar.update(self._bar.task_ids[0], completed=done, words=words, left=self._left(done, now))
         elif not console.is_terminal and (done == total or now - self._last_line >= _LINE_EVERY_S):
             self._last_line = now
-            console.print(f"{self._title} {done}/{total}  {words}{self._left(done, now)}")
+            console.print("  ".join(filter(None, (f"{self._title} {done}/{total}", words, self._left(done, now)))))
         if done >= total:
             self.close()
 
@@ -137,11 +137,11 @@ class ProgressBar:
             _Words("{task.description}"),
             BarColumn(bar_width=40 if console.width >= _WIDE else 6, table_column=Column(no_wrap=True)),
             MofNCompleteColumn(table_column=Column(no_wrap=True)),
-            TimeRemainingColumn(table_column=Column(no_wrap=True)),
+            _Words("{task.fields[left]}", table_column=Column(no_wrap=True)),
             _Words("{task.fields[words]}", table_column=Column()),  # wraps if it does not fit
             console=console,
         )
-        self._bar.add_task(self._title, total=total, completed=done, words="")
+        self._bar.add_task(self._title, total=total, completed=done, words="", left="")
         self._bar.start()
 
     def _left(self, done: int, now: float) -> str:
@@ -149,7 +149,7 @@ class ProgressBar:
         advanced, remaining = done - self._first, self._total - done
         if advanced <= 0 or remaining <= 0:
             return ""
-        return f"  {timedelta(seconds=round((now - self._began) / advanced * remaining))} left"
+        return f"{timedelta(seconds=round((now - self._began) / advanced * remaining))} left"
 
 
 class ConsoleReporter:

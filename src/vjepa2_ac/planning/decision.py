@@ -11,9 +11,17 @@ import torch
 from jaxtyping import Float, UInt8
 
 from vjepa2_ac.planning.controller import Controller, Decision
-from vjepa2_ac.planning.energy_slices import EnergySlice, energy_slices
+from vjepa2_ac.planning.energy_slices import (
+    FEWEST_NODES,
+    EnergySlice,
+    energy_slices,
+    fitting_nodes,
+    sequences_of_slices,
+)
 from vjepa2_ac.planning.goals.sub_goals import SubGoal
+from vjepa2_ac.planning.interfaces import Cost, Plan
 from vjepa2_ac.planning.search_space import SearchSpace
+from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.spaces import StateSpace
 
 
@@ -85,13 +93,17 @@ class PlanResult:
         return tuple(place for place in range(len(self.question.goals)) if place not in counted)
 
 
-def decide(controller: Controller, question: PlanRequest, *, nodes: int = 0) -> PlanResult:
+def decide(
+    controller: Controller, question: PlanRequest, *, nodes: int | None = 0, reporter: Reporter = SILENT
+) -> PlanResult:
     """Make one decision, and evaluate its alternatives.
 
     Args:
         controller: The planner; it is reset.
         question: The observation and the goal.
-        nodes: Of an energy slice along each axis; below 3: no slices.
+        nodes: Of an energy slice along each axis; below 3: no slices; None: as many as evaluate no more action
+            sequences than the search did.
+        reporter: Shows the progress of the slices, or why there are none. (The search has the controller's.)
 
     Raises:
         InputError: An image, the state or the mask is invalid.
@@ -113,9 +125,8 @@ def decide(controller: Controller, question: PlanRequest, *, nodes: int = 0) -> 
     if decision.plan is not None and decision.cost is not None:
         with torch.no_grad():
             still = float(decision.cost(torch.zeros_like(decision.plan.actions)[None])[0])
-        if nodes >= 3 and decision.why != "no finite energy":
-            actions, axes = decision.plan.actions, controller.shown_axes
-            slices = energy_slices(decision.cost, actions, controller.space, axes, nodes=nodes)
+        if decision.why != "no finite energy":
+            slices = _slices(controller, decision.plan, decision.cost, nodes, reporter)
     steps, dim = controller.space.steps, controller.space.dim
     return PlanResult(
         question=question,
@@ -127,3 +138,18 @@ def decide(controller: Controller, question: PlanRequest, *, nodes: int = 0) -> 
         slices=slices,
         seconds=Seconds(ready - began, decided - ready, time.perf_counter() - decided),
     )
+
+
+def _slices(
+    controller: Controller, plan: Plan, cost: Cost, nodes: int | None, reporter: Reporter
+) -> tuple[EnergySlice, ...]:
+    axes, searched = controller.shown_axes, sum(one.samples for one in plan.iterations)
+    if nodes is None:
+        nodes = fitting_nodes(searched, len(axes))
+        if not nodes:
+            needed = sequences_of_slices(FEWEST_NODES, len(axes))
+            reporter.note(f"No energy maps: they take {needed} action sequences or more, the search {searched}.")
+    if nodes < 3 or len(axes) < 2:
+        return ()
+    task = reporter.task("energy maps", "action sequences")
+    return energy_slices(cost, plan.actions, controller.space, axes, nodes=nodes, progress=task)

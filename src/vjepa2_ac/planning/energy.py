@@ -13,6 +13,7 @@ from torch.utils.checkpoint import checkpoint
 
 from vjepa2_ac.config.planning import EnergyConfig
 from vjepa2_ac.distances import absolute_difference, squared_difference
+from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.model.network.kv_cache import KeyValueCache
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.axes.mapping import Axes
@@ -85,6 +86,7 @@ class WorldModelCost:
         self._camera = None if scene.camera is None else scene.camera.to(device)
         self._seen = scene.seen
         self._cache = self._past(scene)
+        self.progress: Progress = no_progress  # after each part; it does not wait for the device
 
     def __call__(self, actions: Float[Tensor, "samples steps action_dim"]) -> Float[Tensor, " samples"]:
         """Return energies on the device of the actions; gradients flow to the actions if requested.
@@ -94,9 +96,12 @@ class WorldModelCost:
         """
         parts = actions.to(self._model.device).split(self._config.samples_at_once)  # type: ignore[no-untyped-call]  # torch
         again = torch.is_grad_enabled() and len(parts) > 1
-        energies = [
-            checkpoint(self._energies, part, use_reentrant=False) if again else self._energies(part) for part in parts
-        ]
+        energies: list[Tensor] = []
+        done = 0
+        for part in parts:
+            energies.append(checkpoint(self._energies, part, use_reentrant=False) if again else self._energies(part))
+            done += len(part)
+            self.progress(done, len(actions))
         return torch.cat(energies).to(actions.device)
 
     def imagine(

@@ -5,17 +5,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from math import comb
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vjepa2_ac.planning.interfaces import Cost
+from vjepa2_ac.episode import Progress, no_progress
+from vjepa2_ac.planning.interfaces import Cost, reporting
 from vjepa2_ac.planning.search_space import SearchSpace
 
 _BEYOND = 1.25  # how far a slice reaches beyond the limits
 _LEAST = 0.05  # metres: half the width of a slice along an axis that is held
+FEWEST_NODES, _MOST_NODES = 5, 13  # of those that are chosen by what they cost
 
 
 @dataclass(frozen=True)
@@ -28,19 +31,52 @@ class EnergySlice:
     energy: Float[np.ndarray, "nodes nodes"]  # [up, across]; NaN where the model gives none
 
 
+def sequences_of_slices(nodes: int, axes: int) -> int:
+    """Return how many action sequences the slices over each pair of some axes evaluate."""
+    return comb(axes, 2) * nodes**2
+
+
+def fitting_nodes(sequences: int, axes: int) -> int:
+    """Return the nodes along each axis of slices that evaluate no more than so many action sequences; 0: none do.
+
+    They are odd, so that no motion is one of them, and 5 to 13.
+    """
+    choices = range(_MOST_NODES, FEWEST_NODES - 1, -2)
+    return next((nodes for nodes in choices if sequences_of_slices(nodes, axes) <= sequences), 0)
+
+
 def energy_slices(
-    cost: Cost, actions: Float[Tensor, "steps dim"], space: SearchSpace, axes: Sequence[int] = (0, 1, 2), *, nodes: int
+    cost: Cost,
+    actions: Float[Tensor, "steps dim"],
+    space: SearchSpace,
+    axes: Sequence[int] = (0, 1, 2),
+    *,
+    nodes: int,
+    progress: Progress = no_progress,
 ) -> tuple[EnergySlice, ...]:
     """Return the energy around a plan's first action: over each pair of some numbers of it, such as dx and dy.
 
     Limits are ignored, to show what is beyond them. A first action that is repeated changes as one.
+
+    Args:
+        cost: The energy of action sequences.
+        actions: The plan.
+        space: Its limits say how far the slices reach.
+        axes: The numbers.
+        nodes: Along each axis.
+        progress: Called with the number of evaluated action sequences.
 
     Raises:
         ValueError: Fewer than three nodes.
     """
     if nodes < 3:
         raise ValueError(f"{nodes} nodes")
-    return tuple(_slice(cost, actions, space, pair, nodes) for pair in combinations(axes, 2))
+    total, slices = sequences_of_slices(nodes, len(axes)), []
+    progress(0, total)
+    for number, pair in enumerate(combinations(axes, 2)):
+        with reporting(cost, progress, done=number * nodes**2, share=nodes**2, total=total):
+            slices.append(_slice(cost, actions, space, pair, nodes))
+    return tuple(slices)
 
 
 @torch.no_grad()

@@ -6,6 +6,8 @@ Axes: samples (action sequences), decisions (chosen actions), steps (of the mode
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Literal, Protocol, runtime_checkable
 
@@ -13,6 +15,8 @@ import torch
 from einops import reduce
 from jaxtyping import Float
 from torch import Tensor
+
+from vjepa2_ac.episode import Progress
 
 Stopped = Literal["finished", "out of time", "no finite energy"]
 
@@ -28,6 +32,40 @@ class Cost(Protocol):
     def __call__(self, actions: Float[Tensor, "samples steps dim"]) -> Float[Tensor, " samples"]:
         """Return the energy of each action sequence; for `gradient`, as a differentiable function of it."""
         ...
+
+
+@runtime_checkable
+class ReportingCost(Cost, Protocol):
+    """A cost that evaluates in parts, and says how far it is."""
+
+    progress: Progress  # called after each part with the action sequences so far, and all of the call
+
+
+@contextmanager
+def reporting(cost: Cost, progress: Progress, *, done: int, share: int, total: int) -> Iterator[None]:
+    """Report the progress of the one evaluation within a `with` block: its parts, if the cost says so, and its end.
+
+    Args:
+        cost: What is evaluated.
+        progress: Called with what is done, and the total.
+        done: Before the evaluation.
+        share: Of the evaluation in the total, however many action sequences it has.
+        total: Of all evaluations.
+    """
+
+    def evaluated(part: int, of: int) -> None:
+        if part < of:  # the last part is done when its energies are there
+            progress(done + share * part // of, total)
+
+    if isinstance(cost, ReportingCost):
+        before, cost.progress = cost.progress, evaluated
+        try:
+            yield
+        finally:
+            cost.progress = before
+    else:
+        yield
+    progress(done + share, total)
 
 
 @dataclass(frozen=True)

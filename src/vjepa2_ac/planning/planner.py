@@ -13,7 +13,7 @@ from torch import Generator, Tensor
 
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.episode import Progress, no_progress
-from vjepa2_ac.planning.interfaces import Cost, Iteration, Plan, PlanStart, SearchCancelledError, Stopped
+from vjepa2_ac.planning.interfaces import Cost, Iteration, Plan, PlanStart, SearchCancelledError, Stopped, reporting
 from vjepa2_ac.planning.search_space import SearchSpace, pose_space
 from vjepa2_ac.planning.solvers.base import EvaluatedPlans, Solver
 from vjepa2_ac.planning.solvers.cem import CemSolver
@@ -52,7 +52,8 @@ class Planner:
             config: The solver, and how long it searches.
             space: The allowed actions; None: an arm's actions within `planning.limits`.
             clock: Measures the time budget.
-            progress: Called with the number of finished iterations of a plan.
+            progress: Called with the number of evaluated action sequences of a plan: at its start, after each part that
+                the cost reports, and after each iteration.
         """
         self.config = config
         self.space = pose_space(config) if space is None else space
@@ -79,11 +80,14 @@ class Planner:
         search = SOLVERS[self.config.planner](self.space, self.config, generator, start)
         record: list[Iteration] = []
         best = _Best()
+        shares, total = self.config.sequences, sum(self.config.sequences)
+        self.progress(0, total)
         while len(record) < self.config.iterations and self._has_time(began, record):
             if cancelled():
                 raise SearchCancelledError
-            record.append(self._iterate(search, cost, best))
-            self.progress(len(record), self.config.iterations)
+            done, share = sum(shares[: len(record)]), shares[len(record)]
+            with reporting(cost, self.progress, done=done, share=share, total=total):
+                record.append(self._iterate(search, cost, best))
         stopped: Stopped = "finished" if len(record) == self.config.iterations else "out of time"
         actions, energy, evaluated = self._chosen(search.result(), best, cost, lowest=stopped == "out of time")
         if actions is None:

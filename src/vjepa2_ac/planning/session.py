@@ -54,7 +54,7 @@ class PlanningSession:
         Args:
             seed: Of all decisions; None: the config's.
             extrinsics: Pose of the camera, if the model uses it.
-            progress: Called with the number of finished iterations of a decision.
+            progress: Called with the number of evaluated action sequences of a decision.
 
         Raises:
             InputError: As `Controller`.

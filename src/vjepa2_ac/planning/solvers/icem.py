@@ -40,7 +40,7 @@ class IcemSolver:
 
     def sample(self) -> Float[Tensor, "samples decisions dim"]:
         """Return new samples, the reused elites, and in the last iteration the mean."""
-        count = max(int(self._samples * self._config.shrink**-self._iteration), 2 * self.elites)
+        count = self._config.new_samples(self._samples, self._iteration)
         noise = coloured_noise(
             count, self._space.decisions, self._space.dim, self._config.noise_exponent, self._generator
         )

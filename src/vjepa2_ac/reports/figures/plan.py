@@ -108,6 +108,8 @@ def _search(part: Any, answer: PlanResult, plan: Plan) -> None:
     elites.set(title="Best of each iteration,\nfirst action (dark: last)")
     heights.axhspan(-upper[third], upper[third], color=GREY, alpha=0.12, linewidth=0)
     heights.scatter(len(plan.iterations) + 1, first[third], **_STAR)
+    for axes in (heights, energies):  # iterations are whole, however few
+        axes.xaxis.get_major_locator().set_params(integer=True)
     title = "Their height" if answer.state_space.is_pose else "Another number"
     heights.set(title=title, xlabel="iteration (star: chosen)", ylabel=_label(answer, third))
     _energies(energies, answer, plan)
