@@ -9,7 +9,7 @@ AUDIT := .venv-audit
 
 .PHONY: demo demo-seeds base evidence trap encoders test test-oldest walk docs soak lint links audit format bench clean
 
-# Half of what tests need, in the same environment. --no-compile: Python compiles what is imported, when it is.
+# Half of what tests need, in the same environment.
 $(SIMULATION): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed; set PYTHON=...")'
 	$(PYTHON) -m venv .venv
@@ -59,6 +59,9 @@ $(OLDEST)/installed: pyproject.toml constraints.txt
 test-oldest: $(OLDEST)/installed  ## model, runs, training and planning on the oldest PyTorch and transformers allowed
 	OMP_NUM_THREADS=1 $(OLDEST)/bin/pytest -q -n logical --maxprocesses 8 --dist loadfile \
 		tests/model tests/distributed tests/runs tests/encoding tests/planning tests/training tests/export
+
+walk: $(INSTALLED)  ## every command of every guide, on less, in environments that have only the extras that the guide names
+	OMP_NUM_THREADS=1 $(BIN)/python scripts/walk.py
 
 docs: $(INSTALLED)  ## the site, into build/site: offline, searchable; a link that leads nowhere is an error
 	$(BIN)/sphinx-build -q -W --keep-going -b html docs build/site
