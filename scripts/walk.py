@@ -60,8 +60,10 @@ SHORTER = {  # by the first words of a command
     "python examples/finetune.py": "training.steps=2 training.warmup_steps=0 training.allow_weak_base=true",
 }
 
-DROID = "data.path=demo/data data.frames=4 data.stride=4 data.validation_share=0.2 data.test_share=0.3"
-OF_DROID = f"{DROID} model.base=builtin:sim-tiny model.dtype=float32 training.precision=fp32 data.crop.size=96"
+OF_DROID = (  # in its place, and in the place of Meta's model
+    "data.path=demo/data data.idle.rule=none data.idle.ranges=null data.frames=4 data.stride=4 data.test_share=0.3"
+    " data.validation_share=0.2 model.base=builtin:sim-tiny model.dtype=float32 training.precision=fp32"
+)
 STATE = "0.498,-0.111,0.211,3.142,0,-1.175,0"
 GIVEN = {  # pattern: what the reader has; in this order, in every page
     r"(python examples/\w+\.py) \[.*": r"\1",
@@ -71,7 +73,7 @@ GIVEN = {  # pattern: what the reader has; in this order, in every page
     r"CONFIG checkpoint.remote=gs://my-bucket/my-run": "builtin:demo run_dir=runs/mirrored checkpoint.remote=mirror",
     r"CONFIG": "builtin:demo",
     r"RUN_OR_MODEL|\bMODEL\b": "builtin:sim-tiny",
-    r"init PATH|init data/my_robot$": "init demo/data --model builtin:sim-tiny --out my.yaml",
+    r"init PATH|init data/my_robot$": "init demo/data --model builtin:sim-tiny --out my.yaml --overwrite",
     r"runs/(lora|a)\b": "demo/run",
     r"runs/(other|b)\b": "demo/other",
     r"runs/c\b": "demo/scratch",

@@ -8,6 +8,7 @@ import pytest
 
 from paths import ROOT
 from vjepa2_ac.cli import program
+from vjepa2_ac.config.loading import load_config
 
 WALK = runpy.run_path(str(ROOT / "scripts/walk.py"))
 STEPS = [step for page in WALK["PAGES"] for step in WALK["steps_of"](page)]
@@ -37,11 +38,15 @@ def test_no_exception_is_left_of_a_command_that_is_gone(table: str) -> None:
 
 
 @pytest.mark.parametrize("step", [step for step in STEPS if not step.why_not], ids=lambda step: step.shown)
-def test_what_is_walked_is_what_the_program_takes(step) -> None:
+def test_what_is_walked_is_what_the_program_takes(step, monkeypatch: pytest.MonkeyPatch) -> None:
     words = step.run.partition(" > ")[0].partition("|| ")[2] or step.run.partition(" > ")[0]
     assert not re.search(r"[…\[\]]", words), "a placeholder"
     if words.startswith("vjepa2-ac"):
-        program.parsed(program._parser(), shlex.split(words)[1:])
+        monkeypatch.chdir(ROOT)
+        options = program.parsed(program._parser(), shlex.split(words)[1:])
+        config = str(getattr(options, "config", None))
+        if config.startswith(("builtin:", "configs/")):
+            load_config(config, getattr(options, "overrides", []))
 
 
 def test_pages_name_the_extras_of_what_they_do() -> None:
