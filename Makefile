@@ -1,26 +1,33 @@
-# make demo · make evidence · make trap · make encoders · make test · make test-oldest · make lint · make docs · make links · make audit · make soak · make bench · make base: each creates the environment it needs.
+# make demo · make evidence · make trap · make encoders · make test · make test-oldest · make lint · make docs · make links · make audit · make soak · make walk · make bench · make base: each creates the environment it needs.
 PYTHON ?= python3
 BIN := .venv/bin
+PIP := $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
+SIMULATION := .venv/sim-installed
 INSTALLED := .venv/installed
 OLDEST := .venv-oldest
 AUDIT := .venv-audit
 
-.PHONY: demo demo-seeds base evidence trap encoders test test-oldest docs soak lint links audit format bench clean
+.PHONY: demo demo-seeds base evidence trap encoders test test-oldest walk docs soak lint links audit format bench clean
 
-$(INSTALLED): pyproject.toml constraints.txt
+# Half of what tests need, in the same environment.
+$(SIMULATION): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed; set PYTHON=...")'
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[sim,dev]"
-	touch $(INSTALLED)
+	$(PIP) -e ".[sim]"
+	touch $@
 
-demo: $(INSTALLED)  ## a simulated arm, a tiny world model, a LoRA adapter, and whether it helped
+$(INSTALLED): $(SIMULATION)
+	$(PIP) -e ".[sim,dev]"
+	touch $@
+
+demo: $(SIMULATION)  ## a simulated arm, a tiny world model, a LoRA adapter, and whether it helped
 	$(BIN)/vjepa2-ac demo
 
 demo-seeds: demo  ## the spread of the demo's result over three seeds
 	for seed in 1 2; do $(BIN)/vjepa2-ac train configs/demo.yaml seed=$$seed run_dir=demo/run-$$seed || exit 1; done
 	$(BIN)/vjepa2-ac evaluate demo/run demo/run-1 demo/run-2
 
-base:  $(INSTALLED)  ## make the demo's base model again (about an hour); replaces the one in the package
+base: $(SIMULATION)  ## make the demo's base model again (about an hour); replaces the one in the package
 	test -e base/data || $(BIN)/vjepa2-ac simulate record base/data --domain random --episodes 800 --seed 3 --workers 2
 	$(BIN)/vjepa2-ac train configs/demo_base.yaml
 	rm -rf base/model && $(BIN)/vjepa2-ac export base/run base/model
@@ -29,13 +36,13 @@ base:  $(INSTALLED)  ## make the demo's base model again (about an hour); replac
 	mkdir src/vjepa2_ac/assets/sim-tiny/decoder
 	cp base/decoder/decoder.json base/decoder/decoder.safetensors base/decoder/linear.safetensors src/vjepa2_ac/assets/sim-tiny/decoder
 
-evidence: $(INSTALLED)  ## does LoRA help? every method side by side; goes on where it stopped; replaces table and plot
+evidence: $(SIMULATION)  ## does LoRA help? every method side by side; goes on where it stopped; replaces table and plot
 	$(BIN)/python benchmarks/evidence --page docs/evidence.md
 
-trap: $(INSTALLED)  ## does a lower error plan better? narrow and varied demonstrations, every checkpoint in closed loop
+trap: $(SIMULATION)  ## does a lower error plan better? narrow and varied demonstrations, every checkpoint in closed loop
 	$(BIN)/python benchmarks/trap --picture docs/ranking.png
 
-encoders: $(INSTALLED)  ## what each published encoder costs, by doctor's arithmetic; replaces the table, docs/encoders.md copies it
+encoders: $(SIMULATION)  ## what each published encoder costs, by doctor's arithmetic; replaces the table, docs/encoders.md copies it
 	$(BIN)/python benchmarks/encoders.py
 
 test: $(INSTALLED)  ## the whole test suite, on all cores (8 at most), a thread each; a folder in one process: .venv/bin/pytest tests/data
@@ -52,6 +59,9 @@ $(OLDEST)/installed: pyproject.toml constraints.txt
 test-oldest: $(OLDEST)/installed  ## model, runs, training and planning on the oldest PyTorch and transformers allowed
 	OMP_NUM_THREADS=1 $(OLDEST)/bin/pytest -q -n logical --maxprocesses 8 --dist loadfile \
 		tests/model tests/distributed tests/runs tests/encoding tests/planning tests/training tests/export
+
+walk: $(INSTALLED)  ## every command of every guide, on less, in environments that have only the extras that the guide names
+	OMP_NUM_THREADS=1 $(BIN)/python scripts/walk.py
 
 docs: $(INSTALLED)  ## the site, into build/site: offline, searchable; a link that leads nowhere is an error
 	$(BIN)/sphinx-build -q -W --keep-going -b html docs build/site

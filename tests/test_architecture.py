@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
+import tomllib
 from collections import Counter, defaultdict
 from functools import cache
 from pathlib import Path
 
 import vjepa2_ac
+from paths import ROOT
 
 PACKAGE = Path(vjepa2_ac.__file__).parent
 
@@ -261,6 +264,38 @@ def test_heavy_libraries_stay_in_their_homes() -> None:
             if homes is not None and not any(name.startswith(home) for home in homes):
                 wrong.append(f"{name} imports {module}")
     assert not wrong, "\n".join(sorted(wrong))
+
+
+EXTRAS: dict[str, list[str]] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+BROUGHT = {  # the libraries that each extra of the program brings, by name
+    extra: {re.split("[<>=]", one)[0] for one in needed}
+    for extra, needed in EXTRAS.items() if extra not in {"data", "dev", "docs"}
+}  # fmt: skip
+
+
+def test_every_module_can_be_imported_without_the_libraries_of_extras() -> None:
+    code = (
+        "import sys, importlib\n"
+        f"sys.modules.update(dict.fromkeys({sorted(set().union(*BROUGHT.values()))}))\n"
+        f"for name in {sorted(set(modules()) - {'__init__', 'cli.__main__'})}:\n"
+        "    importlib.import_module(f'vjepa2_ac.{name}')\n"
+    )
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-600:]
+
+
+def test_the_hint_for_a_library_names_an_extra_that_brings_it() -> None:
+    asked, wrong = 0, []
+    for module, path in modules().items():
+        for node in ast.walk(tree_of(path)):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "require_library":
+                named = {word.arg: word.value.value for word in node.keywords if isinstance(word.value, ast.Constant)}
+                library = node.args[0].value if isinstance(node.args[0], ast.Constant) else "websockets"  # serve's loop
+                asked += 1
+                if str(library).split(".")[0] not in BROUGHT.get(str(named["extra"]), set()):
+                    wrong.append(f"{module}: {library}: {named['extra']}")
+    assert asked > 5
+    assert not wrong
 
 
 def test_no_two_public_classes_share_a_name() -> None:

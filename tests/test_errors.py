@@ -1,7 +1,9 @@
 """Errors: they read as sentences, and can be sent between processes."""
 
 import pickle
+import sys
 from importlib.metadata import PathDistribution
+from pathlib import Path
 
 import pytest
 
@@ -60,15 +62,30 @@ def test_a_name_has_no_say_over_a_terminal(text: str, shown: str) -> None:
 @pytest.mark.parametrize(
     ("origin", "extra", "command"),
     [
-        ('{"url": "file:///x", "dir_info": {"editable": true}}', "sim", 'pip install -c constraints.txt -e ".[sim]"'),
-        ('{"url": "file:///x", "dir_info": {"editable": true}}', "", "pip install -c constraints.txt -e ."),
+        ('{"url": "file://HERE", "dir_info": {"editable": true}}', "sim", 'pip install -c constraints.txt -e ".[sim]"'),
+        ('{"url": "file://HERE", "dir_info": {"editable": true}}', "", "pip install -c constraints.txt -e ."),
+        (
+            '{"url": "file:///x", "dir_info": {"editable": true}}',
+            "sim",
+            'pip install -c /x/constraints.txt -e "/x[sim]"',
+        ),
+        (
+            '{"url": "file:///x%20y", "dir_info": {"editable": true}}',
+            "",
+            "pip install -c '/x y/constraints.txt' -e '/x y'",
+        ),
         ('{"url": "file:///x.whl", "archive_info": {}}', "sim", 'pip install "vjepa2-ac[sim] @ file:///x.whl"'),
         (None, "sim", 'pip install "vjepa2-ac[sim]"'),  # from an index
         (None, "", "pip install vjepa2-ac"),
     ],
 )
 def test_the_line_that_installs_an_extra_fits_the_installation(
-    monkeypatch: pytest.MonkeyPatch, origin: str | None, extra: str, command: str
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, origin: str | None, extra: str, command: str
 ) -> None:
+    monkeypatch.chdir(tmp_path)
+    origin = origin and origin.replace("HERE", str(tmp_path))
     monkeypatch.setattr(PathDistribution, "read_text", lambda _self, _name: origin)
+    monkeypatch.setenv("PATH", str(Path(sys.executable).parent))
     assert pip_install(extra) == command
+    monkeypatch.setenv("PATH", str(tmp_path))  # this environment is not activated
+    assert pip_install(extra) == f"{sys.executable} -m {command}"

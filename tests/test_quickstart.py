@@ -1,6 +1,7 @@
 """docs/QUICKSTART.md, walked through line by line: what runs here runs, the rest is what the program takes."""
 
 import re
+import runpy
 import shlex
 import tomllib
 from pathlib import Path
@@ -16,22 +17,12 @@ SECTIONS = {
     int(number): text for number, text in re.findall(r"^## (\d)\. .*?\n(.*?)(?=^## |\Z)", PAGE, re.DOTALL | re.M)
 }
 HERE = (2, 3, 4)
-SHORTER = {  # the same commands on less: they are walked, not measured
-    "train": ["training.steps=2", "validation.every=1", "checkpoint.every=1", "validation.clips=4", "data.workers=0"],
-    "evaluate": [
-        *("--clips", "4", "--sensitivity-clips", "2", "--samples", "8", "--examples", "1"),
-        *("--landscapes", "1", "--nodes", "3", "--axes", "2"),
-    ],
-    "simulate": ["--steps", "1", "planning.samples=16", "planning.iterations=1"],
-}
+WALK = runpy.run_path(str(ROOT / "scripts/walk.py"))  # the same commands on less: they are walked, not measured
 
 
 def commands_of(section: int) -> list[list[str]]:
     """Return the words of every line of a section that is run."""
-    lines = [
-        line for block in re.findall(r"```sh\n(.*?)```", SECTIONS[section], re.DOTALL) for line in block.splitlines()
-    ]
-    return [words for line in lines if (words := shlex.split(line, comments=True))]
+    return [shlex.split(line) for line in WALK["commands_of"](SECTIONS[section])]
 
 
 def test_the_page_has_its_sections() -> None:
@@ -45,8 +36,8 @@ def test_from_data_to_a_number_and_a_plan(
     monkeypatch.chdir(tmp_path)
     printed: dict[str, str] = {}
     for words in [words for section in HERE for words in commands_of(section)]:
-        less = SHORTER.get(words[1], []) if "record" not in words else ["--steps", "33", "--episodes", "10"]
-        assert main([*words[1:], *less]) == 0, words
+        less = "" if "--check" in words else WALK["shorter"](" ".join(words))
+        assert main([*words[1:], *less.split()]) == 0, words
         printed[" ".join(words)] = capsys.readouterr().out
     told = printed["vjepa2-ac init data/my_robot --model builtin:sim-tiny"]
     walked = {" ".join(words) for words in commands_of(3)}

@@ -2,10 +2,16 @@
 
 import errno
 import json
+import re
 import resource
+import shlex
+import shutil
+import sys
 import unicodedata
 from functools import partial
 from importlib.metadata import PackageNotFoundError, distribution
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
 
 _PACKAGE = "vjepa2-ac"
 _MOST_CHARACTERS = 8_000  # of a part of a message: quoted input may have any length
@@ -91,18 +97,41 @@ def in_words(error: BaseException) -> str:
 def pip_install(extra: str = "") -> str:
     """Return the command that installs this package, or an extra of it, as it was installed: a checkout, or a wheel.
 
+    It works where it is pasted: in any folder, and in a shell in which this environment is not activated.
+
     Source: PEP 610, direct_url.json.
     """
     try:
         origin = json.loads(distribution(_PACKAGE).read_text("direct_url.json") or "{}")
     except (PackageNotFoundError, ValueError):
-        origin = {"dir_info": {"editable": True}}
+        origin = {"url": "", "dir_info": {"editable": True}}
     wanted = f"[{extra}]" if extra else ""
     if origin.get("dir_info", {}).get("editable"):
-        return f'pip install -c constraints.txt -e ".{wanted}"' if extra else "pip install -c constraints.txt -e ."
+        clone = Path(unquote(urlsplit(origin["url"]).path))
+        here = clone.resolve() == Path.cwd()
+        constraints = "constraints.txt" if here else shlex.quote(str(clone / "constraints.txt"))
+        place = f'"{"." if here else clone}{wanted}"' if extra else "." if here else shlex.quote(str(clone))
+        return f"{_pip()} install -c {constraints} -e {place}"
     if "archive_info" in origin:  # a wheel's file
-        return f'pip install "{_PACKAGE}{wanted} @ {origin["url"]}"'
-    return f'pip install "{_PACKAGE}{wanted}"' if extra else f"pip install {_PACKAGE}"
+        return f'{_pip()} install "{_PACKAGE}{wanted} @ {origin["url"]}"'
+    return f'{_pip()} install "{_PACKAGE}{wanted}"' if extra else f"{_pip()} install {_PACKAGE}"
+
+
+def _pip() -> str:
+    """Return the pip of this environment: by its interpreter where `pip` would be another one."""
+    found = shutil.which("pip")
+    is_ours = found is not None and Path(found).parent == Path(sys.executable).parent
+    return "pip" if is_ours else f"{shlex.quote(sys.executable)} -m pip"
+
+
+def extra_of(library: str) -> str:
+    """Return the extra of this package that brings a library, the first of several; "" if every installation has it."""
+    try:
+        lines = distribution(_PACKAGE).requires or []
+    except PackageNotFoundError:
+        return ""
+    found = (re.fullmatch(rf"{re.escape(library)}\b.*extra == ['\"](\w+)['\"]", line) for line in lines)
+    return next((match[1] for match in found if match), "")
 
 
 def too_few_files(where: str = "") -> InputError:

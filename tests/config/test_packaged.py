@@ -6,14 +6,18 @@ import pytest
 
 from paths import ROOT
 from vjepa2_ac.cli import main
-from vjepa2_ac.config.loading import load_config
+from vjepa2_ac.config.loading import load_config, load_config_of_run
 from vjepa2_ac.config.packaged import config_path, packaged_configs
 from vjepa2_ac.errors import InputError
 
 
 def test_the_folder_of_a_checkout_is_that_of_the_package() -> None:
     assert sorted(packaged_configs()) == sorted(path.stem for path in (ROOT / "configs").glob("*.yaml"))
-    assert load_config("builtin:demo") == load_config(ROOT / "configs/demo.yaml")
+    assert (
+        load_config("builtin:demo")
+        == load_config(ROOT / "configs/demo.yaml")
+        == load_config_of_run(Path("builtin:demo"))
+    )
     assert all(packaged_configs().values())
 
 

@@ -25,7 +25,7 @@ from vjepa2_ac.cli.decoding import decoder, imagine
 from vjepa2_ac.cli.options import Handler, Parser, parsed
 from vjepa2_ac.cli.setup import config, demo, doctor, download, init
 from vjepa2_ac.distributed.ending import tidy_end
-from vjepa2_ac.errors import InputError, UserError, in_words, is_out_of_memory, pip_install, printable
+from vjepa2_ac.errors import InputError, UserError, extra_of, in_words, is_out_of_memory, pip_install, printable
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -52,11 +52,11 @@ def _run(arguments: Sequence[str] | None) -> int:
     except (UserError, OSError, MemoryError) as error:  # a full disk, a path that is no path: the message names it
         _complain(in_words(error))
         return 2
-    except ModuleNotFoundError as error:  # one that every installation has: those of extras are errors of their own
+    except ModuleNotFoundError as error:  # most of those of extras are errors of their own
         library = (error.name or "vjepa2_ac").partition(".")[0]
         if library == "vjepa2_ac":
             raise
-        _complain(f"{library}: it is not installed. Run {pip_install()}")
+        _complain(f"{library}: it is not installed. Run {pip_install(extra_of(library))}")
         return 2
     except RuntimeError as error:
         if not is_out_of_memory(error):

@@ -45,10 +45,12 @@ def load_config(config: str | Path | Mapping[str, Any], overrides: Iterable[str]
 def load_config_of_run(path: Path, overrides: Iterable[str] = ()) -> Config:
     """Read the config of a run that was made: knobs that are gone since then are passed over, in use or not.
 
+    It may be one of the package, as for `load_config`.
+
     Raises:
         InputError: As `load_config`.
     """
-    values = _read_yaml(path)
+    values = _read_yaml(config_path(path))
     take_gone(values)
     return parse_config(_overridden(values, overrides), where=str(path))
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from vjepa2_ac.errors import InputError, UnreachableError
 from vjepa2_ac.planning.goals.sub_goals import SubGoal
-from vjepa2_ac.serving.wire import MOST_BYTES, pack, unpack
+from vjepa2_ac.serving.wire import MOST_BYTES, pack, require_msgpack, unpack
 from vjepa2_ac.storage.libraries import require_library
 
 
@@ -31,9 +31,10 @@ class PlanningClient:
             key: Of the server, if it needs one.
 
         Raises:
-            UnreachableError: There is no server, or it refuses.
+            UnreachableError: There is no server, or it refuses; or a library of the extra `serve` is missing.
         """
         self.url = url
+        require_msgpack(url)
         library = require_library("websockets.sync.client", where=url, called="websockets", extra="serve")
         headers = {} if key is None else {"Authorization": f"Api-Key {key}"}
         self._open = ExitStack()

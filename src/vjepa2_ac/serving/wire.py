@@ -10,8 +10,9 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-import msgpack
 import numpy as np
+
+from vjepa2_ac.storage.libraries import require_library
 
 MOST_BYTES = 32 << 20  # of a message: eight pictures of 1280 x 720 pixels
 MOST_PARTS = 256  # maps and lists of a message, arrays included
@@ -37,7 +38,7 @@ def unpack(message: bytes) -> dict[str, Any]:
     """
     if len(message) > MOST_BYTES:
         raise WireError(f"a message of {len(message):,} bytes; {MOST_BYTES:,} at most")
-    parts = _Parts()
+    parts, msgpack = _Parts(), require_msgpack()
     try:
         found = msgpack.unpackb(
             message,
@@ -65,7 +66,16 @@ def pack(message: Mapping[str, Any]) -> bytes:
     Raises:
         TypeError: Something in it is neither.
     """
-    return bytes(msgpack.packb(dict(message), default=_packed))
+    return bytes(require_msgpack().packb(dict(message), default=_packed))
+
+
+def require_msgpack(where: str = "msgpack") -> Any:
+    """Return msgpack, which reads and writes messages, and nothing else needs.
+
+    Raises:
+        UnreachableError: It is not installed.
+    """
+    return require_library("msgpack", where=where, called="msgpack, the format of messages", extra="serve")
 
 
 class _Parts:

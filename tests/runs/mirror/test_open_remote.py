@@ -258,7 +258,7 @@ def test_a_missing_library_is_named_with_its_install_line(config: Config, monkey
 
     monkeypatch.setattr(fsspec, "get_filesystem_class", absent)
     monkeypatch.setattr(filesystems, "_filesystems", {})
-    with pytest.raises(InputError, match=r'pip install -c constraints.txt -e "\.\[gcs\]"'):
+    with pytest.raises(InputError, match=r"pip install .*\[gcs\]"):
         open_remote(config, SILENT)
 
 

@@ -164,7 +164,7 @@ def test_an_unknown_domain_is_refused_by_name() -> None:
 
 def test_missing_mujoco_is_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(InputError, match=r'pip install -c constraints.txt -e "\.\[sim\]"'):
+    with pytest.raises(InputError, match=r"pip install .*\[sim\]"):
         load_mujoco()
 
 

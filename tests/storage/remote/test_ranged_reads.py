@@ -201,7 +201,7 @@ def test_a_url_that_nothing_reads_is_named() -> None:
 def test_a_missing_library_is_named_with_the_way_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gcsfs", None)
     monkeypatch.setattr(importlib.import_module("fsspec.registry"), "registry", {})
-    with pytest.raises(InputError, match=r'pip install -c constraints.txt -e "\.\[gcs\]"'):
+    with pytest.raises(InputError, match=r"pip install .*\[gcs\]"):
         storage.exists("gs://bucket/file")
 
 

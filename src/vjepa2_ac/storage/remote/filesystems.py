@@ -12,7 +12,7 @@ from vjepa2_ac.errors import InputError, pip_install
 GOOGLE = frozenset({"gs", "gcs"})
 
 _LOG_IN = {"gs": "gcloud auth application-default login", "hf": "hf auth login", "s3": "aws configure"}
-_EXTRAS = {"gs": "gcs", "hf": "lerobot"}
+_EXTRAS = {"gs": "gcs", "hf": ""}  # the second: every installation
 _KNOWN = "a folder of this machine, or gs://, hf://, s3://"
 _NO_PLACES = frozenset({  # they lead to other file systems, some by templates that are executed
     "async_wrapper", "asyncwrapper", "blockcache", "cached", "dask", "data", "dir", "filecache", "generic",
@@ -161,7 +161,7 @@ def _kind(url: str, protocol: str) -> Any:
         return fsspec.get_filesystem_class(protocol)
     except ImportError as error:
         extra = _EXTRAS.get(protocol)
-        fix = f"Install it: {pip_install(extra)}" if extra else str(error)
+        fix = str(error) if extra is None else f"Install it: {pip_install(extra)}"
         raise InputError(where=url, found=f"the library for {protocol}:// is not installed", fix=fix) from None
     except ValueError:
         raise InputError(where=url, found=f"nothing reads {protocol}://", needed=_KNOWN) from None
