@@ -29,11 +29,11 @@ WHEEL = "wheel"  # environments of the wheel are walked outside of the clone
 PAGES = {
     "README.md": "[sim]",
     "docs/QUICKSTART.md": "wheel[sim,data]",
+    "docs/encoders.md": "[sim]",  # its run is compared in docs/evaluation.md
     "docs/data.md": "[data]",
     "docs/training.md": "[data]",
     "docs/evaluation.md": "[data]",
     "docs/scaling.md": "[data]",
-    "docs/encoders.md": "[sim]",
     "docs/decoding.md": "[sim]",
     "docs/planning.md": "[sim]",
     "docs/python.md": "[sim]",
@@ -49,13 +49,16 @@ FEW_STEPS = (
     "training.steps=2 validation.every=1 checkpoint.every=1 validation.clips=4 data.workers=0 training.batch_size=2"
     " training.accumulation=1 training.warmup_steps=0 training.allow_weak_base=true"
 )
+FEW_CLIPS = "--clips 4 --sensitivity-clips 2 --samples 8 --examples 1 --landscapes 1 --nodes 3 --axes 2"
+FEW_SAMPLES = "planning.samples=16 planning.iterations=1"
 SHORTER = {  # by the first words of a command
     "train": FEW_STEPS,
-    "evaluate": "--clips 4 --sensitivity-clips 2 --samples 8 --examples 1 --landscapes 1 --nodes 3 --axes 2",
+    "evaluate runs/lora --planning": f"{FEW_SAMPLES} {FEW_CLIPS} --planning-clips 2",
+    "evaluate": FEW_CLIPS,
     "decoder": "decoder.steps=2 decoder.warmup_steps=0 data.workers=0",
     "simulate record": "--episodes 10 --steps 33",
-    "simulate": "--episodes 1 --steps 1 planning.samples=16 planning.iterations=1",
-    "plan": "planning.samples=16 planning.iterations=1",
+    "simulate": f"--episodes 1 --steps 1 {FEW_SAMPLES}",
+    "plan": FEW_SAMPLES,
     "data calibrate CONFIG --axes": "--limit 8 || test $? = 1",  # of so few pairs: not to plan by
     "data calibrate": "--limit 8",
     "python examples/finetune.py": "training.steps=2 training.warmup_steps=0 training.allow_weak_base=true",
@@ -149,9 +152,8 @@ def steps_of(page: str) -> list[Step]:
         run = shown
         for pattern, given in GIVEN.items():
             run = re.sub(pattern, given, run)
-        less = "" if "--check" in run else shorter(shown)
         here = "[sim]" if "vjepa2-ac simulate" in shown and "sim" not in where else where  # docs/data.md says so
-        steps.append(Step(page, shown, f"{run} {less}".strip(), here, reason))
+        steps.append(Step(page, shown, f"{run} {shorter(shown)}".strip(), here, reason))
     return steps
 
 
