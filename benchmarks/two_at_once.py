@@ -39,6 +39,7 @@ def main(arguments: list[str] | None = None) -> int:
             for spins in options.spins:
                 alone[spins].append(_seconds(1, spins, options.steps, folder))
                 both[spins].append(_seconds(2, spins, options.steps, folder))
+                print(f"{spins}: {alone[spins][-1]:.1f} s alone, {both[spins][-1]:.1f} s two at once", flush=True)
     base = min(alone.get(DEFAULT, alone[options.spins[0]]))
     print(f"{os.cpu_count()} cores, {options.steps} steps, the best of {options.rounds}")
     for spins in options.spins:
