@@ -30,7 +30,17 @@ if missing.SHAPES not in ABSENT:
 import gcs as gcs_server  # noqa: E402 - the hook comes first
 from data_fixtures import droid, spoiled  # noqa: E402, F401 - fixtures for every folder
 from paths import ROOT  # noqa: E402
-from run_fixtures import base_folder, data_folder, encoded_frames, make_config, nursery, one_thread, reporter, whole_run  # noqa: E402, F401
+from run_fixtures import (  # noqa: E402, F401
+    base_folder,
+    data_folder,
+    default_signals,
+    encoded_frames,
+    make_config,
+    nursery,
+    one_thread,
+    reporter,
+    whole_run,
+)
 from simulated import clone, simulated  # noqa: E402, F401
 
 

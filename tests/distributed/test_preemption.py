@@ -33,12 +33,7 @@ with preemption.stop_on_signals() as stop:
 """
 
 
-@pytest.fixture(autouse=True)
-def _signals_are_not_ignored():
-    before = {number: signal.signal(number, signal.SIG_DFL) for number in SIGNALS}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
+pytestmark = pytest.mark.usefixtures("default_signals")
 
 
 def signalled_reporter(reporter, at: int, number: int):
@@ -64,6 +59,12 @@ def test_a_run_that_was_asked_to_stop_goes_on_as_if_it_had_not(
     train(config, reporter)
     assert reporter.steps[0] == at + 1
     assert_same_run(whole_run, tmp_path / "stopped")
+
+
+def test_a_run_under_nohup_outlives_its_terminal(make_config, reporter, tmp_path, whole_run) -> None:
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    train(make_config(run_dir=str(tmp_path / "run")), signalled_reporter(reporter, 3, signal.SIGHUP))
+    assert_same_run(whole_run, tmp_path / "run")
 
 
 def test_a_run_asked_to_stop_after_its_last_step_is_done(make_config, reporter) -> None:

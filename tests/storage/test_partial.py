@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from vjepa2_ac import storage
+from vjepa2_ac.distributed.ending import tidy_end
 from vjepa2_ac.storage import partial
 
 WRITING = """
@@ -50,6 +51,7 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
+@pytest.mark.usefixtures("default_signals")
 @pytest.mark.parametrize("kind", ["file", "folder"])
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_writer_that_is_told_to_end_leaves_nothing_and_dies_of_it(tmp_path: Path, kind: str, number: int) -> None:
@@ -58,6 +60,15 @@ def test_a_writer_that_is_told_to_end_leaves_nothing_and_dies_of_it(tmp_path: Pa
     process.send_signal(number)
     assert process.wait(timeout=60) == -number
     assert names(tmp_path) == []
+
+
+@pytest.mark.usefixtures("default_signals")
+def test_a_writer_under_nohup_outlives_its_terminal(tmp_path: Path) -> None:
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    with tidy_end():
+        os.kill(os.getpid(), signal.SIGHUP)
+        storage.write_atomically(tmp_path / "target", "a")
+    assert names(tmp_path) == ["target"]
 
 
 @pytest.mark.parametrize("kind", ["file", "folder"])

@@ -153,6 +153,9 @@ def _become(wish: dict, main: Callable[[list[str]], int]) -> None:
     try:
         os.setsid()  # its workers are in its session, and known by it when it is dead
         signal.alarm(300)  # no test waits for ever
+        for number in (signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP):  # as from a terminal, even under `nohup`
+            signal.signal(number, signal.SIG_DFL)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
         output.LAST_S = 0.5
         os.dup2(os.open(os.devnull, os.O_RDWR), 0)
         os.dup2(os.open(wish["out"], os.O_WRONLY | os.O_NOCTTY), 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +16,7 @@ from killable import Nursery
 from synthetic import write_synthetic_droid
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict, parse_config
+from vjepa2_ac.distributed.preemption import HANG_UP, SIGNALS
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import SILENT, NullReporter
@@ -86,6 +88,15 @@ def base_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("base") / "model"
     WorldModel.random(ModelSizes.model_validate(TINY), seed=3).save_pretrained(folder)
     return folder
+
+
+@pytest.fixture
+def default_signals() -> Iterator[None]:
+    """Stop signals end this process and those it starts, also where the tests were started to ignore some: `nohup`."""
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in (*SIGNALS, HANG_UP)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @pytest.fixture(scope="session")

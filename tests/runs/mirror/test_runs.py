@@ -29,17 +29,13 @@ class KilledError(BaseException):
     """Stands for SIGKILL: nobody sees to anything any more."""
 
 
+pytestmark = pytest.mark.usefixtures("default_signals")
+
+
 @pytest.fixture(autouse=True)
 def _bucket(gcs: Gcs) -> None:
     gcs.put("bucket/other", b"1")
     gcs.forget()
-
-
-@pytest.fixture(autouse=True)
-def _signals_are_not_ignored():
-    before = signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    yield
-    signal.signal(signal.SIGTERM, before)
 
 
 def mirrored(make_config: MakeConfig, tmp_path: Path, machine: str, **changes: object) -> Config:
