@@ -26,6 +26,12 @@ CHECKED = [
 ABSENT = missing.absent(os.environ)
 if missing.SHAPES not in ABSENT:
     _hook = install_import_hook(CHECKED, "beartype.beartype")
+if missing.is_installed("hypothesis"):
+    from hypothesis import HealthCheck, settings
+
+    # A busy machine is slow, and that is no fault of what is tested.
+    settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+    settings.load_profile("busy")
 
 import gcs as gcs_server  # noqa: E402 - the hook comes first
 from data_fixtures import droid, spoiled  # noqa: E402, F401 - fixtures for every folder
@@ -92,7 +98,7 @@ def gcs(_gcs: gcs_server.Gcs, monkeypatch: pytest.MonkeyPatch) -> gcs_server.Gcs
 
     _gcs.wipe()
     monkeypatch.setenv("STORAGE_EMULATOR_HOST", _gcs.url)
-    monkeypatch.setattr(retries, "DEFAULT", retries.RetryPolicy(attempts=5, first_wait_s=0.001, timeout_s=5.0))
+    monkeypatch.setattr(retries, "DEFAULT", retries.RetryPolicy(attempts=5, first_wait_s=0.001, timeout_s=60.0))
     return _gcs
 
 

@@ -86,11 +86,11 @@ def test_a_signal_to_the_whole_group_stops_the_run_and_its_workers_in_good_order
     family = psutil.Process(process.pid).children(recursive=True)
     assert len(family) >= 3, "a fork server and two workers"
     os.killpg(process.pid, signal.SIGUSR1)
-    _, errors = process.communicate(timeout=60)
+    _, errors = process.communicate(timeout=120)
     assert process.returncode == EXIT_STATUS, errors
     assert errors.startswith("SIGUSR1: stopped after step"), errors
     assert len(errors.splitlines()) == 1, errors
-    assert not psutil.wait_procs(family, timeout=10)[1], "a worker stayed"
+    assert not psutil.wait_procs(family, timeout=120)[1], "a worker stayed"
     train(config, reporter)
     assert 1 < reporter.steps[0] < 40
     train(make_config(run_dir=str(tmp_path / "whole"), **{**changes, "data__workers": 0}), reporter)
@@ -104,7 +104,7 @@ def test_a_second_signal_ends_the_process_at_once(number: int) -> None:
     process.send_signal(number)
     assert process.stdout.readline() == f"{signal.Signals(number).name}\n"
     process.send_signal(number)
-    assert process.wait(timeout=60) == -number
+    assert process.wait(timeout=120) == -number
     process.stdout.close()
 
 

@@ -58,7 +58,7 @@ def test_a_writer_that_is_told_to_end_leaves_nothing_and_dies_of_it(tmp_path: Pa
     process = writing(tmp_path / "target", kind)
     assert len(names(tmp_path)) == 1
     process.send_signal(number)
-    assert process.wait(timeout=60) == -number
+    assert process.wait(timeout=120) == -number
     assert names(tmp_path) == []
 
 
@@ -79,7 +79,7 @@ def test_what_a_killed_writer_left_goes_with_the_next_one_and_not_before_it_is_d
     storage.write_atomically(tmp_path / "other", "while it is at work")
     assert names(tmp_path) == [left, "other"]
     process.kill()
-    process.wait(timeout=60)
+    process.wait(timeout=120)
     storage.write_atomically(tmp_path / "other", "of this process, which has looked here before")
     assert names(tmp_path) == [left, "other"]
     partial._remove_abandoned_once.cache_clear()  # a new process

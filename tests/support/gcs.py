@@ -118,7 +118,7 @@ class Gcs:
 
     def names(self, bucket: str) -> list[str]:
         """Return the names of all objects, asked past the proxy."""
-        with closing(http.client.HTTPConnection(LOOPBACK, self._port, timeout=10)) as connection:
+        with closing(http.client.HTTPConnection(LOOPBACK, self._port, timeout=120)) as connection:
             connection.request("GET", f"/storage/v1/b/{bucket}/o?maxResults=1000")
             return sorted(item["name"] for item in json.loads(connection.getresponse().read()).get("items", []))
 
@@ -136,12 +136,12 @@ class Gcs:
     def wipe(self) -> None:
         """Forget everything, also what a client gave up waiting for."""
         with self._lock:
-            self._lock.wait_for(lambda: self._in_flight == 0, timeout=5)
+            self._lock.wait_for(lambda: self._in_flight == 0, timeout=120)
         self.forget()
         self._emulator.wipe()
 
     def _post(self, address: str, data: bytes, kind: str) -> int:
-        with closing(http.client.HTTPConnection(LOOPBACK, self._port, timeout=10)) as connection:
+        with closing(http.client.HTTPConnection(LOOPBACK, self._port, timeout=120)) as connection:
             connection.request("POST", address, data, {"Content-Type": kind})
             return connection.getresponse().status
 
@@ -176,7 +176,7 @@ def running() -> Iterator[Gcs]:
     try:
         yield gcs
     finally:
-        asyncio.run_coroutine_threadsafe(_stop(proxy), loop).result(timeout=10)
+        asyncio.run_coroutine_threadsafe(_stop(proxy), loop).result(timeout=120)
         loop.call_soon_threadsafe(loop.stop)
         thread.join()
         loop.close()

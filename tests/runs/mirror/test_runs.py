@@ -62,7 +62,7 @@ def wait_for_mirrors() -> None:
     """Wait until what is being sent is there, and nothing is being sent."""
     for thread in threading.enumerate():
         if thread.name == "mirror":
-            thread.join(60)
+            thread.join(120)
             assert not thread.is_alive()
 
 
@@ -98,12 +98,12 @@ def test_a_machine_killed_while_sending_leaves_the_last_complete_checkpoint_to_t
     def upload(source: Path, target: str) -> None:
         if f"{checkpoint_name(4)}/optimizer.pt" in target:
             fourth_is_on_its_way.set()
-            assert dead.wait(60)
+            assert dead.wait(120)
             raise OSError("the process is gone")
         storage.upload(source, target)
 
     def die() -> None:
-        assert fourth_is_on_its_way.wait(60)
+        assert fourth_is_on_its_way.wait(120)
         raise KilledError
 
     monkeypatch.setattr("vjepa2_ac.runs.mirror.remote_checkpoints.upload", upload)
