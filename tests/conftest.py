@@ -44,10 +44,23 @@ from run_fixtures import (  # noqa: E402, F401
     make_config,
     nursery,
     one_thread,
+    popen,
     reporter,
     whole_run,
 )
 from simulated import clone, simulated  # noqa: E402, F401
+
+# Begun first, each by a process of its own: whoever comes to them last would work alone in the end.
+LONGEST = (
+    "test_notebook.py", "test_quickstart.py", "test_end_to_end.py", "test_fake_gpu.py", "test_real_client.py",
+    "test_site.py", "test_wheel.py", "test_fake_step.py", "test_memory.py",
+)  # fmt: skip
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the files first that take longest."""
+    places = {name: place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: places.get(item.path.name, len(places)))
 
 
 def pytest_report_header() -> list[str]:

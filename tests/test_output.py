@@ -7,10 +7,12 @@ import pty
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from run_fixtures import Popen
 from vjepa2_ac import output
 from vjepa2_ac.output import Writer
 
@@ -29,8 +31,12 @@ NEVER_WAIT = "    output.never_wait()\n"
 SMALLEST_PIPE = 4096
 
 
-def start(code: str, **streams: object) -> subprocess.Popen:
-    return subprocess.Popen([sys.executable, "-c", BEGINNING + code], **streams)
+Start = Callable[..., subprocess.Popen]
+
+
+@pytest.fixture
+def start(popen: Popen) -> Start:
+    return lambda code, **streams: popen([sys.executable, "-c", BEGINNING + code], **streams)
 
 
 def full_pipe() -> tuple[int, int]:
@@ -53,7 +59,7 @@ def third(tmp_path: Path):
 
 
 @pytest.mark.parametrize("mode", ["", NEVER_WAIT], ids=["waits", "never waits"])
-def test_a_reader_who_leaves_changes_nothing(third, mode: str) -> None:
+def test_a_reader_who_leaves_changes_nothing(start: Start, third, mode: str) -> None:
     path, shift = third
     process = start(mode + SAY_MUCH, stdout=subprocess.PIPE, stderr=subprocess.PIPE, preexec_fn=shift, close_fds=False)
     assert process.stdout.readline() == b"line 000000 " + b"." * 80 + b"\n"
@@ -64,7 +70,7 @@ def test_a_reader_who_leaves_changes_nothing(third, mode: str) -> None:
     assert path.read_bytes() == b"done"
 
 
-def test_a_reader_who_never_reads_holds_up_nothing_and_what_was_left_out_is_told(third) -> None:
+def test_a_reader_who_never_reads_holds_up_nothing_and_what_was_left_out_is_told(start: Start, third) -> None:
     path, shift = third
     reader, writer = full_pipe()
     process = start(
@@ -101,19 +107,18 @@ def test_what_waits_for_a_reader_is_bounded() -> None:
     assert received == b"x" * SMALLEST_PIPE + line * waiting + b"again\n"
 
 
-def test_a_slow_reader_gets_all_of_what_a_command_is_there_to_print() -> None:
+def test_a_slow_reader_gets_all_of_what_a_command_is_there_to_print(start: Start) -> None:
     process = start("    print('x' * 500_000 + 'end')\n", stdout=subprocess.PIPE)
     slow = threading.Event()
     received = b""
     while piece := os.read(process.stdout.fileno(), 9_973):
         slow.wait(0.001)
         received += piece
-    process.stdout.close()
     assert process.wait(timeout=120) == 0
     assert received == b"x" * 500_000 + b"end\n"
 
 
-def test_a_full_disk_of_a_log_is_told_once_where_somebody_reads(third) -> None:
+def test_a_full_disk_of_a_log_is_told_once_where_somebody_reads(start: Start, third) -> None:
     path, shift = third
     with Path("/dev/full").open("wb") as full:
         process = start(
@@ -164,7 +169,7 @@ def test_streams_that_were_closed_are_no_files_of_ours(tmp_path: Path, closed: t
     assert (tmp_path / "file").read_text() == "ours"
 
 
-def test_a_terminal_that_is_gone_is_nobodys_error() -> None:
+def test_a_terminal_that_is_gone_is_nobodys_error(start: Start) -> None:
     ours, theirs = pty.openpty()
     code = """
     print(sys.stdout.isatty(), flush=True)
@@ -183,7 +188,7 @@ def test_a_terminal_that_is_gone_is_nobodys_error() -> None:
     assert process.returncode == 0
 
 
-def test_both_streams_on_one_file_keep_their_order() -> None:
+def test_both_streams_on_one_file_keep_their_order(start: Start) -> None:
     code = """
     output.never_wait()
     for number in range(100):
@@ -194,7 +199,7 @@ def test_both_streams_on_one_file_keep_their_order() -> None:
     assert said.split() == [str(number).encode() for number in range(100)]
 
 
-def test_what_a_terminal_cannot_show_is_spelt_out() -> None:
+def test_what_a_terminal_cannot_show_is_spelt_out(start: Start) -> None:
     process = start(
         "    print('Grüße', chr(0xDCFF))\n", stdout=subprocess.PIPE, env={**os.environ, "PYTHONIOENCODING": "ascii"}
     )

@@ -98,14 +98,13 @@ def test_a_signal_to_the_whole_group_stops_the_run_and_its_workers_in_good_order
 
 
 @pytest.mark.parametrize("number", SIGNALS)
-def test_a_second_signal_ends_the_process_at_once(number: int) -> None:
-    process = subprocess.Popen([sys.executable, "-c", WAITING], stdout=subprocess.PIPE, text=True)
+def test_a_second_signal_ends_the_process_at_once(popen, number: int) -> None:
+    process = popen([sys.executable, "-c", WAITING], stdout=subprocess.PIPE, text=True)
     assert process.stdout.readline() == "None\n"
     process.send_signal(number)
     assert process.stdout.readline() == f"{signal.Signals(number).name}\n"
     process.send_signal(number)
     assert process.wait(timeout=120) == -number
-    process.stdout.close()
 
 
 def test_a_signal_that_comes_twice_at_once_is_one(monkeypatch: pytest.MonkeyPatch) -> None:

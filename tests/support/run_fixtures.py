@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import signal
+import subprocess
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 import torch
@@ -97,6 +98,25 @@ def default_signals() -> Iterator[None]:
     yield
     for number, handler in before.items():
         signal.signal(number, handler)
+
+
+Popen = Callable[..., "subprocess.Popen[Any]"]
+
+
+@pytest.fixture
+def popen() -> Iterator[Popen]:
+    """Starts processes that end with the test, and whose pipes are closed then: also where it fails.
+
+    Otherwise a later test would be blamed for them, when they are found as garbage.
+    """
+    with ExitStack() as ending:
+
+        def start(*arguments: Any, **named: Any) -> subprocess.Popen[Any]:
+            process = ending.enter_context(subprocess.Popen(*arguments, **named))
+            ending.callback(process.kill)
+            return process
+
+        yield start
 
 
 @pytest.fixture(scope="session")

@@ -4,7 +4,6 @@ import errno
 import logging
 import os
 import pickle
-import subprocess
 import sys
 from pathlib import Path
 
@@ -190,8 +189,8 @@ with ThreadPoolExecutor(4) as pool:
 """
 
 
-def test_several_processes_and_threads_share_a_folder(tmp_path: Path) -> None:
-    writers = [subprocess.Popen([sys.executable, "-c", WRITE_MANY, str(tmp_path)]) for _ in range(2)]
+def test_several_processes_and_threads_share_a_folder(popen, tmp_path: Path) -> None:
+    writers = [popen([sys.executable, "-c", WRITE_MANY, str(tmp_path)]) for _ in range(2)]
     assert [writer.wait(timeout=120) for writer in writers] == [0, 0]
     assert 0 < size_of(tmp_path) <= 5000
     assert int((tmp_path / "ledger").read_text()) == size_of(tmp_path)
