@@ -101,7 +101,7 @@ def _parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--latent-dim", type=int, default=128)
     parser.add_argument("--batch", type=int, default=24, help="frames")
     parser.add_argument("--size", nargs="+", choices=("tiny", "small", "medium"), default=["tiny"])
-    parser.add_argument("--dtype", choices=("float32", "bfloat16"), default="bfloat16")
+    parser.add_argument("--dtype", choices=("float32", "bfloat16"), default="float32")
     return parser.parse_args(arguments)
 
 

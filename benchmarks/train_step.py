@@ -212,7 +212,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--batch", nargs="+", default=["1"], help="numbers, or largest: what fits with the last way")
     parser.add_argument("--cap-gb", type=float, default=0.0, help="memory that may be used, but for timing; 0: all")
     parser.add_argument("--rollout-steps", type=int, default=2)
-    parser.add_argument("--dtype", nargs="+", choices=tuple(PRECISIONS), default=["bfloat16"])
+    parser.add_argument("--dtype", nargs="+", choices=tuple(PRECISIONS), help="default: bfloat16; CPU: float32")
     parser.add_argument("--checkpointing", nargs="+", choices=("off", "on"), default=["off"])
     parser.add_argument("--attention", nargs="+", default=["auto"], help="auto, per_step, flex, dense: a line each")
     parser.add_argument("--compile", action="store_true", help="each way of ours once more with compiled blocks")
@@ -226,6 +226,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
         options.source = ["pixels"]
     on_cpu = options.device == "cpu"
     options.layers = options.layers or (2 if on_cpu else 24)
+    options.dtype = options.dtype or ["float32" if on_cpu else "bfloat16"]
     options.encoder_layers = 1 if "pixels" not in options.source else options.encoder_layers or (1 if on_cpu else 40)
     return options
 

@@ -26,12 +26,41 @@ CHECKED = [
 ABSENT = missing.absent(os.environ)
 if missing.SHAPES not in ABSENT:
     _hook = install_import_hook(CHECKED, "beartype.beartype")
+if missing.is_installed("hypothesis"):
+    from hypothesis import HealthCheck, settings
+
+    # A busy machine is slow, and that is no fault of what is tested.
+    settings.register_profile("busy", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+    settings.load_profile("busy")
 
 import gcs as gcs_server  # noqa: E402 - the hook comes first
 from data_fixtures import droid, spoiled  # noqa: E402, F401 - fixtures for every folder
 from paths import ROOT  # noqa: E402
-from run_fixtures import base_folder, data_folder, encoded_frames, make_config, nursery, one_thread, reporter, whole_run  # noqa: E402, F401
+from run_fixtures import (  # noqa: E402, F401
+    base_folder,
+    data_folder,
+    default_signals,
+    encoded_frames,
+    make_config,
+    nursery,
+    one_thread,
+    popen,
+    reporter,
+    whole_run,
+)
 from simulated import clone, simulated  # noqa: E402, F401
+
+# Begun first, each by a process of its own: whoever comes to them last would work alone in the end.
+LONGEST = (
+    "test_notebook.py", "test_quickstart.py", "test_end_to_end.py", "test_fake_gpu.py", "test_real_client.py",
+    "test_site.py", "test_wheel.py", "test_fake_step.py", "test_memory.py",
+)  # fmt: skip
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the files first that take longest."""
+    places = {name: place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: places.get(item.path.name, len(places)))
 
 
 def pytest_report_header() -> list[str]:
@@ -82,7 +111,7 @@ def gcs(_gcs: gcs_server.Gcs, monkeypatch: pytest.MonkeyPatch) -> gcs_server.Gcs
 
     _gcs.wipe()
     monkeypatch.setenv("STORAGE_EMULATOR_HOST", _gcs.url)
-    monkeypatch.setattr(retries, "DEFAULT", retries.RetryPolicy(attempts=5, first_wait_s=0.001, timeout_s=5.0))
+    monkeypatch.setattr(retries, "DEFAULT", retries.RetryPolicy(attempts=5, first_wait_s=0.001, timeout_s=60.0))
     return _gcs
 
 

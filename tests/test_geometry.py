@@ -50,7 +50,7 @@ def test_applied_actions_equal_the_official_ones(official: dict[str, np.ndarray]
     assert_same_pose(found, official["composed"], 1e-6)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seed=st.integers(0, 2**31), stride=st.integers(1, 15))
 def test_integrating_the_actions_of_a_trajectory_returns_its_states(seed: int, stride: int) -> None:
     states = synthetic_states(60, seed=seed)[::stride]
@@ -60,7 +60,7 @@ def test_integrating_the_actions_of_a_trajectory_returns_its_states(seed: int, s
         assert_same_pose(pose, expected)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(angle=st.floats(-0.2, 0.2), axis=st.sampled_from([3, 5]))
 def test_a_turn_across_pi_is_as_small_as_the_same_turn_elsewhere(angle: float, axis: int) -> None:
     states = np.zeros((2, 7))

@@ -7,17 +7,19 @@ import pty
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from run_fixtures import Popen
 from vjepa2_ac import output
 from vjepa2_ac.output import Writer
 
 BEGINNING = """
 import sys, os
 from vjepa2_ac import output
-output.LAST_S = 0.3
+output.LAST_S = 120.0
 with output.own_streams() as streams:
 """
 SAY_MUCH = """
@@ -29,8 +31,12 @@ NEVER_WAIT = "    output.never_wait()\n"
 SMALLEST_PIPE = 4096
 
 
-def start(code: str, **streams: object) -> subprocess.Popen:
-    return subprocess.Popen([sys.executable, "-c", BEGINNING + code], **streams)
+Start = Callable[..., subprocess.Popen]
+
+
+@pytest.fixture
+def start(popen: Popen) -> Start:
+    return lambda code, **streams: popen([sys.executable, "-c", BEGINNING + code], **streams)
 
 
 def full_pipe() -> tuple[int, int]:
@@ -53,24 +59,25 @@ def third(tmp_path: Path):
 
 
 @pytest.mark.parametrize("mode", ["", NEVER_WAIT], ids=["waits", "never waits"])
-def test_a_reader_who_leaves_changes_nothing(third, mode: str) -> None:
+def test_a_reader_who_leaves_changes_nothing(start: Start, third, mode: str) -> None:
     path, shift = third
     process = start(mode + SAY_MUCH, stdout=subprocess.PIPE, stderr=subprocess.PIPE, preexec_fn=shift, close_fds=False)
     assert process.stdout.readline() == b"line 000000 " + b"." * 80 + b"\n"
     process.stdout.close()
     assert process.stderr.read() == b""
-    assert process.wait(timeout=60) == 0
+    assert process.wait(timeout=120) == 0
     process.stderr.close()
     assert path.read_bytes() == b"done"
 
 
-def test_a_reader_who_never_reads_holds_up_nothing_and_what_was_left_out_is_told(third) -> None:
+def test_a_reader_who_never_reads_holds_up_nothing_and_what_was_left_out_is_told(start: Start, third) -> None:
     path, shift = third
     reader, writer = full_pipe()
     process = start(
-        NEVER_WAIT + SAY_MUCH, stdout=writer, stderr=subprocess.PIPE, preexec_fn=shift, close_fds=False
+        "    output.LAST_S = 0.3\n" + NEVER_WAIT + SAY_MUCH,
+        stdout=writer, stderr=subprocess.PIPE, preexec_fn=shift, close_fds=False,
     )  # fmt: skip
-    _, said = process.communicate(timeout=60)
+    _, said = process.communicate(timeout=120)
     os.close(reader), os.close(writer)
     assert process.returncode == 0
     assert path.read_bytes() == b"done"
@@ -96,29 +103,28 @@ def test_what_waits_for_a_reader_is_bounded() -> None:
     late.start()
     mouth.finish(60.0)
     mouth.write(b"again\n")
-    late.join(timeout=60)
+    late.join(timeout=120)
     assert received == b"x" * SMALLEST_PIPE + line * waiting + b"again\n"
 
 
-def test_a_slow_reader_gets_all_of_what_a_command_is_there_to_print() -> None:
+def test_a_slow_reader_gets_all_of_what_a_command_is_there_to_print(start: Start) -> None:
     process = start("    print('x' * 500_000 + 'end')\n", stdout=subprocess.PIPE)
     slow = threading.Event()
     received = b""
     while piece := os.read(process.stdout.fileno(), 9_973):
         slow.wait(0.001)
         received += piece
-    process.stdout.close()
-    assert process.wait(timeout=60) == 0
+    assert process.wait(timeout=120) == 0
     assert received == b"x" * 500_000 + b"end\n"
 
 
-def test_a_full_disk_of_a_log_is_told_once_where_somebody_reads(third) -> None:
+def test_a_full_disk_of_a_log_is_told_once_where_somebody_reads(start: Start, third) -> None:
     path, shift = third
     with Path("/dev/full").open("wb") as full:
         process = start(
             NEVER_WAIT + SAY_MUCH, stdout=full, stderr=subprocess.PIPE, preexec_fn=shift, close_fds=False
         )  # fmt: skip
-        _, said = process.communicate(timeout=60)
+        _, said = process.communicate(timeout=120)
     assert (process.returncode, path.read_bytes()) == (0, b"done")
     assert said == (b"warning: standard output: cannot be written (No space left on device): some output is missing\n")
 
@@ -156,14 +162,14 @@ def test_streams_that_were_closed_are_no_files_of_ours(tmp_path: Path, closed: t
         file.write("ours")
 """
     process = subprocess.run(
-        [sys.executable, "-c", BEGINNING + code, str(tmp_path / "file")], preexec_fn=close, check=False, timeout=60,
+        [sys.executable, "-c", BEGINNING + code, str(tmp_path / "file")], preexec_fn=close, check=False, timeout=120,
         capture_output=True,
     )  # fmt: skip
     assert process.returncode == 0
     assert (tmp_path / "file").read_text() == "ours"
 
 
-def test_a_terminal_that_is_gone_is_nobodys_error() -> None:
+def test_a_terminal_that_is_gone_is_nobodys_error(start: Start) -> None:
     ours, theirs = pty.openpty()
     code = """
     print(sys.stdout.isatty(), flush=True)
@@ -178,26 +184,26 @@ def test_a_terminal_that_is_gone_is_nobodys_error() -> None:
         said += os.read(ours, 100)
     assert said == b"True\r\n", "it is known to be one"
     os.close(ours)
-    process.communicate(b"go\n", timeout=60)
+    process.communicate(b"go\n", timeout=120)
     assert process.returncode == 0
 
 
-def test_both_streams_on_one_file_keep_their_order() -> None:
+def test_both_streams_on_one_file_keep_their_order(start: Start) -> None:
     code = """
     output.never_wait()
     for number in range(100):
         print(number, file=sys.stderr if number % 2 else sys.stdout)
 """
     process = start(code, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
-    said, _ = process.communicate(timeout=60)
+    said, _ = process.communicate(timeout=120)
     assert said.split() == [str(number).encode() for number in range(100)]
 
 
-def test_what_a_terminal_cannot_show_is_spelt_out() -> None:
+def test_what_a_terminal_cannot_show_is_spelt_out(start: Start) -> None:
     process = start(
         "    print('Grüße', chr(0xDCFF))\n", stdout=subprocess.PIPE, env={**os.environ, "PYTHONIOENCODING": "ascii"}
     )
-    said, _ = process.communicate(timeout=60)
+    said, _ = process.communicate(timeout=120)
     assert (process.returncode, said) == (0, rb"Gr\xfc\xdfe \udcff" + b"\n")
 
 
@@ -208,7 +214,7 @@ def test_a_file_that_others_made_unblocking_is_waited_for() -> None:
     thread = threading.Thread(target=mouth.write, args=(b"y" * 10,))
     thread.start()
     assert os.read(reader, SMALLEST_PIPE) == b"x" * SMALLEST_PIPE
-    thread.join(timeout=30)
+    thread.join(timeout=120)
     assert os.read(reader, 100) == b"y" * 10
     assert mouth.problem is None
 

@@ -5,7 +5,7 @@ import math
 import os
 import shutil
 import signal
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -129,14 +129,7 @@ def test_without_test_episodes_nothing_is_measured(make_decoder: MakeConfig) -> 
 # ---- whatever happens ----------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def _signals_end_a_process() -> Iterator[None]:
-    before = signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    yield
-    signal.signal(signal.SIGTERM, before)
-
-
-@pytest.mark.usefixtures("_signals_end_a_process")
+@pytest.mark.usefixtures("default_signals")
 @pytest.mark.parametrize("at", [1, 4])
 def test_a_training_that_was_asked_to_stop_goes_on_as_if_it_had_not(
     make_decoder: MakeConfig, whole_decoder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, at: int
@@ -158,7 +151,7 @@ def test_a_training_that_was_asked_to_stop_goes_on_as_if_it_had_not(
     assert_same_decoder(whole_decoder, tmp_path / "decoder")
 
 
-@pytest.mark.usefixtures("_signals_end_a_process")
+@pytest.mark.usefixtures("default_signals")
 def test_a_stop_while_frames_are_encoded_keeps_them_and_has_its_status(
     make_decoder: MakeConfig, whole_decoder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -23,6 +23,8 @@ from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.resume import micro_batches_of
 from vjepa2_ac.training.setup import batches_from
 
+pytestmark = pytest.mark.usefixtures("default_signals")
+
 
 @pytest.fixture
 def without_dropout(make_config, tmp_path):

@@ -33,12 +33,7 @@ with preemption.stop_on_signals() as stop:
 """
 
 
-@pytest.fixture(autouse=True)
-def _signals_are_not_ignored():
-    before = {number: signal.signal(number, signal.SIG_DFL) for number in SIGNALS}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
+pytestmark = pytest.mark.usefixtures("default_signals")
 
 
 def signalled_reporter(reporter, at: int, number: int):
@@ -66,6 +61,12 @@ def test_a_run_that_was_asked_to_stop_goes_on_as_if_it_had_not(
     assert_same_run(whole_run, tmp_path / "stopped")
 
 
+def test_a_run_under_nohup_outlives_its_terminal(make_config, reporter, tmp_path, whole_run) -> None:
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    train(make_config(run_dir=str(tmp_path / "run")), signalled_reporter(reporter, 3, signal.SIGHUP))
+    assert_same_run(whole_run, tmp_path / "run")
+
+
 def test_a_run_asked_to_stop_after_its_last_step_is_done(make_config, reporter) -> None:
     train(make_config(), signalled_reporter(reporter, 6, signal.SIGTERM))
 
@@ -85,11 +86,11 @@ def test_a_signal_to_the_whole_group_stops_the_run_and_its_workers_in_good_order
     family = psutil.Process(process.pid).children(recursive=True)
     assert len(family) >= 3, "a fork server and two workers"
     os.killpg(process.pid, signal.SIGUSR1)
-    _, errors = process.communicate(timeout=60)
+    _, errors = process.communicate(timeout=120)
     assert process.returncode == EXIT_STATUS, errors
     assert errors.startswith("SIGUSR1: stopped after step"), errors
     assert len(errors.splitlines()) == 1, errors
-    assert not psutil.wait_procs(family, timeout=10)[1], "a worker stayed"
+    assert not psutil.wait_procs(family, timeout=120)[1], "a worker stayed"
     train(config, reporter)
     assert 1 < reporter.steps[0] < 40
     train(make_config(run_dir=str(tmp_path / "whole"), **{**changes, "data__workers": 0}), reporter)
@@ -97,14 +98,13 @@ def test_a_signal_to_the_whole_group_stops_the_run_and_its_workers_in_good_order
 
 
 @pytest.mark.parametrize("number", SIGNALS)
-def test_a_second_signal_ends_the_process_at_once(number: int) -> None:
-    process = subprocess.Popen([sys.executable, "-c", WAITING], stdout=subprocess.PIPE, text=True)
+def test_a_second_signal_ends_the_process_at_once(popen, number: int) -> None:
+    process = popen([sys.executable, "-c", WAITING], stdout=subprocess.PIPE, text=True)
     assert process.stdout.readline() == "None\n"
     process.send_signal(number)
     assert process.stdout.readline() == f"{signal.Signals(number).name}\n"
     process.send_signal(number)
-    assert process.wait(timeout=60) == -number
-    process.stdout.close()
+    assert process.wait(timeout=120) == -number
 
 
 def test_a_signal_that_comes_twice_at_once_is_one(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ KNOBS = st.builds(Knob, VALUES, WORDS, st.booleans())
 SECTIONS = st.recursive(KNOBS, lambda inner: st.dictionaries(NAMES, inner, min_size=1, max_size=3), max_leaves=8)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(knobs=st.dictionaries(NAMES, SECTIONS, min_size=1, max_size=4), head=st.lists(WORDS, max_size=2))
 def test_text_reads_back(knobs: dict[str, object], head: list[str]) -> None:
     assert parse_yaml(as_yaml(head, knobs), where="here") == plain(knobs)  # type: ignore[arg-type]

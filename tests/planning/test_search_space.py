@@ -22,7 +22,7 @@ def pose(horizon: int = 1, action_repeat: int = 1, **limits: object) -> SearchSp
     )
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(
     values=st.lists(st.floats(width=32), min_size=7, max_size=7),
     ball=st.sampled_from(["none", "l1", "l2"]),

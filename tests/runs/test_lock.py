@@ -45,7 +45,7 @@ def test_a_folder_in_use_is_refused_and_its_process_named_until_it_is_killed(tmp
         ):
             lock.take()
         process.send_signal(signal.SIGKILL)
-        assert process.wait(timeout=60) == -signal.SIGKILL
+        assert process.wait(timeout=120) == -signal.SIGKILL
     with RunLock(tmp_path / "run") as lock:
         lock.take()
         assert f'"process": {os.getpid()}' in (tmp_path / "run" / LOCK).read_text()

@@ -22,7 +22,7 @@ def said(caplog: pytest.LogCaptureFixture) -> Callable[[], list[str]]:
 
 
 def wait_until(happens: Callable[[], object]) -> None:
-    until = time.monotonic() + 30
+    until = time.monotonic() + 120
     while not happens():
         assert time.monotonic() < until
         time.sleep(0.002)

@@ -27,12 +27,12 @@ CUP = {"cup": (SubGoal(image(50), "cup"),)}
 def robot(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the Python of an environment with the client and what it asks for, which is not ours."""
     here = tmp_path_factory.mktemp("robot")
-    subprocess.run([sys.executable, "-m", "venv", here], check=True, capture_output=True)
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", here], check=True, capture_output=True)
     python = here / "bin/python"
     # typing_extensions: the client imports it and does not ask for it.
-    install = [python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", CLIENT, "typing_extensions"]
+    pip = [sys.executable, "-m", "pip", "--python", python, "install", "--quiet", "--disable-pip-version-check"]
     try:
-        done = subprocess.run(install, capture_output=True, text=True, timeout=180)
+        done = subprocess.run([*pip, CLIENT, "typing_extensions"], capture_output=True, text=True, timeout=180)
     except subprocess.TimeoutExpired:
         pytest.skip(f"{CLIENT} could not be installed within 3 minutes")
     if done.returncode:

@@ -26,7 +26,7 @@ KEY = "correct-horse-battery-staple"
 
 def get(running: Running, path: str, **headers: str) -> tuple[int, str]:
     host, port = running.http.removeprefix("http://").split(":")
-    connection = http.client.HTTPConnection(host, int(port), timeout=10)
+    connection = http.client.HTTPConnection(host, int(port), timeout=120)
     try:
         connection.request("GET", path, headers=headers)
         answer = connection.getresponse()
@@ -42,7 +42,7 @@ def connect(running: Running, **how: object) -> Iterator[websockets.sync.client.
 
 
 def wait_for(is_so: Callable[[], bool]) -> None:
-    until = time.monotonic() + 10
+    until = time.monotonic() + 120
     while not is_so():
         assert time.monotonic() < until
         time.sleep(0.01)
@@ -85,7 +85,7 @@ def test_it_is_alive_at_once_and_ready_when_it_is_loaded() -> None:
     go = threading.Event()
 
     def load() -> Session:
-        assert go.wait(20)
+        assert go.wait(120)
         return session()
 
     with serving(load, wait=False) as running:
@@ -96,7 +96,7 @@ def test_it_is_alive_at_once_and_ready_when_it_is_loaded() -> None:
             with pytest.raises(TimeoutError):
                 early.recv(timeout=0.2)
             go.set()
-            assert unpack(early.recv(timeout=20))["needs_session_id"] is True
+            assert unpack(early.recv(timeout=120))["needs_session_id"] is True
         assert get(running, "/readyz") == (200, "ready\n")
 
 
@@ -126,25 +126,18 @@ def test_a_second_robot_is_refused_by_the_name_of_the_first_until_that_leaves() 
 def test_pings_are_answered_during_a_long_decision() -> None:
     slow = SlowSession()
 
-    async def drive(url: str) -> float:
-        async with websockets.asyncio.client.connect(
-            url, compression=None, proxy=None, ping_interval=0.2, ping_timeout=0.4
-        ) as connection:
+    async def drive(url: str) -> None:
+        async with websockets.asyncio.client.connect(url, compression=None, proxy=None) as connection:
             await connection.recv()
             await connection.send(pack(request(0, goal_image=image(100))))
-            await asyncio.to_thread(slow.asked.wait, 20)
-            slowest = 0.0
-            for _ in range(6):
-                began = time.monotonic()
-                await asyncio.wait_for(await connection.ping(), 5)
-                slowest = max(slowest, time.monotonic() - began)
-                await asyncio.sleep(0.2)
-            slow.go.set()
+            await asyncio.to_thread(slow.asked.wait, 120)
+            for _ in range(3):
+                await asyncio.wait_for(await connection.ping(), 120)
+            slow.go.set()  # not before
             assert unpack(await connection.recv())["why"] == "planned"
-            return slowest
 
-    with serving(lambda: slow.one, ping_s=0.5) as running:
-        assert asyncio.run(drive(running.url)) < 5
+    with serving(lambda: slow.one) as running:
+        asyncio.run(drive(running.url))
 
 
 def test_a_client_that_leaves_ends_its_search_and_the_next_one_is_served() -> None:
@@ -153,8 +146,8 @@ def test_a_client_that_leaves_ends_its_search_and_the_next_one_is_served() -> No
         with connect(running) as connection:
             connection.recv()
             connection.send(pack(request(0, goal_image=image(100))))
-            assert slow.asked.wait(20)
-        assert slow.left.wait(10)
+            assert slow.asked.wait(120)
+        assert slow.left.wait(120)
         slow.go.set()
         wait_for(lambda: "vjepa2_ac_robots 0" in get(running, "/metrics")[1])
         with PlanningClient(running.url) as client:
@@ -168,12 +161,11 @@ def test_a_server_that_ends_during_a_decision_does_not_wait_for_it() -> None:
             connection = client.enter_context(connect(running))
             connection.recv()
             connection.send(pack(request(0, goal_image=image(100))))
-            assert slow.asked.wait(20)
-            began = time.monotonic()
-        assert time.monotonic() - began < 5
+            assert slow.asked.wait(120)
+        assert not slow.go.is_set()
         assert slow.left.is_set()
         with pytest.raises(ConnectionClosed):
-            connection.recv(timeout=5)
+            connection.recv(timeout=120)
 
 
 def test_a_key_is_asked_of_robots_and_of_figures_and_of_nobody_who_asks_for_health() -> None:
@@ -207,16 +199,16 @@ def test_what_is_no_request_is_answered_by_a_sentence_and_the_next_one_is_served
     with serving(session) as running, connect(running) as connection:
         connection.recv()
         connection.send("a text")
-        assert connection.recv(timeout=10) == "a request is a binary message, in msgpack"
+        assert connection.recv(timeout=120) == "a request is a binary message, in msgpack"
         for _ in range(300):
             wrong = bytearray(good)
             for _ in range(rng.randint(1, 4)):
                 wrong[rng.randrange(120)] = rng.randrange(256)
             connection.send(bytes(wrong[: rng.choice([len(wrong), rng.randrange(len(wrong))])]))
-            answer = connection.recv(timeout=20)
+            answer = connection.recv(timeout=120)
             assert isinstance(answer, bytes) or (len(answer) < 1000 and "Traceback" not in answer)
         connection.send(bytes(good))
-        found = unpack(connection.recv(timeout=20))
+        found = unpack(connection.recv(timeout=120))
         assert found["why"] == "planned"
         figures = get(running, "/metrics")[1]
         assert "requests_failed_total 0" in figures
@@ -230,7 +222,7 @@ def test_a_message_that_is_too_large_ends_the_connection_and_not_the_server() ->
             with contextlib.suppress(ConnectionClosed, OSError):
                 connection.send(bytes(33 << 20))
             with pytest.raises(ConnectionClosed) as caught:
-                connection.recv(timeout=10)
+                connection.recv(timeout=120)
         assert caught.value.rcvd is None or caught.value.rcvd.code == 1009
         wait_for(lambda: "vjepa2_ac_robots 0" in get(running, "/metrics")[1])
         with PlanningClient(running.url) as client:

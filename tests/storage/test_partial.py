@@ -6,11 +6,14 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from run_fixtures import Popen
 from vjepa2_ac import storage
+from vjepa2_ac.distributed.ending import tidy_end
 from vjepa2_ac.storage import partial
 
 WRITING = """
@@ -39,36 +42,53 @@ def _looks_again() -> None:
     partial._remove_abandoned_once.cache_clear()
 
 
-def writing(target: Path, kind: str) -> subprocess.Popen:
-    process = subprocess.Popen([sys.executable, "-c", WRITING, str(target), kind], stdout=subprocess.PIPE)
-    assert process.stdout.readline() == b"writing\n"
-    process.stdout.close()
-    return process
+@pytest.fixture
+def writing(popen: Popen) -> Callable[[Path, str], subprocess.Popen]:
+    def start(target: Path, kind: str) -> subprocess.Popen:
+        process = popen([sys.executable, "-c", WRITING, str(target), kind], stdout=subprocess.PIPE)
+        assert process.stdout.readline() == b"writing\n"
+        return process
+
+    return start
 
 
 def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
+@pytest.mark.usefixtures("default_signals")
 @pytest.mark.parametrize("kind", ["file", "folder"])
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_a_writer_that_is_told_to_end_leaves_nothing_and_dies_of_it(tmp_path: Path, kind: str, number: int) -> None:
+def test_a_writer_that_is_told_to_end_leaves_nothing_and_dies_of_it(
+    tmp_path: Path, writing, kind: str, number: int
+) -> None:
     process = writing(tmp_path / "target", kind)
     assert len(names(tmp_path)) == 1
     process.send_signal(number)
-    assert process.wait(timeout=60) == -number
+    assert process.wait(timeout=120) == -number
     assert names(tmp_path) == []
 
 
+@pytest.mark.usefixtures("default_signals")
+def test_a_writer_under_nohup_outlives_its_terminal(tmp_path: Path) -> None:
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    with tidy_end():
+        os.kill(os.getpid(), signal.SIGHUP)
+        storage.write_atomically(tmp_path / "target", "a")
+    assert names(tmp_path) == ["target"]
+
+
 @pytest.mark.parametrize("kind", ["file", "folder"])
-def test_what_a_killed_writer_left_goes_with_the_next_one_and_not_before_it_is_dead(tmp_path: Path, kind: str) -> None:
+def test_what_a_killed_writer_left_goes_with_the_next_one_and_not_before_it_is_dead(
+    tmp_path: Path, writing, kind: str
+) -> None:
     process = writing(tmp_path / "target", kind)
     (left,) = names(tmp_path)
     assert partial.is_partial(tmp_path / left)
     storage.write_atomically(tmp_path / "other", "while it is at work")
     assert names(tmp_path) == [left, "other"]
     process.kill()
-    process.wait(timeout=60)
+    process.wait(timeout=120)
     storage.write_atomically(tmp_path / "other", "of this process, which has looked here before")
     assert names(tmp_path) == [left, "other"]
     partial._remove_abandoned_once.cache_clear()  # a new process

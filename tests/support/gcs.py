@@ -7,6 +7,7 @@ import http.client
 import json
 import re
 import threading
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ if TYPE_CHECKING:  # tests that need no storage run without the emulator
     from gcp_storage_emulator.server import Server
 
 LOOPBACK = "127.0.0.1"
+_PATIENCE_S = 30.0
 
 Failure = int | str
 
@@ -46,13 +48,19 @@ class _Fault:
     match: str
 
 
+@dataclass(frozen=True)
+class _Meeting:
+    number: int  # of requests
+    match: str
+    until_s: float = 0.0  # of time.monotonic
+
+
 class Gcs:
     """What a test tells the storage, and asks it. A test begins with an empty one without faults.
 
     Attributes:
         url: Where it answers; STORAGE_EMULATOR_HOST is set to it.
         requests: All that came in, in the order of the answers.
-        latency_s: Waited before every answer, as many at once as come.
         most_in_flight: Most requests that were open at the same time.
     """
 
@@ -62,8 +70,8 @@ class Gcs:
         self._in_flight = 0
         self.url = ""
         self.requests: list[Request] = []
-        self.latency_s = 0.0
         self.most_in_flight = 0
+        self._meeting = _Meeting(0, "")
 
     def upload(self, source: Path, place: str) -> str:
         """Put a file, or all files of a folder, at "bucket" or "bucket/prefix"; return the gs:// URL of it."""
@@ -99,6 +107,10 @@ class Gcs:
         with self._lock:
             self._faults.append(_Fault(failure, times, match))
 
+    def hold(self, number: int, match: str) -> None:
+        """Answer no request of such an address before so many requests were open at the same time, or 30 s are over."""
+        self._meeting = _Meeting(number, match, time.monotonic() + _PATIENCE_S)
+
     @property
     def faults_left(self) -> int:
         """How many of the faults asked for have not happened."""
@@ -118,7 +130,7 @@ class Gcs:
 
     def names(self, bucket: str) -> list[str]:
         """Return the names of all objects, asked past the proxy."""
-        with closing(http.client.HTTPConnection(LOOPBACK, self._port, timeout=10)) as connection:
+        with closing(http.client.HTTPConnection(LOOPBACK, self._port, timeout=120)) as connection:
             connection.request("GET", f"/storage/v1/b/{bucket}/o?maxResults=1000")
             return sorted(item["name"] for item in json.loads(connection.getresponse().read()).get("items", []))
 
@@ -127,21 +139,21 @@ class Gcs:
         return sum(request.sent for request in self.reads(end))
 
     def forget(self) -> None:
-        """Forget requests, faults and latency; the objects stay."""
+        """Forget requests, faults and what is held; the objects stay."""
         with self._lock:
             self._faults.clear()
             self.requests.clear()
-            self.latency_s, self.most_in_flight = 0.0, 0
+            self._meeting, self.most_in_flight = _Meeting(0, ""), 0
 
     def wipe(self) -> None:
         """Forget everything, also what a client gave up waiting for."""
         with self._lock:
-            self._lock.wait_for(lambda: self._in_flight == 0, timeout=5)
+            self._lock.wait_for(lambda: self._in_flight == 0, timeout=120)
         self.forget()
         self._emulator.wipe()
 
     def _post(self, address: str, data: bytes, kind: str) -> int:
-        with closing(http.client.HTTPConnection(LOOPBACK, self._port, timeout=10)) as connection:
+        with closing(http.client.HTTPConnection(LOOPBACK, self._port, timeout=120)) as connection:
             connection.request("POST", address, data, {"Content-Type": kind})
             return connection.getresponse().status
 
@@ -176,7 +188,7 @@ def running() -> Iterator[Gcs]:
     try:
         yield gcs
     finally:
-        asyncio.run_coroutine_threadsafe(_stop(proxy), loop).result(timeout=10)
+        asyncio.run_coroutine_threadsafe(_stop(proxy), loop).result(timeout=120)
         loop.call_soon_threadsafe(loop.stop)
         thread.join()
         loop.close()
@@ -213,8 +225,9 @@ class _Proxy:
         target = f"{method} {unquote(address)}"
         gcs._count(1)
         try:
-            if gcs.latency_s:
-                await asyncio.sleep(gcs.latency_s)
+            if re.search(gcs._meeting.match, target):
+                while gcs.most_in_flight < gcs._meeting.number and time.monotonic() < gcs._meeting.until_s:
+                    await asyncio.sleep(0.002)
             failure = gcs._failure_of(target)
             if failure is None and target.startswith("DELETE /upload/"):
                 failure = 499  # as Google answers to whoever gives an upload up; the emulator does not know it

@@ -61,7 +61,7 @@ class Nursery:
     def close(self) -> None:
         self._process.stdin.close()
         self._process.stdout.close()
-        self._process.wait(timeout=60)
+        self._process.wait(timeout=120)
 
     def _ask(self, what: dict) -> int:
         self._process.stdin.write(json.dumps(what) + "\n")
@@ -153,7 +153,10 @@ def _become(wish: dict, main: Callable[[list[str]], int]) -> None:
     try:
         os.setsid()  # its workers are in its session, and known by it when it is dead
         signal.alarm(300)  # no test waits for ever
-        output.LAST_S = 0.5
+        for number in (signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP):  # as from a terminal, even under `nohup`
+            signal.signal(number, signal.SIG_DFL)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        output.LAST_S = 0.5 if Path(wish["out"]).is_fifo() else 120.0  # a pipe has a reader who may never read
         os.dup2(os.open(os.devnull, os.O_RDWR), 0)
         os.dup2(os.open(wish["out"], os.O_WRONLY | os.O_NOCTTY), 1)
         if wish["err"] is not None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 import torch
@@ -15,6 +17,7 @@ from killable import Nursery
 from synthetic import write_synthetic_droid
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict, parse_config
+from vjepa2_ac.distributed.preemption import HANG_UP, SIGNALS
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import SILENT, NullReporter
@@ -86,6 +89,34 @@ def base_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("base") / "model"
     WorldModel.random(ModelSizes.model_validate(TINY), seed=3).save_pretrained(folder)
     return folder
+
+
+@pytest.fixture
+def default_signals() -> Iterator[None]:
+    """Stop signals end this process and those it starts, also where the tests were started to ignore some: `nohup`."""
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in (*SIGNALS, HANG_UP)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+Popen = Callable[..., "subprocess.Popen[Any]"]
+
+
+@pytest.fixture
+def popen() -> Iterator[Popen]:
+    """Starts processes that end with the test, and whose pipes are closed then: also where it fails.
+
+    Otherwise a later test would be blamed for them, when they are found as garbage.
+    """
+    with ExitStack() as ending:
+
+        def start(*arguments: Any, **named: Any) -> subprocess.Popen[Any]:
+            process = ending.enter_context(subprocess.Popen(*arguments, **named))
+            ending.callback(process.kill)
+            return process
+
+        yield start
 
 
 @pytest.fixture(scope="session")

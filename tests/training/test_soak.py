@@ -88,7 +88,7 @@ def test_a_run_killed_many_times_is_the_run_that_was_not(
             status = nursery.start("train", str(config_file), folder=run).wait()
         assert status == 0
         assert_same_run(tmp_path / "whole", run)
-    assert not wait_for_the_end_of(killer.processes, timeout_s=30), "a worker outlived its run"
+    assert not wait_for_the_end_of(killer.processes, timeout_s=120), "a worker outlived its run"
     logger.info(
         "%d workers, keep_best %s: %d kills in %d runs, %d of them in the middle of a checkpoint",
         workers, keep_best, killer.kills, runs, killer.in_a_checkpoint,

@@ -34,7 +34,7 @@ def pairs(low: float, high: float) -> st.SearchStrategy[list[float]]:
     return st.tuples(st.floats(low, high), st.floats(low, high)).map(sorted)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.integers(1, 400), st.integers(1, 400), pairs(0.01, 1.0), pairs(0.1, 9.0), st.integers(0, 2**40))
 def test_the_box_lies_inside_the_frame(
     height: int, width: int, scale: list[float], aspect: list[float], position: int

@@ -207,7 +207,7 @@ def test_workers_end_with_the_run_however_it_ends(droid: Path, tmp_path: Path, d
         start_new_session=True,
     ) as run:
         try:
-            _, said = run.communicate(timeout=60)  # waits until no process holds the pipe any more
+            _, said = run.communicate(timeout=120)  # waits until no process holds the pipe any more
         except subprocess.TimeoutExpired:
             os.killpg(run.pid, signal.SIGKILL)
             pytest.fail("a worker outlives the run")
@@ -530,7 +530,7 @@ def test_with_every_knob_on_neither_workers_nor_resuming_change_a_bit(
 
 
 def test_clips_of_a_set_that_lies_elsewhere_are_read_several_at_once(in_memory: Callable[..., Dataset]) -> None:
-    meeting = threading.Barrier(4, timeout=30)
+    meeting = threading.Barrier(4, timeout=120)
 
     class Slow(MemorySource):
         def read(self, *arguments: Any) -> Episode:

@@ -45,7 +45,7 @@ def windows_of(infos: list[EpisodeInfo], config: DataConfig, split: Split) -> Wi
 ALL_TRAIN = {"validation_share": 0.0, "test_share": 0.0}
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(size=st.integers(1, 300), seed=st.integers(0, 2**31), epoch=st.integers(0, 1000))
 def test_a_permutation_hits_every_index_once(size: int, seed: int, epoch: int) -> None:
     assert sorted(permuted(index, size=size, seed=seed, epoch=epoch) for index in range(size)) == list(range(size))
@@ -258,7 +258,7 @@ def test_a_range_of_kept_steps_costs_a_few_bytes() -> None:
     assert sum(column.nbytes for column in (*windows.starts.columns, windows.ends)) == 24_000
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(size=st.integers(1, 500), count=st.integers(1, 100))
 def test_what_is_spread_is_distinct_and_even(size: int, count: int) -> None:
     chosen = spread(size, count)

@@ -95,7 +95,7 @@ def test_short_rests_stay_and_short_moves_go() -> None:
     assert ranges([(0, 80)]) == []
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(idle=st.lists(st.booleans(), max_size=120))
 def test_kept_ranges_lie_apart_and_hold_no_long_rest(idle: list[bool]) -> None:
     ranges = moving_ranges(np.array(idle, bool), MOTION)

@@ -94,7 +94,7 @@ def test_a_folder_that_cannot_be_written_costs_a_warning(
 
 
 def test_two_that_write_one_index_at_once_do_not_meet(tmp_path: Path) -> None:
-    here, there = threading.Barrier(2, timeout=10), threading.Barrier(2, timeout=10)
+    here, there = threading.Barrier(2, timeout=120), threading.Barrier(2, timeout=120)
 
     def write(text: str) -> None:
         with storage.atomic_writer(tmp_path / "index") as file:

@@ -1,7 +1,6 @@
 """Randomly damaged RLDS files: read correctly or named; no garbage, no crash, no hang."""
 
 import os
-import time
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,6 @@ from vjepa2_ac.data.sources.rlds.tfrecord import write_record
 from vjepa2_ac.errors import InputError
 
 MUTATIONS = int(os.environ.get("VJEPA2_AC_MUTATIONS", "50"))  # of each kind; more in a longer run
-LONGEST_S = 10.0
 
 Contents = dict[str, tuple[Any, ...]]
 
@@ -74,13 +72,11 @@ def mutated(data: bytes, generator: np.random.Generator) -> bytes:
 
 def outcome(source: RldsSource, true: Contents, file: str) -> str:
     """Return what came of a damaged file, having seen that it is one of what is allowed."""
-    start = time.process_time()  # a busy machine is no hang
     refused = ""
     try:
         found, problems = contents(source), source.infos().problems
     except InputError as error:
         refused = str(error)
-    assert time.process_time() - start < LONGEST_S
     if refused:
         assert file in refused or "shards are missing" in refused
         return "refused"

@@ -95,7 +95,7 @@ features = st.dictionaries(
 )
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(features=features)
 def test_features_are_found_without_reading_the_others(features: dict) -> None:
     data = b"before" + encode_example(features) + b"after"
@@ -110,7 +110,7 @@ def test_features_are_found_without_reading_the_others(features: dict) -> None:
     assert {name: list(values) for name, (_, values) in decoded.items()} == {n: v for n, (_, v) in features.items()}
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(features=features, share=st.floats(0, 1))
 def test_what_is_found_from_the_end_lies_where_it_does(features: dict, share: float) -> None:
     data = encode_example(features)

@@ -1,5 +1,6 @@
 """The axes of an oracle that is turned by a known angle are found; a model without axes is said to have none."""
 
+import functools
 from dataclasses import replace
 
 import numpy as np
@@ -43,9 +44,14 @@ def fitted(model: object, **changes: object) -> AxisFit:
     return infer_axes(model, starts(**changes), at_once=64)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("degrees", [0.0, 43.0, -60.0, 135.0, 179.9])
+@functools.cache
+def fitted_to_turned(degrees: float) -> AxisFit:
+    return fitted(Turned(degrees))
+
+
+@pytest.mark.parametrize("degrees", [0.0, -60.0, 135.0, 179.9])
 def test_the_angle_of_a_turned_oracle_is_recovered_within_half_a_degree(degrees: float) -> None:
-    found = fitted(Turned(degrees))
+    found = fitted_to_turned(degrees)
     for yaw in (found.yaw_degrees, found.fitted_yaw_degrees):
         assert yaw.value == pytest.approx(degrees, abs=0.5)
         assert yaw.low <= yaw.value <= yaw.high < yaw.low + 3
@@ -69,11 +75,11 @@ def test_a_model_that_ignores_actions_is_refused_as_ill_conditioned() -> None:
 
 
 def test_a_turn_that_predicts_no_better_than_none_and_one_of_a_wide_interval_are_refused() -> None:
-    found = fitted(Turned(60.0))
+    found = fitted_to_turned(-60.0)
     unsure = replace(found, error=Estimate(0.98, 0.95, 1.01))
     assert (unsure.problem or "").startswith("no better than none")
-    wide = replace(found, yaw_degrees=Estimate(60.0, 30.0, 80.0))
-    assert (wide.problem or "").startswith("uncertain: yaw 60 degrees, 95 % interval 30 to 80")
+    wide = replace(found, yaw_degrees=Estimate(-60.0, -80.0, -30.0))
+    assert (wide.problem or "").startswith("uncertain: yaw -60 degrees, 95 % interval -80 to -30")
 
 
 def test_a_direction_in_which_nothing_moved_is_no_axis() -> None:

@@ -420,7 +420,7 @@ def test_the_encoder_of_a_model_stays_the_same_encoder_under_another_predictor()
 def test_only_the_encoder_is_read_from_a_large_file(tmp_path: Path) -> None:
     """Peak memory is the encoder and a group of tensors, whatever the optimizer's part of the file is."""
     whole = torch.load(V21, weights_only=True)
-    whole["opt"] = {"state": {0: {"exp_avg": torch.zeros(200_000_000)}}}  # 0.8 GB
+    whole["opt"] = {"state": {0: {"exp_avg": torch.zeros(75_000_000)}}}  # 300 MB
     torch.save(whole, tmp_path / "large.pt")
     code = f"""
 import resource, torch

@@ -260,7 +260,7 @@ class Gate:
             self.most = max(self.most, self.sending)
             if match in target:
                 self.waiting.set()
-                assert self.opened.wait(20)
+                assert self.opened.wait(120)
             upload(source, target)
             self.sending -= 1
 
@@ -281,7 +281,7 @@ def test_training_goes_on_while_something_is_sent_and_nothing_is_sent_twice_at_o
     mirror = mirror_of(run)
     write(run, 10, keep=1)
     mirror.tick()
-    assert held.waiting.wait(20)
+    assert held.waiting.wait(120)
     write(run, 20, keep=1)  # removes what is being sent
     assert not (run / "checkpoints" / checkpoint_name(10)).exists()
     for _ in range(5):
@@ -345,7 +345,7 @@ def test_in_the_end_the_newest_is_sent_instead_of_the_one_that_was_on_its_way(
     write(run, 10)
     mirror = mirror_of(run, minutes=30.0)
     mirror.tick()
-    assert held.waiting.wait(20)
+    assert held.waiting.wait(120)
     write(run, 20)
     threading.Timer(0.05, held.opened.set).start()
     mirror.finish(lambda: False)

@@ -29,17 +29,13 @@ class KilledError(BaseException):
     """Stands for SIGKILL: nobody sees to anything any more."""
 
 
+pytestmark = pytest.mark.usefixtures("default_signals")
+
+
 @pytest.fixture(autouse=True)
 def _bucket(gcs: Gcs) -> None:
     gcs.put("bucket/other", b"1")
     gcs.forget()
-
-
-@pytest.fixture(autouse=True)
-def _signals_are_not_ignored():
-    before = signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    yield
-    signal.signal(signal.SIGTERM, before)
 
 
 def mirrored(make_config: MakeConfig, tmp_path: Path, machine: str, **changes: object) -> Config:
@@ -66,7 +62,7 @@ def wait_for_mirrors() -> None:
     """Wait until what is being sent is there, and nothing is being sent."""
     for thread in threading.enumerate():
         if thread.name == "mirror":
-            thread.join(60)
+            thread.join(120)
             assert not thread.is_alive()
 
 
@@ -102,12 +98,12 @@ def test_a_machine_killed_while_sending_leaves_the_last_complete_checkpoint_to_t
     def upload(source: Path, target: str) -> None:
         if f"{checkpoint_name(4)}/optimizer.pt" in target:
             fourth_is_on_its_way.set()
-            assert dead.wait(60)
+            assert dead.wait(120)
             raise OSError("the process is gone")
         storage.upload(source, target)
 
     def die() -> None:
-        assert fourth_is_on_its_way.wait(60)
+        assert fourth_is_on_its_way.wait(120)
         raise KilledError
 
     monkeypatch.setattr("vjepa2_ac.runs.mirror.remote_checkpoints.upload", upload)

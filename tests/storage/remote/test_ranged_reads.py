@@ -5,7 +5,6 @@ import os
 import pickle
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
@@ -60,10 +59,12 @@ def test_everything_survives_what_passes(
 
 
 def test_a_server_that_does_not_answer_is_asked_again(gcs: Gcs, file: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(retries, "DEFAULT", retries.RetryPolicy(attempts=2, first_wait_s=0.0, timeout_s=0.3))
+    # A busy machine is slow as well: it has further attempts.
+    monkeypatch.setattr(retries, "DEFAULT", retries.RetryPolicy(attempts=100, first_wait_s=0.0, timeout_s=0.3))
     gcs.fail_next("hang", match="/download/")
     assert storage.read_range(file, 0, 5) == DATA[:5]
-    gcs.fail_next("hang", times=2, match="/download/")
+    monkeypatch.setattr(retries, "DEFAULT", retries.RetryPolicy(attempts=2, first_wait_s=0.0, timeout_s=0.3))
+    gcs.fail_next("hang", times=100, match="/download/")
     with pytest.raises(UnreachableError, match=r"2 attempts over \d s; the last: time-out"):
         storage.read_range(file, 0, 5)
 
@@ -75,10 +76,8 @@ def test_attempts_are_counted_and_the_error_says_where_and_why(
     gcs: Gcs, file: str, failure: Failure, words: str
 ) -> None:
     gcs.fail_next(failure, times=100, match="/download/")
-    begin = time.monotonic()
     with pytest.raises(UnreachableError, match=rf"^{file}: not reached in 5 attempts.*{words}.*Check the net"):
         storage.read_range(file, 0, 5)
-    assert time.monotonic() - begin < 2
     attempts = 5 if failure != "reset" else 10  # aiohttp asks again at once where a connection in use before was cut
     assert len(gcs.reads()) <= attempts, "gcsfs would make six of each"
 
@@ -132,9 +131,9 @@ def test_a_read_past_the_end_gives_what_there_is(gcs: Gcs, file: str) -> None:
 
 def test_ranges_are_read_at_the_same_time_and_come_in_order(gcs: Gcs, file: str) -> None:
     ranges = [(start, 3) for start in range(0, 9600, 100)]
-    gcs.latency_s = 0.05
+    gcs.hold(33, match="/download/")
     assert storage.read_ranges(file, ranges) == [DATA[start : start + 3] for start, _ in ranges]
-    assert gcs.most_in_flight > 32
+    assert gcs.most_in_flight >= 33
     assert len(gcs.reads()) == len(ranges)
 
 
@@ -146,7 +145,7 @@ def test_a_long_read_comes_in_pieces(gcs: Gcs, file: str, monkeypatch: pytest.Mo
 
 
 def test_many_threads_share_the_connections(gcs: Gcs, file: str) -> None:
-    gcs.latency_s = 0.02
+    gcs.hold(8, match="/download/")
     with ThreadPoolExecutor(16) as pool:
         pieces = list(pool.map(lambda start: storage.read_range(file, start, 2), range(200)))
     assert pieces == [DATA[start : start + 2] for start in range(200)]
@@ -184,7 +183,7 @@ def test_a_worker_process_reads_on_its_own(file: str) -> None:
         "        with futures.ProcessPoolExecutor(1, multiprocessing.get_context(method)) as pool:\n"
         "            assert pool.submit(storage.read_range, sys.argv[1], 5, 3).result(30) == bytes([5, 6, 7]), method\n"
     )
-    subprocess.run([sys.executable, "-W", "ignore", "-c", code, file], check=True, timeout=60)
+    subprocess.run([sys.executable, "-W", "ignore", "-c", code, file], check=True, timeout=120)
 
 
 def test_an_unreachable_error_survives_the_trip_from_a_worker() -> None:
@@ -213,4 +212,4 @@ def test_zonal_buckets_are_off_unless_the_user_wants_them(file: str) -> None:
         "assert 'gcsfs.extended_gcsfs' not in sys.modules\n"
     )
     environment = {name: value for name, value in os.environ.items() if name != "GCSFS_EXPERIMENTAL_ZB_HNS_SUPPORT"}
-    subprocess.run([sys.executable, "-c", code, file], check=True, timeout=60, env=environment)
+    subprocess.run([sys.executable, "-c", code, file], check=True, timeout=120, env=environment)
