@@ -8,6 +8,7 @@ import pytest
 from vjepa2_ac.config import Config, DataConfig
 from vjepa2_ac.config.effects import Affects, mark_of, marks_of
 from vjepa2_ac.config.loading import config_as_yaml, load_config, parse_config
+from vjepa2_ac.config.replay import ReplayConfig
 from vjepa2_ac.data.clips.dataset import open_dataset
 from vjepa2_ac.data.clips.loader import training_loader
 from vjepa2_ac.errors import InputError
@@ -27,8 +28,8 @@ def _toy() -> Iterator[None]:
 
 def _rebuild() -> None:
     marks_of.cache_clear()
-    DataConfig.model_rebuild(force=True)
-    Config.model_rebuild(force=True)
+    for section in (DataConfig, ReplayConfig, Config):  # each holds those before it
+        section.model_rebuild(force=True)
 
 
 def values(**data: object) -> dict[str, object]:
