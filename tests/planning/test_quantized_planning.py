@@ -21,7 +21,8 @@ from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.model_setup import prepare_for_planning
 
 with_torchao = pytest.mark.skipif(
-    importlib.util.find_spec("torchao") is None, reason="torchao (extra quantize) is not installed"
+    importlib.util.find_spec("torchao") is None or not quantization.has_int8(),
+    reason="torchao (extra quantize) is not installed, or this CPU's products in 8 bits are wrong",
 )
 PLAIN = PlanningConfig(samples=64, iterations=3, cem=CemConfig(elites=8))
 INT8 = PLAIN.model_copy(update={"quantize": "int8"})
@@ -137,3 +138,10 @@ def test_without_its_library_the_way_out_is_named(monkeypatch: pytest.MonkeyPatc
 def test_gradients_are_not_in_8_bits() -> None:
     with pytest.raises(ValidationError, match="planner gradient needs gradients"):
         PlanningConfig(planner="gradient", gradient=GradientConfig(starts=2), quantize="int8")
+
+
+@with_torchao
+def test_a_cpu_whose_sums_overflow_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(quantization, "has_int8", lambda: False)
+    with pytest.raises(InputError, match=r"where PyTorch's sums overflow\. Set planning\.quantize=off"):
+        Controller(in_bfloat16(), INT8)

@@ -84,7 +84,7 @@ def evaluate(
     Example:
         >>> result = evaluate("demo/run", clips=64)
         >>> result.error_over_persistence["adapter"][-1]  # at the last horizon, with its 95 % interval
-        Estimate(value=0.732, low=0.702, high=0.764)
+        Estimate(value=0.728, low=0.699, high=0.759)
     """
     if data is not None and out is None:
         needed = "a folder for the results: those in a run's own folder are of its own data"

@@ -64,6 +64,15 @@ def require_8_bits(kind: Kind, dtype: torch.dtype, device: torch.device, *, wher
     if kind == "fp8" and not _has_fp8(device):
         needed = "a CUDA device of compute capability 8.9 or more (Ada, Hopper or later)"
         raise InputError(where=where, found=f"fp8, on {device.type}", needed=needed, fix=f"Set {where}=int8 or off")
+    if kind == "int8" and device.type == "cpu" and not has_int8():
+        found = "int8, on a CPU without instructions for it (VNNI), where PyTorch's sums overflow"
+        raise InputError(where=where, found=found, fix=f"Set {where}=off")
+
+
+def has_int8() -> bool:
+    """Return whether products of 8-bit matrices are right on this CPU."""
+    ones = torch.full((32, 32), 127, dtype=torch.int8)
+    return int(torch._int_mm(ones, ones)[0, 0]) == 32 * 127**2
 
 
 def _torchao(kind: Kind, where: str) -> tuple[Any, Any]:

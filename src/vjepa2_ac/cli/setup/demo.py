@@ -19,7 +19,7 @@ def add_to(commands: Commands) -> None:
     """Add `demo` to a parser."""
     text = (
         "A simulated arm, a tiny world model, LoRA, whether it helped, and a film of what the model imagines: into the"
-        " folder demo, in 5 to 8 minutes on 2 cores, without a download. The same command goes on after a stop."
+        " folder demo, in 4 to 6 minutes on 2 cores, without a download. The same command goes on after a stop."
     )
     command(commands, "demo", _demo, text)
 
