@@ -41,7 +41,7 @@ from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.data.clips.dataset import open_dataset
 from vjepa2_ac.data.clips.loader import validation_batches
 from vjepa2_ac.data.sources.latents.dtypes import DTYPES, bytes_per_frame, pack_latents, unpack_latents
-from vjepa2_ac.distributed.device import autocast
+from vjepa2_ac.distributed.device import autocast, matmul_speed
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.encoding.disk_space import small_frame_bytes
 from vjepa2_ac.encoding.encode_dataset import encode_config
@@ -51,7 +51,6 @@ from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import NullReporter
 from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
 from vjepa2_ac.training.cost.flops import frame_flops
-from vjepa2_ac.training.monitoring.throughput import matmul_speed
 from vjepa2_ac.training.setup import Run, batches_from, open_data, open_model
 from vjepa2_ac.training.step import training_step
 

@@ -43,8 +43,8 @@ from step_memory import MEMORY_TITLES, NAMES, asked, found, memory_line, memory_
 from timing import Turns, about, add_options, introduction, prepare, profiled, ratio, rounds, settle
 from train_step_variants import OFFICIAL, OFFICIAL_FULL, PRECISIONS, Bench, Setting, Started, has_checkout, our_ways
 
+from vjepa2_ac.distributed.device import matmul_speed
 from vjepa2_ac.model.adapter.lora import trainable_report
-from vjepa2_ac.training.monitoring.throughput import matmul_speed
 
 QUICK = {
     "layers": 1, "width": 128, "latent_dim": 128, "encoder_layers": 1, "image_size": 64, "frames": [4], "batch": ["1"],

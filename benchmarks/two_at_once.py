@@ -40,12 +40,13 @@ def main(arguments: list[str] | None = None) -> int:
                 alone[spins].append(_seconds(1, spins, options.steps, folder))
                 both[spins].append(_seconds(2, spins, options.steps, folder))
                 print(f"{spins}: {alone[spins][-1]:.1f} s alone, {both[spins][-1]:.1f} s two at once", flush=True)
-    base = min(alone.get(DEFAULT, alone[options.spins[0]]))
+    first = DEFAULT if DEFAULT in alone else options.spins[0]
+    base = min(alone[first])
     print(f"{os.cpu_count()} cores, {options.steps} steps, the best of {options.rounds}")
     for spins in options.spins:
         one, two = min(alone[spins]), min(both[spins])
         print(
-            f"GOMP_SPINCOUNT {spins:>8}: alone {one:6.1f} s ({one / base:.3f} of {DEFAULT}),"
+            f"GOMP_SPINCOUNT {spins:>8}: alone {one:6.1f} s ({one / base:.3f} of {first}),"
             f" two at once {two:6.1f} s ({two / one:.2f}x)"
         )
     return 0

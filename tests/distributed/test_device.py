@@ -65,7 +65,7 @@ def products(monkeypatch: pytest.MonkeyPatch) -> dict[torch.dtype, float]:
     """Milliseconds that a product takes on a CPU without a GPU."""
     taken = {torch.bfloat16: 238.0, torch.float32: 4.0}
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    monkeypatch.setattr(device, "_product_ms", taken.get)
+    monkeypatch.setattr(device, "matmul_speed", lambda _cpu, dtype: 2e3 * device._CPU_MATRIX**3 / taken[dtype])
     device._warn.cache_clear()
     return taken
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import time
-from functools import cache
+from functools import cache, lru_cache
 
 import torch
+from torch import Tensor
 
 from vjepa2_ac.config import ModelConfig, TrainingConfig
 from vjepa2_ac.errors import InputError
@@ -17,6 +19,8 @@ _log = logging.getLogger(__name__)
 
 PRECISIONS = {"bf16": torch.bfloat16, "fp16": torch.float16, "fp32": torch.float32}
 _BF16_FROM = (8, 0)  # compute capability; PyTorch's is_bf16_supported includes emulation, which is slower than fp32
+_CEILING_S = 0.2
+_CUDA_MATRIX, _CPU_MATRIX = 8192, 512
 _SLOW = 2.0  # times as long as in float32: of a CPU that computes bfloat16 without instructions for it
 
 
@@ -57,9 +61,8 @@ def computing_device(training: TrainingConfig) -> torch.device:
         raise InputError(where=where, found="true, on a CPU", needed="a CUDA device", fix=fix)
     device = torch.device("cpu") if on_cpu else torch.device("cuda", cuda_index())
     if training.precision == "bf16":  # fp32 is for float32 weights only, and fp16 casts any weights
-        _require_bf16(device, where="training.precision", found="bf16", fix="Set training.precision=fp16")
-        if on_cpu:
-            _warn("training.precision: bf16", "training.precision=fp32 with model.dtype=float32")
+        fix = f"Set training.precision={'fp32 with model.dtype=float32' if on_cpu else 'fp16'}"
+        _require_bf16(device, where="training.precision", found="bf16", fix=fix)
     if training.compile == "blocks":
         require_compiler(device.type, where="training.compile")
     return device
@@ -75,8 +78,6 @@ def require_type_of_weights(model: ModelConfig, device: torch.device) -> None:
     """
     if model.dtype == "bfloat16":
         _require_bf16(device, where="model.dtype", found="bfloat16", fix="Set model.dtype=float32")
-        if device.type == "cpu":
-            _warn("model.dtype: bfloat16", "model.dtype=float32")
 
 
 def slow_bf16() -> str | None:
@@ -84,10 +85,27 @@ def slow_bf16() -> str | None:
 
     Measured here: which instructions a CPU has, and which of them PyTorch uses, no list of names tells.
     """
-    bf16, fp32 = _product_ms(torch.bfloat16), _product_ms(torch.float32)
+    cpu = torch.device("cpu")
+    bf16, fp32 = (2e3 * _CPU_MATRIX**3 / matmul_speed(cpu, dtype) for dtype in (torch.bfloat16, torch.float32))
     if bf16 < _SLOW * fp32:
         return None
     return f"a product of matrices takes {bf16:.3g} ms on this CPU, {fp32:.3g} ms in float32 ({bf16 / fp32:.0f} times)"
+
+
+@lru_cache(maxsize=8)
+def matmul_speed(device: torch.device, dtype: torch.dtype) -> float:
+    """Return the FLOPs per second of a large matrix product, the best within a fraction of a second.
+
+    Measured once per device and type in a program: load by other programs affects it.
+    """
+    size = _CUDA_MATRIX if device.type == "cuda" else _CPU_MATRIX
+    generator = torch.Generator(device).manual_seed(0)  # its own, so that training's random numbers do not change
+    matrix = torch.randn(size, size, device=device, generator=generator).to(dtype)
+    _product_s(matrix)  # warm-up
+    best, ends = math.inf, time.perf_counter() + _CEILING_S
+    while best == math.inf or time.perf_counter() < ends:
+        best = min(best, _product_s(matrix))
+    return 2 * size**3 / best
 
 
 def has_bf16() -> bool:
@@ -107,6 +125,9 @@ def autocast(training: TrainingConfig, device: torch.device) -> torch.autocast:
 
 
 def _require_bf16(device: torch.device, *, where: str, found: str, fix: str) -> None:
+    """Refuse bfloat16 where a GPU only emulates it; on a CPU that is slow in it, say so."""
+    if device.type == "cpu":
+        _warn(f"{where}: {found}", fix)
     if device.type != "cuda" or has_bf16():
         return
     major, minor = torch.cuda.get_device_capability(cuda_index())
@@ -118,16 +139,17 @@ def _require_bf16(device: torch.device, *, where: str, found: str, fix: str) -> 
 @cache  # once
 def _warn(found: str, fix: str) -> None:
     if slow := slow_bf16():
-        _log.warning("%s: %s. Set %s", found, slow, fix)
+        _log.warning("%s: %s. %s", found, slow, fix)
 
 
-@cache
-def _product_ms(dtype: torch.dtype) -> float:
-    """Return the milliseconds of one product of a small model's size: the best of a few."""
-    left, right = torch.ones(1024, 192, dtype=dtype), torch.ones(192, 768, dtype=dtype)
-    taken: list[float] = []
-    while len(taken) < 3 or (len(taken) < 20 and sum(taken) < 100):
-        started = time.perf_counter()
-        left @ right
-        taken.append(1e3 * (time.perf_counter() - started))
-    return min(taken)
+def _product_s(matrix: Tensor) -> float:
+    _wait_for(matrix.device)
+    started = time.perf_counter()
+    torch.mm(matrix, matrix)
+    _wait_for(matrix.device)
+    return time.perf_counter() - started
+
+
+def _wait_for(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)

@@ -12,18 +12,18 @@ import torch
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.data.clips.clip_reader import no_clips
+from vjepa2_ac.distributed import device
+from vjepa2_ac.distributed.device import matmul_speed
 from vjepa2_ac.episode import POSE_WIDTHS, Batch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.training.cost.flops import clip_flops
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.monitoring import throughput
 from vjepa2_ac.training.monitoring.throughput import (
     MEASURED,
     Throughput,
     TimedBatches,
     Update,
-    matmul_speed,
     peak_memory_gb,
 )
 
@@ -88,7 +88,7 @@ def test_the_ceiling_is_the_best_product_that_was_timed(clock: list[float], monk
 
     monkeypatch.setattr(torch, "mm", product)
     speed = matmul_speed.__wrapped__(CPU, torch.float32)
-    assert speed == pytest.approx(2 * throughput._CPU_MATRIX**3 / 0.05)
+    assert speed == pytest.approx(2 * device._CPU_MATRIX**3 / 0.05)
 
 
 def test_measuring_the_ceiling_leaves_the_random_numbers_alone() -> None:

@@ -14,10 +14,8 @@ from __future__ import annotations
 
 import math
 import resource
-import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -25,16 +23,13 @@ from torch.distributed.tensor import DTensor
 
 from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.data.clips.prefetch import prefetch_next
-from vjepa2_ac.distributed.device import PRECISIONS
+from vjepa2_ac.distributed.device import PRECISIONS, matmul_speed
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.training.cost.flops import clip_flops
 from vjepa2_ac.training.monitoring.stopwatch import Stopwatch
 
 MEASURED = frozenset({"data_wait_share", "samples_per_second", "tokens_per_second", "mfu", "memory_gb"})
 """Metrics of the machine: they differ between identical runs."""
-
-_CEILING_S = 0.2
-_CUDA_MATRIX, _CPU_MATRIX = 8192, 512
 
 
 class TimedBatches:
@@ -144,35 +139,6 @@ def peak_memory_gb(device: torch.device) -> float:
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device) / 1e9
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9  # Linux counts in KiB
-
-
-@lru_cache(maxsize=8)
-def matmul_speed(device: torch.device, dtype: torch.dtype) -> float:
-    """Return the FLOPs per second of a large matrix product, the best within a fraction of a second.
-
-    Measured once per device and type in a program: load by other programs affects it.
-    """
-    size = _CUDA_MATRIX if device.type == "cuda" else _CPU_MATRIX
-    generator = torch.Generator(device).manual_seed(0)  # its own, so that training's random numbers do not change
-    matrix = torch.randn(size, size, device=device, generator=generator).to(dtype)
-    _product_s(matrix)  # warm-up
-    best, ends = math.inf, time.perf_counter() + _CEILING_S
-    while best == math.inf or time.perf_counter() < ends:
-        best = min(best, _product_s(matrix))
-    return 2 * size**3 / best
-
-
-def _product_s(matrix: Tensor) -> float:
-    _wait_for(matrix.device)
-    started = time.perf_counter()
-    torch.mm(matrix, matrix)
-    _wait_for(matrix.device)
-    return time.perf_counter() - started
-
-
-def _wait_for(device: torch.device) -> None:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
 
 
 def _norm(tensors: list[Tensor]) -> float:
