@@ -57,7 +57,7 @@ def test_every_path_knob_knows_the_users_home(key: str, monkeypatch: pytest.Monk
     monkeypatch.setenv("HOME", "/home/of/mine")
     assert read(key, "~/x/") == "/home/of/mine/x"
     assert read(key, "./~/x") == "./~/x", "a folder may be called so"
-    for wrong in ("~nobody-at-all/x", " ", "a\0b", "gs:/bucket/x"):
+    for wrong in ("~nobody-at-all/x", " ", "gs:/bucket/x"):
         with pytest.raises(InputError, match=rf"  {key}: "):
             read(key, wrong)
 

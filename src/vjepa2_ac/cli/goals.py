@@ -139,7 +139,7 @@ def _recording(options: argparse.Namespace, *, is_film: bool) -> tuple[Recording
         from vjepa2_ac.planning.demonstrations.recording import recording_of_film
 
         return recording_of_film(Path(options.source)), options.stride
-    config = read_config(options.source, options.overrides, of_run=True)
+    config = read_config(options.source, options.overrides)
     stride = options.stride or config.data.stride
     if stride == "auto":
         found, fix = "auto", "Say how many control steps a model step has: --stride 4"

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vjepa2_ac import output, places
+from vjepa2_ac import places
 from vjepa2_ac.cli.options import (
     Commands,
     add_checkpoint,
@@ -111,7 +111,6 @@ def _record(options: argparse.Namespace) -> int:
     from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
     from vjepa2_ac.simulation.recording.recorded_task import default_steps
 
-    output.never_wait()
     task = None if options.task == "reach" else options.task
     spec = record_of_options(RecordingSpec, options, task=task, steps=options.steps or default_steps(task))
     episodes, workers = options.episodes or 40, options.workers or 1

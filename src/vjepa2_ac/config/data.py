@@ -338,17 +338,3 @@ class DataConfig(Section):
     def with_stride(self, stride: int) -> DataConfig:
         """Return the config with a calibrated stride."""
         return self.model_copy(update={"stride": stride})
-
-
-def without_sections_of_others(values: Any) -> Any:
-    """Drop, from the values of a data section, those of other forms of data with their defaults.
-
-    Earlier versions wrote them for each run. A cache is used in place of any form: there all are dropped.
-    """
-    kind = DataConfig.kinds.get(source_of(values))
-    if not isinstance(values, dict) or kind is None:
-        return values
-    others = {name: one for other in DataConfig.kinds.values() for name, one in other.own_sections().items()}
-    foreign = {name: one for name, one in others.items() if name in values and name not in kind.model_fields}
-    unused = {name for name, one in foreign.items() if kind.is_cache or values[name] == one().model_dump(mode="json")}
-    return {name: value for name, value in values.items() if name not in unused}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.resources
 import json
 import os
 import re
@@ -12,15 +13,13 @@ from typing import Any
 import yaml  # to write: `storage.structured` reads
 from pydantic import ValidationError
 
-from vjepa2_ac.config import Config
-from vjepa2_ac.config.data import without_sections_of_others
+from vjepa2_ac.config import Config, DataConfig
 from vjepa2_ac.config.diagnostics import wrong_values
-from vjepa2_ac.config.gone import GONE, take_gone
-from vjepa2_ac.config.packaged import config_path
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage.structured import parse_yaml, require_shallow
+from vjepa2_ac.places import BUILTIN
+from vjepa2_ac.storage.structured import parse_yaml
 
-_MOST_BYTES = 4 << 20  # of a config: data.exclude may name thousands of episodes
+_PACKAGED = Path(str(importlib.resources.files("vjepa2_ac"))) / "assets" / "configs"
 
 
 def load_config(config: str | Path | Mapping[str, Any], overrides: Iterable[str] = ()) -> Config:
@@ -42,26 +41,24 @@ def load_config(config: str | Path | Mapping[str, Any], overrides: Iterable[str]
     return parse_config(_overridden(_read_yaml(config_path(config)), overrides), where=str(config))
 
 
-def load_config_of_run(path: Path, overrides: Iterable[str] = ()) -> Config:
-    """Read the config of a run that was made: knobs that are gone since then are passed over, in use or not.
-
-    It may be one of the package, as for `load_config`.
-
-    Raises:
-        InputError: As `load_config`.
-    """
-    values = _read_yaml(config_path(path))
-    take_gone(values)
-    return parse_config(_overridden(values, overrides), where=str(path))
+def packaged_configs() -> dict[str, str]:
+    """Return the first sentence of each config that comes with the package, by name."""
+    heads = {path.stem: path.read_text(encoding="utf-8").split("\n\n")[0] for path in _PACKAGED.glob("*.yaml")}
+    return {name: re.sub(r"\n?# ?", " ", head).split(". ")[0].strip(" .:\n") for name, head in sorted(heads.items())}
 
 
-def gone_in_use(path: Path) -> dict[str, Any]:
-    """Return the knobs that are gone and that the run of a config was made with, by dotted key.
+def config_path(name: str | Path) -> Path:
+    """Return the file of a config: of `builtin:NAME` that of the package, else the path itself.
 
     Raises:
-        InputError: The file cannot be read.
+        InputError: The package has no config of that name.
     """
-    return take_gone(_read_yaml(path))
+    if not str(name).startswith(BUILTIN):
+        return Path(name)
+    if (known := str(name).removeprefix(BUILTIN)) not in packaged_configs():
+        needed = f"one of {', '.join(f'{BUILTIN}{one}' for one in packaged_configs())}"
+        raise InputError(where=str(name), found="no config of that name comes with the package", needed=needed)
+    return _PACKAGED / f"{known}.yaml"
 
 
 def config_from(values: Mapping[str, Any], overrides: Iterable[str] = (), *, where: str) -> Config:
@@ -74,22 +71,15 @@ def config_from(values: Mapping[str, Any], overrides: Iterable[str] = (), *, whe
 
 
 def parse_config(values: Mapping[str, Any], *, where: str) -> Config:
-    """Validate plain values, as YAML or JSON gives them; a knob that is gone may stand there where it is off.
+    """Validate plain values, as YAML or JSON gives them.
 
     Raises:
         InputError: Names every key that is wrong, all at once.
     """
-    plain = json.loads(_as_json(values, where))
-    if "data" in plain:
-        plain["data"] = without_sections_of_others(plain["data"])
-    lines = [f"{key}: {GONE[key]}; leave it out" for key in take_gone(plain)]
     try:
-        config = Config.model_validate_json(json.dumps(plain))
+        return Config.model_validate_json(_as_json(values, where))
     except ValidationError as error:
-        lines += wrong_values(plain, error)
-    else:
-        if not lines:
-            return config
+        lines = wrong_values(error)
     found = f"{len(lines)} value{'s are' if len(lines) > 1 else ' is'} wrong\n  " + "\n  ".join(lines) + "\n"
     raise InputError(where=where, found=found, fix="`vjepa2-ac config schema` lists every key with its range")
 
@@ -144,16 +134,12 @@ _Dumper.add_implicit_resolver("!number", re.compile(r"^[-+]?[\d_]*\.?[\d_]*[eE][
 
 def _read_yaml(path: Path) -> dict[str, Any]:
     try:
-        with path.open("rb") as file:  # which may be a pipe
-            data = file.read(_MOST_BYTES + 1)
-        text = data.decode()
+        text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         fix = "`vjepa2-ac init` writes one for your data; `vjepa2-ac config list` shows those of the package"
         raise InputError(where=str(path), found="no such file", needed="a config", fix=fix) from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(where=str(path), found=f"cannot be read ({error})", needed="a YAML file") from None
-    if len(data) > _MOST_BYTES:
-        raise InputError(where=str(path), found=f"more than {_MOST_BYTES:,} bytes", needed="a config")
     values = parse_yaml(text, where=str(path))
     if not isinstance(values, dict):
         found = "nothing" if values is None else f"a {type(values).__name__}"
@@ -163,7 +149,6 @@ def _read_yaml(path: Path) -> dict[str, Any]:
 
 def _as_json(values: Mapping[str, Any], where: str) -> str:
     """Return values as a file would hold them: a Path is text."""
-    require_shallow(dict(values), where=where)
     try:
         return json.dumps(dict(values), default=os.fspath)
     except (TypeError, ValueError) as error:
@@ -188,4 +173,8 @@ def _set(values: dict[str, Any], keys: list[str], value: Any, override: str) -> 
             found = f"{'.'.join(keys[: depth + 1])} is a value"
             raise InputError(where=f"override {override}", found=found, needed="a section")
         values = inner
+    if keys[-2:] == ["data", "source"] and value != values.get("source", "rlds"):
+        others = [kind for name, kind in DataConfig.kinds.items() if name != value]
+        for section in {section for kind in others for section in kind.own_sections()}:
+            values.pop(section, None)  # of the form of data that it replaces
     values[keys[-1]] = value

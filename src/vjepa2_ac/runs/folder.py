@@ -29,14 +29,7 @@ from pathlib import Path
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.effects import Affects, mark_of
-from vjepa2_ac.config.gone import GONE
-from vjepa2_ac.config.loading import (
-    changed_keys,
-    config_as_flat_dict,
-    config_as_yaml,
-    gone_in_use,
-    load_config_of_run,
-)
+from vjepa2_ac.config.loading import changed_keys, config_as_flat_dict, config_as_yaml, load_config
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.places import is_url, literal
 from vjepa2_ac.runs.checkpoint import remove_leavings
@@ -144,8 +137,7 @@ def config_changes(config: Config) -> list[str]:
     old = read_run_config(folder)
     before, now = config_as_flat_dict(old), config_as_flat_dict(config)
     keys = [key for key in changed_keys(old, config) if key != "run_dir"]
-    gone = [f"{key}: {json.dumps(value)} -> null" for key, value in gone_in_use(folder / CONFIG).items()]
-    return [*(f"{key}: {json.dumps(before.get(key))} -> {json.dumps(now.get(key))}" for key in keys), *gone]
+    return [f"{key}: {json.dumps(before.get(key))} -> {json.dumps(now.get(key))}" for key in keys]
 
 
 def is_run(subject: str) -> bool:
@@ -154,7 +146,7 @@ def is_run(subject: str) -> bool:
 
 
 def read_run_config(folder: Path) -> Config:
-    """Return the config of a run. What it says of knobs that are gone is passed over: only training asks for them.
+    """Return the config of a run.
 
     Raises:
         InputError: Not the folder of a run.
@@ -163,7 +155,7 @@ def read_run_config(folder: Path) -> Config:
         found = "no config.yaml" if folder.is_dir() else "no such folder"
         needed = "the folder of a run, which `vjepa2-ac train CONFIG` makes"
         raise InputError(where=str(folder), found=found, needed=needed)
-    return load_config_of_run(folder / CONFIG, [f"run_dir={json.dumps(literal(folder))}"])
+    return load_config(folder / CONFIG, [f"run_dir={json.dumps(literal(folder))}"])
 
 
 def places_elsewhere(config: Config) -> list[str]:
@@ -213,11 +205,6 @@ def _paths(config: Config) -> list[str]:
 
 
 def _refuse_another_config(folder: Path, config: Config) -> None:
-    if gone := gone_in_use(folder / CONFIG):
-        found = "a run that was trained with " + "; ".join(f"{key}, {GONE[key]}" for key in gone)
-        fix = "Set another run_dir for a new run, or add --allow-config-change to go on without it; evaluate,"
-        fix += " plan and export take this one as it is"
-        raise InputError(where=str(folder), found=found, needed="a run whose every knob is there", fix=fix)
     changed = changed_keys(read_run_config(folder), config)
     differing = [key for key in changed if Affects.RUN in mark_of(key, Config)]
     if differing:

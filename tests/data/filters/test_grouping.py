@@ -15,7 +15,6 @@ from memory_source import MemorySource
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.clips import dataset as opening
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
-from vjepa2_ac.data.filters import bounded_match
 from vjepa2_ac.data.filters.grouping import split_hash
 from vjepa2_ac.data.index.episode_table import EpisodeTable
 from vjepa2_ac.data.inspection.check import check_data
@@ -106,17 +105,6 @@ def test_a_field_that_is_not_there_is_refused_with_those_that_are(monkeypatch: p
 def test_a_pattern_without_one_group_is_refused_with_the_config(pattern: str) -> None:
     with pytest.raises(ValidationError, match="split_by"):
         config_of(split_by=pattern)
-
-
-def test_a_pattern_that_would_run_for_ever_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bounded_match, "LONGEST_S", 0.5)
-    with pytest.raises(InputError, match=r"split_by: \(\(\?:a\+\)\+\)b.*not done"):
-        opened(monkeypatch, ["a" * 64, "a" * 65], split_by="((?:a+)+)b")
-
-
-def test_matching_takes_the_group_or_none_of_any_text() -> None:
-    texts = ["küche/1", 'quo"te/2', "none", "line\nbreak/3"]  # codespell:ignore te
-    assert bounded_match.first_groups(r"/(\d)$", texts, where="here") == ["1", "2", None, "3"]
 
 
 def test_a_split_without_groups_says_that_groups_are_drawn(monkeypatch: pytest.MonkeyPatch) -> None:

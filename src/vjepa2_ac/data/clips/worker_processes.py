@@ -9,8 +9,6 @@ import threading
 from collections.abc import Iterable
 from multiprocessing import forkserver, resource_tracker
 
-from vjepa2_ac import output
-
 
 def end_workers(workers: Iterable[multiprocessing.process.BaseProcess]) -> None:
     """Kill workers that did not end on request: blocked by a clip, and ignoring SIGTERM."""
@@ -44,7 +42,6 @@ def end_with_the_run(_worker: int) -> None:
     if run is None:
         raise ValueError("not in a worker")
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the run, which ends its workers
-    output.never_wait()  # a warning that nobody reads must not block the batch
 
     def watch() -> None:
         run.join()

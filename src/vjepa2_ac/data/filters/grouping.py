@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Bool, Int, UInt64
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.filters.bounded_match import first_groups
 from vjepa2_ac.data.filters.exclusion import named
 from vjepa2_ac.data.index.episode_table import EpisodeTable, identity_hash
 from vjepa2_ac.errors import InputError
@@ -52,9 +51,7 @@ def _groups(table: EpisodeTable, members: Int[np.ndarray, " members"], split_by:
     if labels is not None:
         return [labels.of_episode(int(member)) for member in members]
     identities = [table.identity(int(member)) for member in members]
-    if pattern := IN_IDENTITY.get(split_by):
-        return [found.group(1) if (found := pattern.search(identity)) else None for identity in identities]
-    if re.fullmatch(r"[A-Za-z_]+", split_by):
+    if split_by not in IN_IDENTITY and re.fullmatch(r"[A-Za-z_]+", split_by):
         raise InputError(
             where=f"data.split_by: {split_by}",
             found=f"no such field; this data set has {', '.join(table.labels) or 'none of its own'}, and its identities"
@@ -62,7 +59,8 @@ def _groups(table: EpisodeTable, members: Int[np.ndarray, " members"], split_by:
             needed="a field, or a regular expression with one group for the identity"
             + (f", such as {identities[0]}" if identities else ""),
         )
-    return first_groups(split_by, identities, where=f"data.split_by: {split_by}")
+    pattern = IN_IDENTITY.get(split_by) or re.compile(split_by)
+    return [found.group(1) if (found := pattern.search(identity)) else None for identity in identities]
 
 
 def _without_group(table: EpisodeTable, lacking: list[int], members: int, split_by: str) -> InputError:

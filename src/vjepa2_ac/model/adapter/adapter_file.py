@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from vjepa2_ac.config import AdapterConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.targets import PEFT_NAMES
-from vjepa2_ac.storage.structured import message_of, read_json_object, require_quick, shown
+from vjepa2_ac.storage.structured import message_of, read_json_object, shown
 
 ADAPTER_FILE = "adapter_config.json"  # PEFT's name
 
@@ -51,8 +51,6 @@ def read_adapter_file(folder: Path, defaults: Mapping[str, Any]) -> AdapterConfi
     except ValidationError as error:
         problems = [f"{_peft_name(detail['loc'])}: {message_of(detail)}" for detail in error.errors()[:4]]
         raise _refused(path, "; ".join(problems)) from None
-    for pattern in (*config.rank_pattern, *config.alpha_pattern):
-        require_quick(pattern, where=str(path))
     return config
 
 

@@ -11,7 +11,6 @@ from torch import nn
 from vjepa2_ac.config import AdapterConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.predictor_network import PredictorNetwork
-from vjepa2_ac.storage.structured import require_quick
 
 ATTENTION = ("q", "k", "v", "o")
 MLP = ("fc1", "fc2")
@@ -124,7 +123,6 @@ def _check_saved(config: AdapterConfig, predictor: PredictorNetwork) -> None:
 
 def _check_patterns(knob: str, patterns: Mapping[str, object], adapted: Iterable[str]) -> None:
     for pattern in patterns:
-        require_quick(pattern, where=f"adapter.{knob}")
         if not any(_matches(pattern, name) for name in adapted):
             raise InputError(
                 where=f"adapter.{knob}",

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-import re
 import secrets
-import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -20,9 +18,6 @@ logger = logging.getLogger(__name__)
 
 _T = TypeVar("_T")
 
-_NETWORK_LIBRARIES = frozenset(
-    {"aiohttp", "http", "httpcore", "httpcore2", "httpx", "httpx2", "requests", "urllib", "urllib3"}
-)
 # 499 is Google's answer to cancelling an upload after a failed piece; gcsfs raises it instead of that failure.
 _PASSING_STATUS = frozenset({408, 425, 429, 499, *range(500, 600)})
 _NO_ACCESS = frozenset({401, 403, 407})
@@ -89,7 +84,7 @@ def with_retries(
         except (*_ABSENT, UserError):
             raise
         except Exception as error:
-            if not _comes_from_outside(error):
+            if _is_a_bug(error):
                 raise
             if not _passes(error):
                 raise _refused(where, error, access, doing) from error
@@ -98,8 +93,10 @@ def with_retries(
             before, failures = progress(), failures + 1
             wait_s, seconds = policy.wait_s(failures), time.monotonic() - begin
             if failures >= policy.attempts or seconds + wait_s > policy.total_s:
-                raise _given_up(where, error, failures, seconds) from error
-            _say(failures, "%s: %s; trying again in %.1f s", where, _words(error), wait_s)
+                found = f"not reached in {failures} attempts over {seconds:.0f} s; the last: {_summary(error)}"
+                fix = "Check the network, and start again: a run goes on from its last checkpoint"
+                raise UnreachableError(where=where, found=found, fix=fix) from error
+            _say(failures, "%s: %s; trying again in %.1f s", where, _summary(error), wait_s)
         time.sleep(wait_s)
 
 
@@ -114,20 +111,17 @@ def quietly() -> Iterator[None]:
 
 
 _quiet = ContextVar("_quiet", default=False)
+_last_warning_s = [-_WARNING_INTERVAL_S]
 
 
 def _say(failures: int, text: str, *arguments: object) -> None:
     """Log a failure; as a warning from the third of a call on, at most once in half a minute."""
     now = time.monotonic()
-    is_warning = (
-        failures >= _FAILURES_BEFORE_WARNING and now - _last_warning_s[0] > _WARNING_INTERVAL_S and not _quiet.get()
-    )
+    is_late = failures >= _FAILURES_BEFORE_WARNING and now - _last_warning_s[0] > _WARNING_INTERVAL_S
+    is_warning = is_late and not _quiet.get()
     if is_warning:
         _last_warning_s[0] = now
     logger.log(logging.WARNING if is_warning else logging.INFO, text, *arguments)
-
-
-_last_warning_s = [-_WARNING_INTERVAL_S]
 
 
 def status_of(error: BaseException) -> int | None:
@@ -140,18 +134,9 @@ def status_of(error: BaseException) -> int | None:
     return 403 if isinstance(error, PermissionError) or str(error).startswith("Forbidden") else None  # as gcsfs says
 
 
-def _comes_from_outside(error: Exception) -> bool:
-    """Distinguish external failures from bugs."""
-    of_the_system = isinstance(error, OSError | ValueError | EOFError)
-    return of_the_system or status_of(error) is not None or _is_of_network(error) or _is_of_google_login(error)
-
-
-def _is_of_network(error: Exception) -> bool:
-    return any(kind.__module__.split(".")[0] in _NETWORK_LIBRARIES for kind in type(error).__mro__)
-
-
-def _is_of_google_login(error: Exception) -> bool:
-    return any(kind.__module__.startswith("google.auth") for kind in type(error).__mro__)
+def _is_a_bug(error: Exception) -> bool:
+    """Return whether it is an error of Python's own that no network causes, such as a TypeError."""
+    return type(error).__module__ == "builtins" and not isinstance(error, OSError | ValueError | EOFError)
 
 
 def _passes(error: Exception) -> bool:
@@ -160,29 +145,24 @@ def _passes(error: Exception) -> bool:
         return status in _PASSING_STATUS
     if _is_of_google_login(error):
         return type(error).__name__ == "TransportError" or bool(getattr(error, "retryable", False))
-    # JSON: a truncated listing. Errors in the user's JSON are found elsewhere.
-    kinds = TimeoutError | ConnectionError | EOFError | socket.gaierror | json.JSONDecodeError
-    return isinstance(error, kinds) or _is_of_network(error)
+    # JSON: a truncated listing. A file is said to exist where a condition of the server's is not met.
+    return isinstance(error, json.JSONDecodeError) or not isinstance(error, ValueError | FileExistsError)
+
+
+def _is_of_google_login(error: Exception) -> bool:
+    return type(error).__module__.startswith("google.auth")
 
 
 def _refused(where: str, error: Exception, access: str, doing: str) -> RefusedError:
     if status_of(error) in _NO_ACCESS or _is_of_google_login(error):
-        return RefusedError(where=where, found=f"no permission ({_words(error)})", fix=access)
-    return RefusedError(where=where, found=f"cannot be {doing} ({_words(error)})", fix="Check the address")
+        return RefusedError(where=where, found=f"no permission ({_summary(error)})", fix=access)
+    return RefusedError(where=where, found=f"cannot be {doing} ({_summary(error)})", fix="Check the address")
 
 
-def _given_up(where: str, error: Exception, attempts: int, seconds: float) -> UnreachableError:
-    return UnreachableError(
-        where=where,
-        found=f"not reached in {attempts} attempts over {seconds:.0f} s; the last: {_words(error)}",
-        fix="Check the network, and start again: a run goes on from its last checkpoint",
-    )
-
-
-def _words(error: Exception) -> str:
+def _summary(error: Exception) -> str:
     """Return a library's error in one line."""
     status = status_of(error)
-    text = re.sub(r"\s+", " ", str(getattr(error, "message", "") or error)).strip()
+    text = " ".join(str(getattr(error, "message", "") or error).split())
     text = text if len(text) <= _LONGEST_SUMMARY else f"{text[:_LONGEST_SUMMARY]}…"
     name = "time-out" if isinstance(error, TimeoutError) else type(error).__name__
     return ": ".join(part for part in (f"HTTP {status}" if status else name, text) if part)

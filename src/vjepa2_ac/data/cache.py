@@ -1,14 +1,19 @@
-"""Cached reads of an episode's files, whole or in parts: remote data is fetched once."""
+"""The cache of remote data on this machine: files of episodes, whole or in parts, are fetched once."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 from vjepa2_ac import storage
-from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.cache.block_cached_file import BlockCachedFile
-from vjepa2_ac.data.cache.disk_cache import fetched_data
+from vjepa2_ac.config import DataConfig, DiskCacheConfig
+from vjepa2_ac.data.index.index_cache import cache_folder
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage.block_file import BlockCachedFile, DiskCache
+
+
+def fetched_data(config: DiskCacheConfig) -> DiskCache:
+    """Return the cache of fetched data: one for all sources and runs, with one limit."""
+    return DiskCache(cache_folder(config) / "remote", int(config.limit_gb * 1e9))
 
 
 class EpisodeFiles:

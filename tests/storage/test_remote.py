@@ -1,19 +1,20 @@
-"""Remote reads: network failures are retried, or reported in time; with a real server that fails."""
+"""Remote reads: network failures are retried, or reported in time; with a real server that fails. And who logs in."""
 
 import importlib
 import os
-import pickle
+import re
 import subprocess
 import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 
 from gcs import Failure, Gcs
 from vjepa2_ac import storage
-from vjepa2_ac.errors import InputError, UnreachableError
-from vjepa2_ac.storage.remote import retries
+from vjepa2_ac.errors import InputError, UnreachableError, pip_install
+from vjepa2_ac.storage import remote, retries
 
 DATA = bytes(range(256)) * 400
 FILE = "gs://bucket/folder/file"
@@ -102,22 +103,6 @@ def test_an_absent_file_is_absent_and_not_asked_for_again(gcs: Gcs, file: str) -
         storage.open_to_read(f"{file}.none")
 
 
-@pytest.mark.usefixtures("gcs")
-def test_a_bucket_that_does_not_exist_is_named() -> None:
-    for action in (storage.exists, storage.list_names, storage.read_bytes, storage.open_to_read):
-        with pytest.raises(UnreachableError, match=r"there is no bucket nobodys. Check its name"):
-            action("gs://nobodys/folder/file")
-
-
-@pytest.mark.usefixtures("gcs")
-def test_an_absent_file_in_a_bucket_that_may_not_be_listed_is_absent(gcs: Gcs) -> None:
-    gcs.put("unlisted/a", b"1")
-    gcs.fail_next(403, match=r"/unlisted/o\?.*maxResults=1")
-    with pytest.raises(FileNotFoundError):
-        storage.read_range("gs://unlisted/b", 0, 1)
-    assert gcs.faults_left == 0
-
-
 def test_a_read_past_the_end_gives_what_there_is(gcs: Gcs, file: str) -> None:
     size = len(DATA)
     assert storage.read_range(file, size - 3, 10) == DATA[-3:]
@@ -138,7 +123,7 @@ def test_ranges_are_read_at_the_same_time_and_come_in_order(gcs: Gcs, file: str)
 
 
 def test_a_long_read_comes_in_pieces(gcs: Gcs, file: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vjepa2_ac.storage.remote.ranged_reads._PIECE_BYTES", 1000)
+    monkeypatch.setattr("vjepa2_ac.storage.remote._PIECE_BYTES", 1000)
     assert storage.read_bytes(file) == DATA
     assert len(gcs.reads()) == -(-len(DATA) // 1000)
     assert storage.read_ranges(file, [(5, 2500), (7, 3)]) == [DATA[5:2505], DATA[7:10]]
@@ -186,22 +171,21 @@ def test_a_worker_process_reads_on_its_own(file: str) -> None:
     subprocess.run([sys.executable, "-W", "ignore", "-c", code, file], check=True, timeout=120)
 
 
-def test_an_unreachable_error_survives_the_trip_from_a_worker() -> None:
-    error = UnreachableError(where="gs://a", found="nothing", fix="Wait")
-    copy = pickle.loads(pickle.dumps(error))  # noqa: S301 - our own
-    assert (type(copy), str(copy)) == (UnreachableError, str(error))
-
-
 def test_a_url_that_nothing_reads_is_named() -> None:
     with pytest.raises(InputError, match=r"nothing reads ftpx://.*gs://, hf://, s3://"):
         storage.exists("ftpx://host/file")
 
 
-def test_a_missing_library_is_named_with_the_way_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "gcsfs", None)
+@pytest.mark.parametrize(("url", "extra"), [("gs://bucket/set", "gcs"), ("hf://datasets/one/set", "")])
+def test_a_missing_library_is_named_with_the_extra_that_brings_it(
+    url: str, extra: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(importlib.import_module("fsspec.registry"), "registry", {})
-    with pytest.raises(InputError, match=r"pip install .*\[gcs\]"):
-        storage.exists("gs://bucket/file")
+    monkeypatch.setattr(remote, "_filesystems", {})
+    monkeypatch.setitem(sys.modules, "gcsfs", None)
+    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
+    with pytest.raises(InputError, match=rf"is not installed\. Install it: {re.escape(pip_install(extra))}"):
+        storage.exists(url)
 
 
 def test_zonal_buckets_are_off_unless_the_user_wants_them(file: str) -> None:
@@ -213,3 +197,38 @@ def test_zonal_buckets_are_off_unless_the_user_wants_them(file: str) -> None:
     )
     environment = {name: value for name, value in os.environ.items() if name != "GCSFS_EXPERIMENTAL_ZB_HNS_SUPPORT"}
     subprocess.run([sys.executable, "-c", code, file], check=True, timeout=120, env=environment)
+
+
+# ---- who logs in ----
+
+
+@pytest.fixture
+def nobody(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A machine without any login."""
+    for name in ("STORAGE_EMULATOR_HOST", "GOOGLE_APPLICATION_CREDENTIALS"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("CLOUDSDK_CONFIG", str(tmp_path))
+    monkeypatch.setattr(remote, "_MACHINE", tmp_path / "product_name")
+    return tmp_path
+
+
+def test_google_is_asked_as_the_user_as_the_machine_or_as_nobody(nobody: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert remote.google_token() == "anon"
+    assert remote.login_hint("gs://a/b").startswith("You are not logged in. Log in with `gcloud auth application-de")
+    (nobody / "product_name").write_text("Some other machine\n")
+    assert remote.google_token() == "anon"
+    (nobody / "product_name").write_text("Google Compute Engine\n")
+    assert remote.google_token() == "cloud"
+    (nobody / "application_default_credentials.json").write_text("{}")
+    assert remote.google_token() == "google_default"
+    assert remote.login_hint("gcs://a/b").startswith("Log in with `gcloud")
+    (nobody / "application_default_credentials.json").unlink()
+    monkeypatch.setenv("GOOGLE_APPLICATION_CREDENTIALS", "key.json")
+    assert remote.google_token() == "google_default"
+    monkeypatch.setenv("STORAGE_EMULATOR_HOST", "http://127.0.0.1:1")
+    assert remote.google_token() == "anon", "an emulator is shown no login"
+
+
+def test_the_way_in_is_that_of_the_place() -> None:
+    assert "hf auth login" in remote.login_hint("hf://datasets/owner/name")
+    assert remote.login_hint("https://host/file") == "Check the login"

@@ -22,29 +22,24 @@ def from_hub(name: str, files: Sequence[str], *, where: str) -> Path:
         UnreachableError: The Hub cannot be reached, and the model is not in the cache.
         InputError: The Hub answers something else, or the disk is full.
     """
-    from huggingface_hub import snapshot_download
-    from huggingface_hub.errors import (
-        GatedRepoError,
-        HfHubHTTPError,
-        LocalEntryNotFoundError,
-        RepositoryNotFoundError,
-        RevisionNotFoundError,
-    )
+    from huggingface_hub import errors, snapshot_download
 
     model, _, revision = name.removeprefix(HUB).partition("@")
     log_in = "for one that is not public, `hf auth login` or set HF_TOKEN"
     try:
         return Path(snapshot_download(model, revision=revision or None, allow_patterns=list(files)))
-    except GatedRepoError:
+    except errors.GatedRepoError:
         fix = f"Ask for it on its page; then {log_in}"
         raise RefusedError(where=where, found="a model that must be asked for", needed="access", fix=fix) from None
-    except (RepositoryNotFoundError, RevisionNotFoundError) as error:
-        found = "no such revision" if isinstance(error, RevisionNotFoundError) else "no such model, or none for you"
+    except (errors.RepositoryNotFoundError, errors.RevisionNotFoundError) as error:
+        found = (
+            "no such revision" if isinstance(error, errors.RevisionNotFoundError) else "no such model, or none for you"
+        )
         fix = f"Check the name (hf://owner/name@revision); {log_in}"
         raise RefusedError(where=where, found=found, fix=fix) from None
-    except LocalEntryNotFoundError:
+    except errors.LocalEntryNotFoundError:
         fix = "Check the network, or name a folder of this machine"
         raise UnreachableError(where=where, found="the Hub cannot be reached", fix=fix) from None
-    except (HfHubHTTPError, OSError, ValueError) as error:
-        said = (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
+    except (errors.HfHubHTTPError, OSError, ValueError) as error:
+        said = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise InputError(where=where, found=said, needed="the files of a model", fix="Check name and disk") from None

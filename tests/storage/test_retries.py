@@ -7,8 +7,8 @@ import pytest
 from google.auth.exceptions import RefreshError
 
 from vjepa2_ac.errors import UnreachableError
-from vjepa2_ac.storage.remote import retries
-from vjepa2_ac.storage.remote.retries import RetryPolicy, with_retries
+from vjepa2_ac.storage import retries
+from vjepa2_ac.storage.retries import RetryPolicy, with_retries
 
 AT_ONCE = RetryPolicy(attempts=3, first_wait_s=0.0, longest_wait_s=0.0)
 
@@ -50,6 +50,7 @@ class StatusError(Exception):
     ("error", "attempts", "words"),
     [
         (ConnectionResetError("gone"), 3, "not reached in 3 attempts"),
+        (OSError(5, "of a library that we do not know"), 3, "not reached in 3 attempts"),
         (TimeoutError(), 3, "the last: time-out"),
         (StatusError(503), 3, "HTTP 503: as another library says it"),
         (json.JSONDecodeError("Unterminated string", '{"items": [{"na', 12), 3, "JSONDecodeError: Unterminated"),
