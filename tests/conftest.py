@@ -107,7 +107,7 @@ def _gcs() -> Iterator[gcs_server.Gcs]:
 @pytest.fixture
 def gcs(_gcs: gcs_server.Gcs, monkeypatch: pytest.MonkeyPatch) -> gcs_server.Gcs:
     """A local Google Cloud Storage, empty; gs:// means it. What fails is tried again at once, 5 times in all."""
-    from vjepa2_ac.storage.remote import retries
+    from vjepa2_ac.storage import retries
 
     _gcs.wipe()
     monkeypatch.setenv("STORAGE_EMULATOR_HOST", _gcs.url)

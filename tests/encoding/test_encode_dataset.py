@@ -28,7 +28,7 @@ from vjepa2_ac.episode import Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.storage import writing
+from vjepa2_ac.storage import files as writing
 from vjepa2_ac.training.loop import train
 
 CAMERA = "exterior_1_left"

@@ -83,7 +83,7 @@ def add_to(commands: Commands) -> None:
 
 
 def _serve(options: argparse.Namespace) -> int:
-    from vjepa2_ac.storage.libraries import require_library
+    from vjepa2_ac.errors import require_library
 
     # Wrong words are told before what takes seconds is imported.
     require_overrides(options.overrides)

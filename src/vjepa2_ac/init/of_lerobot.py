@@ -47,7 +47,7 @@ def look_at_lerobot(path: str) -> FoundData:
     fields = _pose_fields(info, pose) if pose else _vector_fields(info, columns)
     velocity = next((name for name in columns if "joint_vel" in name and name.startswith("action")), None)
     success = next((name for name in info.features if "success" in name), None)
-    raw = read_json_object(info.where, needed="a description", allow_nan=True)
+    raw = read_json_object(info.where, needed="a description")
     frames = raw.get("total_frames")
     return FoundData(
         source="lerobot",
@@ -134,7 +134,7 @@ def _statistics(root: str) -> Iterator[Mapping[str, Any]]:
         with contextlib.suppress(OSError, UserError):
             data = storage.read_bounded(storage.join(root, name), _MOST_BYTES)
             for line in [data] if name.endswith(".json") else data.splitlines():
-                found = json_object(line, where=name, allow_nan=True)
+                found = json_object(line, where=name)
                 yield found.get("stats", found)
 
 

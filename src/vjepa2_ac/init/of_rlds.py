@@ -128,7 +128,7 @@ def _features(path: str) -> Iterator[tuple[str, _Feature]]:
     """Yield the features by their names in a record."""
     where = storage.join(path, "features.json")
     try:
-        content = read_json_object(where, needed="a description as TFDS writes it", allow_nan=True)
+        content = read_json_object(where, needed="a description as TFDS writes it")
     except FileNotFoundError:
         fix = "Name the features in the config by hand: `vjepa2-ac config text builtin:bridge` is an example"
         raise InputError(

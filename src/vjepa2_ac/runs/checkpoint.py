@@ -220,7 +220,7 @@ def written_state(checkpoint: Path) -> RunState:
     """
     path = checkpoint / STATE
     try:
-        values = read_json_object(path, needed=_NEEDED, fix=_FIX, allow_nan=True)  # a loss scale may be infinite
+        values = read_json_object(path, needed=_NEEDED, fix=_FIX)  # a loss scale may be infinite
     except OSError as error:
         raise InputError(where=str(path), found=f"cannot be read ({error})", needed=_NEEDED, fix=_FIX) from None
     if "clips_done" not in values:  # or the run would begin the row of clips again
@@ -232,7 +232,7 @@ def written_state(checkpoint: Path) -> RunState:
 def _another_step(checkpoint: Path, name: str) -> str | None:
     """Return the error of a checkpoint that is a copy of another one: its name and its state differ in the step."""
     try:
-        step = read_json_object(checkpoint / STATE, allow_nan=True).get("step")
+        step = read_json_object(checkpoint / STATE).get("step")
     except (OSError, InputError) as error:
         return f"no readable {STATE} ({error})"
     if type(step) is not int:

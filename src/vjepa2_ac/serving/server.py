@@ -12,12 +12,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, require_library
 from vjepa2_ac.serving.access import Access
 from vjepa2_ac.serving.prometheus import Histogram, counter, plain, text
 from vjepa2_ac.serving.wire import MOST_BYTES, pack
 from vjepa2_ac.serving.worker import GoneError, Worker
-from vjepa2_ac.storage.libraries import require_library
 
 if TYPE_CHECKING:  # PyTorch is imported with the model, when the server listens
     from vjepa2_ac.serving.session import Session

@@ -27,7 +27,7 @@ from vjepa2_ac.data.sources.rlds.writing.droid_writer import write_droid_rlds
 from vjepa2_ac.encoding.encode_dataset import encode_config
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import UnreachableError
-from vjepa2_ac.storage.remote import retries
+from vjepa2_ac.storage import retries
 
 LENGTHS = (14, 17, 15, 12)
 SIZE = (36, 64)

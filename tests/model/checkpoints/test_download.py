@@ -17,7 +17,7 @@ from vjepa2_ac.model.checkpoints import published
 from vjepa2_ac.model.checkpoints.download import download
 from vjepa2_ac.model.checkpoints.published import VIT_B, Published
 from vjepa2_ac.model.checkpoints.published_names import OFFICIAL
-from vjepa2_ac.storage.remote.retries import RetryPolicy
+from vjepa2_ac.storage.retries import RetryPolicy
 
 MADE_UP = Published(
     "made-up", "elsewhere.pt", "encoder", "v2.1", VIT_B, 384, "ema_encoder", 0.0001,

@@ -18,7 +18,7 @@ from vjepa2_ac.runs.checkpoint import RunState, checkpoint_name, newest_checkpoi
 from vjepa2_ac.runs.folder import check_run_folder
 from vjepa2_ac.runs.lock import RunLock
 from vjepa2_ac.runs.mirror.open_remote import Remote, open_remote
-from vjepa2_ac.storage.remote import filesystems
+from vjepa2_ac.storage import remote as filesystems
 
 PLACE = "gs://bucket/run"
 

@@ -15,7 +15,7 @@ from vjepa2_ac import storage
 from vjepa2_ac.errors import InputError, RefusedError, UnreachableError
 from vjepa2_ac.model.checkpoints.published import Published
 from vjepa2_ac.reporter import SILENT, Reporter
-from vjepa2_ac.storage.remote.retries import RetryPolicy, with_retries
+from vjepa2_ac.storage.retries import RetryPolicy, with_retries
 
 logger = logging.getLogger(__name__)
 

@@ -16,7 +16,7 @@ from vjepa2_ac.model.checkpoints.encoder_folder import encoder_in_folder
 from vjepa2_ac.model.checkpoints.meta_file import open_file
 from vjepa2_ac.model.checkpoints.published import published_as
 from vjepa2_ac.model.sizes import check_sizes
-from vjepa2_ac.storage.remote.hub import from_hub
+from vjepa2_ac.storage.hub import from_hub
 from vjepa2_ac.storage.structured import message_of
 
 logger = logging.getLogger(__name__)

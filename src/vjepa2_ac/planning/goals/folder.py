@@ -16,8 +16,8 @@ from vjepa2_ac.media.image_file import decode_image, encode_png
 from vjepa2_ac.planning.goals.sub_goals import GripperMode, SubGoal
 from vjepa2_ac.planning.input_checks import require_image
 from vjepa2_ac.storage import read_bounded, unreadable
+from vjepa2_ac.storage.files import folder_writer
 from vjepa2_ac.storage.structured import json_text, read_json_object, record_of, shown
-from vjepa2_ac.storage.writing import folder_writer
 
 logger = logging.getLogger(__name__)
 

@@ -21,7 +21,7 @@ from vjepa2_ac.runs.mirror.fetch import fetch_newest
 from vjepa2_ac.runs.mirror.remote_checkpoints import Listing, RemoteCheckpoints, complete
 from vjepa2_ac.runs.mirror.upload import RemoteUpdate
 from vjepa2_ac.storage import is_url, place, try_writing
-from vjepa2_ac.storage.remote.retries import quietly
+from vjepa2_ac.storage.retries import quietly
 
 logger = logging.getLogger(__name__)
 

@@ -108,7 +108,7 @@ def read_manifest(folder: Path) -> Manifest:
     """
     where = str(folder / MANIFEST)
     try:
-        content = read_json_object(folder / MANIFEST, most_bytes=_MOST_BYTES, allow_nan=True, fix=_AGAIN)
+        content = read_json_object(folder / MANIFEST, most_bytes=_MOST_BYTES, fix=_AGAIN)
     except (FileNotFoundError, NotADirectoryError):
         found = "an unfinished latent cache" if (folder / "episodes").is_dir() else "no latent cache"
         found = found if folder.is_dir() else f"no such folder, seen from {Path.cwd()}"
