@@ -157,7 +157,7 @@ def test_another_form_of_data_takes_the_place_of_that_in_the_file_with_its_knobs
     assert (cached.data.source, cached.data.is_cache) == ("latents", True)
     ported = load_config(write(tmp_path, resolved), ["data.lerobot.gripper_open=2", "data.source=lerobot"])
     assert ported.data.lerobot.gripper_open == 2
-    with pytest.raises(InputError, match=r"data\.lerobot: a knob of another data\.source"):
+    with pytest.raises(InputError, match=r"data\.lerobot: a section of source lerobot, and this is source rlds"):
         load_config(write(tmp_path, resolved), ["data.lerobot.gripper_open=2"])
 
 

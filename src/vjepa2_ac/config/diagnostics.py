@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Sequence
-from functools import cache
 from typing import Any
 
 from pydantic import ValidationError
@@ -47,12 +46,11 @@ def wrong_values(error: ValidationError) -> list[str]:
     found: dict[str, list[str]] = {}
     for detail in error.errors(include_url=False):
         if detail["type"] != "default_factory_not_called":  # a default that follows from another value, which is wrong
-            key = _key_of(detail["loc"])
+            key = _key_of(detail["loc"]) + ".source" * (detail["type"] == "union_tag_invalid")
             found.setdefault(key, []).append(_explain(key, detail))
     return [f"{key}: {_joined(lines)}".removeprefix(": ") for key, lines in found.items()]
 
 
-@cache
 def all_keys() -> list[str]:
     """Return the dotted keys of all sections and knobs."""
     paths = [key.split(".") for key in marks_of(Config)]
@@ -79,15 +77,19 @@ def _joined(lines: list[str]) -> str:
 def _explain(key: str, detail: Any) -> str:
     if detail["type"] == "missing":
         return "missing; it has no default"
+    if detail["type"] == "union_tag_invalid":
+        return f"Input should be {' or '.join(map(repr, DataConfig.kinds))} (found {detail['ctx']['tag']!r})"
     if detail["type"] != "extra_forbidden":
         return message_of(detail)
-    if key in all_keys():
-        return "a knob of another data.source"
     section, _, name = key.rpartition(".")
+    if key in all_keys():
+        owners = [source for source, kind in DataConfig.kinds.items() if name in kind.model_fields]
+        return f"a section of source {' or '.join(owners)}, and this is source {detail['loc'][-2]}"
     siblings = [one.rpartition(".")[2] for one in all_keys() if one.rpartition(".")[0] == section]
     prefix = f"{section}." if section else ""
     close = [prefix + one for one in difflib.get_close_matches(name, siblings, n=1)]
     elsewhere = [one for one in all_keys() if one.endswith(f".{name}")]
     also = [_ALSO_CALLED[name]] if name in _ALSO_CALLED else []
     meant = next(iter([*also, *close, *elsewhere]), None)
-    return f"unknown key; did you mean {meant}?" if meant else f"unknown key; known here: {', '.join(siblings)}"
+    hint = f"known here: {', '.join(siblings)}" if meant is None else f"did you mean {meant.removeprefix(prefix)}?"
+    return f"unknown key; {hint}"

@@ -13,7 +13,7 @@ from vjepa2_ac.storage.block_file import BlockCachedFile, DiskCache
 
 def fetched_data(config: DiskCacheConfig) -> DiskCache:
     """Return the cache of fetched data: one for all sources and runs, with one limit."""
-    return DiskCache(cache_folder(config) / "remote", int(config.limit_gb * 1e9))
+    return DiskCache(cache_folder(config) / "fetched", int(config.limit_gb * 1e9))
 
 
 class EpisodeFiles:

@@ -12,6 +12,7 @@ import logging
 import os
 import secrets
 import time
+import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -28,6 +29,7 @@ _CACHED_BLOCKS = 128
 
 _CHECK_SHARE = 0.02  # of the limit: after so many bytes of its own a process looks whether the limit is reached
 _KEPT_SHARE = 0.8  # of the limit, when it was: ten processes together do not come above it until the next look
+_CRC_BYTES = 4  # behind the data of an entry
 _PARTIAL = ".partial"
 _ABANDONED_S = 3600.0
 
@@ -129,31 +131,32 @@ class DiskCache:
         self._written, self._warned = 0, False
 
     def read(self, key: str) -> bytes | None:
-        """Return the entry of a key, or None; it counts as used now. An empty one, as a power cut leaves, is none."""
+        """Return the entry of a key, or None; it counts as used now. A damaged one, as a power cut leaves, is none."""
         path = self._path(key)
         try:
-            data = path.read_bytes()
+            content = path.read_bytes()
         except OSError:  # usually: absent
             return None
         with suppress(OSError):  # evicted meanwhile, or in a read-only folder
             os.utime(path)
-        return data or None
+        data, crc = content[:-_CRC_BYTES], content[-_CRC_BYTES:]
+        return data if crc == _crc(data) else None
 
     def write(self, key: str, data: bytes) -> None:
         """Store bytes under a key, replacing an old entry; a warning is logged if that is not possible."""
-        path = self._path(key)
-        if len(data) > self._limit * _KEPT_SHARE:
+        path, content = self._path(key), data + _crc(data)
+        if len(content) > self._limit * _KEPT_SHARE:
             return
         partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}{_PARTIAL}")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             try:
-                partial.write_bytes(data)
+                partial.write_bytes(content)
                 partial.replace(path)
             except OSError:
                 partial.unlink(missing_ok=True)
                 raise
-            self._written += len(data)
+            self._written += len(content)
             if self._written > self._limit * _CHECK_SHARE:
                 self._written = 0
                 self._evict()
@@ -193,6 +196,10 @@ class DiskCache:
                         yield stat.st_mtime_ns, stat.st_size, entry.path
                     elif time.time() - stat.st_mtime > _ABANDONED_S:
                         Path(entry.path).unlink()
+
+
+def _crc(data: bytes) -> bytes:
+    return zlib.crc32(data).to_bytes(_CRC_BYTES, "big")
 
 
 class BlockCachedFile(RangedFile):
