@@ -55,7 +55,7 @@ def test_every_field_of_a_state_comes_back(tmp_path: Path) -> None:
         ({"step": "10"}, "step: Input should be a valid integer (found '10')"),
         ({"step": -1}, "step: "),
         ({"step": True}, "step: "),
-        ({"step": 2**70}, "a whole number of 22 digits"),
+        ({"step": 2**70}, "step: Input should be"),
         ({"clips_done": None}, "clips_done: "),
         ({"clips_per_step": 0}, "clips_per_step: "),
         ({"processes": 0}, "processes: "),
