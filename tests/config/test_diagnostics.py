@@ -5,8 +5,7 @@ from typing import Any
 
 import pytest
 
-from vjepa2_ac.config.diagnostics import _ALSO_CALLED, all_keys
-from vjepa2_ac.config.loading import config_from
+from vjepa2_ac.config.loading import _ALSO_CALLED, all_keys, config_from
 from vjepa2_ac.errors import InputError
 
 MINIMAL = {"run_dir": "runs/x", "data": {"path": "d"}, "model": {"base": "b.pt"}}

@@ -12,9 +12,8 @@ from pydantic import BaseModel
 from copied_sets import WRITERS
 from run_fixtures import TINY
 from vjepa2_ac.config import Config, DataConfig, EncoderConfig, ModelSizes
-from vjepa2_ac.config.effects import Affects, knobs_that_affect, mark_of, marks_of, names_that_affect
 from vjepa2_ac.config.loading import changed_keys, config_as_yaml, parse_config
-from vjepa2_ac.config.section import Section
+from vjepa2_ac.config.section import Affects, Section, knobs_that_affect, mark_of, marks_of, names_that_affect
 from vjepa2_ac.data.filters import idle_ranges
 from vjepa2_ac.data.index.episode_table import EpisodeInfo, EpisodeTable
 from vjepa2_ac.data.index.index_cache import IndexKeys

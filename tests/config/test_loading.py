@@ -12,8 +12,8 @@ import yaml
 from paths import ROOT
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import AdapterConfig, CheckpointConfig, DataConfig, IdleConfig
-from vjepa2_ac.config.diagnostics import all_keys
 from vjepa2_ac.config.loading import (
+    all_keys,
     changed_keys,
     config_as_yaml,
     config_path,
