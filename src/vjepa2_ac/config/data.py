@@ -8,8 +8,18 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import AfterValidator, BeforeValidator, Field, GetCoreSchemaHandler, model_validator
 from pydantic_core import CoreSchema, core_schema
 
-from vjepa2_ac.config.effects import Affects
-from vjepa2_ac.config.section import OFF, Count, Local, NonNegative, Place, Positive, PositiveInt, Section, Share
+from vjepa2_ac.config.section import (
+    OFF,
+    Affects,
+    Count,
+    Local,
+    NonNegative,
+    Place,
+    Positive,
+    PositiveInt,
+    Section,
+    Share,
+)
 from vjepa2_ac.places import is_url
 
 # A serial number is a name, also where YAML takes it for a number.

@@ -8,8 +8,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from vjepa2_ac import places
-from vjepa2_ac.config.effects import Affects
-from vjepa2_ac.config.section import PositiveInt, Section, Share
+from vjepa2_ac.config.section import Affects, PositiveInt, Section, Share
 
 # Far beyond every such model (released: width 1408, depth 40, 1.3 billion weights): a file may claim any size.
 Width = Annotated[int, Field(ge=1, le=16_384)]

@@ -9,11 +9,10 @@ from pydantic import AfterValidator, Field, model_validator
 from vjepa2_ac import places
 from vjepa2_ac.config.data import DataConfig
 from vjepa2_ac.config.decoder import DecoderConfig
-from vjepa2_ac.config.effects import Affects
 from vjepa2_ac.config.model import AdapterConfig, ModelConfig
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.config.replay import ReplayConfig
-from vjepa2_ac.config.section import Section
+from vjepa2_ac.config.section import Affects, Section
 from vjepa2_ac.config.sources import RldsData  # noqa: F401 - all forms of data
 from vjepa2_ac.config.training import CheckpointConfig, TrackingConfig, TrainingConfig, ValidationConfig
 

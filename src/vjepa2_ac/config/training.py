@@ -6,9 +6,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from vjepa2_ac.config.effects import Affects
 from vjepa2_ac.config.section import (
     OFF,
+    Affects,
     Count,
     LocalOrBuiltin,
     NonNegative,

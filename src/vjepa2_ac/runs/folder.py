@@ -28,8 +28,8 @@ import sys
 from pathlib import Path
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.config.effects import Affects, mark_of
 from vjepa2_ac.config.loading import changed_keys, config_as_flat_dict, config_as_yaml, load_config
+from vjepa2_ac.config.section import Affects, mark_of
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.places import is_url, literal
 from vjepa2_ac.runs.checkpoint import remove_leavings

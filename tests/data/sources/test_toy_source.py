@@ -6,9 +6,9 @@ from itertools import islice
 import pytest
 
 from vjepa2_ac.config import Config, DataConfig
-from vjepa2_ac.config.effects import Affects, mark_of, marks_of
 from vjepa2_ac.config.loading import config_as_yaml, load_config, parse_config
 from vjepa2_ac.config.replay import ReplayConfig
+from vjepa2_ac.config.section import Affects, mark_of, marks_of
 from vjepa2_ac.data.clips.dataset import open_dataset
 from vjepa2_ac.data.clips.loader import training_loader
 from vjepa2_ac.errors import InputError

@@ -15,7 +15,7 @@ from jaxtyping import Int32
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig, LeRobotFields, RawDroidOptions, RldsFields
-from vjepa2_ac.config.effects import Affects, knobs_that_affect
+from vjepa2_ac.config.section import Affects, knobs_that_affect
 from vjepa2_ac.data.filters.broken_episodes import as_error, as_problem
 from vjepa2_ac.data.filters.idle_rules import kept_ranges
 from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable, NotATableError

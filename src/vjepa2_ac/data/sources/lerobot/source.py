@@ -9,7 +9,7 @@ from functools import cached_property, partial
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import LeRobotData
-from vjepa2_ac.config.effects import Affects, knobs_that_affect
+from vjepa2_ac.config.section import Affects, knobs_that_affect
 from vjepa2_ac.data.cache import fetched_data
 from vjepa2_ac.data.index.episode_table import EpisodeTable
 from vjepa2_ac.data.index.index_cache import IndexKeys, get_or_build
