@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from vjepa2_ac.config.planning import LimitsConfig
+from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.energy import distance
 from vjepa2_ac.planning.goals.key_frames import OF_MODEL_STEPS, gripper_key_frames
@@ -72,7 +72,7 @@ def choices(controller: Controller, arm: SimulatedArm, problem: TaskProblem) -> 
     for frame in (grasp, 1):
         yield shown.states[frame, :3] - start[:3]
         goal = controller.encoded(shown.frames[frame])
-        yield STEPS[int(distance(torch.stack(latents), goal, "l1").argmin())]
+        yield STEPS[int(distance(torch.stack(latents), goal, EnergyConfig()).argmin())]
         controller.reset(shown.frames[frame])
         controller.act(shown.frames[0], start)
         assert controller.decision is not None

@@ -59,7 +59,7 @@ class PlainCost:
             following = self._model.predict(latents, tried[:, :end], states.to(self._model.device))[:, -1:]
             latents = torch.cat([latents, following], dim=1)
             states = torch.cat([states, _poses_one_by_one(states[:, -1], actions[:, end - 1])[:, None]], dim=1)
-        return distance(latents[:, -1], self._goal, self._config.distance)
+        return distance(latents[:, -1], self._goal, self._config)
 
 
 class Bench:

@@ -20,7 +20,7 @@ PACKAGE = Path(vjepa2_ac.__file__).parent
 ORDERS: dict[str, list[str]] = {
     "": [
         "__init__ errors places output episode geometry distances intervals",
-        "spaces reporter",
+        "spaces reporter registry",
         "storage",
         "config",
         "media",

@@ -13,8 +13,7 @@ from vjepa2_ac.config.planning import EnergyConfig, GradientConfig, LimitsConfig
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.decision import PlanRequest, PlanResult, decide
 from vjepa2_ac.planning.energy import WorldModelCost
-from vjepa2_ac.planning.plan_json import write_plan
-from vjepa2_ac.planning.summary import axes_at_limit, summarize
+from vjepa2_ac.planning.plan_json import axes_at_limit, summarize, write_plan
 
 
 def read(found: PlanResult, folder: Path) -> dict:

@@ -94,8 +94,7 @@ def _plan(options: argparse.Namespace) -> int:
     from vjepa2_ac.console.progress import ConsoleReporter, console
     from vjepa2_ac.decoding.imagined_plan import imagine_plan
     from vjepa2_ac.planning.decision import PlanRequest, decide
-    from vjepa2_ac.planning.plan_json import PLAN_FILE, write_plan
-    from vjepa2_ac.planning.summary import summarize
+    from vjepa2_ac.planning.plan_json import PLAN_FILE, summarize, write_plan
     from vjepa2_ac.reports.figures.plan import PLAN_IMAGE, plot_plan
 
     say_places_elsewhere(options.subject)

@@ -285,7 +285,7 @@ class Controller:
         """Return which goal applies to the current image."""
 
         def energy(place: int) -> float:
-            return float(distance(latents, goal.latents[place], self.config.energy.distance, goal.weights))
+            return float(distance(latents, goal.latents[place], self.config.energy, goal.weights))
 
         if self._progress is None:
             return GoalProgress.first(energy)
@@ -298,7 +298,7 @@ class Controller:
         goal, done = goals.rest(progress.place), self._done - progress.since
         places = tuple(progress.place + goal.place(done + step) for step in range(self.config.horizon))
         wanted = goal.ahead(done, self.config.horizon)
-        still = distance(latents.expand_as(wanted), wanted, self.config.energy.distance, goal.weights)
+        still = distance(latents.expand_as(wanted), wanted, self.config.energy, goal.weights)
         energy = float(still[-1] if self.config.energy.steps == "last" else still.sum())
         reason: Why | None = "at the goal" if progress.done or float(still.max()) <= REACHED else None
         if reason is None and self._workspace is not None and not self._workspace.is_near(state, self.config.limits):

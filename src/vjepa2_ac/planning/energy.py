@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -19,6 +18,7 @@ from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.axes.mapping import Axes
 from vjepa2_ac.planning.goals.goal import Goal
 from vjepa2_ac.planning.state_integration import states_along
+from vjepa2_ac.registry import ENERGIES
 from vjepa2_ac.spaces import POSES, Spaces
 
 
@@ -123,7 +123,7 @@ class WorldModelCost:
         wanted = self._goal.ahead(self._done, actions.shape[1])
         if self._config.steps == "last":
             predicted, wanted = predicted[:, -1:], wanted[-1:]
-        far = distance(predicted, wanted, self._config.distance, self._goal.weights)
+        far = distance(predicted, wanted, self._config, self._goal.weights)
         return far.sum(dim=1)
 
     @torch.no_grad()
@@ -143,20 +143,33 @@ class WorldModelCost:
 def distance(
     predicted: Float[Tensor, "*batch tokens dim"],
     wanted: Float[Tensor, "*wanted tokens dim"],
-    kind: Literal["l1", "l2", "cosine"],
+    energy: EnergyConfig,
     weights: Float[Tensor, " tokens"] | None = None,
 ) -> Float[Tensor, "*batch"]:
-    """Return the distance between latents, over patches by weight (None: equal weights).
+    """Return the distance between latents that a config names, over patches by weight (None: equal weights)."""
+    by_token: Tensor = ENERGIES.function(energy.distance, energy.options)(predicted, wanted)
+    return by_token.mean(dim=-1) if weights is None else (by_token * (weights / weights.sum())).sum(dim=-1)
 
-    l1: mean absolute difference. l2: mean square. cosine: 1 - cosine of each token.
+
+def mean_difference(
+    predicted: Float[Tensor, "*batch tokens dim"], wanted: Float[Tensor, "*wanted tokens dim"]
+) -> Float[Tensor, "*batch tokens"]:
+    """Return the mean absolute difference of each token.
 
     Source: facebookresearch/vjepa2 @ c2963a4, notebooks/utils/mpc_utils.py, l1.
     """
-    if kind == "cosine":
-        by_token = 1 - cosine_similarity(predicted, wanted, dim=-1)
-    else:
-        by_number = absolute_difference if kind == "l1" else squared_difference
-        by_token = by_number(predicted, wanted).mean(dim=-1)
-    if weights is None:
-        return by_token.mean(dim=-1)
-    return (by_token * (weights / weights.sum())).sum(dim=-1)
+    return absolute_difference(predicted, wanted).mean(dim=-1)
+
+
+def mean_square(
+    predicted: Float[Tensor, "*batch tokens dim"], wanted: Float[Tensor, "*wanted tokens dim"]
+) -> Float[Tensor, "*batch tokens"]:
+    """Return the mean squared difference of each token."""
+    return squared_difference(predicted, wanted).mean(dim=-1)
+
+
+def one_minus_cosine(
+    predicted: Float[Tensor, "*batch tokens dim"], wanted: Float[Tensor, "*wanted tokens dim"]
+) -> Float[Tensor, "*batch tokens"]:
+    """Return 1 - cosine of each token."""
+    return 1 - cosine_similarity(predicted, wanted, dim=-1)

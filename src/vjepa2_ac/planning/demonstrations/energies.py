@@ -44,9 +44,9 @@ class Energies:
         self, seen: Float[Tensor, "frames tokens dim"], wanted: Float[Tensor, "*frames tokens dim"]
     ) -> Float[np.ndarray, " frames"]:
         """Return the energy of each frame to a wanted one, or to one of its own."""
-        kind = self.session.config.planning.energy.distance
+        energy = self.session.config.planning.energy
         return np.array([
-            float(distance(one, to, kind)) for one, to in zip(seen, wanted.expand_as(seen), strict=True)
+            float(distance(one, to, energy)) for one, to in zip(seen, wanted.expand_as(seen), strict=True)
         ])  # fmt: skip
 
     def noise(

@@ -7,7 +7,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import Field
 
@@ -55,7 +55,7 @@ class NoiseFloor:
     energy: Energy
     pairs: Annotated[int, Field(ge=1)]  # of frames
     encoder: str  # SHA-256 of its weights: energies of another one mean something else
-    distance: Literal["l1", "l2", "cosine"]  # as planning.energy.distance
+    distance: str  # as planning.energy.distance
 
 
 @dataclass(frozen=True, eq=False)
