@@ -26,7 +26,7 @@ from typing import Any
 
 import torch
 
-from vjepa2_ac.planning.goals.sub_goals import SubGoal
+from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.planning.session import load_to_plan
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.simulation.closed_loop.oracles import oracle_for

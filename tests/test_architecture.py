@@ -29,7 +29,7 @@ ORDERS: dict[str, list[str]] = {
         "runs",
         "encoding",
         "planning",
-        "serving",
+        "serving demonstrations",
         "decoding",
         "evaluation",
         "reports",

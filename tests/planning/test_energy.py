@@ -12,7 +12,7 @@ from vjepa2_ac.geometry import apply_action
 from vjepa2_ac.model.network.kv_cache import KeyValueCache
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.energy import Scene, WorldModelCost, distance
-from vjepa2_ac.planning.goals.goal import Goal, patch_weights
+from vjepa2_ac.planning.goals import Goal, patch_weights
 from vjepa2_ac.planning.planner import Planner
 from vjepa2_ac.spaces import Spaces
 

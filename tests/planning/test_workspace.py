@@ -13,8 +13,7 @@ from tiny_models import tiny_model
 from vjepa2_ac.config.planning import CemConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.search_space import pose_space
-from vjepa2_ac.planning.workspace import Workspace
+from vjepa2_ac.planning.search_space import Workspace, pose_space
 from vjepa2_ac.spaces import CAMERA_POSE, POSE, vector_states
 
 CORNERS = ((0.3, -0.2, 0.1), (0.6, 0.2, 0.5))

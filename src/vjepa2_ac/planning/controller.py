@@ -23,17 +23,22 @@ from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.axes.axes_file import no_vertical_axis
 from vjepa2_ac.planning.axes.mapping import Axes
 from vjepa2_ac.planning.energy import Scene, WorldModelCost, distance
-from vjepa2_ac.planning.goals.goal import GoalSequence, patch_weights
-from vjepa2_ac.planning.goals.progress import REACHED, AdvanceRule, GoalProgress
-from vjepa2_ac.planning.goals.sub_goals import GripperMode, SubGoal
+from vjepa2_ac.planning.goals import (
+    REACHED,
+    AdvanceRule,
+    GoalProgress,
+    GoalSequence,
+    GripperMode,
+    SubGoal,
+    patch_weights,
+)
 from vjepa2_ac.planning.input_checks import require_image, require_mask, require_numbers
 from vjepa2_ac.planning.interfaces import Plan
 from vjepa2_ac.planning.model_setup import Fingerprints, prepare_for_planning
 from vjepa2_ac.planning.planner import Cancelled, Planner
-from vjepa2_ac.planning.search_space import SearchSpace, search_space
+from vjepa2_ac.planning.search_space import SearchSpace, Workspace, search_space
 from vjepa2_ac.planning.settings import warn_beyond_taught, with_taught_limits
 from vjepa2_ac.planning.state_integration import states_along
-from vjepa2_ac.planning.workspace import Workspace
 from vjepa2_ac.runs.loading import TrainedRun
 from vjepa2_ac.spaces import EXTRINSICS, POSES, Spaces
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from vjepa2_ac.config.planning import LimitsConfig
-from vjepa2_ac.planning.workspace import Workspace
+from vjepa2_ac.planning.search_space import Workspace
 from vjepa2_ac.spaces import StateSpace
 
 _ROUNDING = 1e-6  # limits are float32 where actions are searched

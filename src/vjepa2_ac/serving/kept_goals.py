@@ -7,8 +7,8 @@ from pathlib import Path
 
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.image_file import read_image
-from vjepa2_ac.planning.goals.folder import GOALS_FILE, GoalFolder, read_goal_folder
-from vjepa2_ac.planning.goals.sub_goals import SubGoal
+from vjepa2_ac.planning.goal_folder import GOALS_FILE, GoalFolder, read_goal_folder
+from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.planning.input_checks import require_image
 
 KeptGoals = Mapping[str, GoalFolder]

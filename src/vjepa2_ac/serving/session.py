@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.controller import Controller, Decision
-from vjepa2_ac.planning.goals.sub_goals import SubGoal
+from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.planning.interfaces import SearchCancelledError
 from vjepa2_ac.serving.bounds import why_not_sent
 from vjepa2_ac.serving.recording import Recorder

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from vjepa2_ac import __version__
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.media.video_writer import video_library
-from vjepa2_ac.planning.goals.folder import read_goal_folder
+from vjepa2_ac.planning.goal_folder import read_goal_folder
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.simulation.closed_loop.oracles import oracle_for
 from vjepa2_ac.simulation.closed_loop.policies import DoNothing, GoalsOf, Policy, RandomActions

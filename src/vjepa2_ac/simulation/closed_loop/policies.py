@@ -15,7 +15,7 @@ from vjepa2_ac.data.clips.transforms import frame_of_seen
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
 from vjepa2_ac.decoding.imagined_plan import imagined_next
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.goals.sub_goals import SubGoal
+from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.simulation.closed_loop.tasks import TaskProblem
 
 GoalsOf = Callable[[TaskProblem], Sequence[SubGoal]]

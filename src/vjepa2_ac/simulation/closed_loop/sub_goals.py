@@ -9,10 +9,15 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from vjepa2_ac.config.planning import LimitsConfig
+from vjepa2_ac.demonstrations.key_frames import (
+    OF_MODEL_STEPS,
+    Timing,
+    gripper_key_frames,
+    sub_goals_of,
+    with_frames_between,
+)
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.planning.goals.from_demonstration import Timing, sub_goals_of
-from vjepa2_ac.planning.goals.key_frames import OF_MODEL_STEPS, gripper_key_frames, with_frames_between
-from vjepa2_ac.planning.goals.sub_goals import SubGoal
+from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.simulation.closed_loop.oracles import oracle_for
 from vjepa2_ac.simulation.closed_loop.rollout import run_episode
 from vjepa2_ac.simulation.closed_loop.tasks import STEPS, TaskName, TaskProblem, arm_for

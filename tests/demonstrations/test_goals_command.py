@@ -14,7 +14,7 @@ pytest.importorskip("av", reason="the extra `video` is not installed")
 from tiny_models import tiny_model
 from vjepa2_ac.cli import main
 from vjepa2_ac.media.video_writer import write_video
-from vjepa2_ac.planning.goals.folder import read_goal_folder
+from vjepa2_ac.planning.goal_folder import read_goal_folder
 from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
 
 QUICK = ["planning.samples=8", "planning.iterations=2", "planning.cem.elites=4"]
@@ -212,7 +212,7 @@ def test_a_folder_that_holds_something_is_left_as_it_is(
 def test_of_a_long_film_every_so_many_frames_are_looked_at(
     workshop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("vjepa2_ac.planning.demonstrations.make_goals._MOST_ENCODED", 10)
+    monkeypatch.setattr("vjepa2_ac.demonstrations.make_goals._MOST_ENCODED", 10)
     given = ["--model", str(workshop / "model"), "--stride", "2", "--apart", "6"]
     status, file = goals(workshop, tmp_path / "goals", *given, source="film.mp4")
     assert status == 0

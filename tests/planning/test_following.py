@@ -14,10 +14,9 @@ from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.decision import PlanRequest, decide
-from vjepa2_ac.planning.goals.folder import write_goals
-from vjepa2_ac.planning.goals.sub_goals import GripperMode, SubGoal
-from vjepa2_ac.planning.plan_json import plan_as_dict
+from vjepa2_ac.planning.decision import PlanRequest, decide, plan_as_dict
+from vjepa2_ac.planning.goal_folder import write_goals
+from vjepa2_ac.planning.goals import GripperMode, SubGoal
 from vjepa2_ac.spaces import Spaces
 
 

@@ -7,15 +7,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vjepa2_ac.planning.goals.from_demonstration import Timing, sub_goals_of
-from vjepa2_ac.planning.goals.key_frames import (
+from vjepa2_ac.demonstrations.key_frames import (
     OF_MODEL_STEPS,
     KeyFrame,
+    Timing,
     every_key_frame,
     gripper_key_frames,
     latent_key_frames,
     resting,
     resting_pairs,
+    sub_goals_of,
     with_frames_between,
 )
 

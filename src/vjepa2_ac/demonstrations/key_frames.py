@@ -1,4 +1,4 @@
-"""Key frames of a demonstration: which of its frames are worth being goals on the way. Pure functions of arrays.
+"""Key frames of a demonstration: which of its frames are worth being goals, and how long each may take. Pure functions.
 
 A frame is a recorded moment: a control step of an episode, a frame of a film, or a model step.
 """
@@ -8,12 +8,13 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from vjepa2_ac.geometry import actions_from_states
+from vjepa2_ac.planning.goals import GripperMode, SubGoal
 
 GRIPPER = 6  # which number of a state
 GRIPS = 0.15  # of closedness: less is no change of the gripper
@@ -221,3 +222,50 @@ def _maximum_before(values: Float[np.ndarray, " frames"], least: int) -> int | N
         if values[frame] > values[frame - 1] and values[frame] >= values[frame + 1]:
             return frame
     return None
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How long goals of a demonstration apply."""
+
+    stride: int = 1  # frames of a model step
+    slack: int = 3  # model steps that a goal may take fewer or more than the demonstration
+    share: float | None = None  # of each goal but the last
+
+    def steps(self, begin: int, end: int) -> int:
+        """Return the model steps from one frame to another, 1 at least."""
+        return max(1, math.ceil((end - begin) / self.stride))
+
+
+def sub_goals_of(
+    images: Sequence[np.ndarray],
+    keys: Sequence[KeyFrame],
+    timing: Timing,
+    states: Float[np.ndarray, "frames 7"] | None = None,
+) -> tuple[SubGoal, ...]:
+    """Return key frames as goals, with the demonstration's durations and, if states are known, gripper modes.
+
+    On the way to a frame at which the gripper is more closed than at the one before, it closes; likewise it opens; else
+    it is held.
+
+    Args:
+        images: Of the key frames.
+        keys: Which they are.
+        timing: How long they may take.
+        states: Of all frames of the demonstration; None: the gripper does what planning.limits say.
+    """
+    goals, before = [], 0
+    for image, key in zip(images, keys, strict=True):
+        steps = timing.steps(before, key.frame)
+        gripper = None if states is None else _gripper_mode(states[before], states[key.frame])
+        low, high = max(1, steps - timing.slack), steps + timing.slack
+        goals.append(SubGoal(image, key.name, low, high, timing.share, gripper))
+        before = key.frame
+    return (*goals[:-1], replace(goals[-1], at_most=None, share=None))
+
+
+def _gripper_mode(before: Float[np.ndarray, " 7"], after: Float[np.ndarray, " 7"]) -> GripperMode:
+    change = after[GRIPPER] - before[GRIPPER]
+    if abs(change) < GRIPS:
+        return "held"
+    return "close" if change > 0 else "open"

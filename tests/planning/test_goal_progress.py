@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vjepa2_ac.planning.goals.progress import AdvanceRule, GoalProgress
+from vjepa2_ac.planning.goals import AdvanceRule, GoalProgress
 
 
 def progress_over(rules: Sequence[AdvanceRule], energies: Sequence[Sequence[float]]) -> list[GoalProgress]:

@@ -1,9 +1,11 @@
-"""Named actions that were not taken, and the states to which such actions lead.
+"""Actions that were not taken, named or of a file, and the states to which they lead.
 
 They need no simulator: a model can predict under them from any start of recorded robot data.
 """
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -14,7 +16,7 @@ from vjepa2_ac.episode import ACTION_DIM
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.search_space import GRIPPER
 from vjepa2_ac.planning.state_integration import states_along
-from vjepa2_ac.spaces import POSE, StateSpace
+from vjepa2_ac.spaces import POSE, POSE_CHANGE, StateSpace
 
 STEP_M, GRIPPER_STEP = 0.05, 0.75
 """Metres, and change of closedness, of a named step: the largest that upstream plans (`planning.limits`). A run may
@@ -31,6 +33,7 @@ _DIRECTIONS: dict[str, tuple[int, float]] = {  # in the robot base frame: x to t
     "close": (6, 1.0),
 }
 ACTION_NAMES = ("none", *_DIRECTIONS)
+_LARGEST = np.array([1.0] * 3 + [np.pi] * 3 + [1.0])  # metres, radians, closedness in one step: more are other units
 
 
 def named_actions(
@@ -66,6 +69,44 @@ def named_actions(
         raise InputError(where=key, found=f"0, so that nothing can move {name}", needed="a limit above 0")
     actions[:, axis] = sign * size
     return actions
+
+
+def read_actions(path: str | Path, *, steps: int | None = None) -> Float[np.ndarray, "steps 7"]:
+    """Read actions of poses (legend: episode.py), one for each model step, from a `.npy` or `.csv` file.
+
+    A CSV may begin with a line of names; empty lines do not count.
+
+    Args:
+        path: The file.
+        steps: How many are needed; None: any number. Further ones of the file are left out.
+
+    Raises:
+        InputError: It cannot be read, a row has not 7 finite numbers in metres, radians and closedness, or there are
+            too few rows.
+    """
+    where, needed = str(path), f"one line of {ACTION_DIM} numbers for each model step: {', '.join(POSE_CHANGE.names)}"
+    fix = "In metres, radians, and closedness from -1 to 1; a .npy of NumPy, or a .csv with commas"
+    try:
+        if where.lower().endswith(".npy"):
+            with Path(path).open("rb") as file:
+                actions = np.asarray(np.lib.format.read_array(file, allow_pickle=False), dtype=np.float64)
+        else:
+            text = Path(path).read_text(encoding="utf-8-sig")
+            lines = [line for line in text.splitlines() if line.strip()]
+            names = bool(lines) and lines[0].replace(" ", "") == ",".join(POSE_CHANGE.names)
+            actions = np.loadtxt(lines[names:], delimiter=",", ndmin=2)
+    except (OSError, ValueError, TypeError) as error:
+        raise InputError(where=where, found=f"cannot be read ({error})", needed=needed, fix=fix) from None
+    if actions.ndim != 2 or actions.shape[1] != ACTION_DIM or not len(actions):
+        raise InputError(where=where, found=f"an array of shape {actions.shape}", needed=needed, fix=fix)
+    wrong = ~(np.abs(actions) <= _LARGEST).all(axis=1)  # NaN is wrong, too
+    if wrong.any():
+        step = int(wrong.argmax())
+        found = f"action {step} is {np.array2string(actions[step], precision=4, max_line_width=200)}"
+        raise InputError(where=where, found=found, needed=needed, fix=fix)
+    if steps is not None and len(actions) < steps:
+        raise InputError(where=where, found=f"{len(actions)} actions", needed=f"{steps}, one for each model step")
+    return actions[:steps]
 
 
 def counterfactual_states(

@@ -2,7 +2,6 @@
 
 import json
 import logging
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +11,8 @@ import pytest
 from decisions import image
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.image_file import encode_png
-from vjepa2_ac.planning.goals.folder import GOALS_FILE, NoiseFloor, read_goal_folder, read_goals, write_goals
-from vjepa2_ac.planning.goals.sub_goals import SubGoal
+from vjepa2_ac.planning.goal_folder import GOALS_FILE, NoiseFloor, read_goal_folder, read_goals, write_goals
+from vjepa2_ac.planning.goals import SubGoal
 
 NOISE = NoiseFloor(0.08, 12, "a" * 64, "l1")
 GOALS = (
@@ -86,17 +85,10 @@ def first(**changes: object) -> Any:
 @pytest.mark.parametrize(
     ("change", "wrong"),
     [
-        (first(file="../goal_1.png"), r"goal 1: '\.\./goal_1.png'"),
-        (first(file="/etc/passwd"), r"goal 1: '/etc/passwd'"),
-        (first(file="sub/goal_1.png"), "goal 1: 'sub/goal_1.png'"),
-        (first(file="goals.json"), "needed: the name of a PNG or JPEG"), (first(file=".x.png"), "goal 1: '.x.png'"),
-        (first(file="..\\x.png"), "goal 1"), (first(file="none.png"), "none.png: cannot be read"),
-        (first(file=3), "goal 1: file: "), (first(at_least=0), "goal 1: at_least"), (first(at_least=9), "at least 9"),
-        (first(at_most=10**7), "at_most"), (first(share=0.0), "share"), (first(share=1.5), "share"),
-        (first(gripper="shut"), "gripper"), (first(more=1), "goal 1: more: unknown"), (first(sha256="x"), "sha256"),
-        (first(sha256="0" * 64), "goal_1.png: another image than was written"), (first(began=-1.0), "began"),
-        (lambda goals: goals.clear(), "goals: 0 of them"), (lambda goals: goals.append(3), "goal 4: 3"),
-        (lambda goals: goals.extend(goals * 100), "a list of 1 to 256"),
+        (first(file="none.png"), "none.png: "), (first(file=3), r"goals\.0\.file"), (first(at_least=9), "at least 9"),
+        (first(share=1.5), "share"), (first(gripper="shut"), "gripper"), (first(more=1), r"goals\.0\.more"),
+        (lambda goals: goals.clear(), "goals: List should have at least 1"),
+        (lambda goals: goals.append(3), r"goals\.3"),
     ],
 )  # fmt: skip
 def test_a_broken_goal_is_refused_by_name(change: Any, wrong: str, folder: Path) -> None:
@@ -105,48 +97,19 @@ def test_a_broken_goal_is_refused_by_name(change: Any, wrong: str, folder: Path)
         read_goals(folder)
 
 
-@pytest.mark.parametrize(
-    ("text", "wrong"),
-    [
-        ("[]", "a JSON list"), ("{", "not JSON"), ('{"goals": []}', "format: None. needed: 1"),
-        ('{"format": 2, "goals": []}', "format: 2. needed: 1"), ('{"format": 1}', "goals: None"),
-        ('{"format": 1, "goals": [], "x": 1}', "unknown: x"), ('{"format": 1, "goals": {}}', "goals: {}"),
-        ('{"format": 1, "format": 1}', "given twice"), ("[" * 5000, "goals.json"), ("", "not JSON"),
-    ],
-)  # fmt: skip
-def test_a_file_that_says_something_else_is_refused(text: str, wrong: str, folder: Path) -> None:
+@pytest.mark.parametrize("text", ["[]", "{", '{"goals": []}', '{"format": 2, "goals": []}', '{"format": 1}'])
+def test_a_file_that_says_something_else_is_refused(text: str, folder: Path) -> None:
     (folder / GOALS_FILE).write_text(text)
-    with pytest.raises(InputError, match=wrong):
-        read_goals(folder)
-
-
-@pytest.mark.parametrize(
-    ("key", "value", "wrong"),
-    [
-        ("noise", 3, "noise: 3"), ("noise", {"energy": 1.0}, "noise: pairs: missing"), ("origin", [], r"origin: \[\]"),
-        ("noise", {"energy": -1.0, "pairs": 1, "encoder": "", "distance": "l1"}, "noise: energy"),
-    ],
-)  # fmt: skip
-def test_what_is_said_beside_the_goals_is_checked_too(key: str, value: object, wrong: str, folder: Path) -> None:
-    edit(folder, lambda content: content.update({key: value}), None)
-    with pytest.raises(InputError, match=wrong):
+    with pytest.raises(InputError, match=r"goals\.json: "):
         read_goals(folder)
 
 
 def test_images_that_are_none_or_of_another_size_are_refused(folder: Path) -> None:
-    edit(folder, lambda goals: [goal.update(sha256=None) for goal in goals])
     (folder / "goal_2.png").write_bytes(encode_png(image(2)[:40]))
     with pytest.raises(InputError, match=r"goal_2\.png: 48 x 40 pixels"):
         read_goals(folder)
     (folder / "goal_2.png").write_bytes(b"GIF89a")
     with pytest.raises(InputError, match=r"goal_2\.png: 6 bytes that are no image"):
-        read_goals(folder)
-
-
-def test_a_link_out_of_the_folder_is_not_followed(folder: Path, tmp_path: Path) -> None:
-    shutil.move(folder / "goal_1.png", tmp_path / "elsewhere.png")
-    (folder / "goal_1.png").symlink_to(tmp_path / "elsewhere.png")
-    with pytest.raises(InputError, match=r"goal_1\.png: a link out of the folder"):
         read_goals(folder)
 
 
