@@ -1,4 +1,4 @@
-"""Bounds of what is sent: a last check of every action, independent of how it was planned."""
+"""Motion: the poses at each control step on the way to a target, and a last check of all that is sent."""
 
 from __future__ import annotations
 
@@ -6,10 +6,41 @@ import math
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from vjepa2_ac.config.planning import LimitsConfig
+from vjepa2_ac.geometry import apply_action, euler_from_matrices, matrices_from_euler
 from vjepa2_ac.planning.search_space import Workspace
 from vjepa2_ac.spaces import StateSpace
+
+
+def waypoints(
+    state: Float[np.ndarray, " 7"], action: Float[np.ndarray, " 7"], steps: int
+) -> Float[np.ndarray, "steps 7"]:
+    """Return evenly spaced poses to the target, which is the last: x, y, z, extrinsic xyz angles, closedness 0 .. 1.
+
+    Positions go straight, rotations about one axis at one speed (R_delta^share @ R).
+
+    Args:
+        state: Measured: metres, radians, closedness.
+        action: Its change in a model step.
+        steps: Control steps of a model step.
+    """
+    shares = np.arange(1, steps + 1)[:, None] / steps
+    turn = Rotation.from_matrix(matrices_from_euler(action[3:6])).as_rotvec()
+    turns = Rotation.from_rotvec(shares * turn).as_matrix()
+    poses = np.concatenate(
+        [
+            state[:3] + shares * action[:3],
+            euler_from_matrices(turns @ matrices_from_euler(state[3:6])),
+            state[6:] + shares * action[6:],
+        ],
+        axis=1,
+    )
+    poses[-1] = apply_action(state, action)  # to the last bit
+    poses[:, 6] = poses[:, 6].clip(0.0, 1.0)
+    return poses
+
 
 _ROUNDING = 1e-6  # limits are float32 where actions are searched
 
