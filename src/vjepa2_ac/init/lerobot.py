@@ -10,8 +10,7 @@ from vjepa2_ac import storage
 from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, read_info
 from vjepa2_ac.data.sources.lerobot.path_templates import filled
 from vjepa2_ac.errors import InputError, UserError
-from vjepa2_ac.init.found import FoundData
-from vjepa2_ac.init.knob import Knob, Knobs
+from vjepa2_ac.init.found import FoundData, Knob, Knobs
 from vjepa2_ac.init.names import Column, Pose, find_pose, pick_camera, short_name
 from vjepa2_ac.storage.structured import json_object, read_json_object
 

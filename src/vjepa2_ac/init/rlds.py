@@ -10,8 +10,7 @@ from typing import Any
 from vjepa2_ac import storage
 from vjepa2_ac.data.sources.rlds.dataset_info import dataset_name, find_shards
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.init.found import FoundData
-from vjepa2_ac.init.knob import Knob, Knobs
+from vjepa2_ac.init.found import FoundData, Knob, Knobs
 from vjepa2_ac.init.names import Column, find_pose, pick_camera, short_name
 from vjepa2_ac.storage.structured import read_json_object
 
