@@ -109,6 +109,13 @@ def test_a_robot_slightly_outside_goes_back_and_one_far_outside_goes_nowhere() -
     assert run.decision.plan is None
 
 
+def test_the_energy_of_a_plan_that_was_kept_inside_is_that_of_its_own_actions() -> None:
+    run = controller(workspace=CORNERS)
+    run.act(image(0), position(0.63, 0.0, 0.3))
+    plan = run.decision.plan
+    assert plan.energy == pytest.approx(float(run.decision.cost(plan.actions[None]).detach()), rel=1e-6)
+
+
 def test_without_a_model_that_answers_nobody_moves_even_outside() -> None:
     run = controller(workspace=CORNERS)
     with torch.no_grad():

@@ -316,22 +316,26 @@ class Controller:
         generator = torch.Generator().manual_seed(self.seed + self._done)
         before = None if self.decision is None else self.decision.plan
         start = before.start_after(1) if before is not None and self.config.warm_start else None
-        plan = self._planned(state, lambda planner: planner.plan(cost, generator, start, cancelled))
+        plan = self._planned(state, cost, lambda planner: planner.plan(cost, generator, start, cancelled))
         why: Why = "planned" if plan.stopped == "finished" else plan.stopped
         states = states_along(torch.from_numpy(state), plan.actions.double()[None], self.spaces.state)[0]
         action = self._command(state, plan.actions[0].double().numpy())
         return Decision(action, why, energy, places[0], places, plan, states.numpy(), cost)
 
-    def _planned(self, state: np.ndarray, search: Callable[[Planner], Plan]) -> Plan:
-        """Return what a search finds, inside the workspace if there is one."""
+    def _planned(self, state: np.ndarray, cost: WorldModelCost, search: Callable[[Planner], Plan]) -> Plan:
+        """Return what a search finds, inside the workspace if there is one; the energy is of what is sent."""
         planner, box = self.planner, self._workspace
         if box is None:
             return search(planner)
         plan = search(Planner(planner.config, box.narrowed(planner.space, state), planner.clock, planner.progress))
         if plan.stopped == "no finite energy":
             return plan
-        kept = box.kept(state, plan.actions.double().numpy(), self.config.limits)
-        return replace(plan, actions=torch.from_numpy(kept).to(plan.actions))
+        kept = torch.from_numpy(box.kept(state, plan.actions.double().numpy(), self.config.limits)).to(plan.actions)
+        if torch.equal(kept, plan.actions):
+            return plan
+        with torch.no_grad():
+            energy = float(cost(kept[None])[0])
+        return replace(plan, actions=kept, energy=energy, evaluations=plan.evaluations + 1)
 
     def _use(self, gripper: GripperMode | None) -> None:
         """Let the planner search what a gripper mode allows."""
