@@ -18,11 +18,11 @@ from vjepa2_ac.geometry import actions_from_states
 
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 
-from vjepa2_ac.planning.counterfactual.named_actions import named_actions
+from vjepa2_ac.planning.counterfactual import named_actions
 from vjepa2_ac.simulation.counterfactual import RECORDED_CAMERAS, Resimulation, resimulate
 from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset, record_episode
 from vjepa2_ac.simulation.recording.simulation_file import SIMULATION_FILE
-from vjepa2_ac.simulation.world.projection import exterior_pose, hand_pixels
+from vjepa2_ac.simulation.world.camera import exterior_pose, hand_pixels
 
 STEPS, START, STRIDE = 13, 4, 4
 SPECS = {

@@ -136,7 +136,7 @@ def _asked(options: argparse.Namespace) -> list[tuple[str, EvaluationOptions]]:
     every = record_of_options(
         EvaluationOptions,
         options,
-        data=read_config(options.data) if options.data else None,
+        data=read_config(options.data, of_run=True) if options.data else None,
         against=tuple(options.against) if options.against else None,
         probes=record_of_options(ProbeOptions, options, planning_clips=clips),
         planning=(*(plan_settings or ()), *options.overrides),

@@ -26,9 +26,7 @@ from vjepa2_ac.cli.options import (
 from vjepa2_ac.errors import InputError
 
 if TYPE_CHECKING:
-    from vjepa2_ac.planning.demonstrations.energies import Energies
-    from vjepa2_ac.planning.demonstrations.make_goals import KeyFrameOptions
-    from vjepa2_ac.planning.demonstrations.recording import Recording
+    from vjepa2_ac.demonstrations.make_goals import Energies, KeyFrameOptions, Recording
     from vjepa2_ac.planning.session import PlanningSession
 
 _FILMS = (".mp4", ".m4v", ".mov")
@@ -80,8 +78,7 @@ def _goals(options: argparse.Namespace) -> int:
 
     from vjepa2_ac.console.goals import goals_notes, goals_table
     from vjepa2_ac.console.progress import ConsoleReporter, console
-    from vjepa2_ac.planning.demonstrations.make_goals import make_goals
-    from vjepa2_ac.planning.demonstrations.recording import recording_of_film
+    from vjepa2_ac.demonstrations.make_goals import make_goals, recording_of_film
     from vjepa2_ac.reports.figures.goals import GOALS_IMAGE, plot_goals
 
     still = None if options.still is None else recording_of_film(options.still)
@@ -136,17 +133,17 @@ def _require_fitting(options: argparse.Namespace, way: str, *, is_film: bool) ->
 def _recording(options: argparse.Namespace, *, is_film: bool) -> tuple[Recording, int]:
     """Return the demonstration, and the frames of a model step."""
     if is_film:
-        from vjepa2_ac.planning.demonstrations.recording import recording_of_film
+        from vjepa2_ac.demonstrations.make_goals import recording_of_film
 
         return recording_of_film(Path(options.source)), options.stride
-    config = read_config(options.source, options.overrides)
+    config = read_config(options.source, options.overrides, of_run=True)
     stride = options.stride or config.data.stride
     if stride == "auto":
         found, fix = "auto", "Say how many control steps a model step has: --stride 4"
         raise InputError(where="data.stride", found=found, needed="a number", fix=fix)
 
     from vjepa2_ac.console.progress import ConsoleReporter
-    from vjepa2_ac.planning.demonstrations.recording import recording_of_episode
+    from vjepa2_ac.demonstrations.make_goals import recording_of_episode
     from vjepa2_ac.reporter import INDEXING
 
     with ConsoleReporter() as reporter:
@@ -164,12 +161,12 @@ def _session(options: argparse.Namespace) -> PlanningSession | None:
 
 
 def _energies(session: PlanningSession | None) -> Energies | None:
-    from vjepa2_ac.planning.demonstrations.energies import Energies
+    from vjepa2_ac.demonstrations.make_goals import Energies
 
     return None if session is None else Energies(session)
 
 
 def _chosen(options: argparse.Namespace, way: str, step: int | None, stride: int) -> KeyFrameOptions:
-    from vjepa2_ac.planning.demonstrations.make_goals import KeyFrameOptions
+    from vjepa2_ac.demonstrations.make_goals import KeyFrameOptions
 
     return record_of_options(KeyFrameOptions, options, by=way, every=step, stride=stride)

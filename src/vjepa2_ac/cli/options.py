@@ -44,6 +44,8 @@ def command(commands: Commands, name: str, handler: Handler, text: str) -> argpa
     """Add a command with its handler, and return its parser."""
     parser = commands.add_parser(name, help=text, description=text)
     parser.set_defaults(handler=handler)
+    about = "a module of yours that registers a form of data, a loss, a planner, ... (docs/extending.md); repeatable"
+    argument(parser, "--plugin MODULE", about, action="append", default=[])
     return parser
 
 
@@ -94,7 +96,7 @@ def say_places_elsewhere(subject: str) -> None:
             console.print(f"{subject} names a place elsewhere: {place}")
 
 
-def read_config(path: str | Path, overrides: Sequence[str] = (), *, base: bool = False) -> Config:
+def read_config(path: str | Path, overrides: Sequence[str] = (), *, base: bool = False, of_run: bool = False) -> Config:
     """Read a config, and refuse one whose data set is not on this machine, before what takes seconds is imported.
 
     What lies elsewhere is found out later.
@@ -103,14 +105,15 @@ def read_config(path: str | Path, overrides: Sequence[str] = (), *, base: bool =
         path: The YAML file.
         overrides: Such as training.steps=100.
         base: Whether `model.base` and `model.encoder` have to be there, too.
+        of_run: It may be the config of a run that was made.
 
     Raises:
         InputError: The config is wrong, or one of them is not there.
     """
-    from vjepa2_ac.config.loading import load_config
+    from vjepa2_ac.config.loading import load_config, load_config_of_run
     from vjepa2_ac.model.base_model import require_model
 
-    config = load_config(path, overrides)
+    config = load_config_of_run(Path(path), overrides) if of_run else load_config(path, overrides)
     data = config.data.path
     if not places.is_url(data) and not Path(data).exists():
         found = f"no such file or folder, seen from {Path.cwd()}"

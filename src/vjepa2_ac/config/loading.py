@@ -15,6 +15,7 @@ import yaml  # to write: `storage.structured` reads
 from pydantic import ValidationError
 
 from vjepa2_ac.config import Config, DataConfig
+from vjepa2_ac.config.plugins import admit_forms_of_data, with_plugins
 from vjepa2_ac.config.section import marks_of
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.places import BUILTIN
@@ -40,6 +41,17 @@ def load_config(config: str | Path | Mapping[str, Any], overrides: Iterable[str]
     if isinstance(config, Mapping):
         return config_from(config, overrides, where="load_config")
     return parse_config(_overridden(_read_yaml(config_path(config)), overrides), where=str(config))
+
+
+def load_config_of_run(path: Path, overrides: Iterable[str] = ()) -> Config:
+    """Read the config of a run, which may be a stranger's: its plug-ins are not looked for in the working directory.
+
+    It may be one of the package, as for `load_config`.
+
+    Raises:
+        InputError: As `load_config`.
+    """
+    return parse_config(_overridden(_read_yaml(config_path(path)), overrides), where=str(path), here=False)
 
 
 def packaged_configs() -> dict[str, str]:
@@ -71,14 +83,19 @@ def config_from(values: Mapping[str, Any], overrides: Iterable[str] = (), *, whe
     return parse_config(_overridden(json.loads(_as_json(values, where)), overrides), where=where)
 
 
-def parse_config(values: Mapping[str, Any], *, where: str) -> Config:
+def parse_config(values: Mapping[str, Any], *, where: str, here: bool = True) -> Config:
     """Validate plain values, as YAML or JSON gives them.
+
+    Args:
+        values: The values.
+        where: Their file, for messages.
+        here: Whether plug-ins may lie in the working directory: not those of a run, which may be a stranger's.
 
     Raises:
         InputError: Names every key that is wrong, all at once.
     """
     try:
-        return Config.model_validate_json(_as_json(values, where))
+        return Config.model_validate_json(_as_json(with_plugins(values, where=where, here=here), where))
     except ValidationError as error:
         lines = _wrong_values(error)
     found = f"{len(lines)} value{'s are' if len(lines) > 1 else ' is'} wrong\n  " + "\n  ".join(lines) + "\n"
@@ -117,6 +134,7 @@ def yaml_line(key: str, value: Any) -> str:
 
 def config_schema() -> dict[str, Any]:
     """Return the JSON schema of a config file, for editors."""
+    admit_forms_of_data(all_installed=True)
     return Config.model_json_schema()
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.config.loading import config_from, load_config
+from vjepa2_ac.config.loading import config_from, load_config_of_run
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.config.section import Affects, mark_of, names_that_affect
 from vjepa2_ac.errors import InputError
@@ -170,14 +170,16 @@ def _of_run(subject: str, config: str | Path | None, overrides: Sequence[str]) -
             needed="one config",
             fix="Change single settings behind the run's name, such as planning.horizon=2",
         )
-    return load_config(Path(subject) / CONFIG, [*overrides, f"run_dir={json.dumps(literal(Path(subject)))}", _ANY_TYPE])
+    return load_config_of_run(
+        Path(subject) / CONFIG, [*overrides, f"run_dir={json.dumps(literal(Path(subject)))}", _ANY_TYPE]
+    )
 
 
 def _of_model(subject: str, config: str | Path | None, overrides: Sequence[str], dtype: str) -> Config:
     if config is None:
         plain = {"run_dir": "none", "data": {"path": "none"}, "model": {"base": subject, "dtype": dtype}}
         return config_from(plain, overrides, where="overrides")
-    its = load_config(Path(config), [*overrides, _ANY_TYPE])
+    its = load_config_of_run(Path(config), [*overrides, _ANY_TYPE])
     return its.model_copy(update={"model": its.model.with_base(subject)})
 
 

@@ -28,7 +28,7 @@ import sys
 from pathlib import Path
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.config.loading import changed_keys, config_as_flat_dict, config_as_yaml, load_config
+from vjepa2_ac.config.loading import changed_keys, config_as_flat_dict, config_as_yaml, load_config_of_run
 from vjepa2_ac.config.section import Affects, mark_of
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.places import is_url, literal
@@ -155,7 +155,7 @@ def read_run_config(folder: Path) -> Config:
         found = "no config.yaml" if folder.is_dir() else "no such folder"
         needed = "the folder of a run, which `vjepa2-ac train CONFIG` makes"
         raise InputError(where=str(folder), found=found, needed=needed)
-    return load_config(folder / CONFIG, [f"run_dir={json.dumps(literal(folder))}"])
+    return load_config_of_run(folder / CONFIG, [f"run_dir={json.dumps(literal(folder))}"])
 
 
 def places_elsewhere(config: Config) -> list[str]:

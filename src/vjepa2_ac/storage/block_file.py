@@ -158,7 +158,6 @@ class DiskCache:
                 raise
             self._written += len(content)
             if self._written > self._limit * _CHECK_SHARE:
-                self._written = 0
                 self._evict()
         except OSError as error:
             if not self._warned:
@@ -176,6 +175,7 @@ class DiskCache:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:  # another one does it
                 return
+            self._written = 0
             entries = sorted(self._entries())
             total = sum(size for _, size, _ in entries)
             if total <= self._limit:

@@ -108,7 +108,7 @@ def _of_clip(options: argparse.Namespace, out: Path, reporter: Reporter) -> Imag
     from vjepa2_ac.evaluation.request import EvaluationOptions
     from vjepa2_ac.simulation.imagined_truth import with_what_happens
 
-    data = None if options.data is None else read_config(options.data)
+    data = None if options.data is None else read_config(options.data, of_run=True)
     asked = ImagineOptions(
         decoder=options.decoder,
         actions=_words(options),

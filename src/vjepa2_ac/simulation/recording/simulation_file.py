@@ -12,9 +12,7 @@ from pydantic import Field
 
 from vjepa2_ac import storage
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.simulation.recording.demonstration import RecordingSpec, episode_folder, world_of
-from vjepa2_ac.simulation.recording.recorded_task import RecordedTask
-from vjepa2_ac.simulation.world.arm import Renderer
+from vjepa2_ac.simulation.recording.demonstration import RecordedTask, RecordingSpec, episode_folder, world_of
 from vjepa2_ac.simulation.world.domains import Domain, DomainRanges
 from vjepa2_ac.simulation.world.motion import MotionRecipe
 from vjepa2_ac.storage.structured import json_text, read_json_object, record_of
@@ -37,7 +35,6 @@ class _Content:
     steps: Annotated[int, Field(ge=2, le=1_000_000)]
     seed: Annotated[int, Field(ge=0)]
     cameras: Literal[1, 3]
-    renderer: Renderer
     recipe: MotionRecipe
     task: RecordedTask | None
     domain: Domain | None = None
@@ -93,7 +90,6 @@ def simulation_text(spec: RecordingSpec, episodes: int) -> str:
         steps=spec.steps,
         seed=spec.seed,
         cameras=spec.cameras,
-        renderer=spec.renderer,
         recipe=spec.recipe or MotionRecipe(),
         task=spec.task,
         domain=worlds if isinstance(worlds, Domain) else None,
@@ -128,7 +124,7 @@ def read_simulation(folder: str | Path) -> RecordedSimulation:
     if unknown or len(worlds) != 1:
         found = "; ".join(f"{key}: unknown" for key in unknown) or f"{len(worlds)} of the keys domain and ranges"
         raise InputError(where=where, found=found, needed=_NEEDED, fix=_AGAIN)
-    spec = RecordingSpec(worlds[0], content.steps, content.seed, content.cameras, content.renderer)
+    spec = RecordingSpec(worlds[0], content.steps, content.seed, content.cameras)
     spec = replace(spec, recipe=content.recipe, task=content.task)
     return RecordedSimulation(str(folder), spec, content.episodes, content.version, content.libraries)
 
