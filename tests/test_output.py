@@ -114,6 +114,16 @@ def test_both_streams_on_one_file_keep_their_order_and_all_text(start: Start) ->
     ]
 
 
+def test_a_pipe_that_others_made_unblocking_is_waited_for(start: Start) -> None:
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    process = start("    print('x' * 500_000)\n    assert not lost()\n", stdout=writer)
+    os.close(writer)
+    with open(reader, "rb") as file:  # noqa: PTH123 - a descriptor
+        assert file.read() == b"x" * 500_000 + b"\n"
+    assert process.wait(timeout=120) == 0
+
+
 def test_streams_of_a_test_or_a_notebook_stay_theirs(capsys: pytest.CaptureFixture[str]) -> None:
     before = sys.stdout
     with output.own_streams() as lost:

@@ -9,6 +9,7 @@ import contextlib
 import errno
 import io
 import os
+import select
 import sys
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -27,7 +28,10 @@ class _Stream(io.FileIO):
         left = memoryview(data)
         try:
             while left:
-                left = left[os.write(self.fileno(), left) :]
+                try:
+                    left = left[os.write(self.fileno(), left) :]
+                except BlockingIOError:  # another process that shares this file has made it non-blocking
+                    select.select((), (self,), ())
         except OSError as error:
             self.problem = self.problem or error
         return len(data)

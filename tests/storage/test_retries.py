@@ -46,6 +46,10 @@ class StatusError(Exception):
         self.response = type("Response", (), {"status_code": status})()
 
 
+class NoCredentialsError(Exception):
+    """As botocore says it."""
+
+
 @pytest.mark.parametrize(
     ("error", "attempts", "words"),
     [
@@ -56,6 +60,7 @@ class StatusError(Exception):
         (json.JSONDecodeError("Unterminated string", '{"items": [{"na', 12), 3, "JSONDecodeError: Unterminated"),
         (RefreshError("the login service is down", retryable=True), 3, "the login service is down"),
         (RefreshError("invalid_grant: expired"), 1, "no permission.*expired.*Log in so"),
+        (NoCredentialsError("none found"), 1, "no permission.*none found.*Log in so"),
         (StatusError(403), 1, r"no permission \(HTTP 403"),
         (PermissionError("not yours"), 1, "no permission.*Log in so"),
         (OSError("Forbidden: https://somewhere\nno"), 1, r"no permission \(HTTP 403: Forbidden.*Log in so"),

@@ -143,18 +143,18 @@ def _passes(error: Exception) -> bool:
     status = status_of(error)
     if status is not None:
         return status in _PASSING_STATUS
-    if _is_of_google_login(error):
+    if _is_of_login(error):
         return type(error).__name__ == "TransportError" or bool(getattr(error, "retryable", False))
     # JSON: a truncated listing. A file is said to exist where a condition of the server's is not met.
     return isinstance(error, json.JSONDecodeError) or not isinstance(error, ValueError | FileExistsError)
 
 
-def _is_of_google_login(error: Exception) -> bool:
-    return type(error).__module__.startswith("google.auth")
+def _is_of_login(error: Exception) -> bool:
+    return type(error).__module__.startswith("google.auth") or "Credentials" in type(error).__name__
 
 
 def _refused(where: str, error: Exception, access: str, doing: str) -> RefusedError:
-    if status_of(error) in _NO_ACCESS or _is_of_google_login(error):
+    if status_of(error) in _NO_ACCESS or _is_of_login(error):
         return RefusedError(where=where, found=f"no permission ({_summary(error)})", fix=access)
     return RefusedError(where=where, found=f"cannot be {doing} ({_summary(error)})", fix="Check the address")
 
