@@ -178,7 +178,7 @@ def test_a_folder_that_cannot_be_followed_is_told_before_anything_is_planned(
         (["config.yaml", "data.stride=auto"], "data.stride: auto"),
         (["none.yaml"], "none.yaml"),
         (["film.mp4", "--stride", "4"], "--by latent: no model"),
-        (["film.mp4", "--by", "gripper", "--stride", "4"], "--by gripper: a film"),
+        (["film.mp4", "--by", "gripper", "--stride", "4"], "--by gripper: film.mp4: no measured poses"),
         (["film.mp4", "--by", "every", "9"], "--stride: a film"),
         (["film.mp4", "--by", "every", "9", "--episode", "0"], "--episode"),
         (["film.mp4", "--by", "every", "9", "data.stride=3"], "key=value"),

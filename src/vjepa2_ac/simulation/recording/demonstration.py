@@ -3,22 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
 
-from vjepa2_ac.config.planning import LimitsConfig
-from vjepa2_ac.episode import ACTION_DIM
-from vjepa2_ac.geometry import apply_action
-from vjepa2_ac.simulation.closed_loop.policies import oracle_for, shortened
-from vjepa2_ac.simulation.closed_loop.rollout import put, ways_along
-from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, TaskProblem, make_problem
 from vjepa2_ac.simulation.world.arm import SimulatedArm
 from vjepa2_ac.simulation.world.domains import Domain, DomainRanges, named_domain, sample_domain
-from vjepa2_ac.simulation.world.motion import Motion, MotionRecipe, OutOfReachError, random_reaching
+from vjepa2_ac.simulation.world.motion import Motion, MotionRecipe, random_reaching
 
 RecordedTask = Literal["push", "pick", "place"]
 
@@ -34,99 +26,6 @@ INSTRUCTIONS: dict[RecordedTask | None, str] = {
 def default_steps(task: RecordedTask | None) -> int:
     """Return the control steps of an episode, enough for its task: the script of `place` releases the block late."""
     return 81 if task == "place" else 41
-
-
-_NOISE_M = 0.008  # standard deviation of the noise on each axis of an oracle's step
-_LOWEST_M, _HIGHEST_M = 0.155, 0.34  # of the flange while playing
-_TO_BLOCK = 0.5  # probability that a step of play goes to the block, or through it
-_AREA = np.array([[0.30, -0.28], [0.64, 0.28]])  # of the flange while playing, in the world
-
-
-def play(
-    arm: SimulatedArm,
-    task: RecordedTask,
-    steps: int,
-    rng: np.random.Generator,
-    *,
-    script: bool,
-    look: Callable[[SimulatedArm], None] | None = None,
-) -> Motion:
-    """Return a demonstration of `steps` control steps with an arm that touches the block.
-
-    Afterwards arm and block are where control step `steps` would be measured; fewer steps are the beginning of more.
-
-    Args:
-        arm: From `arm_for` of this task.
-        task: The problem at the start, and whether the gripper is used.
-        steps: Control steps; 0: only the start is drawn.
-        rng: The only source of randomness.
-        script: Whether an oracle solves the problem, with noise; otherwise, random play.
-        look: Called at every control step, at the time of its measurements.
-
-    Raises:
-        InputError: MuJoCo or OpenGL is missing.
-    """
-    recipe = MotionRecipe()
-    problem = make_problem(task, arm.domain, int(rng.integers(2**31)), 0)
-    limits = LimitsConfig(xyz=(recipe.reach_m,) * 3)
-    oracle = oracle_for(task, limits, arm)
-    put(arm, problem.start, problem.block_start, problem.mark)
-    unseen = np.zeros((1, 1, 3), dtype=np.uint8)
-    oracle.reset(problem, unseen)
-    rows: list[tuple[np.ndarray, float, np.ndarray, float]] = []
-    joints, grip = arm.joints, float(problem.start[6])
-    for step in range(steps):
-        if step % recipe.stride == 0:
-            if script:
-                exact = oracle.act(unseen, arm.state)
-                noise = np.append(rng.normal(0.0, _NOISE_M, size=3), np.zeros(4))
-                action = shortened(exact + noise, limits)
-            else:
-                action = _play_action(arm, problem, limits, rng)
-            joints, grip = _sent(arm, action)
-        rows.append((joints, grip, arm.joints, arm.closedness))
-        if look:
-            look(arm)
-        arm.command_joints(joints, grip)
-    commanded, commanded_grip, measured, measured_grip = zip(*rows, strict=True) if rows else ((), (), (), ())
-    return Motion(
-        np.reshape(commanded, (-1, 7)),
-        np.array(commanded_grip),
-        np.reshape(measured, (-1, 7)),
-        np.array(measured_grip),
-    )
-
-
-def _play_action(arm: SimulatedArm, problem: TaskProblem, limits: LimitsConfig, rng: np.random.Generator) -> np.ndarray:
-    """Return a step to or through the block, or anywhere; but for `push`, sometimes the gripper opens or closes."""
-    state, block = arm.state, arm.block
-    if block is None:
-        raise ValueError("there is no block to play with")
-    turn = arm.domain.base_pose()[:3, :3]
-    way = np.zeros(ACTION_DIM)
-    if rng.uniform() < _TO_BLOCK:
-        height = GRASP_M if problem.task != "push" else problem.goal[2] - block[2]
-        way[:3] = block[:3] - state[:3] + np.append(rng.normal(0.0, 0.03, size=2), height)
-        way[:2] *= rng.uniform(0.6, 1.8)
-    else:
-        way[:3] = rng.uniform(-1.0, 1.0, size=3) * limits.xyz_m
-    if problem.task != "push" and rng.uniform() < 0.25:
-        way[6] = rng.choice([-1.0, 1.0]) * limits.gripper
-    way = shortened(way, limits)
-    place = turn @ (state[:3] + way[:3])
-    low, high = np.append(_AREA[0], _LOWEST_M), np.append(_AREA[1], _HIGHEST_M)
-    way[:3] = turn.T @ np.clip(place, low, high) - state[:3]
-    return shortened(way, limits)
-
-
-def _sent(arm: SimulatedArm, action: Float[np.ndarray, " 7"]) -> tuple[np.ndarray, float]:
-    """Return the joints and closedness of a step's command, as far along it as joint angles exist."""
-    joints, target = arm.joints, apply_action(arm.state, action)
-    for way in [target, *reversed(ways_along(arm.state, action)[:-1])]:
-        with suppress(OutOfReachError):
-            joints = arm.joints_for(way)
-            break
-    return joints, float(np.clip(target[6], 0.0, 1.0))
 
 
 SUCCESS_SHARE = 0.9
@@ -194,7 +93,7 @@ def carry_out(
     """
     rng = _stream(index, spec, _MOTION)
     if spec.task is not None:
-        from vjepa2_ac.simulation.recording.demonstration import play
+        from vjepa2_ac.simulation.recording.scripted_play import play  # imports torch
 
         return play(arm, spec.task, spec.steps, rng, script=index % 2 == 0, look=look)
     motion = random_reaching(arm.domain, spec.steps, rng, spec.recipe)
@@ -216,7 +115,7 @@ def put_at(arm: SimulatedArm, index: int, spec: RecordingSpec, step: int) -> Sim
     """
     rng = _stream(index, spec, _MOTION)
     if spec.task is not None:  # contacts depend on all that happened before
-        from vjepa2_ac.simulation.recording.demonstration import play
+        from vjepa2_ac.simulation.recording.scripted_play import play  # imports torch
 
         play(arm, spec.task, step, rng, script=index % 2 == 0)
         return arm

@@ -6,7 +6,7 @@ import re
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -119,10 +119,9 @@ def read_simulation(folder: str | Path) -> RecordedSimulation:
             fix=f"What happens under other actions can only be simulated. {_AGAIN}",
         ) from None
     content = record_of(_Content, values, where=where, needed=_NEEDED, fix=_AGAIN)
-    unknown = _unknown_keys(values, asdict(content))
     worlds = [world for world in (content.domain, content.ranges) if world is not None]
-    if unknown or len(worlds) != 1:
-        found = "; ".join(f"{key}: unknown" for key in unknown) or f"{len(worlds)} of the keys domain and ranges"
+    if len(worlds) != 1:
+        found = f"{len(worlds)} of the keys domain and ranges"
         raise InputError(where=where, found=found, needed=_NEEDED, fix=_AGAIN)
     spec = RecordingSpec(worlds[0], content.steps, content.seed, content.cameras)
     spec = replace(spec, recipe=content.recipe, task=content.task)
@@ -138,11 +137,3 @@ def other_versions(simulation: RecordedSimulation) -> str:
 
 def _versions() -> dict[str, str]:
     return {name: version(name) for name in _LIBRARIES}
-
-
-def _unknown_keys(values: Any, known: Any, place: str = "") -> list[str]:
-    """Return the keys within mappings that the records do not have, as `domain.look.colour`."""
-    if not isinstance(values, dict) or not isinstance(known, dict):
-        return []
-    inside = [_unknown_keys(value, known[key], f"{place}{key}.") for key, value in values.items() if key in known]
-    return [f"{place}{key}" for key in values if key not in known] + [key for keys in inside for key in keys]
