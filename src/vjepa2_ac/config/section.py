@@ -61,6 +61,9 @@ class AtMost:
     mark: Affects
 
 
+_ALL = AtMost(~Affects.NOTHING)
+
+
 @cache
 def marks_of(knobs: type[BaseModel]) -> Mapping[str, Affects]:
     """Return the mark of each knob of a section and of those in it, by its dotted key.
@@ -79,14 +82,12 @@ def mark_of(key: str, knobs: type[BaseModel]) -> Affects:
     Raises:
         KeyError: There is no such knob.
     """
-    marks = marks_of(knobs)
-    inner = [mark for known, mark in marks.items() if known.startswith(f"{key}.")]
-    if inner:
-        return reduce(or_, inner)
-    for known, mark in marks.items():
-        if f"{key}.".startswith(f"{known}."):
-            return mark
-    raise KeyError(key)
+    wanted = f"{key}."
+    known = [(f"{name}.", mark) for name, mark in marks_of(knobs).items()]
+    found = [mark for name, mark in known if name.startswith(wanted) or wanted.startswith(name)]
+    if not found:
+        raise KeyError(key)
+    return reduce(or_, found)
 
 
 def names_that_affect(what: Affects, knobs: type[BaseModel]) -> list[str]:
@@ -112,10 +113,9 @@ def knobs_that_affect(
     """
     found: dict[str, Any] = {}
     for name, field in type(section).model_fields.items():
-        value, mark = getattr(section, name), _mark_of(field)
-        mark = outer if mark is None else mark
+        value, mark = getattr(section, name), _noted(field, Affects, outer)
         if isinstance(value, BaseModel):
-            if inner := knobs_that_affect(what, value, mark, most & _limit_of(field)):
+            if inner := knobs_that_affect(what, value, mark, most & _noted(field, AtMost, _ALL).mark):
                 found[name] = inner
         elif mark is not None and what & mark & most:
             found[name] = section.model_dump(mode="json", include={name})[name]
@@ -126,24 +126,20 @@ def _marks(
     section: type[BaseModel], outer: Affects | None, prefix: str, most: Affects
 ) -> Iterator[tuple[str, Affects]]:
     for name, field in section.model_fields.items():
-        mark = _mark_of(field)
-        mark = outer if mark is None else mark
+        mark = _noted(field, Affects, outer)
         inner = sections_in(field.annotation)
         inner = [kind for one in inner for kind in [*getattr(one, "kinds", {}).values()] or [one]]
         for one in inner:
-            yield from _marks(one, mark, f"{prefix}{name}.", most & _limit_of(field))
+            yield from _marks(one, mark, f"{prefix}{name}.", most & _noted(field, AtMost, _ALL).mark)
         if not inner and mark is None:
             raise TypeError(f"{prefix}{name}: say what it affects, as in Annotated[int, Affects.RUN]")
         if not inner and mark is not None:
             yield prefix + name, mark & most
 
 
-def _mark_of(field: FieldInfo) -> Affects | None:
-    return next((one for one in field.metadata if isinstance(one, Affects)), None)
-
-
-def _limit_of(field: FieldInfo) -> Affects:
-    return next((one.mark for one in field.metadata if isinstance(one, AtMost)), ~Affects.NOTHING)
+def _noted(field: FieldInfo, kind: type[Any], otherwise: Any) -> Any:
+    """Return the note of a kind at a knob."""
+    return next((one for one in field.metadata if isinstance(one, kind)), otherwise)
 
 
 def sections_in(annotation: Any) -> list[type[BaseModel]]:
