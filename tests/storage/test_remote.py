@@ -6,7 +6,6 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -127,14 +126,6 @@ def test_a_long_read_comes_in_pieces(gcs: Gcs, file: str, monkeypatch: pytest.Mo
     assert storage.read_bytes(file) == DATA
     assert len(gcs.reads()) == -(-len(DATA) // 1000)
     assert storage.read_ranges(file, [(5, 2500), (7, 3)]) == [DATA[5:2505], DATA[7:10]]
-
-
-def test_many_threads_share_the_connections(gcs: Gcs, file: str) -> None:
-    gcs.hold(8, match="/download/")
-    with ThreadPoolExecutor(16) as pool:
-        pieces = list(pool.map(lambda start: storage.read_range(file, start, 2), range(200)))
-    assert pieces == [DATA[start : start + 2] for start in range(200)]
-    assert gcs.most_in_flight >= 8
 
 
 def test_the_bytes_fetched_are_counted(file: str) -> None:

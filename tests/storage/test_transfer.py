@@ -89,13 +89,6 @@ def test_an_upload_that_stalls_is_cut_off_and_begun_again(
     assert not isinstance(raised.value, RefusedError)
 
 
-def test_a_large_file_has_longer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    allowed = []
-    monkeypatch.setattr(remote, "send", lambda source, url, timeout_s: allowed.append((source, url, timeout_s)))
-    storage.upload(source_of(tmp_path, LARGE), PLACE)
-    assert allowed == [(tmp_path / "source", PLACE, retries.DEFAULT.timeout_s + 6)]
-
-
 @pytest.mark.parametrize(
     ("failure", "words"),
     [(403, r"no permission .*You are not logged in\. Log in with `gcloud"), (412, "cannot be written")],
