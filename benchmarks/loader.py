@@ -32,6 +32,7 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.clips.clip_reader import ClipRequest, read_clip
 from vjepa2_ac.data.clips.dataset import open_dataset
 from vjepa2_ac.data.clips.loader import training_loader
+from vjepa2_ac.data.clips.splits import in_split
 from vjepa2_ac.data.clips.windows import ClipOrder, windows_of
 from vjepa2_ac.data.filters.step_ranges import StepSelection, clip_starts
 from vjepa2_ac.data.index.episode_table import FORMAT, EpisodeTable
@@ -192,7 +193,8 @@ def _open_index(config: DataConfig) -> tuple[int, float, float, float]:
     everyone = np.ones(len(table), bool)
     kept = StepSelection.whole(table, everyone)
     order = ClipOrder(
-        windows_of(table, everyone, clip_starts(table, kept, config), config, "train", table.id_hash), seed=0
+        windows_of(table, in_split(table.id_hash, config, "train"), clip_starts(table, kept, config), config, "train"),
+        seed=0,
     )
     order.window(123_456)
     taken, memory = time.perf_counter() - start, (process.memory_info().rss - before) / 1e6

@@ -5,17 +5,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from memory_source import MemorySource
 from vjepa2_ac.config.data import DataConfig, Split
+from vjepa2_ac.data.clips import dataset as opening
 from vjepa2_ac.data.clips.splits import in_split
 
 SPLITS: tuple[Split, ...] = ("train", "validation", "test")
 HASHES = st.lists(st.integers(0, 1023), min_size=1, max_size=40, unique=True)  # in 1/1024
 
 
-def counts(hashes: list[int], taking_part: list[bool] | None = None, **shares: float) -> dict[str, int]:
-    part = np.ones(len(hashes), bool) if taking_part is None else np.array(taking_part)
+def counts(hashes: list[int], **shares: float) -> dict[str, int]:
     config = DataConfig(path="nowhere", **shares)
-    return {split: int(in_split(np.array(hashes, np.uint64), part, config, split).sum()) for split in SPLITS}
+    return {split: int(in_split(np.array(hashes, np.uint64), config, split).sum()) for split in SPLITS}
 
 
 @given(numbers=HASHES, validation=st.floats(0, 0.4), test=st.floats(0, 0.4))
@@ -41,9 +42,8 @@ def test_twenty_demonstrations_with_the_default_shares_have_all_three(seed: int)
 def test_those_whose_number_comes_next_move_and_nobody_else() -> None:
     hashes = [int(share * 2**64) for share in (0.9, 0.5, 0.3, 0.7)]
     config = DataConfig(path="nowhere", validation_share=0.05, test_share=0.05)
-    everyone = np.ones(4, bool)
-    assert in_split(np.array(hashes, np.uint64), everyone, config, "test").tolist() == [False, False, True, False]
-    assert in_split(np.array(hashes, np.uint64), everyone, config, "validation").tolist() == [False, True, False, False]
+    assert in_split(np.array(hashes, np.uint64), config, "test").tolist() == [False, False, True, False]
+    assert in_split(np.array(hashes, np.uint64), config, "validation").tolist() == [False, True, False, False]
 
 
 def test_a_group_moves_as_a_whole() -> None:
@@ -51,10 +51,41 @@ def test_a_group_moves_as_a_whole() -> None:
     assert counts(hashes) == {"train": 1, "validation": 2, "test": 2}
 
 
-def test_those_that_are_left_out_count_for_nothing() -> None:
-    hashes = [int(share * 2**64) for share in (0.01, 0.07, 0.3, 0.5, 0.9)]
-    assert counts(hashes) == {"train": 3, "validation": 1, "test": 1}
-    assert counts(hashes, [False, False, True, True, True]) == {"train": 1, "validation": 1, "test": 1}
+def splits_of(monkeypatch: pytest.MonkeyPatch, source: MemorySource, **knobs: object) -> dict[str, Split]:
+    """Return the split of every episode that takes part."""
+    monkeypatch.setattr(opening, "open_source", lambda _: source)
+    values = {"path": "the set", "frames": 3, "stride": 2, "validation_share": 0.02, "test_share": 0.02} | knobs
+    dataset = opening.open_dataset(DataConfig.model_validate(values))
+    return {
+        dataset.table.identity(int(place)): split
+        for split in SPLITS
+        for place in np.flatnonzero(dataset.members(split))
+    }
+
+
+@pytest.mark.parametrize("split_by", [None, r"episode (\d)"])
+@pytest.mark.parametrize("left_out", range(8))
+def test_leaving_an_episode_out_moves_no_other(
+    monkeypatch: pytest.MonkeyPatch, left_out: int, split_by: str | None
+) -> None:
+    """Neither `data.exclude` nor an episode that breaks: what a run has trained on stays out of its validation."""
+    knobs = {"split_by": split_by, "idle": {"rule": "motion"}, "broken_episodes": "skip"}
+    before = splits_of(monkeypatch, MemorySource([60] * 8), **knobs)
+    assert set(before.values()) == set(SPLITS)
+    without = {name: split for name, split in before.items() if name != f"episode {left_out}"}
+    excluded = {"exclude": (f"episode {left_out}",)}
+    assert splits_of(monkeypatch, MemorySource([60] * 8), **knobs, **excluded) == without
+    monkeypatch.setattr("vjepa2_ac.data.filters.broken_episodes.MOST_BROKEN", 0.2)
+    assert (
+        splits_of(monkeypatch, MemorySource([61 + left_out] * 8, unreadable=frozenset({left_out})), **knobs) == without
+    )
+
+
+def test_of_the_outcomes_only_the_chosen_one_is_split(monkeypatch: pytest.MonkeyPatch) -> None:
+    source = MemorySource([60] * 12, [number % 2 == 0 for number in range(12)])
+    found = splits_of(monkeypatch, source, outcome="success")
+    assert sorted(found.values()).count("train") == 4
+    assert set(found.values()) == set(SPLITS)
 
 
 def test_one_or_two_episodes_and_shares_of_zero_stay_as_the_hash_says() -> None:

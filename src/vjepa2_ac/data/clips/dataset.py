@@ -17,7 +17,7 @@ from vjepa2_ac.data.clips.splits import in_split
 from vjepa2_ac.data.clips.windows import Windows, windows_of
 from vjepa2_ac.data.filters.broken_episodes import BrokenEpisodes
 from vjepa2_ac.data.filters.exclusion import included, with_way_out
-from vjepa2_ac.data.filters.grouping import split_hash
+from vjepa2_ac.data.filters.grouping import groups_of
 from vjepa2_ac.data.filters.idle_ranges import FoundRanges, find_ranges
 from vjepa2_ac.data.filters.step_ranges import ClipStarts, StepSelection, clip_starts
 from vjepa2_ac.data.index.episode_table import EpisodeTable
@@ -67,7 +67,8 @@ class Dataset:
 
     def members(self, split: Split) -> Bool[np.ndarray, " episodes"]:
         """Return which episodes are used and belong to a split."""
-        return in_split(self.split_hash, self.kept.taking_part, self.config, split)
+        among = _of_outcome(self.table, self.config)
+        return self.kept.taking_part & in_split(self.split_hash, self.config, split, among)
 
     def windows(self, split: Split) -> Windows:
         """Return the clips of a split.
@@ -75,7 +76,25 @@ class Dataset:
         Raises:
             InputError: There are none; see `windows_of`.
         """
-        return windows_of(self.table, self.kept.taking_part, self.starts, self.config, split, self.split_hash)
+        members = self.members(split)
+        if not members.any():
+            raise self._empty_split(split)
+        return windows_of(self.table, members, self.starts, self.config, split)
+
+    def _empty_split(self, split: Split) -> InputError:
+        config, taking_part = self.config, self.kept.taking_part
+        groups = None if config.split_by is None else len(np.unique(self.split_hash[taking_part]))
+        together = "" if groups is None else f" in {groups} groups (data.split_by)"
+        shares = f"validation_share {config.validation_share:g}, test_share {config.test_share:g}"
+        always = f"above 0, three {'episodes' if groups is None else 'groups'} or more always have one"
+        return InputError(
+            where=f"data.path: {config.path}",
+            found=f"no {split} episodes among {taking_part.sum()}{together} ({shares})",
+            needed="one or more",
+            fix="Lower data.validation_share or data.test_share"
+            if split == "train"
+            else f"Raise data.{split}_share: {always}, unless it is broken or in data.exclude",
+        )
 
     def with_stride(self, stride: int) -> Dataset:
         """Return the data set with another stride.
@@ -211,7 +230,7 @@ def open_dataset(config: DataConfig, *, progress: Progress | None = None) -> Dat
             ranges = find_ranges(source, table, config, progress)
         kept = _select_steps(ranges, table, taking_part, broken)
         _log_listed_episodes(ranges, table, config)
-    dataset = Dataset(config, source, table, kept, broken, split_hash(table, kept.taking_part, config))
+    dataset = Dataset(config, source, table, kept, broken, groups_of(table, kept.taking_part, config))
     if not len(dataset.episodes):
         raise _nothing_left(dataset)
     if isinstance(source, LatentSource):

@@ -13,25 +13,26 @@ _FEWEST_GROUPS = 3  # one for each split
 
 def in_split(
     split_hash: UInt64[np.ndarray, " episodes"],
-    taking_part: Bool[np.ndarray, " episodes"],
     config: DataConfig,
     split: Split,
+    among: Bool[np.ndarray, " episodes"] | None = None,
 ) -> Bool[np.ndarray, " episodes"]:
-    """Return which of the episodes that take part belong to a split.
+    """Return which episodes belong to a split.
 
     The hash, as a number in [0, 1), is compared with the shares. Where that leaves validation or test without any,
     as may happen to few episodes, though its share is above 0, the one whose number comes next moves there.
 
     Args:
         split_hash: Of each episode's identity; with `data.split_by`, of the name of its group.
-        taking_part: Which episodes are used.
         config: The shares.
         split: Which split.
+        among: Which of them are split, None: all. The split of one depends on the others where these are few: so they
+            are the same throughout a run, with those that are broken or left out by `data.exclude`.
     """
     number = split_hash.astype(np.float64) / 2**64
-    test, held_out = _bounds(np.unique(number[taking_part]), config)
+    test, held_out = _bounds(np.unique(number if among is None else number[among]), config)
     low, high = {"test": (0.0, test), "validation": (test, held_out), "train": (held_out, 2.0)}[split]
-    return np.asarray(taking_part & (number >= low) & (number < high))
+    return np.asarray((number >= low) & (number < high) & (True if among is None else among))
 
 
 def _bounds(groups: Float[np.ndarray, " groups"], config: DataConfig) -> tuple[float, float]:

@@ -18,7 +18,6 @@ from jaxtyping import Bool, Int32, Int64, UInt64
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.clips.permutation import permuted
-from vjepa2_ac.data.clips.splits import in_split
 from vjepa2_ac.data.filters.exclusion import NAMED, named
 from vjepa2_ac.data.filters.step_ranges import ClipStarts
 from vjepa2_ac.data.index.episode_table import EpisodeTable
@@ -74,31 +73,21 @@ class ClipOrder:
 
 
 def windows_of(
-    table: EpisodeTable,
-    taking_part: Bool[np.ndarray, " episodes"],
-    starts: ClipStarts,
-    config: DataConfig,
-    split: Split,
-    split_hash: UInt64[np.ndarray, " episodes"],
+    table: EpisodeTable, members: Bool[np.ndarray, " episodes"], starts: ClipStarts, config: DataConfig, split: Split
 ) -> Windows:
     """Return the windows of a split.
 
     Args:
         table: The episodes.
-        taking_part: Which of them are used.
-        starts: The result of `clip_starts` for all of these.
-        config: Shares of the splits, and what to do with short episodes.
-        split: Which split.
-        split_hash: The hash that determines the split of each episode.
+        members: Which of them are used, and belong to the split: at least one.
+        starts: The result of `clip_starts`, at least of these.
+        config: What to do with short episodes.
+        split: The name of the split.
 
     Raises:
-        InputError: The split has no episodes, or only short ones, or none with a clip's length of kept steps, or
+        InputError: The split has only short episodes, or none with a clip's length of kept steps, or
             `data.short_episodes` forbids short ones.
     """
-    members = in_split(split_hash, taking_part, config, split)
-    if not members.any():
-        groups = None if config.split_by is None else len(np.unique(split_hash[taking_part]))
-        raise _empty_split(int(taking_part.sum()), groups, config, split)
     short = np.flatnonzero(members & (table.num_steps < config.clip_steps)).astype(np.int32)
     short = short[np.argsort(table.id_rank[short])]
     if len(short) and (config.short_episodes == "error" or len(short) == members.sum()):
@@ -157,23 +146,6 @@ def _warn_of_short(path: str, split: Split, clip_steps: int, members: int, short
         "%s: %d of %d %s episodes are shorter than a clip of %d control steps and left out: %s",
         path, short, members, split, clip_steps, named(names, short),
     )  # fmt: skip
-
-
-def _empty_split(episodes: int, groups: int | None, config: DataConfig, split: Split) -> InputError:
-    shares = f"validation_share {config.validation_share:g}, test_share {config.test_share:g}"
-    members = "episodes" if groups is None else "groups"
-    fix = (
-        "Lower data.validation_share or data.test_share"
-        if split == "train"
-        else f"Raise data.{split}_share: above 0, three {members} or more always have one"
-    )
-    together = "" if groups is None else f" in {groups} groups (data.split_by)"
-    return InputError(
-        where=f"data.path: {config.path}",
-        found=f"no {split} episodes among {episodes}{together} ({shares})",
-        needed="one or more",
-        fix=fix,
-    )
 
 
 def _too_short(

@@ -5,56 +5,51 @@ from __future__ import annotations
 import re
 
 import numpy as np
-from jaxtyping import Bool, Int, UInt64
+from jaxtyping import Bool, UInt64
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.filters.bounded_match import first_groups
 from vjepa2_ac.data.filters.exclusion import named
 from vjepa2_ac.data.index.episode_table import EpisodeTable, identity_hash
 from vjepa2_ac.errors import InputError
 
 # For DROID, whose identities contain .../LAB/success|failure/DATE/..., and for any data in folders.
 IN_IDENTITY = {
-    "lab": re.compile(r"([^/]+)/(?:success|failure)/"),
-    "day": re.compile(r"/(?:success|failure)/([0-9]{4}-[0-9]{2}-[0-9]{2})(?:/|$)"),
-    "folder": re.compile(r"^(.+)/[^/]*$"),
+    "lab": r"([^/]+)/(?:success|failure)/",
+    "day": r"/(?:success|failure)/([0-9]{4}-[0-9]{2}-[0-9]{2})(?:/|$)",
+    "folder": r"^(.+)/[^/]*$",
 }
 
 
-def split_hash(
+def groups_of(
     table: EpisodeTable, taking_part: Bool[np.ndarray, " episodes"], config: DataConfig
 ) -> UInt64[np.ndarray, " episodes"] | None:
-    """Return the hash that determines each episode's split: of its group; None: of its identity.
+    """Return the hash of each episode's group, which determines its split; None: its identity does.
 
     Args:
         table: The episodes.
-        taking_part: Which of them are used; the others need not belong to a group.
+        taking_part: Which of them are used; the others need not belong to a group, and then get that of another one.
         config: `data.split_by`.
 
     Raises:
-        InputError: There is no such field, an episode has none, or a pattern does not match its identity.
+        InputError: There is no such field, one of those has none, or a pattern does not match its identity.
     """
     if config.split_by is None:
         return None
-    members = np.flatnonzero(taking_part)
-    groups = _groups(table, members, config.split_by)
-    lacking = [int(member) for member, group in zip(members, groups, strict=True) if not group]
+    groups = _groups(table, config.split_by)
+    lacking = [place for place in np.flatnonzero(taking_part).tolist() if not groups[place]]
     if lacking:
-        raise _without_group(table, lacking, len(members), config.split_by)
-    hashes = {group: identity_hash(group) for group in set(groups) if group}
-    found = table.id_hash.copy()
-    found[members] = [hashes[group] for group in groups if group]
-    return found
+        raise _without_group(table, lacking, int(taking_part.sum()), config.split_by)
+    hashes = {group: identity_hash(group) for group in groups if group}
+    another = next(iter(hashes.values()), 0)
+    return np.array([hashes[group] if group else another for group in groups], np.uint64)
 
 
-def _groups(table: EpisodeTable, members: Int[np.ndarray, " members"], split_by: str) -> list[str | None]:
+def _groups(table: EpisodeTable, split_by: str) -> list[str | None]:
     labels = table.labels.get(split_by)
     if labels is not None:
-        return [labels.of_episode(int(member)) for member in members]
-    identities = [table.identity(int(member)) for member in members]
-    if pattern := IN_IDENTITY.get(split_by):
-        return [found.group(1) if (found := pattern.search(identity)) else None for identity in identities]
-    if re.fullmatch(r"[A-Za-z_]+", split_by):
+        return [labels.of_episode(place) for place in range(len(table))]
+    identities = [table.identity(place) for place in range(len(table))]
+    if split_by not in IN_IDENTITY and re.fullmatch(r"[A-Za-z_]+", split_by):
         raise InputError(
             where=f"data.split_by: {split_by}",
             found=f"no such field; this data set has {', '.join(table.labels) or 'none of its own'}, and its identities"
@@ -62,7 +57,8 @@ def _groups(table: EpisodeTable, members: Int[np.ndarray, " members"], split_by:
             needed="a field, or a regular expression with one group for the identity"
             + (f", such as {identities[0]}" if identities else ""),
         )
-    return first_groups(split_by, identities, where=f"data.split_by: {split_by}")
+    search = re.compile(IN_IDENTITY.get(split_by, split_by)).search
+    return [found.group(1) if (found := search(identity)) else None for identity in identities]
 
 
 def _without_group(table: EpisodeTable, lacking: list[int], members: int, split_by: str) -> InputError:
