@@ -38,7 +38,17 @@ ORDERS: dict[str, list[str]] = {
         "console",
         "cli",
     ],
-    "data": ["picture_file", "index", "cache filters", "sources", "clips", "inspection"],
+    "data": [
+        "picture_file streams",
+        "index",
+        "selection cache transforms",
+        "idle windows",
+        "sources",
+        "dataset",
+        "clips",
+        "loader",
+        "inspection",
+    ],
     "data.sources": ["listing configured_spaces indexed_source", "rlds droid_raw lerobot npz latents", "registry"],
     "serving": [
         "wire worker prometheus access",

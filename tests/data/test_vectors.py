@@ -16,8 +16,8 @@ from memory_source import MemorySource
 from vector_sets import vectors, write_vectors
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.loading import parse_config
-from vjepa2_ac.data.clips.actions import actions_of, joined
-from vjepa2_ac.data.clips.dataset import open_dataset
+from vjepa2_ac.data.clips import actions_of, joined
+from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.inspection.check import check_data, findings_in
 from vjepa2_ac.data.inspection.statistics import inspect_dataset
 from vjepa2_ac.data.sources.registry import open_source
@@ -176,7 +176,7 @@ def test_an_episode_of_another_width_that_no_index_saw_is_named_when_it_is_read(
 
 
 def open_dataset_of(source: MemorySource) -> Any:
-    import vjepa2_ac.data.clips.dataset as module
+    import vjepa2_ac.data.dataset as module
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "open_source", lambda _: source)

@@ -8,7 +8,7 @@ import torch
 
 from synthetic import write_synthetic_droid
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.clips.dataset import open_dataset
+from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.inspection.check import Finding, at_some_stride, check_data, findings_in
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError

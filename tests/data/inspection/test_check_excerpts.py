@@ -10,14 +10,13 @@ from latent_sets import write_cache
 from memory_source import MemorySource
 from moving_arms import COLUMNS, ROWS, STEPS, spot_excerpt, spot_frames, spot_states, write_spots
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
-from vjepa2_ac.data.filters.broken_episodes import BrokenEpisodes
-from vjepa2_ac.data.filters.step_ranges import StepSelection
+from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.inspection import check_excerpts
 from vjepa2_ac.data.inspection.check import check_data
 from vjepa2_ac.data.inspection.check_excerpts import excerpt_findings, signs_in
 from vjepa2_ac.data.inspection.excerpts import Excerpt, excerpts_of, small_grey, warmth_of
 from vjepa2_ac.data.inspection.finding import Finding
+from vjepa2_ac.data.selection import BrokenEpisodes, StepSelection
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.spaces import POSE, StateSpace, vector_states
 

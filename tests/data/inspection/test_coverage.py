@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.clips.dataset import open_dataset
+from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.inspection.check import check_data
 from vjepa2_ac.data.inspection.coverage import PLAY, Coverage, PoseCoverage, VectorCoverage, coverage_of
 from vjepa2_ac.data.inspection.statistics import ReadEpisode, coverage_in, inspect_dataset

@@ -15,15 +15,14 @@ from memory_source import MemorySource
 from synthetic import synthetic_states
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.console.data import inspection_lines
-from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
-from vjepa2_ac.data.filters.broken_episodes import BrokenEpisodes
-from vjepa2_ac.data.filters.step_ranges import StepSelection
+from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.index.episode_table import FORMAT, EpisodeTable
 from vjepa2_ac.data.index.index_cache import IndexKeys, get_or_build
 from vjepa2_ac.data.index.state_hash import UNKNOWN, hash_of_states
 from vjepa2_ac.data.inspection.check import check_data
 from vjepa2_ac.data.inspection.duplicates import Duplicates, find_duplicates
 from vjepa2_ac.data.inspection.statistics import inspect_dataset
+from vjepa2_ac.data.selection import BrokenEpisodes, StepSelection
 from vjepa2_ac.data.sources.latents.manifest import EPISODES
 from vjepa2_ac.data.sources.rlds import lookalikes
 from vjepa2_ac.episode import EpisodeInfo

@@ -9,9 +9,7 @@ import pytest
 from clips import split_of
 from memory_source import MemorySource
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
-from vjepa2_ac.data.filters.broken_episodes import BrokenEpisodes
-from vjepa2_ac.data.filters.step_ranges import StepSelection
+from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.inspection.statistics import (
     RELEASED_STEP_CM,
     ReadEpisode,
@@ -20,6 +18,7 @@ from vjepa2_ac.data.inspection.statistics import (
     motion_per_step,
     sample_of,
 )
+from vjepa2_ac.data.selection import BrokenEpisodes, StepSelection
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.reports.figures import dataset as figure
 from vjepa2_ac.reports.figures.contact_sheet import ContactSheet

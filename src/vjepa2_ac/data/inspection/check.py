@@ -14,13 +14,13 @@ from torch import Tensor
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
-from vjepa2_ac.data.clips.loader import training_loader
+from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.inspection.check_excerpts import excerpt_findings
 from vjepa2_ac.data.inspection.check_vectors import has_moved, vector_findings
 from vjepa2_ac.data.inspection.duplicates import find_duplicates
 from vjepa2_ac.data.inspection.finding import Finding, Level
 from vjepa2_ac.data.inspection.statistics import coverage_in
+from vjepa2_ac.data.loader import training_loader
 from vjepa2_ac.episode import Batch, Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.spaces import POSE, POSES, Spaces

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from vjepa2_ac import storage
-from vjepa2_ac.data.clips.dataset import Dataset
+from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.inspection import oddities
 from vjepa2_ac.data.inspection.agreement import FEWEST_EPISODES, Agreement, agreement_of
 from vjepa2_ac.data.inspection.excerpts import EPISODES, Excerpt, excerpts_of

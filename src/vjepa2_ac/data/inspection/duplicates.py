@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.clips.dataset import Dataset
+from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.index.state_hash import UNKNOWN
 
 _SPLITS: tuple[Split, ...] = ("train", "validation", "test")

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from vjepa2_ac import storage
-from vjepa2_ac.data.clips.dataset import Dataset
+from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.inspection.statistics import sample_of
 from vjepa2_ac.errors import InputError
 

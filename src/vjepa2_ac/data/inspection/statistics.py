@@ -15,13 +15,13 @@ from scipy.spatial.transform import Rotation
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.clips.dataset import Dataset, Removed
-from vjepa2_ac.data.clips.windows import spread
-from vjepa2_ac.data.filters.idle_rules import idle_by_motion
+from vjepa2_ac.data.dataset import Dataset, Removed
+from vjepa2_ac.data.idle import idle_by_motion
 from vjepa2_ac.data.inspection.coverage import Coverage, coverage_of
 from vjepa2_ac.data.inspection.duplicates import Duplicates, find_duplicates
 from vjepa2_ac.data.inspection.statistics_vectors import ChangePerStep, change_per_step
 from vjepa2_ac.data.sources.configured_spaces import spaces_of
+from vjepa2_ac.data.windows import spread
 from vjepa2_ac.episode import Episode, Progress, Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.geometry import states_in_camera_frame

@@ -7,9 +7,9 @@ import torch
 
 from recording_cuda import RecordingCuda, recorded_copies
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.clips.prefetch import Batches, MicroBatch, prefetch_next
-from vjepa2_ac.data.clips.streams import NO_COPIES, Copies
-from vjepa2_ac.data.filters.broken_episodes import BrokenEpisodes
+from vjepa2_ac.data.loader import Batches, MicroBatch, prefetch_next
+from vjepa2_ac.data.selection import BrokenEpisodes
+from vjepa2_ac.data.streams import NO_COPIES, Copies
 from vjepa2_ac.episode import Batch, Skipped
 from vjepa2_ac.errors import InputError
 

@@ -11,17 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from clips import split_of
+from memory_source import MemorySource
 from paths import GOLDEN, ROOT
-from vjepa2_ac.config import DataConfig
-from vjepa2_ac.config.data import Split
+from vjepa2_ac.config.data import DataConfig, Split
 from vjepa2_ac.config.loading import load_config
-from vjepa2_ac.data.clips.permutation import permuted
-from vjepa2_ac.data.clips.splits import in_split
-from vjepa2_ac.data.clips.windows import ClipOrder, Windows, far_neighbours, spread
-from vjepa2_ac.data.clips.windows import windows_of as windows_of_starts
-from vjepa2_ac.data.filters.exclusion import included
-from vjepa2_ac.data.filters.step_ranges import StepSelection, clip_starts
+from vjepa2_ac.data import dataset as opening
 from vjepa2_ac.data.index.episode_table import EpisodeTable
+from vjepa2_ac.data.selection import StepSelection, included
+from vjepa2_ac.data.windows import ClipOrder, Windows, clip_starts, far_neighbours, in_split, permuted, spread
+from vjepa2_ac.data.windows import windows_of as windows_of_starts
 from vjepa2_ac.episode import EpisodeInfo
 from vjepa2_ac.errors import InputError
 
@@ -67,19 +65,6 @@ def test_seeds_and_epochs_have_orders_of_their_own() -> None:
         for epoch in range(5)
     }
     assert len(orders) == 25
-
-
-@pytest.mark.parametrize("size", [5, 16])
-def test_every_place_is_equally_likely_for_every_index(size: int) -> None:
-    epochs = 600
-    counts = np.zeros((size, size))
-    for epoch in range(epochs):
-        for index in range(size):
-            counts[index, permuted(index, size=size, seed=1, epoch=epoch)] += 1
-    expected = epochs / size
-    deviation = (counts - expected) / np.sqrt(expected * (1 - 1 / size))
-    assert abs(deviation).max() < 5
-    assert deviation.std() < 1.25
 
 
 def test_neighbours_do_not_stay_together() -> None:
@@ -152,14 +137,6 @@ def test_shares_are_kept_and_growing_one_moves_few_episodes() -> None:
         assert before == after or (before, after) == ("train", "validation")
 
 
-def test_all_episodes_are_split_at_once_as_each_alone() -> None:
-    infos = episodes(*[20] * 300)
-    config = settings_of(validation_share=0.23, test_share=0.31)
-    for split in ("train", "validation", "test"):
-        expected = [split_of(info.id, config) == split for info in infos]
-        assert in_split(EpisodeTable.of(infos).id_hash, config, split).tolist() == expected
-
-
 def test_the_split_never_changes_between_versions() -> None:
     config = settings_of(validation_share=0.3, test_share=0.3)
     assert [split_of(f"episode {number}", config) for number in range(8)] == [
@@ -200,24 +177,10 @@ def test_short_episodes_are_left_out_counted_and_named(caplog: pytest.LogCapture
     assert "episode 2" in caplog.text
 
 
-def test_short_episodes_are_spoken_of_once_for_each_set_of_data(caplog: pytest.LogCaptureFixture) -> None:
-    for path in ("this set", "this set", "another set"):
-        windows_of(episodes(9, 10), settings_of(**ALL_TRAIN).model_copy(update={"path": path}), "train")
-    assert [record.getMessage().split(":")[0] for record in caplog.records] == ["this set", "another set"]
-
-
 def test_short_episodes_stop_the_run_when_told_to() -> None:
     config = settings_of(short_episodes="error", **ALL_TRAIN)
     with pytest.raises(InputError, match=r"2 of 3 train episodes.*episode 0, has 9 steps.*needed: 10 steps.*skip"):
         windows_of(episodes(9, 10, 3), config, "train")
-
-
-def test_short_episodes_that_stop_the_run_are_named_ten_at_most() -> None:
-    config = settings_of(short_episodes="error", **ALL_TRAIN)
-    with pytest.raises(InputError, match=r"Too short: episode 1, episode 2\."):
-        windows_of(episodes(10, 3, 3), config, "train")
-    with pytest.raises(InputError, match=r"Too short: episode 0, (episode \d+, ){8}episode \d+ and 2 more\."):
-        windows_of(episodes(*[3] * 12, 10), config, "train")
 
 
 def test_an_excluded_episode_is_in_no_split_and_the_others_stay_where_they_were() -> None:
@@ -249,7 +212,8 @@ def test_nothing_but_short_episodes_stops_the_run() -> None:
 
 def test_a_range_of_kept_steps_costs_a_few_bytes() -> None:
     windows = windows_of(episodes(*[300] * 1000), settings_of(**ALL_TRAIN), "train")
-    assert sum(column.nbytes for column in (*windows.starts.columns, windows.ends)) == 24_000
+    starts = windows.starts
+    assert sum(one.nbytes for one in (starts.episode, starts.first, starts.count, windows.ends)) == 20_000
 
 
 @settings(max_examples=50)
@@ -268,3 +232,86 @@ def test_far_neighbours_are_all_there_and_lie_half_the_list_apart(count: int) ->
     assert sorted(order) == list(range(count))
     for one, other in itertools.pairwise(order):
         assert abs(one - other) >= count // 2 - 1
+
+
+SPLITS: tuple[Split, ...] = ("train", "validation", "test")
+HASHES = st.lists(st.integers(0, 1023), min_size=1, max_size=40, unique=True)  # in 1/1024
+
+
+def counts(hashes: list[int], **shares: float) -> dict[str, int]:
+    config = DataConfig(path="nowhere", **shares)
+    return {split: int(in_split(np.array(hashes, np.uint64), config, split).sum()) for split in SPLITS}
+
+
+@given(numbers=HASHES, validation=st.floats(0, 0.4), test=st.floats(0, 0.4))
+def test_each_episode_is_in_one_split_and_none_that_has_a_share_is_empty(
+    numbers: list[int], validation: float, test: float
+) -> None:
+    found = counts([number * 2**54 for number in numbers], validation_share=validation, test_share=test)
+    assert sum(found.values()) == len(numbers)
+    if len(numbers) >= 20:
+        assert (found["validation"] > 0) == (validation > 0) or found["train"] < 2
+        assert found["test"] > 0 or test == 0
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_twenty_demonstrations_with_the_default_shares_have_all_three(seed: int) -> None:
+    hashes = np.random.default_rng(seed).integers(0, 2**64, 20, dtype=np.uint64).tolist()
+    found = counts(hashes)
+    assert found["validation"] >= 1
+    assert found["test"] >= 1
+    assert found["train"] >= 10
+
+
+def test_those_whose_number_comes_next_move_and_nobody_else() -> None:
+    hashes = [int(share * 2**64) for share in (0.9, 0.5, 0.3, 0.7)]
+    config = DataConfig(path="nowhere", validation_share=0.05, test_share=0.05)
+    assert in_split(np.array(hashes, np.uint64), config, "test").tolist() == [False, False, True, False]
+    assert in_split(np.array(hashes, np.uint64), config, "validation").tolist() == [False, True, False, False]
+
+
+def test_a_group_moves_as_a_whole() -> None:
+    hashes = [int(share * 2**64) for share in (0.3, 0.3, 0.5, 0.5, 0.9)]
+    assert counts(hashes) == {"train": 1, "validation": 2, "test": 2}
+
+
+def splits_of(monkeypatch: pytest.MonkeyPatch, source: MemorySource, **knobs: object) -> dict[str, Split]:
+    """Return the split of every episode that takes part."""
+    monkeypatch.setattr(opening, "open_source", lambda _: source)
+    values = {"path": "the set", "frames": 3, "stride": 2, "validation_share": 0.02, "test_share": 0.02} | knobs
+    dataset = opening.open_dataset(DataConfig.model_validate(values))
+    return {
+        dataset.table.identity(int(place)): split
+        for split in SPLITS
+        for place in np.flatnonzero(dataset.members(split))
+    }
+
+
+@pytest.mark.parametrize("split_by", [None, r"episode (\d)"])
+@pytest.mark.parametrize("left_out", range(8))
+def test_leaving_an_episode_out_moves_no_other(
+    monkeypatch: pytest.MonkeyPatch, left_out: int, split_by: str | None
+) -> None:
+    """Neither `data.exclude` nor an episode that breaks: what a run has trained on stays out of its validation."""
+    knobs = {"split_by": split_by, "idle": {"rule": "motion"}, "broken_episodes": "skip"}
+    before = splits_of(monkeypatch, MemorySource([60] * 8), **knobs)
+    assert set(before.values()) == set(SPLITS)
+    without = {name: split for name, split in before.items() if name != f"episode {left_out}"}
+    excluded = {"exclude": (f"episode {left_out}",)}
+    assert splits_of(monkeypatch, MemorySource([60] * 8), **knobs, **excluded) == without
+    monkeypatch.setattr("vjepa2_ac.data.selection.MOST_BROKEN", 0.2)
+    assert (
+        splits_of(monkeypatch, MemorySource([61 + left_out] * 8, unreadable=frozenset({left_out})), **knobs) == without
+    )
+
+
+def test_of_the_outcomes_only_the_chosen_one_is_split(monkeypatch: pytest.MonkeyPatch) -> None:
+    source = MemorySource([60] * 12, [number % 2 == 0 for number in range(12)])
+    found = splits_of(monkeypatch, source, outcome="success")
+    assert sorted(found.values()).count("train") == 4
+    assert set(found.values()) == set(SPLITS)
+
+
+def test_one_or_two_episodes_and_shares_of_zero_stay_as_the_hash_says() -> None:
+    assert counts([2**63, 2**63 + 2**60]) == {"train": 2, "validation": 0, "test": 0}
+    assert counts([2**63] * 9, validation_share=0.0, test_share=0.0) == {"train": 9, "validation": 0, "test": 0}

@@ -13,11 +13,11 @@ import pytest
 from memory_source import MemorySource
 from synthetic import write_synthetic_droid
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.clips import dataset as opening
-from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
-from vjepa2_ac.data.filters.broken_episodes import BrokenEpisodes
-from vjepa2_ac.data.filters.idle_ranges import FoundRanges
+from vjepa2_ac.data import dataset as opening
+from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.idle import FoundRanges
 from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable
+from vjepa2_ac.data.selection import BrokenEpisodes
 from vjepa2_ac.errors import InputError
 
 Open = Callable[..., Dataset]
@@ -181,10 +181,10 @@ def two_ranges_each(table: EpisodeTable) -> FoundRanges:
     count, steps = len(table), table.num_steps
     start, end = (np.zeros(2 * count, np.int32) for _ in range(2))
     start[1::2], end[0::2], end[1::2] = steps * 0.4, steps * 0.3, steps * 0.85
-    return FoundRanges(np.repeat(np.arange(count, dtype=np.int32), 2), start, end, listed=count)
+    return FoundRanges(np.repeat(np.arange(count, dtype=np.int32), 2), start, end)
 
 
-@pytest.mark.parametrize("idle", [{}, {"rule": "motion"}, {"rule": "motion", "keep_share": 0.2}])
+@pytest.mark.parametrize("idle", [{}, {"rule": "motion"}])
 def test_a_set_of_droids_size_is_opened_without_a_call_for_each_episode_and_in_fifty_megabytes(
     open_with: Open, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, idle: dict[str, Any]
 ) -> None:

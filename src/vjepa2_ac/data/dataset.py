@@ -3,28 +3,32 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Int, UInt64
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.clips.actions import widths_of
-from vjepa2_ac.data.clips.splits import in_split
-from vjepa2_ac.data.clips.windows import Windows, windows_of
-from vjepa2_ac.data.filters.broken_episodes import BrokenEpisodes
-from vjepa2_ac.data.filters.exclusion import included, with_way_out
-from vjepa2_ac.data.filters.grouping import groups_of
-from vjepa2_ac.data.filters.idle_ranges import FoundRanges, find_ranges
-from vjepa2_ac.data.filters.step_ranges import ClipStarts, StepSelection, clip_starts
-from vjepa2_ac.data.index.episode_table import EpisodeTable
+from vjepa2_ac.data.idle import FoundRanges, find_ranges
+from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable
+from vjepa2_ac.data.selection import (
+    BrokenEpisodes,
+    StepSelection,
+    groups_of,
+    included,
+    of_outcome,
+    require_distinct,
+    with_way_out,
+)
 from vjepa2_ac.data.sources.configured_spaces import spaces_of
-from vjepa2_ac.data.sources.latents.source import LatentSource
 from vjepa2_ac.data.sources.registry import open_source
-from vjepa2_ac.episode import POSE_WIDTHS, EpisodeSource, Progress, StepRanges, Widths
+from vjepa2_ac.data.windows import ClipStarts, Windows, clip_starts, in_split, windows_of
+from vjepa2_ac.episode import POSE_WIDTHS, Episode, EpisodeSource, Progress, StepRanges, Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.spaces import Spaces
 
@@ -41,12 +45,27 @@ class Removed:
     episodes: int  # without remaining steps
     steps: int  # of episodes that could be read
     windows: int | None  # clips; None while data.stride is auto
-    stays: float = 0.0  # share of the clips from these steps that are still used (data.idle.keep_share)
 
     def __str__(self) -> str:
         clips = "" if self.windows is None else f", {self.windows:,} clips"
-        stays = f" ({self.stays:.0%} of the clips from these stay)" if self.stays else ""
-        return f"{self.episodes:,} episodes, {self.steps:,} steps{clips}{stays}"
+        return f"{self.episodes:,} episodes, {self.steps:,} steps{clips}"
+
+
+@runtime_checkable
+class EncodedSource(EpisodeSource, Protocol):
+    """A source of encoded episodes: its steps were selected when they were encoded."""
+
+    def kept_ranges(self) -> FoundRanges:
+        """Return the ranges that `data.idle` keeps."""
+        ...
+
+    def settle(self, episodes: Int[np.ndarray, " episodes"]) -> tuple[DataConfig, list[EpisodeProblem]]:
+        """Return the config with the cameras that there are, and the episodes whose files are not as written.
+
+        Raises:
+            InputError: One of these episodes, that clips come from, was not encoded.
+        """
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +86,8 @@ class Dataset:
 
     def members(self, split: Split) -> Bool[np.ndarray, " episodes"]:
         """Return which episodes are used and belong to a split."""
-        among = _of_outcome(self.table, self.config)
-        return self.kept.taking_part & in_split(self.split_hash, self.config, split, among)
+        among = of_outcome(self.table, self.config)
+        return np.asarray(self.kept.taking_part & in_split(self.split_hash, self.config, split, among))
 
     def windows(self, split: Split) -> Windows:
         """Return the clips of a split.
@@ -115,34 +134,27 @@ class Dataset:
     def removed(self) -> tuple[Removed, ...]:
         """What each filter removed, in their order."""
         included_ones = included(self.table, self.config)
-        of_outcome = included_ones & _of_outcome(self.table, self.config)
-        excluded = sum(problem.name in self.config.exclude for problem in self.table.problems)
-        unread = {"excluded": excluded, "broken": len(self.table.problems) - excluded}
-        stays = {"idle": self.config.idle.keep_share}
-        everyone = np.ones(len(self.table), bool)
-        stages = {"excluded": everyone, "outcome": included_ones, "broken": of_outcome, "idle": self.kept.taking_part}
-        left = [self._count(StepSelection.whole(self.table, mask)) for mask in stages.values()]
+        chosen = included_ones & of_outcome(self.table, self.config)
+        masks = np.ones(len(self.table), bool), included_ones, chosen, self.kept.taking_part
+        left = [self._count(StepSelection.whole(self.table, mask)) for mask in masks]
         gone = -np.diff([*left, self._count(self.kept)], axis=0)
+        excluded = sum(problem.name in self.config.exclude for problem in self.table.problems)
+        unread = {"excluded": excluded, "outcome": 0, "broken": len(self.table.problems) - excluded, "idle": 0}
         is_known = self.config.stride != "auto"
         return tuple(
-            Removed(name, count + unread.get(name, 0), steps, windows if is_known else None, stays.get(name, 0.0))
-            for name, (count, steps, windows) in zip(stages, gone.tolist(), strict=True)
+            Removed(name, episodes + unread[name], steps, windows if is_known else None)
+            for name, (episodes, steps, windows) in zip(unread, gone.tolist(), strict=True)
         )
 
     def _count(self, kept: StepSelection) -> tuple[int, int, int]:
         """Return the numbers of episodes, steps and, if the stride is known, windows."""
-        windows = 0
-        if self.config.stride != "auto":
-            starts = self.starts if kept is self.kept else clip_starts(self.table, kept, self.config)
-            windows = starts.windows
-        episodes = self.episodes if kept is self.kept else np.unique(kept.episode)
-        return len(episodes), kept.steps, windows
+        is_known = self.config.stride != "auto"
+        windows = clip_starts(self.table, kept, self.config).windows if is_known else 0
+        return len(np.unique(kept.episode)), kept.steps, windows
 
     @property
     def episodes(self) -> Int[np.ndarray, " episodes"]:
         """The episodes that clips may come from."""
-        if self.config.idle.rule != "none" and self.config.idle.keep_share > 0:
-            return np.flatnonzero(self.kept.taking_part)
         return np.unique(self.kept.episode)
 
     @cached_property
@@ -197,9 +209,7 @@ class Dataset:
 
     def needed_steps(self, episode: int) -> StepRanges | None:
         """Return the steps of an episode that clips may come from; None: all of them."""
-        if self.config.idle.rule == "none" or self.config.idle.keep_share > 0:
-            return None
-        return self.kept.of(episode)
+        return None if self.config.idle.rule == "none" else self.kept.of(episode)
 
 
 def open_dataset(config: DataConfig, *, progress: Progress | None = None) -> Dataset:
@@ -217,26 +227,24 @@ def open_dataset(config: DataConfig, *, progress: Progress | None = None) -> Dat
     table = EpisodeTable.of(source.infos(progress))
     broken = BrokenEpisodes(config, len(table) + len(table.problems))
     taking_part = included(table, config)
-    _require_distinct(table, taking_part, config)
-    excluded = frozenset(config.exclude)
-    broken.found([problem for problem in table.problems if problem.name not in excluded])
-    taking_part &= _of_outcome(table, config)
-    if config.idle.rule == "none":
-        kept = StepSelection.whole(table, taking_part)
-    else:
-        if isinstance(source, LatentSource):
-            ranges = source.kept_ranges()
+    require_distinct(table, taking_part, config)
+    broken.found(_not_excluded(table.problems, config))
+    taking_part &= of_outcome(table, config)
+    kept = StepSelection.whole(table, taking_part)
+    if config.idle.rule != "none":
+        if isinstance(source, EncodedSource):
+            found = source.kept_ranges()
         else:
-            ranges = find_ranges(source, table, config, progress)
-        kept = _select_steps(ranges, table, taking_part, broken)
-        _log_listed_episodes(ranges, table, config)
+            found = find_ranges(source, table, config, progress)
+        met = [(place, problem) for place, problem in found.problems if taking_part[place]]
+        broken.found([problem for _, problem in met])
+        taking_part[[place for place, _ in met]] = False
+        kept = StepSelection(found.episode, found.start, found.end, taking_part).only(taking_part)
     dataset = Dataset(config, source, table, kept, broken, groups_of(table, kept.taking_part, config))
     if not len(dataset.episodes):
         raise _nothing_left(dataset)
-    if isinstance(source, LatentSource):
-        dataset = _of_latents(dataset, source)
     logger.info("%s: %d episodes take part, %d steps of them", config.path, kept.taking_part.sum(), kept.steps)
-    return dataset
+    return _settled(dataset)
 
 
 def through_latents(dataset: Dataset, folder: Path) -> Dataset:
@@ -246,16 +254,22 @@ def through_latents(dataset: Dataset, folder: Path) -> Dataset:
         InputError: The cache lacks episodes or is damaged.
     """
     config = dataset.config.as_kind("latents", path=str(folder), cache="off", camera=dataset.config.cameras)
-    source = LatentSource(config)
-    return _of_latents(replace(dataset, source=source, table=source.infos()), source)
+    source = open_source(config)
+    return _settled(replace(dataset, source=source, table=EpisodeTable.of(source.infos()), config=config))
 
 
-def _of_latents(dataset: Dataset, source: LatentSource) -> Dataset:
-    """Check that a cache has what the clips need, and set its cameras in the config."""
-    source.require_encoded(dataset.starts.episode)
-    excluded = frozenset(dataset.config.exclude)
-    dataset.broken.found([problem for problem in source.wrong_files() if problem.name not in excluded])
-    return replace(dataset, config=source.settled_config)
+def _settled(dataset: Dataset) -> Dataset:
+    """Check that a latent cache has what the clips need, and set its cameras in the config."""
+    if not isinstance(dataset.source, EncodedSource):
+        return dataset
+    config, wrong_files = dataset.source.settle(dataset.starts.episode)
+    dataset.broken.found(_not_excluded(wrong_files, config))
+    return replace(dataset, config=config)
+
+
+def _not_excluded(problems: Sequence[EpisodeProblem], config: DataConfig) -> list[EpisodeProblem]:
+    excluded = frozenset(config.exclude)
+    return [problem for problem in problems if problem.name not in excluded]
 
 
 def _nothing_left(dataset: Dataset) -> InputError:
@@ -269,51 +283,23 @@ def _nothing_left(dataset: Dataset) -> InputError:
     )
 
 
-def _select_steps(
-    found: FoundRanges, table: EpisodeTable, taking_part: Bool[np.ndarray, " episodes"], broken: BrokenEpisodes
-) -> StepSelection:
-    met = [(place, problem) for place, problem in found.problems if taking_part[place]]
-    broken.found([problem for _, problem in met])
-    taking_part[[place for place, _ in met]] = False
-    everything = StepSelection(found.episode, found.start, found.end, np.ones(len(table), bool))
-    return everything.only(taking_part)
+def widths_of(episode: Episode) -> Widths:
+    """Return the widths of an episode's states and actions."""
+    state = int(episode.states.shape[1])
+    return Widths(state, state if episode.commands is None else int(episode.commands.shape[1]))
 
 
-def _of_outcome(table: EpisodeTable, config: DataConfig) -> Bool[np.ndarray, " episodes"]:
-    if config.outcome == "all":
-        return np.ones(len(table), bool)
-    if len(table) and (table.success < 0).all():
+def require_widths(episode: Episode, widths: Widths) -> None:
+    """Refuse an episode whose widths differ from those of the others.
+
+    Raises:
+        InputError: Names both.
+    """
+    found = widths_of(episode)
+    if found != widths:
         raise InputError(
-            where=f"data.outcome: {config.outcome}",
-            found=f"no episode of {config.path} says whether it succeeded",
-            needed="at least some that do",
-            fix="Set data.outcome: all",
+            where=f"episode {episode.info.id}",
+            found=f"states of {found.state} and actions of {found.action} numbers",
+            needed=f"{widths.state} and {widths.action}, as in the others",
+            fix="Keep the recordings of different robots in different data sets",
         )
-    return np.asarray(table.success == (config.outcome == "success"))
-
-
-def _log_listed_episodes(found: FoundRanges, table: EpisodeTable, config: DataConfig) -> None:
-    if config.idle.rule != "published":
-        return
-    logger.log(
-        logging.INFO if found.listed == len(table) else logging.WARNING,
-        "%s: knows %d of the %d episodes; the other %d count as idle",
-        config.idle.ranges, found.listed, len(table), len(table) - found.listed,
-    )  # fmt: skip
-
-
-def _require_distinct(table: EpisodeTable, taking_part: Bool[np.ndarray, " episodes"], config: DataConfig) -> None:
-    """Refuse two episodes with one identity: they would share a split, and an error could not name one of them."""
-    order = np.argsort(table.id_hash, kind="stable")
-    order = order[taking_part[order]]
-    hashes = table.id_hash[order]
-    for place in np.flatnonzero(hashes[1:] == hashes[:-1]):
-        first, second = sorted((int(order[place]), int(order[place + 1])))
-        if table.identity(first) == table.identity(second):
-            error = InputError(
-                where=f"data.path: {config.path}",
-                found=f"episodes {first} and {second} have the same identity: {table.identity(first)}",
-                needed="episodes that can be told apart: the split is a hash of the identity",
-                fix=config.same_identity_fix,
-            )
-            raise with_way_out(error, [table.identity(first)], skippable=False)

@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -58,19 +58,6 @@ class Cuda:
         return event
 
 
-@runtime_checkable
-class Copying(Protocol):
-    """Copies in one direction."""
-
-    def start(self, mapped: Callable[[Change], _T]) -> Callable[[], _T]:
-        """Start to copy tensors, and return a function that returns the copies.
-
-        Args:
-            mapped: Replaces each of them, such as `Batch.mapped`; called once, immediately.
-        """
-        ...
-
-
 class ToDevice:
     """Copies tensors to the device, on its own stream. Only the computation that uses the copies waits.
 
@@ -84,7 +71,13 @@ class ToDevice:
         self._cuda, self._stream = cuda, cuda.new_stream()
 
     def start(self, mapped: Callable[[Change], _T]) -> Callable[[], _T]:
-        """Start to copy; the returned function lets the computing stream, not the host, wait for the copies."""
+        """Start to copy tensors, and return a function that returns the copies.
+
+        That function lets the computing stream, not the host, wait for them.
+
+        Args:
+            mapped: Replaces each of the tensors, such as `Batch.mapped`; called once, immediately.
+        """
         cuda, copies = self._cuda, list[Tensor]()
 
         def copy(tensor: Tensor) -> Tensor:
@@ -116,7 +109,7 @@ class ToHost:
         self._cuda, self._stream = cuda, cuda.new_stream()
 
     def start(self, mapped: Callable[[Change], _T]) -> Callable[[], _T]:
-        """Start to copy; the returned function waits for these copies only, not for work enqueued since."""
+        """Start to copy, as `ToDevice.start`; the returned function waits for these copies, not for work since."""
         cuda, stream = self._cuda, self._stream
 
         def copy(tensor: Tensor) -> Tensor:
@@ -146,7 +139,7 @@ class AtOnce:
         self._device = device
 
     def start(self, mapped: Callable[[Change], _T]) -> Callable[[], _T]:
-        """Copy."""
+        """Copy, as `ToDevice.start`."""
         moved = mapped(lambda tensor: tensor.to(self._device))
         return lambda: moved
 
@@ -155,8 +148,8 @@ class AtOnce:
 class Copies:
     """Copies in both directions."""
 
-    to_device: Copying
-    to_host: Copying
+    to_device: ToDevice | AtOnce
+    to_host: ToHost | AtOnce
     overlap: bool  # whether copies overlap with computation
 
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from recording_cuda import COMPUTING, RecordingCuda, recorded_copies
-from vjepa2_ac.data.clips.streams import Change, copies_for
+from vjepa2_ac.data.streams import Change, copies_for
 from vjepa2_ac.episode import Batch, StoredLatents
 
 CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")

@@ -21,14 +21,14 @@ import torch
 from clips import clip_at
 from memory_source import MemorySource
 from recording_cuda import Pinning, RecordingCuda, recorded_copies
-from synthetic import synthetic_states, write_synthetic_droid
+from synthetic import write_synthetic_droid
 from tfrecords import index_records
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.clips import dataset as opening
-from vjepa2_ac.data.clips import loader
-from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
-from vjepa2_ac.data.clips.loader import ProcessShare, collate, training_loader, validation_batches
-from vjepa2_ac.data.clips.streams import copies_for
+from vjepa2_ac.data import dataset as opening
+from vjepa2_ac.data import loader
+from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.loader import ProcessShare, collate, training_loader, validation_batches
+from vjepa2_ac.data.streams import NO_COPIES, copies_for
 from vjepa2_ac.episode import Batch, Episode
 from vjepa2_ac.errors import InputError, UnreachableError
 from vjepa2_ac.geometry import actions_from_states, apply_action, matrices_from_euler, states_in_camera_frame
@@ -76,10 +76,6 @@ def test_the_actions_of_a_clip_lead_from_each_state_to_the_next(droid: Path) -> 
     np.testing.assert_allclose(
         matrices_from_euler(reached[:, 3:6]), matrices_from_euler(clip.states[1:, 3:6].astype(np.float64)), atol=1e-5
     )
-
-
-def test_workers_change_nothing(droid: Path) -> None:
-    assert_same(take(7, config_of(droid, workers=2)), take(7, config_of(droid)))
 
 
 def test_resumed_run_sees_the_clips_the_uninterrupted_run_would_have(droid: Path) -> None:
@@ -154,13 +150,19 @@ def test_validation_without_held_out_episodes_says_so_at_once(droid: Path) -> No
 
 
 @pytest.mark.parametrize("workers", [0, 1])
-def test_an_error_in_a_worker_is_the_error_the_user_reads(spoiled: Callable[..., Path], workers: int) -> None:
+@pytest.mark.parametrize("pinned", [False, True])
+def test_an_error_in_a_worker_is_the_error_the_user_reads(
+    spoiled: Callable[..., Path], monkeypatch: pytest.MonkeyPatch, workers: int, *, pinned: bool
+) -> None:
     def spoil(features: dict[str, tuple[Any, Any]]) -> None:
         features["steps/observation/exterior_image_1_left"][1][:] = [b"GIF89a"] * 12
 
     config = config_of(spoiled(spoil), workers=workers, validation_share=0.0)
-    with pytest.raises(InputError, match="not a JPEG") as caught:
-        take(60, config)
+    copies = recorded_copies(RecordingCuda()) if pinned else NO_COPIES
+    with monkeypatch.context() as patch:
+        _ = Pinning(patch) if pinned else None
+        with pytest.raises(InputError, match="not a JPEG") as caught:
+            take(60, config, copies=copies)
     assert type(caught.value) is InputError
     assert "tfrecord-00000-of-00002: record 0 at byte 0" in caught.value.where
     assert caught.value.needed == "a JPEG image"
@@ -184,8 +186,8 @@ def test_a_clip_of_a_damaged_record_says_how_to_leave_it_out(droid: Path, tmp_pa
 RUN_THAT_DIES = """
 import os, signal, sys
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.clips.dataset import open_dataset
-from vjepa2_ac.data.clips.loader import training_loader
+from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.data.loader import training_loader
 if __name__ == "__main__":
     config = DataConfig(path=sys.argv[1], frames=3, stride=2, workers=1, validation_share=0.0, test_share=0.0)
     batches = training_loader(open_dataset(config), seed=0, batch_size=1)
@@ -251,21 +253,6 @@ def test_batches_reach_a_cuda_device_as_they_are(droid: Path, workers: int) -> N
     there = [batch.on_device() for batch in found]
     assert all(batch.frames.is_cuda for batch in there)
     assert_same([batch.mapped(torch.Tensor.cpu) for batch in there], take(2, config_of(droid)))
-
-
-@pytest.mark.parametrize("workers", [0, 1])
-def test_an_error_passes_the_pinning_unharmed(
-    spoiled: Callable[..., Path], monkeypatch: pytest.MonkeyPatch, workers: int
-) -> None:
-    def spoil(features: dict[str, tuple[Any, Any]]) -> None:
-        features["steps/observation/exterior_image_1_left"][1][:] = [b"GIF89a"] * 12
-
-    config, copies = config_of(spoiled(spoil), workers=workers, validation_share=0.0), recorded_copies(RecordingCuda())
-    Pinning(monkeypatch)
-    with pytest.raises(InputError, match="not a JPEG") as caught:
-        take(60, config, copies=copies)
-    assert type(caught.value) is InputError
-    assert caught.value.needed == "a JPEG image"
 
 
 def test_frames_of_two_sizes_do_not_stack(droid: Path) -> None:
@@ -360,24 +347,6 @@ def test_the_camera_of_a_validation_clip_stays(in_memory: Callable[..., Dataset]
 
     assert cameras() == cameras()
     assert len(set(cameras().values())) == 2  # the names of the exterior cameras are as long
-
-
-def test_idle_windows_that_stay_are_seen_by_every_camera(in_memory: Callable[..., Dataset]) -> None:
-    def still(_: int) -> np.ndarray:
-        return np.repeat(synthetic_states(1), 60, axis=0) + np.eye(60, 7) * 0.5  # moves in the first seven steps
-
-    knobs = {"camera": (CAMERAS[0], CAMERAS[2]), "validation_share": 0.5}
-    idle = {"rule": "motion", "keep_share": 0.3, "cut_last_steps": 0, "shortest_kept_steps": 2}
-    source = MemorySource([60] * 20, states=still)
-    dataset = in_memory(source, idle=idle, **knobs)
-    source.reads.clear()
-    windows = dataset.windows("validation")
-    kept = {(episode, start) for episode in range(20) for start in range(10)}
-    chosen = [windows[index] for index in range(len(windows)) if windows[index] not in kept]
-    list(loader.batches_of(dataset, chosen, batch_size=4))
-    cameras = [camera for _, camera, _ in source.reads]
-    assert len(cameras) > 50
-    assert 0.3 < cameras.count(CAMERAS[0]) / len(cameras) < 0.7
 
 
 def test_training_clips_are_changed_by_their_position_and_validation_clips_never(
@@ -491,31 +460,16 @@ def test_a_validation_of_nothing_but_broken_clips_is_refused(in_memory: Callable
         list(validation_batches(nothing, "validation", clips=1, batch_size=1))
 
 
-def test_skipping_does_not_depend_on_workers_nor_on_where_a_run_resumed(
-    spoiled: Callable[..., Path], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    def spoil(features: dict[str, tuple[Any, Any]]) -> None:
-        features["steps/observation/exterior_image_1_left"][1][3] = b"GIF89a"
-
-    monkeypatch.setattr("vjepa2_ac.data.filters.broken_episodes.MOST_BROKEN", 0.2)
-    config = config_of(spoiled(spoil), validation_share=0.0, broken_episodes="skip")
-    alone = [names([batch]) for batch in take(30, config)]
-    assert sum(len(row) for row in alone) < 60
-    assert [names([batch]) for batch in take(30, config.model_copy(update={"workers": 2}))] == alone
-    assert [names([batch]) for batch in take(10, config, start_position=40)] == alone[20:]
-    assert "not a JPEG" in caplog.text
-
-
 def test_with_every_knob_on_neither_workers_nor_resuming_change_a_bit(
     spoiled: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def spoil(features: dict[str, tuple[Any, Any]]) -> None:
         features["steps/observation/exterior_image_1_left"][1][3] = b"GIF89a"
 
-    monkeypatch.setattr("vjepa2_ac.data.filters.broken_episodes.MOST_BROKEN", 0.2)
+    monkeypatch.setattr("vjepa2_ac.data.selection.MOST_BROKEN", 0.2)
     config = config_of(
         spoiled(spoil), validation_share=0.0, broken_episodes="skip", camera=CAMERAS, crop="letterbox",
-        idle={"rule": "motion", "keep_share": 0.5, "shortest_kept_steps": 2, "cut_last_steps": 6},
+        idle={"rule": "motion", "shortest_kept_steps": 2, "cut_last_steps": 6},
         augment={"crop_scale": (0.3, 1.0), "brightness": 0.4},
     )  # fmt: skip
     alone = take(40, config)

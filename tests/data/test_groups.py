@@ -13,12 +13,12 @@ from copied_sets import write_lerobot, write_npz, write_raw, write_rlds
 from latent_sets import write_cache
 from memory_source import MemorySource
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.clips import dataset as opening
-from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
-from vjepa2_ac.data.filters.grouping import groups_of
+from vjepa2_ac.data import dataset as opening
+from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.index.episode_table import EpisodeTable
 from vjepa2_ac.data.inspection.check import check_data
 from vjepa2_ac.data.inspection.statistics import inspect_dataset
+from vjepa2_ac.data.selection import groups_of
 from vjepa2_ac.episode import EpisodeInfo
 from vjepa2_ac.errors import InputError
 

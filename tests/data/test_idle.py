@@ -16,11 +16,9 @@ from memory_source import MemorySource
 from paths import GOLDEN
 from synthetic import synthetic_states
 from vjepa2_ac.config import DataConfig, IdleConfig
-from vjepa2_ac.data.clips import dataset as opening
-from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
-from vjepa2_ac.data.filters.idle_ranges import FoundRanges
-from vjepa2_ac.data.filters.idle_rules import idle_by_commands, idle_by_motion, kept_ranges, moving_ranges
-from vjepa2_ac.data.filters.step_ranges import drawn
+from vjepa2_ac.data import dataset as opening
+from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.idle import FoundRanges, idle_by_commands, idle_by_motion, kept_ranges, moving_ranges
 from vjepa2_ac.data.index.episode_table import EpisodeProblem, NotATableError
 from vjepa2_ac.errors import InputError, UnreachableError
 
@@ -160,7 +158,6 @@ def test_clips_come_from_kept_ranges_only(open_with: Any) -> None:
 def test_an_episode_is_read_with_the_steps_that_clips_may_come_from(open_with: Any) -> None:
     source = restful()
     assert open_with(source, idle=MOTION).needed_steps(0) == ((0, 10), (35, 50))
-    assert open_with(source, idle=MOTION.model_copy(update={"keep_share": 0.5})).needed_steps(0) is None
     assert open_with(source).needed_steps(0) is None
     clip_at(open_with(source, idle=MOTION), 2, 40)
     assert source.reads[-1] == (2, None, ((0, 10), (35, 70)))
@@ -189,42 +186,11 @@ def test_a_data_set_that_changed_is_indexed_anew(tmp_path: Path) -> None:
     assert kept([(22, 37)]) == ((0, 12), (37, 50)), "another file of the same size and length"
 
 
-def test_a_share_of_idle_windows_stays_the_same_ones_each_time(open_with: Any) -> None:
-    def some(share: float) -> set[tuple[int, int]]:
-        return starts(open_with(restful([400] * 12), idle=MOTION.model_copy(update={"keep_share": share})))
-
-    none, few, many, everything = some(0.0), some(0.2), some(0.6), some(1.0)
-    idle = len(everything) - len(none)
-    assert none < few < many < everything
-    assert everything == {(episode, start) for episode in range(12) for start in range(396)}
-    for share, kept in ((0.2, few), (0.6, many)):
-        assert abs((len(kept) - len(none)) / idle - share) < 0.15
-    assert some(0.2) == few
-    table = restful([400] * 12).infos()
-    assert few - none == {
-        (episode, start)
-        for episode, start in everything - none
-        if drawn(table.id_hash[[episode]], np.array([start]))[0] < 0.2
-    }
-
-
-def test_keeping_every_idle_window_is_the_same_order_as_no_filter(open_with: Any) -> None:
-    unfiltered = open_with(restful()).windows("train")
-    everything = open_with(restful(), idle=MOTION.model_copy(update={"keep_share": 1.0})).windows("train")
-    assert [everything[i] for i in range(len(everything))] == [unfiltered[i] for i in range(len(unfiltered))]
-
-
-def test_an_episode_that_stands_still_all_the_time_gives_idle_windows_only(open_with: Any) -> None:
+def test_an_episode_that_stands_still_all_the_time_has_no_clips(open_with: Any) -> None:
     source = MemorySource([60, 60], states=lambda index: resting(60, [(1, 60)] if index else []))
-    assert {episode for episode, _ in starts(open_with(source, idle=MOTION))} == {0}
-    some = MOTION.model_copy(update={"keep_share": 0.5})
-    shared = open_with(source, idle=some)
-    assert {episode for episode, _ in starts(shared)} == {0, 1} == set(shared.episodes.tolist())
-    assert str(shared.removed[-1]).startswith("0 episodes, 70 steps, ")
-    assert str(shared.removed[-1]).endswith(" clips (50% of the clips from these stay)")
-    still = MemorySource([60], states=lambda _: resting(60, [(1, 60)]))
-    assert 10 < len(open_with(still, idle=some).windows("train")) < 46
-    assert open_with(still, idle=some).control_rate_hz == 15.0
+    dataset = open_with(source, idle=MOTION)
+    assert {episode for episode, _ in starts(dataset)} == {0}
+    assert str(dataset.removed[-1]).startswith("1 episodes, 70 steps, ")
     with pytest.raises(InputError, match=r"none of 1 episodes is left \(left out: idle 1\)"):
         open_with(MemorySource([60], states=lambda _: resting(60, [(1, 60)])), idle=MOTION)
 
@@ -262,10 +228,10 @@ def test_an_unreachable_network_is_nobodys_broken_episode(open_with: Any) -> Non
 
 
 def test_what_was_found_survives_the_disk_and_damage_is_seen() -> None:
-    found = FoundRanges.of([[(0, 3), (5, 9)], EpisodeProblem("x", "here", "bad"), [], [(1, 2)]], listed=3)
+    found = FoundRanges.of([[(0, 3), (5, 9)], EpisodeProblem("x", "here", "bad"), [], [(1, 2)]])
     data = found.to_bytes()
     back = FoundRanges.from_bytes(data)
-    assert (back.problems, back.listed) == (found.problems, 3)
+    assert back.problems == found.problems
     assert np.array_equal([back.episode, back.start, back.end], [[0, 0, 3], [0, 5, 1], [3, 9, 2]])
     for damaged in (b"", data[:-40], data.replace(b"here", b"gone")):
         with pytest.raises(NotATableError):
@@ -281,7 +247,7 @@ def published(tmp_path: Path, content: object) -> dict[str, Any]:
     return {"idle": IdleConfig(rule="published", ranges=str(path))}
 
 
-def test_published_ranges_are_taken_by_identity(open_with: Any, tmp_path: Path, caplog: Any) -> None:
+def test_published_ranges_are_taken_by_identity(open_with: Any, tmp_path: Path, caplog: Any, gcs: Gcs) -> None:
     ranges = {"episode 1": [[0, 12], [20, 40]], "elsewhere": [[0, 9999]], "episode 2": []}
     source = restful()
     dataset = open_with(source, **published(tmp_path, ranges))
@@ -289,29 +255,18 @@ def test_published_ranges_are_taken_by_identity(open_with: Any, tmp_path: Path, 
     assert "knows 2 of the 3 episodes; the other 1 count as idle" in caplog.text
     assert source.reads == []
     assert starts(dataset) == {(1, start) for start in (*range(8), *range(20, 36))}
-    other = open_with(source, **published(tmp_path, {"episode 1": [[0, 13]]}))
-    assert other.kept.of(1) == ((0, 13),), "a changed list is read anew"
-
-
-def test_a_changed_list_of_the_same_length_is_read_anew_from_a_bucket(open_with: Any, gcs: Gcs) -> None:
-    def kept(end: int) -> object:
-        url = gcs.put("robots/ranges.json", json.dumps({"episode 1": [[0, end]]}).encode())
-        return open_with(restful(), idle=IdleConfig(rule="published", ranges=url)).kept.of(1)
-
-    assert [kept(12), kept(13)] == [((0, 12),), ((0, 13),)]
+    url = gcs.put("robots/ranges.json", json.dumps({"episode 1": [[0, 13]]}).encode())
+    assert open_with(source, idle=IdleConfig(rule="published", ranges=url)).kept.of(1) == ((0, 13),)
+    with pytest.raises(InputError, match=r"nowhere\.json: cannot be read"):
+        open_with(source, idle=IdleConfig(rule="published", ranges=str(tmp_path / "nowhere.json")))
 
 
 BAD_LISTS = {
     "of another set": ({"elsewhere": [[0, 3]]}, r"none of the 3 episodes; its first is elsewhere.*such as episode 0"),
-    "beyond the episode": ({"episode 1": [[0, 41]]}, r"episode 1: steps 0 to 41.*0 to 40, which is the length"),
-    "negative": ({"episode 1": [[-1, 4]]}, r"steps -1 to 4"),
-    "overlapping": ({"episode 1": [[0, 9], [5, 12]]}, r"do not overlap"),
-    "turned round": ({"episode 1": [[9, 3]]}, r"pairs \[start, end\)"),
-    "empty range": ({"episode 1": [[3, 3]]}, r"pairs \[start, end\)"),
-    "not pairs": ({"episode 1": [1, 2]}, r"pairs \[start, end\)"),
-    "not numbers": ({"episode 1": [[0, "9"]]}, r"pairs \[start, end\)"),
-    "fractions": ({"episode 1": [[0, 9.5]]}, r"pairs \[start, end\)"),
-    "null": ({"episode 1": None}, r"pairs \[start, end\)"),
+    **{
+        str(wrong): ({"episode 1": wrong}, r"ranges\.json: episode 1: .*pairs \[start, end\) of steps from 0 to 40")
+        for wrong in ([[0, 41]], [[-1, 4]], [[0, 9], [5, 12]], [[9, 3]], [[3, 3]], [1, 2], [[0, "9"]], [[0, 9.5]], None)
+    },
     "not an object": ([1, 2], r"a JSON list"),
     "not JSON": ("{", r"not JSON"),
 }
@@ -324,11 +279,6 @@ def test_a_list_that_does_not_fit_is_one_clear_error(
     with pytest.raises(InputError, match=complaint) as caught:
         open_with(restful(), **published(tmp_path, content))
     assert "ranges.json" in caught.value.where
-
-
-def test_a_list_that_is_not_there_is_named(open_with: Any, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"nowhere\.json: cannot be read"):
-        open_with(restful(), idle=IdleConfig(rule="published", ranges=str(tmp_path / "nowhere.json")))
 
 
 def test_an_opened_set_travels_to_a_worker(open_with: Any) -> None:
