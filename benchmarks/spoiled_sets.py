@@ -22,7 +22,7 @@ from faults import CLEAN, FAULTS, Fault, Recording, spoiled
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import load_config, parse_config
-from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
+from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.inspection.check import at_some_stride, check_data
 from vjepa2_ac.data.inspection.finding import Finding
 from vjepa2_ac.data.inspection.statistics import sample_of

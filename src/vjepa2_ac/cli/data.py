@@ -128,7 +128,7 @@ def check_and_print(config: Config, *, clips: int = 32) -> int:
 def _probe(config: Config, model: str, *, clips: int) -> None:
     from vjepa2_ac.console.data import print_finding, probe_table
     from vjepa2_ac.console.progress import ConsoleReporter, console
-    from vjepa2_ac.data.clips.dataset import open_dataset
+    from vjepa2_ac.data.dataset import open_dataset
     from vjepa2_ac.data.inspection.check import at_some_stride
     from vjepa2_ac.data.inspection.finding import Finding
     from vjepa2_ac.evaluation.data_variants.from_config import probe_config
@@ -145,7 +145,7 @@ def _index(options: argparse.Namespace) -> None:
 
     from vjepa2_ac.console.data import index_lines
     from vjepa2_ac.console.progress import ConsoleReporter, console
-    from vjepa2_ac.data.clips.dataset import open_dataset
+    from vjepa2_ac.data.dataset import open_dataset
     from vjepa2_ac.data.index.index_cache import record_usage
     from vjepa2_ac.reporter import INDEXING
 
@@ -162,7 +162,7 @@ def _inspect(options: argparse.Namespace) -> None:
 
     from vjepa2_ac.console.data import inspection_lines, motion_table
     from vjepa2_ac.console.progress import ConsoleReporter, console
-    from vjepa2_ac.data.clips.dataset import open_dataset
+    from vjepa2_ac.data.dataset import open_dataset
     from vjepa2_ac.data.inspection.check import at_some_stride
     from vjepa2_ac.data.inspection.statistics import RELEASED, inspect_dataset
     from vjepa2_ac.reporter import INDEXING

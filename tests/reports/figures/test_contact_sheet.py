@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from vjepa2_ac.data.clips.transforms import crop_box
+from vjepa2_ac.data.transforms import crop_box
 from vjepa2_ac.reports.figures.contact_sheet import ContactSheet, Strip, pictures_per_row, plot_contact_sheet
 from vjepa2_ac.reports.figures.dataset import _short_names
 

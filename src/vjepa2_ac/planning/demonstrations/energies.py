@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from vjepa2_ac.data.clips.windows import spread_with_ends
+from vjepa2_ac.data.windows import spread_with_ends
 from vjepa2_ac.encoding.batch import encode_frames
 from vjepa2_ac.episode import FrameReader, Progress, no_progress
 from vjepa2_ac.planning.energy import distance

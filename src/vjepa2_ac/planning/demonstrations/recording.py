@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
+from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.episode import FrameReader, Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.video_reader import count_frames, read_frames

@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Float
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.clips.dataset import Dataset
-from vjepa2_ac.data.clips.transforms import crop_box
+from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.inspection.coverage import PoseCoverage
 from vjepa2_ac.data.inspection.statistics import RELEASED_STEP_CM, Inspection, ReadEpisode, idle_runs
 from vjepa2_ac.data.inspection.statistics_vectors import largest_change
+from vjepa2_ac.data.transforms import crop_box
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.reports.figures.contact_sheet import ContactSheet, Strip, pictures_per_row, plot_contact_sheet
