@@ -33,6 +33,7 @@ ORDERS: dict[str, list[str]] = {
         "decoding",
         "evaluation",
         "reports",
+        "inspection",
         "training export",
         "simulation api init",
         "console",
@@ -46,8 +47,8 @@ ORDERS: dict[str, list[str]] = {
         "sources",
         "dataset",
         "clips",
-        "loader",
-        "inspection",
+        "loader duplicates",
+        "coverage",
     ],
     "data.sources": ["listing configured_spaces indexed_source", "rlds droid_raw lerobot npz latents", "registry"],
     "serving": [

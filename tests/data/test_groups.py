@@ -16,11 +16,11 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data import dataset as opening
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.index.episode_table import EpisodeTable
-from vjepa2_ac.data.inspection.check import check_data
-from vjepa2_ac.data.inspection.statistics import inspect_dataset
 from vjepa2_ac.data.selection import groups_of
 from vjepa2_ac.episode import EpisodeInfo
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.inspection.check import check_data
+from vjepa2_ac.inspection.statistics import inspect_dataset
 
 DROID = "gs://xembodiment_data/r2d2/r2d2-data-full/{lab}/{outcome}/{day}/Fri_Jul__7_09:42:23_2023/{number}--{number}.h5"
 NAMES = [

@@ -18,13 +18,13 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.data.clips import actions_of, joined
 from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.data.inspection.check import check_data, findings_in
-from vjepa2_ac.data.inspection.statistics import inspect_dataset
 from vjepa2_ac.data.sources.registry import open_source
 from vjepa2_ac.episode import Batch, Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.geometry import actions_from_states
-from vjepa2_ac.reports.figures.dataset import plot_dataset
+from vjepa2_ac.inspection.check import check_data, findings_in
+from vjepa2_ac.inspection.sheet import plot_dataset
+from vjepa2_ac.inspection.statistics import CHANGED, inspect_dataset
 from vjepa2_ac.spaces import Spaces
 
 JOINTS = ("steps/observation/joint_position", "steps/observation/gripper_position")
@@ -277,15 +277,15 @@ def test_inspection_and_frame_of_vectors(tmp_path: Path) -> None:
     assert "gripper" not in figures
     assert [one["stride"] for one in figures["per_model_step"]] == [3, 5, 10]
     assert any(line.startswith("states") and "14 numbers: -" in line for line in inspection_lines(found))
-    assert motion_table(found).row_count == 3
-    assert plot_dataset(dataset, found, tmp_path / "sheet.png").stat().st_size > 10_000
+    assert motion_table(found.steps).row_count == 3
+    assert plot_dataset(found, tmp_path / "sheet.png").stat().st_size > 10_000
 
 
 def test_a_number_changes_by_a_share_of_its_range(tmp_path: Path) -> None:
     ramp = np.stack([np.linspace(0, 1, 24), np.linspace(0, 460, 24) / 2], axis=1)
     ramp[:, 1] = np.minimum(ramp[:, 1], 115.0)  # twice as fast, over half the time
     dataset = open_dataset(knobs(write_vectors(tmp_path, width=2, states=ramp), stride_candidates=[1, 5]))
-    one, five = inspect_dataset(dataset).changes
-    assert one.percent.max() == pytest.approx(100 / 11.5)
-    assert one.percent.min() == pytest.approx(100 / 23)
-    assert five.percent.max() == pytest.approx(500 / 11.5)
+    one, five = (step.sizes[CHANGED] for step in inspect_dataset(dataset).steps)
+    assert one.max() == pytest.approx(100 / 11.5)
+    assert one.min() == pytest.approx(100 / 23)
+    assert five.max() == pytest.approx(500 / 11.5)

@@ -28,8 +28,6 @@ from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.clips import frames_of
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.index.episode_table import EpisodeTable
-from vjepa2_ac.data.inspection.check import check_data
-from vjepa2_ac.data.inspection.statistics import inspect_dataset
 from vjepa2_ac.data.loader import batches_of, training_loader, validation_batches
 from vjepa2_ac.data.selection import BrokenEpisodes, StepSelection
 from vjepa2_ac.data.sources.latents.dtypes import CacheType, pack_latents, unpack_latents
@@ -40,7 +38,9 @@ from vjepa2_ac.data.windows import clip_starts
 from vjepa2_ac.encoding.cache_lookup import needed_frames, require_encoding, through_cache
 from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, StoredLatents
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.reports.figures.dataset import plot_dataset
+from vjepa2_ac.inspection.check import check_data
+from vjepa2_ac.inspection.sheet import plot_dataset
+from vjepa2_ac.inspection.statistics import inspect_dataset
 
 STEPS, FRAMES, TOKENS, DIM = 12, (0, 2, 5, 11), 4, 24
 
@@ -614,5 +614,5 @@ def test_a_cache_can_be_checked_and_inspected(a_cache: tuple[Dataset, Dataset, P
     assert "camera exterior_1_left" in found["source"].text
     assert "error" not in {finding.level for finding in found.values()}
     dataset = open_dataset(config)
-    sheet = plot_dataset(dataset, inspect_dataset(dataset), tmp_path / "sheet.png", rows=2)
+    sheet = plot_dataset(inspect_dataset(dataset), tmp_path / "sheet.png", rows=2)
     assert sheet.stat().st_size > 10_000

@@ -175,7 +175,7 @@ class MicroBatch:
 
 @dataclass(frozen=True)
 class _Clips(TorchDataset[MicroBatch]):
-    """_Clips by position, read a micro-batch at a time."""
+    """Clips by position, read a micro-batch at a time."""
 
     dataset: Dataset
     request_at: Callable[[int], ClipRequest]  # a pure function of the position, the same in every worker

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from matplotlib.patches import Rectangle
 
-from vjepa2_ac.data.inspection.coverage import ENOUGH_NEAR
+from vjepa2_ac.data.coverage import ENOUGH_NEAR
 from vjepa2_ac.data.transforms import CropBox
 from vjepa2_ac.reports.figures.page import BLUE, GREEN, GREY, ORANGE, Page, written_page
 

@@ -16,16 +16,16 @@ from synthetic import synthetic_states
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.console.data import inspection_lines
 from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.duplicates import Duplicates, find_duplicates
 from vjepa2_ac.data.index.episode_table import FORMAT, EpisodeTable
 from vjepa2_ac.data.index.index_cache import IndexKeys, get_or_build
 from vjepa2_ac.data.index.state_hash import UNKNOWN, hash_of_states
-from vjepa2_ac.data.inspection.check import check_data
-from vjepa2_ac.data.inspection.duplicates import Duplicates, find_duplicates
-from vjepa2_ac.data.inspection.statistics import inspect_dataset
 from vjepa2_ac.data.selection import BrokenEpisodes, StepSelection
 from vjepa2_ac.data.sources.latents.manifest import EPISODES
 from vjepa2_ac.data.sources.rlds import lookalikes
 from vjepa2_ac.episode import EpisodeInfo
+from vjepa2_ac.inspection.check import check_data
+from vjepa2_ac.inspection.statistics import inspect_dataset
 
 RECORDINGS = (0, 1, 2, 3, 0, 4, 5, 0, 6, 4)  # the first one three times, the fifth one twice
 

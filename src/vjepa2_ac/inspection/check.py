@@ -7,37 +7,30 @@ from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
 
 import numpy as np
-import torch
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation
-from torch import Tensor
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
+from vjepa2_ac.data.coverage import coverage_in
 from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.data.inspection.check_excerpts import excerpt_findings
-from vjepa2_ac.data.inspection.check_vectors import has_moved, vector_findings
-from vjepa2_ac.data.inspection.duplicates import find_duplicates
-from vjepa2_ac.data.inspection.finding import Finding, Level
-from vjepa2_ac.data.inspection.statistics import coverage_in
+from vjepa2_ac.data.duplicates import find_duplicates
 from vjepa2_ac.data.loader import training_loader
 from vjepa2_ac.episode import Batch, Progress
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.inspection.excerpts import Finding, Level, excerpt_findings
+from vjepa2_ac.inspection.statistics import PERCENTILES, at_some_stride
 from vjepa2_ac.spaces import POSE, POSES, Spaces
 
-_MOVED_M = 0.01  # of the flange: it should be visible
+_MOVED_M, _MOVED_SHARE = 0.01, 0.05  # of the flange, or of the range of a number: it should be visible
 _DARK = 8  # of 255: mean of frames that show next to nothing
 _STILL_CM, _FAR_CM = 0.2, 30.0  # medians of |dxyz| per model step that are reported
 _REACH_M = 1.6  # beyond the reach of common arms
 _LONGEST = 300  # characters of a reason
 _NARROW = 0.2  # a gripper that never closes further may be given in metres
-
-
-def at_some_stride(dataset: Dataset) -> Dataset:
-    """Return a data set at its stride; if that is auto, at the smallest candidate."""
-    if dataset.config.stride != "auto":
-        return dataset
-    return dataset.with_stride(min(dataset.config.strides_to_try(dataset.control_rate_hz)))
+_LARGE = 100.0  # numbers of vectors beyond plausible radians, metres and shares
+_NUMBERED = 8  # numbers of a vector in a message
 
 
 def check_data(
@@ -76,15 +69,10 @@ def check_data(
         yield Finding("ok", "stride", f"auto; looked at here at the smallest candidate, {dataset.config.stride}")
     yield from _what_takes_part(dataset)
     yield from _read(dataset, seed=seed, batch_size=batch_size, clips=clips, clock=clock)
-    yield from _coverage(dataset)
-    yield from excerpt_findings(dataset)
-
-
-def _coverage(dataset: Dataset) -> Iterator[Finding]:
-    coverage = coverage_in(dataset)
-    if coverage is not None:
+    if coverage := coverage_in(dataset):
         yield from (Finding("ok", name, text) for name, text in coverage.lines.items())
         yield Finding("warning" if coverage.narrow else "ok", "coverage", coverage.verdict)
+    yield from excerpt_findings(dataset)
 
 
 def _what_takes_part(dataset: Dataset) -> Iterator[Finding]:
@@ -94,16 +82,14 @@ def _what_takes_part(dataset: Dataset) -> Iterator[Finding]:
             yield Finding("warning" if one.name == "broken" else "ok", f"filter {one.name}", f"left out: {one}")
     for problem in dataset.table.problems[:3]:
         yield Finding("warning", "broken episode", f"{problem.where}: {problem.found}")
-    splits: tuple[tuple[Split, float], ...] = (
-        ("train", 1.0), ("validation", config.validation_share), ("test", config.test_share),
-    )  # fmt: skip
-    for split, share in splits:
+    splits: dict[Split, float] = {"train": 1.0, "validation": 1.0, "test": config.test_share}
+    for split, share in splits.items():
         try:
             windows = dataset.windows(split)
         except InputError as error:
             if split == "train":
                 raise
-            level: Level = "error" if split == "validation" or share else "ok"  # training opens splits with a share
+            level: Level = "error" if share else "ok"  # training opens validation, and test if it has a share
             yield Finding(level, split, f"{_shortened(error.found)}. {error.fix}")
             continue
         episodes = len(np.unique(windows.episodes))
@@ -145,38 +131,31 @@ def _read(dataset: Dataset, *, seed: int, batch_size: int, clips: int, clock: Ca
 
 def findings_in(batches: Sequence[Batch], spaces: Spaces = POSES) -> Iterator[Finding]:
     """Yield the findings of some batches, with or without poses; a pure function, reads nothing."""
-    clips = sum(len(batch.starts) for batch in batches)
     first = batches[0]
-    name, seen = ("latents", first.latents.values) if first.latents else ("frames", _frames(first))
-    shapes = f"{name} {tuple(seen.shape)} {str(seen.dtype).removeprefix('torch.')}"
+    name, seen = ("latents", first.latents.values) if first.latents else ("frames", first.frames)
+    shapes = f"{name} {tuple(seen.shape)} {str(seen.dtype).removeprefix('torch.')}" if seen is not None else name
     poses = "no camera poses" if first.extrinsics is None else f"camera poses {tuple(first.extrinsics.shape)}"
-    yield Finding(
-        "ok", "batch", f"{shapes}, states {tuple(first.states.shape)}, actions {tuple(first.actions.shape)}, {poses}"
-    )
+    text = f"{shapes}, states {tuple(first.states.shape)}, actions {tuple(first.actions.shape)}, {poses}"
+    yield Finding("ok", "batch", text)
     states = np.concatenate([batch.states.flatten(0, 1).numpy() for batch in batches]).astype(np.float64)
     actions = np.concatenate([batch.actions.flatten(0, 1).numpy() for batch in batches]).astype(np.float64)
-    has_pixels = first.latents is None
-    if has_pixels:
+    if first.latents is None:
         yield _pixels(batches)
+        yield _still_frames(batches, spaces, np.maximum(np.ptp(states, axis=0), 1e-12))
     if spaces.state.position is None:
-        ranges = torch.from_numpy((states.max(axis=0) - states.min(axis=0)).astype(np.float32))
-        if has_pixels:
-            yield _still_frames(batches, [has_moved(batch.states, ranges) for batch in batches])
-        yield from vector_findings(states, actions)
+        yield _numbers("states", states, "Check which fields the state is made of")
+        yield _numbers("actions", actions, "There is nothing to learn from")
         return
-    if has_pixels:
-        moved = [batch.actions[..., spaces.action.sized].norm(dim=-1) > _MOVED_M for batch in batches]
-        yield _still_frames(batches, moved)
     yield _positions(states)
     yield _rotations(states, actions)
-    yield _gripper(states[:, POSE.gripper], clips)
+    yield _gripper(states[:, POSE.gripper], sum(len(batch.starts) for batch in batches))
     yield _motion(actions)
 
 
 def _pixels(batches: Sequence[Batch]) -> Finding:
-    low = min(int(_frames(batch).min()) for batch in batches)
-    high = max(int(_frames(batch).max()) for batch in batches)
-    mean = float(np.mean([_frames(batch).float().mean().item() for batch in batches]))
+    frames = [batch.frames for batch in batches if batch.frames is not None]
+    low, high = min(int(one.min()) for one in frames), max(int(one.max()) for one in frames)
+    mean = float(np.mean([one.float().mean().item() for one in frames]))
     text = f"{low} to {high}, mean {mean:.0f}"
     if low == high:
         return Finding("error", "pixels", f"all are {low}: there is nothing to see. Check data.camera")
@@ -185,18 +164,17 @@ def _pixels(batches: Sequence[Batch]) -> Finding:
     return Finding("ok", "pixels", text)
 
 
-def _frames(batch: Batch) -> Tensor:
-    if batch.frames is None:
-        raise ValueError("a batch of cached latents has no pixels")
-    return batch.frames
-
-
-def _still_frames(batches: Sequence[Batch], has_moved: Sequence[Tensor]) -> Finding:
+def _still_frames(batches: Sequence[Batch], spaces: Spaces, spans: Float[np.ndarray, " state_dim"]) -> Finding:
     """Compare frames with the ones before them, where the robot has moved."""
     same = moved = 0
-    for batch, far in zip(batches, has_moved, strict=True):
-        frames = _frames(batch)
-        equal = (frames[:, 1:] == frames[:, :-1]).flatten(2).all(dim=-1)
+    for batch in batches:
+        if batch.frames is None:
+            continue
+        if spaces.state.position is None:
+            far = (abs(np.diff(batch.states.numpy(), axis=1)) > _MOVED_SHARE * spans).any(axis=-1)
+        else:
+            far = np.linalg.norm(batch.actions[..., spaces.action.sized].numpy(), axis=-1) > _MOVED_M
+        equal = (batch.frames[:, 1:] == batch.frames[:, :-1]).flatten(2).all(dim=-1).numpy()
         moved += int(far.sum())
         same += int((far & equal).sum())
     text = f"{same} of {moved} frames equal the one before although the robot moved"
@@ -205,7 +183,28 @@ def _still_frames(batches: Sequence[Batch], has_moved: Sequence[Tensor]) -> Find
     return Finding("warning" if same > moved / 20 else "ok", "pictures", text)
 
 
-def _positions(states: np.ndarray) -> Finding:
+def _numbers(name: str, values: Float[np.ndarray, "rows width"], way_out: str) -> Finding:
+    """Return the finding about numbers of unknown meaning."""
+    low, high = values.min(axis=0), values.max(axis=0)
+    text = f"{values.shape[1]} numbers, {low.min():.3g} to {high.max():.3g}"
+    fixed, large = low == high, abs(values).max(axis=0) > _LARGE
+    if fixed.all():
+        return Finding("error", name, f"{text}: none of them ever changes. {way_out}")
+    if large.any():
+        fix = "bring them to the order of 1, such as radians, metres, or 0 to 1"
+        why = f"large are {_numbered(large)} (from 0). Numbers go into the network as they are"
+        return Finding("warning", name, f"{text}: {why}: {fix}")
+    if fixed.any():
+        return Finding("warning", name, f"{text}: {_numbered(fixed)} (from 0) never change")
+    return Finding("ok", name, text)
+
+
+def _numbered(mask: np.ndarray) -> str:
+    places = np.flatnonzero(mask).tolist()
+    return ", ".join(map(str, places[:_NUMBERED])) + (", ..." if len(places) > _NUMBERED else "")
+
+
+def _positions(states: Float[np.ndarray, "rows 7"]) -> Finding:
     places = states[:, POSE.position]
     low, high = places.min(axis=0), places.max(axis=0)
     text = ", ".join(f"{axis} {a:.3f} to {b:.3f}" for axis, a, b in zip("xyz", low, high, strict=True)) + " m"
@@ -218,7 +217,7 @@ def _positions(states: np.ndarray) -> Finding:
     return Finding("ok", "position", text)
 
 
-def _rotations(states: np.ndarray, actions: np.ndarray) -> Finding:
+def _rotations(states: Float[np.ndarray, "rows 7"], actions: Float[np.ndarray, "pairs 7"]) -> Finding:
     turned = np.rad2deg(Rotation.from_euler("xyz", actions[:, POSE.rotation]).magnitude())
     low, high = states[:, POSE.rotation].min(), states[:, POSE.rotation].max()
     text = f"angles {low:.2f} to {high:.2f} rad; degrees per model step {_percentiles(turned, '.1f')}"
@@ -229,7 +228,7 @@ def _rotations(states: np.ndarray, actions: np.ndarray) -> Finding:
     return Finding("ok", "rotation", text)
 
 
-def _gripper(closedness: np.ndarray, clips: int) -> Finding:
+def _gripper(closedness: Float[np.ndarray, " rows"], clips: int) -> Finding:
     low, high = closedness.min(), closedness.max()
     text = f"{low:.2f} to {high:.2f} (0 open, 1 closed)"
     if low == high:
@@ -239,7 +238,7 @@ def _gripper(closedness: np.ndarray, clips: int) -> Finding:
     return Finding("ok", "gripper", text)
 
 
-def _motion(actions: np.ndarray) -> Finding:
+def _motion(actions: Float[np.ndarray, "pairs 7"]) -> Finding:
     moved = POSE.shown_size(actions)
     text = f"cm per model step {_percentiles(moved, '.2f')}"
     if not np.any(actions):
@@ -251,6 +250,6 @@ def _motion(actions: np.ndarray) -> Finding:
     return Finding("ok", "actions", text)
 
 
-def _percentiles(values: np.ndarray, form: str) -> str:
-    """Return the percentiles 10, 50, 90 and 99 as text."""
-    return " / ".join(f"{value:{form}}" for value in np.percentile(values, [10, 50, 90, 99])) + " (10/50/90/99 %)"
+def _percentiles(values: Float[np.ndarray, " pairs"], form: str) -> str:
+    numbers = " / ".join(f"{value:{form}}" for value in np.percentile(values, list(PERCENTILES)))
+    return f"{numbers} (10/50/90/99 %)"

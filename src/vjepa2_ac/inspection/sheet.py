@@ -9,21 +9,27 @@ import numpy as np
 from jaxtyping import Float
 
 from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.coverage import ReadEpisode
 from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.data.inspection.coverage import PoseCoverage
-from vjepa2_ac.data.inspection.statistics import RELEASED_STEP_CM, Inspection, ReadEpisode, idle_runs
-from vjepa2_ac.data.inspection.statistics_vectors import largest_change
+from vjepa2_ac.data.idle import runs_of
 from vjepa2_ac.data.transforms import crop_box
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.inspection.statistics import (
+    CHANGED,
+    MOVED,
+    RELEASED_STEP_CM,
+    Inspection,
+    idle_runs,
+    largest_change,
+    shown_hours,
+)
 from vjepa2_ac.reports.figures.contact_sheet import ContactSheet, Strip, pictures_per_row, plot_contact_sheet
 
 _PLACES = 6000  # points of the map, at most
 
 
-def plot_dataset(
-    dataset: Dataset, inspection: Inspection, path: Path, *, rows: int = 8, progress: Progress = no_progress
-) -> Path:
+def plot_dataset(inspection: Inspection, path: Path, *, rows: int = 8, progress: Progress = no_progress) -> Path:
     """Write the contact sheet of an inspected data set; decodes only the frames that it shows.
 
     `progress` is called with (episodes whose frames were read, episodes shown).
@@ -31,12 +37,12 @@ def plot_dataset(
     Raises:
         InputError: A frame cannot be read, and `data.broken_episodes` does not leave its episode out.
     """
-    shown = _rows_of(inspection, rows)
+    dataset, shown = inspection.dataset, _rows_of(inspection, rows)
     names = _short_names([dataset.table.identity(one.index) for one in shown])
     strips = []
     for done, (one, name) in enumerate(zip(shown, names, strict=True), start=1):
         try:
-            strips.append(_strip(dataset, inspection, one, name))
+            strips.append(_strip(inspection, one, name))
         except InputError as error:
             dataset.leave_out(one.index, error)
         progress(done, len(shown))
@@ -45,50 +51,49 @@ def plot_dataset(
 
 def sheet_of(inspection: Inspection, strips: Sequence[Strip]) -> ContactSheet:
     """Return the content of the sheet besides the strips: the title, the facts and the data of the plots."""
-    config, has_poses = inspection.config, inspection.has_poses
-    places = np.concatenate([one.states[:, inspection.spaces.state.sized] for one in inspection.sample])
-    moved = {one.stride: one.moved_cm for one in inspection.motions}
+    dataset, has_poses, coverage = inspection.dataset, inspection.has_poses, inspection.coverage
+    places = np.concatenate([one.states[:, dataset.spaces.state.sized] for one in inspection.sample])
     return ContactSheet(
-        title=config.path,
+        title=dataset.config.path,
         facts=_facts(inspection),
         strips=tuple(strips),
-        control_rate_hz=inspection.control_rate_hz,
-        lengths_s=inspection.lengths / inspection.control_rate_hz,
-        moved=moved if has_poses else {one.stride: one.percent for one in inspection.changes},
+        control_rate_hz=dataset.control_rate_hz,
+        lengths_s=inspection.lengths / dataset.control_rate_hz,
+        moved={one.stride: one.sizes[MOVED if has_poses else CHANGED] for one in inspection.steps},
         reference=RELEASED_STEP_CM if has_poses else None,
         places_m=places[:: -(-len(places) // _PLACES)] if has_poses else None,
-        shaded_means=_shaded_means(config),
+        shaded_means=_shaded_means(dataset.config),
         ranges=None if has_poses else inspection.ranges,
-        directions=inspection.coverage.density if isinstance(inspection.coverage, PoseCoverage) else None,
+        directions=None if coverage is None else coverage.density,
     )
 
 
 def _facts(inspection: Inspection) -> tuple[str, ...]:
-    config = inspection.config
-    success = inspection.success_share
+    dataset, config, success = inspection.dataset, inspection.config, inspection.success_share
     shortest, _, median, _, longest = inspection.length_percentiles
-    steps = int(inspection.lengths.sum())
-    lasting = f"{inspection.hours:,.1f} h" if inspection.hours >= 1 else f"{inspection.hours * 60:.1f} min"
+    lasting = f"{inspection.lengths.sum():,} steps at {dataset.control_rate_hz:g} per second"
     first = [
-        f"{len(inspection.lengths):,} episodes",
-        f"{steps:,} steps at {inspection.control_rate_hz:g} per second: {lasting}",
+        f"{len(dataset.table):,} episodes",
+        f"{lasting}: {shown_hours(inspection.hours)}",
         f"{shortest} to {longest} steps (median {median})",
         "outcome not known" if success is None else f"{success:.0%} successes",
     ]
-    if inspection.still_share is not None:
+    about_states = f"states of {dataset.widths.state} numbers, actions of {dataset.widths.action}"
+    if inspection.has_poses:
         first.append(f"{inspection.still_share:.0%} of the time standing still")
-    if inspection.broken:
-        first.append(f"{inspection.broken} broken")
+        about_states = "gripper {:.2f} to {:.2f}".format(*inspection.gripper_range)
+    if dataset.table.problems:
+        first.append(f"{len(dataset.table.problems)} broken")
     second = [
-        f"camera {', '.join(config.cameras)} of {', '.join(inspection.cameras)}",
+        f"camera {', '.join(config.cameras)} of {', '.join(config.offered_cameras)}",
         f"crop {config.crop}",
-        _about_states(inspection),
+        about_states,
         f"clips of {config.frames} frames at stride {config.model_stride}: "
         + ", ".join(f"{count:,} {name}" for name, count in inspection.windows_of.items()),
     ]
     sampled = len(inspection.sample)
     shown = "Motion and gripper" if inspection.has_poses else "Motion"
-    third = f"{shown}: from {'all' if sampled == len(inspection.lengths) else 'a sample of'} {sampled} episodes."
+    third = f"{shown}: from {'all' if sampled == len(dataset.table) else 'a sample of'} {sampled} episodes."
     return "  ·  ".join(first), "  ·  ".join(second), third
 
 
@@ -98,16 +103,11 @@ def _shaded_means(config: DataConfig) -> str:
     return "standing still" if config.states == "pose" else ""
 
 
-def _about_states(inspection: Inspection) -> str:
-    if not inspection.has_poses:
-        return f"states of {inspection.widths.state} numbers, actions of {inspection.widths.action}"
-    gripper = inspection.gripper_range
-    return f"gripper {gripper[0]:.2f} to {gripper[1]:.2f}"
-
-
 def _rows_of(inspection: Inspection, rows: int) -> list[ReadEpisode]:
     """Return episodes of the sample, some of each outcome."""
-    groups = [[one for one in inspection.sample if inspection.success[one.index] == kind] for kind in (1, 0, -1)]
+    groups = [
+        [one for one in inspection.sample if inspection.dataset.table.success[one.index] == kind] for kind in (1, 0, -1)
+    ]
     groups = [group for group in groups if group]
     whole = sum(map(len, groups))
     shares = [max(1, round(rows * len(group) / whole)) for group in groups]
@@ -125,7 +125,8 @@ def _short_names(names: Sequence[str]) -> list[str]:
     return ["/".join(part) for part in parts]
 
 
-def _strip(dataset: Dataset, inspection: Inspection, one: ReadEpisode, name: str) -> Strip:
+def _strip(inspection: Inspection, one: ReadEpisode, name: str) -> Strip:
+    dataset = inspection.dataset
     episode = dataset.source.read(one.index)
     steps = len(one.states)
     pictured = np.arange(steps) if episode.frame_steps is None else episode.frame_steps
@@ -138,7 +139,7 @@ def _strip(dataset: Dataset, inspection: Inspection, one: ReadEpisode, name: str
         frames=episode.read_frames([int(step) for step in at]),
         steps=at,
         speed=_change_per_step(one, inspection) * episode.control_rate_hz,
-        closedness=one.states[:, inspection.spaces.state.gripper] if inspection.has_poses else None,
+        closedness=one.states[:, dataset.spaces.state.gripper] if inspection.has_poses else None,
         shaded=_shaded(dataset, one),
         seen=crop_box(height, width, dataset.config.crop),
     )
@@ -150,17 +151,15 @@ def _change_per_step(one: ReadEpisode, inspection: Inspection) -> Float[np.ndarr
         return np.zeros(1)
     if not inspection.has_poses:
         return largest_change(np.gradient(one.states, axis=0), inspection.ranges)
-    return inspection.spaces.state.shown_size(np.gradient(one.states, axis=0))
+    return inspection.dataset.spaces.state.shown_size(np.gradient(one.states, axis=0))
 
 
 def _shaded(dataset: Dataset, one: ReadEpisode) -> tuple[tuple[int, int], ...]:
-    if dataset.config.idle.rule == "none" and dataset.config.states == "vector":
-        return ()  # what standing still means is not known
-    if dataset.config.idle.rule == "none":
-        mask = idle_runs(one.states, dataset.config)
-    else:
-        mask = np.ones(len(one.states), bool)
+    if dataset.config.idle.rule != "none":
+        left_out = np.ones(len(one.states), bool)
         for start, end in one.kept:
-            mask[start:end] = False
-    edges = np.flatnonzero(np.diff(mask.astype(np.int8), prepend=0, append=0)).tolist()
-    return tuple(zip(edges[::2], edges[1::2], strict=True))
+            left_out[start:end] = False
+        return tuple(runs_of(left_out))
+    if dataset.config.states == "vector":
+        return ()  # what standing still means is not known
+    return tuple(runs_of(idle_runs(one.states, dataset.config)))

@@ -16,8 +16,6 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import rankdata
 
-from vjepa2_ac.data.inspection.excerpts import Excerpt
-
 MOST_LAG = 10  # control steps
 _LAG_SHARE = 4  # an excerpt is shifted by a quarter of its length at most
 _FEWEST_CHANGES = 8  # of an excerpt
@@ -45,16 +43,14 @@ class Agreement:
 
 
 def agreement_of(
-    excerpts: Sequence[Excerpt], moved: Sequence[Float[np.ndarray, " _"]], *, least_lag: int = 2
+    pairs: Sequence[tuple[Float[np.ndarray, " changes"], Float[np.ndarray, " changes"]]], stride: int
 ) -> Agreement:
     """Compare the change of frames with that of states.
 
     Args:
-        excerpts: Some episodes.
-        moved: How far each has moved at each step, in any unit.
-        least_lag: Control steps that count as late; a camera easily lags by one step.
+        pairs: Of some episodes: how far the state has moved at each step, and the frame has changed, in any unit.
+        stride: Control steps per model step. A camera easily lags by one control step: that is late at stride 1 only.
     """
-    pairs = [(one, other.frame_change) for one, other in zip(moved, excerpts, strict=True)]
     pairs = [pair for pair in pairs if all(len(values) and np.ptp(values) > 0 for values in pair)]
     usual = float(np.median([len(one) for one, _ in pairs])) if pairs else 0.0
     pairs = [pair for pair in pairs if len(pair[0]) >= usual / 2]  # shorter ones would allow few shifts only
@@ -66,7 +62,7 @@ def agreement_of(
     turned = _ranks([change[::-1] for _, change in pairs])
     shifts = range(1, min(len(pairs), _SHIFTS + 1))
     chance = np.array([_profiles(ways, np.roll(seen, -shift, axis=0), lags).mean(axis=0).max() for shift in shifts])
-    return _judged(_profiles(ways, seen, lags), _profiles(ways, turned, lags), chance, lags, least_lag)
+    return _judged(_profiles(ways, seen, lags), _profiles(ways, turned, lags), chance, lags, min(2, stride))
 
 
 def _judged(

@@ -9,20 +9,14 @@ import pytest
 from clips import split_of
 from memory_source import MemorySource
 from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.coverage import sample_of
 from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.data.inspection.statistics import (
-    RELEASED_STEP_CM,
-    ReadEpisode,
-    idle_runs,
-    inspect_dataset,
-    motion_per_step,
-    sample_of,
-)
 from vjepa2_ac.data.selection import BrokenEpisodes, StepSelection
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.reports.figures import dataset as figure
+from vjepa2_ac.inspection import sheet as figure
+from vjepa2_ac.inspection.sheet import plot_dataset
+from vjepa2_ac.inspection.statistics import MOVED, RELEASED_STEP_CM, TURNED, idle_runs, inspect_dataset
 from vjepa2_ac.reports.figures.contact_sheet import ContactSheet
-from vjepa2_ac.reports.figures.dataset import plot_dataset
 
 
 def knobs(droid: Path, **changes: object) -> DataConfig:
@@ -38,26 +32,23 @@ def straight_on(steps: int) -> np.ndarray:
     return states
 
 
+def in_memory(source: MemorySource, **knobs: object) -> Dataset:
+    config = DataConfig.model_validate({"path": "memory", "frames": 3, **knobs})
+    table = source.infos()
+    kept = StepSelection.whole(table, np.ones(len(table), bool))
+    return Dataset(config, source, table, kept, BrokenEpisodes(config, len(table)))
+
+
 def test_motion_per_step_is_in_centimetres_and_degrees_at_every_stride() -> None:
-    sample = [ReadEpisode(0, straight_on(20), ((0, 20),))]
-    for stride in (1, 4, 15):
-        found = motion_per_step(sample, stride, control_rate_hz=15.0)
-        assert found.seconds == stride / 15
-        assert len(found.moved_cm) == 20 - stride
-        assert found.percentiles("moved_cm") == pytest.approx([stride] * 4)
-        assert found.percentiles("turned_deg") == pytest.approx([stride] * 4)
-
-
-def test_motion_is_that_within_kept_ranges_only() -> None:
-    states = straight_on(20)
-    states[10:, 0] += 1.0  # a jump between the ranges
-    found = motion_per_step([ReadEpisode(0, states, ((0, 10), (10, 20)))], 4, control_rate_hz=15.0)
-    assert len(found.moved_cm) == 12
-    assert found.moved_cm.max() == pytest.approx(4)
-
-
-def test_a_stride_that_fits_nowhere_has_no_percentiles() -> None:
-    assert motion_per_step([ReadEpisode(0, straight_on(5), ((0, 5),))], 5, 15.0).percentiles("moved_cm") == []
+    source = MemorySource([40], states=lambda _: straight_on(40))
+    dataset = in_memory(source, stride_candidates=(1, 4, 15, 40))
+    *found, too_wide = inspect_dataset(dataset).steps
+    for one, stride in zip(found, (1, 4, 15), strict=True):
+        assert (one.stride, one.seconds) == (stride, stride / 15)
+        assert len(one.sizes[MOVED]) == 40 - stride
+        assert one.percentiles[MOVED] == pytest.approx([stride] * 4)
+        assert one.percentiles[TURNED] == pytest.approx([stride] * 4)
+    assert too_wide.percentiles == {MOVED: [], TURNED: []}
 
 
 def test_standing_still_counts_from_a_run_that_is_long_enough() -> None:
@@ -74,7 +65,7 @@ def test_figures_of_a_whole_set(droid: Path) -> None:
     assert found.hours == pytest.approx(87 / 15 / 3600)
     assert found.success_share == pytest.approx(4 / 6)
     assert len(found.sample) == 6
-    assert [one.stride for one in found.motions] == [4, 8, 15]
+    assert [one.stride for one in found.steps] == [4, 8, 15]
     splits = [split_of(info.id, dataset.config) for info in dataset.table]
     assert found.episodes_of == {name: splits.count(name) for name in ("train", "validation", "test")}
     assert found.windows_of["train"] + found.windows_of["validation"] == 87 - 6 * 4
@@ -90,34 +81,31 @@ def test_a_sample_is_drawn_from_those_that_take_part_and_is_always_the_same(droi
     assert len(inspect_dataset(dataset, episodes=1).sample) == 1
 
 
-def in_memory(broken: frozenset[int], policy: str, pictureless: frozenset[int] = frozenset()) -> Dataset:
-    config = DataConfig.model_validate({"path": "memory", "broken_episodes": policy, "frames": 3})
-    source = MemorySource([60] * 100, unreadable=broken, pictureless=pictureless)
-    table = source.infos()
-    return Dataset(config, source, table, StepSelection.whole(table, np.ones(100, bool)), BrokenEpisodes(config, 100))
+def hundred(broken: frozenset[int], policy: str, pictureless: frozenset[int] = frozenset()) -> Dataset:
+    return in_memory(MemorySource([60] * 100, unreadable=broken, pictureless=pictureless), broken_episodes=policy)
 
 
 def test_an_episode_of_the_sample_that_cannot_be_read_is_counted_and_named(caplog: pytest.LogCaptureFixture) -> None:
-    dataset = in_memory(frozenset({7}), "skip")
+    dataset = hundred(frozenset({7}), "skip")
     assert len(inspect_dataset(dataset).sample) == 99
     assert list(dataset.broken.reasons) == ["episode 7"]
     assert "memory: episode 7: damaged" in caplog.text
     with pytest.raises(InputError, match="2 of 100 episodes are broken"):
-        inspect_dataset(in_memory(frozenset({7, 8}), "skip"))
+        inspect_dataset(hundred(frozenset({7, 8}), "skip"))
     with pytest.raises(InputError, match=r"memory: episode 7: damaged\..*add to data\.exclude: \[\"episode 7\"\]"):
-        inspect_dataset(in_memory(frozenset({7}), "error"))
+        inspect_dataset(hundred(frozenset({7}), "error"))
 
 
 def test_a_broken_frame_is_left_out_of_the_contact_sheet(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     sheets: list[ContactSheet] = []
     monkeypatch.setattr(figure, "plot_contact_sheet", lambda sheet, path: sheets.append(sheet) or path)
-    dataset = in_memory(frozenset(), "skip", frozenset({7}))
-    plot_dataset(dataset, inspect_dataset(dataset), tmp_path / "sheet.png", rows=100)
+    dataset = hundred(frozenset(), "skip", frozenset({7}))
+    plot_dataset(inspect_dataset(dataset), tmp_path / "sheet.png", rows=100)
     assert len(sheets[0].strips) == 99
     assert list(dataset.broken.reasons) == ["episode 7"]
-    dataset = in_memory(frozenset(), "error", frozenset({7}))
+    dataset = hundred(frozenset(), "error", frozenset({7}))
     with pytest.raises(InputError, match=r"pictures of episode 7: damaged\..*add to data\.exclude"):
-        plot_dataset(dataset, inspect_dataset(dataset), tmp_path / "sheet.png", rows=100)
+        plot_dataset(inspect_dataset(dataset), tmp_path / "sheet.png", rows=100)
 
 
 def test_the_figures_are_plain_values_and_stand_beside_what_is_known_of_the_released_weights(droid: Path) -> None:

@@ -8,33 +8,31 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.coverage import PLAY, Coverage, ReadEpisode, coverage_by, coverage_in, coverage_of
 from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.data.inspection.check import check_data
-from vjepa2_ac.data.inspection.coverage import PLAY, Coverage, PoseCoverage, VectorCoverage, coverage_of
-from vjepa2_ac.data.inspection.statistics import ReadEpisode, coverage_in, inspect_dataset
 from vjepa2_ac.geometry import matrices_from_euler, rotation_differences, states_in_camera_frame
+from vjepa2_ac.inspection.check import check_data
+from vjepa2_ac.inspection.statistics import inspect_dataset
 from vjepa2_ac.simulation.world.domains import named_domain
 from vjepa2_ac.simulation.world.motion import MotionRecipe, random_reaching
 from vjepa2_ac.spaces import POSE, vector_states
 
 
-def moving(*scales: float, lift: tuple[float, ...] = (0, 0, 0), steps: int = 400, seed: int = 0) -> PoseCoverage:
+def moving(*scales: float, lift: tuple[float, ...] = (0, 0, 0), steps: int = 400, seed: int = 0) -> np.ndarray:
     """Changes of poses: normal with a standard deviation along each axis, in cm, around a mean."""
     changes = np.zeros((steps, 7))
-    normal = np.random.default_rng(seed).normal(size=(steps, 3))
-    changes[:, :3] = (normal * scales + lift) / 100
-    return PoseCoverage(changes, 1)
+    changes[:, :3] = (np.random.default_rng(seed).normal(size=(steps, 3)) * scales + lift) / 100
+    return changes
 
 
-def upwards() -> PoseCoverage:
-    changes = moving(3, 3, 3, steps=4000).changes
+def upwards() -> np.ndarray:
+    changes = moving(3, 3, 3, steps=4000)
     changes[:, 2] = np.abs(changes[:, 2])
-    return PoseCoverage(changes, 1)
+    return changes
 
 
-def reason_of(found: PoseCoverage) -> str:
-    """Return the reason without its numbers."""
-    return found.narrow.split("; ")[-1].split(" (")[0].rstrip("0123456789. ")
+def poses(changes: np.ndarray, stride: int = 1) -> Coverage:
+    return coverage_of(changes, POSE, stride)
 
 
 FIT = {
@@ -42,7 +40,7 @@ FIT = {
     "few steps": moving(3, 3, 3, steps=100),
     "flattened": moving(3, 3, 1.8),
     "leaning": moving(3, 3, 3, lift=(1, 0, 0)),
-    "some stand still": PoseCoverage(np.concatenate([moving(3, 3, 3).changes, np.zeros((100, 7))]), 1),
+    "some stand still": np.concatenate([moving(3, 3, 3), np.zeros((100, 7))]),
 }
 NARROW = {
     "one way": (moving(0.2, 0.2, 0.2, lift=(3, 0, 0)), "nearly all go one way, (x +1.0, y +0.0, z +0.0)"),
@@ -54,63 +52,65 @@ NARROW = {
 }
 
 
-@pytest.mark.parametrize("found", FIT.values(), ids=FIT)
-def test_varied_motion_is_fit_to_plan_with(found: PoseCoverage) -> None:
-    assert (found.narrow, found.verdict) == ("", "fit to plan with")
+@pytest.mark.parametrize("changes", FIT.values(), ids=FIT)
+def test_varied_motion_is_fit_to_plan_with(changes: np.ndarray) -> None:
+    assert (poses(changes).narrow, poses(changes).verdict) == ("", "fit to plan with")
 
 
-@pytest.mark.parametrize(("found", "reason"), NARROW.values(), ids=NARROW)
+@pytest.mark.parametrize(("changes", "reason"), NARROW.values(), ids=NARROW)
 def test_motion_of_few_directions_or_tiny_is_narrow_with_the_reason_and_what_to_record(
-    found: PoseCoverage, reason: str
+    changes: np.ndarray, reason: str
 ) -> None:
+    found = poses(changes)
     assert reason in found.narrow
     assert found.verdict == f"narrow: {found.narrow}. {PLAY}"
-    assert "half an hour of random motion" in found.verdict
 
 
-@pytest.mark.parametrize("found", [*FIT.values(), *(one for one, _ in NARROW.values())], ids=[*FIT, *NARROW])
-def test_turning_the_axes_changes_no_verdict(found: PoseCoverage) -> None:
+@pytest.mark.parametrize("changes", [*FIT.values(), *(one for one, _ in NARROW.values())], ids=[*FIT, *NARROW])
+def test_turning_the_axes_changes_no_verdict(changes: np.ndarray) -> None:
+    def reason_of(found: Coverage) -> str:
+        return found.narrow.split("; ")[-1].split(" (")[0].rstrip("0123456789. ")
+
+    found = poses(changes)
     for rotation in Rotation.random(10, random_state=1):
-        changes = found.changes.copy()
-        changes[:, :3] = rotation.apply(changes[:, :3])
-        turned = PoseCoverage(changes, 1)
-        assert reason_of(turned) == reason_of(found)
-        assert turned.covered == pytest.approx(found.covered, abs=0.04)
-        assert turned.one_way == pytest.approx(found.one_way, abs=1e-6)
-        np.testing.assert_allclose(turned.spread[0], found.spread[0], atol=1e-6)
+        turned = changes.copy()
+        turned[:, :3] = rotation.apply(changes[:, :3])
+        again = poses(turned)
+        assert reason_of(again) == reason_of(found)
+        assert again.metrics["directions"] == pytest.approx(found.metrics["directions"], abs=0.04)
+        assert again.metrics["mean_direction"] == pytest.approx(found.metrics["mean_direction"], abs=1e-6)
+        np.testing.assert_allclose(again.metrics["principal_shares"], found.metrics["principal_shares"], atol=1e-6)
 
 
 def test_the_unit_of_coverage_is_an_equal_share() -> None:
     """Over the whole sphere the density is 1 on average, of any data: the cells have equal areas."""
-    for found in (moving(3, 3, 3), moving(1, 2, 3, lift=(1, 1, 0)), NARROW["one way"][0]):
-        assert found.density.mean() == pytest.approx(1, abs=0.05)
-    up = PoseCoverage(np.tile([0, 0, 0.03, 0, 0, 0, 0], (200, 1)), 1).density
+    for changes in (moving(3, 3, 3), moving(1, 2, 3, lift=(1, 1, 0)), NARROW["one way"][0]):
+        assert poses(changes).density.mean() == pytest.approx(1, abs=0.05)
+    up = poses(np.tile([0, 0, 0.03, 0, 0, 0, 0], (200, 1))).density
     assert up[-1].min() > 10, "z is up"
-    forward = PoseCoverage(np.tile([0.03, 0, 0, 0, 0, 0, 0], (200, 1)), 1).density
+    forward = poses(np.tile([0.03, 0, 0, 0, 0, 0, 0], (200, 1))).density
     assert forward[12, 24] > 10, "x is in the middle"
     assert forward[12, 0] == 0
 
 
 def test_too_few_steps_decide_nothing() -> None:
-    for found in (moving(3, 0, 0, steps=99), PoseCoverage(moving(3, 0, 0, steps=399).changes, 4)):
+    for found in (poses(moving(3, 0, 0, steps=99)), poses(moving(3, 0, 0, steps=399), 4)):
         assert found.narrow == ""
         assert found.verdict.startswith("not known of fewer than 100 model steps")
-    still = PoseCoverage(np.zeros((5, 7)), 1)
-    assert (still.covered, still.one_way, still.narrow) == (0, 0, "")
-
-
-def recorded(recipe: MotionRecipe | None, domain: str) -> Coverage:
-    generator = np.random.default_rng(0)
-    motions = [random_reaching(named_domain(domain), 61, generator, recipe) for _ in range(12)]
-    states = [np.concatenate([one.poses, one.gripper[:, None]], axis=1) for one in motions]
-    pieces = [piece for one in states for piece in ReadEpisode(0, one, ((0, 61),)).changes(4, POSE)]
-    return coverage_of(np.concatenate(pieces), POSE, 4)
+    still = poses(np.zeros((5, 7)))
+    assert (still.metrics["directions"], still.metrics["mean_direction"], still.narrow) == (0, 0, "")
 
 
 @pytest.mark.parametrize("domain", ["A", "B"])
 def test_random_reaching_of_the_simulator_is_fit_and_one_way_reaching_is_narrow(domain: str) -> None:
-    assert recorded(None, domain).verdict == "fit to plan with"
-    one_way = recorded(MotionRecipe(drift_m=(0.01, 0.0, 0.0)), domain)
+    def recorded(recipe: MotionRecipe | None) -> Coverage | None:
+        generator = np.random.default_rng(0)
+        motions = [random_reaching(named_domain(domain), 61, generator, recipe) for _ in range(12)]
+        states = [np.concatenate([one.poses, one.gripper[:, None]], axis=1) for one in motions]
+        return coverage_by([ReadEpisode(0, one, ((0, 61),)) for one in states], POSE, 4)
+
+    assert recorded(None).verdict == "fit to plan with"
+    one_way = recorded(MotionRecipe(drift_m=(0.01, 0.0, 0.0)))
     assert "steps go to 7% of all directions; nearly all go one way" in one_way.narrow
 
 
@@ -118,10 +118,10 @@ def test_what_is_said_of_each_axis_and_of_the_gripper_is_what_the_steps_do() -> 
     changes = np.zeros((200, 7))
     changes[:, 0] = np.where(np.arange(200) % 4 == 0, -0.02, 0.03)
     changes[:20, 6] = 0.5
-    found = PoseCoverage(changes, 1)
+    found = poses(changes)
     assert "dx 3.0 cm (25% back, 75% forth), dy 0.0 cm (0% back, 0% forth)" in found.lines["axes"]
     assert "the gripper changes in 10%" in found.lines["axes"]
-    values = json.loads(json.dumps(found.as_dict()))
+    values = json.loads(json.dumps(found.metrics))
     assert values["length_cm_10_50_90_99"] == pytest.approx([2, 3, 3, 3])
     assert values["back_share_xyz"] == [0.25, 0, 0]
     assert values["gripper_share"] == 0.1
@@ -133,13 +133,8 @@ def test_changes_are_those_over_a_stride_within_kept_ranges_in_the_frame_of_the_
     kept = ((0, 7), (9, 12), (14, 20))
     found = np.concatenate(list(ReadEpisode(0, states, kept).changes(3, POSE)))
     pairs = [(first, first + 3) for start, end in kept for first in range(start, end - 3)]
-    expected = np.array(
-        [
-            np.concatenate([(states[b] - states[a])[:3], rotation_differences(states[[a, b], 3:6])[0],
-                            (states[b] - states[a])[6:]])
-            for a, b in pairs
-        ]
-    )  # fmt: skip
+    expected = np.array([states[b] - states[a] for a, b in pairs])
+    expected[:, 3:6] = [rotation_differences(states[[a, b], 3:6])[0] for a, b in pairs]
     order = [found[:, 6].tolist().index(one) for one in expected[:, 6]]
     np.testing.assert_allclose(found[order], expected, atol=1e-12)
     assert len(found) == len(pairs)
@@ -152,16 +147,17 @@ def test_changes_are_those_over_a_stride_within_kept_ranges_in_the_frame_of_the_
 
 
 def test_vectors_are_narrow_where_most_numbers_hardly_move_or_go_one_way() -> None:
-    generator = np.random.default_rng(0)
-    free = generator.normal(size=(300, 6)) * 0.1
-    assert VectorCoverage(free, 1).verdict == "fit to plan with"
+    def vectors(changes: np.ndarray, stride: int = 1) -> Coverage:
+        return coverage_of(changes, vector_states(6), stride)
+
+    free = np.random.default_rng(0).normal(size=(300, 6)) * 0.1
+    assert vectors(free).verdict == "fit to plan with"
     held = free * [1, 1, 0, 0, 0.001, 0.001]
-    found = coverage_of(held, vector_states(6), 1)
-    assert isinstance(found, VectorCoverage)
-    assert (found.both_ways, found.still) == ([0, 1], [2, 3, 4, 5])
+    found = vectors(held)
+    assert (found.metrics["both_ways"], found.metrics["still"]) == ([0, 1], [2, 3, 4, 5])
     assert found.narrow == "4 of 6 numbers hardly move, 0 only one way"
-    assert VectorCoverage(np.abs(free), 1).narrow == "0 of 6 numbers hardly move, 6 only one way"
-    assert VectorCoverage(held, 4).narrow == "", "75 steps"
+    assert vectors(np.abs(free)).narrow == "0 of 6 numbers hardly move, 6 only one way"
+    assert vectors(held, 4).narrow == "", "75 steps"
     assert found.lines["numbers"] == "2 of 6 go up and down, 4 hardly move"
 
 
@@ -183,12 +179,10 @@ def test_data_check_and_inspect_say_whether_data_are_fit_to_plan_with(tmp_path: 
     found = {one.about: one for one in check_data(config, clips=4)}
     assert found["coverage"].level == ("warning" if one_way else "ok")
     assert ("nearly all go one way, (x +1.0, y +0.0, z +0.0)" in found["coverage"].text) == one_way
-    inspection = inspect_dataset(open_dataset(config))
-    assert inspection.as_dict()["coverage"]["narrow"].startswith("steps go to 7%" if one_way else "")
-    assert bool(inspection.as_dict()["coverage"]["narrow"]) == one_way
-    coverage = coverage_in(open_dataset(config))
-    assert coverage is not None
-    assert coverage.as_dict() == inspection.as_dict()["coverage"], "of the same episodes"
+    written_down = inspect_dataset(open_dataset(config)).as_dict()["coverage"]
+    assert written_down["narrow"].startswith("steps go to 7%" if one_way else "")
+    assert bool(written_down["narrow"]) == one_way
+    assert coverage_in(open_dataset(config)).metrics == written_down, "of the same episodes"
 
 
 def test_a_stride_that_fits_nowhere_has_no_coverage(tmp_path: Path) -> None:

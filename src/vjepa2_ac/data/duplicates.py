@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Int
 
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset
@@ -51,37 +51,22 @@ def find_duplicates(dataset: Dataset) -> Duplicates:
         return Duplicates(is_known=False)
     members = np.flatnonzero(dataset.kept.taking_part & (table.state_hash != UNKNOWN))
     members = members[np.argsort(table.id_rank[members])]
-    _, first, group, count = np.unique(
-        table.state_hash[members], return_index=True, return_inverse=True, return_counts=True
-    )
-    is_copy = count[group] > 1
-    if not is_copy.any():
+    hashes, count = np.unique(table.state_hash[members], return_counts=True)
+    members = members[np.isin(table.state_hash[members], hashes[count > 1])]
+    if not len(members):
         return Duplicates(is_known=True)
-    splits = _splits(dataset, members)
-    is_across = _is_across(splits, group)
-    chosen = int(np.argmax(is_across if is_across.any() else is_copy))
-    twins = np.flatnonzero((group == group[chosen]) & (np.arange(len(members)) != chosen))
-    twin = int(twins[np.argmax(splits[twins] != splits[chosen])])
-    is_first = np.zeros(len(members), bool)
-    is_first[first] = True
+    splits = np.argmax([dataset.members(split)[members] for split in _SPLITS], axis=0)
+    groups: dict[int, list[tuple[str, Split]]] = defaultdict(list)
+    for member, split in zip(members.tolist(), splits.tolist(), strict=True):
+        groups[int(table.state_hash[member])].append((table.identity(member), _SPLITS[split]))
+    across = [group for group in groups.values() if len({split for _, split in group}) > 1]
+    first, *others = (across or list(groups.values()))[0]
+    other = next((one for one in others if one[1] != first[1]), others[0])
     return Duplicates(
         is_known=True,
-        episodes=int(is_copy.sum()),
-        different=int((count > 1).sum()),
-        across=int(is_across.sum()),
-        example=tuple((table.identity(int(members[place])), _SPLITS[splits[place]]) for place in (chosen, twin)),
-        copies=tuple(table.identity(int(member)) for member in members[~is_first]),
+        episodes=len(members),
+        different=len(groups),
+        across=sum(map(len, across)),
+        example=(first, other),
+        copies=tuple(name for group in groups.values() for name, _ in group[1:]),
     )
-
-
-def _splits(dataset: Dataset, members: Int[np.ndarray, " members"]) -> Int[np.ndarray, " members"]:
-    """Return the split of each, as an index into `_SPLITS`."""
-    return np.asarray(np.argmax([dataset.members(split)[members] for split in _SPLITS], axis=0))
-
-
-def _is_across(splits: Int[np.ndarray, " members"], group: Int[np.ndarray, " members"]) -> Bool[np.ndarray, " members"]:
-    least = np.full(group.max() + 1, len(_SPLITS))
-    most = np.full(group.max() + 1, -1)
-    np.minimum.at(least, group, splits)
-    np.maximum.at(most, group, splits)
-    return np.asarray((least != most)[group])

@@ -1,0 +1,223 @@
+"""Statistics of a data set: lengths, outcomes, idle time, and the motion of the robot per model step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
+
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config.data import Split
+from vjepa2_ac.data.coverage import Coverage, ReadEpisode, coverage_by, read_sample
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.duplicates import Duplicates, find_duplicates
+from vjepa2_ac.data.idle import idle_by_motion, long_idle_runs
+from vjepa2_ac.episode import Progress, no_progress
+from vjepa2_ac.errors import InputError
+
+PERCENTILES = (10, 50, 90, 99)
+SPLITS: tuple[Split, ...] = ("train", "validation", "test")
+MOVED, TURNED, CHANGED = "moved_cm", "turned_deg", "changed_percent_of_range"
+
+RELEASED_STEP_CM = 12.9  # motion of the flange between the two frames of upstream's example (franka_example_traj.npz)
+RELEASED = (
+    "the released weights saw DROID at a step of 4, 8 or 15 control steps (0.27, 0.53 or 1 s): which one is unsettled."
+    f" The one known pair of frames, upstream's own example, is {RELEASED_STEP_CM} cm apart."
+    " `data calibrate` lets the weights choose"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class StepSizes:
+    """How far the state moves in a model step, at one stride."""
+
+    stride: int
+    seconds: float
+    sizes: dict[str, Float[np.ndarray, " pairs"]]  # of poses MOVED and TURNED, of vectors CHANGED
+
+    @property
+    def percentiles(self) -> dict[str, list[float]]:
+        """The percentiles 10, 50, 90 and 99 of each; empty if no pair of steps fits."""
+        return {
+            name: np.percentile(one, list(PERCENTILES)).tolist() if len(one) else [] for name, one in self.sizes.items()
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Inspection:
+    """The statistics of a data set; motion is measured on a sample of the used episodes."""
+
+    dataset: Dataset
+    duplicates: Duplicates
+    sample: tuple[ReadEpisode, ...]
+
+    @property
+    def config(self) -> DataConfig:
+        """The data."""
+        return self.dataset.config
+
+    @property
+    def lengths(self) -> np.ndarray:
+        """Control steps of every readable episode."""
+        return self.dataset.table.num_steps
+
+    @property
+    def hours(self) -> float:
+        """The total duration of all readable episodes."""
+        return float(self.lengths.sum() / self.dataset.control_rate_hz / 3600)
+
+    @property
+    def success_share(self) -> float | None:
+        """The share of successes among the episodes with known outcome; None: there are none."""
+        known = self.dataset.table.success >= 0
+        return float(self.dataset.table.success[known].mean()) if known.any() else None
+
+    @property
+    def length_percentiles(self) -> list[int]:
+        """The shortest, the percentiles 10, 50 and 90, and the longest length in control steps."""
+        return [int(value) for value in np.percentile(self.lengths, [0, 10, 50, 90, 100])]
+
+    @cached_property
+    def episodes_of(self) -> dict[Split, int]:
+        """The number of episodes of each split."""
+        return {split: int(self.dataset.members(split).sum()) for split in SPLITS}
+
+    @cached_property
+    def windows_of(self) -> dict[Split, int]:
+        """The number of clips of each split."""
+        return {split: self._windows(split) for split in SPLITS}
+
+    def _windows(self, split: Split) -> int:
+        try:
+            return len(self.dataset.windows(split))
+        except InputError:  # an empty split is a statistic here, not an error
+            return 0
+
+    @property
+    def has_poses(self) -> bool:
+        """Whether there is a position, of which motion is measured."""
+        return self.dataset.spaces.state.position is not None
+
+    @cached_property
+    def ranges(self) -> Float[np.ndarray, "state_dim 2"]:
+        """The least and the greatest value of each number of the sample's states."""
+        states = np.concatenate([one.states for one in self.sample])
+        return np.stack([states.min(axis=0), states.max(axis=0)], axis=1)
+
+    def range_of(self, column: int) -> tuple[float, float]:
+        """Return the least and the greatest value of one number of the sample's states."""
+        low, high = self.ranges[column].tolist()
+        return low, high
+
+    @property
+    def gripper_range(self) -> tuple[float, float]:
+        """The least and the greatest closedness of the sample."""
+        return self.range_of(self.dataset.spaces.state.gripper or 0)
+
+    @cached_property
+    def coverage(self) -> Coverage | None:
+        """The coverage of actions by the sample at the config's stride; None: no step fits."""
+        return coverage_by(self.sample, self.dataset.spaces.state, self.config.model_stride)
+
+    @cached_property
+    def still_share(self) -> float | None:
+        """The share of the sample's steps in a run of idle ones, by the measured motion; None: no poses."""
+        if not self.has_poses:
+            return None
+        return float(np.concatenate([idle_runs(one.states, self.config) for one in self.sample]).mean())
+
+    @cached_property
+    def steps(self) -> tuple[StepSizes, ...]:
+        """The motion per model step at each candidate stride."""
+        rate = self.dataset.control_rate_hz
+        return tuple(self._at_stride(stride, rate) for stride in self.config.strides_to_try(rate))
+
+    def _at_stride(self, stride: int, control_rate_hz: float) -> StepSizes:
+        space = self.dataset.spaces.state
+        pieces = [piece for one in self.sample for piece in one.changes(stride, space)]
+        changes = np.concatenate([np.zeros((0, len(space))), *pieces])
+        if self.has_poses:
+            turned = Rotation.from_euler("xyz", changes[:, space.rotation]).magnitude()
+            sizes = {MOVED: space.shown_size(changes), TURNED: np.rad2deg(turned)}
+        else:
+            sizes = {CHANGED: largest_change(changes, self.ranges)}
+        return StepSizes(stride, stride / control_rate_hz, sizes)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return all statistics as plain values, for `inspect.json`."""
+        config, table, widths = self.config, self.dataset.table, self.dataset.widths
+        about_states = {"ranges": self.ranges.tolist()}
+        if self.has_poses:
+            about_states = {
+                "still_share": self.still_share,
+                "xyz_m": [self.range_of(column) for column in range(3)],
+                "gripper": self.gripper_range,
+                "released_weights": RELEASED,
+            }
+        return {
+            "path": config.path,
+            "source": config.source,
+            "cameras": list(config.offered_cameras),
+            "camera": list(config.cameras),
+            "control_rate_hz": self.dataset.control_rate_hz,
+            "episodes": len(table),
+            "broken_episodes": len(table.problems),
+            "steps": int(self.lengths.sum()),
+            "hours": self.hours,
+            "length_percentiles_0_10_50_90_100": self.length_percentiles,
+            "success_share": self.success_share,
+            "success_known_of": int((table.success >= 0).sum()),
+            "removed": [vars(one) for one in self.dataset.removed],
+            "splits": {name: {"episodes": self.episodes_of[name], "windows": self.windows_of[name]} for name in SPLITS},
+            "duplicates": self.duplicates.as_dict(),
+            "sampled_episodes": len(self.sample),
+            "state_dim": widths.state,
+            "action_dim": widths.action,
+            "percentiles": list(PERCENTILES),
+            "per_model_step": [{"stride": one.stride, "seconds": one.seconds, **one.percentiles} for one in self.steps],
+            "coverage": None if self.coverage is None else dict(self.coverage.metrics),
+            **about_states,
+        }
+
+
+def inspect_dataset(dataset: Dataset, *, episodes: int = 100, progress: Progress = no_progress) -> Inspection:
+    """Compute the statistics of a data set: from the table for all episodes, from the states of a sample for motion.
+
+    Args:
+        dataset: Its stride is a number.
+        episodes: At most as many are read, without frames, spread over the used ones.
+        progress: Called with (episodes read, total number).
+
+    Raises:
+        InputError: Episodes of the sample cannot be read, and `data.broken_episodes` does not skip them.
+    """
+    return Inspection(dataset, find_duplicates(dataset), tuple(read_sample(dataset, episodes, progress)))
+
+
+def idle_runs(states: Float[np.ndarray, "steps 7"], config: DataConfig) -> Bool[np.ndarray, " steps"]:
+    """Return the steps in runs of idle ones, by measured motion, that are long enough for the idle filter."""
+    return long_idle_runs(idle_by_motion(states, config.idle), config.idle)
+
+
+def largest_change(
+    changes: Float[np.ndarray, "steps state_dim"], ranges: Float[np.ndarray, "state_dim 2"]
+) -> Float[np.ndarray, " steps"]:
+    """Return, at each step, the change of the number that changes most, in percent of its range."""
+    spans = ranges[:, 1] - ranges[:, 0]
+    return np.asarray((abs(changes) / np.where(spans > 0, spans, np.inf)).max(axis=1) * 100)
+
+
+def at_some_stride(dataset: Dataset) -> Dataset:
+    """Return a data set at its stride; if that is auto, at the smallest candidate."""
+    if dataset.config.stride != "auto":
+        return dataset
+    return dataset.with_stride(min(dataset.config.strides_to_try(dataset.control_rate_hz)))
+
+
+def shown_hours(hours: float) -> str:
+    """Return a duration for people."""
+    return f"{hours:,.1f} hours" if hours >= 1 else f"{hours * 60:.1f} minutes"
