@@ -13,8 +13,8 @@ from torch import nn
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.duplicates import find_duplicates
 from vjepa2_ac.data.index.index_cache import fingerprints_of
-from vjepa2_ac.data.inspection.duplicates import find_duplicates
 from vjepa2_ac.data.loader import Batches, Mixed, ProcessShare, training_loader, validation_batches
 from vjepa2_ac.data.streams import Copies, copies_for
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
