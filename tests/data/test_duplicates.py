@@ -14,7 +14,6 @@ from latent_sets import write_cache
 from memory_source import MemorySource
 from synthetic import synthetic_states
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.console.data import inspection_lines
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.duplicates import Duplicates, find_duplicates
 from vjepa2_ac.data.index.episode_table import FORMAT, EpisodeTable
@@ -160,7 +159,7 @@ def test_check_and_inspect_warn_of_copies_and_are_calm_without(tmp_path: Path) -
     finding = next(one for one in check_data(copied, clips=2) if one.about == "duplicates")
     assert (finding.level, "5 episodes have the states" in finding.text) == ("warning", True)
     inspection = inspect_dataset(open_dataset(copied))
-    assert any(line.startswith("duplicates") and "inspect.json" in line for line in inspection_lines(inspection))
+    assert "inspect.json" in inspection.summary["duplicates"]
     assert sorted(inspection.as_dict()["duplicates"]["copies"]) == ["004", "007", "009"]
     single = config_of("npz", write_npz(tmp_path / "single", range(10)), tmp_path)
     finding = next(one for one in check_data(single, clips=2) if one.about == "duplicates")

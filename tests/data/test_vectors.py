@@ -268,7 +268,7 @@ def test_frames_that_never_change_while_a_number_does_are_an_error() -> None:
 
 
 def test_inspection_and_frame_of_vectors(tmp_path: Path) -> None:
-    from vjepa2_ac.console.data import inspection_lines, motion_table
+    from vjepa2_ac.console.data import motion_table
 
     dataset = open_dataset(knobs(write_vectors(tmp_path / "set", width=14)))
     found = inspect_dataset(dataset)
@@ -276,7 +276,7 @@ def test_inspection_and_frame_of_vectors(tmp_path: Path) -> None:
     assert (figures["state_dim"], figures["action_dim"], len(figures["ranges"])) == (14, 14, 14)
     assert "gripper" not in figures
     assert [one["stride"] for one in figures["per_model_step"]] == [3, 5, 10]
-    assert any(line.startswith("states") and "14 numbers: -" in line for line in inspection_lines(found))
+    assert found.summary["states"].startswith("14 numbers: -")
     assert motion_table(found.steps).row_count == 3
     assert plot_dataset(found, tmp_path / "sheet.png").stat().st_size > 10_000
 

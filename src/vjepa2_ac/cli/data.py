@@ -160,7 +160,7 @@ def _inspect(options: argparse.Namespace) -> None:
     config = read_config(options.config, options.overrides)
     _make_folder(options.out)
 
-    from vjepa2_ac.console.data import inspection_lines, motion_table
+    from vjepa2_ac.console.data import motion_table
     from vjepa2_ac.console.progress import ConsoleReporter, console
     from vjepa2_ac.data.dataset import open_dataset
     from vjepa2_ac.inspection.sheet import plot_dataset
@@ -174,8 +174,8 @@ def _inspect(options: argparse.Namespace) -> None:
         console.print(f"data.stride is auto: looked at the smallest candidate, {dataset.config.stride}")
     with ConsoleReporter() as reporter:
         inspection = inspect_dataset(dataset, episodes=options.episodes, progress=reporter.task("reading states"))
-    for line in inspection_lines(inspection):
-        console.print(line)
+    for name, text in inspection.summary.items():
+        console.print(f"{name:<16}{text}")
     console.print(motion_table(inspection.steps))
     if inspection.has_poses:
         console.print(f"For comparison: {RELEASED}.")

@@ -14,7 +14,7 @@ from vjepa2_ac.evaluation.axis_fit import AxisFit
 from vjepa2_ac.evaluation.data_variants.measure import VariantProbe, rows_of
 from vjepa2_ac.evaluation.stride_calibration.measure import Calibration
 from vjepa2_ac.inspection.excerpts import Finding
-from vjepa2_ac.inspection.statistics import CHANGED, MOVED, TURNED, Inspection, StepSizes, shown_hours
+from vjepa2_ac.inspection.statistics import CHANGED, MOVED, TURNED, StepSizes
 
 _COLOURS = {"ok": "green", "warning": "yellow", "error": "red"}
 
@@ -34,49 +34,6 @@ def index_lines(table: EpisodeTable, watch: Usage, seconds: float) -> list[str]:
         size = f"{path.stat().st_size / 1e6:.2f} MB" if path.is_file() else "could not be kept"
         lines.append(f"  {path}  {size}")
     return lines
-
-
-def inspection_lines(inspection: Inspection) -> list[str]:
-    """Return the output of `data inspect` before its table."""
-    dataset, config, coverage = inspection.dataset, inspection.config, inspection.coverage
-    table, success = dataset.table, inspection.success_share
-    known, steps = int((table.success >= 0).sum()), int(table.num_steps.sum())
-    lengths = " / ".join(map(str, inspection.length_percentiles))
-    splits = ", ".join(
-        f"{name} {windows:,} clips in {inspection.episodes_of[name]:,} episodes"
-        for name, windows in inspection.windows_of.items()
-    )
-    removed = ", ".join(f"{one.name} {one}" for one in dataset.removed if one.episodes or one.steps)
-    duplicates = inspection.duplicates
-    rows = {
-        "data set": f"{config.path} ({config.source})",
-        "episodes": f"{len(table):,} ({len(table.problems):,} broken)",
-        "steps": f"{steps:,} at {dataset.control_rate_hz:g} per second: {shown_hours(inspection.hours)}",
-        "length": f"{lengths} steps (least, 10 %, median, 90 %, most)",
-        "cameras": f"{', '.join(config.offered_cameras)}; used: {', '.join(config.cameras)}",
-        "success": "not known" if success is None else f"{success:.1%} of {known:,} episodes of which it is known",
-        "left out": removed or "nothing",
-        "splits": f"{splits}; clips of {config.frames} frames at stride {config.model_stride}",
-        "duplicates": f"{duplicates}{'; inspect.json lists the copies' if duplicates.copies else ''}",
-        "sample": f"{len(inspection.sample):,} episodes, for what follows",
-        **_rows_of_states(inspection),
-        **({} if coverage is None else {**coverage.lines, "coverage": coverage.verdict}),
-    }
-    return [f"{name:<16}{text}" for name, text in rows.items()]
-
-
-def _rows_of_states(inspection: Inspection) -> dict[str, str]:
-    config, widths = inspection.config, inspection.dataset.widths
-    ranges = [f"{low:.2f} to {high:.2f}" for low, high in inspection.ranges]
-    if not inspection.has_poses:
-        how = f", joined by {config.join_actions}" if config.join_actions else ""
-        actions = f"{widths.action} numbers, {config.actions}{how}"
-        return {"states": f"{widths.state} numbers: {', '.join(ranges)}", "actions": actions}
-    return {
-        "standing still": f"{inspection.still_share:.1%} of the steps, by the measured motion",
-        "position": f"{', '.join(f'{axis} {one}' for axis, one in zip('xyz', ranges, strict=False))} m",
-        "gripper": "{:.2f} to {:.2f} (0 open, 1 closed)".format(*inspection.gripper_range),
-    }
 
 
 _SIZES = {

@@ -27,7 +27,7 @@ from vjepa2_ac.data.selection import (
 )
 from vjepa2_ac.data.sources.configured_spaces import spaces_of
 from vjepa2_ac.data.sources.registry import open_source
-from vjepa2_ac.data.windows import ClipStarts, Windows, clip_starts, in_split, windows_of
+from vjepa2_ac.data.windows import Windows, clip_starts, in_split, windows_of
 from vjepa2_ac.episode import POSE_WIDTHS, Episode, EpisodeSource, Progress, StepRanges, Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.spaces import Spaces
@@ -149,7 +149,7 @@ class Dataset:
     def _count(self, kept: StepSelection) -> tuple[int, int, int]:
         """Return the numbers of episodes, steps and, if the stride is known, windows."""
         is_known = self.config.stride != "auto"
-        windows = clip_starts(self.table, kept, self.config).windows if is_known else 0
+        windows = len(clip_starts(self.table, kept, self.config)) if is_known else 0
         return len(np.unique(kept.episode)), kept.steps, windows
 
     @property
@@ -158,8 +158,8 @@ class Dataset:
         return np.unique(self.kept.episode)
 
     @cached_property
-    def starts(self) -> ClipStarts:
-        """The first steps of the clips of all splits.
+    def starts(self) -> Windows:
+        """The clips of all splits.
 
         Raises:
             ValueError: The stride is not yet calibrated.

@@ -9,8 +9,8 @@ from __future__ import annotations
 import hashlib
 import itertools
 import logging
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Int32, Int64, UInt64
@@ -69,17 +69,36 @@ def _bounds(groups: Float[np.ndarray, " groups"], config: DataConfig) -> tuple[f
 
 
 @dataclass(frozen=True, eq=False)
-class ClipStarts:
-    """First steps of clips as runs of neighbours: `first`, `first` + `every`, ..., `count` of them."""
+class Windows:
+    """Clips in the order of their episodes' identities, then of their starts; as runs of neighbours.
 
-    episode: Int32[np.ndarray, " runs"]
-    first: Int32[np.ndarray, " runs"]
+    A run has the clips that start at `first`, `first` + `every`, ..., `count` of them.
+    """
+
+    episode: Int32[np.ndarray, " runs"]  # index into the source
+    first: Int32[np.ndarray, " runs"]  # control step
     count: Int32[np.ndarray, " runs"]
     every: int = 1  # control steps
+    short: tuple[int, ...] = ()  # episodes skipped because they are shorter than a clip
 
-    def __getitem__(self, chosen: np.ndarray) -> ClipStarts:
+    def of(self, runs: np.ndarray) -> Windows:
         """Return some of the runs, by a mask or by index."""
-        return ClipStarts(self.episode[chosen], self.first[chosen], self.count[chosen], self.every)
+        return replace(self, episode=self.episode[runs], first=self.first[runs], count=self.count[runs])
+
+    @cached_property
+    def _ends(self) -> Int64[np.ndarray, " runs"]:
+        return np.cumsum(self.count, dtype=np.int64)
+
+    def __len__(self) -> int:
+        return int(self._ends[-1]) if len(self._ends) else 0
+
+    def __getitem__(self, index: int) -> tuple[int, int]:
+        """Return (episode, first control step) of a window."""
+        if not 0 <= index < len(self):
+            raise IndexError(f"window {index} of {len(self)}")
+        run = int(np.searchsorted(self._ends, index, side="right"))
+        place = index - (int(self._ends[run]) - int(self.count[run]))
+        return int(self.episode[run]), int(self.first[run]) + self.every * place
 
     def steps_of(self, run: int) -> Int[np.ndarray, " n"]:
         """Return the starts of a run, by its index."""
@@ -90,53 +109,23 @@ class ClipStarts:
         """The episodes that clips come from, each once, ascending."""
         return np.unique(self.episode)
 
-    @property
-    def windows(self) -> int:
-        """The number of clips."""
-        return int(self.count.sum(dtype=np.int64))
 
+def clip_starts(table: EpisodeTable, kept: StepSelection, config: DataConfig) -> Windows:
+    """Return all clips within kept ranges.
 
-def clip_starts(table: EpisodeTable, kept: StepSelection, config: DataConfig) -> ClipStarts:
-    """Return all clip starts within kept ranges, sorted by the episodes' identities.
-
-    With `data.start_every` they are multiples of it, counted from the first kept step of their episode.
+    With `data.start_every` their starts are multiples of it, counted from the first kept step of their episode.
     """
     span = kept.end - kept.start - (config.clip_steps - 1)
     phase = np.zeros(len(table), np.int32)
     phase[kept.episode[::-1]] = kept.start[::-1]  # the last write counts: an episode's first range
     skipped = (phase[kept.episode] - kept.start) % config.start_every
     count = -((skipped - span) // config.start_every)  # rounded up; 0 or less if none remains
-    runs = ClipStarts(kept.episode, kept.start + skipped, count, config.start_every)[count > 0]
-    return runs[np.lexsort((runs.first, table.id_rank[runs.episode]))]
-
-
-@dataclass(frozen=True, eq=False)
-class Windows:
-    """Every clip of a split, in the order of the episodes' identities, then of the starts; as runs of neighbours."""
-
-    starts: ClipStarts
-    ends: Int64[np.ndarray, " runs"]  # windows up to and including each run
-    short: Int32[np.ndarray, " short"]  # episodes skipped because they are shorter than a clip
-
-    def __len__(self) -> int:
-        return int(self.ends[-1])
-
-    def __getitem__(self, index: int) -> tuple[int, int]:
-        """Return (episode, first control step) of a window."""
-        if not 0 <= index < len(self):
-            raise IndexError(f"window {index} of {len(self)}")
-        run, starts = int(np.searchsorted(self.ends, index, side="right")), self.starts
-        place = index - (int(self.ends[run]) - int(starts.count[run]))
-        return int(starts.episode[run]), int(starts.first[run]) + starts.every * place
-
-    @property
-    def episodes(self) -> Int32[np.ndarray, " episodes"]:
-        """The episodes that clips come from; an index into the source."""
-        return self.starts.episodes
+    runs = Windows(kept.episode, kept.start + skipped, count, config.start_every).of(count > 0)
+    return runs.of(np.lexsort((runs.first, table.id_rank[runs.episode])))
 
 
 def windows_of(
-    table: EpisodeTable, members: Bool[np.ndarray, " episodes"], starts: ClipStarts, config: DataConfig, split: Split
+    table: EpisodeTable, members: Bool[np.ndarray, " episodes"], starts: Windows, config: DataConfig, split: Split
 ) -> Windows:
     """Return the windows of a split.
 
@@ -168,15 +157,15 @@ def windows_of(
         )
     if len(short):
         _warn_of_short(config.path, split, config.clip_steps, count, len(short), names)
-    own = starts[members[starts.episode]]
-    if not own.windows:
+    own = starts.of(members[starts.episode])
+    if not len(own):
         raise InputError(
             where=where,
             found=f"no {split} episode has a range of kept steps as long as a clip (data.idle.rule {config.idle.rule})",
             needed=length,
             fix="Lower data.frames or data.stride, or set data.idle.rule: none",
         )
-    return Windows(own, np.cumsum(own.count, dtype=np.int64), short)
+    return replace(own, short=tuple(short.tolist()))
 
 
 @lru_cache(maxsize=64)  # logged once: every validation uses the same windows

@@ -156,12 +156,12 @@ def _pixels(batches: Sequence[Batch]) -> Finding:
     frames = [batch.frames for batch in batches if batch.frames is not None]
     low, high = min(int(one.min()) for one in frames), max(int(one.max()) for one in frames)
     mean = float(np.mean([one.float().mean().item() for one in frames]))
-    text = f"{low} to {high}, mean {mean:.0f}"
-    if low == high:
-        return Finding("error", "pixels", f"all are {low}: there is nothing to see. Check data.camera")
-    if mean < _DARK:
-        return Finding("warning", "pixels", f"{text}: the frames are nearly black. Check data.camera")
-    return Finding("ok", "pixels", text)
+    return _first(
+        "pixels",
+        f"{low} to {high}, mean {mean:.0f}",
+        (low == high, "error", f"all are {low}: there is nothing to see. Check data.camera"),
+        (mean < _DARK, "warning", "the frames are nearly black. Check data.camera"),
+    )
 
 
 def _still_frames(batches: Sequence[Batch], spaces: Spaces, spans: Float[np.ndarray, " state_dim"]) -> Finding:
@@ -188,15 +188,14 @@ def _numbers(name: str, values: Float[np.ndarray, "rows width"], way_out: str) -
     low, high = values.min(axis=0), values.max(axis=0)
     text = f"{values.shape[1]} numbers, {low.min():.3g} to {high.max():.3g}"
     fixed, large = low == high, abs(values).max(axis=0) > _LARGE
-    if fixed.all():
-        return Finding("error", name, f"{text}: none of them ever changes. {way_out}")
-    if large.any():
-        fix = "bring them to the order of 1, such as radians, metres, or 0 to 1"
-        why = f"large are {_numbered(large)} (from 0). Numbers go into the network as they are"
-        return Finding("warning", name, f"{text}: {why}: {fix}")
-    if fixed.any():
-        return Finding("warning", name, f"{text}: {_numbered(fixed)} (from 0) never change")
-    return Finding("ok", name, text)
+    why = f"large are {_numbered(large)} (from 0). Numbers go into the network as they are"
+    return _first(
+        name,
+        text,
+        (fixed.all(), "error", f"none of them ever changes. {way_out}"),
+        (large.any(), "warning", f"{why}: bring them to the order of 1, such as radians, metres, or 0 to 1"),
+        (fixed.any(), "warning", f"{_numbered(fixed)} (from 0) never change"),
+    )
 
 
 def _numbered(mask: np.ndarray) -> str:
@@ -204,50 +203,58 @@ def _numbered(mask: np.ndarray) -> str:
     return ", ".join(map(str, places[:_NUMBERED])) + (", ..." if len(places) > _NUMBERED else "")
 
 
+def _first(about: str, text: str, *cases: tuple[bool, Level, str]) -> Finding:
+    """Return the finding of the first case that holds, or that all is well."""
+    level, words = next(((level, words) for holds, level, words in cases if holds), ("ok", ""))
+    return Finding(level, about, f"{text}: {words}" if words else text)
+
+
 def _positions(states: Float[np.ndarray, "rows 7"]) -> Finding:
     places = states[:, POSE.position]
     low, high = places.min(axis=0), places.max(axis=0)
-    text = ", ".join(f"{axis} {a:.3f} to {b:.3f}" for axis, a, b in zip("xyz", low, high, strict=True)) + " m"
-    if (high - low).max() == 0:
-        return Finding("error", "position", f"{text}: it never changes. Check which fields the state is made of")
-    if np.linalg.norm(places, axis=1).max() > _REACH_M:
-        return Finding("warning", "position", f"{text}: farther than most arms reach. Is it metres, from the base?")
-    if (high - low).max() < 0.01:
-        return Finding("warning", "position", f"{text}: all within 1 cm. Is it metres?")
-    return Finding("ok", "position", text)
+    return _first(
+        "position",
+        ", ".join(f"{axis} {a:.3f} to {b:.3f}" for axis, a, b in zip("xyz", low, high, strict=True)) + " m",
+        ((high - low).max() == 0, "error", "it never changes. Check which fields the state is made of"),
+        (
+            np.linalg.norm(places, axis=1).max() > _REACH_M,
+            "warning",
+            "farther than most arms reach. Is it metres, from the base?",
+        ),
+        ((high - low).max() < 0.01, "warning", "all within 1 cm. Is it metres?"),
+    )
 
 
 def _rotations(states: Float[np.ndarray, "rows 7"], actions: Float[np.ndarray, "pairs 7"]) -> Finding:
     turned = np.rad2deg(Rotation.from_euler("xyz", actions[:, POSE.rotation]).magnitude())
     low, high = states[:, POSE.rotation].min(), states[:, POSE.rotation].max()
-    text = f"angles {low:.2f} to {high:.2f} rad; degrees per model step {_percentiles(turned, '.1f')}"
-    if turned.max() == 0:
-        return Finding("warning", "rotation", f"{text}: it never changes. Is it in the state?")
-    if np.percentile(turned, 90) > 90:
-        return Finding("warning", "rotation", f"{text}: wild. Are these extrinsic xyz Euler angles in radians?")
-    return Finding("ok", "rotation", text)
+    return _first(
+        "rotation",
+        f"angles {low:.2f} to {high:.2f} rad; degrees per model step {_percentiles(turned, '.1f')}",
+        (turned.max() == 0, "warning", "it never changes. Is it in the state?"),
+        (np.percentile(turned, 90) > 90, "warning", "wild. Are these extrinsic xyz Euler angles in radians?"),
+    )
 
 
 def _gripper(closedness: Float[np.ndarray, " rows"], clips: int) -> Finding:
     low, high = closedness.min(), closedness.max()
-    text = f"{low:.2f} to {high:.2f} (0 open, 1 closed)"
-    if low == high:
-        return Finding("warning", "gripper", f"{text}: it never moves in {clips} clips. Is it in the state?")
-    if high < _NARROW:
-        return Finding("warning", "gripper", f"{text}: it never closes. Is it a width in metres? 0..1 is needed")
-    return Finding("ok", "gripper", text)
+    return _first(
+        "gripper",
+        f"{low:.2f} to {high:.2f} (0 open, 1 closed)",
+        (low == high, "warning", f"it never moves in {clips} clips. Is it in the state?"),
+        (high < _NARROW, "warning", "it never closes. Is it a width in metres? 0..1 is needed"),
+    )
 
 
 def _motion(actions: Float[np.ndarray, "pairs 7"]) -> Finding:
     moved = POSE.shown_size(actions)
-    text = f"cm per model step {_percentiles(moved, '.2f')}"
-    if not np.any(actions):
-        return Finding("error", "actions", f"{text}: all are zero; there is nothing to learn from")
-    if np.median(moved) < _STILL_CM:
-        return Finding("warning", "actions", f"{text}: nearly still. See data.idle, or a wider data.stride")
-    if np.median(moved) > _FAR_CM:
-        return Finding("warning", "actions", f"{text}: very far. Is it metres? Is data.stride too wide?")
-    return Finding("ok", "actions", text)
+    return _first(
+        "actions",
+        f"cm per model step {_percentiles(moved, '.2f')}",
+        (not np.any(actions), "error", "all are zero; there is nothing to learn from"),
+        (np.median(moved) < _STILL_CM, "warning", "nearly still. See data.idle, or a wider data.stride"),
+        (np.median(moved) > _FAR_CM, "warning", "very far. Is it metres? Is data.stride too wide?"),
+    )
 
 
 def _percentiles(values: Float[np.ndarray, " pairs"], form: str) -> str:

@@ -22,11 +22,15 @@ from vjepa2_ac.inspection.statistics import (
     Inspection,
     idle_runs,
     largest_change,
-    shown_hours,
 )
 from vjepa2_ac.reports.figures.contact_sheet import ContactSheet, Strip, pictures_per_row, plot_contact_sheet
 
 _PLACES = 6000  # points of the map, at most
+_FACTS = (
+    ("episodes", "steps", "length", "success", "standing still"),
+    ("cameras", "gripper", "states", "splits"),
+    ("left out", "sample"),
+)  # of the summary, line by line
 
 
 def plot_dataset(inspection: Inspection, path: Path, *, rows: int = 8, progress: Progress = no_progress) -> Path:
@@ -52,10 +56,11 @@ def plot_dataset(inspection: Inspection, path: Path, *, rows: int = 8, progress:
 def sheet_of(inspection: Inspection, strips: Sequence[Strip]) -> ContactSheet:
     """Return the content of the sheet besides the strips: the title, the facts and the data of the plots."""
     dataset, has_poses, coverage = inspection.dataset, inspection.has_poses, inspection.coverage
+    summary = inspection.summary
     places = np.concatenate([one.states[:, dataset.spaces.state.sized] for one in inspection.sample])
     return ContactSheet(
         title=dataset.config.path,
-        facts=_facts(inspection),
+        facts=tuple("  ·  ".join(f"{name}: {summary[name]}" for name in line if name in summary) for line in _FACTS),
         strips=tuple(strips),
         control_rate_hz=dataset.control_rate_hz,
         lengths_s=inspection.lengths / dataset.control_rate_hz,
@@ -66,35 +71,6 @@ def sheet_of(inspection: Inspection, strips: Sequence[Strip]) -> ContactSheet:
         ranges=None if has_poses else inspection.ranges,
         directions=None if coverage is None else coverage.density,
     )
-
-
-def _facts(inspection: Inspection) -> tuple[str, ...]:
-    dataset, config, success = inspection.dataset, inspection.config, inspection.success_share
-    shortest, _, median, _, longest = inspection.length_percentiles
-    lasting = f"{inspection.lengths.sum():,} steps at {dataset.control_rate_hz:g} per second"
-    first = [
-        f"{len(dataset.table):,} episodes",
-        f"{lasting}: {shown_hours(inspection.hours)}",
-        f"{shortest} to {longest} steps (median {median})",
-        "outcome not known" if success is None else f"{success:.0%} successes",
-    ]
-    about_states = f"states of {dataset.widths.state} numbers, actions of {dataset.widths.action}"
-    if inspection.has_poses:
-        first.append(f"{inspection.still_share:.0%} of the time standing still")
-        about_states = "gripper {:.2f} to {:.2f}".format(*inspection.gripper_range)
-    if dataset.table.problems:
-        first.append(f"{len(dataset.table.problems)} broken")
-    second = [
-        f"camera {', '.join(config.cameras)} of {', '.join(config.offered_cameras)}",
-        f"crop {config.crop}",
-        about_states,
-        f"clips of {config.frames} frames at stride {config.model_stride}: "
-        + ", ".join(f"{count:,} {name}" for name, count in inspection.windows_of.items()),
-    ]
-    sampled = len(inspection.sample)
-    shown = "Motion and gripper" if inspection.has_poses else "Motion"
-    third = f"{shown}: from {'all' if sampled == len(dataset.table) else 'a sample of'} {sampled} episodes."
-    return "  ·  ".join(first), "  ·  ".join(second), third
 
 
 def _shaded_means(config: DataConfig) -> str:

@@ -113,11 +113,6 @@ class Inspection:
         low, high = self.ranges[column].tolist()
         return low, high
 
-    @property
-    def gripper_range(self) -> tuple[float, float]:
-        """The least and the greatest closedness of the sample."""
-        return self.range_of(self.dataset.spaces.state.gripper or 0)
-
     @cached_property
     def coverage(self) -> Coverage | None:
         """The coverage of actions by the sample at the config's stride; None: no step fits."""
@@ -147,6 +142,43 @@ class Inspection:
             sizes = {CHANGED: largest_change(changes, self.ranges)}
         return StepSizes(stride, stride / control_rate_hz, sizes)
 
+    @cached_property
+    def summary(self) -> dict[str, str]:
+        """What there is to say, by what it is about."""
+        config, table, success = self.config, self.dataset.table, self.success_share
+        hours = f"{self.hours:,.1f} hours" if self.hours >= 1 else f"{self.hours * 60:.1f} minutes"
+        lengths = " / ".join(map(str, self.length_percentiles))
+        splits = ", ".join(f"{n} {self.windows_of[n]:,} clips in {self.episodes_of[n]:,} episodes" for n in SPLITS)
+        removed = ", ".join(f"{one.name} {one}" for one in self.dataset.removed if one.episodes or one.steps)
+        known = f"of {(table.success >= 0).sum():,} episodes of which it is known"
+        return {
+            "data set": f"{config.path} ({config.source})",
+            "episodes": f"{len(table):,} ({len(table.problems):,} broken)",
+            "steps": f"{self.lengths.sum():,} at {self.dataset.control_rate_hz:g} per second: {hours}",
+            "length": f"{lengths} steps (least, 10 %, median, 90 %, most)",
+            "cameras": f"{', '.join(config.offered_cameras)}; used: {', '.join(config.cameras)}",
+            "success": "not known" if success is None else f"{success:.1%} {known}",
+            "left out": removed or "nothing",
+            "splits": f"{splits}; clips of {config.frames} frames at stride {config.model_stride}",
+            "duplicates": f"{self.duplicates}{'; inspect.json lists the copies' if self.duplicates.copies else ''}",
+            "sample": f"{len(self.sample):,} episodes, for what follows",
+            **self._summary_of_states(),
+            **({} if self.coverage is None else {**self.coverage.lines, "coverage": self.coverage.verdict}),
+        }
+
+    def _summary_of_states(self) -> dict[str, str]:
+        config, widths = self.config, self.dataset.widths
+        ranges = [f"{low:.2f} to {high:.2f}" for low, high in self.ranges]
+        if not self.has_poses:
+            how = f", joined by {config.join_actions}" if config.join_actions else ""
+            actions = f"{widths.action} numbers, {config.actions}{how}"
+            return {"states": f"{widths.state} numbers: {', '.join(ranges)}", "actions": actions}
+        return {
+            "standing still": f"{self.still_share:.1%} of the steps, by the measured motion",
+            "position": f"{', '.join(f'{axis} {one}' for axis, one in zip('xyz', ranges, strict=False))} m",
+            "gripper": f"{ranges[-1]} (0 open, 1 closed)",
+        }
+
     def as_dict(self) -> dict[str, Any]:
         """Return all statistics as plain values, for `inspect.json`."""
         config, table, widths = self.config, self.dataset.table, self.dataset.widths
@@ -155,7 +187,7 @@ class Inspection:
             about_states = {
                 "still_share": self.still_share,
                 "xyz_m": [self.range_of(column) for column in range(3)],
-                "gripper": self.gripper_range,
+                "gripper": self.ranges[-1].tolist(),
                 "released_weights": RELEASED,
             }
         return {
@@ -216,8 +248,3 @@ def at_some_stride(dataset: Dataset) -> Dataset:
     if dataset.config.stride != "auto":
         return dataset
     return dataset.with_stride(min(dataset.config.strides_to_try(dataset.control_rate_hz)))
-
-
-def shown_hours(hours: float) -> str:
-    """Return a duration for people."""
-    return f"{hours:,.1f} hours" if hours >= 1 else f"{hours * 60:.1f} minutes"
