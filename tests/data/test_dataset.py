@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from memory_source import MemorySource
-from synthetic import write_synthetic_droid
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data import dataset as opening
 from vjepa2_ac.data.dataset import Dataset, open_dataset
@@ -103,15 +102,6 @@ def test_broken_episodes_that_are_excluded_are_nobodys_concern(open_with: Open) 
     assert len(open_with(MemorySource([10], problems=problems(12)), exclude=names).broken) == 0
 
 
-def test_broken_episodes_met_later_count_once_each() -> None:
-    ledger = BrokenEpisodes(DataConfig(path="the set", broken_episodes="skip"), 300)
-    for name in ("a", "b", "a", "c", "b"):
-        ledger.met(name, f"{name} is damaged")
-    assert list(ledger.reasons) == ["a", "b", "c"]
-    with pytest.raises(InputError, match=r"4 of 300 episodes are broken: a, b, c, d\. The first, a: a is damaged\."):
-        ledger.met("d", "d is damaged")
-
-
 def test_what_a_run_met_before_it_was_resumed_counts_unless_it_is_excluded() -> None:
     def resumed(**knobs: Any) -> BrokenEpisodes:
         ledger = BrokenEpisodes(DataConfig(path="the set", broken_episodes="skip", **knobs), 300)
@@ -122,6 +112,20 @@ def test_what_a_run_met_before_it_was_resumed_counts_unless_it_is_excluded() -> 
     with pytest.raises(InputError, match=r"4 of 300 episodes are broken: a, b, c, d\. The first, a: a is damaged\."):
         resumed().met("d", "d is damaged")
     resumed(exclude=("b",)).met("d", "d is damaged")
+
+
+def test_the_broken_episodes_of_all_processes_count_together() -> None:
+    """One in a hundred of the whole, and not in each process."""
+    ledgers = [BrokenEpisodes(DataConfig(path="the set", broken_episodes="skip"), 300) for _ in range(2)]
+    for ledger, names in zip(ledgers, ("ab", "bc"), strict=True):
+        for name in names:
+            ledger.met(name, "damaged")
+    everyone = ledgers[0].reasons | ledgers[1].reasons
+    for ledger in ledgers:
+        ledger.recall(everyone)
+        assert set(ledger.reasons) == set("abc")
+        with pytest.raises(InputError, match="4 of 300 episodes are broken"):
+            ledger.recall(everyone | {"d": "damaged"})
 
 
 def test_excluding_what_there_is_not_is_refused(open_with: Open) -> None:
@@ -139,27 +143,11 @@ def test_two_episodes_of_one_identity_are_refused(open_with: Open) -> None:
     assert open_with(source, exclude=("same",)).windows("train").episodes.tolist() == [1]
 
 
-def test_the_control_rate_is_the_sources(open_with: Open) -> None:
-    source = MemorySource([10])
-    assert open_with(source).control_rate_hz == 15.0
-    assert len(source.reads) == 1
-
-
 def test_nothing_is_read_to_open_a_set(open_with: Open) -> None:
     source = MemorySource([10, 20])
     dataset = open_with(source)
     _ = dataset.removed, dataset.windows("train")
     assert source.reads == []
-
-
-def test_shards_and_order_of_the_records_change_nothing(tmp_path: Path) -> None:
-    found = []
-    for shards in (1, 4):
-        folder = write_synthetic_droid(tmp_path / str(shards), steps=range(12, 18), size=(16, 16), shards=shards)
-        windows = open_dataset(DataConfig(path=str(folder), frames=3, stride=2)).windows("train")
-        dataset = open_dataset(DataConfig(path=str(folder), frames=3, stride=2))
-        found.append([(dataset.table.identity(e), s) for e, s in map(windows.__getitem__, range(len(windows)))])
-    assert found[0] == found[1]
 
 
 def droid_sized() -> EpisodeTable:

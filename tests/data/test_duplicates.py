@@ -8,7 +8,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from copied_sets import STEPS, WRITERS, write_lerobot, write_npz, write_rlds
+from copied_sets import STEPS, WRITERS, write_lerobot, write_npz
 from gcs import Gcs
 from latent_sets import write_cache
 from memory_source import MemorySource
@@ -16,13 +16,10 @@ from synthetic import synthetic_states
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.duplicates import Duplicates, find_duplicates
-from vjepa2_ac.data.index.episode_table import FORMAT, EpisodeTable
-from vjepa2_ac.data.index.index_cache import IndexKeys, get_or_build
+from vjepa2_ac.data.index.episode_table import EpisodeTable
 from vjepa2_ac.data.index.state_hash import UNKNOWN, hash_of_states
 from vjepa2_ac.data.selection import BrokenEpisodes, StepSelection
 from vjepa2_ac.data.sources.latents.manifest import EPISODES
-from vjepa2_ac.data.sources.rlds import lookalikes
-from vjepa2_ac.episode import EpisodeInfo
 from vjepa2_ac.inspection.check import check_data
 from vjepa2_ac.inspection.statistics import inspect_dataset
 
@@ -95,17 +92,6 @@ def with_statistics(folder: Path) -> None:
     pq.write_table(table, path)
 
 
-def test_of_records_far_away_only_states_of_those_as_long_but_for_their_names_are_read(
-    gcs: Gcs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    gcs.upload(write_rlds(tmp_path / "set", RECORDINGS), "bucket/set/1.0.0")
-    read: list[int] = []
-    states_of = lookalikes.states_of
-    monkeypatch.setattr(lookalikes, "states_of", lambda *given: read.append(1) or states_of(*given))
-    assert find_duplicates(open_dataset(config_of("rlds", "gs://bucket/set/1.0.0", tmp_path))).episodes == 5
-    assert len(read) == 5
-
-
 def test_a_far_set_of_which_nothing_tells_the_states_is_said_to_be_not_known(gcs: Gcs, tmp_path: Path) -> None:
     gcs.upload(write_lerobot(tmp_path / "set", RECORDINGS), "bucket/set")
     found = find_duplicates(open_dataset(config_of("lerobot", "gs://bucket/set", tmp_path)))
@@ -164,16 +150,3 @@ def test_check_and_inspect_warn_of_copies_and_are_calm_without(tmp_path: Path) -
     single = config_of("npz", write_npz(tmp_path / "single", range(10)), tmp_path)
     finding = next(one for one in check_data(single, clips=2) if one.about == "duplicates")
     assert (finding.level, finding.text) == ("ok", "no two episodes have the same states")
-
-
-def test_an_index_of_another_form_is_built_again_and_the_key_of_the_data_stays(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config = config_of("npz", tmp_path, tmp_path).disk_cache
-    table = EpisodeTable.of([EpisodeInfo("one", 3)])
-    built: list[int] = []
-    keys = set()
-    for form in (FORMAT, FORMAT, FORMAT + 1):
-        monkeypatch.setattr("vjepa2_ac.data.index.index_cache.FORMAT", form)
-        keys.add(get_or_build(config, IndexKeys("a", "a"), "", lambda: built.append(1) or table).texts["index"])
-    assert (len(built), keys) == (2, {"a"})

@@ -73,11 +73,6 @@ def test_episodes_of_a_group_share_the_split_of_its_name(monkeypatch: pytest.Mon
     assert sum(len(dataset.windows(split)) for split in ("train", "validation", "test")) == 60 * (20 - 4)
 
 
-def test_the_laboratory_is_in_the_identities_of_droid(monkeypatch: pytest.MonkeyPatch) -> None:
-    dataset = opened(monkeypatch, split_by="lab", validation_share=0.49, test_share=0.0)
-    assert count_of_groups(dataset) == 3
-
-
 def count_of_groups(dataset: Dataset) -> int:
     return len(np.unique(dataset.split_hash))
 
@@ -159,13 +154,6 @@ def test_check_says_how_many_groups_there_are_and_inspect_counts_the_splits_of_t
     counts = {split: len(dataset.windows(split).episodes) for split in ("train", "validation")}
     found = inspect_dataset(dataset).episodes_of
     assert {split: found[split] for split in counts} == counts
-
-
-def test_a_damaged_label_is_no_table() -> None:
-    from vjepa2_ac.data.index.labels import Labels
-
-    with pytest.raises(ValueError, match="numbers up to 3"):
-        Labels(("a",), np.array([0, 3], np.int32))
 
 
 def test_labels_come_back_from_a_file() -> None:

@@ -3,7 +3,6 @@
 import itertools
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -22,7 +21,6 @@ from clips import clip_at
 from memory_source import MemorySource
 from recording_cuda import Pinning, RecordingCuda, recorded_copies
 from synthetic import write_synthetic_droid
-from tfrecords import index_records
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data import dataset as opening
 from vjepa2_ac.data import loader
@@ -31,7 +29,7 @@ from vjepa2_ac.data.loader import ProcessShare, collate, training_loader, valida
 from vjepa2_ac.data.streams import NO_COPIES, copies_for
 from vjepa2_ac.episode import Batch, Episode
 from vjepa2_ac.errors import InputError, UnreachableError
-from vjepa2_ac.geometry import actions_from_states, apply_action, matrices_from_euler, states_in_camera_frame
+from vjepa2_ac.geometry import actions_from_states, states_in_camera_frame
 
 Names = list[tuple[str, int]]
 
@@ -68,28 +66,11 @@ def test_a_clip_holds_the_strided_steps_of_its_episode(droid: Path) -> None:
     assert np.array_equal(clip.frames, episode.read_frames([4, 7, 10, 13])[:, :, 15:80])
 
 
-def test_the_actions_of_a_clip_lead_from_each_state_to_the_next(droid: Path) -> None:
-    config = config_of(droid)
-    clip = clip_at(open_dataset(config), 0, 1)
-    reached = apply_action(clip.states[:-1].astype(np.float64), clip.actions.astype(np.float64))
-    np.testing.assert_allclose(reached[:, [0, 1, 2, 6]], clip.states[1:][:, [0, 1, 2, 6]], atol=1e-6)
-    np.testing.assert_allclose(
-        matrices_from_euler(reached[:, 3:6]), matrices_from_euler(clip.states[1:, 3:6].astype(np.float64)), atol=1e-5
-    )
-
-
 def test_resumed_run_sees_the_clips_the_uninterrupted_run_would_have(droid: Path) -> None:
     config = config_of(droid)
     uninterrupted = take(40, config)  # more than an epoch
     for done in (1, 17, 33):
         assert_same(take(5, config, start_position=done * 2), uninterrupted[done : done + 5])
-
-
-def test_ranks_share_one_order_between_them(droid: Path) -> None:
-    config = config_of(droid)
-    alone = take(12, config)
-    ranks = [take(4, config, share=ProcessShare(rank, 3)) for rank in range(3)]
-    assert_same([ranks[rank][step] for step in range(4) for rank in range(3)], alone)
 
 
 def test_another_layout_goes_on_where_the_run_stopped(droid: Path) -> None:
@@ -143,12 +124,6 @@ def test_validation_clips_are_few_distinct_and_from_all_held_out_episodes(droid:
     assert {name for name, _ in names(batches)} == everyone
 
 
-def test_validation_without_held_out_episodes_says_so_at_once(droid: Path) -> None:
-    config = config_of(droid, validation_share=0.0)
-    with pytest.raises(InputError, match=r"no validation episodes among 6 .*Raise data\.validation_share"):
-        validation_batches(open_dataset(config), "validation", clips=1, batch_size=1)
-
-
 @pytest.mark.parametrize("workers", [0, 1])
 @pytest.mark.parametrize("pinned", [False, True])
 def test_an_error_in_a_worker_is_the_error_the_user_reads(
@@ -169,18 +144,6 @@ def test_an_error_in_a_worker_is_the_error_the_user_reads(
     exclude = tuple(json.loads(caught.value.fix.split("data.exclude: ")[1]))
     assert len(exclude) == 1
     assert exclude[0] not in {name for name, _ in names(take(60, config.model_copy(update={"exclude": exclude})))}
-
-
-def test_a_clip_of_a_damaged_record_says_how_to_leave_it_out(droid: Path, tmp_path: Path) -> None:
-    folder = shutil.copytree(droid, tmp_path / "set")
-    shard = sorted(folder.glob("*.tfrecord-*"))[0]
-    config = config_of(folder)
-    whole = bytearray(shard.read_bytes())
-    whole[index_records(shard)[0].end - 10] ^= 1
-    shard.write_bytes(whole)
-    dataset = open_dataset(config)
-    with pytest.raises(InputError, match=r"CRC of the data.*add to data\.exclude: .*episode_0000"):
-        next(loader.batches_of(dataset, [(0, 0)], batch_size=1))
 
 
 RUN_THAT_DIES = """
@@ -281,8 +244,8 @@ def first(dataset: Dataset, count: int, **knobs: Any) -> list[Batch]:
     return list(itertools.islice(training_loader(dataset, **chosen), count))
 
 
-@pytest.mark.parametrize("world_size", [1, 2, 3, 4])
-@pytest.mark.parametrize("batch_size", [1, 3, 4])
+@pytest.mark.parametrize("world_size", [1, 3])
+@pytest.mark.parametrize("batch_size", [1, 4])
 def test_ranks_lose_no_window_and_see_none_twice_in_an_epoch(
     in_memory: Callable[..., Dataset], world_size: int, batch_size: int
 ) -> None:
@@ -309,15 +272,6 @@ def test_resuming_reads_nothing_that_came_before(in_memory: Callable[..., Datase
     assert len(source.decoded) == 4 * 3
 
 
-def test_a_clip_decodes_its_own_frames_of_its_own_camera(in_memory: Callable[..., Dataset]) -> None:
-    source = MemorySource([30] * 4)
-    dataset = in_memory(source, camera="wrist_left", frames=4, stride=3)
-    clip = clip_at(dataset, 2, 5, camera="wrist_left")
-    assert source.reads == [(2, "wrist_left", None)]
-    assert source.decoded == [(2, 5), (2, 8), (2, 11), (2, 14)]
-    assert clip.frames[:, 0, 0, :2].tolist() == [[2, 5], [2, 8], [2, 11], [2, 14]]
-
-
 CAMERAS = ("exterior_1_left", "exterior_2_left", "wrist_left")
 
 
@@ -331,12 +285,6 @@ def test_the_camera_is_drawn_per_clip_by_the_position_alone(in_memory: Callable[
     assert cameras(150, 50) == drawn[150:]
     assert set(drawn) == set(CAMERAS[:2])
     assert 70 < drawn.count(CAMERAS[0]) < 130
-
-
-def test_a_window_meets_other_cameras_in_other_epochs(in_memory: Callable[..., Dataset]) -> None:
-    source = MemorySource([5])  # one window
-    first(in_memory(source, camera=CAMERAS), 40, batch_size=1)
-    assert {camera for _, camera, _ in source.reads} == set(CAMERAS)
 
 
 def test_the_camera_of_a_validation_clip_stays(in_memory: Callable[..., Dataset]) -> None:
@@ -436,11 +384,6 @@ def test_a_batch_may_lose_all_its_clips(in_memory: Callable[..., Dataset]) -> No
 def test_the_default_is_to_stop_at_a_clip_that_cannot_be_read(in_memory: Callable[..., Dataset]) -> None:
     with pytest.raises(InputError, match=r"pictures of episode \d+: damaged\..*broken_episodes: skip, or add to"):
         first(broken_set(in_memory, set(range(300)), broken_episodes="error"), 1)
-
-
-def test_too_many_episodes_that_cannot_be_read_stop_the_run(in_memory: Callable[..., Dataset]) -> None:
-    with pytest.raises(InputError, match="4 of 300 episodes are broken: episode "):
-        first(broken_set(in_memory, set(range(20))), 10_000)
 
 
 def test_a_network_that_is_away_is_no_broken_episode(in_memory: Callable[..., Dataset]) -> None:

@@ -16,12 +16,10 @@ from memory_source import MemorySource
 from vector_sets import vectors, write_vectors
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.loading import parse_config
-from vjepa2_ac.data.clips import actions_of, joined
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.sources.registry import open_source
 from vjepa2_ac.episode import Batch, Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.geometry import actions_from_states
 from vjepa2_ac.inspection.check import check_data, findings_in
 from vjepa2_ac.inspection.sheet import plot_dataset
 from vjepa2_ac.inspection.statistics import CHANGED, inspect_dataset
@@ -70,18 +68,6 @@ def test_at_stride_one_there_is_nothing_to_join(tmp_path: Path) -> None:
     np.testing.assert_array_equal(clip.actions, vectors(24, 8, seed=1000)[:2].astype(np.float32))
 
 
-def test_summed_deltas_of_absolute_commands_equal_the_difference_of_the_commands() -> None:
-    targets = vectors(13, 6, seed=0)
-    deltas = np.diff(targets, axis=0)
-    np.testing.assert_allclose(joined(deltas, 4, "sum"), np.diff(targets[::4], axis=0), atol=1e-12)
-
-
-def test_poses_keep_their_own_actions() -> None:
-    states = vectors(4, 7, seed=1)
-    pose = DataConfig(path="nowhere", source="npz")
-    np.testing.assert_array_equal(actions_of(states, None, range(4), pose), actions_from_states(states))
-
-
 def test_a_pose_that_is_read_as_a_vector_is_not_turned_into_rotations(droid: Path) -> None:
     states = ["steps/observation/cartesian_position", "steps/observation/gripper_position"]
     plain = open_dataset(knobs(droid, source="rlds", states="pose"))
@@ -126,14 +112,6 @@ def test_rlds_without_a_flag_for_each_step_cannot_say_how_wide_a_vector_is(
     folder = spoiled(lambda features: features.pop("steps/is_first"))
     with pytest.raises(InputError, match="steps/is_first"):
         open_dataset(knobs(folder, source="rlds", fields={"state": JOINTS}))
-
-
-def test_a_number_that_is_not_finite_is_named(spoiled: Callable[[Callable[[Any], None]], Path]) -> None:
-    def spoil(features: Any) -> None:
-        features[JOINTS[0]][1][9] = float("nan")
-
-    with pytest.raises(InputError, match=r"step 1.*finite numbers"):
-        open_dataset(knobs(spoiled(spoil), source="rlds", fields={"state": JOINTS}))
 
 
 def bimanual(number: int, steps: int) -> Recorded:
@@ -258,13 +236,6 @@ def test_the_check_tells_numbers_that_teach_nothing(states: np.ndarray, about: s
     found = {one.about: one for one in findings_in([batch(states)], FIVE)}
     assert found[about].level == level
     assert words in found[about].text
-
-
-def test_frames_that_never_change_while_a_number_does_are_an_error() -> None:
-    moving = batch(vectors(9, 5, seed=0))
-    stuck = Batch(torch.zeros_like(moving.frames), moving.states, moving.actions, None, ("e",), (0,))
-    found = {one.about: one for one in findings_in([stuck], FIVE)}
-    assert found["pictures"].level == "error"
 
 
 def test_inspection_and_frame_of_vectors(tmp_path: Path) -> None:

@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from synthetic import write_synthetic_droid
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.episode import Batch
@@ -97,21 +96,6 @@ def test_an_empty_test_split_is_an_error_line_where_one_is_asked_for_as_training
     for share, level in ((0.001, "error"), (0.0, "ok")):
         findings = check_data(knobs(droid, test_share=share, validation_share=0.0, **in_one_group), clips=2)
         assert {finding.about: finding.level for finding in findings}["test"] == level
-
-
-def test_a_reason_that_names_many_episodes_is_cut_between_words_and_says_so(tmp_path: Path) -> None:
-    def write(name: str, lengths: list[int]) -> DataConfig:
-        folder = write_synthetic_droid(tmp_path / name, episodes=16, steps=lengths, size=(36, 64))
-        return knobs(folder, validation_share=0.4, short_episodes="error")
-
-    dataset = open_dataset(write("long", [30] * 16))
-    held_out = {dataset.table.identity(int(number)) for number in dataset.windows("validation").episodes}
-    short = [3 if any(f"episode_{n:04d}" in name for name in held_out) else 30 for n in range(16)]
-    findings = {finding.about: finding for finding in check_data(write("short", short), clips=2)}
-    text = findings["validation"].text
-    assert "Too short:" in text
-    assert " …. Lower data.frames" in text
-    assert len(text) < 450
 
 
 def test_an_auto_stride_is_looked_at_at_the_smallest_candidate(droid: Path) -> None:

@@ -77,7 +77,7 @@ def alarms_in(pairs: list[Pair], **about: object) -> list[Finding]:
     return [finding for finding in found_in(pairs, **about) if finding.level != "ok"]  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("space", [POSE, vector_states(7)], ids=["poses", "vectors"])
 def test_what_belongs_together_gives_no_alarm(seed: int, space: StateSpace) -> None:
     findings = found_in(recorded(seed), space=space)
@@ -114,16 +114,6 @@ def test_a_camera_that_is_one_step_behind_is_none_but_at_stride_1_it_is_a_whole_
     assert found_in(SPOILS["a step late"](recorded()))[-1].text.endswith("best where frames are 1 step late")
     (alarm,) = alarms_in(SPOILS["a step late"](recorded()), stride=1)
     assert (alarm.level, "are 1 step late (0.07 s)" in alarm.text) == ("error", True)
-
-
-def test_a_shift_as_far_as_was_looked_is_said_to_be_at_least_so_far() -> None:
-    (alarm,) = alarms_in([(states[9:], frames[:-9]) for states, frames in recorded()])
-    assert "at least 9 steps" in alarm.text
-
-
-def test_shifts_below_a_model_step_are_worth_a_warning_and_others_an_error() -> None:
-    levels = [alarms_in(SPOILS["late"](recorded()), stride=stride)[0].level for stride in (8, 9)]
-    assert levels == ["error", "warning"]
 
 
 @pytest.mark.parametrize("how", ["as it is", "foreign", "reversed"])
