@@ -179,7 +179,7 @@ def test_data_check_and_inspect_say_whether_data_are_fit_to_plan_with(tmp_path: 
     found = {one.about: one for one in check_data(config, clips=4)}
     assert found["coverage"].level == ("warning" if one_way else "ok")
     assert ("nearly all go one way, (x +1.0, y +0.0, z +0.0)" in found["coverage"].text) == one_way
-    written_down = inspect_dataset(open_dataset(config)).as_dict()["coverage"]
+    written_down = inspect_dataset(open_dataset(config)).values["coverage"]
     assert written_down["narrow"].startswith("steps go to 7%" if one_way else "")
     assert bool(written_down["narrow"]) == one_way
     assert coverage_in(open_dataset(config)).metrics == written_down, "of the same episodes"
@@ -188,4 +188,4 @@ def test_data_check_and_inspect_say_whether_data_are_fit_to_plan_with(tmp_path: 
 def test_a_stride_that_fits_nowhere_has_no_coverage(tmp_path: Path) -> None:
     dataset = open_dataset(written(tmp_path, one_way=False)).with_stride(50)
     assert coverage_in(dataset) is None
-    assert inspect_dataset(dataset).as_dict()["coverage"] is None
+    assert inspect_dataset(dataset).values["coverage"] is None

@@ -146,7 +146,7 @@ def test_check_and_inspect_warn_of_copies_and_are_calm_without(tmp_path: Path) -
     assert (finding.level, "5 episodes have the states" in finding.text) == ("warning", True)
     inspection = inspect_dataset(open_dataset(copied))
     assert "inspect.json" in inspection.summary["duplicates"]
-    assert sorted(inspection.as_dict()["duplicates"]["copies"]) == ["004", "007", "009"]
+    assert sorted(inspection.values["duplicates"]["copies"]) == ["004", "007", "009"]
     single = config_of("npz", write_npz(tmp_path / "single", range(10)), tmp_path)
     finding = next(one for one in check_data(single, clips=2) if one.about == "duplicates")
     assert (finding.level, finding.text) == ("ok", "no two episodes have the same states")

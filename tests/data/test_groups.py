@@ -151,9 +151,9 @@ def test_check_says_how_many_groups_there_are_and_inspect_counts_the_splits_of_t
     findings = {one.about: one for one in check_data(config, clips=2)}
     assert findings["groups"].text == "4 by scene, each in one split"
     dataset = open_dataset(config)
-    counts = {split: len(dataset.windows(split).episodes) for split in ("train", "validation")}
-    found = inspect_dataset(dataset).episodes_of
-    assert {split: found[split] for split in counts} == counts
+    found = inspect_dataset(dataset).values["splits"]
+    for split in ("train", "validation"):
+        assert found[split]["episodes"] == len(dataset.windows(split).episodes)
 
 
 def test_labels_come_back_from_a_file() -> None:

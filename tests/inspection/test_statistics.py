@@ -61,15 +61,19 @@ def test_standing_still_counts_from_a_run_that_is_long_enough() -> None:
 def test_figures_of_a_whole_set(droid: Path) -> None:
     dataset = open_dataset(knobs(droid))
     found = inspect_dataset(dataset)
-    assert found.length_percentiles == [12, 12, 14, 16, 17]
-    assert found.hours == pytest.approx(87 / 15 / 3600)
-    assert found.success_share == pytest.approx(4 / 6)
+    values = found.values
+    assert values["length_percentiles_0_10_50_90_100"] == [12, 12, 14, 16, 17]
+    assert values["hours"] == pytest.approx(87 / 15 / 3600)
+    assert values["success_share"] == pytest.approx(4 / 6)
     assert len(found.sample) == 6
     assert [one.stride for one in found.steps] == [4, 8, 15]
     splits = [split_of(info.id, dataset.config) for info in dataset.table]
-    assert found.episodes_of == {name: splits.count(name) for name in ("train", "validation", "test")}
-    assert found.windows_of["train"] + found.windows_of["validation"] == 87 - 6 * 4
-    assert found.windows_of["test"] == 0
+    assert {name: one["episodes"] for name, one in values["splits"].items()} == {
+        name: splits.count(name) for name in ("train", "validation", "test")
+    }
+    assert [values["splits"][name]["windows"] for name in ("train", "validation", "test")] == [
+        *(len(dataset.windows(split)) for split in ("train", "validation")), 0,
+    ]  # fmt: skip
     by_hand = np.concatenate([dataset.source.read(index).states for index in range(6)])
     assert found.range_of(6) == (pytest.approx(by_hand[:, 6].min()), pytest.approx(by_hand[:, 6].max()))
 
@@ -110,7 +114,7 @@ def test_a_broken_frame_is_left_out_of_the_contact_sheet(monkeypatch: pytest.Mon
 
 def test_the_figures_are_plain_values_and_stand_beside_what_is_known_of_the_released_weights(droid: Path) -> None:
     found = inspect_dataset(open_dataset(knobs(droid)))
-    read = json.loads(json.dumps(found.as_dict()))
+    read = json.loads(json.dumps(found.values))
     assert read["episodes"] == 6
     assert [row["stride"] for row in read["per_model_step"]] == [4, 8, 15]
     assert "unsettled" in read["released_weights"]

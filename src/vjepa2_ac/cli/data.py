@@ -179,7 +179,7 @@ def _inspect(options: argparse.Namespace) -> None:
     console.print(motion_table(inspection.steps))
     if inspection.has_poses:
         console.print(f"For comparison: {RELEASED}.")
-    write_atomically(options.out / "inspect.json", json.dumps(inspection.as_dict(), indent=1).encode())
+    write_atomically(options.out / "inspect.json", json.dumps(inspection.values, indent=1).encode())
     path = options.out / "contact_sheet.png"
     with ConsoleReporter() as reporter:
         image = plot_dataset(inspection, path, rows=options.rows, progress=reporter.task("reading frames"))

@@ -116,9 +116,10 @@ def _computed(source: EpisodeSource, table: EpisodeTable, config: DataConfig, pr
     for one in in_order(look, range(len(table)), config):
         found.append(one)
         progress(len(found), len(table))
-        problems = [problem for problem in found if isinstance(problem, EpisodeProblem)]
-        if problems and len(problems) == len(found) == min(_ALL_BROKEN, len(table)):
-            raise as_error(problems[0])
+        if len(found) == min(_ALL_BROKEN, len(table)):
+            problems = [problem for problem in found if isinstance(problem, EpisodeProblem)]
+            if len(problems) == len(found):
+                raise as_error(problems[0])
     return FoundRanges.of(found)
 
 

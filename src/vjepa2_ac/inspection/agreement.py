@@ -117,14 +117,11 @@ def _profiles(
     for lag in lags:
         one = moved[:, max(-lag, 0) : length - max(lag, 0)]
         other = seen[:, max(lag, 0) : length - max(-lag, 0)]
-        both = ~np.isnan(one + other)
-        count = np.maximum(both.sum(axis=1, keepdims=True), 1)
-        first, second = (np.where(both, values, 0) for values in (one, other))
-        first, second = (
-            np.where(both, values - values.sum(axis=1, keepdims=True) / count, 0) for values in (first, second)
-        )
-        size = np.sqrt((first**2).sum(axis=1) * (second**2).sum(axis=1))
-        columns.append((first * second).sum(axis=1) / np.where(size > 0, size, np.inf))
+        ends = np.isnan(one + other)
+        first, second = (np.where(ends, np.nan, values) for values in (one, other))
+        first, second = (values - np.nanmean(values, axis=1, keepdims=True) for values in (first, second))
+        size = np.sqrt(np.nansum(first**2, axis=1) * np.nansum(second**2, axis=1))
+        columns.append(np.nansum(first * second, axis=1) / np.where(size > 0, size, np.inf))
     return np.stack(columns, axis=1)
 
 

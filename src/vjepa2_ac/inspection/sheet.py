@@ -63,7 +63,7 @@ def sheet_of(inspection: Inspection, strips: Sequence[Strip]) -> ContactSheet:
         facts=tuple("  ·  ".join(f"{name}: {summary[name]}" for name in line if name in summary) for line in _FACTS),
         strips=tuple(strips),
         control_rate_hz=dataset.control_rate_hz,
-        lengths_s=inspection.lengths / dataset.control_rate_hz,
+        lengths_s=dataset.table.num_steps / dataset.control_rate_hz,
         moved={one.stride: one.sizes[MOVED if has_poses else CHANGED] for one in inspection.steps},
         reference=RELEASED_STEP_CM if has_poses else None,
         places_m=places[:: -(-len(places) // _PLACES)] if has_poses else None,

@@ -56,48 +56,6 @@ class Inspection:
     sample: tuple[ReadEpisode, ...]
 
     @property
-    def config(self) -> DataConfig:
-        """The data."""
-        return self.dataset.config
-
-    @property
-    def lengths(self) -> np.ndarray:
-        """Control steps of every readable episode."""
-        return self.dataset.table.num_steps
-
-    @property
-    def hours(self) -> float:
-        """The total duration of all readable episodes."""
-        return float(self.lengths.sum() / self.dataset.control_rate_hz / 3600)
-
-    @property
-    def success_share(self) -> float | None:
-        """The share of successes among the episodes with known outcome; None: there are none."""
-        known = self.dataset.table.success >= 0
-        return float(self.dataset.table.success[known].mean()) if known.any() else None
-
-    @property
-    def length_percentiles(self) -> list[int]:
-        """The shortest, the percentiles 10, 50 and 90, and the longest length in control steps."""
-        return [int(value) for value in np.percentile(self.lengths, [0, 10, 50, 90, 100])]
-
-    @cached_property
-    def episodes_of(self) -> dict[Split, int]:
-        """The number of episodes of each split."""
-        return {split: int(self.dataset.members(split).sum()) for split in SPLITS}
-
-    @cached_property
-    def windows_of(self) -> dict[Split, int]:
-        """The number of clips of each split."""
-        return {split: self._windows(split) for split in SPLITS}
-
-    def _windows(self, split: Split) -> int:
-        try:
-            return len(self.dataset.windows(split))
-        except InputError:  # an empty split is a statistic here, not an error
-            return 0
-
-    @property
     def has_poses(self) -> bool:
         """Whether there is a position, of which motion is measured."""
         return self.dataset.spaces.state.position is not None
@@ -116,20 +74,13 @@ class Inspection:
     @cached_property
     def coverage(self) -> Coverage | None:
         """The coverage of actions by the sample at the config's stride; None: no step fits."""
-        return coverage_by(self.sample, self.dataset.spaces.state, self.config.model_stride)
-
-    @cached_property
-    def still_share(self) -> float | None:
-        """The share of the sample's steps in a run of idle ones, by the measured motion; None: no poses."""
-        if not self.has_poses:
-            return None
-        return float(np.concatenate([idle_runs(one.states, self.config) for one in self.sample]).mean())
+        return coverage_by(self.sample, self.dataset.spaces.state, self.dataset.config.model_stride)
 
     @cached_property
     def steps(self) -> tuple[StepSizes, ...]:
         """The motion per model step at each candidate stride."""
         rate = self.dataset.control_rate_hz
-        return tuple(self._at_stride(stride, rate) for stride in self.config.strides_to_try(rate))
+        return tuple(self._at_stride(stride, rate) for stride in self.dataset.config.strides_to_try(rate))
 
     def _at_stride(self, stride: int, control_rate_hz: float) -> StepSizes:
         space = self.dataset.spaces.state
@@ -143,50 +94,15 @@ class Inspection:
         return StepSizes(stride, stride / control_rate_hz, sizes)
 
     @cached_property
-    def summary(self) -> dict[str, str]:
-        """What there is to say, by what it is about."""
-        config, table, success = self.config, self.dataset.table, self.success_share
-        hours = f"{self.hours:,.1f} hours" if self.hours >= 1 else f"{self.hours * 60:.1f} minutes"
-        lengths = " / ".join(map(str, self.length_percentiles))
-        splits = ", ".join(f"{n} {self.windows_of[n]:,} clips in {self.episodes_of[n]:,} episodes" for n in SPLITS)
-        removed = ", ".join(f"{one.name} {one}" for one in self.dataset.removed if one.episodes or one.steps)
-        known = f"of {(table.success >= 0).sum():,} episodes of which it is known"
-        return {
-            "data set": f"{config.path} ({config.source})",
-            "episodes": f"{len(table):,} ({len(table.problems):,} broken)",
-            "steps": f"{self.lengths.sum():,} at {self.dataset.control_rate_hz:g} per second: {hours}",
-            "length": f"{lengths} steps (least, 10 %, median, 90 %, most)",
-            "cameras": f"{', '.join(config.offered_cameras)}; used: {', '.join(config.cameras)}",
-            "success": "not known" if success is None else f"{success:.1%} {known}",
-            "left out": removed or "nothing",
-            "splits": f"{splits}; clips of {config.frames} frames at stride {config.model_stride}",
-            "duplicates": f"{self.duplicates}{'; inspect.json lists the copies' if self.duplicates.copies else ''}",
-            "sample": f"{len(self.sample):,} episodes, for what follows",
-            **self._summary_of_states(),
-            **({} if self.coverage is None else {**self.coverage.lines, "coverage": self.coverage.verdict}),
-        }
-
-    def _summary_of_states(self) -> dict[str, str]:
-        config, widths = self.config, self.dataset.widths
-        ranges = [f"{low:.2f} to {high:.2f}" for low, high in self.ranges]
-        if not self.has_poses:
-            how = f", joined by {config.join_actions}" if config.join_actions else ""
-            actions = f"{widths.action} numbers, {config.actions}{how}"
-            return {"states": f"{widths.state} numbers: {', '.join(ranges)}", "actions": actions}
-        return {
-            "standing still": f"{self.still_share:.1%} of the steps, by the measured motion",
-            "position": f"{', '.join(f'{axis} {one}' for axis, one in zip('xyz', ranges, strict=False))} m",
-            "gripper": f"{ranges[-1]} (0 open, 1 closed)",
-        }
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return all statistics as plain values, for `inspect.json`."""
-        config, table, widths = self.config, self.dataset.table, self.dataset.widths
+    def values(self) -> dict[str, Any]:
+        """All statistics as plain values, as in `inspect.json`."""
+        config, table, rate = self.dataset.config, self.dataset.table, self.dataset.control_rate_hz
+        known = table.success[table.success >= 0]
         about_states = {"ranges": self.ranges.tolist()}
         if self.has_poses:
             about_states = {
-                "still_share": self.still_share,
-                "xyz_m": [self.range_of(column) for column in range(3)],
+                "still_share": self._still_share(),
+                "xyz_m": self.ranges[:3].tolist(),
                 "gripper": self.ranges[-1].tolist(),
                 "released_weights": RELEASED,
             }
@@ -195,24 +111,77 @@ class Inspection:
             "source": config.source,
             "cameras": list(config.offered_cameras),
             "camera": list(config.cameras),
-            "control_rate_hz": self.dataset.control_rate_hz,
+            "control_rate_hz": rate,
             "episodes": len(table),
             "broken_episodes": len(table.problems),
-            "steps": int(self.lengths.sum()),
-            "hours": self.hours,
-            "length_percentiles_0_10_50_90_100": self.length_percentiles,
-            "success_share": self.success_share,
-            "success_known_of": int((table.success >= 0).sum()),
+            "steps": int(table.num_steps.sum()),
+            "hours": float(table.num_steps.sum() / rate / 3600),
+            "length_percentiles_0_10_50_90_100": np.percentile(table.num_steps, [0, 10, 50, 90, 100])
+            .astype(int)
+            .tolist(),
+            "success_share": float(known.mean()) if len(known) else None,
+            "success_known_of": len(known),
             "removed": [vars(one) for one in self.dataset.removed],
-            "splits": {name: {"episodes": self.episodes_of[name], "windows": self.windows_of[name]} for name in SPLITS},
+            "splits": {split: self._size_of(split) for split in SPLITS},
             "duplicates": self.duplicates.as_dict(),
             "sampled_episodes": len(self.sample),
-            "state_dim": widths.state,
-            "action_dim": widths.action,
+            "state_dim": self.dataset.widths.state,
+            "action_dim": self.dataset.widths.action,
             "percentiles": list(PERCENTILES),
             "per_model_step": [{"stride": one.stride, "seconds": one.seconds, **one.percentiles} for one in self.steps],
             "coverage": None if self.coverage is None else dict(self.coverage.metrics),
             **about_states,
+        }
+
+    def _size_of(self, split: Split) -> dict[str, int]:
+        try:
+            windows = len(self.dataset.windows(split))
+        except InputError:  # an empty split is a statistic here, not an error
+            windows = 0
+        return {"episodes": int(self.dataset.members(split).sum()), "windows": windows}
+
+    def _still_share(self) -> float:
+        """Return the share of the sample's steps in a run of idle ones, by the measured motion."""
+        return float(np.concatenate([idle_runs(one.states, self.dataset.config) for one in self.sample]).mean())
+
+    @cached_property
+    def summary(self) -> dict[str, str]:
+        """What there is to say, by what it is about."""
+        config, values = self.dataset.config, self.values
+        hours, success, copies = values["hours"], values["success_share"], self.duplicates.copies
+        lasting = f"{hours:,.1f} hours" if hours >= 1 else f"{hours * 60:.1f} minutes"
+        lengths = " / ".join(map(str, values["length_percentiles_0_10_50_90_100"]))
+        splits = ", ".join(
+            f"{name} {one['windows']:,} clips in {one['episodes']:,} episodes" for name, one in values["splits"].items()
+        )
+        removed = ", ".join(f"{one.name} {one}" for one in self.dataset.removed if one.episodes or one.steps)
+        known = f"of {values['success_known_of']:,} episodes of which it is known"
+        return {
+            "data set": f"{config.path} ({config.source})",
+            "episodes": f"{values['episodes']:,} ({values['broken_episodes']:,} broken)",
+            "steps": f"{values['steps']:,} at {values['control_rate_hz']:g} per second: {lasting}",
+            "length": f"{lengths} steps (least, 10 %, median, 90 %, most)",
+            "cameras": f"{', '.join(values['cameras'])}; used: {', '.join(values['camera'])}",
+            "success": "not known" if success is None else f"{success:.1%} {known}",
+            "left out": removed or "nothing",
+            "splits": f"{splits}; clips of {config.frames} frames at stride {config.model_stride}",
+            "duplicates": f"{self.duplicates}{'; inspect.json lists the copies' if copies else ''}",
+            "sample": f"{len(self.sample):,} episodes, for what follows",
+            **self._summary_of_states(),
+            **({} if self.coverage is None else {**self.coverage.lines, "coverage": self.coverage.verdict}),
+        }
+
+    def _summary_of_states(self) -> dict[str, str]:
+        config, widths = self.dataset.config, self.dataset.widths
+        ranges = [f"{low:.2f} to {high:.2f}" for low, high in self.ranges]
+        if not self.has_poses:
+            how = f", joined by {config.join_actions}" if config.join_actions else ""
+            actions = f"{widths.action} numbers, {config.actions}{how}"
+            return {"states": f"{widths.state} numbers: {', '.join(ranges)}", "actions": actions}
+        return {
+            "standing still": f"{self.values['still_share']:.1%} of the steps, by the measured motion",
+            "position": f"{', '.join(f'{axis} {one}' for axis, one in zip('xyz', ranges, strict=False))} m",
+            "gripper": f"{ranges[-1]} (0 open, 1 closed)",
         }
 
 
