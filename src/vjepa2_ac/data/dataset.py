@@ -105,14 +105,16 @@ class Dataset:
         groups = None if config.split_by is None else len(np.unique(self.split_hash[taking_part]))
         together = "" if groups is None else f" in {groups} groups (data.split_by)"
         shares = f"validation_share {config.validation_share:g}, test_share {config.test_share:g}"
+        share = {"train": 1.0, "validation": config.validation_share, "test": config.test_share}[split]
         always = f"above 0, three {'episodes' if groups is None else 'groups'} or more always have one"
+        always += ", unless it is broken or in data.exclude" if share else ""
         return InputError(
             where=f"data.path: {config.path}",
             found=f"no {split} episodes among {taking_part.sum()}{together} ({shares})",
             needed="one or more",
             fix="Lower data.validation_share or data.test_share"
             if split == "train"
-            else f"Raise data.{split}_share: {always}, unless it is broken or in data.exclude",
+            else f"Raise data.{split}_share: {always}",
         )
 
     def with_stride(self, stride: int) -> Dataset:

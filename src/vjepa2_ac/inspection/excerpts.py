@@ -19,6 +19,7 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
+from scipy.spatial.transform import Rotation
 
 from vjepa2_ac import storage
 from vjepa2_ac.data.coverage import sample_of
@@ -138,10 +139,17 @@ def signs_in(excerpts: Sequence[Excerpt], space: StateSpace, stride: int, contro
 
 def _motion_in(excerpts: Sequence[Excerpt], space: StateSpace) -> list[Float[np.ndarray, " _"]]:
     """Return the motion of each episode at each step: the sum over its numbers, each in units of its typical change."""
-    changes = [space.differences(one.states) for one in excerpts]
+    changes = [_change(one.states, space) for one in excerpts]
     scale = np.sqrt((np.concatenate(changes) ** 2).mean(axis=0))
     scale = np.where(scale > 0, scale, np.inf)  # constant numbers do not count
     return [np.abs(change / scale).sum(axis=1) for change in changes]
+
+
+def _change(states: Float[np.ndarray, "steps dim"], space: StateSpace) -> Float[np.ndarray, "changes dim"]:
+    change = space.differences(states)
+    if space.rotation is not None:
+        change[:, space.rotation] = Rotation.from_euler("xyz", change[:, space.rotation]).as_rotvec()
+    return change
 
 
 def _noise_as_frames(excerpts: Sequence[Excerpt]) -> Iterator[Finding]:
