@@ -3,33 +3,21 @@
 import hashlib
 import sys
 import tracemalloc
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from clips import open_in_memory
 from memory_source import MemorySource
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data import dataset as opening
-from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.idle import FoundRanges
 from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable
 from vjepa2_ac.data.selection import BrokenEpisodes
 from vjepa2_ac.errors import InputError
-
-Open = Callable[..., Dataset]
-
-
-@pytest.fixture
-def open_with(monkeypatch: pytest.MonkeyPatch) -> Open:
-    def open_it(source: Any, **knobs: Any) -> Dataset:
-        monkeypatch.setattr(opening, "open_source", lambda _: source)
-        chosen = {"frames": 3, "stride": 2, "validation_share": 0.0, "test_share": 0.0} | knobs
-        return open_dataset(DataConfig(path="the set", **chosen))
-
-    return open_it
 
 
 def removed(dataset: Dataset) -> dict[str, tuple[int, int, int | None]]:
@@ -43,9 +31,9 @@ def problems(count: int) -> list[EpisodeProblem]:
     ]
 
 
-def test_every_filter_counts_what_it_took(open_with: Open) -> None:
+def test_every_filter_counts_what_it_took() -> None:
     source = MemorySource([10, 20, 30, 40, 50], [True, False, None, True, False], problems=problems(2))
-    dataset = open_with(source, exclude=("episode 4", "bad 1", "bad 0"), outcome="success")
+    dataset = open_in_memory(source, exclude=("episode 4", "bad 1", "bad 0"), outcome="success")
     assert removed(dataset) == {
         "excluded": (3, 50, 46),
         "outcome": (2, 50, 16 + 26),
@@ -53,11 +41,11 @@ def test_every_filter_counts_what_it_took(open_with: Open) -> None:
         "idle": (0, 0, 0),
     }
     assert dataset.windows("train").episodes.tolist() == [0, 3]
-    assert len(open_with(source, exclude=("bad 1", "bad 0"), outcome="failure").windows("train")) == 16 + 46
+    assert len(open_in_memory(source, exclude=("bad 1", "bad 0"), outcome="failure").windows("train")) == 16 + 46
 
 
-def test_windows_are_not_counted_before_the_stride_is_known(open_with: Open) -> None:
-    dataset = open_with(MemorySource([10, 20]), stride="auto", exclude=("episode 1",))
+def test_windows_are_not_counted_before_the_stride_is_known() -> None:
+    dataset = open_in_memory(MemorySource([10, 20]), stride="auto", exclude=("episode 1",))
     assert removed(dataset)["excluded"] == (1, 20, None)
     known = dataset.with_stride(4)
     assert removed(known)["excluded"] == (1, 20, 12)
@@ -65,16 +53,16 @@ def test_windows_are_not_counted_before_the_stride_is_known(open_with: Open) -> 
     assert known.broken is dataset.broken
 
 
-def test_an_outcome_that_nobody_tells_is_refused(open_with: Open) -> None:
+def test_an_outcome_that_nobody_tells_is_refused() -> None:
     with pytest.raises(InputError, match=r"data\.outcome: success: no episode.*Set data\.outcome: all"):
-        open_with(MemorySource([10, 10]), outcome="success")
+        open_in_memory(MemorySource([10, 10]), outcome="success")
     with pytest.raises(InputError, match=r"none of 2 episodes is left \(left out: outcome 2\)"):
-        open_with(MemorySource([10, 10], [False, None]), outcome="success")
+        open_in_memory(MemorySource([10, 10], [False, None]), outcome="success")
 
 
-def test_a_broken_episode_stops_by_default_and_says_how_to_go_on(open_with: Open) -> None:
+def test_a_broken_episode_stops_by_default_and_says_how_to_go_on() -> None:
     with pytest.raises(InputError) as caught:
-        open_with(MemorySource([10] * 2000, problems=problems(12)))
+        open_in_memory(MemorySource([10] * 2000, problems=problems(12)))
     error = caught.value
     assert (error.where, error.found, error.needed) == ("shard 3: record 0", "all zeros", "poses")
     assert "Look. To go on without, set data.broken_episodes: skip, or add (the first 10 of 12) to data.exclude" in (
@@ -84,22 +72,22 @@ def test_a_broken_episode_stops_by_default_and_says_how_to_go_on(open_with: Open
     assert "bad 10" not in error.fix
 
 
-def test_broken_episodes_are_skipped_by_policy_counted_and_named(open_with: Open, caplog: Any) -> None:
-    dataset = open_with(MemorySource([10] * 1188, problems=problems(12)), broken_episodes="skip")
+def test_broken_episodes_are_skipped_by_policy_counted_and_named(caplog: Any) -> None:
+    dataset = open_in_memory(MemorySource([10] * 1188, problems=problems(12)), broken_episodes="skip")
     assert "12 of 1200 episodes are broken and left out: bad 0, bad 1" in caplog.text
     assert "and 2 more; the first: shard 3: record 0: all zeros" in caplog.text
     assert len(dataset.broken) == 12
     assert removed(dataset)["broken"] == (12, 0, 0)
 
 
-def test_more_than_one_in_a_hundred_stops_the_run_whatever_the_policy(open_with: Open) -> None:
+def test_more_than_one_in_a_hundred_stops_the_run_whatever_the_policy() -> None:
     with pytest.raises(InputError, match=r"12 of 1199 episodes are broken: bad 0, .*needed: 1% at most"):
-        open_with(MemorySource([10] * 1187, problems=problems(12)), broken_episodes="skip")
+        open_in_memory(MemorySource([10] * 1187, problems=problems(12)), broken_episodes="skip")
 
 
-def test_broken_episodes_that_are_excluded_are_nobodys_concern(open_with: Open) -> None:
+def test_broken_episodes_that_are_excluded_are_nobodys_concern() -> None:
     names = tuple(problem.name for problem in problems(12))
-    assert len(open_with(MemorySource([10], problems=problems(12)), exclude=names).broken) == 0
+    assert len(open_in_memory(MemorySource([10], problems=problems(12)), exclude=names).broken) == 0
 
 
 def test_what_a_run_met_before_it_was_resumed_counts_unless_it_is_excluded() -> None:
@@ -128,24 +116,24 @@ def test_the_broken_episodes_of_all_processes_count_together() -> None:
             ledger.recall(everyone | {"d": "damaged"})
 
 
-def test_excluding_what_there_is_not_is_refused(open_with: Open) -> None:
+def test_excluding_what_there_is_not_is_refused() -> None:
     with pytest.raises(InputError, match=r"data\.exclude: not the identity of any episode: elsewhere\."):
-        open_with(MemorySource([10], problems=problems(1)), exclude=("elsewhere", "bad 0"))
+        open_in_memory(MemorySource([10], problems=problems(1)), exclude=("elsewhere", "bad 0"))
 
 
-def test_two_episodes_of_one_identity_are_refused(open_with: Open) -> None:
+def test_two_episodes_of_one_identity_are_refused() -> None:
     source = MemorySource([10, 20, 30], names=["same", "other", "same"])
     with pytest.raises(
         InputError, match=r"episodes 0 and 2 have the same identity: same.*data\.fields\.identity"
     ) as caught:
-        open_with(source)
+        open_in_memory(source)
     assert "broken_episodes" not in caught.value.fix, "that would not help"
-    assert open_with(source, exclude=("same",)).windows("train").episodes.tolist() == [1]
+    assert open_in_memory(source, exclude=("same",)).windows("train").episodes.tolist() == [1]
 
 
-def test_nothing_is_read_to_open_a_set(open_with: Open) -> None:
+def test_nothing_is_read_to_open_a_set() -> None:
     source = MemorySource([10, 20])
-    dataset = open_with(source)
+    dataset = open_in_memory(source)
     _ = dataset.removed, dataset.windows("train")
     assert source.reads == []
 
@@ -174,7 +162,7 @@ def two_ranges_each(table: EpisodeTable) -> FoundRanges:
 
 @pytest.mark.parametrize("idle", [{}, {"rule": "motion"}])
 def test_a_set_of_droids_size_is_opened_without_a_call_for_each_episode_and_in_fifty_megabytes(
-    open_with: Open, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, idle: dict[str, Any]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, idle: dict[str, Any]
 ) -> None:
     kept, ranges = tmp_path / "table", tmp_path / "ranges"
     table = droid_sized()
@@ -198,7 +186,7 @@ def test_a_set_of_droids_size_is_opened_without_a_call_for_each_episode_and_in_f
 
     tracemalloc.start()
     sys.setprofile(count)
-    windows = open_with(Kept(), outcome="success", stride=4, frames=16, idle=idle).windows("train")
+    windows = open_in_memory(Kept(), outcome="success", stride=4, frames=16, idle=idle).windows("train")
     sys.setprofile(None)
     size, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()

@@ -8,6 +8,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from clips import dataset_in_memory
 from copied_sets import STEPS, WRITERS, write_lerobot, write_npz
 from gcs import Gcs
 from latent_sets import write_cache
@@ -18,7 +19,6 @@ from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.duplicates import Duplicates, find_duplicates
 from vjepa2_ac.data.index.episode_table import EpisodeTable
 from vjepa2_ac.data.index.state_hash import UNKNOWN, hash_of_states
-from vjepa2_ac.data.selection import BrokenEpisodes, StepSelection
 from vjepa2_ac.data.sources.latents.manifest import EPISODES
 from vjepa2_ac.inspection.check import check_data
 from vjepa2_ac.inspection.statistics import inspect_dataset
@@ -34,14 +34,9 @@ def config_of(source: str, path: object, tmp_path: Path, **changes: object) -> D
     return DataConfig.model_validate(values | changes)
 
 
-def in_memory(hashes: list[int], **changes: object) -> Dataset:
-    config = DataConfig.model_validate(
-        {"path": "memory", "frames": 3, "validation_share": 0.3, "test_share": 0.2, **changes}
-    )
-    source = MemorySource([20] * len(hashes))
-    table = replace(source.infos(), state_hash=np.array(hashes, np.uint64))
-    kept = StepSelection.whole(table, np.ones(len(table), bool))
-    return Dataset(config, source, table, kept, BrokenEpisodes(config, len(table)))
+def in_memory(hashes: list[int]) -> Dataset:
+    dataset = dataset_in_memory(MemorySource([20] * len(hashes)), validation_share=0.3, test_share=0.2)
+    return replace(dataset, table=replace(dataset.table, state_hash=np.array(hashes, np.uint64)))
 
 
 def test_a_hash_is_that_of_the_numbers_whatever_their_type() -> None:

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from clips import split_of
+from clips import open_in_memory, split_of
 from copied_sets import write_lerobot, write_npz, write_raw, write_rlds
 from latent_sets import write_cache
 from memory_source import MemorySource
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data import dataset as opening
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.index.episode_table import EpisodeTable
 from vjepa2_ac.data.selection import groups_of
@@ -36,10 +35,9 @@ def config_of(**changes: Any) -> DataConfig:
     return DataConfig.model_validate({"path": "somewhere", "frames": 3, "stride": 2, "workers": 0, **SHARES, **changes})
 
 
-def opened(monkeypatch: pytest.MonkeyPatch, names: list[str] | None = None, **changes: Any) -> Dataset:
+def opened(names: list[str] | None = None, **changes: Any) -> Dataset:
     names = NAMES if names is None else names
-    monkeypatch.setattr(opening, "open_source", lambda _: MemorySource([20] * len(names), names=names))
-    return open_dataset(config_of(**changes))
+    return open_in_memory(MemorySource([20] * len(names), names=names), **(SHARES | changes))
 
 
 def splits_of(dataset: Dataset) -> dict[str, str]:
@@ -58,15 +56,15 @@ def groups_split(dataset: Dataset, group: Any) -> dict[str, set[str]]:
     return dict(found)
 
 
-def test_without_it_the_identity_decides_as_ever(monkeypatch: pytest.MonkeyPatch) -> None:
-    dataset = opened(monkeypatch)
+def test_without_it_the_identity_decides_as_ever() -> None:
+    dataset = opened()
     assert dataset.groups is None
     assert splits_of(dataset) == {name: split_of(name, dataset.config) for name in NAMES}
 
 
 @pytest.mark.parametrize("by", ["day", r"/(\d{4}-\d\d-\d\d)/"])
-def test_episodes_of_a_group_share_the_split_of_its_name(monkeypatch: pytest.MonkeyPatch, by: str) -> None:
-    dataset = opened(monkeypatch, split_by=by)
+def test_episodes_of_a_group_share_the_split_of_its_name(by: str) -> None:
+    dataset = opened(split_by=by)
     days = groups_split(dataset, lambda name: name.split("/")[7])
     assert days == {day: {split_of(day, dataset.config)} for day in days}
     assert len(days) == 7
@@ -77,23 +75,23 @@ def count_of_groups(dataset: Dataset) -> int:
     return len(np.unique(dataset.split_hash))
 
 
-def test_an_identity_without_a_group_is_named_and_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_identity_without_a_group_is_named_and_refused() -> None:
     names = [*NAMES[:20], "elsewhere/one", "elsewhere/two"]
     with pytest.raises(InputError, match=r"split_by: day: .*in the identities of 2 of 22 episodes: elsewhere/one, "):
-        opened(monkeypatch, names, split_by="day")
+        opened(names, split_by="day")
     with pytest.raises(InputError, match=r"2 of 22 episodes: elsewhere/one, elsewhere/two.*data\.exclude"):
-        opened(monkeypatch, names, split_by=r"LAB(\d?)")
-    opened(monkeypatch, names, split_by="day", exclude=("elsewhere/one", "elsewhere/two"))
+        opened(names, split_by=r"LAB(\d?)")
+    opened(names, split_by="day", exclude=("elsewhere/one", "elsewhere/two"))
 
 
-def test_a_group_of_nothing_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_group_of_nothing_is_none() -> None:
     with pytest.raises(InputError, match="60 of 60 episodes"):
-        opened(monkeypatch, split_by=r"LAB(x*)")
+        opened(split_by=r"LAB(x*)")
 
 
-def test_a_field_that_is_not_there_is_refused_with_those_that_are(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_field_that_is_not_there_is_refused_with_those_that_are() -> None:
     with pytest.raises(InputError, match=r"no such field; this data set has none of its own.*lab, day, folder"):
-        opened(monkeypatch, split_by="kitchen")
+        opened(split_by="kitchen")
 
 
 @pytest.mark.parametrize("pattern", ["(", "(a)(b)", r"\d+-\d+", "(?:a)", "", "(?P<a>", "a" * 501])
@@ -102,9 +100,9 @@ def test_a_pattern_without_one_group_is_refused_with_the_config(pattern: str) ->
         config_of(split_by=pattern)
 
 
-def test_a_split_without_groups_says_that_groups_are_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_split_without_groups_says_that_groups_are_drawn() -> None:
     two_days = [name for number, name in enumerate(NAMES) if number % 7 < 2]
-    dataset = opened(monkeypatch, two_days, split_by="day", validation_share=0.001, test_share=0.0)
+    dataset = opened(two_days, split_by="day", validation_share=0.001, test_share=0.0)
     with pytest.raises(InputError, match=r"among 18 in 2 groups \(data.split_by\).*three groups or more always have"):
         dataset.windows("validation")
 

@@ -1,6 +1,7 @@
 """Idle steps: the same as in openpi, and never where the robot moves."""
 
 import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -9,13 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clips import clip_at
+from clips import clip_at, open_in_memory
 from gcs import Gcs
 from memory_source import MemorySource
 from paths import GOLDEN
 from synthetic import synthetic_states
 from vjepa2_ac.config import DataConfig, IdleConfig
-from vjepa2_ac.data import dataset as opening
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.idle import FoundRanges, idle_by_commands, idle_by_motion, kept_ranges, moving_ranges
 from vjepa2_ac.data.index.episode_table import EpisodeProblem, NotATableError
@@ -107,14 +107,8 @@ def test_commands_without_velocities_name_the_way_out() -> None:
 
 
 @pytest.fixture
-def open_with(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
-    def open_it(source: MemorySource, **knobs: Any) -> Dataset:
-        monkeypatch.setattr(opening, "open_source", lambda _: source)
-        chosen = {"frames": 3, "stride": 2, "validation_share": 0.0, "test_share": 0.0} | knobs
-        config = DataConfig(path=str(tmp_path / "set"), disk_cache={"dir": str(tmp_path / "cache")}, **chosen)
-        return open_dataset(config)
-
-    return open_it
+def open_with(tmp_path: Path) -> Any:
+    return partial(open_in_memory, path=str(tmp_path / "set"), disk_cache={"dir": str(tmp_path / "cache")})
 
 
 def restful(lengths: list[int] | None = None, **knobs: Any) -> MemorySource:

@@ -17,12 +17,11 @@ import numpy as np
 import pytest
 import torch
 
-from clips import clip_at
+from clips import clip_at, open_in_memory
 from memory_source import MemorySource
 from recording_cuda import Pinning, RecordingCuda, recorded_copies
 from synthetic import write_synthetic_droid
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data import dataset as opening
 from vjepa2_ac.data import loader
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import ProcessShare, collate, training_loader, validation_batches
@@ -230,15 +229,6 @@ def test_frames_of_two_sizes_do_not_stack(droid: Path) -> None:
 # Laws of the order, on episodes in memory: what is read can be counted.
 
 
-@pytest.fixture
-def in_memory(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Dataset]:
-    def make(source: MemorySource, **knobs: Any) -> Dataset:
-        monkeypatch.setattr(opening, "open_source", lambda _: source)
-        return open_dataset(config_of(Path("nowhere"), **({"validation_share": 0.0} | knobs)))
-
-    return make
-
-
 def first(dataset: Dataset, count: int, **knobs: Any) -> list[Batch]:
     chosen = {"seed": 1, "batch_size": 2} | knobs
     return list(itertools.islice(training_loader(dataset, **chosen), count))
@@ -246,10 +236,8 @@ def first(dataset: Dataset, count: int, **knobs: Any) -> list[Batch]:
 
 @pytest.mark.parametrize("world_size", [1, 3])
 @pytest.mark.parametrize("batch_size", [1, 4])
-def test_ranks_lose_no_window_and_see_none_twice_in_an_epoch(
-    in_memory: Callable[..., Dataset], world_size: int, batch_size: int
-) -> None:
-    dataset = in_memory(MemorySource([9, 12, 7, 10]))
+def test_ranks_lose_no_window_and_see_none_twice_in_an_epoch(world_size: int, batch_size: int) -> None:
+    dataset = open_in_memory(MemorySource([9, 12, 7, 10]))
     everything = {(f"episode {e}", s) for e, length in enumerate((9, 12, 7, 10)) for s in range(length - 4)}
     steps = -(-2 * len(everything) // (world_size * batch_size))
     ranks = [
@@ -262,11 +250,11 @@ def test_ranks_lose_no_window_and_see_none_twice_in_an_epoch(
         assert set(epoch) == everything
 
 
-def test_resuming_reads_nothing_that_came_before(in_memory: Callable[..., Dataset]) -> None:
+def test_resuming_reads_nothing_that_came_before() -> None:
     lengths = [30] * 40
-    whole = names(first(in_memory(MemorySource(lengths)), 60))
+    whole = names(first(open_in_memory(MemorySource(lengths)), 60))
     source = MemorySource(lengths)
-    resumed = first(in_memory(source), 2, start_position=100)
+    resumed = first(open_in_memory(source), 2, start_position=100)
     assert names(resumed) == whole[100:104]
     assert len(source.reads) == 4
     assert len(source.decoded) == 4 * 3
@@ -275,10 +263,10 @@ def test_resuming_reads_nothing_that_came_before(in_memory: Callable[..., Datase
 CAMERAS = ("exterior_1_left", "exterior_2_left", "wrist_left")
 
 
-def test_the_camera_is_drawn_per_clip_by_the_position_alone(in_memory: Callable[..., Dataset]) -> None:
+def test_the_camera_is_drawn_per_clip_by_the_position_alone() -> None:
     def cameras(start: int, count: int) -> list[str | None]:
         source = MemorySource([30] * 10)
-        first(in_memory(source, camera=CAMERAS[:2]), count, batch_size=1, start_position=start)
+        first(open_in_memory(source, camera=CAMERAS[:2]), count, batch_size=1, start_position=start)
         return [camera for _, camera, _ in source.reads]
 
     drawn = cameras(0, 200)
@@ -287,9 +275,9 @@ def test_the_camera_is_drawn_per_clip_by_the_position_alone(in_memory: Callable[
     assert 70 < drawn.count(CAMERAS[0]) < 130
 
 
-def test_the_camera_of_a_validation_clip_stays(in_memory: Callable[..., Dataset]) -> None:
+def test_the_camera_of_a_validation_clip_stays() -> None:
     def cameras() -> dict[tuple[str, int], int]:
-        dataset = in_memory(MemorySource([30] * 10), camera=CAMERAS, validation_share=0.5)
+        dataset = open_in_memory(MemorySource([30] * 10), camera=CAMERAS, validation_share=0.5)
         batches = list(validation_batches(dataset, "validation", clips=40, batch_size=1))
         return dict(zip(names(batches), (int(batch.frames[0, 0, 0, 0, 2]) for batch in batches), strict=True))
 
@@ -297,34 +285,32 @@ def test_the_camera_of_a_validation_clip_stays(in_memory: Callable[..., Dataset]
     assert len(set(cameras().values())) == 2  # the names of the exterior cameras are as long
 
 
-def test_training_clips_are_changed_by_their_position_and_validation_clips_never(
-    in_memory: Callable[..., Dataset],
-) -> None:
+def test_training_clips_are_changed_by_their_position_and_validation_clips_never() -> None:
     knobs = {"augment": {"crop_scale": (0.3, 1.0), "brightness": 0.4}, "validation_share": 0.5}
-    dataset = in_memory(MemorySource([30] * 10), **knobs)
+    dataset = open_in_memory(MemorySource([30] * 10), **knobs)
     whole = [one for batch in first(dataset, 20) for one in batch.augmentations]
     resumed = [one for batch in first(dataset, 5, start_position=30) for one in batch.augmentations]
     assert len(set(whole)) == 40
     assert resumed == whole[30:]
     validation = list(validation_batches(dataset, "validation", clips=4, batch_size=2))
     assert all(batch.augmentations == () for batch in validation)
-    assert first(in_memory(MemorySource([30])), 1)[0].augmentations == ()
+    assert first(open_in_memory(MemorySource([30])), 1)[0].augmentations == ()
 
 
 @pytest.mark.parametrize("crop", ["released", "square", "letterbox"])
-def test_the_crop_is_the_configs(in_memory: Callable[..., Dataset], crop: str) -> None:
+def test_the_crop_is_the_configs(crop: str) -> None:
     sizes = {"released": (4, 5), "square": (4, 4), "letterbox": (5, 5)}
-    assert first(in_memory(MemorySource([30]), crop=crop), 1)[0].frames.shape[2:4] == sizes[crop]
+    assert first(open_in_memory(MemorySource([30]), crop=crop), 1)[0].frames.shape[2:4] == sizes[crop]
 
 
 # Poses of the camera.
 
 
-def test_poses_in_the_cameras_frame_lead_to_actions_in_it(in_memory: Callable[..., Dataset]) -> None:
+def test_poses_in_the_cameras_frame_lead_to_actions_in_it() -> None:
     cameras = np.tile([0.3, -0.2, 0.5, 0.4, -0.3, 1.2], (30, 1))
     source = MemorySource([30], extrinsics=lambda _: cameras)
-    in_base = clip_at(in_memory(source), 0, 3)
-    dataset = in_memory(source)
+    in_base = clip_at(open_in_memory(source), 0, 3)
+    dataset = open_in_memory(source)
     dataset = replace(dataset, config=dataset.config.model_copy(update={"pose_frame": "camera"}))
     clip = clip_at(dataset, 0, 3)
     expected = states_in_camera_frame(source.read(0).states[3:8:2], cameras[3:8:2])
@@ -334,18 +320,18 @@ def test_poses_in_the_cameras_frame_lead_to_actions_in_it(in_memory: Callable[..
     assert np.allclose(clip.extrinsics, cameras[:3])
 
 
-def test_a_camera_without_a_pose_cannot_be_the_frame(in_memory: Callable[..., Dataset]) -> None:
-    dataset = in_memory(MemorySource([30]))
+def test_a_camera_without_a_pose_cannot_be_the_frame() -> None:
+    dataset = open_in_memory(MemorySource([30]))
     dataset = replace(dataset, config=dataset.config.model_copy(update={"pose_frame": "camera"}))
     with pytest.raises(InputError, match=r"episode 0: no pose of the camera.*pose_frame: base.*data\.exclude"):
         next(loader.batches_of(dataset, [(0, 0)], batch_size=1))
 
 
-def test_a_batch_has_camera_poses_if_all_its_clips_have(in_memory: Callable[..., Dataset]) -> None:
+def test_a_batch_has_camera_poses_if_all_its_clips_have() -> None:
     def poses(index: int) -> np.ndarray | None:
         return np.full((30, 6), 0.5) if index else None
 
-    dataset = in_memory(MemorySource([30, 30], extrinsics=poses))
+    dataset = open_in_memory(MemorySource([30, 30], extrinsics=poses))
     without, with_poses = clip_at(dataset, 0, 0), clip_at(dataset, 1, 0)
     assert collate([with_poses, with_poses]).extrinsics.shape == (2, 3, 6)
     assert collate([with_poses, without]).extrinsics is None
@@ -354,17 +340,15 @@ def test_a_batch_has_camera_poses_if_all_its_clips_have(in_memory: Callable[...,
 # Clips that cannot be read.
 
 
-def broken_set(in_memory: Callable[..., Dataset], broken: set[int], **knobs: Any) -> Dataset:
+def broken_set(broken: set[int], **knobs: Any) -> Dataset:
     source = MemorySource([5] * 300, pictureless=frozenset(broken))
-    return in_memory(source, **({"broken_episodes": "skip"} | knobs))
+    return open_in_memory(source, **({"broken_episodes": "skip"} | knobs))
 
 
-def test_a_clip_that_cannot_be_read_is_missing_and_no_other_takes_its_place(
-    in_memory: Callable[..., Dataset], caplog: pytest.LogCaptureFixture
-) -> None:
-    whole = [names([batch]) for batch in first(broken_set(in_memory, set()), 80, batch_size=4)]
+def test_a_clip_that_cannot_be_read_is_missing_and_no_other_takes_its_place(caplog: pytest.LogCaptureFixture) -> None:
+    whole = [names([batch]) for batch in first(broken_set(set()), 80, batch_size=4)]
     broken = {f"episode {number}" for number in (3, 17)}
-    dataset = broken_set(in_memory, {3, 17})
+    dataset = broken_set({3, 17})
     found = first(dataset, 80, batch_size=4)
     assert [names([batch]) for batch in found] == [[one for one in row if one[0] not in broken] for row in whole]
     assert any(len(batch.starts) < 4 for batch in found)
@@ -373,32 +357,32 @@ def test_a_clip_that_cannot_be_read_is_missing_and_no_other_takes_its_place(
     assert "memory: pictures of episode 17: damaged." in caplog.text
 
 
-def test_a_batch_may_lose_all_its_clips(in_memory: Callable[..., Dataset]) -> None:
-    found = first(broken_set(in_memory, {3, 17}), 300, batch_size=1)
+def test_a_batch_may_lose_all_its_clips() -> None:
+    found = first(broken_set({3, 17}), 300, batch_size=1)
     empty = [batch for batch in found if not batch.starts]
     assert empty
     assert empty[0].frames.shape[:2] == (0, 3)
     assert empty[0].actions.shape == (0, 2, 7)
 
 
-def test_the_default_is_to_stop_at_a_clip_that_cannot_be_read(in_memory: Callable[..., Dataset]) -> None:
+def test_the_default_is_to_stop_at_a_clip_that_cannot_be_read() -> None:
     with pytest.raises(InputError, match=r"pictures of episode \d+: damaged\..*broken_episodes: skip, or add to"):
-        first(broken_set(in_memory, set(range(300)), broken_episodes="error"), 1)
+        first(broken_set(set(range(300)), broken_episodes="error"), 1)
 
 
-def test_a_network_that_is_away_is_no_broken_episode(in_memory: Callable[..., Dataset]) -> None:
+def test_a_network_that_is_away_is_no_broken_episode() -> None:
     source = MemorySource(
         [30] * 300, unreadable=frozenset(range(300)), fault=lambda where: UnreachableError(where=where, found="503")
     )
     with pytest.raises(UnreachableError) as caught:
-        first(in_memory(source, broken_episodes="skip"), 1)
+        first(open_in_memory(source, broken_episodes="skip"), 1)
     assert "data.exclude" not in str(caught.value)
 
 
-def test_a_validation_of_nothing_but_broken_clips_is_refused(in_memory: Callable[..., Dataset]) -> None:
-    dataset = broken_set(in_memory, {0}, validation_share=0.5)
+def test_a_validation_of_nothing_but_broken_clips_is_refused() -> None:
+    dataset = broken_set({0}, validation_share=0.5)
     windows = dataset.windows("validation")
-    nothing = broken_set(in_memory, set(windows.episodes.tolist()), validation_share=0.5)
+    nothing = broken_set(set(windows.episodes.tolist()), validation_share=0.5)
     with pytest.raises(InputError, match=r"none of the clips can be read; broken episodes: episode \d+"):
         list(validation_batches(nothing, "validation", clips=1, batch_size=1))
 
@@ -426,7 +410,7 @@ def test_with_every_knob_on_neither_workers_nor_resuming_change_a_bit(
         assert [one.augmentations for one in found] == [one.augmentations for one in alone[start : start + len(found)]]
 
 
-def test_clips_of_a_set_that_lies_elsewhere_are_read_several_at_once(in_memory: Callable[..., Dataset]) -> None:
+def test_clips_of_a_set_that_lies_elsewhere_are_read_several_at_once() -> None:
     meeting = threading.Barrier(4, timeout=120)
 
     class Slow(MemorySource):
@@ -434,16 +418,14 @@ def test_clips_of_a_set_that_lies_elsewhere_are_read_several_at_once(in_memory: 
             meeting.wait()  # nobody gets on before four are here
             return super().read(*arguments)
 
-    dataset = in_memory(Slow([30] * 10))
-    expected = names(first(in_memory(MemorySource([30] * 10)), 3, batch_size=4))
+    dataset = open_in_memory(Slow([30] * 10))
+    expected = names(first(open_in_memory(MemorySource([30] * 10)), 3, batch_size=4))
     remote = replace(dataset, config=dataset.config.model_copy(update={"path": "gs://bucket/set"}))
     assert names(first(remote, 3, batch_size=4)) == expected
 
 
-def test_bytes_that_were_fetched_are_told_with_the_batch(
-    in_memory: Callable[..., Dataset], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    dataset = in_memory(source := MemorySource([30] * 10))
+def test_bytes_that_were_fetched_are_told_with_the_batch(monkeypatch: pytest.MonkeyPatch) -> None:
+    dataset = open_in_memory(source := MemorySource([30] * 10))
     monkeypatch.setattr(loader.storage, "bytes_fetched", lambda: 1000 * len(source.reads))
     assert [batch.bytes_fetched for batch in first(dataset, 3, batch_size=2)] == [2000, 2000, 2000]
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from clips import clip_at
+from clips import clip_at, open_in_memory
 from gcs import Gcs
 from lerobot_sets import Recorded, recorded, write_v21, write_v30
 from memory_source import MemorySource
@@ -147,18 +147,10 @@ def test_a_robot_of_another_width_is_a_broken_episode(tmp_path: Path) -> None:
 
 def test_an_episode_of_another_width_that_no_index_saw_is_named_when_it_is_read() -> None:
     source = MemorySource([9, 9], states=lambda index: vectors(9, 14 - index, seed=index))
-    dataset = open_dataset_of(source)
+    dataset = open_in_memory(source, source="npz", states="vector")
     assert clip_at(dataset, 0, 0).states.shape == (3, 14)
     with pytest.raises(InputError, match=r"episode 1.*states of 13.*14 and 14, as in the others"):
         clip_at(dataset, 1, 0)
-
-
-def open_dataset_of(source: MemorySource) -> Any:
-    import vjepa2_ac.data.dataset as module
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "open_source", lambda _: source)
-        return open_dataset(knobs("memory"))
 
 
 def test_commands_that_are_asked_for_must_be_there_for_every_step(tmp_path: Path) -> None:

@@ -10,12 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from clips import split_of
+from clips import open_in_memory, split_of
 from memory_source import MemorySource
 from paths import GOLDEN, ROOT
 from vjepa2_ac.config.data import DataConfig, Split
 from vjepa2_ac.config.loading import load_config
-from vjepa2_ac.data import dataset as opening
 from vjepa2_ac.data.index.episode_table import EpisodeTable
 from vjepa2_ac.data.selection import StepSelection, included
 from vjepa2_ac.data.windows import ClipOrder, Windows, clip_starts, far_neighbours, in_split, permuted, spread
@@ -209,11 +208,9 @@ def test_a_group_moves_as_a_whole() -> None:
     assert counts(hashes) == {"train": 1, "validation": 2, "test": 2}
 
 
-def splits_of(monkeypatch: pytest.MonkeyPatch, source: MemorySource, **knobs: object) -> dict[str, Split]:
+def splits_of(source: MemorySource, **knobs: object) -> dict[str, Split]:
     """Return the split of every episode that takes part."""
-    monkeypatch.setattr(opening, "open_source", lambda _: source)
-    values = {"path": "the set", "frames": 3, "stride": 2, "validation_share": 0.02, "test_share": 0.02} | knobs
-    dataset = opening.open_dataset(DataConfig.model_validate(values))
+    dataset = open_in_memory(source, **({"validation_share": 0.02, "test_share": 0.02} | knobs))
     return {
         dataset.table.identity(int(place)): split
         for split in SPLITS
@@ -228,20 +225,18 @@ def test_leaving_an_episode_out_moves_no_other(
 ) -> None:
     """Neither `data.exclude` nor an episode that breaks: what a run has trained on stays out of its validation."""
     knobs = {"split_by": split_by, "idle": {"rule": "motion"}, "broken_episodes": "skip"}
-    before = splits_of(monkeypatch, MemorySource([60] * 8), **knobs)
+    before = splits_of(MemorySource([60] * 8), **knobs)
     assert set(before.values()) == set(SPLITS)
     without = {name: split for name, split in before.items() if name != f"episode {left_out}"}
     excluded = {"exclude": (f"episode {left_out}",)}
-    assert splits_of(monkeypatch, MemorySource([60] * 8), **knobs, **excluded) == without
+    assert splits_of(MemorySource([60] * 8), **knobs, **excluded) == without
     monkeypatch.setattr("vjepa2_ac.data.selection.MOST_BROKEN", 0.2)
-    assert (
-        splits_of(monkeypatch, MemorySource([61 + left_out] * 8, unreadable=frozenset({left_out})), **knobs) == without
-    )
+    assert splits_of(MemorySource([61 + left_out] * 8, unreadable=frozenset({left_out})), **knobs) == without
 
 
-def test_of_the_outcomes_only_the_chosen_one_is_split(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_the_outcomes_only_the_chosen_one_is_split() -> None:
     source = MemorySource([60] * 12, [number % 2 == 0 for number in range(12)])
-    found = splits_of(monkeypatch, source, outcome="success")
+    found = splits_of(source, outcome="success")
     assert sorted(found.values()).count("train") == 4
     assert set(found.values()) == set(SPLITS)
 

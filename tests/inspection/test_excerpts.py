@@ -6,12 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from clips import dataset_in_memory
 from latent_sets import write_cache
 from memory_source import MemorySource
 from moving_arms import COLUMNS, ROWS, STEPS, spot_excerpt, spot_frames, spot_states, write_spots
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.data.selection import BrokenEpisodes, StepSelection
+from vjepa2_ac.data.selection import StepSelection
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.inspection.check import check_data
 from vjepa2_ac.inspection.excerpts import (
@@ -164,11 +165,7 @@ def test_the_check_of_a_set_says_it_and_one_of_a_latent_cache_refers_to_the_set(
 
 
 def in_memory(lengths: list[int], **changes: object) -> Dataset:
-    config = DataConfig.model_validate({"path": "memory", "frames": 3, **changes})
-    source = MemorySource(lengths, unreadable=frozenset({3}))
-    table = source.infos()
-    kept = StepSelection.whole(table, np.ones(len(table), bool))
-    return Dataset(config, source, table, kept, BrokenEpisodes(config, len(table)))
+    return dataset_in_memory(MemorySource(lengths, unreadable=frozenset({3})), **changes)
 
 
 def test_the_middle_of_the_longest_kept_range_is_looked_at() -> None:

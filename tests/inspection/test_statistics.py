@@ -6,12 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clips import split_of
+from clips import dataset_in_memory, split_of
 from memory_source import MemorySource
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.coverage import sample_of
 from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.data.selection import BrokenEpisodes, StepSelection
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.inspection import sheet as figure
 from vjepa2_ac.inspection.sheet import plot_dataset
@@ -32,16 +31,9 @@ def straight_on(steps: int) -> np.ndarray:
     return states
 
 
-def in_memory(source: MemorySource, **knobs: object) -> Dataset:
-    config = DataConfig.model_validate({"path": "memory", "frames": 3, **knobs})
-    table = source.infos()
-    kept = StepSelection.whole(table, np.ones(len(table), bool))
-    return Dataset(config, source, table, kept, BrokenEpisodes(config, len(table)))
-
-
 def test_motion_per_step_is_in_centimetres_and_degrees_at_every_stride() -> None:
     source = MemorySource([40], states=lambda _: straight_on(40))
-    dataset = in_memory(source, stride_candidates=(1, 4, 15, 40))
+    dataset = dataset_in_memory(source, stride_candidates=(1, 4, 15, 40))
     *found, too_wide = inspect_dataset(dataset).steps
     for one, stride in zip(found, (1, 4, 15), strict=True):
         assert (one.stride, one.seconds) == (stride, stride / 15)
@@ -86,7 +78,9 @@ def test_a_sample_is_drawn_from_those_that_take_part_and_is_always_the_same(droi
 
 
 def hundred(broken: frozenset[int], policy: str, pictureless: frozenset[int] = frozenset()) -> Dataset:
-    return in_memory(MemorySource([60] * 100, unreadable=broken, pictureless=pictureless), broken_episodes=policy)
+    return dataset_in_memory(
+        MemorySource([60] * 100, unreadable=broken, pictureless=pictureless), broken_episodes=policy
+    )
 
 
 def test_an_episode_of_the_sample_that_cannot_be_read_is_counted_and_named(caplog: pytest.LogCaptureFixture) -> None:
