@@ -17,8 +17,6 @@ CHECKED = [
     "vjepa2_ac.media",
     "vjepa2_ac.data.clips",
     "vjepa2_ac.data.transforms",
-    "vjepa2_ac.data.clips",
-    "vjepa2_ac.data.transforms",
     "vjepa2_ac.planning",
     "vjepa2_ac.evaluation.action_use",
     "vjepa2_ac.simulation.world.kinematics",
