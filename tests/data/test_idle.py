@@ -236,6 +236,8 @@ def test_published_ranges_are_taken_by_identity(open_with: Any, tmp_path: Path, 
     assert "knows 2 of the 3 episodes; the other 1 count as idle" in caplog.text
     assert source.reads == []
     assert starts(dataset) == {(1, start) for start in (*range(8), *range(20, 36))}
+    other = open_with(source, **published(tmp_path, {"episode 1": [[0, 13]]}))
+    assert other.kept.of(1) == ((0, 13),), "a changed list is read anew"
     url = gcs.put("robots/ranges.json", json.dumps({"episode 1": [[0, 13]]}).encode())
     assert open_with(source, idle=IdleConfig(rule="published", ranges=url)).kept.of(1) == ((0, 13),)
     with pytest.raises(InputError, match=r"nowhere\.json: cannot be read"):

@@ -97,12 +97,23 @@ def find_ranges(
     Raises:
         InputError: The list of ranges cannot be read or belongs to another data set; or the rule fits no episode.
     """
-    if config.idle.rule == "published":
-        return published_ranges(str(config.idle.ranges), table)
     knobs = knobs_that_affect(Affects.IDLE, config)
-    key = key_of({"found": "idle ranges", "table": fingerprints_of(table)[0], "data": knobs})
+    parts: dict[str, object] = {"found": "idle ranges", "table": fingerprints_of(table)[0], "data": knobs}
     make = partial(_computed, source, table, config, progress or no_progress)
-    return get_or_make(config.disk_cache, key, make, to_bytes=FoundRanges.to_bytes, from_bytes=FoundRanges.from_bytes)
+    if config.idle.rule == "published":
+        path = str(config.idle.ranges)
+        make, parts["list"] = partial(published_ranges, path, table), _version(path)
+    return get_or_make(
+        config.disk_cache, key_of(parts), make, to_bytes=FoundRanges.to_bytes, from_bytes=FoundRanges.from_bytes
+    )
+
+
+def _version(path: str) -> list[object]:
+    """Return the version of a list, without reading it if possible."""
+    try:
+        return [storage.absolute(path), storage.file_size(path), storage.file_version(path)]
+    except OSError:
+        return [path]
 
 
 def _computed(source: EpisodeSource, table: EpisodeTable, config: DataConfig, progress: Progress) -> FoundRanges:
