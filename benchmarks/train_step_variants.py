@@ -30,8 +30,8 @@ from vjepa2_ac.config import (
     PredictorSizes,
     TrainingConfig,
 )
-from vjepa2_ac.data.clips.dataset import Dataset
-from vjepa2_ac.data.clips.transforms import pixels_to_input
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.transforms import pixels_to_input
 from vjepa2_ac.distributed.launch import make_accelerator
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.model.adapter.lora import add_adapter

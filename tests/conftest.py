@@ -15,10 +15,8 @@ import missing
 CHECKED = [
     "vjepa2_ac.geometry",
     "vjepa2_ac.media",
-    "vjepa2_ac.data.clips.actions",
-    "vjepa2_ac.data.clips.augmentation",
-    "vjepa2_ac.data.clips.clip_reader",
-    "vjepa2_ac.data.clips.transforms",
+    "vjepa2_ac.data.clips",
+    "vjepa2_ac.data.transforms",
     "vjepa2_ac.planning",
     "vjepa2_ac.evaluation.action_use",
     "vjepa2_ac.simulation.world.motion",

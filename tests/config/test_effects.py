@@ -14,7 +14,7 @@ from run_fixtures import TINY
 from vjepa2_ac.config import Config, DataConfig, EncoderConfig, ModelSizes
 from vjepa2_ac.config.loading import changed_keys, config_as_yaml, parse_config
 from vjepa2_ac.config.section import Affects, Section, knobs_that_affect, mark_of, marks_of, names_that_affect
-from vjepa2_ac.data.filters import idle_ranges
+from vjepa2_ac.data import idle as idle_ranges
 from vjepa2_ac.data.index.episode_table import EpisodeInfo, EpisodeTable
 from vjepa2_ac.data.index.index_cache import IndexKeys
 from vjepa2_ac.data.sources.latents.cache_key import key_of_cache

@@ -17,8 +17,8 @@ from ranks import finish, free_port, start_rank
 from run_fixtures import MakeConfig, SilentReporter, as_yaml, set_up
 from same_run import assert_same_run
 from vjepa2_ac.config import Config
-from vjepa2_ac.data.clips.dataset import open_dataset
-from vjepa2_ac.data.clips.loader import validation_batches
+from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.data.loader import validation_batches
 from vjepa2_ac.data.sources.latents.manifest import is_whole, read_manifest
 from vjepa2_ac.encoding import disk_space
 from vjepa2_ac.encoding.batch import encode_batch
@@ -290,7 +290,7 @@ def test_what_cannot_be_encoded_is_refused_before_the_data_is_opened(
 @pytest.fixture
 def mend(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
     """Episode 3 has a frame that cannot be decoded; a call repairs it."""
-    from vjepa2_ac.data.filters import broken_episodes
+    from vjepa2_ac.data import selection as broken_episodes
     from vjepa2_ac.data.sources.rlds.source import RldsSource
 
     read, is_broken = RldsSource.read, True

@@ -9,7 +9,7 @@ import pytest
 
 from copied_sets import WRITERS, write_lerobot, write_npz
 from vjepa2_ac.config.loading import config_from
-from vjepa2_ac.data.clips.dataset import open_dataset
+from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.init.draft import choose_model, make_draft
 from vjepa2_ac.init.found import guesses, plain

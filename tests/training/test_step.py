@@ -10,7 +10,7 @@ import torch
 
 from run_fixtures import set_up
 from vjepa2_ac.config import Config
-from vjepa2_ac.data.clips.loader import training_loader
+from vjepa2_ac.data.loader import training_loader
 from vjepa2_ac.distributed.launch import make_accelerator
 from vjepa2_ac.encoding.batch import extrinsics_for
 from vjepa2_ac.episode import Batch

@@ -13,11 +13,11 @@ from torch import Tensor
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.loading import config_as_dict, config_from
-from vjepa2_ac.data.clips import dataset as datasets
-from vjepa2_ac.data.clips.dataset import Dataset
-from vjepa2_ac.data.clips.loader import validation_batches
-from vjepa2_ac.data.clips.transforms import Crop
-from vjepa2_ac.data.clips.windows import require_stride
+from vjepa2_ac.data import dataset as datasets
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.loader import validation_batches
+from vjepa2_ac.data.transforms import Crop
+from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.encoding.batch import encode_batch, encode_frames
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError

@@ -55,8 +55,6 @@ class IdleConfig(Section):
     ranges: Place | None = None
     """For published: a JSON file, local or a URL, of {"recording_folderpath--file_path": [[start, end), ...]}. Episodes
     that it does not name count as idle."""
-    keep_share: Annotated[float, Field(ge=0.0, le=1.0), Affects.LATENTS | Affects.RUN] = 0.0
-    """Share of the idle windows that are kept: a world model should see stillness too."""
     velocity_change_rad_s: Positive = 1e-3
     """For commands: a step is idle if no commanded joint velocity changes by this much."""
     translation_m: Positive = 1e-3

@@ -17,7 +17,7 @@ from typing import Any
 import torch
 
 from vjepa2_ac.config import Config, DecoderConfig
-from vjepa2_ac.data.clips.permutation import permuted
+from vjepa2_ac.data.windows import permuted
 from vjepa2_ac.decoding.decoder_folder import CARD, DecoderCard, save_decoder
 from vjepa2_ac.decoding.frame_pairs import FramePairs, Pairs
 from vjepa2_ac.decoding.held_out import mean_image, measure_decoders

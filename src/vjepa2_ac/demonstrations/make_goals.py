@@ -16,8 +16,8 @@ from torch import Tensor
 
 from vjepa2_ac import __version__
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
-from vjepa2_ac.data.clips.windows import spread_with_ends
+from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.windows import spread_with_ends
 from vjepa2_ac.demonstrations.key_frames import (
     KeyFrame,
     StillRule,

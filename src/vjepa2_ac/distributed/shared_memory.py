@@ -8,8 +8,8 @@ import shutil
 from accelerate import Accelerator
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.data.clips.dataset import Dataset
-from vjepa2_ac.data.clips.loader import CLIPS_WORTH_WORKERS, validation_batches
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.loader import CLIPS_WORTH_WORKERS, validation_batches
 from vjepa2_ac.distributed.collectives import all_gather_object
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.reporter import Reporter

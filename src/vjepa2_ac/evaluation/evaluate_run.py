@@ -13,11 +13,10 @@ from jaxtyping import UInt8
 
 from vjepa2_ac import __version__
 from vjepa2_ac.config import Config, PlanningConfig
-from vjepa2_ac.data.clips.clip_reader import frames_of
-from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
-from vjepa2_ac.data.clips.loader import batches_of, validation_windows
-from vjepa2_ac.data.clips.streams import copies_for
-from vjepa2_ac.data.clips.transforms import frames_as_seen
+from vjepa2_ac.data.clips import frames_of
+from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.loader import batches_of, validation_windows
+from vjepa2_ac.data.transforms import frames_as_seen
 from vjepa2_ac.decoding.decoder_folder import load_decoder
 from vjepa2_ac.distributed.launch import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch
@@ -93,7 +92,7 @@ def measure_subject(
         sample, progress = ClipSample(asked.split, asked.clips), reporter.task("calibrating strides")
         calibration = calibrate_model(world_model, dataset, config, accelerator, sample, progress).as_dict()
     encode = partial(encode_batch, world_model, device=accelerator.device, chunk=config.model.encode_chunk)
-    read = partial(batches_of, batch_size=config.validation.batch_size, copies=copies_for(accelerator.device))
+    read = partial(batches_of, batch_size=config.validation.batch_size)
     clips = _clips(through_cache, chosen, read, encode, world_model.image_size)
     with accelerator.autocast():
         evaluation = evaluate(

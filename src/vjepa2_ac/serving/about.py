@@ -11,7 +11,7 @@ import numpy as np
 
 from vjepa2_ac import __version__
 from vjepa2_ac.config import Config
-from vjepa2_ac.data.clips.windows import require_stride
+from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.image_file import read_image
 from vjepa2_ac.planning.controller import Controller

@@ -19,9 +19,9 @@ from jaxtyping import Float
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.planning import LimitsConfig
-from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
-from vjepa2_ac.data.clips.loader import batches_of, validation_windows
-from vjepa2_ac.data.clips.transforms import frames_as_seen, view
+from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.loader import batches_of, validation_windows
+from vjepa2_ac.data.transforms import frames_as_seen, view
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
 from vjepa2_ac.decoding.frame_pairs import as_images
 from vjepa2_ac.decoding.imagine import Start, imagined_latents

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from vjepa2_ac.data.clips.dataset import Dataset
-from vjepa2_ac.data.clips.transforms import Crop, crop_box
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.transforms import Crop, crop_box
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.decoded.hand import HandPositions
 from vjepa2_ac.simulation.counterfactual import RECORDED_CAMERAS, camera_of

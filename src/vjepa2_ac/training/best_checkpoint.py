@@ -10,8 +10,8 @@ from dataclasses import replace
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import flat
 from vjepa2_ac.config.section import Affects, knobs_that_affect
-from vjepa2_ac.data.clips.dataset import Dataset
-from vjepa2_ac.data.clips.loader import validation_windows
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.loader import validation_windows
 from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.checkpoint import RunState
 

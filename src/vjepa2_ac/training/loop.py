@@ -18,7 +18,7 @@ import torch
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict
-from vjepa2_ac.data.inspection.statistics import coverage_in
+from vjepa2_ac.data.coverage import coverage_in
 from vjepa2_ac.distributed.collectives import all_reduce_max, broadcast_object, require_same
 from vjepa2_ac.distributed.launch import make_accelerator
 from vjepa2_ac.distributed.preemption import StoppedError, stop_on_signals

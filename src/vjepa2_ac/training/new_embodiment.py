@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.data.clips.dataset import Dataset
+from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.checkpoints.loading import base_sizes
 from vjepa2_ac.model.network.input_heads import fit_heads, heads_to_replace, require_trained

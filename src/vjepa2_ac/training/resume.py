@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.data.clips.dataset import Dataset
+from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.index.index_cache import fingerprints_of
 from vjepa2_ac.distributed.collectives import broadcast_object, broadcast_tensors, require_same
 from vjepa2_ac.errors import InputError

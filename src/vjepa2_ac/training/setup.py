@@ -12,12 +12,11 @@ from torch import nn
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
-from vjepa2_ac.data.clips.loader import Mixed, ProcessShare, training_loader, validation_batches
-from vjepa2_ac.data.clips.prefetch import Batches
-from vjepa2_ac.data.clips.streams import Copies, copies_for
+from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.duplicates import find_duplicates
 from vjepa2_ac.data.index.index_cache import fingerprints_of
-from vjepa2_ac.data.inspection.duplicates import find_duplicates
+from vjepa2_ac.data.loader import Batches, Mixed, ProcessShare, training_loader, validation_batches
+from vjepa2_ac.data.streams import Copies, copies_for
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
 from vjepa2_ac.distributed.collectives import all_gather_object, broadcast_object
 from vjepa2_ac.distributed.device import PRECISIONS

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.distributed.tensor import DTensor
 
-from vjepa2_ac.data.clips.prefetch import prefetch_next
+from vjepa2_ac.data.loader import prefetch_next
 from vjepa2_ac.distributed.collectives import all_reduce_gradients, all_reduce_sum
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError

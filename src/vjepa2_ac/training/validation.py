@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-from vjepa2_ac.data.clips.loader import batches_of, validation_windows
-from vjepa2_ac.data.clips.windows import spread
+from vjepa2_ac.data.loader import batches_of, validation_windows
+from vjepa2_ac.data.windows import spread
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, moves_of
@@ -84,7 +84,7 @@ def validate(run: Run, reporter: TrainingReporter) -> Validation:
     config = run.config
     run.world_model.eval()
     windows = validation_windows(run.dataset, "validation", clips=config.validation.clips)
-    batches = batches_of(run.dataset, windows, batch_size=config.validation.batch_size, copies=run.copies)
+    batches = batches_of(run.dataset, windows, batch_size=config.validation.batch_size)
     moves: list[RolloutStart] = []
     with run.accelerator.autocast():
         encoded = (run.strip.seen(batch, encode(run, batch)) if run.strip else encode(run, batch) for batch in batches)

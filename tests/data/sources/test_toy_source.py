@@ -9,8 +9,8 @@ from vjepa2_ac.config import Config, DataConfig
 from vjepa2_ac.config.loading import config_as_yaml, load_config, parse_config
 from vjepa2_ac.config.replay import ReplayConfig
 from vjepa2_ac.config.section import Affects, mark_of, marks_of
-from vjepa2_ac.data.clips.dataset import open_dataset
-from vjepa2_ac.data.clips.loader import training_loader
+from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.data.loader import training_loader
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.training.loop import train
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from run_fixtures import set_up
-from vjepa2_ac.data.clips import loader
+from vjepa2_ac.data import loader
 from vjepa2_ac.episode import Batch, Clip
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.training.loop import train

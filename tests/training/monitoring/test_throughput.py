@@ -11,7 +11,7 @@ import torch
 
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.config.loading import parse_config
-from vjepa2_ac.data.clips.clip_reader import no_clips
+from vjepa2_ac.data.clips import no_clips
 from vjepa2_ac.distributed import device
 from vjepa2_ac.distributed.device import matmul_speed
 from vjepa2_ac.episode import POSE_WIDTHS, Batch

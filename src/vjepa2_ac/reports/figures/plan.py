@@ -11,7 +11,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.patches import Rectangle
 
-from vjepa2_ac.data.clips.transforms import crop_box
+from vjepa2_ac.data.transforms import crop_box
 from vjepa2_ac.decoding.imagined_plan import ImaginedPlan
 from vjepa2_ac.planning.decision import PlanResult, summarize
 from vjepa2_ac.planning.energy import EnergySlice

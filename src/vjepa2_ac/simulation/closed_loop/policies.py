@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from vjepa2_ac.config.planning import LimitsConfig
-from vjepa2_ac.data.clips.transforms import frame_of_seen
+from vjepa2_ac.data.transforms import frame_of_seen
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
 from vjepa2_ac.decoding.imagined_plan import imagined_next
 from vjepa2_ac.planning.controller import Controller

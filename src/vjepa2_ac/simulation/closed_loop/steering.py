@@ -14,7 +14,7 @@ from jaxtyping import Float, UInt8
 from vjepa2_ac import __version__
 from vjepa2_ac.config import RldsData
 from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
-from vjepa2_ac.data.clips.windows import require_stride
+from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.goal_folder import GoalFolder

@@ -15,9 +15,9 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from vjepa2_ac.data.clips.clip_reader import frames_of
-from vjepa2_ac.data.clips.dataset import Dataset
-from vjepa2_ac.data.clips.transforms import frames_as_seen
+from vjepa2_ac.data.clips import frames_of
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.transforms import frames_as_seen
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
 from vjepa2_ac.decoding.imagine import AS_RECORDED, Imagination, Imagined, Start, rolled_out, shown
 from vjepa2_ac.episode import Batch, LatentBatch

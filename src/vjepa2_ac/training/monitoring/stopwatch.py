@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from vjepa2_ac.data.clips.streams import Cuda
+from vjepa2_ac.data.streams import Cuda
 
 
 class Stopwatch:

@@ -22,7 +22,7 @@ from torch import Tensor
 from torch.distributed.tensor import DTensor
 
 from vjepa2_ac.config import Config, ModelSizes
-from vjepa2_ac.data.clips.prefetch import prefetch_next
+from vjepa2_ac.data.loader import prefetch_next
 from vjepa2_ac.distributed.device import PRECISIONS, matmul_speed
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.training.cost.flops import clip_flops
