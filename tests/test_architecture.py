@@ -52,8 +52,6 @@ ORDERS: dict[str, list[str]] = {
         "network",
         "adapter",
         "checkpoints",
-        "quantization",
-        "load lora heads",
     ],
     "evaluation": [
         "metrics axis_fit distribution video",
@@ -125,7 +123,6 @@ HOMES = {
     "rich": ["console/"],
     "simplejpeg": ["media/", "data/sources/rlds/writing/droid_writer.py"],
     "tensorflow": [],
-    "torchao": ["model/quantization.py"],
     "torchvision": [],
     "transformers": ["model/network/"],
     "websockets": ["serving/"],
