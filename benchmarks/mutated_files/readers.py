@@ -81,7 +81,7 @@ def _disk_cache() -> DiskCacheConfig:
 
 def _write_config(folder: Path) -> None:
     values = {"run_dir": "r", "data": {"path": "d", "exclude": ["a", "b"]}, "model": {"base": "b.pt"}}
-    patterns = {"adapter": {"rank_pattern": {"fc1": 3}}}
+    patterns = {"adapter": {"peft": {"rank_pattern": {"fc1": 3}}}}
     (folder / "config.yaml").write_text(config_as_yaml(parse_config(values | patterns, where="")))
 
 
@@ -102,7 +102,9 @@ def _base() -> WorldModel:
 
 def _write_adapter(folder: Path) -> None:
     model = WorldModel.random(SIZES, seed=0)
-    add_adapter(model, AdapterConfig(rank=2, rank_pattern={"fc1": 3}, modules_to_save=("state_encoder",)), seed=0)
+    add_adapter(
+        model, AdapterConfig(rank=2, modules_to_save=("state_encoder",), peft={"rank_pattern": {"fc1": 3}}), seed=0
+    )
     save_trained(model, folder)
 
 

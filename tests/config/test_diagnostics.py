@@ -118,7 +118,7 @@ def test_a_config_that_is_right_is_read() -> None:
         ("adapter.targets=q", "adapter.targets: Input should be a list (found 'q')"),
         ("training.betas=[0.5]", "training.betas: List should have at least 2 items"),
         ("training.betas=[0.1, 0.2, 0.3]", "training.betas: List should have at most 2 items, not 3"),
-        ("adapter.rank_pattern=3", "adapter.rank_pattern: Input should be a mapping of keys to values (found 3)"),
+        ("adapter.peft=3", "adapter.peft: Input should be a mapping of keys to values (found 3)"),
     ],
 )
 def test_what_is_wrong_is_said_once_without_the_inner_names_of_pydantic(wrong: str, line: str) -> None:

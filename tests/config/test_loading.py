@@ -246,14 +246,14 @@ def test_a_place_of_data_may_name_the_home_and_end_in_a_slash(monkeypatch: pytes
 
 def test_a_pattern_is_given_as_a_table(tmp_path: Path) -> None:
     path = write(tmp_path, yaml.safe_dump(MINIMAL))
-    config = load_config(path, ["adapter.rank_pattern={fc1: 32, blocks.0.attn.q: 4}", "adapter.targets=[all]"])
-    assert config.adapter.rank_pattern == {"fc1": 32, "blocks.0.attn.q": 4}
+    config = load_config(path, ["adapter.peft={rank_pattern: {fc1: 32, blocks.0.attn.q: 4}}", "adapter.targets=[all]"])
+    assert config.adapter.peft["rank_pattern"] == {"fc1": 32, "blocks.0.attn.q": 4}
     assert parse_config(yaml.safe_load(config_as_yaml(config)), where="") == config
     plain = load_config(path, ["adapter.targets=[all]"])
-    assert all(key.startswith("adapter.rank_pattern") for key in changed_keys(plain, config))
+    assert all(key.startswith("adapter.peft") for key in changed_keys(plain, config))
     assert changed_keys(plain, config)
-    with pytest.raises(InputError, match=r"adapter\.rank_pattern.*greater than or equal to 1"):
-        load_config(path, ["adapter.rank_pattern={fc1: 0}"])
+    with pytest.raises(InputError, match=r"adapter.*peft\.r is adapter\.rank here"):
+        load_config(path, ["adapter.peft={r: 4}"])
 
 
 def test_sections_that_others_are_merged_into_are_read(tmp_path: Path) -> None:

@@ -62,7 +62,7 @@ def test_a_run_that_died_and_went_on_equals_the_one_that_did_not(
 
 KINDS = {
     "dora": {"adapter__dora": True, "adapter__dropout": 0.2},
-    "pissa": {"adapter__init": "pissa"},
+    "options of PEFT": {"adapter__peft": {"rank_pattern": {"attn.(q|k)": 2}, "init_lora_weights": "gaussian"}},
     "whole predictor": {"adapter__kind": "none"},
     "8 bit": {"training__optimizer": "adamw_8bit"},
 }

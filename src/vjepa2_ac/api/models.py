@@ -12,7 +12,7 @@ from vjepa2_ac import places
 from vjepa2_ac.config import EncoderConfig, ModelConfig, ModelSizes
 from vjepa2_ac.distributed.device import has_bf16, no_cuda, require_type_of_weights
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.adapter.adapter_file import ADAPTER_FILE
+from vjepa2_ac.model.adapter.adapter_folder import ADAPTER_FILE
 from vjepa2_ac.model.adapter.lora import load_trained
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel

@@ -14,7 +14,7 @@ from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.episode import POSE_WIDTHS
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.export.model_card import model_card
-from vjepa2_ac.model.adapter.adapter_file import ADAPTER_FILE
+from vjepa2_ac.model.adapter.adapter_folder import ADAPTER_FILE
 from vjepa2_ac.model.adapter.merging import merge_adapter
 from vjepa2_ac.model.checkpoints.official import to_official
 from vjepa2_ac.model.finite import require_finite

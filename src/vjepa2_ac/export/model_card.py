@@ -124,8 +124,7 @@ def _adapter(config: Config) -> str:
     words = [f"rank {adapter.rank}", f"alpha {adapter.alpha:g}", f"dropout {adapter.dropout:g}"]
     words.append("rsLoRA" if adapter.rslora else "plain scale")
     words += ["DoRA"] * adapter.dora
-    words += [f"started as {adapter.init}"] * (adapter.init != "default")
-    words += ["other ranks or alphas for some layers"] * bool(adapter.rank_pattern or adapter.alpha_pattern)
+    words += [f"`{name}: {value}`" for name, value in adapter.peft.items()]
     words += [f"`{name}` trained whole" for name in adapter.modules_to_save]
     return ", ".join(words)
 

@@ -10,7 +10,7 @@ from peft.tuners.lora import Linear
 from torch import Tensor, nn
 
 from tracing import tracing
-from vjepa2_ac.model.adapter.lora_linear import LoraLinear
+from vjepa2_ac.model.adapter.lora import LoraLinear
 from vjepa2_ac.model.adapter.low_rank import _LowRankLinear
 
 PLAIN = {"r": 3, "lora_alpha": 5, "use_rslora": True}

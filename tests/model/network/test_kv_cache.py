@@ -16,7 +16,6 @@ LORA = AdapterConfig(rank=4, alpha=8.0, dropout=0.0)
 ADAPTERS = {
     "lora": LORA,
     "dora": LORA.model_copy(update={"dora": True}),
-    "pissa": LORA.model_copy(update={"init": "pissa"}),
     "none": AdapterConfig(kind="none"),
 }
 PARTS = [(1, 1, 1, 1), (2, 2), (3, 1), (1, 3)]

@@ -64,10 +64,7 @@ def test_the_peak_is_that_of_training_or_of_validation() -> None:
 
 def test_other_trained_layers_are_counted() -> None:
     plain = estimate_memory(run_config(), ModelSizes())
-    dora, pissa = (
-        estimate_memory(run_config({**LORA, **how}), ModelSizes()) for how in ({"dora": True}, {"init": "pissa"})
-    )
-    assert pissa == plain  # what PiSSA started from stays on the CPU
+    dora = estimate_memory(run_config({**LORA, "dora": True}), ModelSizes())
     assert dora.trained > plain.trained
     assert dora.step.stored.peak > plain.step.stored.peak
 

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import torch
 
-from vjepa2_ac.model.adapter.initialization import set_original_weights
-from vjepa2_ac.model.adapter.lora import adaptation_of, lora_layers
-from vjepa2_ac.model.network.world_model import Adaptation, WorldModel
+from vjepa2_ac.model.adapter.lora import adaptation_of
+from vjepa2_ac.model.network.world_model import WorldModel
 
 
 @contextmanager
@@ -24,9 +23,10 @@ def base_only(model: WorldModel) -> Iterator[None]:
         yield
         return
     trained = [(value, value.requires_grad) for value in model.predictor.parameters()]
-    switch = _lora_off if model.adaptation.kind == "lora" else _start_weights
+    predictor: Any = model.predictor
+    start = model.adaptation.start
     try:
-        with switch(model, model.adaptation):
+        with predictor.disable_adapter() if start is None else _weights(predictor, start):
             yield
     finally:
         for value, requires_grad in trained:  # PEFT enables gradients when it enables an adapter
@@ -73,23 +73,10 @@ def unadapted_copy(model: WorldModel) -> WorldModel:
 
 
 @contextmanager
-def _lora_off(model: WorldModel, adaptation: Adaptation) -> Iterator[None]:
-    predictor: Any = model.predictor
-    layers = lora_layers(model) if adaptation.start else {}  # PiSSA's: their own weights are not the base's
-    now = {name: layer.get_base_layer().weight.detach().clone() for name, layer in layers.items()}
-    set_original_weights(layers, adaptation.start or {})
-    try:
-        with predictor.disable_adapter():
-            yield
-    finally:
-        set_original_weights(layers, now)
-
-
-@contextmanager
-def _start_weights(model: WorldModel, adaptation: Adaptation) -> Iterator[None]:
-    now = {name: value.detach().clone() for name, value in model.predictor.state_dict().items()}
-    model.predictor.load_state_dict(adaptation.start or {})
+def _weights(predictor: Any, weights: Mapping[str, torch.Tensor]) -> Iterator[None]:
+    now = {name: value.detach().clone() for name, value in predictor.state_dict().items()}
+    predictor.load_state_dict(weights)
     try:
         yield
     finally:
-        model.predictor.load_state_dict(now)
+        predictor.load_state_dict(now)

@@ -35,8 +35,7 @@ class Adaptation:
     kind: Literal["lora", "none"]  # as in config.AdapterConfig; none: every weight is trained
     base: str  # fingerprint of the predictor it started from
     encoder: str  # fingerprint of the encoder whose latents it learns from
-    start: dict[str, Tensor] | None = None  # weights it started from: all (kind none), or the adapted ones (PiSSA)
-    principal: dict[str, Tensor] | None = None  # PiSSA: the matrices that were taken off those weights
+    start: dict[str, Tensor] | None = None  # kind none: the weights it started from
 
 
 @dataclass(frozen=True)
