@@ -12,8 +12,7 @@ from predictor_files import write_predictor_file
 from tiny_models import draw, tiny_model
 from vjepa2_ac.config import EncoderSizes, ModelConfig, ModelSizes, PredictorSizes
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.checkpoints.loading import load_base
-from vjepa2_ac.model.checkpoints.official import load_official
+from vjepa2_ac.model.checkpoints.loading import load_base, load_official
 from vjepa2_ac.model.network.world_model import WorldModel
 
 MODEL = tiny_model(states=False)

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from vjepa2_ac.config import ModelSizes
+from vjepa2_ac.model.base_model import read_sizes
 from vjepa2_ac.model.network.dynamics import LatentDynamics, normalise_latents
 from vjepa2_ac.model.network.encoder import Encoder
 from vjepa2_ac.model.network.encoder_origin import EncoderOrigin, beyond_tensors, described, identified
@@ -25,7 +26,6 @@ from vjepa2_ac.model.network.pretrained_folder import (
     read_encoder_origin,
     write_folder,
 )
-from vjepa2_ac.model.sizes import read_sizes
 
 
 @dataclass(frozen=True)
