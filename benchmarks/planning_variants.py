@@ -20,7 +20,7 @@ from vjepa2_ac.config import AdapterConfig, EncoderSizes, ModelSizes, PredictorS
 from vjepa2_ac.config.planning import CemConfig, EnergyConfig, PlanningConfig
 from vjepa2_ac.geometry import apply_action
 from vjepa2_ac.model.adapter.lora import add_adapter, lora_layers
-from vjepa2_ac.model.checkpoints.official import to_official
+from vjepa2_ac.model.checkpoints.loading import to_official
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.energy import Scene, WorldModelCost, distance
 from vjepa2_ac.planning.goals.goal import Goal

@@ -42,7 +42,7 @@ from vjepa2_ac.data.sources.rlds.source import RldsSource
 from vjepa2_ac.evaluation.evaluate_run import training_curves
 from vjepa2_ac.media.image_file import read_image
 from vjepa2_ac.model.adapter.lora import add_adapter, load_trained, save_trained
-from vjepa2_ac.model.checkpoints.official import load_official, to_official
+from vjepa2_ac.model.checkpoints.loading import load_official, to_official
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reports.comparison import compare
 from vjepa2_ac.reports.metrics_json import write_metrics

@@ -25,7 +25,7 @@ from vjepa2_ac.export import export
 from vjepa2_ac.export.export import CARD, OFFICIAL_NAME, Exported, export_run
 from vjepa2_ac.model.adapter.lora import load_trained
 from vjepa2_ac.model.adapter.merging import base_only
-from vjepa2_ac.model.checkpoints.official import load_official
+from vjepa2_ac.model.checkpoints.loading import load_official
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reports.metrics_json import METRICS_FILE
 from vjepa2_ac.reports.write import PLOT

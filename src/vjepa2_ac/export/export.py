@@ -16,7 +16,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.export.model_card import model_card
 from vjepa2_ac.model.adapter.adapter_folder import ADAPTER_FILE
 from vjepa2_ac.model.adapter.merging import merge_adapter
-from vjepa2_ac.model.checkpoints.official import to_official
+from vjepa2_ac.model.checkpoints.loading import to_official
 from vjepa2_ac.model.finite import require_finite
 from vjepa2_ac.model.network.input_heads import widths_of_model
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics
