@@ -30,7 +30,7 @@ from vjepa2_ac import (
     read_clips,
     train,
 )
-from vjepa2_ac.export.export import export_run
+from vjepa2_ac.export import export_run
 
 PAGE = (ROOT / "docs/python.md").read_text()
 BLOCKS = re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)
@@ -119,7 +119,7 @@ def test_a_model_is_ready_to_predict() -> None:
         ({"name": "nowhere"}, "vjepa2-ac download"),
         ({"name": ""}, "is empty"),
         ({"name": "gs://bucket/model"}, "URL"),
-        ({"name": TINY, "dtype": "float64"}, "auto, float32, bfloat16"),
+        ({"name": TINY, "dtype": "float64"}, "dtype: .*float32"),
         ({"name": TINY, "device": "gpu"}, "auto, cpu, cuda"),
         ({"name": TINY, "adapter": "nowhere"}, "nowhere"),
     ],

@@ -18,11 +18,11 @@ from torch import Tensor
 
 from paths import GOLDEN
 from run_fixtures import TINY, SilentReporter, one_thread, tiny_config
+from vjepa2_ac import export
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.export import export
-from vjepa2_ac.export.export import CARD, OFFICIAL_NAME, Exported, export_run
+from vjepa2_ac.export import CARD, OFFICIAL_NAME, Exported, export_run
 from vjepa2_ac.model.adapter.lora import load_trained
 from vjepa2_ac.model.adapter.merging import base_only
 from vjepa2_ac.model.checkpoints.loading import load_official
@@ -122,7 +122,7 @@ def test_the_official_checkpoint_has_the_names_of_metas(trained, tmp_path: Path)
     assert all(torch.equal(value, found["target_encoder"][name]) for name, value in found["encoder"].items())
 
 
-@pytest.mark.parametrize(("name", "form"), [("x.bin", "official"), ("x.safetensors", "official"), ("x.pt", "merged")])
+@pytest.mark.parametrize(("name", "form"), [("x.pt", "merged"), ("x.pt", "hub")])
 def test_a_name_of_another_kind_of_file_makes_no_folder(tmp_path: Path, name: str, form: Any) -> None:
     with pytest.raises(InputError, match=rf"{name}: the name of a \{Path(name).suffix} file"):
         export_run(tmp_path / "run", tmp_path / name, form)
@@ -162,20 +162,10 @@ def poison(path: Path) -> str:
 
 
 @pytest.mark.parametrize("form", ["merged", "official", "hub"])
-@pytest.mark.parametrize(
-    ("alpha", "reported"),
-    [
-        (float("nan"), r"adapter_config\.json: not JSON: NaN"),
-        (float("inf"), r"adapter_config\.json: not JSON: Infinity"),
-        (1e300, "lora_alpha: .*less than or equal"),
-    ],
-)
-def test_an_adapter_that_spoils_its_base_is_refused_and_leaves_nothing(
-    copied, tmp_path: Path, form: Any, alpha: float, reported: str
-) -> None:
+def test_an_adapter_that_spoils_its_base_is_refused_and_leaves_nothing(copied, tmp_path: Path, form: Any) -> None:
     run = copied()
-    rewrite_adapter(run, lora_alpha=alpha)
-    with pytest.raises(InputError, match=reported):
+    rewrite_adapter(run, lora_alpha=1e300)
+    with pytest.raises(InputError, match=r"lora_alpha: .*less than or equal"):
         export_run(run, tmp_path / "out", form)
     assert not (tmp_path / "out").exists()
 
@@ -246,8 +236,9 @@ def test_the_card_describes_unusual_adapter_settings(trained, tmp_path: Path, da
         trained(adapter__peft={"rank_pattern": {"fc1": 2}}, adapter__dora=True, **given), tmp_path / "hub", "hub"
     )
     card = (tmp_path / "hub" / CARD).read_text()
-    assert "rsLoRA, DoRA, `rank_pattern: {'fc1': 2}`, `action_encoder` trained whole" in card
-    assert "loss: l2, teacher forcing + 2 x rollout of 2 steps" in card
+    assert "rsLoRA, DoRA, `rank_pattern: {'fc1': 2}`\n" in card
+    assert "trained whole: `action_encoder`\n" in card
+    assert "loss: l2, 1 x teacher forcing + 2 x rollout of 2 steps" in card
     assert f"replay: 50% of the training clips from rlds, `{data_folder}`" in card
     assert "warm-up: 1 step\n" in card
 
@@ -338,7 +329,7 @@ def weights_of(run: Path, step: int) -> dict[str, Tensor]:
     return load_file(run / "checkpoints" / checkpoint_name(step) / "adapter" / "adapter_model.safetensors")
 
 
-@pytest.mark.parametrize("content", ["{", "[]", "{}", '{"format": 3}', '{"format": 1, "verdict": 3}'])
+@pytest.mark.parametrize("content", ["{", '{"format": 1, "verdict": 3}'])
 def test_a_damaged_evaluation_is_named_and_nothing_is_written(copied, tmp_path: Path, content: str) -> None:
     run = copied()
     (run / METRICS_FILE).write_text(content)

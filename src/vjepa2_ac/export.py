@@ -1,27 +1,30 @@
-"""Export of a trained run: as one merged model, as Meta's checkpoint, or as an adapter for the Hub."""
+"""Export of a trained run: as one merged model, as Meta's checkpoint, or as an adapter with its card for the Hub."""
 
 from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, Literal
 
-from jinja2 import TemplateError
+from huggingface_hub import EvalResult, ModelCardData
+from jinja2 import Environment, PackageLoader, StrictUndefined, TemplateError, select_autoescape
 
-from vjepa2_ac.config import Config, ModelSizes
-from vjepa2_ac.episode import POSE_WIDTHS
+from vjepa2_ac import __version__
+from vjepa2_ac.config import Config
+from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.export.model_card import model_card
 from vjepa2_ac.model.adapter.adapter_folder import ADAPTER_FILE
+from vjepa2_ac.model.adapter.lora import adapted_report
 from vjepa2_ac.model.adapter.merging import merge_adapter
 from vjepa2_ac.model.checkpoints.loading import to_official
 from vjepa2_ac.model.finite import require_finite
-from vjepa2_ac.model.network.input_heads import widths_of_model
+from vjepa2_ac.model.network.input_heads import widths_as_text, widths_of_model
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics
 from vjepa2_ac.reports.write import PLOT
-from vjepa2_ac.runs.checkpoint import ADAPTER
+from vjepa2_ac.runs.checkpoint import ADAPTER, read_state
 from vjepa2_ac.runs.checkpoint_selection import SELECTED
 from vjepa2_ac.runs.folder import read_run_config
 from vjepa2_ac.runs.loading import TrainedRun, load_run
@@ -29,10 +32,10 @@ from vjepa2_ac.runs.torch_file import write_torch
 from vjepa2_ac.storage import atomic_writer, folder_writer, is_empty, try_writing_at, user_can_write, write_atomically
 
 Form = Literal["merged", "official", "hub"]
+Metrics = Mapping[str, Any]
 
 OFFICIAL_NAME = "vjepa2-ac.pt"  # in a folder; a destination that ends in .pt is the file itself
 CARD = "README.md"
-_FILES = frozenset({".bin", ".ckpt", ".h5", ".onnx", ".pt", ".pth", ".safetensors"})  # not names of folders
 
 
 @dataclass(frozen=True)
@@ -56,21 +59,26 @@ def export_run(folder: Path, destination: Path, form: Form = "merged", checkpoin
         checkpoint: selected (the best, else the newest), newest, best, or a number of optimizer steps.
 
     Raises:
-        InputError: As `load_run`; the destination is occupied or cannot be written; official: the model is of another
-            width than Meta's code, or without states; hub: the run has no adapter, or its `metrics.json` is damaged; or
-            a weight of the merged model is not finite, whatever the form.
+        InputError: As `load_run`; the destination is occupied or cannot be written; official: Meta's code has no such
+            model; hub: the run has no adapter, or its `metrics.json` is damaged; or a weight of the merged model is not
+            finite, whatever the form.
     """
     _check_free(destination, form)
-    config = read_run_config(folder)
-    if form == "hub":
-        _check_adapter(folder, config)
-        evaluation = _read_evaluation(folder)
-        run = load_run(folder, checkpoint)
-        _write_hub(run, folder, destination, evaluation)
-        return Exported(destination, run.chosen)
+    kind = read_run_config(folder).adapter.kind
+    if form == "hub" and kind != "lora":
+        raise InputError(
+            where=str(folder),
+            found=f"a run without an adapter (adapter.kind: {kind})",
+            needed="one with adapter.kind: lora, for --to hub",
+            fix="Export the whole model with --to merged or --to official",
+        )
+    metrics = read_metrics(folder) if form == "hub" and (folder / METRICS_FILE).exists() else None
     run = load_run(folder, checkpoint)
-    if form == "official":
-        _check_predictor(folder, run.world_model.sizes)
+    if form == "hub":
+        card = _card(run, folder, metrics)
+        _merge(run)  # the merged model is not written, but an adapter that makes it not finite is of no use
+        _write_hub(run, folder, destination, card, metrics)
+        return Exported(destination, run.chosen)
     _merge(run)
     if form == "merged":
         run.world_model.save_pretrained(destination)
@@ -93,79 +101,114 @@ def _merge(run: TrainedRun) -> None:
 
 def _check_free(destination: Path, form: Form) -> None:
     """Check that a destination is free and can be written. Changes nothing."""
-    is_own = form == "official" and destination.suffix == ".pt"
-    if destination.suffix in _FILES and not is_own and not destination.is_dir():
-        file = f"a file that ends in .pt, or a folder for {OFFICIAL_NAME}"
-        needed = file if form == "official" else f"a folder, for --to {form}"
-        raise InputError(where=str(destination), found=f"the name of a {destination.suffix} file", needed=needed)
+    if destination.suffix == ".pt" and form != "official" and not destination.is_dir():
+        found = "the name of a .pt file"
+        raise InputError(where=str(destination), found=found, needed=f"a folder, for --to {form}")
     with user_can_write(destination):
         if destination.exists() and not (destination.is_dir() and is_empty(destination)):
             raise InputError(where=str(destination), found="something is there already", needed="a new or empty folder")
         try_writing_at(destination)
 
 
-def _check_adapter(folder: Path, config: Config) -> None:
-    if config.adapter.kind != "lora":
-        raise InputError(
-            where=str(folder),
-            found=f"a run without an adapter (adapter.kind: {config.adapter.kind})",
-            needed="one with adapter.kind: lora, for --to hub",
-            fix="Export the whole model with --to merged or --to official",
-        )
-
-
-def _check_predictor(folder: Path, sizes: ModelSizes) -> None:
-    """Check that Meta's code has such a predictor."""
-    fix, widths = "Export it with --to merged, which `model.base` takes", widths_of_model(sizes)
-    if not sizes.predictor.use_states:
-        raise InputError(
-            where=str(folder),
-            found="a predictor without states (predictor.use_states: false)",
-            needed="one with states: Meta's code has no other, and would miss the weights of its state encoder",
-            fix=fix,
-        )
-    if widths != POSE_WIDTHS:
-        raise InputError(
-            where=str(folder),
-            found=f"a model of states of {widths.state} and actions of {widths.action} numbers",
-            needed="7 and 7: Meta's code has one width for both, and makes that of the camera's pose one less",
-            fix=fix,
-        )
-
-
-def _write_hub(run: TrainedRun, folder: Path, destination: Path, evaluation: dict[str, Any] | None) -> None:
+def _write_hub(run: TrainedRun, folder: Path, destination: Path, card: str, metrics: Metrics | None) -> None:
     """Copy the adapter of a checkpoint, which load_run has verified, and put the card beside it."""
-    plot = folder / PLOT if evaluation is not None and (folder / PLOT).is_file() else None
-    adapter = run.checkpoint / ADAPTER
-    try:
-        card = model_card(run, folder.resolve().name, evaluation, plot.name if plot else None)
-    except (KeyError, TypeError, ValueError, AttributeError, TemplateError) as error:
-        raise _damaged(folder, error) from None
-    _merge(run)  # the merged model is not written, but an adapter that makes it not finite is of no use
     with folder_writer(destination, ADAPTER_FILE) as fresh:
-        for path in (*sorted(adapter.iterdir()), *([plot] if plot else [])):
+        for path in (run.checkpoint / ADAPTER).iterdir():
             shutil.copyfile(path, fresh / path.name)
-        if evaluation is not None:
-            write_atomically(fresh / METRICS_FILE, json.dumps(evaluation, indent=1))
+        if metrics is not None:
+            if (folder / PLOT).is_file():
+                shutil.copyfile(folder / PLOT, fresh / PLOT)
+            here = {
+                "subject": folder.resolve().name,
+                "checkpoint_path": PurePath(metrics["about"]["checkpoint_path"]).name,
+            }
+            told = {**metrics, "about": {**metrics["about"], **here}}  # without paths of this machine
+            write_atomically(fresh / METRICS_FILE, json.dumps(told, indent=1))
         write_atomically(fresh / CARD, card)
 
 
-def _read_evaluation(folder: Path) -> dict[str, Any] | None:
-    """Return the result of `evaluate` for a run, without paths of this machine; None if there is none."""
-    if not (folder / METRICS_FILE).exists():
-        return None
-    metrics = read_metrics(folder)
-    try:
-        about = {**metrics["about"], "subject": folder.resolve().name}
-        return {**metrics, "about": {**about, "checkpoint_path": Path(about["checkpoint_path"]).name}}
-    except (TypeError, KeyError) as error:
-        raise _damaged(folder, error) from None
-
-
-def _damaged(folder: Path, error: Exception) -> InputError:
-    return InputError(
-        where=str(folder / METRICS_FILE),
-        found=f"metrics that cannot be used ({error!r})",
-        needed="what `vjepa2-ac evaluate` writes",
-        fix=f"Write it again with `vjepa2-ac evaluate {folder}`, or delete it",
+def _card(run: TrainedRun, folder: Path, metrics: Metrics | None) -> str:
+    """Return the README.md of an adapter, in Markdown, with the Hub's front matter."""
+    config, model, name = run.config, run.world_model, folder.resolve().name
+    environment = Environment(  # Markdown is not escaped
+        loader=PackageLoader("vjepa2_ac", "assets"),
+        undefined=StrictUndefined,
+        autoescape=select_autoescape(),
+        trim_blocks=True,
+        keep_trailing_newline=True,
     )
+    environment.filters |= {"code": lambda name: f"`{name}`", "count": _count, "ratio": _ratio}
+    try:
+        measured = None if metrics is None else PurePath(metrics["about"]["checkpoint_path"]).name
+        front = ModelCardData(
+            library_name="peft",
+            pipeline_tag="robotics",
+            tags=["v-jepa-2-ac", "world-model", "lora"],
+            model_name=name,
+            eval_results=_eval_results(config, metrics) if metrics and measured == run.checkpoint.name else None,
+        )
+        return environment.get_template("model_card.md.jinja").render(
+            **dict(config),
+            run=run,
+            name=name,
+            evaluation=metrics,
+            measured=measured,
+            plot=PLOT if metrics is not None and (folder / PLOT).is_file() else None,
+            base=model.adaptation,
+            heads=None if model.fresh_heads is None else widths_of_model(model.sizes),
+            takes=widths_as_text(model.sizes),
+            steps=read_state(run.checkpoint).step,
+            trained=adapted_report(model),
+            version=__version__,
+            front=str(front.to_yaml()),
+            base_arguments=_base_arguments(config),
+            every_setting=config_as_yaml(config.model_copy(update={"run_dir": name})),
+        )
+    except (KeyError, TypeError, AttributeError, TemplateError) as error:
+        raise InputError(
+            where=str(folder / METRICS_FILE),
+            found=f"metrics that cannot be used ({error!r})",
+            needed="what `vjepa2-ac evaluate` writes",
+            fix=f"Write it again with `vjepa2-ac evaluate {folder}`, or delete it",
+        ) from None
+
+
+def _eval_results(config: Config, metrics: Metrics) -> list[EvalResult]:
+    """Return the rollout errors over persistence by horizon, as the Hub shows them."""
+    about, models = metrics["about"], metrics["models"]
+    ratios = models[list(models)[-1]]["rollout"]["l1"]["over_persistence"]  # what was measured comes last
+    return [
+        EvalResult(
+            task_type="robotics",
+            task_name="prediction of latents",
+            dataset_type=config.data.source,
+            dataset_name=PurePath(config.data.path).name,
+            dataset_split=about["split"],
+            metric_type="l1_over_persistence",
+            metric_name=f"L1 error over persistence, {step * about['seconds_per_step']:.2f} s ahead",
+            metric_value=round(ratio["value"], 4),
+        )
+        for step, ratio in enumerate(ratios, start=1)
+        if ratio["value"] is not None
+    ]
+
+
+def _base_arguments(config: Config) -> str:
+    """Return the arguments with which `load_model` gives the base, as Python source."""
+    words = [repr(config.model.base), f"dtype={config.model.dtype!r}"]
+    for name, part in (("sizes", config.model.sizes), ("encoder", config.model.encoder)):
+        told = {} if part is None else part.model_dump(mode="json", exclude_defaults=True)
+        if told.keys() == {"path"}:
+            words.append(f"{name}={told['path']!r}")
+        elif told:
+            words.append(f"{name}={type(part).__name__}.model_validate({told!r})")
+    return ", ".join(words)
+
+
+def _ratio(ratio: Metrics) -> str:
+    interval = "" if ratio["low"] is None else f" [{ratio['low']:.3f}, {ratio['high']:.3f}]"
+    return f"{ratio['value']:.3f}{interval}"
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number:,} {what}{'s' * (number != 1)}"

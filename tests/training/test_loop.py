@@ -21,7 +21,7 @@ from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.episode import Clip
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.request import EvaluationOptions, settle
-from vjepa2_ac.export.export import export_run
+from vjepa2_ac.export import export_run
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.planning.settings import planning_settings
 from vjepa2_ac.runs.checkpoint import CheckpointClock, checkpoint_name, newest_checkpoint, read_state

@@ -214,5 +214,5 @@ def test_sizes_that_were_given_must_be_those_of_the_model(tmp_path: Path) -> Non
 
 
 def test_meta_has_no_name_for_other_widths() -> None:
-    with pytest.raises(ValueError, match="Meta's code takes"):
+    with pytest.raises(InputError, match="Meta's code has no other"):
         to_official(fitted(Widths(14, 14)))

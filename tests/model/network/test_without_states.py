@@ -175,5 +175,5 @@ def test_sizes_with_a_width_of_states_that_are_not_used_are_refused() -> None:
 
 
 def test_meta_has_no_such_predictor() -> None:
-    with pytest.raises(ValueError, match="no predictor without states"):
+    with pytest.raises(InputError, match="a predictor without states"):
         to_official(tiny_model(states=False))

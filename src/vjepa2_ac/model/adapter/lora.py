@@ -184,6 +184,12 @@ def trainable_report(model: WorldModel) -> TrainableReport:
     return TrainableReport(sum(p.numel() for p in model.parameters() if p.requires_grad), own, own + encoder)
 
 
+def adapted_report(model: WorldModel) -> TrainableReport:
+    """Return the report of a model with an adapter as it was when it was trained, also if it is frozen now."""
+    trained = (value.numel() for name, value in model.predictor.named_parameters() if _is_trained(name))
+    return trainable_report(model)._replace(trained=sum(trained))
+
+
 def save_trained(model: WorldModel, folder: str | Path, weights: dict[str, Tensor] | None = None) -> None:
     """Write the trained weights: an adapter in PEFT's format, or the whole predictor; and the base's identity.
 

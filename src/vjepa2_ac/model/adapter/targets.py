@@ -37,15 +37,11 @@ def lora_arguments(predictor: PredictorNetwork, config: AdapterConfig) -> dict[s
 
 
 def adapter_ranks(predictor: PredictorNetwork, config: AdapterConfig) -> dict[str, int]:
-    """Return the rank of each layer that gets an adapter, by name.
+    """Return the rank of each layer that gets an adapter, by name; with `adapter.peft` use `lora.ranks_by_peft`.
 
     Raises:
         InputError: As of `lora_arguments`.
     """
-    if config.peft:  # PEFT itself says what its options do, which takes seconds to import
-        from vjepa2_ac.model.adapter.lora import ranks_by_peft
-
-        return ranks_by_peft(predictor, config)
     targets = lora_arguments(predictor, config)["target_modules"]
     return {name: config.rank for name in _linear(predictor) if {name, _last(name)} & set(targets)}
 

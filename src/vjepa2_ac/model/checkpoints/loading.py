@@ -39,7 +39,7 @@ from vjepa2_ac.model.checkpoints.meta_file import (
 )
 from vjepa2_ac.model.network.blocks import mlp_ratio_of
 from vjepa2_ac.model.network.encoder_origin import HEADS
-from vjepa2_ac.model.network.input_heads import widths_of_model
+from vjepa2_ac.model.network.input_heads import widths_as_text, widths_of_model
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.places import BUILTIN
 
@@ -126,15 +126,20 @@ def to_official(model: WorldModel) -> dict[str, Any]:
     """Return the weights by Meta's names, q, k and v fused: `torch.save` of it is an official checkpoint.
 
     Raises:
-        ValueError: There is an adapter: merge it first. Or states and actions differ in width from Meta's code, which
-            has no predictor without states either.
+        InputError: States and actions differ in width from Meta's code, which has no predictor without states either.
+        ValueError: There is an adapter: merge it first.
     """
     if model.predictor is not model.base_predictor:
         raise ValueError("an adapter is on: merge_adapter first")
-    if not model.sizes.predictor.use_states:
-        raise ValueError("Meta's code has no predictor without states: save_pretrained writes it")
-    if widths_of_model(model.sizes) != POSE_WIDTHS:
-        raise ValueError(f"Meta's code takes {POSE_WIDTHS}, not {widths_of_model(model.sizes)}")
+    if not model.sizes.predictor.use_states or widths_of_model(model.sizes) != POSE_WIDTHS:
+        raise InputError(
+            where="the official format",
+            found=f"a model that takes {widths_as_text(model.sizes)}"
+            if model.sizes.predictor.use_states
+            else "a predictor without states",
+            needed=f"states and actions of {POSE_WIDTHS.state} numbers: Meta's code has no other predictor",
+            fix="Export it with --to merged (WorldModel.save_pretrained), which `model.base` takes",
+        )
     encoder = to_official_names(model.present_encoder.state_dict(), part_of(model.sizes.encoder.family))
     return {
         "encoder": encoder,
