@@ -47,8 +47,7 @@ ORDERS: dict[str, list[str]] = {
         "about server",
     ],
     "model": [
-        "finite sizes quiet_imports",
-        "base_model",
+        "base_model quiet_imports",
         "network",
         "adapter",
         "checkpoints",

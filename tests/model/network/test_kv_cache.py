@@ -9,7 +9,7 @@ from torch import Tensor
 
 from vjepa2_ac.config import AdapterConfig, ModelSizes
 from vjepa2_ac.model.adapter.lora import add_adapter
-from vjepa2_ac.model.network.kv_cache import KeyValueCache
+from vjepa2_ac.model.network.predictor_network import KeyValueCache
 from vjepa2_ac.model.network.world_model import WorldModel
 
 LORA = AdapterConfig(rank=4, alpha=8.0, dropout=0.0)

@@ -30,8 +30,8 @@ FULL_WEIGHTS = "predictor.safetensors"
 _NEEDED = "a LoRA adapter of V-JEPA 2-AC's predictor, as this program writes it in PEFT's format"
 _FIX = "Copy the adapter again, or train it again: other kinds of PEFT's are not read"
 _INFORMATIONAL = frozenset({  # origin and purpose
-    "auto_mapping", "base_model_name_or_path", "inference_mode", "megatron_core", "peft_version", "revision",
-    "task_type",
+    "auto_mapping", "base_model_name_or_path", "inference_mode", "megatron_core", "peft_type", "peft_version",
+    "revision", "task_type",
 })  # fmt: skip
 _LITERAL = re.compile(r"[\w.]+")  # names of layers, which as regular expressions cannot take long
 _MOST_RANK, _MOST_ALPHA = 1024, 1e6
@@ -116,32 +116,25 @@ def adapter_of(values: Mapping[str, Any], defaults: Mapping[str, Any], *, where:
     Raises:
         InputError: An option is none that can be read.
     """
-    knobs = {ours: values[peft] for peft, ours in PEFT_NAMES.items() if values.get(peft) is not None}
-    options = {
-        name: value
-        for name, value in values.items()
-        if name not in PEFT_NAMES and name not in _INFORMATIONAL
-        and value is not None and value is not False and value not in ([], {})
-        and (name not in defaults or value != defaults[name] or name == "peft_type")
-    }  # fmt: skip
-    if options.pop("peft_type", None) != "LORA":
+    if values.get("peft_type") != "LORA":
         raise _refused(where, f"an adapter with peft_type {shown(values.get('peft_type'))}", "peft_type LORA")
+    knobs = {ours: values[peft] for peft, ours in PEFT_NAMES.items() if values.get(peft) is not None}
     missing = {"rank", "alpha", "targets"} - knobs.keys()
     if missing:
         raise _refused(where, f"no {' and no '.join(sorted(missing))}")
+    options = {
+        name: value
+        for name, value in values.items()
+        if name not in PEFT_NAMES and name not in _INFORMATIONAL and not _is_off(value, defaults.get(name))
+    }
     for name, value in options.items():
-        _require_plain(name, value, known=name in defaults, where=where)
+        if not _can_be_read(name, value, known=name in defaults):
+            raise _refused(where, f"an adapter with {shown(name)} {shown(value)}, which is not read here")
     try:
         given = {"kind": "lora", "rslora": False, **knobs, "peft": options}  # not rsLoRA: PEFT's default
         return AdapterConfig.model_validate_json(json.dumps(given))
     except ValidationError as error:
-        ours = {one: peft for peft, one in PEFT_NAMES.items()}
-        problems = [
-            ".".join(map(str, (*(ours.get(part, part) for part in one["loc"][:1]), *one["loc"][1:])))
-            + f": {message_of(one)}"
-            for one in error.errors()[:4]
-        ]
-        raise _refused(where, "; ".join(problems)) from None
+        raise _refused(where, "; ".join(map(_problem, error.errors()[:4]))) from None
 
 
 def read_weights(path: Path, like: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -162,17 +155,24 @@ def _object_in(path: Path, needed: str) -> dict[str, Any]:
         raise InputError(where=str(path), found=found, needed=needed) from None
 
 
-def _require_plain(name: str, value: object, *, known: bool, where: str) -> None:
-    """Refuse an option that cannot be read back: anything but numbers, switches, and patterns of whole names."""
-    is_pattern = name in {"rank_pattern", "alpha_pattern"} and isinstance(value, dict)
-    if is_pattern and all(_LITERAL.fullmatch(key) for key in value):
-        most = _MOST_RANK if name == "rank_pattern" else _MOST_ALPHA
-        kinds = (int,) if name == "rank_pattern" else (int, float)
-        if all(type(one) in kinds and 0 < one <= most for one in value.values()):
-            return
-    is_start = name == "init_lora_weights" and isinstance(value, str)  # a knob says which of them are read
-    if not known or not (is_start or isinstance(value, bool | int | float)):
-        raise _refused(where, f"an adapter with {shown(name)} {shown(value)}, which is not read here")
+def _is_off(value: object, default: object) -> bool:
+    return value is None or value is False or value in ([], {}) or value == default
+
+
+def _can_be_read(name: str, value: object, *, known: bool) -> bool:
+    """Return whether an option is a number, a switch, a start (a knob says which), or a pattern of whole names."""
+    if name in {"rank_pattern", "alpha_pattern"}:
+        kinds, most = ((int,), _MOST_RANK) if name == "rank_pattern" else ((int, float), _MOST_ALPHA)
+        return isinstance(value, dict) and all(
+            _LITERAL.fullmatch(key) and type(one) in kinds and 0 < one <= most for key, one in value.items()
+        )
+    return known and (name == "init_lora_weights" or isinstance(value, bool | int | float))
+
+
+def _problem(detail: Any) -> str:
+    first, *rest = map(str, detail["loc"] or ("peft",))
+    peft = next((peft for peft, ours in PEFT_NAMES.items() if ours == first), first)
+    return f"{'.'.join([peft, *rest])}: {message_of(detail)}"
 
 
 def _refused(where: str, found: str, needed: str = _NEEDED) -> InputError:

@@ -334,9 +334,7 @@ def _lora_config(model: WorldModel) -> Any:
 
 def _written(model: WorldModel, *, where: str) -> AdapterConfig:
     """Return the knobs that a model's adapter is read with after it was written."""
-    config = _lora_config(model)
-    values = config.to_dict() | {"peft_type": str(config.peft_type.value), "target_modules": config.target_modules}
-    return adapter_of(values, LoraConfig().to_dict(), where=where)
+    return adapter_of(_lora_config(model).to_dict(), LoraConfig().to_dict(), where=where)
 
 
 def _set_trainable(model: WorldModel, trainable: bool) -> None:

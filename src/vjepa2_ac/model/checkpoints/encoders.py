@@ -307,10 +307,10 @@ def _weight_files(folder: Path) -> list[Path]:
     if not (folder / INDEX).is_file():
         return [folder / WEIGHTS]
     listed = read_json_object(folder / INDEX, needed=_NEEDED, fix=_FIX).get("weight_map")
-    names = list(listed.values()) if isinstance(listed, dict) else [None]
-    if not all(isinstance(one, str) and Path(one).name == one for one in names):
+    names = dict.fromkeys(map(str, listed.values())) if isinstance(listed, dict) else {}
+    if not names or not all(Path(one).name == one for one in names):
         raise InputError(where=str(folder / INDEX), found="no list of files beside it", needed=_NEEDED, fix=_FIX)
-    return [folder / one for one in dict.fromkeys(names)]
+    return [folder / one for one in names]
 
 
 def _mapped(files: list[Path]) -> dict[str, Tensor]:

@@ -12,8 +12,7 @@ from torch import Tensor, nn
 
 from vjepa2_ac.config.model import Family
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.finite import require_finite
-from vjepa2_ac.model.network.pretrained_folder import check_tensors
+from vjepa2_ac.model.network.pretrained_folder import check_tensors, require_finite
 
 ENCODER_KEYS = ("ema_encoder", "target_encoder", "encoder")
 """Where an encoder can be in a file. The first that is there is taken: an average of weights, which Meta's own use is

@@ -60,7 +60,7 @@ class WorldModel(LatentDynamics):
     Latents and predictions are layer-normalised over `dim` without affine, and float32 whatever the weights' type:
     inputs are cast inside. `model.adapter.lora.add_adapter` selects the trained weights; before that there are none.
 
-    Create one with `random`, `from_pretrained` or `model.checkpoints.official.load_official`.
+    Create one with `random`, `from_pretrained` or `model.checkpoints.loading.load_official`.
     """
 
     def __init__(self, sizes: ModelSizes) -> None:
