@@ -22,7 +22,7 @@ from torch.utils._pytree import tree_leaves, tree_map
 from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.distributed.device import PRECISIONS
 from vjepa2_ac.model.adapter.low_rank import CastMatrices
-from vjepa2_ac.model.network.kv_cache import KeyValueCache
+from vjepa2_ac.model.network.predictor_network import KeyValueCache
 from vjepa2_ac.training.cost.fake_model import FakeModel, Kind, fake_tensors, meta_predictor
 from vjepa2_ac.training.cost.live_storages import LiveStorages
 from vjepa2_ac.training.loss import Objective
