@@ -129,13 +129,6 @@ def test_in_bfloat16_the_weights_are_rounded(golden: Golden) -> None:
         assert torch.equal(value, exact.state_dict()[name].bfloat16()), name
 
 
-def test_a_fresh_predictor_is_the_same_for_the_same_seed_and_the_encoder_is_the_files(golden: Golden) -> None:
-    first, again = model_of(golden.path), model_of(golden.path)
-    assert first.predictor_fingerprint() == again.predictor_fingerprint()
-    assert first.encoder_fingerprint() == again.encoder_fingerprint()
-    assert not any(value.requires_grad for value in first.parameters())
-
-
 # Every other form of file gives the same latents.
 
 
@@ -370,24 +363,9 @@ def test_a_folder_that_is_damaged_or_hostile_is_refused(tmp_path: Path) -> None:
         model_of(folder, key="encoder")
 
 
-def test_a_truncated_file_and_one_that_would_run_code_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "cut.pt").write_bytes(V2.read_bytes()[:100_000])
-    with pytest.raises(InputError, match="truncated, or of another kind"):
-        model_of(tmp_path / "cut.pt")
-    with pytest.raises(InputError, match=r"no such file or folder.*download --list"):
-        model_of(tmp_path / "none.pt")
-
-
 def test_pretrainings_masked_predictor_is_not_taken_for_one_of_actions() -> None:
     with pytest.raises(InputError, match=r"knows no actions.*set model\.encoder\.path to this file"):
         load_base(ModelConfig(base=str(V21)), seed=0)
-
-
-def test_sizes_that_are_no_multiple_of_a_patch_are_refused() -> None:
-    with pytest.raises(ValueError, match="image_size 90 is not a multiple of patch_size 16"):
-        model_of(V21, 90)
-    with pytest.raises(InputError, match="one patch"):
-        model_of(V21, 16)
 
 
 def test_two_encoders_of_the_same_tensors_and_other_latents_are_two() -> None:
@@ -408,9 +386,9 @@ def test_the_encoder_of_a_model_stays_the_same_encoder_under_another_predictor()
 
 
 def test_only_the_encoder_is_read_from_a_large_file(tmp_path: Path) -> None:
-    """Peak memory is the encoder and a group of tensors, whatever the optimizer's part of the file is."""
+    """Peak memory is the encoder, whatever the optimizer's part of the file is."""
     whole = torch.load(V21, weights_only=True)
-    whole["opt"] = {"state": {0: {"exp_avg": torch.zeros(75_000_000)}}}  # 300 MB
+    whole["opt"] = {"state": {0: {"exp_avg": torch.zeros(40_000_000)}}}  # 160 MB
     torch.save(whole, tmp_path / "large.pt")
     code = f"""
 import resource, torch
@@ -423,4 +401,4 @@ load_base(ModelConfig.model_validate(model), seed=0)
 print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
-    assert int(done.stdout) < 200e6
+    assert int(done.stdout) < 120e6

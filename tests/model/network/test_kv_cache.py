@@ -113,14 +113,6 @@ def test_what_is_kept_holds_nothing_of_the_rest(sizes: ModelSizes, inputs) -> No
         assert piece.untyped_storage().nbytes() == piece.nbytes == 2 * 2 * (9 + 2) * sizes.predictor.width * 4
 
 
-def test_a_pass_that_keeps_nothing_leaves_the_cache_as_it_was(sizes: ModelSizes, inputs) -> None:
-    model, cache, given = adapted(sizes), KeyValueCache(), arguments(inputs)
-    model.predict(*(value[:, :2] for value in given), cache=cache)
-    before = cache.layer(0)
-    model.predict(*(value[:, 2:] for value in given), cache=cache, keep=0)
-    assert cache.layer(0) is before
-
-
 def plain_rollout(model: WorldModel, context: Tensor, actions: Tensor, states: Tensor) -> Tensor:
     """Compute everything again for each prediction."""
     latents = context
@@ -164,10 +156,3 @@ def test_many_samples_go_on_from_one_start_that_was_computed_once(sizes: ModelSi
         found = model.rollout(latents[:, 2:], actions[:, 2:], states[:, 2:], cache=many)
         torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
     assert many.layer(0)[0].untyped_storage().data_ptr() == cache.layer(0)[0].untyped_storage().data_ptr()
-
-
-def test_a_cache_of_several_starts_is_not_expanded(sizes: ModelSizes, inputs) -> None:
-    cache = KeyValueCache()
-    adapted(sizes).predict(*arguments(inputs), cache=cache)
-    with pytest.raises(RuntimeError, match="expand"):
-        cache.expanded(5)
