@@ -74,6 +74,7 @@ def test_what_this_program_writes_names_its_layers_and_holds_no_pattern_of_the_u
         ({"bias": "all"}, "an adapter with 'bias' 'all'"),
         ({"layer_replication": [[0, 4], [2, 5]]}, "'layer_replication'"),
         ({"exclude_modules": "(a+)+"}, "'exclude_modules'"),
+        ({"trainable_token_indices": 3}, "'trainable_token_indices'"),
         ({"use_of_the_future": 1}, "'use_of_the_future'"),
     ],
 )

@@ -128,7 +128,7 @@ def adapter_of(values: Mapping[str, Any], defaults: Mapping[str, Any], *, where:
         if name not in PEFT_NAMES and name not in _INFORMATIONAL and not _is_off(value, defaults.get(name))
     }
     for name, value in options.items():
-        if not _can_be_read(name, value, known=name in defaults):
+        if not _can_be_read(name, value, defaults.get(name)):
             raise _refused(where, f"an adapter with {shown(name)} {shown(value)}, which is not read here")
     try:
         given = {"kind": "lora", "rslora": False, **knobs, "peft": options}  # not rsLoRA: PEFT's default
@@ -159,14 +159,14 @@ def _is_off(value: object, default: object) -> bool:
     return value is None or value is False or value in ([], {}) or value == default
 
 
-def _can_be_read(name: str, value: object, *, known: bool) -> bool:
-    """Return whether an option is a number, a switch, a start (a knob says which), or a pattern of whole names."""
+def _can_be_read(name: str, value: object, default: object) -> bool:
+    """Return whether an option is a pattern of whole names, a start (a knob says which), or a number as PEFT has it."""
     if name in {"rank_pattern", "alpha_pattern"}:
         kinds, most = ((int,), _MOST_RANK) if name == "rank_pattern" else ((int, float), _MOST_ALPHA)
         return isinstance(value, dict) and all(
             _LITERAL.fullmatch(key) and type(one) in kinds and 0 < one <= most for key, one in value.items()
         )
-    return known and (name == "init_lora_weights" or isinstance(value, bool | int | float))
+    return name == "init_lora_weights" or (isinstance(value, bool | int | float) and type(value) is type(default))
 
 
 def _problem(detail: Any) -> str:

@@ -156,7 +156,7 @@ def with_adapter(predictor: PredictorNetwork, config: AdapterConfig, start: bool
             peft_config = LoraConfig(**arguments)
             peft_config._register_custom_module({nn.Linear: LoraLinear})
             wrapped = get_peft_model(predictor, peft_config)
-    except (ArithmeticError, RuntimeWarning, TypeError, ValueError, re.error) as error:
+    except (ArithmeticError, AttributeError, RuntimeWarning, TypeError, ValueError, re.error) as error:
         needed = "options of PEFT's LoraConfig, which fit the predictor"
         raise InputError(where="adapter.peft", found=str(error), needed=needed) from None
     wrapped.train(predictor.training)  # PEFT's dropout is enabled at first

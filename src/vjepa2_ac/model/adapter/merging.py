@@ -33,14 +33,6 @@ def base_only(model: WorldModel) -> Iterator[None]:
             value.requires_grad_(requires_grad)
 
 
-def base_dtype(model: WorldModel) -> torch.dtype:
-    """Return the type of the predictor's weights before training, which is in float32: `model.dtype`."""
-    if model.adaptation is not None and model.adaptation.kind == "none" and model.adaptation.start:
-        return next(iter(model.adaptation.start.values())).dtype
-    weight: torch.Tensor = model.base_predictor.predictor_norm.weight  # never trained beside an adapter
-    return weight.dtype
-
-
 def merge_adapter(model: WorldModel) -> None:
     """Merge the trained weights into the predictor: added in float32, then cast to the base's type, frozen.
 
@@ -49,8 +41,10 @@ def merge_adapter(model: WorldModel) -> None:
     Raises:
         ValueError: The model is not adapted.
     """
-    dtype = base_dtype(model)
-    if adaptation_of(model).kind == "lora":
+    adaptation = adaptation_of(model)
+    never_trained = model.base_predictor.predictor_norm.weight  # beside an adapter
+    dtype = (adaptation.start or {}).get("predictor_norm.weight", never_trained).dtype
+    if adaptation.kind == "lora":
         kind = model.device.type
         has_autocast = torch.amp.is_autocast_available(kind)  # some, such as meta, have none
         with torch.autocast(kind, enabled=False) if has_autocast else nullcontext():  # or its type would be computed in

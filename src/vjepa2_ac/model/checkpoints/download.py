@@ -52,7 +52,7 @@ def download(
             raise InputError(where=str(path), found="a folder", needed="the name of a file", fix="Name a file in it")
         if path.exists():
             _require_size(known, _size(path), where=str(path))
-            _require_hash(known, path, reporter)
+            _require_hash(known, path)
             return path
         path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f"{path.name}.{known.name}.part" if known else f"{path.name}.part")
@@ -71,7 +71,7 @@ def download(
         fix = "Check the network and start again: it goes on where it stopped"
         raise UnreachableError(where=url, found=found, fix=fix) from None
     try:
-        _require_hash(known, part, reporter)
+        _require_hash(known, part)
     except InputError:
         part.unlink()
         raise
@@ -128,12 +128,11 @@ def _require_size(known: Published | None, size: int, *, where: str) -> None:
         raise InputError(where=where, found=f"a file of {size:,} bytes", needed=needed, fix=fix)
 
 
-def _require_hash(known: Published | None, file: Path, reporter: Reporter) -> None:
+def _require_hash(known: Published | None, file: Path) -> None:
     """Refuse a whole file of another SHA-256 than the published one."""
     if known is None or known.sha256 is None:
         return
-    show, whole = reporter.task(f"SHA-256 of {file.name} (MB)"), _size(file)
-    found = storage.sha256_of_file(file, progress=lambda done: show(done // _MEGABYTE, whole // _MEGABYTE))
+    found = storage.sha256_of_file(file)
     if found != known.sha256:
         needed = f"{known.sha256} ({known.name})"
         fix = "Delete it if it is still there, and start again; if it ends so again, the address holds another file"

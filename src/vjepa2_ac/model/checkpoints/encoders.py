@@ -117,15 +117,7 @@ def expected_sizes(config: EncoderConfig, given: ModelSizes) -> ModelSizes:
     known = published_as(Path(config.path).name)
     if known is None or Path(config.path).exists():
         return sizes_with(find_encoder(config), given)
-    shape = known.encoder
-    encoder = EncoderSizes(
-        width=shape.width,
-        depth=shape.depth,
-        heads=shape.heads,
-        mlp_ratio=shape.mlp_ratio,
-        family=known.family,
-        frame=config.frame,
-    )
+    encoder = known.encoder.sizes(known.family, config.frame)
     try:
         return ModelSizes.model_validate(given.model_dump() | {"encoder": encoder.model_dump()})
     except ValidationError as error:

@@ -66,7 +66,7 @@ def load_base(config: ModelConfig, *, seed: int) -> WorldModel:
         if found is None:
             return WorldModel.random(config.random, seed, dtype, at_persistence=at_persistence)
         model = _on_encoder(found, sizes_with(found, config.random), dtype)
-        model.draw_predictor(seed, dtype, at_persistence=at_persistence)
+        model.draw_predictor(torch.Generator().manual_seed(seed), dtype, at_persistence=at_persistence)
         return model
     if config.base is None:
         raise ValueError("a ModelConfig has a base or random sizes")

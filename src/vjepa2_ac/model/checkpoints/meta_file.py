@@ -152,5 +152,5 @@ def _foreign(path: Path, error: Exception) -> str:
     if not head.startswith(b"PK"):
         kind = "a safetensors file" if head[8:10] == b'{"' else "no file of torch.save"
         return next((known for start, known in _FOREIGN if head.startswith(start)), kind)
-    size, reason = path.stat().st_size / 1e9, (str(error).splitlines() or [type(error).__name__])[0][:120]
-    return f"{size:.2f} GB that torch cannot read ({reason}): truncated, or of another kind"
+    size, (reason, *_) = path.stat().st_size / 1e9, [*str(error).splitlines(), type(error).__name__]
+    return f"{size:.2f} GB that torch cannot read ({reason[:120]}): truncated, or of another kind"

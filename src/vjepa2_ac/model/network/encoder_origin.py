@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from vjepa2_ac.config import EncoderSizes
+from vjepa2_ac.config.model import Family, FramePath
 
 
 @dataclass(frozen=True)
@@ -24,10 +25,12 @@ class EncoderShape:
     heads: int
     hidden: int  # width of the MLP
 
-    @property
-    def mlp_ratio(self) -> float:
-        """Hidden width of the MLP over the width."""
-        return self.hidden / self.width
+    def sizes(self, family: Family, frame: FramePath) -> EncoderSizes:
+        """Return the sizes of an encoder of this shape."""
+        ratio = self.hidden / self.width
+        return EncoderSizes(
+            width=self.width, depth=self.depth, heads=self.heads, mlp_ratio=ratio, family=family, frame=frame
+        )
 
 
 VIT_B = EncoderShape("ViT-B", 768, 12, 12, 3072)

@@ -92,15 +92,12 @@ class WorldModel(LatentDynamics):
         model = cls.empty(sizes).to_empty(device=device)
         generator = torch.Generator(device).manual_seed(seed)
         model.present_encoder.initialise(generator)
-        model.base_predictor.initialise(generator)
-        if at_persistence:
-            model.base_predictor.start_at_persistence(generator)
+        model.draw_predictor(generator, dtype, at_persistence=at_persistence)
         return model.to(dtype)
 
-    def draw_predictor(self, seed: int, dtype: torch.dtype, *, at_persistence: bool = False) -> None:
-        """Initialise the predictor, which may be without weights: the encoder is one that was read."""
-        predictor = self.base_predictor.to_empty(device="cpu")
-        generator = torch.Generator().manual_seed(seed)
+    def draw_predictor(self, generator: torch.Generator, dtype: torch.dtype, *, at_persistence: bool = False) -> None:
+        """Initialise the predictor on the generator's device; it may be without weights."""
+        predictor = self.base_predictor.to_empty(device=generator.device)
         predictor.initialise(generator)
         if at_persistence:
             predictor.start_at_persistence(generator)
