@@ -12,18 +12,15 @@ import peft
 import pytest
 import torch
 import yaml
-from huggingface_hub import ModelCard
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from paths import GOLDEN
 from run_fixtures import TINY, SilentReporter, one_thread, tiny_config
 from vjepa2_ac import export
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.export import CARD, OFFICIAL_NAME, Exported, export_run
-from vjepa2_ac.model.adapter.lora import load_trained
+from vjepa2_ac.export import CARD, Exported, export_run
 from vjepa2_ac.model.adapter.merging import base_only
 from vjepa2_ac.model.checkpoints.loading import load_official
 from vjepa2_ac.model.network.world_model import WorldModel
@@ -110,32 +107,11 @@ def test_the_official_checkpoint_predicts_as_the_run_does(trained, tmp_path: Pat
     assert_predicts_as(load_official(written, sizes_of(run)), run)
 
 
-def test_the_official_checkpoint_has_the_names_of_metas(trained, tmp_path: Path) -> None:
-    written = export_run(trained(), tmp_path / "folder", "official").path
-    assert written == tmp_path / "folder" / OFFICIAL_NAME
-    assert list(written.parent.iterdir()) == [written]
-    found = torch.load(written, weights_only=True)
-    meta = torch.load(GOLDEN / "model" / "tiny.pt", weights_only=True)
-    without_number = lambda weights: {re.sub(r"blocks\.\d+", "blocks.N", name) for name in weights}  # noqa: E731
-    for part in ("encoder", "target_encoder", "predictor"):
-        assert without_number(found[part]) == without_number(meta[part])
-    assert all(torch.equal(value, found["target_encoder"][name]) for name, value in found["encoder"].items())
-
-
 @pytest.mark.parametrize(("name", "form"), [("x.pt", "merged"), ("x.pt", "hub")])
 def test_a_name_of_another_kind_of_file_makes_no_folder(tmp_path: Path, name: str, form: Any) -> None:
     with pytest.raises(InputError, match=rf"{name}: the name of a \{Path(name).suffix} file"):
         export_run(tmp_path / "run", tmp_path / name, form)
     assert not (tmp_path / name).exists()
-
-
-def test_it_loads_as_the_base_of_another_run(trained, make_config, reporter, tmp_path: Path) -> None:
-    run = trained()
-    written = export_run(run, tmp_path / "base.pt", "official").path
-    config = make_config(run_dir=str(tmp_path / "next"), model__base=str(written), training__steps=1)
-    sizes = config.model.model_copy(update={"sizes": sizes_of(run)})
-    train(config.model_copy(update={"model": sizes}), reporter)
-    assert load_run(tmp_path / "next", "1").checkpoint.name == "step-00000001"
 
 
 def test_merged_is_a_folder_that_predicts_as_the_run_does(trained, tmp_path: Path) -> None:
@@ -196,14 +172,6 @@ def test_plain_peft_loads_what_goes_to_the_hub(trained, base_folder: Path, tmp_p
     export_run(run, tmp_path / "hub", "hub")
     model = WorldModel.from_pretrained(base_folder)
     model.predictor = peft.PeftModel.from_pretrained(model.predictor, str(tmp_path / "hub"))
-    assert_predicts_as(model, run)
-
-
-def test_we_load_what_goes_to_the_hub(trained, base_folder: Path, tmp_path: Path) -> None:
-    run = trained()
-    export_run(run, tmp_path / "hub", "hub")
-    model = WorldModel.from_pretrained(base_folder)
-    load_trained(model, tmp_path / "hub")
     assert_predicts_as(model, run)
 
 
@@ -285,17 +253,6 @@ def test_the_card_takes_what_evaluate_writes_and_says_of_which_checkpoint(copied
     assert "model-index" not in card, "results of another checkpoint are not those of this adapter"
 
 
-def test_what_was_measured_are_results_on_the_hub(copied, tmp_path: Path) -> None:
-    run = copied()
-    assert main(["evaluate", str(run), *QUICK]) == 0
-    measured = json.loads((run / METRICS_FILE).read_text())
-    assert main(["export", str(run), str(tmp_path / "hub"), "--to", "hub"]) == 0
-    (entry,) = ModelCard.load(tmp_path / "hub" / CARD).data.to_dict()["model-index"]
-    found = [metric["value"] for result in entry["results"] for metric in result["metrics"]]
-    ratios = measured["models"]["adapter"]["rollout"]["l1"]["over_persistence"]
-    assert found == pytest.approx([ratio["value"] for ratio in ratios], abs=1e-4)
-
-
 def test_another_checkpoint_than_the_newest_is_measured_and_exported_where_it_is_asked_for(
     copied, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -370,15 +327,6 @@ def test_a_place_that_cannot_be_written_is_refused_before_work_begins(tmp_path: 
     (tmp_path / "file").write_text("no folder")
     with pytest.raises(InputError, match="cannot be written"):
         export_run(tmp_path / "run", tmp_path / "file" / "below", form)
-
-
-@pytest.mark.parametrize("form", ["merged", "official", "hub"])
-def test_a_run_without_a_checkpoint_is_refused(copied, tmp_path: Path, form: Any) -> None:
-    run = copied()
-    (run / "checkpoints").rename(run / "elsewhere")
-    with pytest.raises(InputError, match="without a whole checkpoint"):
-        export_run(run, tmp_path / "out", form)
-    assert not (tmp_path / "out").exists()
 
 
 def test_a_full_disk_leaves_nothing_behind(trained, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -114,21 +114,6 @@ def test_norms_of_lower_levels_are_where_they_belong() -> None:
     assert_equal_to_rounding(found, io[name])
 
 
-def test_the_file_says_what_it_is(golden: Golden) -> None:
-    sizes, constructor = model_of(golden.path).sizes.encoder, golden.facts["constructor"]
-    assert (sizes.width, sizes.depth, sizes.heads) == tuple(
-        constructor[name] for name in ("embed_dim", "depth", "num_heads")
-    )
-    assert sizes.family == ("v2.1" if golden.is_newer else "v2")
-    assert round(sizes.width * sizes.mlp_ratio) == golden.facts["mlp_hidden"]
-
-
-def test_in_bfloat16_the_weights_are_rounded(golden: Golden) -> None:
-    exact, rounded = model_of(golden.path).encoder, model_of(golden.path, dtype="bfloat16").encoder
-    for name, value in rounded.state_dict().items():
-        assert torch.equal(value, exact.state_dict()[name].bfloat16()), name
-
-
 # Every other form of file gives the same latents.
 
 

@@ -54,11 +54,6 @@ def test_sizes_that_a_folder_has_and_defaults_are_fine(model: WorldModel, tmp_pa
     assert load_with(tmp_path / "model", written_out).sizes == model.sizes
 
 
-def test_a_base_that_is_not_there_names_every_kind_of_base(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"no such file or folder.*official \.pt, a folder.*builtin:sim-tiny"):
-        load_with(tmp_path / "none.pt", ModelSizes())
-
-
 def test_a_folder_that_is_no_model_gives_the_command_that_makes_one_of_a_run(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"config\.json: no such file.*`vjepa2-ac export RUN FOLDER` makes one"):
         load_with(tmp_path, ModelSizes())

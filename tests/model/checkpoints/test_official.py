@@ -105,10 +105,6 @@ def check_gradients(model: WorldModel, io: dict[str, Tensor], norm: float) -> No
     assert total == pytest.approx(norm, rel=1e-5)
 
 
-def test_the_sizes_it_was_loaded_with_load_it_again(reference: Reference) -> None:
-    assert load_official(reference.path, reference.model.sizes).sizes == reference.model.sizes
-
-
 def test_official_weights_go_out_as_they_came_in(reference: Reference) -> None:
     whole = torch.load(reference.path, weights_only=True)
     exported = to_official(reference.model)

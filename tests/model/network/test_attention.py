@@ -9,7 +9,7 @@ from torch.utils.checkpoint import checkpoint
 
 from tracing import tracing
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.network import attention, blocks
+from vjepa2_ac.model.network import attention
 from vjepa2_ac.model.network.attention import AttentionKind, best_kind, block_causal_attention
 from vjepa2_ac.model.network.blocks import Block
 from vjepa2_ac.model.network.rotary import TokenLayout, rotary_tables
@@ -146,19 +146,6 @@ def test_where_flex_would_not_be_compiled_any_more_is_an_error_with_a_way_out() 
         attended(2)
         with pytest.raises(InputError, match=r"training\.attention: .*more than 2 sizes.*training\.attention=per_step"):
             attended(3)
-
-
-@pytest.mark.usefixtures("traced")
-@pytest.mark.filterwarnings(*(one.args[0] for one in tracing))
-def test_where_blocks_would_not_be_compiled_any_more_is_an_error_with_a_way_out() -> None:
-    def double(given: Tensor, times: int) -> Tensor:
-        return given * times
-
-    call = blocks.compiled(double, way_out="training.compile=off")
-    with dynamo.patch(recompile_limit=1, automatic_dynamic_shapes=False):
-        call(torch.ones(2), 2)
-        with pytest.raises(InputError, match=r"training\.compile: .*more than 1 sizes.*Set training\.compile=off"):
-            call(torch.ones(3), 2)
 
 
 @pytest.mark.parametrize("kind", ["dense", "per_step"])

@@ -22,13 +22,6 @@ def test_chunks_change_nothing(model: WorldModel, inputs, chunk: int) -> None:
     )
 
 
-def test_no_more_than_a_chunk_goes_through_the_network_at_once(model: WorldModel, inputs) -> None:
-    seen: list[int] = []
-    model.encoder.vit.register_forward_pre_hook(lambda _, given: seen.append(len(given[0])))
-    model.encode(inputs.frames, chunk=3)
-    assert seen == [3, 3, 2]
-
-
 def test_latents_are_normalised(model: WorldModel, inputs) -> None:
     latents = model.encode(inputs.frames)
     torch.testing.assert_close(latents.mean(dim=-1), torch.zeros(2, 4, 9), rtol=0, atol=1e-5)
@@ -46,19 +39,6 @@ def test_the_encoder_stays_frozen_and_in_eval_mode_while_the_model_trains(model:
 def test_frames_of_another_size_are_refused(model: WorldModel) -> None:
     with pytest.raises(ValueError, match="64 x 64 px; this encoder needs 48 x 48 px"):
         model.encode(torch.zeros(1, 1, 3, 64, 64))
-
-
-@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float32])
-def test_features_are_float32_and_layers_of_autocasts_own_type_do_without_it(
-    fresh: Callable[..., WorldModel], inputs, dtype: torch.dtype
-) -> None:
-    network, autocast = fresh(dtype=dtype).present_encoder, []
-    network.vit.layer[0].register_forward_hook(lambda *_: autocast.append(torch.is_autocast_enabled("cpu")))
-    with torch.autocast("cpu", torch.bfloat16):
-        features = network(inputs.frames.flatten(0, 1))
-    assert autocast == [dtype != torch.bfloat16]
-    assert features.dtype == torch.float32
-    assert not torch.equal(features, features.bfloat16())
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])

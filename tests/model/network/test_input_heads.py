@@ -11,7 +11,7 @@ from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.lora import add_adapter, load_trained, save_trained
 from vjepa2_ac.model.adapter.merging import base_only, merge_adapter
-from vjepa2_ac.model.checkpoints.loading import load_base, to_official
+from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.input_heads import fit_heads, heads_to_replace, widths_of_model
 from vjepa2_ac.model.network.predictor import ActionConditionedPredictor
 from vjepa2_ac.model.network.world_model import WorldModel
@@ -94,11 +94,6 @@ def test_fresh_heads_are_decided_by_the_seed_and_drawn_as_the_recipe_draws() -> 
     assert torch.equal(fitted(Widths(7, 14)).predictor.action_encoder.weight, one.predictor.action_encoder.weight)
 
 
-@widths
-def test_fresh_heads_do_not_change_which_base_it_is(widths: Widths) -> None:
-    assert fitted(widths).predictor_fingerprint() == base().predictor_fingerprint()
-
-
 def test_heads_are_replaced_once_and_before_adapting() -> None:
     model = fitted(Widths(14, 14))
     with pytest.raises(ValueError, match="replaced once"):
@@ -164,8 +159,3 @@ def test_merged_it_is_a_base_of_its_own_that_folders_keep(
     torch.testing.assert_close(predict(loaded, widths), before, atol=1e-5, rtol=1e-5)
     alone = ActionConditionedPredictor.from_pretrained(tmp_path / "predictor")
     assert (alone.state_encoder.in_features, alone.action_encoder.in_features) == widths
-
-
-def test_meta_has_no_name_for_other_widths() -> None:
-    with pytest.raises(InputError, match="Meta's code has no other"):
-        to_official(fitted(Widths(14, 14)))

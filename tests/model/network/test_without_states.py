@@ -8,10 +8,10 @@ from torch import Tensor
 from torch.nn.functional import layer_norm
 
 from tiny_models import DIM, draw, tiny_model
-from vjepa2_ac.config import AdapterConfig, ModelConfig, ModelSizes
+from vjepa2_ac.config import AdapterConfig, ModelConfig
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.adapter.lora import add_adapter, load_trained, save_trained, trainable_report
+from vjepa2_ac.model.adapter.lora import add_adapter, load_trained, save_trained
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.input_heads import fit_heads, heads_to_replace, widths_of_model
 from vjepa2_ac.model.network.predictor import ActionConditionedPredictor
@@ -91,15 +91,6 @@ def test_other_states_of_any_width_change_no_bit(extrinsics: bool) -> None:
     assert not torch.equal(cut.predict(latents, actions + 1, states, *cameras), expected)
 
 
-def test_every_weight_of_it_is_trained_and_reported() -> None:
-    model = tiny_model(states=False)
-    add_adapter(model, AdapterConfig(kind="none"), seed=0)
-    report = trainable_report(model)
-    assert report.trained == report.predictor
-    model.predict(*inputs()).sum().backward()
-    assert all(value.grad is not None for value in model.predictor.parameters())
-
-
 def test_an_adapter_on_the_missing_layer_is_refused() -> None:
     with pytest.raises(InputError, match=r"modules_to_save: state_encoder, which this predictor does not have.*Leave"):
         add_adapter(tiny_model(states=False), LORA.model_copy(update={"modules_to_save": ("state_encoder",)}), seed=0)
@@ -132,8 +123,3 @@ def test_a_folder_keeps_it_and_contradictions_are_refused(tmp_path: Path) -> Non
     tiny_model().save_pretrained(tmp_path / "full")
     with pytest.raises(InputError, match=r"predictor\.use_states True\. needed: predictor\.use_states False"):
         load_base(ModelConfig.model_validate(told | {"base": str(tmp_path / "full")}), seed=0)
-
-
-def test_sizes_with_a_width_of_states_that_are_not_used_are_refused() -> None:
-    with pytest.raises(ValueError, match="state_dim 14 with use_states false"):
-        ModelSizes.model_validate({"predictor": {"use_states": False, "state_dim": 14}})
