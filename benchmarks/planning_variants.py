@@ -23,10 +23,10 @@ from vjepa2_ac.model.adapter.lora import add_adapter, lora_layers
 from vjepa2_ac.model.checkpoints.loading import to_official
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.energy import Scene, WorldModelCost, distance
-from vjepa2_ac.planning.goals.goal import Goal
+from vjepa2_ac.planning.goals import Goal
 from vjepa2_ac.planning.interfaces import Cost, Plan
-from vjepa2_ac.planning.model_setup import prepare_for_planning
 from vjepa2_ac.planning.planner import Planner
+from vjepa2_ac.planning.session import prepare_for_planning
 from vjepa2_ac.training.cost.flops import plan_flops
 
 POSE = (0.45, 0.10, 0.35, 3.0, 0.1, -0.4, 0.3)  # of an arm that points down
@@ -59,7 +59,7 @@ class PlainCost:
             following = self._model.predict(latents, tried[:, :end], states.to(self._model.device))[:, -1:]
             latents = torch.cat([latents, following], dim=1)
             states = torch.cat([states, _poses_one_by_one(states[:, -1], actions[:, end - 1])[:, None]], dim=1)
-        return distance(latents[:, -1], self._goal, self._config.distance)
+        return distance(latents[:, -1], self._goal, self._config)
 
 
 class Bench:

@@ -116,8 +116,8 @@ def _asked(
     findings: list[Finding] = []
     with tempfile.TemporaryDirectory(dir=temporary) as folder:
         for number, one in enumerate(spoiled(fault, recordings)):
-            arrays = {"states": one.states, "frames": one.frames, "fps_hz": one.rate_hz}
-            np.savez(Path(folder) / f"{number:03d}.npz", **arrays)
+            path = Path(folder) / f"{number:03d}.npz"
+            np.savez(path, states=one.states, frames=one.frames, fps_hz=np.array(one.rate_hz))
         config = _config(Path(folder), temporary, options.model, {"source": "npz", "stride": stride})
         try:
             findings.extend(check_data(config.data))

@@ -20,7 +20,7 @@ PACKAGE = Path(vjepa2_ac.__file__).parent
 ORDERS: dict[str, list[str]] = {
     "": [
         "__init__ errors places output episode geometry distances intervals",
-        "spaces reporter",
+        "spaces reporter registry",
         "storage",
         "config",
         "media",
@@ -29,7 +29,7 @@ ORDERS: dict[str, list[str]] = {
         "runs",
         "encoding",
         "planning",
-        "serving",
+        "serving demonstrations",
         "decoding",
         "evaluation",
         "reports",
@@ -41,8 +41,8 @@ ORDERS: dict[str, list[str]] = {
     "data": ["picture_file", "index", "cache filters", "sources", "clips", "inspection"],
     "data.sources": ["listing configured_spaces indexed_source", "rlds droid_raw lerobot npz latents", "registry"],
     "serving": [
-        "wire worker prometheus access",
-        "client request waypoints bounds kept_goals recording",
+        "wire access motion",
+        "client request recording",
         "session",
         "about server",
     ],
@@ -118,6 +118,7 @@ HOMES = {
     "msgpack": ["serving/wire.py"],
     "mujoco": ["simulation/world/"],
     "peft": ["model/adapter/"],
+    "prometheus_client": ["serving/server.py"],
     "pyarrow": ["data/sources/lerobot/"],
     "rich": ["console/"],
     "simplejpeg": ["media/", "data/sources/rlds/writing/droid_writer.py"],
@@ -288,7 +289,9 @@ def test_the_hint_for_a_library_names_an_extra_that_brings_it() -> None:
                 named = {word.arg: word.value.value for word in node.keywords if isinstance(word.value, ast.Constant)}
                 library = node.args[0].value if isinstance(node.args[0], ast.Constant) else "websockets"  # serve's loop
                 asked += 1
-                if str(library).split(".")[0] not in BROUGHT.get(str(named["extra"]), set()):
+                if str(library).split(".")[0] not in {
+                    one.replace("-", "_") for one in BROUGHT.get(str(named["extra"]), ())
+                }:
                     wrong.append(f"{module}: {library}: {named['extra']}")
     assert asked > 5
     assert not wrong

@@ -24,7 +24,7 @@ from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.planning.decision import PlanResult
 from vjepa2_ac.reports.comparison import Comparison
 from vjepa2_ac.simulation.closed_loop.benchmark import ClosedLoopBenchmark
-from vjepa2_ac.simulation.closed_loop.result import ClosedLoopResult
+from vjepa2_ac.simulation.closed_loop.rollout import ClosedLoopResult
 from vjepa2_ac.spaces import POSE, vector_states
 from worlds import Copier, Halfway, about, again, clips_batch
 

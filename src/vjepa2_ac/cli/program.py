@@ -48,6 +48,10 @@ def _run(arguments: Sequence[str] | None) -> int:
     handler: Handler = options.handler
     try:
         _require_working_directory()
+        if options.plugin:
+            from vjepa2_ac.config.plugins import name_plugins
+
+            name_plugins(options.plugin)
         return handler(options) or 0
     except (UserError, OSError, MemoryError) as error:  # a full disk, a path that is no path: the message names it
         _complain(in_words(error))

@@ -261,6 +261,14 @@ class DataConfig(Section):
             raise ValueError("join_actions belongs to actions recorded")
         return self
 
+    @classmethod
+    def look(cls, path: str) -> dict[str, Any] | None:  # noqa: ARG003 - of a form that is looked for
+        """Return what `vjepa2-ac init` writes for a folder of this form, beside source and path; None: it is none.
+
+        The values of this section; `control_rate_hz`, beside them, is the number of control steps per second.
+        """
+        return None
+
     @property
     def known_cameras(self) -> tuple[str, ...] | None:
         """The cameras known from the config, or None if only the data set knows them."""

@@ -17,6 +17,7 @@ from vjepa2_ac.config.data import without_sections_of_others
 from vjepa2_ac.config.diagnostics import wrong_values
 from vjepa2_ac.config.gone import GONE, take_gone
 from vjepa2_ac.config.packaged import config_path
+from vjepa2_ac.config.plugins import admit_forms_of_data, with_plugins
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage.structured import parse_yaml, require_shallow
 
@@ -52,7 +53,7 @@ def load_config_of_run(path: Path, overrides: Iterable[str] = ()) -> Config:
     """
     values = _read_yaml(config_path(path))
     take_gone(values)
-    return parse_config(_overridden(values, overrides), where=str(path))
+    return parse_config(_overridden(values, overrides), where=str(path), here=False)
 
 
 def gone_in_use(path: Path) -> dict[str, Any]:
@@ -73,13 +74,18 @@ def config_from(values: Mapping[str, Any], overrides: Iterable[str] = (), *, whe
     return parse_config(_overridden(json.loads(_as_json(values, where)), overrides), where=where)
 
 
-def parse_config(values: Mapping[str, Any], *, where: str) -> Config:
+def parse_config(values: Mapping[str, Any], *, where: str, here: bool = True) -> Config:
     """Validate plain values, as YAML or JSON gives them; a knob that is gone may stand there where it is off.
+
+    Args:
+        values: The values.
+        where: Their file, for messages.
+        here: Whether plug-ins may lie in the working directory: not those of a run, which may be a stranger's.
 
     Raises:
         InputError: Names every key that is wrong, all at once.
     """
-    plain = json.loads(_as_json(values, where))
+    plain = with_plugins(json.loads(_as_json(values, where)), where=where, here=here)
     if "data" in plain:
         plain["data"] = without_sections_of_others(plain["data"])
     lines = [f"{key}: {GONE[key]}; leave it out" for key in take_gone(plain)]
@@ -126,6 +132,7 @@ def yaml_line(key: str, value: Any) -> str:
 
 def config_schema() -> dict[str, Any]:
     """Return the JSON schema of a config file, for editors."""
+    admit_forms_of_data(all_installed=True)
     return Config.model_json_schema()
 
 

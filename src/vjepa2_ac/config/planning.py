@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from vjepa2_ac.config.section import OFF, Count, Local, NonNegative, Positive, PositiveInt, Section, Share, ZeroToOne
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.registry import ENERGIES, PLANNERS
 
 Place = Annotated[float, Field(ge=-5.0, le=5.0)]  # along an axis of the base frame, in metres; no arm reaches farther
 Corner = tuple[Place, Place, Place]
@@ -79,12 +80,20 @@ class LimitsConfig(Section):
 class EnergyConfig(Section):
     """Distance of a prediction from the goal."""
 
-    distance: Literal["l1", "l2", "cosine"] = "l1"
-    """Of predicted and goal latents: mean absolute difference (upstream), mean square, or 1 - cosine of a token."""
+    distance: Annotated[str, AfterValidator(ENERGIES.known), ENERGIES.name_in_schema] = "l1"
+    """Of predicted and goal latents. l1: mean absolute difference (upstream). l2: mean square. cosine: 1 - cosine of a
+    token. Or an energy of your own (docs/extending.md)."""
+    options: Annotated[dict[str, Any], ENERGIES.options_in_schema] = {}
+    """Options of an energy of your own, where its class has some."""
     steps: Literal["last", "sum"] = "last"
     """last: of the plan's last step (upstream). sum: over all its steps."""
     samples_at_once: PositiveInt = 64
     """Action sequences that go through the predictor at once: bounds its memory."""
+
+    @model_validator(mode="after")
+    def _options_fit(self) -> EnergyConfig:
+        ENERGIES.options(self.distance, self.options)
+        return self
 
 
 class GoalsConfig(Section):
@@ -159,8 +168,10 @@ class GradientConfig(Section):
 class PlanningConfig(Section):
     """One decision: from the current frame to an action."""
 
-    planner: Literal["cem", "icem", "mppi", "gradient"] = "cem"
-    """How actions are searched."""
+    planner: Annotated[str, AfterValidator(PLANNERS.known), PLANNERS.name_in_schema] = "cem"
+    """How actions are searched: cem, icem, mppi, gradient, or a planner of your own (docs/extending.md)."""
+    planner_options: Annotated[dict[str, Any], PLANNERS.options_in_schema] = {}
+    """Options of a planner of your own, where its class has some."""
     horizon: PositiveInt = 1
     """Model steps that a plan spans."""
     action_repeat: PositiveInt = 1
@@ -202,6 +213,11 @@ class PlanningConfig(Section):
     """Of planner mppi only."""
     gradient: GradientConfig = GradientConfig()
     """Of planner gradient only."""
+
+    @model_validator(mode="after")
+    def _options_fit(self) -> PlanningConfig:
+        PLANNERS.options(self.planner, self.planner_options)
+        return self
 
     @property
     def sequences(self) -> tuple[int, ...]:

@@ -34,6 +34,9 @@ class Config(Section):
     """Folder of the run, on this machine: resolved config, checkpoints, metrics. `checkpoint.remote` keeps a copy."""
     seed: Annotated[int, Field(ge=0, lt=2**31), Affects.RUN | Affects.PLAN] = 0
     """Decides the order of clips, fresh weights and dropout."""
+    plugins: Annotated[tuple[str, ...], Affects.NOTHING] = ()
+    """Modules of your own, imported before this config is checked: they register forms of data, losses, planners,
+    metrics, energies and trackers (docs/extending.md). Installed packages register theirs without being named."""
     data: DataConfig
     """The data set, and the clips made of it."""
     replay: ReplayConfig | None = None

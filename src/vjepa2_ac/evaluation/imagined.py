@@ -35,7 +35,7 @@ from vjepa2_ac.evaluation.evaluate import Contender
 from vjepa2_ac.evaluation.imagined_image import actions_by_name, require_directions
 from vjepa2_ac.evaluation.request import EvaluationOptions, settle
 from vjepa2_ac.evaluation.subject import load_subject
-from vjepa2_ac.planning.counterfactual.named_actions import ACTION_NAMES, STEP_M
+from vjepa2_ac.planning.counterfactual import ACTION_NAMES, STEP_M
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
 from vjepa2_ac.spaces import StateSpace
 

@@ -16,8 +16,7 @@ from vjepa2_ac.decoding.decoder_folder import load_decoder
 from vjepa2_ac.decoding.imagine import Imagination, Imagined, Start, imagined_latents, shown, worth_knowing
 from vjepa2_ac.encoding.batch import encode_frames
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.planning.counterfactual.actions_file import read_actions
-from vjepa2_ac.planning.counterfactual.named_actions import ACTION_NAMES, STEP_M, named_actions
+from vjepa2_ac.planning.counterfactual import ACTION_NAMES, STEP_M, named_actions, read_actions
 from vjepa2_ac.planning.session import PlanningSession
 from vjepa2_ac.spaces import StateSpace
 

@@ -20,8 +20,8 @@ from vjepa2_ac.model.adapter.merging import merge_adapter
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller, rules_of
-from vjepa2_ac.planning.goals.folder import GoalFolder
-from vjepa2_ac.planning.goals.sub_goals import SubGoal
+from vjepa2_ac.planning.goal_folder import GoalFolder
+from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.planning.model_setup import Fingerprints
 from vjepa2_ac.planning.settings import planning_settings, warn_beyond_taught
 from vjepa2_ac.runs.checkpoint_selection import SELECTED

@@ -33,11 +33,11 @@ from vjepa2_ac.evaluation.decoded_rollouts.setup import fitted_probe
 from vjepa2_ac.evaluation.request import EvaluationOptions, settle
 from vjepa2_ac.evaluation.subject import Subject, load_subject
 from vjepa2_ac.intervals import Estimate, share_of
-from vjepa2_ac.planning.counterfactual.named_actions import STEP_M, named_actions
+from vjepa2_ac.planning.counterfactual import STEP_M, named_actions
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
 from vjepa2_ac.simulation.counterfactual import Outcome, resimulate
 from vjepa2_ac.simulation.hand_in_images import hand_positions
-from vjepa2_ac.simulation.world.projection import HAND_MIDDLE_M
+from vjepa2_ac.simulation.world.camera import HAND_MIDDLE_M
 
 AXES: Mapping[str, tuple[str, str]] = {"x": ("forward", "back"), "y": ("left", "right"), "z": ("up", "down")}
 """Axis of the robot base frame -> the named actions along it."""
