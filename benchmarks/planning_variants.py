@@ -25,8 +25,8 @@ from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.energy import Scene, WorldModelCost, distance
 from vjepa2_ac.planning.goals import Goal
 from vjepa2_ac.planning.interfaces import Cost, Plan
+from vjepa2_ac.planning.model_setup import prepare_for_planning
 from vjepa2_ac.planning.planner import Planner
-from vjepa2_ac.planning.session import prepare_for_planning
 from vjepa2_ac.training.cost.flops import plan_flops
 
 POSE = (0.45, 0.10, 0.35, 3.0, 0.1, -0.4, 0.3)  # of an arm that points down

@@ -38,7 +38,7 @@ ORDERS: dict[str, list[str]] = {
         "console",
         "cli",
     ],
-    "data": ["picture_file", "index", "cache filters", "sources", "clips", "inspection"],
+    "data": ["index", "cache filters", "sources", "clips", "inspection"],
     "data.sources": ["listing configured_spaces indexed_source", "rlds droid_raw lerobot npz latents", "registry"],
     "serving": [
         "wire access motion",
