@@ -512,7 +512,7 @@ def test_check_says_what_would_be_encoded_and_tries_the_rest_on_frames(
 def test_latents_of_another_encoder_are_never_used(
     make_config: MakeConfig, tmp_path: Path, base_folder: Path, cache: Path, reporter: SilentReporter
 ) -> None:
-    from vjepa2_ac.model.sizes import read_sizes
+    from vjepa2_ac.model.base_model import read_sizes
 
     encode_config(make_config(data__cache_dir=str(cache)), reporter)
     other = tmp_path / "other"

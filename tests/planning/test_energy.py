@@ -9,7 +9,7 @@ from tiny_models import DIM, TOKENS, actions, cost, draw, goal, scene, tiny_mode
 from vjepa2_ac.config.planning import EnergyConfig, GradientConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.geometry import apply_action
-from vjepa2_ac.model.network.kv_cache import KeyValueCache
+from vjepa2_ac.model.network.predictor_network import KeyValueCache
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.energy import Scene, WorldModelCost, distance
 from vjepa2_ac.planning.goals import Goal, patch_weights

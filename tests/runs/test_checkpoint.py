@@ -273,9 +273,8 @@ def files_end_at(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-@pytest.mark.parametrize("init", ["default", "pissa"])
-def test_a_disk_that_fills_up_in_any_file_is_the_users_error_and_changes_nothing(make_config, reporter, init) -> None:
-    config = make_config(training__steps=1, adapter__init=init, checkpoint__keep_best="off")
+def test_a_disk_that_fills_up_in_any_file_is_the_users_error_and_changes_nothing(make_config, reporter) -> None:
+    config = make_config(training__steps=1, checkpoint__keep_best="off")
     folder = train(config, reporter)
     run = set_up(config, reporter)
     older = newest_checkpoint(folder / "checkpoints")
@@ -292,8 +291,8 @@ def test_a_disk_that_fills_up_in_any_file_is_the_users_error_and_changes_nothing
 
 @pytest.mark.parametrize(
     "changes",
-    [{}, {"adapter__init": "pissa"}, {"adapter__modules_to_save": ["action_encoder"]}, {"adapter__kind": "none"}],
-    ids=["lora", "pissa", "heads", "none"],
+    [{}, {"adapter__modules_to_save": ["action_encoder"]}, {"adapter__kind": "none"}],
+    ids=["lora", "heads", "none"],
 )
 def test_a_checkpoint_holds_what_is_trained_and_never_the_frozen_base(make_config, reporter, changes) -> None:
     config = make_config(training__steps=1, **changes)
@@ -308,7 +307,7 @@ def test_a_checkpoint_holds_what_is_trained_and_never_the_frozen_base(make_confi
             "predictor.safetensors": model.predictor.state_dict().keys()
         }
         return
-    for weights in written.values():  # the adapter; of PiSSA also where it started
+    for weights in written.values():
         assert sum(value.numel() for value in weights.values()) == trained
         assert all(re.search(r"\.lora_[AB]|\.action_encoder\.", name) for name in weights)
     rest = sum(path.stat().st_size for path in checkpoint.rglob("*") if path.name not in {*written, "optimizer.pt"})
@@ -348,10 +347,3 @@ def test_a_checkpoint_of_another_base_is_refused_though_its_path_is_the_same(
     WorldModel.random(WorldModel.from_pretrained(base_folder).sizes, seed=4).save_pretrained(base)
     with pytest.raises(InputError, match="an adapter trained on another predictor"):
         train(config, reporter)
-
-
-def test_a_run_of_pissa_goes_on_without_computing_where_it_started(make_config, reporter, monkeypatch) -> None:
-    config = make_config(training__steps=1, adapter__init="pissa")
-    train(config, reporter)
-    monkeypatch.setattr(torch.linalg, "svd", lambda *_, **__: pytest.fail("minutes, at the real size"))
-    assert set_up(config, reporter).state.step == 1

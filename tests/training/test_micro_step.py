@@ -14,7 +14,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.distributed.launch import make_accelerator
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.adapter.lora_linear import LoraLinear
+from vjepa2_ac.model.adapter.lora import LoraLinear
 from vjepa2_ac.model.adapter.low_rank import CastMatrices
 from vjepa2_ac.training.micro_step import Body, CapturedMicroStep, MicroStep
 from vjepa2_ac.training.setup import Run, batches_from, encode

@@ -196,10 +196,6 @@ class PlanningConfig(Section):
     compile: Annotated[Literal["off", "blocks"], OFF] = "off"
     """blocks: torch.compile for the predictor's blocks; needs a C compiler, and a minute within the first decision. The
     same energies to rounding. Not of `evaluate --planning`, which computes plainly."""
-    quantize: Annotated[Literal["off", "int8", "fp8"], OFF] = "off"
-    """int8, fp8: the predictor's blocks compute in 8 bits, with the adapter merged in (torchao, extra quantize); the
-    rest in bfloat16, which model.dtype must be. fp8 needs compute capability 8.9. Not of planner gradient, nor of
-    `evaluate --planning`."""
     axes: Local | None = None
     """Calibrated axes of the model (`data calibrate --axes`, its axes.json): it is given what the robot does turned by
     their angle, as its training camera would have seen it. Of poses in the base frame. Not of `evaluate --planning`."""
@@ -239,8 +235,6 @@ class PlanningConfig(Section):
                 f"limits.gripper_from {self.limits.gripper_from} is not a multiple of action_repeat"
                 f" {self.action_repeat}"
             )
-        if self.quantize != "off" and self.planner == "gradient":
-            raise ValueError(f"planner gradient needs gradients, which quantize {self.quantize} does not have")
         elites = {"cem": self.cem.elites, "icem": self.icem.elites}.get(self.planner, 0)
         if elites > self.samples:
             raise ValueError(f"{self.planner}.elites {elites} are more than {self.samples} samples")

@@ -27,7 +27,7 @@ from vjepa2_ac.decoding.optimizer_steps import DecoderSteps
 from vjepa2_ac.decoding.setup import Setup, prepare, setup
 from vjepa2_ac.distributed.preemption import StoppedError, StopRequest, stop_on_signals
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.finite import first_not_finite
+from vjepa2_ac.model.network.pretrained_folder import first_not_finite
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import OPTIMIZER, RunState, newest_checkpoint, read_state, write_checkpoint
 from vjepa2_ac.runs.folder import CHECKPOINTS

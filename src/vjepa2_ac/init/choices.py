@@ -10,8 +10,7 @@ from typing import Any
 from vjepa2_ac.config.model import ModelSizes
 from vjepa2_ac.init.found import FoundData, Knob, Knobs
 from vjepa2_ac.init.machine import Machine
-from vjepa2_ac.model.checkpoints.published import PUBLISHED
-from vjepa2_ac.model.checkpoints.published_names import OFFICIAL
+from vjepa2_ac.model.checkpoints.published import OFFICIAL, PUBLISHED
 from vjepa2_ac.places import BUILTIN
 from vjepa2_ac.training.cost.memory import GIGABYTE
 

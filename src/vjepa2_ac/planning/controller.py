@@ -100,7 +100,7 @@ class Controller:
         Raises:
             InputError: The model's states and actions are of other spaces, or nobody knows which state follows from an
                 action; or it needs a camera pose and none is given, or the other way round; or its blocks cannot be
-                compiled or quantized to 8 bits; or vectors have no limits, or a workspace; or `planning.axes` are not
+                compiled; or vectors have no limits, or a workspace; or `planning.axes` are not
                 this model's.
         """
         _require_spaces(world_model.sizes, spaces)

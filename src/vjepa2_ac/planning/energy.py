@@ -17,7 +17,7 @@ from torch.utils.checkpoint import checkpoint
 from vjepa2_ac.config.planning import EnergyConfig
 from vjepa2_ac.distances import absolute_difference, squared_difference
 from vjepa2_ac.episode import Progress, no_progress
-from vjepa2_ac.model.network.kv_cache import KeyValueCache
+from vjepa2_ac.model.network.predictor_network import KeyValueCache
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.axes.mapping import Axes
 from vjepa2_ac.planning.goals import Goal

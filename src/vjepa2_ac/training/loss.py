@@ -15,7 +15,7 @@ from vjepa2_ac.config import TrainingConfig
 from vjepa2_ac.distances import absolute_difference
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.model.network.dynamics import LatentDynamics
-from vjepa2_ac.model.network.kv_cache import KeyValueCache
+from vjepa2_ac.model.network.predictor_network import KeyValueCache
 from vjepa2_ac.registry import LOSSES
 
 Distance = Callable[[Tensor, Tensor], Tensor]  # of predicted and true latents, number by number

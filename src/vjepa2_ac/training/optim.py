@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from vjepa2_ac.config import TrainingConfig
 from vjepa2_ac.errors import InputError, pip_install
-from vjepa2_ac.model.finite import first_not_finite
+from vjepa2_ac.model.network.pretrained_folder import first_not_finite
 
 _MOST_STEPS = 2**53  # larger counts are not exact in float64
 

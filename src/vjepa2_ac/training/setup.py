@@ -36,7 +36,6 @@ from vjepa2_ac.runs.checkpoint import (
     OPTIMIZER,
     RunState,
     checkpoint_name,
-    newest_checkpoint,
     write_checkpoint,
 )
 from vjepa2_ac.runs.folder import CHECKPOINTS, with_stride
@@ -189,7 +188,7 @@ def open_model(data: RunData, reporter: Reporter = SILENT, *, check_only: bool =
         _require_fitting_clips(dataset, replayed, _first_of(dataset, "train"))
     warn_if_shared_memory_is_small(config, dataset, data.first_clip, accelerator, reporter)
     fit_to_data(world_model, config, dataset, reporter)
-    add_adapter(world_model, config.adapter, seed=config.seed, started=_started(config))
+    add_adapter(world_model, config.adapter, seed=config.seed)
     reporter.note(str(trainable_report(world_model)))
     if unusual := config.adapter.out_of_line:
         reporter.note(f"Warning: {unusual}.")
@@ -279,14 +278,6 @@ def save_checkpoint(run: Run, folder: Path) -> None:
 def _decoder_of(config: Config) -> TrainedDecoder | None:
     name = config.validation.decoder
     return None if name is None else load_decoder(name, where="validation.decoder:")
-
-
-def _started(config: Config) -> Path | None:
-    """Return the adapter of the checkpoint, if knowing it saves minutes: PiSSA starts from its initial weights."""
-    if config.adapter.init != "pissa":
-        return None
-    checkpoint = newest_checkpoint(Path(config.run_dir) / CHECKPOINTS)
-    return checkpoint / ADAPTER if checkpoint else None
 
 
 def _read_one_clip_of_each_split(dataset: Dataset) -> Batch:

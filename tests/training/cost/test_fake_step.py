@@ -179,7 +179,7 @@ def test_all_blocks_are_inferred_exactly_from_two_and_three(
 def test_ranks_of_single_blocks_are_measured_as_they_are() -> None:
     ranks = {r"blocks\.4\..*": 64}
     even, uneven = (
-        measure_step(run_config({**LORA, "rank_pattern": one}), model_sizes(depth=5)) for one in ({}, ranks)
+        measure_step(run_config({**LORA, "peft": one}), model_sizes(depth=5)) for one in ({}, {"rank_pattern": ranks})
     )
     heavier = measure_step(run_config({**LORA, "rank": 64}), model_sizes(depth=5))
     assert even.stored.saved < uneven.stored.saved < heavier.stored.saved

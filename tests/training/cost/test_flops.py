@@ -28,7 +28,7 @@ ADAPTERS: dict[str, dict[str, Any]] = {
     "lora": LORA, "value only": {**LORA, "targets": ["v"]}, "late": {**LORA, "targets": ["fc2"]},
     "everywhere": {**LORA, "targets": ["all"]}, "heads": {**LORA, "modules_to_save": ["action_encoder"]},
     "none": {"kind": "none"}, "ends": {**LORA, "modules_to_save": ["predictor_embed", "predictor_proj"]},
-    "ranks": {**LORA, "rank_pattern": {"fc1": 8, "blocks.0.attn.q": 2}},
+    "ranks": {**LORA, "peft": {"rank_pattern": {"fc1": 8, "blocks.0.attn.q": 2}}},
 }  # fmt: skip
 
 

@@ -9,7 +9,7 @@ from sized_runs import LORA, built, model_sizes, run_config
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import DataConfig, ModelSizes, ReplayConfig
 from vjepa2_ac.console.memory import memory_lines
-from vjepa2_ac.model.network.kv_cache import KeyValueCache
+from vjepa2_ac.model.network.predictor_network import KeyValueCache
 from vjepa2_ac.training.cost.memory import USUAL_GPU, estimate_memory, ways_to_fit
 from vjepa2_ac.training.optim import make_optimizer
 
@@ -64,10 +64,7 @@ def test_the_peak_is_that_of_training_or_of_validation() -> None:
 
 def test_other_trained_layers_are_counted() -> None:
     plain = estimate_memory(run_config(), ModelSizes())
-    dora, pissa = (
-        estimate_memory(run_config({**LORA, **how}), ModelSizes()) for how in ({"dora": True}, {"init": "pissa"})
-    )
-    assert pissa == plain  # what PiSSA started from stays on the CPU
+    dora = estimate_memory(run_config({**LORA, "dora": True}), ModelSizes())
     assert dora.trained > plain.trained
     assert dora.step.stored.peak > plain.step.stored.peak
 

@@ -24,10 +24,13 @@ ADAPTERS: dict[str, dict[str, Any]] = {
     "the ends whole": {**LORA, "targets": ["all"], "modules_to_save": ["predictor_embed", "predictor_proj", *HEADS]},
     "dora": {**LORA, "dora": True},
     "dora everywhere": {**LORA, "dora": True, "targets": ["all"]},
-    "pissa": {**LORA, "init": "pissa"},
-    "patterns": {**LORA, "rank_pattern": {"fc1": 6, r"blocks\.0\.attn\.q": 2, "attn.(k|v)": 3}},
-    "patterns that overlap": {**LORA, "rank_pattern": {r"blocks\.1\..*": 5, "q": 2}, "dora": True},
-    "a pattern for a head": {**LORA, "targets": ["all"], "rank_pattern": {"predictor_embed": 9, ".*_encoder": 1}},
+    "patterns": {**LORA, "peft": {"rank_pattern": {"fc1": 6, r"blocks\.0\.attn\.q": 2, "attn.(k|v)": 3}}},
+    "patterns that overlap": {**LORA, "peft": {"rank_pattern": {r"blocks\.1\..*": 5, "q": 2}}, "dora": True},
+    "a pattern for a head": {
+        **LORA,
+        "targets": ["all"],
+        "peft": {"rank_pattern": {"predictor_embed": 9, ".*_encoder": 1}},
+    },
     "none": {"kind": "none"},
 }
 SHAPES = {

@@ -107,7 +107,7 @@ def meta_predictor(config: Config, sizes: ModelSizes) -> nn.Module:
         return predictor
     predictor.requires_grad_(False)
     with torch.device("meta"):
-        if adapter.dora or adapter.modules_to_save:
+        if adapter.dora or adapter.modules_to_save or adapter.peft:
             from vjepa2_ac.model.adapter.lora import with_adapter
 
             return with_adapter(predictor, adapter)

@@ -1,7 +1,7 @@
 """Measured step: what one micro-step of a run keeps in memory, on fake tensors, through the code that trains.
 
 Blocks after the first are alike: models of two and of three tell what each further one needs, and the rest follows
-exactly, phase by phase of the step. Where `adapter.rank_pattern` makes blocks differ, all of them are measured.
+exactly, phase by phase of the step. Where `adapter.peft` makes blocks differ, all of them are measured.
 
 Fake tensors are on the CPU, because fake CUDA tensors need a driver or a compiled guard. What CUDA does otherwise is in
 `FakeModel`.
@@ -22,7 +22,7 @@ from torch.utils._pytree import tree_leaves, tree_map
 from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.distributed.device import PRECISIONS
 from vjepa2_ac.model.adapter.low_rank import CastMatrices
-from vjepa2_ac.model.network.kv_cache import KeyValueCache
+from vjepa2_ac.model.network.predictor_network import KeyValueCache
 from vjepa2_ac.training.cost.fake_model import FakeModel, Kind, fake_tensors, meta_predictor
 from vjepa2_ac.training.cost.live_storages import LiveStorages
 from vjepa2_ac.training.loss import Objective
@@ -97,7 +97,7 @@ def over_depth(measure: Callable[[ModelSizes], Measured], config: Config, sizes:
         sizes: Of its model.
     """
     predictor = sizes.predictor
-    if predictor.depth <= _BLOCKS[1] or config.adapter.rank_pattern:
+    if predictor.depth <= _BLOCKS[1] or config.adapter.peft:
         return measure(sizes)
     fewer, more = (
         measure(sizes.model_copy(update={"predictor": predictor.model_copy(update={"depth": depth})}))

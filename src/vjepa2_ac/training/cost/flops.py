@@ -15,8 +15,9 @@ from dataclasses import dataclass
 
 from torch import nn
 
-from vjepa2_ac.config import Config, ModelSizes
+from vjepa2_ac.config import AdapterConfig, Config, ModelSizes
 from vjepa2_ac.model.adapter.targets import adapter_ranks
+from vjepa2_ac.model.network.predictor_network import PredictorNetwork
 from vjepa2_ac.training.cost.fake_model import meta_network
 
 
@@ -102,7 +103,7 @@ class _Passes:
         if config is not None and config.adapter.kind == "none":
             self._whole = set(self._layers)
         elif config is not None:
-            self._ranks, self._whole = adapter_ranks(network, config.adapter), set(config.adapter.modules_to_save)
+            self._ranks, self._whole = _ranks(network, config.adapter), set(config.adapter.modules_to_save)
         conditions = ("action_encoder", "state_encoder", "extrinsics_encoder")
         self._conditions = [name for name in conditions if name in self._layers and name not in network.unused_layers]
 
@@ -161,3 +162,11 @@ class _Passes:
 
     def _changes(self, name: str) -> bool:
         return name in self._whole or name in self._ranks
+
+
+def _ranks(network: PredictorNetwork, adapter: AdapterConfig) -> dict[str, int]:
+    if not adapter.peft:
+        return adapter_ranks(network, adapter)
+    from vjepa2_ac.model.adapter.lora import ranks_by_peft  # PEFT itself says what its options do
+
+    return ranks_by_peft(network, adapter)

@@ -12,20 +12,17 @@ import peft
 import pytest
 import torch
 import yaml
-from huggingface_hub import ModelCard
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from paths import GOLDEN
 from run_fixtures import TINY, SilentReporter, one_thread, tiny_config
+from vjepa2_ac import export
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.export import export
-from vjepa2_ac.export.export import CARD, OFFICIAL_NAME, Exported, export_run
-from vjepa2_ac.model.adapter.lora import load_trained
+from vjepa2_ac.export import CARD, Exported, export_run
 from vjepa2_ac.model.adapter.merging import base_only
-from vjepa2_ac.model.checkpoints.official import load_official
+from vjepa2_ac.model.checkpoints.loading import load_official
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reports.metrics_json import METRICS_FILE
 from vjepa2_ac.reports.write import PLOT
@@ -110,32 +107,11 @@ def test_the_official_checkpoint_predicts_as_the_run_does(trained, tmp_path: Pat
     assert_predicts_as(load_official(written, sizes_of(run)), run)
 
 
-def test_the_official_checkpoint_has_the_names_of_metas(trained, tmp_path: Path) -> None:
-    written = export_run(trained(), tmp_path / "folder", "official").path
-    assert written == tmp_path / "folder" / OFFICIAL_NAME
-    assert list(written.parent.iterdir()) == [written]
-    found = torch.load(written, weights_only=True)
-    meta = torch.load(GOLDEN / "model" / "tiny.pt", weights_only=True)
-    without_number = lambda weights: {re.sub(r"blocks\.\d+", "blocks.N", name) for name in weights}  # noqa: E731
-    for part in ("encoder", "target_encoder", "predictor"):
-        assert without_number(found[part]) == without_number(meta[part])
-    assert all(torch.equal(value, found["target_encoder"][name]) for name, value in found["encoder"].items())
-
-
-@pytest.mark.parametrize(("name", "form"), [("x.bin", "official"), ("x.safetensors", "official"), ("x.pt", "merged")])
+@pytest.mark.parametrize(("name", "form"), [("x.pt", "merged"), ("x.pt", "hub")])
 def test_a_name_of_another_kind_of_file_makes_no_folder(tmp_path: Path, name: str, form: Any) -> None:
     with pytest.raises(InputError, match=rf"{name}: the name of a \{Path(name).suffix} file"):
         export_run(tmp_path / "run", tmp_path / name, form)
     assert not (tmp_path / name).exists()
-
-
-def test_it_loads_as_the_base_of_another_run(trained, make_config, reporter, tmp_path: Path) -> None:
-    run = trained()
-    written = export_run(run, tmp_path / "base.pt", "official").path
-    config = make_config(run_dir=str(tmp_path / "next"), model__base=str(written), training__steps=1)
-    sizes = config.model.model_copy(update={"sizes": sizes_of(run)})
-    train(config.model_copy(update={"model": sizes}), reporter)
-    assert load_run(tmp_path / "next", "1").checkpoint.name == "step-00000001"
 
 
 def test_merged_is_a_folder_that_predicts_as_the_run_does(trained, tmp_path: Path) -> None:
@@ -162,30 +138,20 @@ def poison(path: Path) -> str:
 
 
 @pytest.mark.parametrize("form", ["merged", "official", "hub"])
-@pytest.mark.parametrize(
-    ("alpha", "reported"),
-    [
-        (float("nan"), r"adapter_config\.json: lora_alpha: .*nan"),
-        (float("inf"), r"adapter_config\.json: lora_alpha: .*inf"),
-        (1e300, "lora_alpha: .*less than or equal"),
-    ],
-)
-def test_an_adapter_that_spoils_its_base_is_refused_and_leaves_nothing(
-    copied, tmp_path: Path, form: Any, alpha: float, reported: str
-) -> None:
+def test_an_adapter_that_spoils_its_base_is_refused_and_leaves_nothing(copied, tmp_path: Path, form: Any) -> None:
     run = copied()
-    rewrite_adapter(run, lora_alpha=alpha)
-    with pytest.raises(InputError, match=reported):
+    rewrite_adapter(run, lora_alpha=1e300)
+    with pytest.raises(InputError, match=r"lora_alpha: .*less than or equal"):
         export_run(run, tmp_path / "out", form)
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
     ("kind", "file"),
-    [("lora", "adapter_model.safetensors"), ("lora", "pissa_start.safetensors"), ("none", "predictor.safetensors")],
+    [("lora", "adapter_model.safetensors"), ("none", "predictor.safetensors")],
 )
 def test_a_trained_weight_that_is_not_finite_is_named(copied, tmp_path: Path, kind: str, file: str) -> None:
-    run = copied(adapter__kind=kind, **({"adapter__init": "pissa"} if file.startswith("pissa") else {}))
+    run = copied(adapter__kind=kind)
     checkpoint = load_run(run).checkpoint
     name = poison(checkpoint / "adapter" / file)
     write_manifest(checkpoint)
@@ -206,14 +172,6 @@ def test_plain_peft_loads_what_goes_to_the_hub(trained, base_folder: Path, tmp_p
     export_run(run, tmp_path / "hub", "hub")
     model = WorldModel.from_pretrained(base_folder)
     model.predictor = peft.PeftModel.from_pretrained(model.predictor, str(tmp_path / "hub"))
-    assert_predicts_as(model, run)
-
-
-def test_we_load_what_goes_to_the_hub(trained, base_folder: Path, tmp_path: Path) -> None:
-    run = trained()
-    export_run(run, tmp_path / "hub", "hub")
-    model = WorldModel.from_pretrained(base_folder)
-    load_trained(model, tmp_path / "hub")
     assert_predicts_as(model, run)
 
 
@@ -242,14 +200,15 @@ def test_the_card_describes_unusual_adapter_settings(trained, tmp_path: Path, da
     loss = {"training__loss": "l2", "training__rollout_weight": 2}
     second = {"path": str(data_folder), "frames": 4, "stride": 2}
     given = {**heads, **loss, "replay": {"share": 0.5, "data": second}}
-    export_run(trained(adapter__init="pissa", adapter__dora=True, **given), tmp_path / "hub", "hub")
+    export_run(
+        trained(adapter__peft={"rank_pattern": {"fc1": 2}}, adapter__dora=True, **given), tmp_path / "hub", "hub"
+    )
     card = (tmp_path / "hub" / CARD).read_text()
-    assert "rsLoRA, DoRA, started as pissa, `action_encoder` trained whole" in card
-    assert "loss: l2, teacher forcing + 2 x rollout of 2 steps" in card
+    assert "rsLoRA, DoRA, `rank_pattern: {'fc1': 2}`\n" in card
+    assert "trained whole: `action_encoder`\n" in card
+    assert "loss: l2, 1 x teacher forcing + 2 x rollout of 2 steps" in card
     assert f"replay: 50% of the training clips from rlds, `{data_folder}`" in card
     assert "warm-up: 1 step\n" in card
-    assert "PEFT alone cannot use it" in card, "it would cut another part out of the base"
-    assert "from peft" not in card
 
 
 @pytest.mark.parametrize("sizes", [{}, {"model__sizes": TINY}], ids=["released sizes", "other sizes"])
@@ -294,17 +253,6 @@ def test_the_card_takes_what_evaluate_writes_and_says_of_which_checkpoint(copied
     assert "model-index" not in card, "results of another checkpoint are not those of this adapter"
 
 
-def test_what_was_measured_are_results_on_the_hub(copied, tmp_path: Path) -> None:
-    run = copied()
-    assert main(["evaluate", str(run), *QUICK]) == 0
-    measured = json.loads((run / METRICS_FILE).read_text())
-    assert main(["export", str(run), str(tmp_path / "hub"), "--to", "hub"]) == 0
-    (entry,) = ModelCard.load(tmp_path / "hub" / CARD).data.to_dict()["model-index"]
-    found = [metric["value"] for result in entry["results"] for metric in result["metrics"]]
-    ratios = measured["models"]["adapter"]["rollout"]["l1"]["over_persistence"]
-    assert found == pytest.approx([ratio["value"] for ratio in ratios], abs=1e-4)
-
-
 def test_another_checkpoint_than_the_newest_is_measured_and_exported_where_it_is_asked_for(
     copied, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -338,7 +286,7 @@ def weights_of(run: Path, step: int) -> dict[str, Tensor]:
     return load_file(run / "checkpoints" / checkpoint_name(step) / "adapter" / "adapter_model.safetensors")
 
 
-@pytest.mark.parametrize("content", ["{", "[]", "{}", '{"format": 3}', '{"format": 1, "verdict": 3}'])
+@pytest.mark.parametrize("content", ["{", '{"format": 1, "verdict": 3}'])
 def test_a_damaged_evaluation_is_named_and_nothing_is_written(copied, tmp_path: Path, content: str) -> None:
     run = copied()
     (run / METRICS_FILE).write_text(content)
@@ -379,15 +327,6 @@ def test_a_place_that_cannot_be_written_is_refused_before_work_begins(tmp_path: 
     (tmp_path / "file").write_text("no folder")
     with pytest.raises(InputError, match="cannot be written"):
         export_run(tmp_path / "run", tmp_path / "file" / "below", form)
-
-
-@pytest.mark.parametrize("form", ["merged", "official", "hub"])
-def test_a_run_without_a_checkpoint_is_refused(copied, tmp_path: Path, form: Any) -> None:
-    run = copied()
-    (run / "checkpoints").rename(run / "elsewhere")
-    with pytest.raises(InputError, match="without a whole checkpoint"):
-        export_run(run, tmp_path / "out", form)
-    assert not (tmp_path / "out").exists()
 
 
 def test_a_full_disk_leaves_nothing_behind(trained, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
