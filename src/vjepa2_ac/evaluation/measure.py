@@ -19,8 +19,7 @@ from torch import Tensor
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.evaluation.metrics import L1, Metric
-from vjepa2_ac.evaluation.result import MODES, Mode, PredictionErrors, Way
+from vjepa2_ac.evaluation.result import L1, MODES, Metric, Mode, PredictionErrors, Way
 
 ALL: tuple[tuple[Way, Mode], ...] = tuple(product(get_args(Way), MODES))
 VALIDATED: tuple[tuple[Way, Mode], ...] = (  # rollouts, which take longest, with the true actions only

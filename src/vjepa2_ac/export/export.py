@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
-
-from jinja2 import TemplateError
+from typing import Literal
 
 from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.episode import POSE_WIDTHS
@@ -19,7 +17,7 @@ from vjepa2_ac.model.adapter.merging import merge_adapter
 from vjepa2_ac.model.checkpoints.official import to_official
 from vjepa2_ac.model.finite import require_finite
 from vjepa2_ac.model.network.input_heads import widths_of_model
-from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics
+from vjepa2_ac.reports.metrics_json import METRICS_FILE, Metrics, read_metrics
 from vjepa2_ac.reports.write import PLOT
 from vjepa2_ac.runs.checkpoint import ADAPTER
 from vjepa2_ac.runs.checkpoint_selection import SELECTED
@@ -133,39 +131,32 @@ def _check_predictor(folder: Path, sizes: ModelSizes) -> None:
         )
 
 
-def _write_hub(run: TrainedRun, folder: Path, destination: Path, evaluation: dict[str, Any] | None) -> None:
+def _write_hub(run: TrainedRun, folder: Path, destination: Path, evaluation: Metrics | None) -> None:
     """Copy the adapter of a checkpoint, which load_run has verified, and put the card beside it."""
     plot = folder / PLOT if evaluation is not None and (folder / PLOT).is_file() else None
     adapter = run.checkpoint / ADAPTER
-    try:
-        card = model_card(run, folder.resolve().name, evaluation, plot.name if plot else None)
-    except (KeyError, TypeError, ValueError, AttributeError, TemplateError) as error:
-        raise _damaged(folder, error) from None
+    card = model_card(run, folder.resolve().name, evaluation, plot.name if plot else None)
     _merge(run)  # the merged model is not written, but an adapter that makes it not finite is of no use
     with folder_writer(destination, ADAPTER_FILE) as fresh:
         for path in (*sorted(adapter.iterdir()), *([plot] if plot else [])):
             shutil.copyfile(path, fresh / path.name)
         if evaluation is not None:
-            write_atomically(fresh / METRICS_FILE, json.dumps(evaluation, indent=1))
+            write_atomically(fresh / METRICS_FILE, _published(folder))
         write_atomically(fresh / CARD, card)
 
 
-def _read_evaluation(folder: Path) -> dict[str, Any] | None:
+def _read_evaluation(folder: Path) -> Metrics | None:
     """Return the result of `evaluate` for a run, without paths of this machine; None if there is none."""
     if not (folder / METRICS_FILE).exists():
         return None
     metrics = read_metrics(folder)
-    try:
-        about = {**metrics["about"], "subject": folder.resolve().name}
-        return {**metrics, "about": {**about, "checkpoint_path": Path(about["checkpoint_path"]).name}}
-    except (TypeError, KeyError) as error:
-        raise _damaged(folder, error) from None
+    checkpoint = Path(metrics.about.checkpoint_path).name
+    return replace(metrics, about=replace(metrics.about, checkpoint_path=checkpoint))
 
 
-def _damaged(folder: Path, error: Exception) -> InputError:
-    return InputError(
-        where=str(folder / METRICS_FILE),
-        found=f"metrics that cannot be used ({error!r})",
-        needed="what `vjepa2-ac evaluate` writes",
-        fix=f"Write it again with `vjepa2-ac evaluate {folder}`, or delete it",
-    )
+def _published(folder: Path) -> str:
+    """Return the whole file of metrics without paths of this machine."""
+    metrics = json.loads((folder / METRICS_FILE).read_bytes())
+    about = metrics["about"]
+    about |= {"subject": folder.resolve().name, "checkpoint_path": Path(about["checkpoint_path"]).name}
+    return json.dumps(metrics, indent=1)

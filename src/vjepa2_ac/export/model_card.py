@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from pathlib import PurePath
-from typing import Any
 
 from huggingface_hub import EvalResult, ModelCardData
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
@@ -17,11 +15,14 @@ from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.model.adapter.adapter_folder import LORA_WEIGHTS
 from vjepa2_ac.model.adapter.lora import trainable_report
 from vjepa2_ac.model.network.input_heads import widths_as_text, widths_of_model
+from vjepa2_ac.reports.metrics_json import Metrics, WrittenRow
 from vjepa2_ac.runs.checkpoint import ADAPTER, read_state
 from vjepa2_ac.runs.loading import TrainedRun
 
+_ERROR = "rollout.l1.over_persistence.{}"  # the key of a row, by horizon
 
-def model_card(run: TrainedRun, name: str, evaluation: Mapping[str, Any] | None, plot: str | None) -> str:
+
+def model_card(run: TrainedRun, name: str, evaluation: Metrics | None, plot: str | None) -> str:
     """Return the README.md of an adapter, in Markdown, with the Hub's front matter.
 
     Args:
@@ -31,7 +32,7 @@ def model_card(run: TrainedRun, name: str, evaluation: Mapping[str, Any] | None,
         plot: Name of the figure beside the card.
 
     Raises:
-        KeyError: The evaluation lacks a metric; likewise TemplateError, and TypeError if one is of another type.
+        TemplateError: The template does not fit.
     """
     config, model = run.config, run.world_model
     card = Environment(  # Markdown is not escaped
@@ -71,7 +72,7 @@ def _trained(run: TrainedRun) -> str:
     return str(trainable_report(run.world_model)._replace(trained=sum(map(math.prod, shapes))))
 
 
-def _front(run: TrainedRun, name: str, evaluation: Mapping[str, Any] | None) -> str:
+def _front(run: TrainedRun, name: str, evaluation: Metrics | None) -> str:
     """Return what the Hub reads of a card: tags, and the errors of the adapter as results of an evaluation."""
     card = ModelCardData(
         library_name="peft",
@@ -83,32 +84,31 @@ def _front(run: TrainedRun, name: str, evaluation: Mapping[str, Any] | None) -> 
     return str(card.to_yaml())
 
 
-def _eval_results(run: TrainedRun, measured: Mapping[str, Any]) -> list[EvalResult] | None:
+def _eval_results(run: TrainedRun, measured: Metrics) -> list[EvalResult] | None:
     """Return the rollout errors of this very checkpoint; None where it was not measured."""
-    if measured["about"]["checkpoint_path"] != run.checkpoint.name:
+    about = measured.about
+    if about.checkpoint_path != run.checkpoint.name:
         return None
-    about, models = measured["about"], measured["models"]
-    ratios = models[list(models)[-1]]["rollout"]["l1"]["over_persistence"]  # what was measured comes last
     return [
         EvalResult(
             task_type="robotics",
             task_name="prediction of latents",
             dataset_type=run.config.data.source,
             dataset_name=PurePath(run.config.data.path).name,
-            dataset_split=about["split"],
+            dataset_split=about.split,
             metric_type="l1_over_persistence",
-            metric_name=f"L1 error over persistence, {step * about['seconds_per_step']:.2f} s ahead",
-            metric_value=round(ratio["value"], 4),
+            metric_name=f"L1 error over persistence, {step * about.seconds_per_step:.2f} s ahead",
+            metric_value=round(row.value, 4),
         )
-        for step, ratio in enumerate(ratios, start=1)
-        if ratio["value"] is not None
+        for step in range(1, about.frames)
+        if (row := measured.of(_ERROR.format(step))) is not None and row.value is not None
     ]
 
 
-def _rankings(evaluation: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the mean rank of the true action, by model; an earlier version did not measure it."""
-    found = {name: model.get("ranking") for name, model in evaluation["models"].items()}
-    return {name: ranking["rank"] for name, ranking in found.items() if ranking}
+def _rankings(evaluation: Metrics) -> dict[str, WrittenRow]:
+    """Return the mean rank of the true action, by model."""
+    found = {name: evaluation.of("ranking.rank", name) for name in evaluation.models}
+    return {name: row for name, row in found.items() if row is not None}
 
 
 def _loss(config: Config) -> str:
@@ -130,15 +130,16 @@ def _adapter(config: Config) -> str:
     return ", ".join(words)
 
 
-def _curves(measured: Mapping[str, Any]) -> list[tuple[Mapping[str, Any], ...]]:
+def _curves(measured: Metrics) -> list[list[WrittenRow | None]]:
     """Return the errors over persistence of all models at each horizon."""
-    by_model = [model["rollout"]["l1"]["over_persistence"] for model in measured["models"].values()]
-    return list(zip(*by_model, strict=True))
+    steps = range(1, measured.about.frames)
+    return [[measured.of(_ERROR.format(step), name) for name in measured.models] for step in steps]
 
 
-def _ratio(ratio: Mapping[str, Any]) -> str:
-    interval = "" if ratio["low"] is None else f" [{ratio['low']:.3f}, {ratio['high']:.3f}]"
-    return f"{ratio['value']:.3f}{interval}"
+def _ratio(row: WrittenRow | None) -> str:
+    if row is None or row.value is None:
+        return "not measured"
+    return f"{row.value:.3f}" + ("" if row.low is None else f" [{row.low:.3f}, {row.high:.3f}]")
 
 
 def _base_arguments(config: Config) -> str:
