@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 from faults import CLEAN, FAULTS, Fault, Recording, spoiled
 
+from vjepa2_ac.calibration.data import VariantProbe, probe_config
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import load_config, parse_config
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
@@ -27,8 +28,6 @@ from vjepa2_ac.data.inspection.check import at_some_stride, check_data
 from vjepa2_ac.data.inspection.finding import Finding
 from vjepa2_ac.data.inspection.statistics import sample_of
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.data_variants.from_config import probe_config
-from vjepa2_ac.evaluation.data_variants.measure import VariantProbe
 from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
 
 HELD_OUT = 0.7  # of the episodes: the probe measures these

@@ -12,7 +12,7 @@ from tiny_models import tiny_model
 from vjepa2_ac.config.planning import CemConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.config.training import TrainingConfig
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.strata import clips_of
+from vjepa2_ac.evaluation.clips import clips_of
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.planner import SOLVERS, Planner
