@@ -8,8 +8,8 @@ from planned import with_plans
 from vjepa2_ac.console.evaluation import row_tables
 from vjepa2_ac.console.progress import PlainConsole
 from vjepa2_ac.evaluation.estimates import gain_over, over_persistence, rank_difference, stratum_gain
-from vjepa2_ac.evaluation.result import L1, Row
-from vjepa2_ac.evaluation.rows import rows_of, sections
+from vjepa2_ac.evaluation.result import L1, Row, sections
+from vjepa2_ac.evaluation.rows import rows_of
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics, write_metrics
 from vjepa2_ac.reports.page import report_page

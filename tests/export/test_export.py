@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from run_fixtures import TINY, SilentReporter, one_thread, tiny_config
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.result import Row
 from vjepa2_ac.export import export
 from vjepa2_ac.export.export import CARD, OFFICIAL_NAME, Exported, export_run
 from vjepa2_ac.model.adapter.lora import load_trained
@@ -35,21 +37,23 @@ from vjepa2_ac.runs.loading import load_run
 from vjepa2_ac.runs.manifest import write_manifest
 from vjepa2_ac.training.loop import train
 
+ROWS = [
+    Row("a table", "0.50 s ahead", "rollout.l1.over_persistence.1", "base", 0.9, 0.8, 0.95),
+    Row("a table", "0.50 s ahead", "rollout.l1.over_persistence.1", "adapter", 0.7),
+]
 EVALUATED = {
-    "format": 1,
+    "format": 3,
     "verdict": "The adapter predicts better.",
+    "trained": "adapter",
+    "base": "base",
     "about": {
-        "subject": "somewhere/run",
-        "checkpoint_path": "somewhere/run/checkpoints/step-00000002",
-        "split": "test",
-        "seconds_per_step": 0.5,
+        "subject": "somewhere/run", "checkpoint_path": "somewhere/run/checkpoints/step-00000002", "data": "data",
+        "cameras": ["exterior"], "split": "test", "frames": 2, "stride": 4, "seconds_per_step": 0.5,
     },
-    "clips": {"count": 8, "episodes": 3},
-    "models": {
-        "base": {"rollout": {"l1": {"over_persistence": [{"value": 0.9, "low": 0.8, "high": 0.95}]}}},
-        "adapter": {"rollout": {"l1": {"over_persistence": [{"value": 0.7, "low": None, "high": None}]}}},
-    },
-}
+    "clips": {"count": 8, "episodes": 3, "fingerprint": "0", "named": []},
+    "rows": [{name: None if value != value else value for name, value in asdict(row).items()} for row in ROWS],  # noqa: PLR0124
+    "by_clip": {"persistence": [], "models": {"base": [], "adapter": []}},
+}  # fmt: skip
 
 
 Trained = Callable[..., Path]
@@ -301,8 +305,12 @@ def test_what_was_measured_are_results_on_the_hub(copied, tmp_path: Path) -> Non
     assert main(["export", str(run), str(tmp_path / "hub"), "--to", "hub"]) == 0
     (entry,) = ModelCard.load(tmp_path / "hub" / CARD).data.to_dict()["model-index"]
     found = [metric["value"] for result in entry["results"] for metric in result["metrics"]]
-    ratios = measured["models"]["adapter"]["rollout"]["l1"]["over_persistence"]
-    assert found == pytest.approx([ratio["value"] for ratio in ratios], abs=1e-4)
+    ratios = [
+        row["value"]
+        for row in measured["rows"]
+        if row["model"] == "adapter" and row["key"].startswith("rollout.l1.over_persistence.")
+    ]
+    assert found == pytest.approx(ratios, abs=1e-4)
 
 
 def test_another_checkpoint_than_the_newest_is_measured_and_exported_where_it_is_asked_for(
@@ -338,7 +346,7 @@ def weights_of(run: Path, step: int) -> dict[str, Tensor]:
     return load_file(run / "checkpoints" / checkpoint_name(step) / "adapter" / "adapter_model.safetensors")
 
 
-@pytest.mark.parametrize("content", ["{", "[]", "{}", '{"format": 3}', '{"format": 1, "verdict": 3}'])
+@pytest.mark.parametrize("content", ["{", "[]", "{}", '{"format": 99}', '{"format": 3, "verdict": 3}'])
 def test_a_damaged_evaluation_is_named_and_nothing_is_written(copied, tmp_path: Path, content: str) -> None:
     run = copied()
     (run / METRICS_FILE).write_text(content)

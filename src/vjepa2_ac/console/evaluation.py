@@ -8,8 +8,7 @@ from itertools import groupby
 from rich.table import Table
 
 from vjepa2_ac.console.progress import MetricsTable
-from vjepa2_ac.evaluation.result import Row
-from vjepa2_ac.evaluation.rows import sections
+from vjepa2_ac.evaluation.result import Row, sections
 
 
 def row_tables(rows: Sequence[Row], title: str) -> list[Table]:

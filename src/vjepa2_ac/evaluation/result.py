@@ -8,7 +8,7 @@ layer-normalised latents, by METRICS. What has intervals is computed from these 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
@@ -22,6 +22,9 @@ from vjepa2_ac.spaces import ActionSpace
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+
+PERSISTENCE = "persistence"  # the model of rows that stand where chance does
 
 
 @dataclass(frozen=True)
@@ -49,6 +52,37 @@ class Row:
     def __str__(self) -> str:
         text = "\N{EN DASH}" if math.isnan(self.value) else f"{self.estimate:{self.form}}"
         return f"{text} ({self.note})" if self.note else text
+
+
+@dataclass(frozen=True)
+class RowTable:
+    """The rows of one group as a table."""
+
+    title: str
+    columns: tuple[str, ...]
+    lines: tuple[tuple[str, str, tuple[str, ...]], ...]  # label, by chance or persistence, a cell for each column
+
+
+def sections(rows: Sequence[Row]) -> list[RowTable]:
+    """Return rows as tables: those of one key are a line, each in the column of its model."""
+    by_key: dict[str, dict[str, Row]] = {}
+    for row in rows:
+        by_key.setdefault(row.key, {})[row.model] = row
+    groups: dict[str, list[dict[str, Row]]] = {}
+    for line in by_key.values():
+        groups.setdefault(next(iter(line.values())).group, []).append(line)
+    return [_section(title, lines) for title, lines in groups.items()]
+
+
+def _section(title: str, lines: Sequence[Mapping[str, Row]]) -> RowTable:
+    columns = tuple(dict.fromkeys(model for line in lines for model in line if model != PERSISTENCE))
+    found = []
+    for line in lines:
+        first = next(iter(line.values()))
+        chance = "" if first.chance is None else f"{first.chance:{first.form}}"
+        chance = str(line.get(PERSISTENCE, chance))
+        found.append((first.name, chance, tuple(str(line.get(model, "")) for model in columns)))
+    return RowTable(title, columns, tuple(found))
 
 
 class Measurement(Protocol):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -27,6 +27,7 @@ from vjepa2_ac.evaluation.result import (
     ACTIONS,
     L1,
     MODES,
+    PERSISTENCE,
     DecodedRollouts,
     Evaluation,
     Landscapes,
@@ -39,43 +40,11 @@ from vjepa2_ac.evaluation.result import (
 )
 from vjepa2_ac.intervals import Estimate
 
-PERSISTENCE = "persistence"  # the model of rows that stand where chance does
 MOST_HORIZONS = 8  # on a screen
 _TOP = 5  # likewise
 _MODES: dict[Mode, str] = {"rollout": "open loop", "teacher_forced": "teacher-forced"}
 _SIMILARITIES = {"psnr_db": ("PSNR (dB)", ".1f"), "ssim": ("SSIM", ".3f"), "lpips": ("LPIPS", ".3f")}
 _REGIONS = {"whole": "whole image", "moving": "where something moves"}
-
-
-@dataclass(frozen=True)
-class RowTable:
-    """The rows of one group as a table."""
-
-    title: str
-    columns: tuple[str, ...]
-    lines: tuple[tuple[str, str, tuple[str, ...]], ...]  # label, by chance or persistence, a cell for each column
-
-
-def sections(rows: Sequence[Row]) -> list[RowTable]:
-    """Return rows as tables: those of one key are a line, each in the column of its model."""
-    by_key: dict[str, dict[str, Row]] = {}
-    for row in rows:
-        by_key.setdefault(row.key, {})[row.model] = row
-    groups: dict[str, list[dict[str, Row]]] = {}
-    for line in by_key.values():
-        groups.setdefault(next(iter(line.values())).group, []).append(line)
-    return [_section(title, lines) for title, lines in groups.items()]
-
-
-def _section(title: str, lines: Sequence[Mapping[str, Row]]) -> RowTable:
-    columns = tuple(dict.fromkeys(model for line in lines for model in line if model != PERSISTENCE))
-    found = []
-    for line in lines:
-        first = next(iter(line.values()))
-        chance = "" if first.chance is None else f"{first.chance:{first.form}}"
-        chance = str(line.get(PERSISTENCE, chance))
-        found.append((first.name, chance, tuple(str(line.get(model, "")) for model in columns)))
-    return RowTable(title, columns, tuple(found))
 
 
 def rows_of(evaluation: Evaluation) -> list[Row]:

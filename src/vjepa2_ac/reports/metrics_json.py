@@ -18,8 +18,6 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.request import SCORED
 from vjepa2_ac.evaluation.result import L1, Clips, Evaluation, ModelResult, PlanningStudy
-from vjepa2_ac.evaluation.rows import rows_of
-from vjepa2_ac.evaluation.verdict import uses_actions, verdict
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.storage import write_atomically
 from vjepa2_ac.storage.structured import finite_or_none, json_text
@@ -135,6 +133,9 @@ def read_metrics(folder: Path) -> Metrics:
 
 def metrics_as_dict(evaluation: Evaluation) -> dict[str, Any]:
     """Return all metrics as plain values; see docs/evaluation.md for the meaning of each."""
+    from vjepa2_ac.evaluation.rows import rows_of  # reading needs no PyTorch
+    from vjepa2_ac.evaluation.verdict import uses_actions, verdict
+
     about = {field.name: getattr(evaluation.about, field.name) for field in fields(evaluation.about)}
     del about["space"]
     decoded = evaluation.decoded

@@ -18,8 +18,8 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from vjepa2_ac.evaluation.estimates import gain_over, over_persistence
-from vjepa2_ac.evaluation.result import L1, EpisodeScore, Evaluation, Row
-from vjepa2_ac.evaluation.rows import RowTable, rows_of, sections
+from vjepa2_ac.evaluation.result import L1, EpisodeScore, Evaluation, Row, RowTable, sections
+from vjepa2_ac.evaluation.rows import rows_of
 from vjepa2_ac.evaluation.verdict import verdict
 from vjepa2_ac.media.jpeg import encode_jpeg
 from vjepa2_ac.reports.figures import evaluation as figures
