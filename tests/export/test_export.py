@@ -51,7 +51,7 @@ EVALUATED = {
         "cameras": ["exterior"], "split": "test", "frames": 2, "stride": 4, "seconds_per_step": 0.5,
     },
     "clips": {"count": 8, "episodes": 3, "fingerprint": "0", "named": []},
-    "rows": [{name: None if value != value else value for name, value in asdict(row).items()} for row in ROWS],  # noqa: PLR0124
+    "rows": [{name: None if value != value else value for name, value in asdict(row).items()} for row in ROWS],
     "by_clip": {"persistence": [], "models": {"base": [], "adapter": []}},
 }  # fmt: skip
 

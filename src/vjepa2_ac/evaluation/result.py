@@ -10,10 +10,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
+from pydantic import BeforeValidator
 
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.distances import absolute_difference, squared_difference
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
+_Number = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]  # null in JSON: NaN
 PERSISTENCE = "persistence"  # the model of rows that stand where chance does
 
 
@@ -35,9 +37,9 @@ class Row:
     name: str  # its line
     key: str  # both, for programs, such as rollout.l1.over_persistence.3
     model: str  # its column: a model, persistence, or plans without a model
-    value: float  # NaN: there is none
-    low: float = math.nan  # 95 % interval over episodes; NaN: there is none
-    high: float = math.nan
+    value: _Number  # NaN: there is none
+    low: _Number = math.nan  # 95 % interval over episodes; NaN: there is none
+    high: _Number = math.nan
     form: str = ".3f"
     better: Literal["lower", "higher", ""] = "lower"
     chance: float | None = None  # what doing nothing has, or a model that ignores its actions

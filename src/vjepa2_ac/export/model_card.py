@@ -12,10 +12,11 @@ from safetensors import safe_open
 from vjepa2_ac import __version__
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_yaml
+from vjepa2_ac.evaluation.result import Row
 from vjepa2_ac.model.adapter.adapter_folder import LORA_WEIGHTS
 from vjepa2_ac.model.adapter.lora import trainable_report
 from vjepa2_ac.model.network.input_heads import widths_as_text, widths_of_model
-from vjepa2_ac.reports.metrics_json import Metrics, WrittenRow
+from vjepa2_ac.reports.metrics_json import Metrics
 from vjepa2_ac.runs.checkpoint import ADAPTER, read_state
 from vjepa2_ac.runs.loading import TrainedRun
 
@@ -101,11 +102,11 @@ def _eval_results(run: TrainedRun, measured: Metrics) -> list[EvalResult] | None
             metric_value=round(row.value, 4),
         )
         for step in range(1, about.frames)
-        if (row := measured.of(_ERROR.format(step))) is not None and row.value is not None
+        if (row := measured.of(_ERROR.format(step))) is not None and math.isfinite(row.value)
     ]
 
 
-def _rankings(evaluation: Metrics) -> dict[str, WrittenRow]:
+def _rankings(evaluation: Metrics) -> dict[str, Row]:
     """Return the mean rank of the true action, by model."""
     found = {name: evaluation.of("ranking.rank", name) for name in evaluation.models}
     return {name: row for name, row in found.items() if row is not None}
@@ -130,16 +131,14 @@ def _adapter(config: Config) -> str:
     return ", ".join(words)
 
 
-def _curves(measured: Metrics) -> list[list[WrittenRow | None]]:
+def _curves(measured: Metrics) -> list[list[Row | None]]:
     """Return the errors over persistence of all models at each horizon."""
     steps = range(1, measured.about.frames)
     return [[measured.of(_ERROR.format(step), name) for name in measured.models] for step in steps]
 
 
-def _ratio(row: WrittenRow | None) -> str:
-    if row is None or row.value is None:
-        return "not measured"
-    return f"{row.value:.3f}" + ("" if row.low is None else f" [{row.low:.3f}, {row.high:.3f}]")
+def _ratio(row: Row | None) -> str:
+    return "not measured" if row is None else str(row.estimate)
 
 
 def _base_arguments(config: Config) -> str:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ from jaxtyping import Float
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.result import L1, Row
 from vjepa2_ac.intervals import Estimate, bootstrapped
-from vjepa2_ac.reports.metrics_json import METRICS_FILE, Metrics, WrittenRow, read_metrics
+from vjepa2_ac.reports.metrics_json import METRICS_FILE, Metrics, read_metrics
 
 _SAME_LATENTS = 1e-3  # errors of persistence that differ by a larger share are of other latents
 
@@ -52,7 +52,12 @@ def compare(folders: Sequence[Path]) -> Comparison:
     for name, folder in zip(names[1:], folders[1:], strict=True):
         _check_same_clips(first, measured[name], folders[0], folder)
     about, clips = first.about, first.clips
-    rows = [_as_row(row, name) for name, one in measured.items() for row in one.rows if row.model == one.trained]
+    rows = [
+        replace(row, model=name, detail=row.detail and not row.key.startswith(f"rollout.{L1.name}.gain_over_base"))
+        for name, one in measured.items()
+        for row in one.rows
+        if row.model == one.trained
+    ]
     return Comparison(
         title=f"{L1.label} error over persistence on {clips.count} {about.split} clips of {clips.episodes}"
         f" episode{'s' * (clips.episodes != 1)}",
@@ -61,13 +66,6 @@ def compare(folders: Sequence[Path]) -> Comparison:
         curves={name: _curve(metrics) for name, metrics in measured.items()},
         notes=_notes(measured),
     )
-
-
-def _as_row(row: WrittenRow, run: str) -> Row:
-    values = {**vars(row), "model": run}
-    gain = row.key.startswith(f"rollout.{L1.name}.gain_over_base")
-    values |= {name: math.nan if values[name] is None else values[name] for name in ("value", "low", "high")}
-    return Row(**values | {"detail": row.detail and not gain})
 
 
 def _check_same_clips(one: Metrics, other: Metrics, first: Path, second: Path) -> None:
@@ -121,10 +119,8 @@ def _last(metrics: Metrics, clips: int, run: str) -> tuple[np.ndarray, np.ndarra
 
 
 def _curve(metrics: Metrics) -> tuple[Estimate, ...]:
-    rows = [metrics.of(f"rollout.{L1.name}.over_persistence.{h}") for h in range(1, metrics.about.frames)]
-    none = (math.nan,) * 3
-    sides = [none if row is None else (row.value, row.low, row.high) for row in rows]
-    return tuple(Estimate(*(math.nan if one is None else one for one in side)) for side in sides)
+    rows = (metrics.of(f"rollout.{L1.name}.over_persistence.{h}") for h in range(1, metrics.about.frames))
+    return tuple(Estimate(math.nan, math.nan, math.nan) if row is None else row.estimate for row in rows)
 
 
 def _notes(measured: Mapping[str, Metrics]) -> tuple[str, ...]:

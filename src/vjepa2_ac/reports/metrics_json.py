@@ -17,7 +17,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.request import SCORED
-from vjepa2_ac.evaluation.result import L1, Clips, Evaluation, ModelResult, PlanningStudy
+from vjepa2_ac.evaluation.result import L1, Clips, Evaluation, ModelResult, PlanningStudy, Row
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.storage import write_atomically
 from vjepa2_ac.storage.structured import finite_or_none, json_text
@@ -51,24 +51,6 @@ class WrittenClips:
 
 
 @dataclass(frozen=True)
-class WrittenRow:
-    """A row; None: no value, or no interval."""
-
-    group: str
-    name: str
-    key: str
-    model: str
-    value: float | None
-    low: float | None
-    high: float | None
-    form: str
-    better: Literal["lower", "higher", ""]
-    chance: float | None
-    note: str
-    detail: bool
-
-
-@dataclass(frozen=True)
 class WrittenErrors:
     """The L1 errors of rollouts, clip by clip, which `compare` pairs between runs: [clips][horizon]."""
 
@@ -86,7 +68,7 @@ class Metrics:
     base: str | None
     about: WrittenAbout
     clips: WrittenClips
-    rows: tuple[WrittenRow, ...]
+    rows: tuple[Row, ...]
     by_clip: WrittenErrors
     planning: dict[str, Any] | None = None
 
@@ -95,7 +77,7 @@ class Metrics:
         """The models, what was evaluated last."""
         return tuple(self.by_clip.models)
 
-    def of(self, key: str, model: str | None = None) -> WrittenRow | None:
+    def of(self, key: str, model: str | None = None) -> Row | None:
         """Return the row of a key for a model, by default the evaluated one; None: it was not measured."""
         name = model or self.trained
         return next((row for row in self.rows if row.key == key and row.model == name), None)
