@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from vjepa2_ac.calibration.strides import Calibration, calibrate
+from vjepa2_ac.calibration.variants import is_certainly_better
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.data.filters.broken_episodes import BrokenEpisodes
@@ -16,6 +17,7 @@ from vjepa2_ac.data.index.episode_table import EpisodeTable
 from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, LatentBatch, Progress, StepRanges, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.measure import ClipSample
+from vjepa2_ac.intervals import Estimate
 
 
 class Tracks:
@@ -205,3 +207,11 @@ def test_the_figures_are_plain_values() -> None:
     assert read["strides"][0]["error_over_persistence"]["value"] == pytest.approx(0.0, abs=1e-3)
     assert read["impossible"].keys() == {"15"}
     assert torch.is_grad_enabled()
+
+
+def test_the_best_of_several_is_certain_only_by_twice_its_interval() -> None:
+    """Both were chosen on these clips: an interval that just leaves 0 out says little."""
+    narrow, wide = Estimate(-0.1, -0.13, -0.07), Estimate(-0.1, -0.18, -0.02)
+    assert is_certainly_better(narrow, 10, needed=10)
+    assert not is_certainly_better(wide, 10, needed=10)
+    assert not is_certainly_better(narrow, 9, needed=10)

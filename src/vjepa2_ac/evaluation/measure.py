@@ -154,7 +154,10 @@ def with_other_actions(
 def prediction(
     model: Predictor, batch: LatentBatch, way: Way = "true", mode: Mode = "rollout", others: Tensor | None = None
 ) -> Float[Tensor, "batch horizon tokens dim"]:
-    """Return the frames after the first as predicted; states are the true ones, whatever the actions."""
+    """Return the frames after the first as predicted.
+
+    States are the true ones, whatever the actions, and may reveal the motion: what wrong actions cost is a lower bound.
+    """
     seen = batch.latents[:, :1] if mode == "rollout" else batch.latents[:, :-1]
     if way == "persistence":
         return seen.expand_as(batch.latents[:, 1:])

@@ -6,6 +6,7 @@ import itertools
 import math
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,9 @@ def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
         draw_use_of_actions(lower, evaluation)
         if evaluation.examples:
             axes = halves[1].subplots()
-            axes.imshow(draw_strip(example_strip(evaluation, evaluation.examples[0], most=4)))
+            strip = example_strip(evaluation, evaluation.examples[0], most=4)
+            rows = tuple(row for row in strip.rows if row.kind != "latents") or strip.rows
+            axes.imshow(draw_strip(replace(strip, rows=rows)))
             axes.set_axis_off()
     return path
 
@@ -63,7 +66,7 @@ def plot_comparison(comparison: Comparison, path: Path) -> Path:
 def draw_errors(axes: Any, evaluation: Evaluation, mode: Mode = "rollout") -> None:
     """Draw the error over persistence of every model by horizon."""
     curves = {name: over_persistence(model.errors, mode) for name, model in evaluation.models.items()}
-    _by_horizon(axes, evaluation, curves, level=1.0)
+    _by_horizon(axes, evaluation, curves, level=(1.0, _NOTHING))
     how = {"rollout": "open loop", "teacher_forced": "teacher-forced"}[mode]
     axes.set(title=f"L1 error by horizon, {how} (band: 95 % over episodes)", ylabel="latent error / persistence")
     axes.set_ylim(0, None)
@@ -74,7 +77,7 @@ def draw_gains(axes: Any, evaluation: Evaluation) -> None:
     base, models = evaluation.base_errors, evaluation.models
     if base is not None:
         gains = {name: gain_over(model.errors, base) for name, model in models.items() if model.errors is not base}
-        _by_horizon(axes, evaluation, gains, level=0.0)
+        _by_horizon(axes, evaluation, gains, level=(0.0, "the base"))
         axes.set(title="Gain over the base, open loop, L1 (above 0: better)", ylabel="gain over the base")
         axes.yaxis.set_major_formatter("{x:.0%}")
 
@@ -82,7 +85,9 @@ def draw_gains(axes: Any, evaluation: Evaluation) -> None:
 def draw_spread(axes: Any, evaluation: Evaluation) -> None:
     """Draw the spread of predictions over that of the truth by horizon."""
     found = {name: model.distribution for name, model in evaluation.models.items()}
-    _by_horizon(axes, evaluation, {name: one.spread for name, one in found.items() if one is not None}, level=1.0)
+    _by_horizon(
+        axes, evaluation, {name: one.spread for name, one in found.items() if one is not None}, level=(1.0, "the truth")
+    )
     axes.set(title="Spread of predicted latents, open loop (1: as varied as the truth)", ylabel="spread / the truth's")
     axes.set_ylim(0, None)
 
@@ -277,14 +282,18 @@ def _overlay(
     return np.asarray(0.35 * grey + 0.65 * colours[rows][:, columns]).astype(np.uint8)
 
 
-def _by_horizon(axes: Any, evaluation: Evaluation, curves: Mapping[str, Curve], *, level: float | None) -> None:
-    """Draw curves with their intervals, and a level that is none of a model."""
+def _by_horizon(
+    axes: Any, evaluation: Evaluation, curves: Mapping[str, Curve], *, level: tuple[float, str] | None
+) -> None:
+    """Draw curves with their intervals, and a level that is none of a model, with its name."""
     seconds = evaluation.about.seconds_per_step * np.arange(1, evaluation.horizon + 1)
     colours = _colours(curves)
-    drawn = _curves(axes, seconds, ((curve, {"color": colours[name]}) for name, curve in curves.items()), level)
+    drawn = _curves(
+        axes, seconds, ((curve, {"color": colours[name]}) for name, curve in curves.items()), level and level[0]
+    )
     shown = seconds[:: -(-len(seconds) // 8)]
     axes.set_xticks(shown, [f"{value:.2f}" for value in shown])
-    labels = [_NOTHING if level == 1.0 else "none"] * (level is not None)
+    labels = [] if level is None else [level[1]]
     axes.legend(drawn, [*labels, *map(_short, curves)], loc="best")
 
 
