@@ -275,8 +275,7 @@ def test_progress_names_each_part_of_the_work() -> None:
         [Contender("model", "trained", Oracle())],
         again(clips_batch()),
         about(),
-        probes=PROBES,
-        find_axes=infer_axes,
+        probes=replace(PROBES, find_axes=infer_axes),
         reporter=reporter,
     )
     assert {title: seen[-1] for title, seen in reporter.tasks.items()} == {
