@@ -5,7 +5,7 @@
     python benchmarks/counterfactuals.py demo/pick-run demo/pick-decoder --of gripper --starts 64
 
 Of simulated data only: the simulator carries out the same actions from the same held-out starts. See
-`vjepa2_ac.simulation.counterfactual_sides` and `gripper_sides` for what is counted. Cells of one episode are alike, so
+`counterfactual_probes` for what is counted. Cells of one episode are alike, so
 the intervals of shares (Wilson, of independent cells) are somewhat too narrow; those of `extent` are over episodes.
 """
 
@@ -17,8 +17,19 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from vjepa2_ac.simulation.counterfactual_sides import AXES, CHANCE, LEAST_PX, Sides, SidesOptions, measure_sides
-from vjepa2_ac.simulation.gripper_sides import ACTIONS, LEAST_CLOSEDNESS, GripperSides, measure_gripper
+from counterfactual_probes import (
+    ACTIONS,
+    AXES,
+    CHANCE,
+    LEAST_CLOSEDNESS,
+    LEAST_PX,
+    GripperSides,
+    Sides,
+    SidesOptions,
+    measure_gripper,
+    measure_sides,
+)
+
 from vjepa2_ac.storage import write_atomically
 
 

@@ -20,13 +20,12 @@ from pathlib import Path
 import numpy as np
 from faults import CLEAN, FAULTS, Fault, Recording, spoiled
 
+from vjepa2_ac.calibration.data import VariantProbe, probe_config
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import load_config, parse_config
 from vjepa2_ac.data.coverage import sample_of
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.data_variants.from_config import probe_config
-from vjepa2_ac.evaluation.data_variants.measure import VariantProbe
 from vjepa2_ac.inspection.check import check_data
 from vjepa2_ac.inspection.excerpts import Finding
 from vjepa2_ac.inspection.statistics import at_some_stride

@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from vjepa2_ac import export
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.result import Row
 from vjepa2_ac.export import CARD, Exported, export_run
 from vjepa2_ac.model.adapter.merging import base_only
 from vjepa2_ac.model.checkpoints.loading import load_official
@@ -32,21 +34,23 @@ from vjepa2_ac.runs.loading import load_run
 from vjepa2_ac.runs.manifest import write_manifest
 from vjepa2_ac.training.loop import train
 
+ROWS = [
+    Row("a table", "0.50 s ahead", "rollout.l1.over_persistence.1", "base", 0.9, 0.8, 0.95),
+    Row("a table", "0.50 s ahead", "rollout.l1.over_persistence.1", "adapter", 0.7),
+]
 EVALUATED = {
-    "format": 1,
+    "format": 3,
     "verdict": "The adapter predicts better.",
+    "trained": "adapter",
+    "base": "base",
     "about": {
-        "subject": "somewhere/run",
-        "checkpoint_path": "somewhere/run/checkpoints/step-00000002",
-        "split": "test",
-        "seconds_per_step": 0.5,
+        "subject": "somewhere/run", "checkpoint_path": "somewhere/run/checkpoints/step-00000002", "data": "data",
+        "cameras": ["exterior"], "split": "test", "frames": 2, "stride": 4, "seconds_per_step": 0.5,
     },
-    "clips": {"count": 8, "episodes": 3},
-    "models": {
-        "base": {"rollout": {"l1": {"over_persistence": [{"value": 0.9, "low": 0.8, "high": 0.95}]}}},
-        "adapter": {"rollout": {"l1": {"over_persistence": [{"value": 0.7, "low": None, "high": None}]}}},
-    },
-}
+    "clips": {"count": 8, "episodes": 3, "fingerprint": "0", "named": []},
+    "rows": [{name: None if value != value else value for name, value in asdict(row).items()} for row in ROWS],
+    "by_clip": {"persistence": [], "models": {"base": [], "adapter": []}},
+}  # fmt: skip
 
 
 Trained = Callable[..., Path]

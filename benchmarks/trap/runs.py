@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -22,10 +22,10 @@ from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
 from vjepa2_ac.config.training import CheckpointConfig
 from vjepa2_ac.evaluation.evaluate_run import measure_subject
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
+from vjepa2_ac.evaluation.rows import rows_of
 from vjepa2_ac.model.adapter.merging import merge_adapter
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.reporter import SILENT
-from vjepa2_ac.reports.metrics_json import metrics_as_dict
 from vjepa2_ac.runs.loading import load_run
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.simulation.closed_loop.policies import Planning
@@ -57,21 +57,21 @@ PLANNING = PlanningConfig(
 """As in the evidence: horizon 1, 7.5 cm an axis and model step."""
 
 
-OFFLINE: dict[str, Callable[[dict[str, Any]], float]] = {
-    "one-step error / persistence": lambda one: one["one_step_by_actions"]["true"]["value"],
-    "rollout error / persistence, last horizon": lambda one: one["rollout"]["l1"]["over_persistence"][-1]["value"],
-    "gap of zero actions, negated": lambda one: -one["gap_of_zero_actions"]["value"],
-    "gap of shuffled actions, negated": lambda one: -one["gap_of_shuffled_actions"]["value"],
-    "change with the action, negated": lambda one: -one["sensitivity"]["change_over_persistence"]["value"],
-    "own steps: rank among others' actions": lambda one: one["sensitivity"]["rankings"][0]["mean_rank"]["value"],
-    "own steps: rank in a box": lambda one: one["sensitivity"]["rankings"][1]["mean_rank"]["value"],
-    "own steps: distance of the lowest energy": lambda one: one["landscapes"]["distance"]["value"],
-    "moves: rank in a box": lambda one: one["ranking"]["box"]["value"],
-    "moves: rank among other directions": lambda one: one["ranking"]["shell"]["value"],
-    "moves: rank (the one that selects)": lambda one: one["ranking"]["rank"]["value"],
-    "moves: spread of the energy, negated": lambda one: -one["ranking"]["spread"]["value"],
+OFFLINE: dict[str, tuple[str, int]] = {
+    "one-step error / persistence": ("one_step.true", 1),
+    "rollout error / persistence, last horizon": ("rollout.l1.over_persistence.7", 1),
+    "gap of zero actions, negated": ("gap_of_actions.zero", -1),
+    "gap of shuffled actions, negated": ("gap_of_actions.shuffled", -1),
+    "change with the action, negated": ("sensitivity.change", -1),
+    "own steps: rank among others' actions": ("sensitivity.rank.clips", 1),
+    "own steps: rank in a box": ("sensitivity.rank.box", 1),
+    "own steps: distance of the lowest energy": ("landscapes.distance", 1),
+    "moves: rank in a box": ("ranking.box", 1),
+    "moves: rank among other directions": ("ranking.shell", 1),
+    "moves: rank (the one that selects)": ("ranking.rank", 1),
+    "moves: spread of the energy, negated": ("ranking.spread", -1),
 }
-"""What `evaluate` finds of a model, so that less is meant to be better."""
+"""What `evaluate` finds of a model: the key of a row, and its sign, so that less is meant to be better."""
 
 
 @dataclass(frozen=True)
@@ -178,11 +178,11 @@ def measure_alone(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
     spec = RolloutSpec("reach", WORLD, goals, GOALS + cell.run.seed)
     result = run_task(spec, Planning(Controller(model.eval(), PLANNING)))
     evaluation = found.evaluation
-    measured = metrics_as_dict(evaluation)["models"][evaluation.trained]
+    measured = {row.key: row.value for row in rows_of(evaluation) if row.model == evaluation.trained}
     return {
         "cell": asdict(cell.run) | {"step": cell.step, "name": cell.name},
         "validation": validated,
-        "offline": {name: figure(measured) for name, figure in OFFLINE.items()},
+        "offline": {name: sign * measured[key] for name, (key, sign) in OFFLINE.items()},
         "distance_cm": result.distance_cm.round(3).tolist(),
     }
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePath
-from typing import Any, Literal
+from typing import Literal
 
 from huggingface_hub import EvalResult, ModelCardData
 from jinja2 import Environment, PackageLoader, StrictUndefined, TemplateError, select_autoescape
@@ -16,13 +16,14 @@ from vjepa2_ac import __version__
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.result import Row
 from vjepa2_ac.model.adapter.adapter_folder import ADAPTER_FILE
 from vjepa2_ac.model.adapter.lora import adapted_report
 from vjepa2_ac.model.adapter.merging import merge_adapter
 from vjepa2_ac.model.checkpoints.loading import to_official
 from vjepa2_ac.model.network.input_heads import widths_as_text, widths_of_model
 from vjepa2_ac.model.network.pretrained_folder import require_finite
-from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics
+from vjepa2_ac.reports.metrics_json import METRICS_FILE, Metrics, read_metrics
 from vjepa2_ac.reports.write import PLOT
 from vjepa2_ac.runs.checkpoint import ADAPTER, read_state
 from vjepa2_ac.runs.checkpoint_selection import SELECTED
@@ -32,7 +33,6 @@ from vjepa2_ac.runs.torch_file import write_torch
 from vjepa2_ac.storage import atomic_writer, folder_writer, is_empty, try_writing_at, user_can_write, write_atomically
 
 Form = Literal["merged", "official", "hub"]
-Metrics = Mapping[str, Any]
 
 OFFICIAL_NAME = "vjepa2-ac.pt"  # in a folder; a destination that ends in .pt is the file itself
 CARD = "README.md"
@@ -118,11 +118,8 @@ def _write_hub(run: TrainedRun, folder: Path, destination: Path, card: str, metr
         if metrics is not None:
             if (folder / PLOT).is_file():
                 shutil.copyfile(folder / PLOT, fresh / PLOT)
-            here = {
-                "subject": folder.resolve().name,
-                "checkpoint_path": PurePath(metrics["about"]["checkpoint_path"]).name,
-            }
-            told = {**metrics, "about": {**metrics["about"], **here}}  # without paths of this machine
+            told = json.loads((folder / METRICS_FILE).read_bytes())  # without paths of this machine
+            told["about"] |= {"subject": folder.resolve().name, "checkpoint_path": _measured(metrics)}
             write_atomically(fresh / METRICS_FILE, json.dumps(told, indent=1))
         write_atomically(fresh / CARD, card)
 
@@ -139,7 +136,7 @@ def _card(run: TrainedRun, folder: Path, metrics: Metrics | None) -> str:
     )
     environment.filters |= {"code": lambda name: f"`{name}`", "count": _count, "ratio": _ratio}
     try:
-        measured = None if metrics is None else PurePath(metrics["about"]["checkpoint_path"]).name
+        measured = None if metrics is None else _measured(metrics)
         front = ModelCardData(
             library_name="peft",
             pipeline_tag="robotics",
@@ -175,22 +172,26 @@ def _card(run: TrainedRun, folder: Path, metrics: Metrics | None) -> str:
 
 def _eval_results(config: Config, metrics: Metrics) -> list[EvalResult]:
     """Return the rollout errors over persistence by horizon, as the Hub shows them."""
-    about, models = metrics["about"], metrics["models"]
-    ratios = models[list(models)[-1]]["rollout"]["l1"]["over_persistence"]  # what was measured comes last
+    about = metrics.about
     return [
         EvalResult(
             task_type="robotics",
             task_name="prediction of latents",
             dataset_type=config.data.source,
             dataset_name=PurePath(config.data.path).name,
-            dataset_split=about["split"],
+            dataset_split=about.split,
             metric_type="l1_over_persistence",
-            metric_name=f"L1 error over persistence, {step * about['seconds_per_step']:.2f} s ahead",
-            metric_value=round(ratio["value"], 4),
+            metric_name=f"L1 error over persistence, {step * about.seconds_per_step:.2f} s ahead",
+            metric_value=round(row.value, 4),
         )
-        for step, ratio in enumerate(ratios, start=1)
-        if ratio["value"] is not None
+        for step in range(1, about.frames)
+        if (row := metrics.of(f"rollout.l1.over_persistence.{step}")) is not None and math.isfinite(row.value)
     ]
+
+
+def _measured(metrics: Metrics) -> str:
+    """Return the name of the checkpoint that was evaluated."""
+    return PurePath(metrics.about.checkpoint_path).name
 
 
 def _base_arguments(config: Config) -> str:
@@ -205,9 +206,8 @@ def _base_arguments(config: Config) -> str:
     return ", ".join(words)
 
 
-def _ratio(ratio: Metrics) -> str:
-    interval = "" if ratio["low"] is None else f" [{ratio['low']:.3f}, {ratio['high']:.3f}]"
-    return f"{ratio['value']:.3f}{interval}"
+def _ratio(row: Row | None) -> str:
+    return "not measured" if row is None else str(row.estimate)
 
 
 def _count(number: int, what: str) -> str:

@@ -43,8 +43,13 @@ class Estimate:
         metrics = {"value": self.value, "low": self.low, "high": self.high}
         return {name: number if math.isfinite(number) else None for name, number in metrics.items()}
 
+    def __format__(self, form: str) -> str:
+        """Return the number, and its interval if it has one, each in a number format."""
+        value, low, high = (f"{number:{form or '.3f'}}" for number in (self.value, self.low, self.high))
+        return f"{value} [{low}, {high}]" if self.has_interval else value
+
     def __str__(self) -> str:
-        return f"{self.value:.3f} [{self.low:.3f}, {self.high:.3f}]" if self.has_interval else f"{self.value:.3f}"
+        return f"{self:.3f}"
 
 
 def bootstrapped(

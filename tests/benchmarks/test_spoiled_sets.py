@@ -13,7 +13,7 @@ import yaml
 
 from benches import imported
 from moving_arms import RATE_HZ, STEPS, spot_frames, spot_states, write_spots
-from vjepa2_ac.evaluation.data_variants.measure import VariantProbe, VariantResult
+from vjepa2_ac.calibration.data import VariantProbe, VariantResult
 from vjepa2_ac.intervals import Estimate
 
 EPISODES = 10

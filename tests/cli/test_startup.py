@@ -19,7 +19,7 @@ evaluate nope
 evaluate builtin:sim-tiny
 evaluate nope --data {demo} --out out
 evaluate nope --lpips alex.pth --lpips-heads heads.pth
-evaluate nope --i3d i3d.pt
+evaluate nope --lpips a.pth
 evaluate nope --decoder builtin:sim-tiny --lpips alex.pth
 compare a b
 data check nope.yaml

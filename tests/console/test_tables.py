@@ -10,19 +10,20 @@ import pytest
 import torch
 from rich.table import Table
 
+from vjepa2_ac.calibration.data import VariantProbe, VariantResult
+from vjepa2_ac.calibration.strides import Calibration, StrideResult
 from vjepa2_ac.console.closed_loop import benchmark_table
 from vjepa2_ac.console.data import calibration_table, motion_table, probe_table
-from vjepa2_ac.console.evaluation import comparison_table, evaluation_tables
+from vjepa2_ac.console.evaluation import row_tables
 from vjepa2_ac.console.plan import plan_table
 from vjepa2_ac.console.progress import PlainConsole
-from vjepa2_ac.evaluation.data_variants.measure import VariantProbe, VariantResult
 from vjepa2_ac.evaluation.evaluate import Contender, evaluate
 from vjepa2_ac.evaluation.request import ProbeOptions
-from vjepa2_ac.evaluation.stride_calibration.measure import Calibration, StrideResult
-from vjepa2_ac.inspection.statistics import CHANGED, MOVED, TURNED, StepSizes
+from vjepa2_ac.evaluation.result import Row
+from vjepa2_ac.evaluation.rows import rows_of
+from vjepa2_ac.inspection.statistics import Inspection
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.planning.decision import PlanResult
-from vjepa2_ac.reports.comparison import Comparison
 from vjepa2_ac.simulation.closed_loop.benchmark import ClosedLoopBenchmark
 from vjepa2_ac.simulation.closed_loop.rollout import ClosedLoopResult
 from vjepa2_ac.spaces import POSE, vector_states
@@ -46,9 +47,9 @@ def probes() -> list[Table]:
 
 
 def motions() -> list[Table]:
-    sizes = np.array([1234.5, 2345.6, 3456.7, 4567.8])
-    kinds = [{MOVED: sizes, TURNED: sizes}, {CHANGED: sizes}]
-    return [motion_table([StepSizes(15, 1.0, kind)]) for kind in kinds]
+    one = Mock(stride=15, seconds=1.0, percentiles=lambda _: (1234.5, 2345.6, 3456.7, 4567.8))
+    both = [Mock(spec=Inspection, has_poses=poses, motions=[one], changes=[one]) for poses in (True, False)]
+    return [motion_table(inspection) for inspection in both]
 
 
 def evaluations() -> list[Table]:
@@ -56,13 +57,15 @@ def evaluations() -> list[Table]:
     contenders = [Contender(name, "trained" if name == "adapter" else "base", Halfway()) for name in names[:2]]
     contenders += [Contender(name, "other", Copier()) for name in names[2:]]
     probes = ProbeOptions(sensitivity_clips=4, samples=4, landscape_clips=2, nodes=3, examples=0)
-    return list(evaluation_tables(evaluate(cast("Any", contenders), again(clips_batch(12, 0)), about(), probes=probes)))
+    found = evaluate(cast("Any", contenders), again(clips_batch(12, 0)), about(), probes=probes)
+    return row_tables(rows_of(found), "Held-out episodes")
 
 
 def comparisons() -> list[Table]:
-    columns = ("4.00 s ahead", "gain over first", "gain over its base", "one step", "shuffled", "rank", "4.00 s, L2")
-    rows = {name: (SHARE,) * len(columns) for name in ("first", "a/run/with/a/name/that/does/not/end/anywhere/near")}
-    return [comparison_table(Comparison("L1 error over persistence", columns, rows, np.arange(1.0), {}, ()))]
+    runs = ("first", "a/run/with/a/name/that/does/not/end/anywhere/near")
+    lines = ("4.00 s ahead", "one step", "4.00 s, L2")
+    rows = [Row("a group", line, line, run, 0.912, 0.888, 0.934) for run in runs for line in lines]
+    return row_tables(rows, "L1 error over persistence")
 
 
 def plans() -> list[Table]:

@@ -8,12 +8,12 @@ import torch
 
 from latent_sets import encode_for
 from same_run import assert_same_run, metrics, trained_weights
+from vjepa2_ac.calibration.strides import calibrate_config
 from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.measure import ClipSample
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
-from vjepa2_ac.evaluation.stride_calibration.from_config import calibrate_config
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reports.metrics_json import metrics_as_dict

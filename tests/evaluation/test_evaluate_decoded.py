@@ -1,9 +1,7 @@
-"""A run is evaluated with a decoder: in metrics.json, report and console; a decoder that does not fit is refused."""
+"""A run is evaluated with a decoder: a decoder that does not fit is refused."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -19,6 +17,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.reporter import SILENT
+from vjepa2_ac.reports.metrics_json import read_metrics
 from vjepa2_ac.reports.write import evaluate_subject
 from vjepa2_ac.training.loop import train
 
@@ -69,56 +68,45 @@ def decoder(config: Config, tmp_path_factory: pytest.TempPathFactory) -> str:
     return saved(card_of(config), tmp_path_factory.mktemp("decoder") / "decoder")
 
 
-def decoded_of(folder: Path | str) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((Path(folder) / "metrics.json").read_text())["decoded"]
-    return found
-
-
-def test_a_decoder_adds_one_key_a_section_and_two_lines(
-    config: Config, decoder: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_a_decoder_adds_rows_and_images_and_changes_nothing_else(
+    config: Config, decoder: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["evaluate", config.run_dir, *QUICK]) == 0
-    without = json.loads((Path(config.run_dir) / "metrics.json").read_text())
-    plain = capsys.readouterr().out
-    assert without["decoded"] is None
+    without = read_metrics(Path(config.run_dir))
+    assert "Decoded images" not in capsys.readouterr().out
     assert "Decoded images: not measured." in (Path(config.run_dir) / "report.html").read_text()
     assert main(["evaluate", config.run_dir, *QUICK, "--decoder", decoder]) == 0
-    printed = capsys.readouterr().out
-    metrics = json.loads((Path(config.run_dir) / "metrics.json").read_text())
-    assert {key: one for key, one in metrics.items() if key not in {"decoded", "about"}} == {
-        key: one for key, one in without.items() if key not in {"decoded", "about"}
-    }
-    assert "Decoded, 0.4 s ahead, PSNR against the truth (dB): decoded truth " in printed
-    assert "Decoded," not in plain
-    found = metrics["decoded"]
-    assert list(found["models"]) == ["base", "adapter"]
-    assert found["decoder"]["folder"] == decoder
-    assert found["models"]["adapter"]["against_truth"]["whole"]["psnr_db"][2]["value"] > 0
-    assert found["models"]["adapter"]["cycle_error"][0]["value"] > 0
-    assert "were not simulated" in found["hand"]["reason"]
-    assert found["video_mmd"]["reason"].startswith("5 clips")
+    metrics = read_metrics(Path(config.run_dir))
+    added = [row for row in metrics.rows if row.key.startswith("decoded.")]
+    assert tuple(row for row in metrics.rows if row not in added) == without.rows
+    assert {row.model for row in added} >= {"decoded truth", "raw persistence", "base", "adapter"}
+    assert (metrics.of("decoded.psnr_db.whole.truth.3") or added[0]).value > 0  # type: ignore[operator]
+    assert "decoded truth" in capsys.readouterr().out
     page = (Path(config.run_dir) / "report.html").read_text()
-    assert "decoded truth" in page
-    assert "<script" not in page
-    assert len(page) < 5_000_000
-    assert not list(tmp_path.iterdir())
+    assert "Decoded images against the truth: PSNR (dB), whole image" in page
 
 
-def test_from_a_cache_nothing_is_said_about_the_truth(config: Config, decoder: str, tmp_path: Path) -> None:
+def test_from_a_cache_the_images_are_those_of_the_frames(config: Config, decoder: str, tmp_path: Path) -> None:
     values = config_as_dict(config)
     values["data"]["cache"] = "auto"
     data = parse_config(values, where="test")
     encode_for(config, load_base(config.model, seed=0), open_dataset(config.data))
+    found = []
     for name, config_of_data in (("cached", data), ("frames", config)):
-        out, given = tmp_path / name, {"decoder": decoder, "probes": PROBES}
-        evaluate_subject(config.run_dir, EvaluationOptions(clips=5, data=config_of_data, out=out, **given))  # type: ignore[arg-type]
-    cached, frames = decoded_of(tmp_path / "cached"), decoded_of(tmp_path / "frames")
-    one, other = cached["models"]["adapter"], frames["models"]["adapter"]
-    assert one["against_truth"]["whole"]["ssim"][0]["value"] is None
-    assert "cache" in one["against_truth"]["whole"]["ssim"][0]["reason"]
-    assert "encoder was set aside" in one["cycle_error"][0]["reason"]
-    values = [which["against_decoded_truth"]["whole"]["ssim"][2]["value"] for which in (one, other)]
-    assert values[0] == pytest.approx(values[1], abs=1e-4)
+        given = EvaluationOptions(clips=5, data=config_of_data, out=tmp_path / name, decoder=decoder, probes=PROBES)
+        evaluate_subject(config.run_dir, given)
+        found.append(read_metrics(tmp_path / name))
+    assert found[0].of("decoded.ssim.whole.truth.3") is None
+    one, other = (each.of("decoded.ssim.whole.decoded_truth.3") for each in found)
+    assert one is not None
+    assert other is not None
+    assert one.value == pytest.approx(other.value, abs=1e-4)
+
+
+@pytest.mark.parametrize("given", [["--lpips", "a.pth"], ["--decoder", "D", "--lpips-heads", "a.pth"]])
+def test_lpips_needs_both_files_and_a_decoder(given: list[str], config: Config, capsys) -> None:
+    assert main(["evaluate", config.run_dir, *given]) == 2
+    assert "one without the others" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -78,7 +78,9 @@ def written(config: Config, folder: Path, **data: object) -> str:
 
 
 def rollout(metrics: dict[str, Any], name: str) -> list[float]:
-    return [one["value"] for one in metrics["models"][name]["rollout"]["l1"]["error"]]
+    return [
+        row["value"] for row in metrics["rows"] if row["model"] == name and row["key"].startswith("rollout.l1.error.")
+    ]
 
 
 def figures_of(folder: Path | str) -> dict[str, Any]:
@@ -113,7 +115,7 @@ def test_figures_depend_on_neither_the_batch_size_nor_the_workers(config: Config
     one, other = figures_of(run), figures_of(tmp_path / "b")
     for name in ("base", "adapter"):
         assert rollout(one, name) == pytest.approx(rollout(other, name), rel=1e-5)
-        ranks = [metrics["models"][name]["sensitivity"]["rankings"][0]["rank_by_clip"] for metrics in (one, other)]
+        ranks = [metrics["models"][name]["sensitivity"]["rankings"][0]["rank"] for metrics in (one, other)]
         assert ranks[0] == ranks[1]
     assert one["clips"] == other["clips"]
 
@@ -163,13 +165,13 @@ def test_a_cache_gives_the_figures_of_the_frames_and_frames_of_its_own(
     found = main(["evaluate", run, "--data", path, "--out", str(tmp_path / "cached"), "--clips", "5", *QUICK])
     assert found == 0
     fly, cached = figures_of(run), figures_of(tmp_path / "cached")
-    assert fly["models"] == cached["models"]
+    assert (fly["models"], fly["rows"]) == (cached["models"], cached["rows"])
     assert fly["clips"] == cached["clips"]
 
 
 def test_strides_are_calibrated_where_it_is_asked_for(run: str, tmp_path: Path) -> None:
     evaluate_subject(run, asked(calibrate=True, out=tmp_path))
-    calibration = figures_of(tmp_path)["calibration"]
+    calibration = figures_of(tmp_path)["strides"]
     assert calibration["split"] == "test"
     assert calibration["strides"]
 
@@ -180,7 +182,7 @@ def test_compare_prints_a_row_for_each_run(run: str, tmp_path: Path, capsys: pyt
     shutil.copy(Path(run) / "metrics.json", tmp_path / "again")
     assert main(["compare", run, str(tmp_path / "again"), "--out", str(tmp_path / "plot.png")]) == 0
     printed = capsys.readouterr().out
-    assert "gain over run" in printed
+    assert "Gain over run" in printed
     assert "again" in printed
     assert (tmp_path / "plot.png").is_file()
 
@@ -212,9 +214,18 @@ WRONG: dict[str, tuple[Callable[[Config], EvaluationOptions], str]] = {
 def test_invalid_input_is_reported_before_a_model_is_loaded(
     config: Config, run: str, make: Callable[[Config], EvaluationOptions], words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("vjepa2_ac.evaluation.subject.load_run", lambda *_: pytest.fail("loaded"))
+    monkeypatch.setattr("vjepa2_ac.evaluation.evaluate_run.load_run", lambda *_: pytest.fail("loaded"))
     with pytest.raises(InputError, match=words):
         evaluate_subject(run, make(config))
+
+
+@pytest.mark.parametrize("command", [["evaluate"], ["imagine", "--decoder", "builtin:sim-tiny"]])
+def test_several_processes_are_refused_since_all_would_write_the_same_files(
+    command: list[str], run: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    assert main([command[0], run, *command[1:]]) == 2
+    assert "torchrun: 2 processes" in capsys.readouterr().err
 
 
 def test_what_to_compare_with_and_is_not_there_is_named_as_it_was_given(run: str, tmp_path: Path) -> None:

@@ -9,9 +9,8 @@ from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persistence
 from vjepa2_ac.evaluation.evaluate import Contender, evaluate
 from vjepa2_ac.evaluation.measure import ALL, VALIDATED, measured, prediction_errors, with_other_actions
-from vjepa2_ac.evaluation.metrics import L1, L2, METRICS
 from vjepa2_ac.evaluation.request import ProbeOptions
-from vjepa2_ac.evaluation.result import ACTIONS
+from vjepa2_ac.evaluation.result import ACTIONS, L1, L2, METRICS
 from worlds import TIME, Copier, Halfway, Oracle, about, again, clips_batch, in_batches, rows
 
 

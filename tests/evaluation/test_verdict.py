@@ -7,10 +7,20 @@ import numpy as np
 import pytest
 
 from evaluation_results import ranking_of
-from vjepa2_ac.console.evaluation import evaluation_tables
-from vjepa2_ac.evaluation.metrics import L1, L2, METRICS, Metric
-from vjepa2_ac.evaluation.result import MODES, Evaluation, Example, ModelResult, PredictionErrors
-from vjepa2_ac.evaluation.strata import clips_of
+from vjepa2_ac.console.evaluation import row_tables
+from vjepa2_ac.evaluation.clips import clips_of
+from vjepa2_ac.evaluation.result import (
+    L1,
+    L2,
+    METRICS,
+    MODES,
+    Evaluation,
+    Example,
+    Metric,
+    ModelResult,
+    PredictionErrors,
+)
+from vjepa2_ac.evaluation.rows import rows_of
 from vjepa2_ac.evaluation.verdict import improvement, spread, uses_actions, verdict
 from vjepa2_ac.reports.figures.evaluation import plot_evaluation
 from vjepa2_ac.spaces import POSE_CHANGE
@@ -194,7 +204,7 @@ def test_one_episode_gives_no_interval_and_no_certainty(tmp_path) -> None:
     words = verdict(one)
     assert "one episode: no interval" in words
     assert "did not clearly help" in words
-    titles = [evaluation_tables(found)[0].title for found in (one, evaluation(model("model", 0.5)))]
+    titles = [row_tables(rows_of(found), "")[0].title for found in (one, evaluation(model("model", 0.5)))]
     assert [str(title).partition("(")[2] for title in titles] == [
         "one episode: no interval)",
         "95 % interval over episodes)",

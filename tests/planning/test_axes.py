@@ -12,10 +12,10 @@ import torch
 
 from adapted_run import write_adapted_run
 from tiny_models import actions, goal, scene, tiny_model
+from vjepa2_ac.calibration.axes import TRIED_DEGREES, fit_axes
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.planning import CemConfig, EnergyConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.axis_fit import TRIED_DEGREES, fit_axes
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.axes.mapping import Axes
 from vjepa2_ac.planning.controller import Controller

@@ -12,7 +12,7 @@ from paths import GOLDEN
 from solver_problems import PLANNERS, config, parabola, rosenbrock, solve, space, two_basins
 from vjepa2_ac.config.planning import CemConfig, GradientConfig, IcemConfig, LimitsConfig, MppiConfig, PlanningConfig
 from vjepa2_ac.episode import no_progress
-from vjepa2_ac.evaluation.action_score.protocol import SCORED
+from vjepa2_ac.evaluation.request import SCORED
 from vjepa2_ac.planning.interfaces import Plan, PlanStart
 from vjepa2_ac.planning.planner import Planner
 from vjepa2_ac.planning.search_space import Ball, SearchSpace

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from vjepa2_ac.evaluation.axis_fit import TRIED_DEGREES, AxisFit, fit_axes
-from vjepa2_ac.evaluation.distribution.mmd import Discrepancy
-from vjepa2_ac.evaluation.distribution.record import LatentDistribution
+from vjepa2_ac.calibration.axes import TRIED_DEGREES, AxisFit, fit_axes
+from vjepa2_ac.evaluation.distribution import Discrepancy, LatentDistribution
 from vjepa2_ac.evaluation.estimates import episode_scores
-from vjepa2_ac.evaluation.metrics import L1, L2
 from vjepa2_ac.evaluation.result import (
     ACTIONS,
+    L1,
+    L2,
     MODES,
     About,
     ActionRanking,
@@ -169,7 +169,7 @@ def evaluation(
             _sensitivity(rng, ids, skill),
             _landscapes(rng, ids, 4 - 3 * skill),
             ranking=ranking_of(0.3 * (1 - skill) + 0.1 * rng.random(len(ids)), ids),
-            axes=_axes(ids, degrees=60 - 60 * skill),
+            beside={"axes": _axes(ids, degrees=60 - 60 * skill)},
             distribution=_distribution(np.random.default_rng(place), ids, 0.5 + 0.4 * skill, horizon),
         )
     size_of_action = rng.gamma(2.0, 2.0, size=(clips, horizon))

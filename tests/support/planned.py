@@ -8,7 +8,7 @@ import numpy as np
 from torch import Tensor
 
 from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig, PlanningConfig
-from vjepa2_ac.evaluation.action_score.measure import PlanningStart, planning_start, study_of
+from vjepa2_ac.evaluation.action_score import PlanningStart, planning_start, study_of
 from vjepa2_ac.evaluation.evaluate import Contender, evaluate
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import Evaluation, PlanningStudy, Plans
@@ -64,6 +64,6 @@ def with_plans(evaluation: Evaluation, seed: int = 0, starts: int = 8) -> Evalua
     models = {}
     for place, (name, model) in enumerate(evaluation.models.items()):
         off = 0.04 / (1 + 3 * place) * rng.standard_normal((1, starts, 3, 7))
-        models[name] = replace(model, plans=Plans((demonstrated + off)[:, :, 0], demonstrated + off, 0, 2.0 * starts))
+        models[name] = replace(model, plans=Plans((demonstrated + off)[:, :, 0], demonstrated + off))
     ids = evaluation.clips.episode_ids[:starts]
     return replace(evaluation, models=models, planning=study(demonstrated, ids))

@@ -11,12 +11,12 @@ import yaml
 
 from same_run import assert_same_run
 from vector_sets import write_vectors
+from vjepa2_ac.calibration.strides import calibrate_config
 from vjepa2_ac.config import Config, ModelConfig
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.measure import ClipSample
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
-from vjepa2_ac.evaluation.stride_calibration.from_config import calibrate_config
 from vjepa2_ac.export import export_run
 from vjepa2_ac.model.base_model import read_sizes
 from vjepa2_ac.model.checkpoints.loading import load_base

@@ -126,10 +126,10 @@ def check_and_print(config: Config, *, clips: int = 32) -> int:
 
 
 def _probe(config: Config, model: str, *, clips: int) -> None:
+    from vjepa2_ac.calibration.data import probe_config
     from vjepa2_ac.console.data import print_finding, probe_table
     from vjepa2_ac.console.progress import ConsoleReporter, console
     from vjepa2_ac.data.dataset import open_dataset
-    from vjepa2_ac.evaluation.data_variants.from_config import probe_config
     from vjepa2_ac.inspection.excerpts import Finding
     from vjepa2_ac.inspection.statistics import at_some_stride
 
@@ -194,10 +194,10 @@ def _calibrate(options: argparse.Namespace) -> int:
         require_subject(options.model)
     _make_folder(options.out)
 
+    from vjepa2_ac.calibration.strides import calibrate_config
     from vjepa2_ac.console.data import calibration_table
     from vjepa2_ac.console.progress import ConsoleReporter, console
     from vjepa2_ac.evaluation.measure import ClipSample
-    from vjepa2_ac.evaluation.stride_calibration.from_config import calibrate_config
     from vjepa2_ac.storage import write_atomically
 
     with ConsoleReporter() as reporter:
@@ -225,9 +225,9 @@ def _calibrate_axes(options: argparse.Namespace, config: Config) -> int:
     require_axes_in(config.data)
     _make_folder(options.out)
 
+    from vjepa2_ac.calibration.axes import calibrate_axes
     from vjepa2_ac.console.data import axes_table
     from vjepa2_ac.console.progress import ConsoleReporter, console
-    from vjepa2_ac.evaluation.axis_calibration import calibrate_axes
     from vjepa2_ac.reports.figures.axes import plot_axes
 
     with ConsoleReporter() as reporter:

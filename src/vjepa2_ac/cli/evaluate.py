@@ -47,7 +47,7 @@ def add_to(commands: Commands) -> None:
     add_checkpoint(parser)
     text = "decode the rollouts and measure the images, too: what `vjepa2-ac decoder` made, or builtin:sim-tiny"
     argument(parser, "--decoder FOLDER", text, as_model)
-    _add_metric_files(parser.add_argument_group("files of metrics of decoded images (see docs/decoding.md)"))
+    _add_metric_files(parser.add_argument_group("LPIPS of decoded images (see docs/decoding.md)"))
     argument(parser, "--calibrate", "measure the one-step error at other strides, too", action="store_true")
     _add_probes(parser.add_argument_group("use of the actions"))
     _add_planning(parser.add_argument_group("plans (they take long: see docs/evaluation.md)"))
@@ -63,8 +63,6 @@ def _add_metric_files(group: argparse._ArgumentGroup) -> None:
     text = "LPIPS of the decoded images, by these weights: alexnet-owt-7be5be79.pth or vgg16-397923af.pth"
     argument(group, "--lpips FILE", text, as_path)
     argument(group, "--lpips-heads FILE", "its heads: alex.pth or vgg.pth of version 0.1", as_path)
-    text = "FVD of the decoded clips, which is biased, by this I3D network: i3d_torchscript.pt"
-    argument(group, "--i3d FILE", text, as_path)
 
 
 def _add_probes(group: argparse._ArgumentGroup) -> None:
@@ -98,24 +96,22 @@ def _evaluate(options: argparse.Namespace) -> None:
         settle(subject, how)
         require_subject(subject, how.checkpoint)
 
-    from vjepa2_ac.console.evaluation import decoded_lines, evaluation_tables
+    from vjepa2_ac.console.evaluation import row_tables
     from vjepa2_ac.console.progress import ConsoleReporter, console
+    from vjepa2_ac.evaluation.rows import rows_of
     from vjepa2_ac.evaluation.verdict import spread, verdict
     from vjepa2_ac.reports.write import evaluate_subject
-    from vjepa2_ac.simulation.hand_in_images import hand_positions
 
     evaluations = []
     for subject, how in asked:
         say_places_elsewhere(subject)
         with ConsoleReporter() as reporter:
-            measured = evaluate_subject(subject, how, reporter, hands=hand_positions)
+            measured = evaluate_subject(subject, how, reporter)
         evaluations.append(measured.evaluation)
         console.print(f"{subject}: checkpoint {measured.checkpoint}" if measured.checkpoint else subject)
-        for table in evaluation_tables(measured.evaluation):
+        for table in row_tables(rows_of(measured.evaluation), "Held-out episodes"):
             console.print(table)
         console.print(verdict(measured.evaluation))
-        for line in decoded_lines(measured.evaluation):
-            console.print(line)
         for path in measured.files:
             console.print(f"  {path}")
     if len(evaluations) > 1:
@@ -152,11 +148,12 @@ def _compare(options: argparse.Namespace) -> None:
 
     comparison = compare(options.runs)
 
-    from vjepa2_ac.console.evaluation import comparison_table
+    from vjepa2_ac.console.evaluation import row_tables
     from vjepa2_ac.console.progress import console
     from vjepa2_ac.reports.figures.evaluation import plot_comparison
 
-    console.print(comparison_table(comparison))
+    for table in row_tables(comparison.rows, comparison.title):
+        console.print(table)
     for line in comparison.notes:
         console.print(line)
     console.print(f"  {plot_comparison(comparison, options.out)}")

@@ -7,12 +7,12 @@ from collections.abc import Mapping, Sequence
 from rich.table import Table
 from rich.text import Text
 
+from vjepa2_ac.calibration.axes import AxisFit
+from vjepa2_ac.calibration.data import VariantProbe, rows_of
+from vjepa2_ac.calibration.strides import Calibration
 from vjepa2_ac.console.progress import MetricsTable, console, with_interval
 from vjepa2_ac.data.index.episode_table import EpisodeTable
 from vjepa2_ac.data.index.index_cache import Usage
-from vjepa2_ac.evaluation.axis_fit import AxisFit
-from vjepa2_ac.evaluation.data_variants.measure import VariantProbe, rows_of
-from vjepa2_ac.evaluation.stride_calibration.measure import Calibration
 from vjepa2_ac.inspection.excerpts import Finding
 from vjepa2_ac.inspection.statistics import CHANGED, MOVED, TURNED, StepSizes
 

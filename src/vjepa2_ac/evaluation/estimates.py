@@ -4,8 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from vjepa2_ac.evaluation.metrics import L1, Metric
-from vjepa2_ac.evaluation.result import ActionRanking, Actions, EpisodeScore, Mode, PredictionErrors, Stratum, Way
+from vjepa2_ac.evaluation.result import (
+    L1,
+    ActionRanking,
+    Actions,
+    EpisodeScore,
+    Metric,
+    Mode,
+    PredictionErrors,
+    Stratum,
+    Way,
+)
 from vjepa2_ac.intervals import Estimate, bootstrapped, mean_of, ratio
 
 Curve = tuple[Estimate, ...]  # at horizon 1, 2, ...; index h - 1

@@ -13,26 +13,33 @@ from jaxtyping import Float, UInt8
 
 from vjepa2_ac.data.windows import spread
 from vjepa2_ac.episode import LatentBatch, Progress
-from vjepa2_ac.evaluation.action_score.measure import PlanningStart, measure_plans, planning_start, study_of
-from vjepa2_ac.evaluation.action_use.energy_landscape import LandscapeGrid, measure_landscapes
-from vjepa2_ac.evaluation.action_use.inferred_moves import infer_axes
-from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, moves_of, start_of
-from vjepa2_ac.evaluation.action_use.ranking import pool_of, rank_actions
-from vjepa2_ac.evaluation.action_use.sensitivity import ActionPool, measure_sensitivity
-from vjepa2_ac.evaluation.axis_fit import AxisFit
-from vjepa2_ac.evaluation.distribution.latent_sums import LatentSums, distribution_of, latent_noise_floor
+from vjepa2_ac.evaluation.action_score import PlanningStart, measure_plans, planning_start, study_of
+from vjepa2_ac.evaluation.action_use import (
+    ActionPool,
+    LandscapeGrid,
+    RolloutStart,
+    measure_landscapes,
+    measure_sensitivity,
+    moves_of,
+    pool_of,
+    rank_actions,
+    start_of,
+)
+from vjepa2_ac.evaluation.clips import chosen_clips, clips_of, make_example, predicted_rollout, strata_of
+from vjepa2_ac.evaluation.distribution import LatentSums, distribution_of, latent_noise_floor
 from vjepa2_ac.evaluation.estimates import episode_scores
-from vjepa2_ac.evaluation.examples import chosen_clips, make_example, predicted_rollout
 from vjepa2_ac.evaluation.measure import ALL, Predictor, joined, measured, with_other_actions
-from vjepa2_ac.evaluation.metrics import METRICS, Metric
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import (
+    METRICS,
     About,
     ActionRanking,
     Clips,
     Evaluation,
     Example,
     Landscapes,
+    Measurement,
+    Metric,
     Mode,
     ModelResult,
     PersistenceDistribution,
@@ -42,7 +49,6 @@ from vjepa2_ac.evaluation.result import (
     Sensitivity,
     Way,
 )
-from vjepa2_ac.evaluation.strata import clips_of, strata_of
 from vjepa2_ac.reporter import SILENT, Reporter
 
 ClipName = tuple[str, int]  # id of the episode, first control step
@@ -97,19 +103,11 @@ def evaluate(
     seen = _collect(contenders, clips, probes, about, metrics, reporter.task("measuring"))
     ids, seconds = tuple(seen.ids), about.seconds_per_step
     known = clips_of(seen.actions, ids, tuple(seen.firsts), space=about.space, seconds_per_step=seconds)
-    pool = _pool(seen, about, probes)
+    probe = _Probe(seen, known, _pool(seen, about, probes), probes, about, reporter)
     models: dict[str, ModelResult] = {}
     for contender in contenders:
-        result = _predictions(contender, seen)
         with contender.switched():
-            models[contender.name] = replace(
-                result,
-                sensitivity=_sensitivity(contender, seen.starts, pool, probes, reporter),
-                ranking=_ranking(contender, seen.moves, about, probes, reporter),
-                landscapes=_landscapes(contender, seen.starts, known, pool, probes, reporter),
-                plans=_plans(contender, seen.planned, probes, reporter),
-                axes=_axes(contender, seen.starts, about, probes, reporter),
-            )
+            models[contender.name] = probe.of(contender)
     evaluation = Evaluation(
         about=about,
         clips=known,
@@ -136,12 +134,6 @@ def _pool(seen: _Seen, about: About, probes: ProbeOptions) -> ActionPool:
         samples=probes.samples,
         seed=about.seed,
     )
-
-
-def _predictions(contender: Contender, seen: _Seen) -> ModelResult:
-    """Return what the predictions of all clips gave: their errors, and how they are distributed."""
-    distribution = distribution_of(seen.latents.predicted[contender.name], seen.latents.true)
-    return ModelResult(contender.name, contender.role, joined(seen.errors[contender.name]), distribution=distribution)
 
 
 def _left_out(probes: ProbeOptions, about: About, *, action_dim: int) -> tuple[str, ...]:
@@ -242,62 +234,71 @@ def _largest_step(actions: Float[torch.Tensor, "time action_dim"], about: About)
     return int(actions[:, about.space.sized].norm(dim=-1).argmax())
 
 
-def _sensitivity(
-    contender: Contender, starts: Sequence[RolloutStart], pool: ActionPool, probes: ProbeOptions, reporter: Reporter
-) -> Sensitivity | None:
-    if not starts:
-        return None
-    progress = reporter.task(f"other actions, {contender.name}")
-    return measure_sensitivity(contender.model, starts, pool, at_once=probes.at_once, progress=progress)
+@dataclass(frozen=True)
+class _Probe:
+    """The measurements of one model beyond its predictions; each gives None where nothing was asked for."""
 
+    seen: _Seen
+    clips: Clips
+    pool: ActionPool
+    options: ProbeOptions
+    about: About
+    reporter: Reporter
 
-def _ranking(
-    contender: Contender, moves: Sequence[RolloutStart], about: About, probes: ProbeOptions, reporter: Reporter
-) -> ActionRanking | None:
-    if not moves:
-        return None
-    pool = pool_of(moves, about.space, reach=probes.reach_cm / 100, samples=probes.samples, seed=about.seed)
-    progress = reporter.task(f"action ranking, {contender.name}")
-    return rank_actions(contender.model, moves, pool, at_once=probes.at_once, progress=progress)
+    def of(self, contender: Contender) -> ModelResult:
+        """Return all results of a model."""
+        name, seen = contender.name, self.seen
+        return ModelResult(
+            name,
+            contender.role,
+            joined(seen.errors[name]),
+            sensitivity=self._sensitivity(contender),
+            ranking=self._ranking(contender),
+            landscapes=self._landscapes(contender),
+            plans=self._plans(contender),
+            beside=self._axes(contender),
+            distribution=distribution_of(seen.latents.predicted[name], seen.latents.true),
+        )
 
+    def _sensitivity(self, contender: Contender) -> Sensitivity | None:
+        if not self.seen.starts:
+            return None
+        progress = self.reporter.task(f"other actions, {contender.name}")
+        at_once = self.options.at_once
+        return measure_sensitivity(contender.model, self.seen.starts, self.pool, at_once=at_once, progress=progress)
 
-def _landscapes(
-    contender: Contender,
-    starts: Sequence[RolloutStart],
-    clips: Clips,
-    pool: ActionPool,
-    probes: ProbeOptions,
-    reporter: Reporter,
-) -> Landscapes | None:
-    moving = [start for start in starts if clips.moving[start.clip].any()] or list(starts)
-    if not probes.landscape_clips or not moving or pool.actions.shape[-1] < 3:
-        return None
-    chosen = [moving[place] for place in spread(len(moving), probes.landscape_clips)]
-    grid = LandscapeGrid(pool.space, probes.nodes, reach=0.0 if pool.space.position is None else pool.reach)
-    progress = reporter.task(f"energy landscapes, {contender.name}")
-    return measure_landscapes(contender.model, chosen, grid, at_once=probes.at_once, progress=progress)
+    def _ranking(self, contender: Contender) -> ActionRanking | None:
+        if not (moves := self.seen.moves):
+            return None
+        options, about = self.options, self.about
+        pool = pool_of(moves, about.space, reach=options.reach_cm / 100, samples=options.samples, seed=about.seed)
+        progress = self.reporter.task(f"action ranking, {contender.name}")
+        return rank_actions(contender.model, moves, pool, at_once=options.at_once, progress=progress)
 
+    def _landscapes(self, contender: Contender) -> Landscapes | None:
+        starts, options, pool = self.seen.starts, self.options, self.pool
+        moving = [start for start in starts if self.clips.moving[start.clip].any()] or starts
+        if not options.landscape_clips or not moving or pool.actions.shape[-1] < 3:
+            return None
+        chosen = [moving[place] for place in spread(len(moving), options.landscape_clips)]
+        grid = LandscapeGrid(pool.space, options.nodes, reach=0.0 if pool.space.position is None else pool.reach)
+        progress = self.reporter.task(f"energy landscapes, {contender.name}")
+        return measure_landscapes(contender.model, chosen, grid, at_once=options.at_once, progress=progress)
 
-def _axes(
-    contender: Contender, starts: Sequence[RolloutStart], about: About, probes: ProbeOptions, reporter: Reporter
-) -> AxisFit | None:
-    if not starts or not probes.axis_clips or not about.space.is_pose:
-        return None
-    chosen = [starts[place] for place in spread(len(starts), probes.axis_clips)]
-    progress = reporter.task(f"axes, {contender.name}")
-    return infer_axes(contender.model, chosen, at_once=probes.at_once, progress=progress)
+    def _plans(self, contender: Contender) -> Plans | None:
+        if not self.seen.planned:
+            return None
+        model = contender.model if contender.to_plan is None else contender.to_plan()
+        progress = self.reporter.task(f"planning, {contender.name}")
+        return measure_plans(model, self.seen.planned, self.options.planning, progress)
 
-
-def _plans(
-    contender: Contender,
-    starts: Sequence[PlanningStart],
-    probes: ProbeOptions,
-    reporter: Reporter,
-) -> Plans | None:
-    if not starts:
-        return None
-    model = contender.model if contender.to_plan is None else contender.to_plan()
-    return measure_plans(model, starts, probes.planning, reporter.task(f"planning, {contender.name}"))
+    def _axes(self, contender: Contender) -> dict[str, Measurement]:
+        starts, clips = self.seen.starts, self.options.axis_clips
+        if self.options.find_axes is None or not starts or not clips or not self.about.space.is_pose:
+            return {}
+        chosen = [starts[place] for place in spread(len(starts), clips)]
+        progress = self.reporter.task(f"axes, {contender.name}")
+        return {"axes": self.options.find_axes(contender.model, chosen, self.options.at_once, progress)}
 
 
 def _examples(

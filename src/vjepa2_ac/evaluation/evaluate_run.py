@@ -1,42 +1,178 @@
-"""Evaluation of a run or a model on held-out episodes: load it and its references, measure, write the results."""
+"""Evaluation of a run or a model on held-out episodes: load it and what it is compared with, measure on the clips."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+import torch
+from accelerate import Accelerator
 from jaxtyping import UInt8
 
 from vjepa2_ac import __version__
-from vjepa2_ac.config import Config, PlanningConfig
+from vjepa2_ac.config import Config
 from vjepa2_ac.data.clips import frames_of
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import batches_of, validation_windows
 from vjepa2_ac.data.transforms import frames_as_seen
-from vjepa2_ac.decoding.decoder_folder import load_decoder
+from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
 from vjepa2_ac.distributed.launch import make_accelerator
-from vjepa2_ac.encoding.batch import encode_batch
+from vjepa2_ac.encoding.batch import encode_batch, require_widths
 from vjepa2_ac.encoding.training_cache import with_latents_if_there
-from vjepa2_ac.episode import Batch, LatentBatch
-from vjepa2_ac.evaluation.decoded_rollouts.measure import measure_decoded
-from vjepa2_ac.evaluation.decoded_rollouts.metric_networks import load_metric_networks
-from vjepa2_ac.evaluation.decoded_rollouts.setup import HandsOf, decoding_of
-from vjepa2_ac.evaluation.evaluate import ClipName, FramesOfRow, RepeatableClips, evaluate
+from vjepa2_ac.episode import Batch, LatentBatch, Progress, Widths
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.decoded import NEIGHBOURS, TRUE_FRAMES, Decoding, load_lpips, measure_decoded
+from vjepa2_ac.evaluation.evaluate import ClipName, Contender, FramesOfRow, RepeatableClips, evaluate
 from vjepa2_ac.evaluation.measure import ClipSample
-from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions, settle
-from vjepa2_ac.evaluation.result import About, Evaluation, TrainingCurve
-from vjepa2_ac.evaluation.stride_calibration.measure import calibrate_model
-from vjepa2_ac.evaluation.subject import load_subject
+from vjepa2_ac.evaluation.request import EvaluationOptions, settle
+from vjepa2_ac.evaluation.result import About, Evaluation, Measurement, Role, TrainingCurve
+from vjepa2_ac.model.adapter.merging import base_only, unadapted_copy
+from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.network.input_heads import heads_to_replace, widths_as_text
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.places import BUILTIN
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.runs.checkpoint_selection import select_checkpoint
 from vjepa2_ac.runs.folder import METRICS, is_run
-from vjepa2_ac.runs.loading import TrainedRun
+from vjepa2_ac.runs.loading import TrainedRun, load_run
 from vjepa2_ac.runs.metrics_log import read_metrics_log, warnings_of
 from vjepa2_ac.storage import try_writing_at, user_can_write
 from vjepa2_ac.storage.structured import utc_now
+
+BASE = "base"
+_NO_BASE = "There is no base to compare with: it takes states or actions of other widths than this robot's."
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """A run or a model, loaded, and all that is measured with it."""
+
+    run: TrainedRun | None  # None: a model
+    world_model: WorldModel
+    contenders: tuple[Contender, ...]  # the base first and the subject last
+    notes: tuple[str, ...]  # on them
+
+    def put_on(self, device: torch.device) -> None:
+        """Move all models to a device, ready to be measured; the encoder of the subject is enough for all."""
+        for each in self.contenders:
+            if isinstance(each.model, WorldModel):
+                each.model.predictor.to(device).eval()
+        self.world_model.to(device).eval()
+
+
+def load_subject(
+    name: str, config: Config, asked: EvaluationOptions, dataset: Dataset, decoder: TrainedDecoder | None = None
+) -> Subject:
+    """Load a run or a model, and what it is compared with, on the CPU. Cheap failures first.
+
+    Args:
+        name: The folder of a run; or a model, as in `model.base`.
+        config: As `settle` returned it.
+        asked: Which checkpoint, and what to compare with.
+        dataset: What it is measured on.
+        decoder: If its latents are to be decoded.
+
+    Raises:
+        InputError: One of the models cannot be loaded; it does not fit the data, the decoder, or the others.
+    """
+    run = load_run(Path(name), asked.checkpoint) if is_run(name) else None
+    world_model = run.world_model if run else load_model(name, config)
+    require_widths(world_model, dataset.widths, where=name)
+    if decoder is not None:
+        decoder.require_fit(world_model, config.data.crop, subject=name)
+    contenders, notes = _contenders_of(name, config, run, world_model, asked, dataset.widths)
+    return Subject(run, world_model, tuple(contenders), notes)
+
+
+def load_model(name: str, config: Config) -> WorldModel:
+    """Load a model by its name, with the config's other settings of a model."""
+    return load_base(config.model.with_base(name), seed=config.seed)
+
+
+def _contenders_of(
+    subject: str,
+    config: Config,
+    run: TrainedRun | None,
+    world_model: WorldModel,
+    asked: EvaluationOptions,
+    widths: Widths,
+) -> tuple[list[Contender], tuple[str, ...]]:
+    """Return the models to measure, the base first and the subject last; and notes on them."""
+    against = asked.against if asked.against is not None else (BASE,) * (run is not None)
+    found: list[Contender] = []
+    notes: tuple[str, ...] = ()
+    if BASE in against and run is not None and config.model.base is not None:
+        if world_model.fresh_heads is not None:
+            notes = (_NO_BASE,)
+        else:
+            found.append(_contender(BASE, "base", world_model, partial(base_only, world_model)))
+    elif BASE in against and run is None:
+        if config.model.base is None:
+            raise InputError(
+                where="--against base", found="a config without model.base", needed="a base to compare with"
+            )
+        found.append(Contender(BASE, "base", _like(world_model, config.model.base, config, subject, widths)))
+    name = "adapter" if world_model.adaptation is not None and world_model.adaptation.kind == "lora" else "model"
+    for other in against:
+        if other != BASE:
+            taken = {each.name for each in found} | {name, BASE, "persistence", TRUE_FRAMES, *NEIGHBOURS}
+            called = Path(other).name if Path(other).name not in taken else other
+            found.append(_contender(called, "other", _like(world_model, other, config, subject, widths)))
+    return [*found, _contender(name, "trained", world_model)], notes
+
+
+def _contender(
+    name: str, role: Role, model: WorldModel, switched: Callable[[], AbstractContextManager[object]] = nullcontext
+) -> Contender:
+    """Return a model to measure unmerged; a merged copy plans in its place (see `planning.model_setup`)."""
+    adaptation = model.adaptation
+    plans_as_it_is = adaptation is None or (role == "base" and adaptation.kind == "lora")  # whose adapter is off then
+    return Contender(name, role, model, switched, None if plans_as_it_is else partial(unadapted_copy, model))
+
+
+def _like(world_model: WorldModel, other: str, config: Config, subject: str, widths: Widths) -> WorldModel:
+    """Load another run or model that can be measured on the same latents, and states and actions of these widths.
+
+    Raises:
+        InputError: It has another encoder, or takes other states or actions.
+    """
+    if not (other.startswith(BUILTIN) or Path(other).exists()):
+        raise InputError(
+            where=f"--against {other}",
+            found="no such file or folder",
+            needed="base, the folder of a run, or a model: what model.base takes",
+        )
+    loaded = load_run(Path(other)).world_model if is_run(other) else load_model(other, config)
+    same = loaded.image_size == world_model.image_size
+    if not same or loaded.encoder_fingerprint() != world_model.encoder_fingerprint():
+        raise InputError(
+            where=f"--against {other}",
+            found=f"another encoder than that of {subject}",
+            needed="the same one: errors are compared on the same latents",
+            fix="Evaluate each by itself, and put their ratios to persistence side by side with `vjepa2-ac compare`",
+        )
+    if heads_to_replace(loaded.sizes, widths):
+        raise InputError(
+            where=f"--against {other}",
+            found=f"a model of {widths_as_text(loaded.sizes)}",
+            needed=f"{widths.state} and {widths.action}, as the data of {subject} has",
+        )
+    return loaded
+
+
+CalibrateStrides = Callable[[WorldModel, Dataset, Config, Accelerator, ClipSample, Progress], Measurement]
+
+
+@dataclass(frozen=True)
+class Beside:
+    """What is measured beside the core (`calibration`); None: it is not."""
+
+    axes: Callable[..., Measurement] | None = None
+    strides: CalibrateStrides | None = None
 
 
 @dataclass(frozen=True)
@@ -53,7 +189,7 @@ def measure_subject(
     asked: EvaluationOptions | None = None,
     *,
     reporter: Reporter = SILENT,
-    hands: HandsOf | None = None,
+    beside: Beside | None = None,
 ) -> Measured:
     """Measure a run or a model on held-out episodes. Cheap failures first.
 
@@ -61,19 +197,19 @@ def measure_subject(
         subject: The folder of a run; or a model, as in `model.base`.
         asked: The options.
         reporter: Shows the progress of each part of the work.
-        hands: Returns where the hand is in the images of a data set, if its data say so; with a decoder only.
+        beside: What else is measured, if the options ask for it.
 
     Raises:
         InputError: The subject, the data, the decoder, a file of a metric, or a model to compare with cannot be used;
             the split is empty.
     """
-    asked = asked or EvaluationOptions()
+    asked, beside = asked or EvaluationOptions(), beside or Beside()
     config, planning, folder = settle(subject, asked)
     if is_run(subject):
         select_checkpoint(Path(subject), asked.checkpoint)
     _make_writable(folder)
     decoder = None if asked.decoder is None else load_decoder(asked.decoder)
-    networks = load_metric_networks(asked)
+    lpips = load_lpips(asked.lpips, asked.lpips_heads) if asked.lpips and asked.lpips_heads else None
     accelerator = make_accelerator(config)
     dataset = open_dataset(config.data, progress=reporter.task("looking through the data"))
     chosen = validation_windows(dataset, asked.split, clips=asked.clips)
@@ -83,31 +219,32 @@ def measure_subject(
     if through_cache.config.is_cache and not asked.calibrate:
         world_model.set_encoder_aside()
     loaded.put_on(accelerator.device)
-    calibration = None
-    if asked.calibrate:
+    found: dict[str, Measurement] = {}
+    if asked.calibrate and beside.strides is not None:
         sample, progress = ClipSample(asked.split, asked.clips), reporter.task("calibrating strides")
-        calibration = calibrate_model(world_model, dataset, config, accelerator, sample, progress).as_dict()
+        found["strides"] = beside.strides(world_model, dataset, config, accelerator, sample, progress)
     encode = partial(encode_batch, world_model, device=accelerator.device, chunk=config.model.encode_chunk)
     read = partial(batches_of, batch_size=config.validation.batch_size)
     clips = _clips(through_cache, chosen, read, encode, world_model.image_size)
+    find_axes = beside.axes if dataset.spaces.state.is_base_pose else None
     with accelerator.autocast():
         evaluation = evaluate(
             contenders,
             clips,
             _about(subject, run, config, dataset, asked),
-            probes=_probes(asked, planning, dataset),
+            probes=replace(asked.probes, planning=planning, find_axes=find_axes),
             reporter=reporter,
         )
         decoded = None
         if decoder is not None:
-            decoding = decoding_of(decoder.to(accelerator.device), world_model, through_cache, hands)
-            decoding = replace(decoding, networks=networks.to(accelerator.device))
+            lpips = None if lpips is None else lpips.to(accelerator.device)
+            decoding = Decoding(decoder.to(accelerator.device), not through_cache.config.is_cache, lpips)
             decoded = measure_decoded(contenders, clips, decoding, evaluation.examples, reporter=reporter)
     evaluation = replace(
         evaluation,
         decoded=decoded,
         training=training_curves(Path(subject)) if run else (),
-        calibration=calibration,
+        beside=found,
         notes=(*loaded.notes, *(_warnings(Path(subject)) if run else ()), *evaluation.notes),
     )
     return Measured(evaluation, run.chosen if run else "", folder)
@@ -118,12 +255,6 @@ def _make_writable(folder: Path) -> None:
     with user_can_write(folder):
         folder.mkdir(parents=True, exist_ok=True)
         try_writing_at(folder)
-
-
-def _probes(asked: EvaluationOptions, planning: PlanningConfig, dataset: Dataset) -> ProbeOptions:
-    """Return the probes that these data allow: axes are those of poses in the robot base frame."""
-    axis_clips = asked.probes.axis_clips if dataset.spaces.state.is_base_pose else 0
-    return replace(asked.probes, planning=planning, axis_clips=axis_clips)
 
 
 def _warnings(folder: Path) -> list[str]:

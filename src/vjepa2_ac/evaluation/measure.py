@@ -19,8 +19,7 @@ from torch import Tensor
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.evaluation.metrics import L1, Metric
-from vjepa2_ac.evaluation.result import MODES, Mode, PredictionErrors, Way
+from vjepa2_ac.evaluation.result import L1, MODES, Metric, Mode, PredictionErrors, Way
 
 ALL: tuple[tuple[Way, Mode], ...] = tuple(product(get_args(Way), MODES))
 VALIDATED: tuple[tuple[Way, Mode], ...] = (  # rollouts, which take longest, with the true actions only
@@ -155,7 +154,10 @@ def with_other_actions(
 def prediction(
     model: Predictor, batch: LatentBatch, way: Way = "true", mode: Mode = "rollout", others: Tensor | None = None
 ) -> Float[Tensor, "batch horizon tokens dim"]:
-    """Return the frames after the first as predicted; states are the true ones, whatever the actions."""
+    """Return the frames after the first as predicted.
+
+    States are the true ones, whatever the actions, and may reveal the motion: what wrong actions cost is a lower bound.
+    """
     seen = batch.latents[:, :1] if mode == "rollout" else batch.latents[:, :-1]
     if way == "persistence":
         return seen.expand_as(batch.latents[:, 1:])

@@ -1,20 +1,53 @@
-"""What is asked of an evaluation: its options, and the config that follows from them. PyTorch is not imported."""
+"""What is asked of an evaluation: its options, and the config that follows from them. PyTorch is not imported.
+
+The protocol of the Action Score stands here, too. No option changes it, so that scores of different runs compare.
+
+Source: facebookresearch/jepa-wms @ 6eafb14, configs/evals/simu_env_planning/droid/vj2ac,
+evals/simu_env_planning/planning (planner.py: CEMPlanner; objectives.py: ReprTargetDistMPCObjective; plan_evaluator.py:
+sample_traj_segment_from_dset), app/vjepa_wm/modelcustom/simu_env_planning/vit_enc_preds.py: EncPredWM.unroll.
+Where it differs: docs/evaluation.md.
+"""
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-from vjepa2_ac.config import Config, PlanningConfig
+from vjepa2_ac.config import Config
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.loading import config_as_dict, config_from
+from vjepa2_ac.config.planning import CemConfig, EnergyConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.action_score.protocol import FRAMES
 from vjepa2_ac.planning.settings import require_limits, with_taught_limits
 from vjepa2_ac.runs.checkpoint_selection import SELECTED
 from vjepa2_ac.runs.folder import is_run, read_run_config
 from vjepa2_ac.runs.relative_paths import DATA, with_paths_from_start
+
+STEPS = 3  # of a scored plan
+FRAMES = STEPS + 1  # required of a clip
+FRAMES_SEEN = 2  # by the model at most, predicted ones included
+BEST_SCORE = 80.0
+SCORED = PlanningConfig(
+    planner="cem",
+    horizon=STEPS,
+    samples=300,
+    iterations=15,
+    gripper_start_std=0.1,
+    limits=LimitsConfig(xyz=(0.1, 0.1, 0.1), rotation=0.1, gripper=0.75, gripper_mode="free"),
+    energy=EnergyConfig(distance="l2", steps="last"),
+    cem=CemConfig(
+        elites=10,
+        momentum_mean=0.0,
+        momentum_std=0.0,
+        momentum_mean_gripper=0.0,
+        momentum_std_gripper=0.0,
+        try_mean=True,
+    ),
+)
 
 
 @dataclass(frozen=True)
@@ -31,6 +64,7 @@ class ProbeOptions:
     at_once: int = 64  # samples per batch
     planning_clips: int = 0  # number of clips whose plans are compared with the demonstration; of poses only
     planning: PlanningConfig = field(default_factory=PlanningConfig)  # settings of one-step plans
+    find_axes: Callable[..., Any] | None = None  # `calibration.axes.infer_axes`; None: no axes
 
 
 @dataclass(frozen=True)
@@ -46,9 +80,8 @@ class EvaluationOptions:
     probes: ProbeOptions = field(default_factory=ProbeOptions)
     calibrate: bool = False  # also measure the error at other strides
     decoder: str | None = None  # folder of a decoder, or builtin:sim-tiny: rollouts are decoded and measured as images
-    lpips: Path | None = None  # with a decoder: torchvision's AlexNet or VGG16, for LPIPS; no file, no LPIPS
+    lpips: Path | None = None  # with a decoder: torchvision's AlexNet or VGG16, for LPIPS
     lpips_heads: Path | None = None  # its heads
-    i3d: Path | None = None  # with a decoder: i3d_torchscript.pt, for FVD; no file, no FVD
     planning: tuple[str, ...] = ()  # settings in place of the config's, such as planning.samples=200
 
 
@@ -61,9 +94,10 @@ def settle(subject: str, asked: EvaluationOptions, *, frames: int | None = None)
         frames: Of a clip; None: as `data.frames` says.
 
     Raises:
-        InputError: The subject is no run and no data are named, a setting is wrong, a folder is missing, or files of
-            metrics are named without a decoder or incompletely.
+        InputError: Several processes; the subject is no run and no data are named, a setting is wrong, a folder is
+            missing, or files of LPIPS are named without a decoder or incompletely.
     """
+    require_one_process()
     _check_metric_files(asked)
     config, folder = _config_of(subject, asked)
     if frames is not None:
@@ -72,23 +106,29 @@ def settle(subject: str, asked: EvaluationOptions, *, frames: int | None = None)
     return config, _planning_of(subject, config, asked), folder
 
 
-def _check_metric_files(asked: EvaluationOptions) -> None:
-    files = {"--lpips": asked.lpips, "--lpips-heads": asked.lpips_heads, "--i3d": asked.i3d}
-    given = [option for option, path in files.items() if path is not None]
-    if given and asked.decoder is None:
+def require_one_process(environment: Mapping[str, str] = os.environ) -> None:
+    """Refuse several processes: each would measure everything, and all would write the same files.
+
+    Raises:
+        InputError: torchrun or `accelerate launch` started several.
+    """
+    if (processes := environment.get("WORLD_SIZE", "1")) != "1":
         raise InputError(
-            where=" ".join(given),
-            found="no --decoder",
-            needed="a decoder: LPIPS and FVD are of decoded images",
-            fix="Add --decoder FOLDER; `vjepa2-ac decoder CONFIG` trains one",
+            where="torchrun",
+            found=f"{processes} processes",
+            needed="one: only training shares its work among processes",
+            fix="Start the command without torchrun or accelerate launch",
         )
-    missing = {"--lpips", "--lpips-heads"} - set(given)
-    if len(missing) == 1:
+
+
+def _check_metric_files(asked: EvaluationOptions) -> None:
+    given = [asked.decoder, asked.lpips, asked.lpips_heads]
+    if any(given[1:]) and not all(given):
         raise InputError(
-            where=next(option for option in given if option != "--i3d"),
-            found=f"no {missing.pop()}",
-            needed="both files of LPIPS: a backbone (--lpips) and its heads (--lpips-heads)",
-            fix="docs/decoding.md says where to get them",
+            where="--lpips, --lpips-heads",
+            found="one without the others",
+            needed="a backbone (--lpips), its heads (--lpips-heads) and a --decoder, whose images LPIPS compares",
+            fix="docs/decoding.md says where to get the files",
         )
 
 

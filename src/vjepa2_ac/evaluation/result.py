@@ -1,26 +1,137 @@
-"""Evaluation results: records of plain arrays, the input of estimates, tables and the report.
+"""Evaluation results: records of plain arrays, and the rows that people and programs read. PyTorch is not imported.
 
 Axes: clips in one fixed order; horizon 1 .. H model steps ahead (index h - 1; H is frames - 1). All errors compare
-layer-normalised latents, by the metrics of `evaluation.metrics`. What has intervals is computed from these by
-`evaluation.estimates`, the verdict as text by `evaluation.verdict`.
+layer-normalised latents, by METRICS. What has intervals is computed from these by `evaluation.estimates`; the rows by
+`evaluation.rows`, the verdict as text by `evaluation.verdict`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Literal
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
+from pydantic import BeforeValidator
 
 from vjepa2_ac.config.planning import PlanningConfig
-from vjepa2_ac.evaluation.axis_fit import AxisFit
-from vjepa2_ac.evaluation.decoded.record import DecodedRollouts
-from vjepa2_ac.evaluation.distribution.record import LatentDistribution
-from vjepa2_ac.evaluation.metrics import L1, METRICS, Metric
+from vjepa2_ac.distances import absolute_difference, squared_difference
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.spaces import ActionSpace
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+_Number = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]  # null in JSON: NaN
+PERSISTENCE = "persistence"  # the model of rows that stand where chance does
+
+
+@dataclass(frozen=True)
+class Row:
+    """One number of an evaluation: console, report page, metrics.json and comparison show the same ones."""
+
+    group: str  # the table that it stands in
+    name: str  # its line
+    key: str  # both, for programs, such as rollout.l1.over_persistence.3
+    model: str  # its column: a model, persistence, or plans without a model
+    value: _Number  # NaN: there is none
+    low: _Number = math.nan  # 95 % interval over episodes; NaN: there is none
+    high: _Number = math.nan
+    form: str = ".3f"
+    better: Literal["lower", "higher", ""] = "lower"
+    chance: float | None = None  # what doing nothing has, or a model that ignores its actions
+    note: str = ""
+    detail: bool = False  # not for a screen
+
+    @property
+    def estimate(self) -> Estimate:
+        """The number with its interval."""
+        return Estimate(self.value, self.low, self.high)
+
+    def __str__(self) -> str:
+        text = "\N{EN DASH}" if math.isnan(self.value) else f"{self.estimate:{self.form}}"
+        return f"{text} ({self.note})" if self.note else text
+
+
+@dataclass(frozen=True)
+class RowTable:
+    """The rows of one group as a table."""
+
+    title: str
+    columns: tuple[str, ...]
+    lines: tuple[tuple[str, str, tuple[str, ...]], ...]  # label, by chance or persistence, a cell for each column
+
+
+def sections(rows: Sequence[Row]) -> list[RowTable]:
+    """Return rows as tables: those of one key are a line, each in the column of its model."""
+    by_key: dict[str, dict[str, Row]] = {}
+    for row in rows:
+        by_key.setdefault(row.key, {})[row.model] = row
+    groups: dict[str, list[dict[str, Row]]] = {}
+    for line in by_key.values():
+        groups.setdefault(next(iter(line.values())).group, []).append(line)
+    return [_section(title, lines) for title, lines in groups.items()]
+
+
+def _section(title: str, lines: Sequence[Mapping[str, Row]]) -> RowTable:
+    columns = tuple(dict.fromkeys(model for line in lines for model in line if model != PERSISTENCE))
+    found = []
+    for line in lines:
+        first = next(iter(line.values()))
+        chance = "" if first.chance is None else f"{first.chance:{first.form}}"
+        chance = str(line.get(PERSISTENCE, chance))
+        found.append((first.name, chance, tuple(str(line.get(model, "")) for model in columns)))
+    return RowTable(title, columns, tuple(found))
+
+
+class Measurement(Protocol):
+    """What a measurement beside the core found of a model."""
+
+    def rows(self, model: str) -> list[Row]:
+        """Return its numbers."""
+        ...
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return all of it as plain values, for metrics.json."""
+        ...
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A measure of predictions, of positive numbers: they are shown as ratios to those of persistence."""
+
+    name: str  # in metrics.json
+    label: str  # in tables and sentences
+    explanation: str
+    of: Callable[[Tensor, Tensor], Tensor]  # predicted and true [batch time tokens dim] -> [batch time]
+    smaller_is_better: bool = True
+
+    @property
+    def heading(self) -> str:
+        """The label, and which way is better if that is not the usual one."""
+        return self.label if self.smaller_is_better else f"{self.label} (larger is better)"
+
+    def side(self, of_ratio: Estimate) -> int:
+        """Return 1 or -1 if the whole interval of a ratio of two results is better or worse than 1, else 0."""
+        return of_ratio.side(of=1.0) * (-1 if self.smaller_is_better else 1)
+
+
+def _l1(predicted: Tensor, true: Tensor) -> Tensor:
+    return absolute_difference(predicted, true).mean(dim=(2, 3))
+
+
+def _l2(predicted: Tensor, true: Tensor) -> Tensor:
+    return squared_difference(predicted, true).mean(dim=(2, 3))
+
+
+L1 = Metric("l1", "L1", "mean absolute difference", _l1)
+L2 = Metric("l2", "L2", "mean squared difference", _l2)
+
+METRICS: tuple[Metric, ...] = (L1, L2)  # L1, which models are trained on, comes first: the others stand beside it
+
 
 Mode = Literal["teacher_forced", "rollout"]
 Actions = Literal["true", "zero", "shuffled"]
@@ -181,7 +292,6 @@ class Plans:
     one_step: Float[np.ndarray, "draws starts 7"]  # towards the next frame; an action as in `vjepa2_ac.episode`
     three_steps: Float[np.ndarray, "draws starts 3 7"]  # towards the frame three steps later
     empty: int = 0  # plans without a finite energy, which do nothing
-    seconds: float = 0.0  # for all plans
 
 
 @dataclass(frozen=True)
@@ -204,6 +314,48 @@ class PlanningStudy:
 
 
 @dataclass(frozen=True)
+class Discrepancy:
+    """The squared MMD of two sets of features, times 100, and whether the sets differ."""
+
+    squared: Estimate  # NaN of one episode
+    p_value: float  # of no difference, by sign flips; NaN of one episode
+
+
+@dataclass(frozen=True)
+class LatentDistribution:
+    """How the latents of one kind of prediction are distributed, by horizon (index h - 1), against the truth."""
+
+    spread: tuple[Estimate, ...]  # 1: as varied as the truth
+    mmd: tuple[Discrepancy, ...]  # of latents averaged over tokens
+
+
+@dataclass(frozen=True, eq=False)
+class DecodedStrip:
+    """The images of one example clip."""
+
+    why: str
+    episode_id: str
+    start: int
+    rows: Mapping[str, UInt8[np.ndarray, "time size size 3"]]  # truth, decoded_truth, base, adapter; the first is given
+
+
+@dataclass(frozen=True)
+class DecodedRollouts:
+    """What was measured of decoded rollouts. Frame 0 is given: horizons begin at 1.
+
+    A *source* is a model's rollout under the true actions, or one of its neighbours: decoded truth (the ceiling of the
+    decoder), decoded persistence (the floor), and raw persistence, a copy of the pixels of frame 0, which beats any
+    decoder in PSNR where little moves.
+    """
+
+    decoder: Mapping[str, Any]  # what is known of it: folder, size, encoder, data, frames, steps, held_out
+    sources: tuple[str, ...]  # the neighbours, then the models
+    curves: Mapping[tuple[str, str], tuple[Estimate, ...]]  # by source and metric, such as psnr_db.moving.truth
+    strips: tuple[DecodedStrip, ...] = ()
+    notes: tuple[str, ...] = ()  # what is absent, and why; how many clips were left out
+
+
+@dataclass(frozen=True)
 class ModelResult:
     """The results of one model."""
 
@@ -214,8 +366,8 @@ class ModelResult:
     landscapes: Landscapes | None = None
     plans: Plans | None = None
     ranking: ActionRanking | None = None
-    axes: AxisFit | None = None
     distribution: LatentDistribution | None = None  # of the rollout with the true actions
+    beside: Mapping[str, Measurement] = field(default_factory=dict)  # by measurements that the core does not know
 
 
 @dataclass(frozen=True)
@@ -278,7 +430,7 @@ class Evaluation:
     episodes: tuple[EpisodeScore, ...]  # best first
     examples: tuple[Example, ...]
     training: tuple[TrainingCurve, ...] = ()
-    calibration: Mapping[str, Any] | None = None  # what `Calibration.as_dict` gives
+    beside: Mapping[str, Measurement] = field(default_factory=dict)  # as of a model: of the one that is evaluated
     notes: tuple[str, ...] = ()  # for the reader: why there is no base, no landscape ...
     planning: PlanningStudy | None = None
     metrics: tuple[Metric, ...] = METRICS  # of the errors

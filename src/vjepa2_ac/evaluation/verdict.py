@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vjepa2_ac.evaluation.action_score.metrics import differences_of, metrics_of
-from vjepa2_ac.evaluation.action_score.protocol import BEST_SCORE, STEPS
+from vjepa2_ac.evaluation.action_score import differences_of, metrics_of
 from vjepa2_ac.evaluation.estimates import (
     gain_over,
     gap_of_actions,
@@ -15,8 +14,8 @@ from vjepa2_ac.evaluation.estimates import (
     over_persistence,
     rank_difference,
 )
-from vjepa2_ac.evaluation.metrics import L1, Metric
-from vjepa2_ac.evaluation.result import Evaluation, Ranking
+from vjepa2_ac.evaluation.request import BEST_SCORE, STEPS
+from vjepa2_ac.evaluation.result import L1, Evaluation, Metric, Ranking
 from vjepa2_ac.intervals import Estimate
 
 _SIDES = {1: "better", 0: "no clear difference", -1: "NOT better"}  # of an error over persistence

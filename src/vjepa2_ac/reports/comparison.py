@@ -1,122 +1,87 @@
-"""Comparison of runs that were measured on the same clips, from their metrics.json alone.
+"""Comparison of runs that were measured on the same clips, from their metrics.json alone: their rows, joined by key.
 
 Nothing is measured here: missing results have to be written by `vjepa2-ac evaluate` first.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.metrics import L1, METRICS, Metric
+from vjepa2_ac.evaluation.result import L1, Row
 from vjepa2_ac.intervals import Estimate, bootstrapped
-from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics
+from vjepa2_ac.reports.metrics_json import METRICS_FILE, Metrics, read_metrics
 
-Cell = Estimate | str
 _SAME_LATENTS = 1e-3  # errors of persistence that differ by a larger share are of other latents
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Runs side by side: a table, and curves for a figure."""
+    """Runs side by side: rows, of which a run is the model, and curves for a figure."""
 
     title: str
-    columns: tuple[str, ...]
-    rows: Mapping[str, tuple[Cell, ...]]  # by run
+    rows: tuple[Row, ...]
     seconds: Float[np.ndarray, " horizon"]
     curves: Mapping[str, tuple[Estimate, ...]]  # run -> rollout error over persistence by horizon
     notes: tuple[str, ...]
 
 
-def compare(folders: Sequence[Path], metrics: Sequence[Metric] = METRICS) -> Comparison:
-    """Compare runs; each is compared with the first one, paired by clip.
+def compare(folders: Sequence[Path]) -> Comparison:
+    """Compare what was evaluated in each run; the gain over the first one is paired by clip.
 
     Args:
         folders: Of the runs.
-        metrics: What the table shows; the cell of a run that was evaluated without one is empty.
 
     Raises:
         InputError: Fewer than two, one is named twice or was not evaluated, or they were measured on different clips.
     """
     if len(folders) < 2:
         raise InputError(where="runs to compare", found=f"{len(folders)}", needed="two or more to compare")
-    for number, folder in enumerate(folders):
-        if folder.resolve() in [other.resolve() for other in folders[:number]]:
-            raise InputError(where=str(folder), found="a run that is named twice", needed="each run once")
-    measured = {_name(folder, folders): read_metrics(folder) for folder in folders}
-    try:
-        return _compared(measured, dict(zip(measured, folders, strict=True)), metrics)
-    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
-        raise InputError(
-            where=", ".join(str(folder / METRICS_FILE) for folder in folders),
-            found=f"metrics that cannot be used ({error!r})",
-            fix="Write them again with `vjepa2-ac evaluate`",
-        ) from None
-
-
-def _name(folder: Path, folders: Sequence[Path]) -> str:
-    alike = [other for other in folders if other.resolve().name == folder.resolve().name]
-    return folder.resolve().name if len(alike) == 1 else str(folder)
-
-
-def _compared(
-    measured: Mapping[str, dict[str, Any]], folders: Mapping[str, Path], shown: Sequence[Metric]
-) -> Comparison:
-    names = list(measured)
+    places = [folder.resolve() for folder in folders]
+    names = [place.name if [one.name for one in places].count(place.name) == 1 else str(place) for place in places]
+    if len(set(places)) < len(places):
+        raise InputError(where=", ".join(map(str, folders)), found="a run that is named twice", needed="each run once")
+    measured = {name: read_metrics(folder) for name, folder in zip(names, folders, strict=True)}
     first = measured[names[0]]
-    for name in names[1:]:
-        _check_same_clips(first, measured[name], folders[names[0]], folders[name])
-    about, clips = first["about"], first["clips"]
-    ids = [clip["episode"] for clip in clips["named"]]
-    ahead = f"{(about['frames'] - 1) * about['seconds_per_step']:.2f} s"
-    columns = [f"{ahead} ahead", f"gain over {names[0]}", "gain over its base", "one step", "shuffled", "rank"]
-    columns += [f"{ahead}, {metric.heading}" for metric in shown[1:]]
-    rows = {
-        name: [*_row(metrics, first, ids), *(_last_ratio(metrics, metric) for metric in shown[1:])]
-        for name, metrics in measured.items()
-    }
-    if any(_trained(metrics).get("planning") for metrics in measured.values()):
-        columns += ["Action Score", "plans end off, cm"]
-        for name, metrics in measured.items():
-            plans = _trained(metrics).get("planning")  # None: none were requested, or evaluate did not know them yet
-            rows[name] += ["", ""] if plans is None else [_estimate(plans["score"]), _estimate(plans["missed_cm"])]
+    for name, folder in zip(names[1:], folders[1:], strict=True):
+        _check_same_clips(first, measured[name], folders[0], folder)
+    about, clips = first.about, first.clips
+    rows = [
+        replace(row, model=name, detail=row.detail and not row.key.startswith(f"rollout.{L1.name}.gain_over_base"))
+        for name, one in measured.items()
+        for row in one.rows
+        if row.model == one.trained
+    ]
     return Comparison(
-        title=f"{L1.label} error over persistence on {clips['count']} {about['split']} clips of {clips['episodes']}"
-        f" episode{'s' * (clips['episodes'] != 1)}",
-        columns=tuple(columns),
-        rows={name: tuple(cells) for name, cells in rows.items()},
-        seconds=about["seconds_per_step"] * np.arange(1, about["frames"]),
-        curves={
-            name: tuple(map(_estimate, _trained(metrics)["rollout"][L1.name]["over_persistence"]))
-            for name, metrics in measured.items()
-        },
-        notes=_notes(measured, names),
+        title=f"{L1.label} error over persistence on {clips.count} {about.split} clips of {clips.episodes}"
+        f" episode{'s' * (clips.episodes != 1)}",
+        rows=(*_gains(measured), *rows),
+        seconds=about.seconds_per_step * np.arange(1, about.frames),
+        curves={name: _curve(metrics) for name, metrics in measured.items()},
+        notes=_notes(measured),
     )
 
 
-def _trained(metrics: dict[str, Any]) -> dict[str, Any]:
-    """Return the metrics of the evaluated model."""
-    model: dict[str, Any] = metrics["models"][metrics["trained"]]
-    return model
-
-
-def _check_same_clips(one: dict[str, Any], other: dict[str, Any], first: Path, second: Path) -> None:
+def _check_same_clips(one: Metrics, other: Metrics, first: Path, second: Path) -> None:
     differences = [
         f"{what}: {a} and {b}"
         for what, a, b in [
-            *((key, one["about"][key], other["about"][key]) for key in ("split", "frames", "stride", "cameras")),
-            ("clips", one["clips"]["count"], other["clips"]["count"]),
+            *(
+                (key, getattr(one.about, key), getattr(other.about, key))
+                for key in ("split", "frames", "stride", "cameras")
+            ),
+            ("clips", one.clips.count, other.clips.count),
         ]
         if a != b
     ]
-    if not differences and one["clips"]["fingerprint"] != other["clips"]["fingerprint"]:
-        differences = [f"other episodes or starts, of {one['about']['data']} and {other['about']['data']}"]
+    if not differences and one.clips.fingerprint != other.clips.fingerprint:
+        differences = [f"other episodes or starts, of {one.about.data} and {other.about.data}"]
     if differences:
         raise InputError(
             where=f"{first} and {second}",
@@ -126,56 +91,48 @@ def _check_same_clips(one: dict[str, Any], other: dict[str, Any], first: Path, s
         )
 
 
-def _row(metrics: dict[str, Any], first: dict[str, Any], ids: Sequence[str]) -> tuple[Cell, ...]:
-    model = _trained(metrics)
-    base_gain = model["rollout"][L1.name].get("gain_over_base")
-    sensitivity = model["sensitivity"]
-    return (
-        _last_ratio(metrics, L1),
-        "" if metrics is first else _gain(metrics, first, ids),
-        "no base" if base_gain is None else _estimate(base_gain[-1]),
-        _estimate(model["one_step_by_actions"]["true"]),
-        f"{model['one_step_by_actions']['shuffled']['value']:.3f}",
-        "" if sensitivity is None else f"{sensitivity['rankings'][0]['mean_rank']['value']:.3f}",
-    )
+def _gains(measured: Mapping[str, Metrics]) -> list[Row]:
+    """Return the share by which each error over persistence is below the first run's, at the last horizon, paired."""
+    (name, first), *others = measured.items()
+    ids = [episode for episode, _ in first.clips.named]
+    found = []
+    for other, metrics in others:
+        columns = np.stack([*_last(metrics, len(ids), other), *_last(first, len(ids), name)])[:, :, None]
+        (gain,) = bootstrapped(lambda sums: 1 - (sums[0] / sums[1]) / (sums[2] / sums[3]), columns, ids)
+        group, line = f"Gain over {name}", f"{(first.about.frames - 1) * first.about.seconds_per_step:.2f} s ahead"
+        numbers = (gain.value, gain.low, gain.high)
+        found.append(Row(group, line, "gain_over_first", other, *numbers, form=".1%", better="higher", chance=0.0))
+    return found
 
 
-def _last_ratio(metrics: dict[str, Any], metric: Metric) -> Cell:
-    found = _trained(metrics)["rollout"].get(metric.name)
-    return "" if found is None else _estimate(found["over_persistence"][-1])
+def _last(metrics: Metrics, clips: int, run: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return the errors of each clip at the last horizon: of what was evaluated, and of persistence."""
+    sides = metrics.by_clip.models.get(metrics.trained, []), metrics.by_clip.persistence
+    if any(len(side) != clips or not all(side) for side in sides):
+        raise InputError(
+            where=f"{METRICS_FILE} of {run}",
+            found=f"metrics that cannot be used (by_clip: not errors of {clips} clips)",
+            fix="Write them again with `vjepa2-ac evaluate`",
+        )
+    errors, persistence = (np.array([clip[-1] for clip in side]) for side in sides)
+    return errors, persistence
 
 
-def _gain(metrics: dict[str, Any], first: dict[str, Any], ids: Sequence[str]) -> Estimate:
-    """Return the share by which the error over persistence is below the first run's, at the last horizon, paired."""
-    columns = [column for one in (metrics, first) for column in _last(one)]
-    return bootstrapped(
-        lambda sums: 1 - (sums[0] / sums[1]) / (sums[2] / sums[3]), np.stack(columns)[:, :, None], list(ids)
-    )[0]
+def _curve(metrics: Metrics) -> tuple[Estimate, ...]:
+    rows = (metrics.of(f"rollout.{L1.name}.over_persistence.{h}") for h in range(1, metrics.about.frames))
+    return tuple(Estimate(math.nan, math.nan, math.nan) if row is None else row.estimate for row in rows)
 
 
-def _last(metrics: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    by_clip = metrics["by_clip"]
-    trained = np.array(by_clip["models"][metrics["trained"]], dtype=np.float64)
-    return trained[:, -1], np.array(by_clip["persistence"], dtype=np.float64)[:, -1]
-
-
-def _notes(measured: Mapping[str, dict[str, Any]], names: Sequence[str]) -> tuple[str, ...]:
-    nothing = {
-        name: np.array(metrics["by_clip"]["persistence"], dtype=np.float64).mean() for name, metrics in measured.items()
-    }
-    others = [name for name in names[1:] if abs(nothing[name] / nothing[names[0]] - 1) > _SAME_LATENTS]
+def _notes(measured: Mapping[str, Metrics]) -> tuple[str, ...]:
+    nothing = {name: _last(one, one.clips.count, name)[1].mean() for name, one in measured.items()}
+    first, *names = measured
+    others = [name for name in names if abs(nothing[name] / nothing[first] - 1) > _SAME_LATENTS]
     notes = []
     if others:
         notes.append(
-            f"Other latents than those of {names[0]} (another encoder or crop): {', '.join(others)}; ratios compare."
+            f"Other latents than those of {first} (another encoder or crop): {', '.join(others)}; ratios compare."
         )
-    planned = [metrics["planning"] for metrics in measured.values() if _trained(metrics).get("planning")]
-    if len({(*starts["clips"], *starts["places"]) for starts in planned}) > 1:
+    plans = [one.planning for one in measured.values() if one.planning is not None]
+    if len({f"{study.get('clips')} {study.get('places')}" for study in plans}) > 1:
         notes.append("Plans began at other frames (another --planning-clips or seed): Action Scores do not compare.")
     return tuple(notes)
-
-
-def _estimate(metrics: Mapping[str, float | None]) -> Estimate:
-    return Estimate(
-        *(float("nan") if metrics[key] is None else float(metrics[key] or 0) for key in ("value", "low", "high"))
-    )

@@ -14,7 +14,7 @@ from vjepa2_ac.media.gif_writer import write_gif
 from vjepa2_ac.media.image_file import encode_png
 from vjepa2_ac.media.video_writer import write_video
 from vjepa2_ac.reporter import SILENT, Reporter
-from vjepa2_ac.reports.figures.film import FilmStrip, Kind, Row, draw_strip, durations, film_frames, held
+from vjepa2_ac.reports.figures.film import FilmStrip, Kind, StripRow, draw_strip, durations, film_frames, held
 from vjepa2_ac.storage import user_can_write, write_atomically
 from vjepa2_ac.storage.structured import json_text
 
@@ -91,7 +91,7 @@ def _short(name: str) -> str:
     return own if len(own) <= _LONGEST_NAME else f"...{own[-_LONGEST_NAME:]}"
 
 
-def _rows_of_other(imagination: Imagination, one: Imagined) -> list[Row]:
+def _rows_of_other(imagination: Imagination, one: Imagined) -> list[StripRow]:
     length = 100 * float(np.linalg.norm(one.actions[0, :3])) if one.actions.shape[1] == _POSE else 0.0
     label = f"{one.model} imagines:\n{one.name}" + (f", {length:.1f} cm a step" if length >= _LEAST_CM else "")
     rows = [_row(label, "imagined", imagination.decoded_first, one.frames)]
@@ -100,8 +100,8 @@ def _rows_of_other(imagination: Imagination, one: Imagined) -> list[Row]:
     return rows
 
 
-def _row(label: str, kind: Kind, first: np.ndarray, frames: np.ndarray, captions: Sequence[str] = ()) -> Row:
-    return Row(label, kind, np.concatenate([first[None], frames]), tuple(captions))
+def _row(label: str, kind: Kind, first: np.ndarray, frames: np.ndarray, captions: Sequence[str] = ()) -> StripRow:
+    return StripRow(label, kind, np.concatenate([first[None], frames]), tuple(captions))
 
 
 def _as_dict(imagination: Imagination) -> dict[str, object]:

@@ -5,16 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from vjepa2_ac.evaluation.decoded_rollouts.setup import HandsOf
+from vjepa2_ac.calibration.axes import infer_axes
+from vjepa2_ac.calibration.strides import calibrate_model
 from vjepa2_ac.evaluation.estimates import Curve, over_persistence
-from vjepa2_ac.evaluation.evaluate_run import measure_subject
+from vjepa2_ac.evaluation.evaluate_run import Beside, measure_subject
 from vjepa2_ac.evaluation.request import EvaluationOptions
 from vjepa2_ac.evaluation.result import Evaluation
 from vjepa2_ac.evaluation.verdict import verdict
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.reports.figures.evaluation import plot_evaluation
-from vjepa2_ac.reports.html.page import write_report
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, write_metrics
+from vjepa2_ac.reports.page import write_report
 
 PLOT, REPORT = "evaluation.png", "report.html"
 
@@ -42,19 +43,17 @@ def evaluate_subject(
     subject: str,
     asked: EvaluationOptions | None = None,
     reporter: Reporter = SILENT,
-    *,
-    hands: HandsOf | None = None,
 ) -> Evaluated:
     """Measure as `measure_subject` does, and write metrics.json, report and figure.
 
     Raises:
         InputError: As `measure_subject`; or the folder cannot be written.
     """
-    measured = measure_subject(subject, asked, reporter=reporter, hands=hands)
+    measured = measure_subject(subject, asked, reporter=reporter, beside=Beside(infer_axes, calibrate_model))
     evaluation, folder = measured.evaluation, measured.folder
     files = (
         plot_evaluation(evaluation, folder / PLOT),
         write_metrics(evaluation, folder / METRICS_FILE),
-        write_report(evaluation, verdict(evaluation), folder / REPORT),
+        write_report(evaluation, folder / REPORT),
     )
     return Evaluated(evaluation, measured.checkpoint, files)

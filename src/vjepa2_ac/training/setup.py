@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 from accelerate import Accelerator
@@ -25,7 +26,6 @@ from vjepa2_ac.distributed.shared_memory import warn_if_shared_memory_is_small
 from vjepa2_ac.encoding.batch import encode_batch, extrinsics_for
 from vjepa2_ac.encoding.training_cache import with_latents
 from vjepa2_ac.episode import Batch, LatentBatch
-from vjepa2_ac.evaluation.stride_calibration.measure import Calibration, require_learned
 from vjepa2_ac.model.adapter.lora import add_adapter, save_trained, trainable_report
 from vjepa2_ac.model.adapter.low_rank import CastMatrices
 from vjepa2_ac.model.checkpoints.loading import load_base
@@ -48,7 +48,10 @@ from vjepa2_ac.training.monitoring.imagined_strip import ImaginedStrip
 from vjepa2_ac.training.new_embodiment import check_heads, fit_to_data
 from vjepa2_ac.training.optim import make_optimizer, trained_parameters
 from vjepa2_ac.training.replay import open_replay, require_same_form
-from vjepa2_ac.training.stride_choice import choose_stride
+
+if TYPE_CHECKING:
+    from vjepa2_ac.calibration.strides import Calibration
+
 
 _CLIPS_TRIED = 8  # one is read; the others are for clips skipped by data.broken_episodes
 
@@ -144,6 +147,8 @@ def open_data(config: Config, reporter: Reporter = SILENT, accelerator: Accelera
     """
     accelerator, is_auto = accelerator or make_accelerator(config), config.data.stride == "auto"
     if is_auto:
+        from vjepa2_ac.calibration.variants import require_learned
+
         require_learned(config.model)
     decoder = _decoder_of(config)
     with accelerator.local_main_process_first():  # the others find the index of the first one on this machine
@@ -154,6 +159,8 @@ def open_data(config: Config, reporter: Reporter = SILENT, accelerator: Accelera
     check_heads(config, dataset)
     world_model, calibration = None, None
     if is_auto:
+        from vjepa2_ac.training.stride_choice import choose_stride
+
         world_model = load_base(config.model, seed=config.seed).to(accelerator.device)
         calibration = broadcast_object(accelerator, choose_stride(world_model, dataset, config, accelerator, reporter))
         config, dataset = with_stride(config, calibration.best.stride), dataset.with_stride(calibration.best.stride)

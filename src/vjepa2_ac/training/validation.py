@@ -9,8 +9,7 @@ from vjepa2_ac.data.loader import batches_of, validation_windows
 from vjepa2_ac.data.windows import spread
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, moves_of
-from vjepa2_ac.evaluation.action_use.ranking import pool_of, rank_actions
+from vjepa2_ac.evaluation.action_use import RolloutStart, moves_of, pool_of, rank_actions
 from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persistence
 from vjepa2_ac.evaluation.measure import prediction_errors
 from vjepa2_ac.evaluation.result import ActionRanking, Validation

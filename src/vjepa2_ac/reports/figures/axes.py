@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vjepa2_ac.evaluation.axis_fit import AxisFit
+from vjepa2_ac.calibration.axes import AxisFit
 from vjepa2_ac.reports.figures.page import new_figure
 from vjepa2_ac.storage import atomic_writer
 

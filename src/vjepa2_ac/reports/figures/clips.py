@@ -11,10 +11,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from vjepa2_ac.data.windows import spread_with_ends
-from vjepa2_ac.reports.figures.page import Page, written_page
+from vjepa2_ac.reports.figures.page import written_page
 
-_WIDTH, _SIDE, _TITLE = 16.0, 0.3, 0.6  # inches, as all below
-_NAME, _FILM, _LABEL, _PLOT, _BETWEEN = 0.25, 1.4, 0.3, 0.9, 0.35
 _MOST_FRAMES = 8
 _BAD = "#c0392b"
 
@@ -36,33 +34,18 @@ def plot_clips(title: str, clips: Sequence[ClipFigure], path: Path) -> Path:
     """
     if not clips:
         raise ValueError("no clip to show")
-    row = _NAME + _FILM + _LABEL + _PLOT + _BETWEEN
-    height = _TITLE + row * len(clips)
-    with written_page(path, _WIDTH, height, dpi=80, style={"font.size": 8}, facecolor="white") as page:
-        page.text(_SIDE, 0.2, title, size=12.0)
-        for number, clip in enumerate(clips):
-            _draw(page, clip, top=_TITLE + row * number)
+    style, height = {"font.size": 8}, 0.6 + 3.2 * len(clips)
+    with written_page(path, 16.0, height, dpi=80, style=style, layout="constrained", facecolor="white") as page:
+        page.headline(title)
+        for part, clip in zip(page.figure.subfigures(len(clips), 1, squeeze=False)[:, 0], clips, strict=True):
+            grid = part.add_gridspec(2, len(clip.numbers), height_ratios=(3, 2))
+            film = part.add_subplot(grid[0, :])
+            film.imshow(np.concatenate(clip.frames[spread_with_ends(len(clip.frames), _MOST_FRAMES)], axis=1))
+            film.set(title=clip.name)
+            film.set_axis_off()
+            for column, (what, values) in enumerate(clip.numbers.items()):
+                _plot(part.add_subplot(grid[1, column]), what, values)
     return path
-
-
-def _draw(page: Page, clip: ClipFigure, top: float) -> None:
-    page.text(_SIDE, top, clip.name, size=9.0)
-    film = page.axes(_SIDE, top + _NAME, _WIDTH - 2 * _SIDE, _FILM)
-    film.imshow(_film(clip.frames))
-    film.set_anchor("W")
-    film.set_axis_off()
-    across = (_WIDTH - _SIDE) / len(clip.numbers)
-    for column, (what, values) in enumerate(clip.numbers.items()):
-        left = _SIDE + 0.3 + column * across
-        _plot(page.axes(left, top + _NAME + _FILM + _LABEL, across - 0.6, _PLOT), what, values)
-
-
-def _film(frames: UInt8[np.ndarray, "time height width 3"]) -> UInt8[np.ndarray, "height _ 3"]:
-    """Return some frames side by side, with a little white between them."""
-    chosen = spread_with_ends(len(frames), _MOST_FRAMES)
-    gap = max(1, frames.shape[2] // 50)
-    spaced = np.pad(frames[chosen], ((0, 0), (0, 0), (0, gap), (0, 0)), constant_values=255)
-    return np.concatenate(list(spaced), axis=1)
 
 
 def _plot(axes: Any, what: str, values: Float[np.ndarray, "_ _"]) -> None:

@@ -1,29 +1,36 @@
-"""The figure of an evaluation: error by horizon, action use, and maps of the prediction error."""
+"""Figures of an evaluation: errors by horizon, use of the actions, episodes, plans, landscapes, training, one clip."""
 
 from __future__ import annotations
 
 import itertools
+import math
 import textwrap
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
+from matplotlib import colormaps
 
-from vjepa2_ac.evaluation.estimates import Curve, one_step_over_persistence, over_persistence
-from vjepa2_ac.evaluation.result import ACTIONS, Evaluation, Example
+from vjepa2_ac.evaluation.action_score import AXES, ways_of
+from vjepa2_ac.evaluation.estimates import Curve, gain_over, one_step_over_persistence, over_persistence
+from vjepa2_ac.evaluation.result import ACTIONS, DecodedStrip, Evaluation, Example, Landscapes, Mode, TrainingCurve
 from vjepa2_ac.evaluation.verdict import verdict
 from vjepa2_ac.reports.comparison import Comparison
-from vjepa2_ac.reports.figures.page import BLUE, GREEN, GREY, ORANGE, RED, written_page
+from vjepa2_ac.reports.figures.film import FilmStrip, Kind, StripRow, draw_strip
+from vjepa2_ac.reports.figures.page import BLUE, GREEN, GREY, ORANGE, RED, visible, written_page
 
 _NOTHING = "persistence (doing nothing)"
-_COLOURS = {"base": ORANGE, "adapter": BLUE, "model": BLUE}
+_COLOURS = {"base": ORANGE, "adapter": BLUE, "model": BLUE, "decoded truth": GREEN, "raw persistence": RED}
 _RUNS = (BLUE, ORANGE, GREEN, "#8f5bb0", RED, "#0b7f8a", "#8a6d0b", "#333333")
 _DASHES = ("-", "--", ":")  # after all colours
 _STYLE = {"font.size": 9}
 _OTHERS = ("#3a9155", "#8f5bb0", "#b0873a", "#4aa3a8")
-_SHAPE = 1.3  # width over height of what there is for the filmstrip
+_MOST_POINTS = 300  # of a curve
+_MOST_CHARTS = 12  # of training
+_DRAWN_FIRST = ("loss", "over_persistence", "learning_rate", "grad_norm")
 
 
 def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
@@ -32,10 +39,14 @@ def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
         page.headline(verdict(evaluation))
         halves = page.figure.subfigures(1, 2, width_ratios=[5, 6], wspace=0.02)
         upper, lower = halves[0].subplots(2, 1, height_ratios=[3, 2])
-        _error_by_horizon(upper, evaluation)
-        _use_of_actions(lower, evaluation)
+        draw_errors(upper, evaluation)
+        draw_use_of_actions(lower, evaluation)
         if evaluation.examples:
-            _filmstrip(halves[1], evaluation.examples[0], evaluation.about.seconds_per_step)
+            axes = halves[1].subplots()
+            strip = example_strip(evaluation, evaluation.examples[0], most=4)
+            rows = tuple(row for row in strip.rows if row.kind != "latents") or strip.rows
+            axes.imshow(draw_strip(replace(strip, rows=rows)))
+            axes.set_axis_off()
     return path
 
 
@@ -45,40 +56,63 @@ def plot_comparison(comparison: Comparison, path: Path) -> Path:
     with written_page(path, 9.5, 4.5, dpi=110, style=_STYLE, layout="constrained") as page:
         axes = page.figure.subplots()
         drawn = _curves(axes, comparison.seconds, zip(comparison.curves.values(), styles, strict=False))
-        axes.set(title=f"{comparison.title} (band: 95 % over episodes)")
-        names = [_NOTHING, *(textwrap.fill(name, 34) for name in comparison.curves)]
+        axes.set(title=f"{comparison.title} (band: 95 % over episodes)", ylabel="latent error / persistence")
+        axes.set_ylim(0, None)
+        names = [_NOTHING, *(textwrap.fill(visible(name), 34) for name in comparison.curves)]
         page.figure.legend(drawn, names, loc="outside right upper")
     return path
 
 
-def _curves(axes: Any, seconds: np.ndarray, curves: Iterable[tuple[Curve, dict[str, str]]]) -> list[Any]:
-    """Draw persistence and errors over it with their intervals, each in its style; return the lines."""
-    drawn = [axes.axhline(1.0, color=GREY, linestyle="--")]
-    for curve, style in curves:
-        low, high = [one.low for one in curve], [one.high for one in curve]
-        axes.fill_between(seconds, low, high, color=style["color"], alpha=0.15, linewidth=0)
-        drawn += axes.plot(seconds, [one.value for one in curve], marker="o", **style)
-    axes.set(xlabel="seconds ahead (open loop)", ylabel="latent error / persistence", ylim=(0, None))
-    return drawn
+def draw_errors(axes: Any, evaluation: Evaluation, mode: Mode = "rollout") -> None:
+    """Draw the error over persistence of every model by horizon."""
+    curves = {name: over_persistence(model.errors, mode) for name, model in evaluation.models.items()}
+    _by_horizon(axes, evaluation, curves, level=(1.0, _NOTHING))
+    how = {"rollout": "open loop", "teacher_forced": "teacher-forced"}[mode]
+    axes.set(title=f"L1 error by horizon, {how} (band: 95 % over episodes)", ylabel="latent error / persistence")
+    axes.set_ylim(0, None)
 
 
-def _error_by_horizon(axes: Any, evaluation: Evaluation) -> None:
-    seconds = evaluation.about.seconds_per_step * np.arange(1, evaluation.horizon + 1)
-    colours = _colours(evaluation)
-    drawn = _curves(
-        axes,
-        seconds,
-        ((over_persistence(evaluation.models[name].errors, "rollout"), {"color": colours[name]}) for name in colours),
+def draw_gains(axes: Any, evaluation: Evaluation) -> None:
+    """Draw the gain of the models over the base by horizon."""
+    base, models = evaluation.base_errors, evaluation.models
+    if base is not None:
+        gains = {name: gain_over(model.errors, base) for name, model in models.items() if model.errors is not base}
+        _by_horizon(axes, evaluation, gains, level=(0.0, "the base"))
+        axes.set(title="Gain over the base, open loop, L1 (above 0: better)", ylabel="gain over the base")
+        axes.yaxis.set_major_formatter("{x:.0%}")
+
+
+def draw_spread(axes: Any, evaluation: Evaluation) -> None:
+    """Draw the spread of predictions over that of the truth by horizon."""
+    found = {name: model.distribution for name, model in evaluation.models.items()}
+    _by_horizon(
+        axes, evaluation, {name: one.spread for name, one in found.items() if one is not None}, level=(1.0, "the truth")
     )
-    shown = seconds[:: -(-len(seconds) // 8)]
-    axes.set_xticks(shown, [f"{value:.2f}" for value in shown])
-    axes.set(title="Prediction error by horizon (band: 95 % over episodes)")
-    axes.legend(drawn, [_NOTHING, *colours], loc="lower right")
+    axes.set(title="Spread of predicted latents, open loop (1: as varied as the truth)", ylabel="spread / the truth's")
+    axes.set_ylim(0, None)
 
 
-def _use_of_actions(axes: Any, evaluation: Evaluation) -> None:
+def draw_decoded(axes: Any, evaluation: Evaluation) -> None:
+    """Draw the PSNR of decoded rollouts by horizon, where something moves if the true frames say so."""
+    found = evaluation.decoded
+    if found is not None:
+        names = ("psnr_db.moving.truth", "psnr_db.whole.truth", "psnr_db.whole.decoded_truth")
+        metric = next(name for name in names if any(math.isfinite(one.value) for one in _any_curve(found.curves, name)))
+        curves = {source.replace("_", " "): found.curves[source, metric] for source in found.sources}
+        _by_horizon(axes, evaluation, curves, level=None)
+        _, region, reference = metric.split(".")
+        where = "where something moves" if region == "moving" else "of the whole image"
+        axes.set(title=f"PSNR {where}, against the {reference.replace('_', ' ')}", ylabel="dB")
+
+
+def _any_curve(curves: Mapping[tuple[str, str], Curve], metric: str) -> list[Any]:
+    return [one for (_, name), curve in curves.items() if name == metric for one in curve]
+
+
+def draw_use_of_actions(axes: Any, evaluation: Evaluation) -> None:
+    """Draw the one-step error of every model with true and wrong actions."""
     width = 0.8 / len(evaluation.models)
-    for i, (name, colour) in enumerate(_colours(evaluation).items()):
+    for i, (name, colour) in enumerate(_colours(evaluation.models).items()):
         ratios = [one_step_over_persistence(evaluation.models[name].errors, actions) for actions in ACTIONS]
         places = np.arange(len(ratios)) + (i - (len(evaluation.models) - 1) / 2) * width
         spread = np.array([(r.value - r.low, r.high - r.value) for r in ratios]).T
@@ -89,44 +123,199 @@ def _use_of_actions(axes: Any, evaluation: Evaluation) -> None:
     axes.set(title="Does it use the actions?", xlabel="actions given", ylabel="one-step error / persistence")
 
 
-def _colours(evaluation: Evaluation) -> dict[str, str]:
-    """Return a colour for each model."""
-    others = iter(_OTHERS * len(evaluation.models))
-    return {name: _COLOURS.get(name) or next(others) for name in evaluation.models}
+def draw_ranks(axes: Any, evaluation: Evaluation) -> None:
+    """Draw how often the true action is among the best share of others, by model; dashed: among those in a box."""
+    axes.plot([0, 1], [0, 100], color=GREY, linestyle=":", label="chance")
+    for name, colour in _colours(evaluation.models).items():
+        sensitivity = evaluation.models[name].sensitivity
+        for ranking, dashes in zip(sensitivity.rankings if sensitivity else (), _DASHES, strict=False):
+            ranks = np.sort(ranking.rank)
+            shares = 100 * np.searchsorted(ranks, np.linspace(0, 1, 51), side="right") / max(len(ranks), 1)
+            label = f"{_short(name)}, {'others' if ranking.drawn_from == 'clips' else 'in a box'}"
+            axes.plot(np.linspace(0, 1, 51), shares, color=colour, linestyle=dashes, label=label)
+    axes.set(title="Rank of the true action (0: best)", xlabel="rank", ylabel="share of clips up to it (%)")
+    axes.legend()
 
 
-def _filmstrip(figure: Any, example: Example, seconds_per_step: float) -> None:
-    """Draw one clip: the first frame and some later ones, and below each the error map of a prediction.
+def draw_episodes(axes: Any, evaluation: Evaluation) -> None:
+    """Draw the error over persistence of every episode, best first."""
+    values = [score.over_persistence for score in evaluation.episodes]
+    axes.plot(range(1, len(values) + 1), values, "o-", color=BLUE, markersize=3)
+    axes.axhline(1.0, color=GREY, linestyle="--")
+    axes.set(title="Error of every episode at the last horizon", xlabel="episodes, best first", ylim=(0, None))
+    axes.set_ylabel("L1 error / persistence")
 
-    All tiles, each of size 1, lie in one pair of axes: drawing so many axes would take longer than all else.
-    """
-    horizons = np.unique(np.linspace(1, len(example.true_colours) - 1, num=4).round().astype(int))
-    columns, rows = 1 + len(horizons), 1 + len(example.errors)
-    right, down = max(1.06, 1.1 * _SHAPE * rows / columns), max(1.1, 1.06 * columns / rows / _SHAPE)  # to the next tile
+
+def draw_plans(figure: Any, evaluation: Evaluation) -> None:
+    """Draw where plans of three steps end, along each axis, against where the demonstrations do."""
+    study = evaluation.planning
+    if study is None:
+        return
+    colours = _colours(evaluation.models)
+    for axis, axes in enumerate(figure.subplots(1, len(AXES))):
+        demonstrated = 100 * study.demonstrated[..., axis].sum(axis=-1)
+        for name, plans in ways_of(evaluation).items():
+            planned = 100 * plans.three_steps[0, ..., axis].sum(axis=-1)
+            axes.scatter(demonstrated, planned, s=12, color=colours[name], label=_short(name))
+        axes.axline((0, 0), slope=1, color=GREY, linestyle="--")
+        axes.axhline(0, color=GREY, linewidth=0.8)
+        axes.set(xlabel=f"demonstrated along {AXES[axis]} (cm)", ylabel=f"planned along {AXES[axis]} (cm)")
+        axes.legend()
+
+
+def draw_landscapes(figure: Any, evaluation: Evaluation) -> None:
+    """Draw slices of the energy through the true action: of the base and the evaluated model, of three clips."""
+    models = {name: model.landscapes for name, model in evaluation.models.items()}
+    drawn = {name: one for name, one in models.items() if one and name in {evaluation.base, evaluation.trained}}
+    places = landscape_clips(evaluation)
+    grid = figure.subplots(len(places) * len(drawn), 3, squeeze=False)
+    for row, (place, (name, found)) in zip(grid, itertools.product(places, drawn.items()), strict=True):
+        for axes, (first, second) in zip(row, itertools.combinations(range(3), 2), strict=True):
+            _plane(axes, found, place, first, second)
+        row[0].set_title(f"{_short(name)}, clip {place + 1}", loc="left")
+
+
+def landscape_clips(evaluation: Evaluation) -> list[int]:
+    """Return the clips whose landscapes are shown: of the nearest, the median and the farthest minimum."""
+    found = evaluation.models[evaluation.trained].landscapes
+    if found is None:
+        return []
+    order = sorted(range(len(found.maps)), key=lambda place: found.maps[place].distance)
+    return sorted({0: order[0], 1: order[len(order) // 2], 2: order[-1]}.values())
+
+
+def _plane(axes: Any, landscapes: Landscapes, place: int, first: int, second: int) -> None:
+    one = landscapes.maps[place]
+    third = ({0, 1, 2} - {first, second}).pop()
+    energy = np.take(one.energy, int(np.abs(one.axes[third] - one.true[third]).argmin()), axis=third)
+    limits = {"vmin": float(one.energy.min()), "vmax": float(one.energy.max())}
+    axes.pcolormesh(one.axes[first], one.axes[second], energy.T, shading="nearest", rasterized=True, **limits)
+    axes.axhline(0, color="white", linewidth=0.6, linestyle=":")
+    axes.axvline(0, color="white", linewidth=0.6, linestyle=":")
+    axes.plot(one.true[first], one.true[second], "+", color="white", markersize=9, markeredgewidth=2)
+    axes.plot(one.minimum[first], one.minimum[second], "o", color="white", markerfacecolor="none", markersize=10)
+    unit = f" ({landscapes.unit})" if landscapes.unit else ""
+    axes.set(xlabel=landscapes.axis_names[first] + unit, ylabel=landscapes.axis_names[second] + unit)
+
+
+def draw_training(figure: Any, evaluation: Evaluation) -> None:
+    """Draw the metrics of training over optimizer steps, those of one kind in one chart."""
+    charts = training_charts(evaluation.training)
+    columns = min(3, len(charts))
+    grid = figure.subplots(-(-len(charts) // columns), columns, squeeze=False).flat
+    for axes, (kind, curves) in zip(grid, charts.items(), strict=False):
+        for curve in curves:
+            every = -(-len(curve.steps) // _MOST_POINTS)
+            kept = sorted({*range(0, len(curve.steps), every), len(curve.steps) - 1})
+            label = _short(curve.name.rpartition("/")[2].replace("_", " "))
+            axes.plot([curve.steps[k] for k in kept], [curve.values[k] for k in kept], label=label)
+        axes.set(title=_short(kind))
+        axes.legend(fontsize=7)
+    for axes in grid:
+        axes.set_axis_off()
+
+
+def training_charts(curves: Sequence[TrainingCurve]) -> dict[str, list[TrainingCurve]]:
+    """Return the curves by chart: losses, errors of validation, and each other in its own; important ones first."""
+    charts: dict[str, list[TrainingCurve]] = {}
+    for curve in curves:
+        if any(map(math.isfinite, curve.values)):
+            where, _, what = curve.name.rpartition("/")
+            kind = f"{where}: {what.replace('_', ' ')}" if where == "validation" else what.replace("_", " ")
+            if where == "validation" and "over_persistence" in what:
+                kind = "validation: error / persistence"
+            elif what.startswith("loss") and what != "loss_scale":
+                kind = "training loss"
+            charts.setdefault(kind, []).append(curve)
+
+    def rank(kind: str) -> int:
+        names = charts[kind][0].name
+        return next((place for place, name in enumerate(_DRAWN_FIRST) if name in names), len(_DRAWN_FIRST))
+
+    return {kind: charts[kind] for kind in sorted(charts, key=rank)[:_MOST_CHARTS]}
+
+
+def example_strip(evaluation: Evaluation, example: Example, most: int = 9) -> FilmStrip:
+    """Return an example clip: its frames, the error of each patch over them, and true and predicted latents."""
+    times = np.unique(np.linspace(0, len(example.true_colours) - 1, num=most).round().astype(int))
     frames = example.true_colours if example.frames is None else example.frames
-    largest = max(float(errors.max()) for errors in example.errors.values())
-    figure.suptitle("One held-out clip, and the error of each patch (brighter is worse)", x=0.02, ha="left", fontsize=9)
-    axes = figure.subplots()
-    for column, time in enumerate([0, *horizons]):
-        axes.imshow(frames[time], extent=_tile(right * column, 0.0))
-        title = "now" if time == 0 else f"+{time * seconds_per_step:.2f} s"
-        axes.text(right * column + 0.5, -0.08, title, ha="center", fontsize=8)
-    for row, (name, errors) in enumerate(example.errors.items(), start=1):
-        axes.text(0.5, down * row + 0.5, f"{name}\nerror", ha="center", va="center")
-        for column, time in enumerate(horizons, start=1):
-            _overlay(axes, _tile(right * column, down * row), frames[time], errors[time - 1], largest)
-    axes.set_axis_off()
-    side = (right - 1) / 2
-    axes.set(xlim=(-side, right * columns - side), ylim=(down * (rows - 1) + 1, -0.3))
+    worst = max(float(errors.max()) for errors in example.errors.values())
+    rows = [] if example.frames is None else [StripRow("true frames", "recorded", frames[times])]
+    for name, errors in example.errors.items():
+        shown = [_overlay(frames[time], errors[time - 1] if time else None, worst) for time in times]
+        captions = tuple(f"mean {errors[time - 1].mean():.3f}" if time else "" for time in times)
+        rows.append(StripRow(f"error of {_short(name)}", "error", np.stack(shown), captions))
+    rows.append(StripRow("true latents", "latents", example.true_colours[times]))
+    for name, colours in example.predicted_colours.items():
+        whole = np.concatenate([example.true_colours[:1], colours])
+        rows.append(StripRow(f"latents predicted\nby {_short(name)}", "latents", whole[times]))
+    seconds = tuple(float(time) * evaluation.about.seconds_per_step for time in times)
+    return FilmStrip(f"{visible(example.why)[:80]}: from control step {example.start}", tuple(rows), seconds)
 
 
-def _tile(left: float, top: float) -> tuple[float, float, float, float]:
-    """Return where a tile lies: left, right, bottom, top."""
-    return left, left + 1, top + 1, top
+def decoded_strip(evaluation: Evaluation, strip: DecodedStrip) -> FilmStrip:
+    """Return the decoded images of an example clip."""
+    labels: dict[str, tuple[str, Kind]] = {
+        "truth": ("what happened", "recorded"),
+        "decoded_truth": ("what happened,\nencoded and decoded", "decoded"),
+    }
+    rows = [
+        StripRow(
+            *labels.get(name, (f"{_short(name)} imagines,\nsame actions", "imagined")), np.ascontiguousarray(frames)
+        )
+        for name, frames in strip.rows.items()
+    ]
+    times = range(len(rows[0].frames))
+    title = f"{visible(strip.why)[:80]}: control step {strip.start}"
+    return FilmStrip(title, tuple(rows), tuple(time * evaluation.about.seconds_per_step for time in times))
 
 
 def _overlay(
-    axes: Any, place: tuple[float, ...], frame: UInt8[np.ndarray, "size size 3"], errors: Any, largest: float
+    frame: UInt8[np.ndarray, "height width 3"], errors: Float[np.ndarray, "grid grid"] | None, worst: float
+) -> UInt8[np.ndarray, "height width 3"]:
+    """Return errors as colours over a grey frame."""
+    grey = np.repeat(frame.mean(axis=-1, keepdims=True), 3, axis=-1)
+    if errors is None:
+        return grey.astype(np.uint8)
+    colours = 255 * colormaps["inferno"](np.nan_to_num(errors / max(worst, 1e-12)))[..., :3]
+    rows, columns = (np.arange(size) * len(errors) // size for size in frame.shape[:2])
+    return np.asarray(0.35 * grey + 0.65 * colours[rows][:, columns]).astype(np.uint8)
+
+
+def _by_horizon(
+    axes: Any, evaluation: Evaluation, curves: Mapping[str, Curve], *, level: tuple[float, str] | None
 ) -> None:
-    axes.imshow(frame.mean(axis=-1), cmap="gray", vmin=-100, vmax=255, extent=place)
-    axes.imshow(errors, cmap="inferno", vmin=0, vmax=largest, alpha=0.65, extent=place)
+    """Draw curves with their intervals, and a level that is none of a model, with its name."""
+    seconds = evaluation.about.seconds_per_step * np.arange(1, evaluation.horizon + 1)
+    colours = _colours(curves)
+    drawn = _curves(
+        axes, seconds, ((curve, {"color": colours[name]}) for name, curve in curves.items()), level and level[0]
+    )
+    shown = seconds[:: -(-len(seconds) // 8)]
+    axes.set_xticks(shown, [f"{value:.2f}" for value in shown])
+    labels = [] if level is None else [level[1]]
+    axes.legend(drawn, [*labels, *map(_short, curves)], loc="best")
+
+
+def _curves(
+    axes: Any, seconds: np.ndarray, curves: Iterable[tuple[Curve, dict[str, str]]], level: float | None = 1.0
+) -> list[Any]:
+    """Draw curves with their intervals, each in its style; return the lines."""
+    drawn = [] if level is None else [axes.axhline(level, color=GREY, linestyle="--")]
+    for curve, style in curves:
+        low, high = [one.low for one in curve], [one.high for one in curve]
+        axes.fill_between(seconds, low, high, color=style["color"], alpha=0.15, linewidth=0)
+        drawn += axes.plot(seconds, [one.value for one in curve], marker="o", **style)
+    axes.set(xlabel="seconds ahead")
+    return drawn
+
+
+def _colours(names: Iterable[str]) -> dict[str, str]:
+    """Return a colour for each model."""
+    others = itertools.cycle(_OTHERS)
+    return {name: _COLOURS.get(name) or next(others) for name in names}
+
+
+def _short(name: str) -> str:
+    """Return the end of a name, in lines of a legend."""
+    return textwrap.fill(visible(name)[-48:], 24)

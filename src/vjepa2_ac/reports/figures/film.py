@@ -16,15 +16,17 @@ from matplotlib.colors import to_rgb
 from vjepa2_ac.data.windows import spread_with_ends
 from vjepa2_ac.media.image_file import resized
 from vjepa2_ac.reports.figures.caption import text_image
-from vjepa2_ac.reports.figures.page import BLUE, GREEN, GREY, ORANGE
+from vjepa2_ac.reports.figures.page import BLUE, GREEN, GREY, ORANGE, RED
 
-Kind = Literal["recorded", "simulated", "decoded", "imagined"]
+Kind = Literal["recorded", "simulated", "decoded", "imagined", "error", "latents"]
 
 MEANING: dict[Kind, tuple[str, str]] = {
     "recorded": (GREY, "recorded"),
     "simulated": (GREEN, "what really happens, simulated"),
     "decoded": (BLUE, "decoded from the true frame's latents"),
     "imagined": (ORANGE, "imagined from the first frame alone"),
+    "error": (RED, "error of each patch: brighter is worse"),
+    "latents": ("#7a4fa3", "latents as colours: alike if the latents are"),
 }
 """Colour and meaning of each kind."""
 
@@ -35,7 +37,7 @@ _HOLD = 3  # how many times as long the first and the last frame of a video are 
 
 
 @dataclass(frozen=True, eq=False)
-class Row:
+class StripRow:
     """Frames of one story, the first one at the start."""
 
     label: str
@@ -53,7 +55,7 @@ class FilmStrip:
     """
 
     title: str
-    rows: tuple[Row, ...]
+    rows: tuple[StripRow, ...]
     seconds: tuple[float, ...]  # of each frame since the start
 
     def __post_init__(self) -> None:
@@ -130,7 +132,7 @@ def held(frames: Sequence[np.ndarray], seconds: Sequence[float], rate_hz: float)
             yield frame
 
 
-def _colour(row: Row, place: int) -> str:
+def _colour(row: StripRow, place: int) -> str:
     kind: Kind = "decoded" if row.kind == "imagined" and place == 0 else row.kind
     return MEANING[kind][0]
 

@@ -5,38 +5,34 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from jaxtyping import UInt8
-
 from vjepa2_ac.demonstrations.key_frames import GRIPPER
 from vjepa2_ac.demonstrations.make_goals import EnergyCourse, MadeGoals
 from vjepa2_ac.planning.goals import SubGoal
-from vjepa2_ac.reports.figures.page import BLUE, GREY, ORANGE, RED, Page, written_page
+from vjepa2_ac.reports.figures.page import BLUE, GREY, ORANGE, RED, written_page
 
 GOALS_IMAGE = "goals.png"
 
-_WIDTH, _SIDE, _HEAD, _TEXT, _PLOT, _FOOT = 13.0, 0.4, 0.55, 0.75, 1.3, 0.45  # inches, as all below
-_ACROSS, _GAP, _MOST = 6, 0.12, 2.4  # images in a row, the space between them, and the highest one
+_ACROSS = 6  # images in a row
 _NAME = 70  # characters of a recording's name, its end
 
 
 def plot_goals(made: MadeGoals, path: Path) -> Path:
     """Write the contact sheet of goals as PNG; it is written atomically."""
     images = [made.first, *(goal.image for goal in made.goals)]
-    slot = (_WIDTH - 2 * _SIDE + _GAP) / _ACROSS
-    height, width = made.first.shape[:2]
-    tall = min((slot - _GAP) * height / width, _MOST)
-    rows, plots = -(-len(images) // _ACROSS), _plots(made)
-    top = _HEAD + rows * (tall + _TEXT)
-    total = top + len(plots) * (_PLOT + _FOOT) + 0.2
-    with written_page(path, _WIDTH, total, dpi=100, style={"font.size": 8}, facecolor="white") as page:
+    rows, plots, style = -(-len(images) // _ACROSS), _plots(made), {"font.size": 8}
+    heights = [2.8 * rows, *(1.8 for _ in plots)]
+    with written_page(
+        path, 13.0, 0.5 + sum(heights), dpi=100, style=style, layout="constrained", facecolor="white"
+    ) as page:
         page.headline(_title(made))
-        for place, image in enumerate(images):
-            left, down = _SIDE + place % _ACROSS * slot, _HEAD + place // _ACROSS * (tall + _TEXT)
-            _image(page, image, (left, down, min(slot - _GAP, tall * width / height), tall))
-            page.text(left, down + tall + 0.05, _caption(made, place), size=8)
-        for number, draw in enumerate(plots):
-            axes = page.axes(_SIDE + 0.3, top + number * (_PLOT + _FOOT), _WIDTH - 2 * _SIDE - 0.3, _PLOT)
+        sheet, *parts = page.figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
+        for place, axes in enumerate(sheet.subplots(rows, _ACROSS, squeeze=False).flat):
+            axes.set_axis_off()
+            if place < len(images):
+                axes.imshow(images[place])
+                axes.set_title(_caption(made, place), fontsize=8)
+        for part, draw in zip(parts, plots, strict=True):
+            axes = part.subplots()
             draw(axes, made)
             for key in made.keys:
                 axes.axvline(key.frame, color=GREY, linewidth=0.8, linestyle=":")
@@ -67,12 +63,6 @@ def _bounds(goal: SubGoal) -> str:
     if goal.at_most is None:
         return f"{goal.at_least} model steps or more"
     return f"{goal.at_least} to {goal.at_most} model steps"
-
-
-def _image(page: Page, image: UInt8[np.ndarray, "height width 3"], place: tuple[float, float, float, float]) -> None:
-    axes = page.axes(*place)
-    axes.set_axis_off()
-    axes.imshow(image, interpolation="nearest" if len(image) < 100 else "bilinear")
 
 
 def _plots(made: MadeGoals) -> list[Any]:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import base64
+import io
+import re
 import textwrap
-from collections.abc import Iterator
+import warnings
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +19,9 @@ from matplotlib.figure import Figure
 
 from vjepa2_ac.storage import atomic_writer
 
+# What a page or an image may not hold, or what misleads a reader: control characters, halves of surrogate pairs,
+# noncharacters, and marks that change the direction of text.
+_HIDDEN = re.compile("[\\x00-\\x08\\x0b-\\x1f\\x7f-\\x9f\\u202a-\\u202e\\u2066-\\u2069\\ud800-\\udfff\\ufffe\\uffff]")
 GREY, BLUE, ORANGE, GREEN, RED = "#8a8a8a", "#1f6fb4", "#d1762a", "#2b8a3e", "#b3246b"
 _STYLE = {
     "axes.spines.right": False,
@@ -76,3 +83,22 @@ def new_figure(width: float, height: float, **options: Any) -> Figure:
     figure = Figure(figsize=(width, height), **options)
     FigureCanvasAgg(figure)
     return figure
+
+
+def svg_of(draw: Callable[[Any], None], width: float, height: float) -> str:
+    """Return a figure of so many inches as SVG in a data: URL, in which nothing can run; always the same bytes."""
+    style = {"font.size": 9, "legend.fontsize": 8, "svg.fonttype": "none", "svg.hashsalt": "vjepa2-ac"}
+    text = io.StringIO()
+    with mpl.rc_context(_STYLE | style), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing", category=UserWarning)  # a reader's fonts have it
+        figure = new_figure(width, height, layout="constrained")
+        draw(figure)
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")  # it has been laid out: once is enough
+        figure.savefig(text, format="svg", metadata={"Date": None})
+    return f"data:image/svg+xml;base64,{base64.b64encode(text.getvalue().encode()).decode()}"
+
+
+def visible(text: str) -> str:
+    """Return a text without what a page or an image may not show."""
+    return _HIDDEN.sub("\N{REPLACEMENT CHARACTER}", text)

@@ -1,1 +1,0 @@
-"""The Action Score: how close are plans to the demonstrated actions?"""

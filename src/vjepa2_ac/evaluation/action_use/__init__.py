@@ -1,1 +1,0 @@
-"""Action use: does the model distinguish the true action from others?"""

@@ -1,1 +1,0 @@
-"""Data variants: does the model predict the data better if it is read in another way?"""

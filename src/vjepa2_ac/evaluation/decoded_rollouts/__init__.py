@@ -1,1 +1,0 @@
-"""Rollouts of models, decoded and measured: what is needed for it, and the pass over the clips."""

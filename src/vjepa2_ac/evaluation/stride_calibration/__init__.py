@@ -1,1 +1,0 @@
-"""Stride calibration: at which stride does a model predict this data best?"""

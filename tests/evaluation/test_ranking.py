@@ -1,0 +1,155 @@
+"""Moves are as large as plans; who looks at actions ranks the true one first, who does not ranks it by chance."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from vjepa2_ac.episode import LatentBatch
+from vjepa2_ac.evaluation.action_use import RolloutStart, moves_of, pool_of, rank_actions
+from vjepa2_ac.evaluation.estimates import rank_difference
+from vjepa2_ac.evaluation.measure import Predictor
+from vjepa2_ac.evaluation.result import ActionRanking
+from vjepa2_ac.spaces import POSE_CHANGE, ActionSpace, vector_actions
+from worlds import Copier, Halfway, Oracle, clips_batch, moved
+
+CLIPS, REACH = 12, 0.075
+
+
+def line(step_m: float = 0.01, times: int = 6) -> LatentBatch:
+    """Return clips of a robot that only ever moves to the front, by the same distance a step."""
+    actions = torch.zeros(CLIPS, times - 1, 7)
+    actions[:, :, 0] = step_m
+    return walked(actions)
+
+
+def walked(actions: Tensor) -> LatentBatch:
+    """Return clips of these actions, with states that agree with them."""
+    batch = clips_batch(CLIPS)
+    states = torch.cat([torch.zeros(CLIPS, 1, 7), actions.cumsum(dim=1)], dim=1)
+    first = batch.latents[:, :1]
+    latents = torch.cat([first, moved(first.expand(-1, actions.shape[1], -1, -1), actions.cumsum(dim=1))], dim=1)
+    return replace(batch, latents=latents, states=states, actions=actions)
+
+
+def moves(batch: LatentBatch, space: ActionSpace = POSE_CHANGE, reach: float = REACH) -> list[RolloutStart]:
+    return [move for clip in range(CLIPS) for move in moves_of(batch, clip, clip, space, reach)]
+
+
+def ranked(model: Predictor, batch: LatentBatch, samples: int = 40, seed: int = 0) -> ActionRanking:
+    begun = moves(batch)
+    pool = pool_of(begun, POSE_CHANGE, reach=REACH, samples=samples, seed=seed)
+    return rank_actions(model, begun, pool, at_once=16)
+
+
+def test_a_move_is_the_longest_within_reach_there_and_back() -> None:
+    there, back = moves(line(times=10))[:2]
+    assert float(there.action[0]) == pytest.approx(0.07), "7 of its 9 steps: 8 are beyond 7.5 cm"
+    assert torch.equal(there.action, -back.action)
+    assert torch.equal(there.frame, back.following)
+    assert torch.equal(there.following, back.frame)
+    assert float(back.state[0] - there.state[0]) == pytest.approx(0.07)
+    assert there.episode_id == back.episode_id
+
+
+def test_a_robot_that_is_faster_than_the_reach_moves_by_one_step() -> None:
+    there, back = moves(line(step_m=0.2))[:2]
+    assert (float(there.action[0]), float(back.action[0])) == pytest.approx((0.2, -0.2))
+
+
+def test_commands_that_are_no_changes_are_taken_as_they_are() -> None:
+    batch = line()
+    batch.actions[:, 2] *= 3
+    found = moves(batch, vector_actions(7, "target"))
+    assert len(found) == CLIPS
+    assert all(torch.equal(one.action, batch.actions[one.clip, 2]) for one in found)
+
+
+def test_any_move_of_vectors_is_within_reach() -> None:
+    there, _ = moves(line(step_m=2.0), vector_actions(7, "change"))[:2]
+    assert float(there.action[0]) == pytest.approx(10.0), "all five steps"
+
+
+def test_who_knows_the_world_ranks_the_true_action_first() -> None:
+    found = ranked(Oracle(), walked(0.02 * torch.randn(CLIPS, 4, 7, generator=torch.Generator().manual_seed(0))))
+    assert (found.rank.value, found.box.value, found.shell.value) == (0.0, 0.0, 0.0)
+    assert found.spread.value > 0.1
+    assert len(found.ranks) == 2 * CLIPS
+
+
+def test_who_ignores_actions_ranks_by_chance_and_spreads_nothing() -> None:
+    found = ranked(Copier(), line())
+    assert set(found.ranks) == {0.5}
+    assert found.spread.value == 0.0
+
+
+class _Taught(Oracle):
+    """Knows what it was taught, steps to the front of 1 cm, and takes every action for one that is as short."""
+
+    def predict(self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
+        return super().predict(latents, actions.clamp(0.0, 0.01), states, extrinsics)
+
+
+def test_who_knows_only_short_steps_to_the_front_is_right_of_each_step_and_found_out() -> None:
+    """The trap: on the steps of the data the model is perfect, and a planner has nothing to go by beyond them."""
+    batch = line()
+    own_steps = batch.latents[:, :-1], batch.actions, batch.states
+    assert torch.equal(_Taught().predict(*own_steps), Oracle().predict(*own_steps))
+    taught, oracle = ranked(_Taught(), batch), ranked(Oracle(), batch)
+    assert oracle.rank.value == 0.0
+    assert taught.rank.low > 0.03
+    assert taught.spread.value < 0.5 * oracle.spread.value
+    worse = rank_difference(taught, oracle)
+    assert worse.low > 0.0
+    assert rank_difference(oracle, taught).value == pytest.approx(-worse.value)
+
+
+class _Length(Oracle):
+    """Sees how far an action goes, and believes that it goes to the front."""
+
+    def predict(self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
+        seen = torch.zeros_like(actions)
+        seen[..., 0] = actions[..., :3].norm(dim=-1)
+        return super().predict(latents, seen, states, extrinsics)
+
+
+def test_the_shell_tells_a_direction_from_a_distance() -> None:
+    found = ranked(_Length(), line(), samples=200)
+    assert found.shell.value == pytest.approx(0.5, abs=0.1), "all of one length are alike"
+    assert found.box.value < 0.5
+
+
+def test_actions_on_the_shell_are_as_long_as_the_true_one_and_go_everywhere() -> None:
+    (move, _), samples = moves(line(times=10))[:2], 4000
+    pool = pool_of([move], POSE_CHANGE, reach=REACH, samples=samples, seed=0)
+    drawn = pool.on_shell(move, np.random.default_rng(0))
+    assert np.linalg.norm(drawn[:, :3], axis=1) == pytest.approx(np.full(samples, 0.07))
+    assert np.abs(drawn[:, :3].mean(axis=0)).max() < 0.005
+    assert np.array_equal(drawn[:, 3:], np.zeros((samples, 4)))
+    still = replace(move, action=torch.zeros(7))
+    assert not pool.on_shell(still, np.random.default_rng(0)).any()
+
+
+def test_numbers_of_vectors_are_lengths_in_their_largest_change() -> None:
+    space = vector_actions(3, "change")
+    move = replace(moves(line())[0], action=torch.tensor([0.1, 0.0, 0.0]))
+    others = replace(move, action=torch.tensor([0.0, 5.0, 0.0]))
+    drawn = pool_of([move, others], space, reach=0.0, samples=500, seed=0).on_shell(move, np.random.default_rng(0))
+    assert np.linalg.norm(drawn[:, :2] / [0.1, 5.0], axis=1) == pytest.approx(np.ones(500))
+    assert not drawn[:, 2].any(), "what never changes is not changed"
+
+
+def test_what_others_are_drawn_does_not_depend_on_the_moves_beside_it() -> None:
+    batch = walked(0.02 * torch.randn(CLIPS, 4, 7, generator=torch.Generator().manual_seed(0)))
+    begun = moves(batch)
+    pool = pool_of(begun, POSE_CHANGE, reach=REACH, samples=20, seed=3)
+    whole, last = (rank_actions(Halfway(), some, pool, at_once=7) for some in (begun, begun[-2:]))
+    assert np.array_equal(whole.ranks[-2:], last.ranks)
+
+
+def test_rankings_of_other_moves_are_not_compared() -> None:
+    one = ranked(Oracle(), line())
+    with pytest.raises(ValueError, match="different moves"):
+        rank_difference(one, replace(one, episode_ids=one.episode_ids[:-1]))

@@ -1,0 +1,78 @@
+"""Every number is a row, and console, page, metrics.json and comparison show the same rows."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from evaluation_results import evaluation
+from planned import with_plans
+from vjepa2_ac.console.evaluation import row_tables
+from vjepa2_ac.console.progress import PlainConsole
+from vjepa2_ac.evaluation.estimates import gain_over, over_persistence, rank_difference, stratum_gain
+from vjepa2_ac.evaluation.result import L1, Row, sections
+from vjepa2_ac.evaluation.rows import rows_of
+from vjepa2_ac.intervals import Estimate
+from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics, write_metrics
+from vjepa2_ac.reports.page import report_page
+
+WHOLE = with_plans(evaluation(others=("runs/other",)))
+
+
+def test_a_key_and_a_model_name_one_row_and_a_key_one_line() -> None:
+    rows = rows_of(WHOLE)
+    assert len({(row.key, row.model) for row in rows}) == len(rows)
+    names = {row.key: (row.group, row.name, row.form, row.better) for row in rows}
+    assert all((row.group, row.name, row.form, row.better) == names[row.key] for row in rows)
+    assert len(set(names.values())) == len(names), "a line says what it is"
+
+
+def test_rows_are_the_estimates() -> None:
+    rows = {(row.key, row.model): row.estimate for row in rows_of(WHOLE)}
+    base, adapter = (WHOLE.models[name] for name in ("base", "adapter"))
+    assert rows["rollout.l1.over_persistence.3", "adapter"] == over_persistence(adapter.errors, "rollout")[2]
+    assert (
+        rows["teacher_forced.l1.over_persistence_shuffled_actions.1", "base"]
+        == (over_persistence(base.errors, "teacher_forced", L1, "shuffled")[0])
+    )
+    assert rows["rollout.l1.gain_over_base.3", "adapter"] == gain_over(adapter.errors, base.errors)[2]
+    assert ("rollout.l1.gain_over_base.3", "base") not in rows
+    assert rows["one_step_gain.motion.moving", "adapter"] == (
+        stratum_gain(adapter.errors, base.errors, WHOLE.strata[0])
+    )
+    assert adapter.sensitivity is not None
+    assert adapter.ranking is not None
+    assert base.ranking is not None
+    assert rows["sensitivity.rank.clips", "adapter"] == adapter.sensitivity.rankings[0].mean_rank
+    assert rows["ranking.difference_to_base", "adapter"] == rank_difference(adapter.ranking, base.ranking)
+    assert {"plans.score", "plans_minus_base.missed_cm", "landscapes.sign.dx", "axes.gain", "spread.3"} <= {
+        key for key, _ in rows
+    }
+    assert "landscapes.sign.dz" not in {key for key, _ in rows}, "no clip moves along it"
+
+
+def test_console_page_and_file_show_the_same_rows(tmp_path: Path) -> None:
+    rows = rows_of(WHOLE)
+    console = PlainConsole(width=250)
+    with console.capture() as capture:
+        console.print(*row_tables(rows, "Held-out episodes"))
+    shown, page = capture.get(), report_page(WHOLE)
+    for row in rows:
+        assert str(row) in page, row
+        assert row.detail or str(row) in shown, row
+    write_metrics(WHOLE, tmp_path / METRICS_FILE)
+    written = read_metrics(tmp_path)
+    assert [(row.key, row.model) for row in written.rows] == [(row.key, row.model) for row in rows]
+    found = written.of("rollout.l1.over_persistence.3")
+    assert found is not None
+    row = next(row for row in rows if (row.key, row.model) == (found.key, found.model))
+    assert Estimate(found.value or 0, found.low or 0, found.high or 0) == row.estimate
+
+
+def test_lines_join_by_key_and_lack_what_was_not_measured() -> None:
+    one = Row("a group", "a line", "a.key", "one", 0.5, 0.4, 0.6, chance=1.0)
+    other = replace(one, key="another", name="another line", model="two", value=float("nan"), note="why")
+    (section,) = sections([one, other])
+    assert section.columns == ("one", "two")
+    assert section.lines == (
+        ("a line", "1.000", ("0.500 [0.400, 0.600]", "")),
+        ("another line", "1.000", ("", "\N{EN DASH} [0.400, 0.600] (why)")),
+    ) or section.lines[1][2][1].endswith("(why)")
