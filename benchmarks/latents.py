@@ -40,11 +40,11 @@ from vjepa2_ac.config import Config, DataConfig, EncoderSizes, ModelConfig, Mode
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.data.clips.dataset import open_dataset
 from vjepa2_ac.data.clips.loader import validation_batches
-from vjepa2_ac.data.sources.latents.dtypes import DTYPES, bytes_per_frame, pack_latents, unpack_latents
+from vjepa2_ac.data.sources.latents.cache_files import DTYPES, bytes_per_frame, pack_latents, unpack_latents
 from vjepa2_ac.distributed.device import autocast, matmul_speed
 from vjepa2_ac.encoding.batch import encode_batch
-from vjepa2_ac.encoding.disk_space import small_frame_bytes
 from vjepa2_ac.encoding.encode_dataset import encode_config
+from vjepa2_ac.encoding.latent_cache import picture_bytes
 from vjepa2_ac.episode import LatentBatch, Progress
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
@@ -219,7 +219,7 @@ def print_sizes(options: argparse.Namespace, rows: Rows) -> None:
     tokens = (options.image_size // 16) ** 2
     print(f"{'stored as':>10}{'MB a frame':>12}{'GB an hour':>12}{f'with start_every={STRIDE}':>22}")
     for kind in DTYPES:
-        frame = bytes_per_frame(tokens, options.latent_dim, kind) + small_frame_bytes(options.image_size)
+        frame = bytes_per_frame(tokens, options.latent_dim, kind) + picture_bytes(options.image_size)
         hour = frame * RATE_HZ * 3600 / 1e9
         print(f"{kind:>10}{frame / 1e6:12.3f}{hour:12.2f}{hour / STRIDE:22.2f}")
         rows.add({"measured": "size", "stored_as": kind, "frame_mb": frame / 1e6, "hour_gb": hour})

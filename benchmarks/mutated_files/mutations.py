@@ -16,7 +16,6 @@ from numpy.random import Generator
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 
-from vjepa2_ac.data.sources.latents.episode_file import _BY_FRAME, _crc_of_rest
 from vjepa2_ac.data.sources.rlds.tfrecord import HEADER_BYTES, write_record
 
 Mutator = Callable[[bytes, Generator], bytes]
@@ -136,7 +135,7 @@ def of_arrays(data: bytes, random: Generator) -> bytes:
 
 
 def of_tensors(data: bytes, random: Generator) -> bytes:
-    """Return a file of a latent cache with other tensors or texts, and the checksum that these have."""
+    """Return a file of a latent cache with other tensors or texts."""
     length = int.from_bytes(data[:8], "little")
     about = dict(json.loads(data[8 : 8 + length]).get("__metadata__", {}))
     tensors = load(data)
@@ -159,8 +158,6 @@ def of_tensors(data: bytes, random: Generator) -> bytes:
     else:
         key = str(random.choice(sorted(about)))
         about[key] = str(_ODD_VALUES[int(random.integers(len(_ODD_VALUES)))])
-    if "crc" in about:
-        about["crc"] = str(_crc_of_rest(about, {key: one for key, one in tensors.items() if key not in _BY_FRAME}))
     try:
         return save({key: one.contiguous() for key, one in tensors.items()}, metadata=about)
     except SafetensorError:  # of text that it does not write

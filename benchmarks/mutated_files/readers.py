@@ -34,7 +34,6 @@ from vjepa2_ac.config.loading import config_as_yaml, load_config, parse_config
 from vjepa2_ac.data.clips.dataset import open_dataset
 from vjepa2_ac.data.filters.idle_ranges import _read_list
 from vjepa2_ac.data.sources.droid_raw.source import RawDroidSource
-from vjepa2_ac.data.sources.latents.cache_key import CacheKey
 from vjepa2_ac.data.sources.latents.source import LatentSource
 from vjepa2_ac.data.sources.lerobot.source import LeRobotSource
 from vjepa2_ac.data.sources.npz.source import NpzSource
@@ -261,18 +260,6 @@ def _read_latents(folder: Path) -> None:
     open_dataset(DataConfig(**config)).windows("train")
 
 
-def _reseal_cache(folder: Path) -> None:
-    path = _cache_of(folder) / "cache.json"
-    try:
-        manifest = json.loads(path.read_text())
-        manifest["digest"] = CacheKey(manifest["key"]).digest
-        names = [name for name in ("episodes.npz", "kept.npz") if (path.parent / name).is_file()]
-        manifest["checksums"] |= {name: zlib.crc32((path.parent / name).read_bytes()) for name in names}
-        path.write_text(json.dumps(manifest))
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
-        return
-
-
 def _write_index(folder: Path) -> None:
     _write_npz(folder)
     os.environ["VJEPA2_AC_CACHE"] = str(folder / "kept")
@@ -343,10 +330,8 @@ READERS: dict[str, Reader] = {
     "info.json": Reader(_write_lerobot, "set/meta/info.json", _read_lerobot, JSON),
     "episodes.jsonl": Reader(_write_lerobot_old, "set/meta/episodes.jsonl", _read_lerobot, (mutations.of_json_lines,)),
     "npz": Reader(_write_npz, "one.npz", _read_npz, (*BYTES, mutations.of_arrays)),
-    "latent cache: cache.json": Reader(_write_latents, "**/cache.json", _read_latents, JSON, _reseal_cache),
-    "latent cache: tables": Reader(
-        _write_latents, "cache/**/*.npz", _read_latents, (*BYTES, mutations.of_arrays), _reseal_cache
-    ),
+    "latent cache: cache.json": Reader(_write_latents, "**/cache.json", _read_latents, JSON),
+    "latent cache: tables": Reader(_write_latents, "cache/**/*.npz", _read_latents, (*BYTES, mutations.of_arrays)),
     "latent cache: latents": Reader(
         _write_latents, "cache/**/*.safetensors", _read_latents, (*BYTES, mutations.of_tensors)
     ),

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from vjepa2_ac.decoding.loss import SMALLEST, decoder_loss
 from vjepa2_ac.decoding.network import Decoder, DecoderShape
+from vjepa2_ac.decoding.steps import SMALLEST, decoder_loss
 
 SIZES = ["linear", "tiny"]
 

@@ -81,27 +81,19 @@ class TrainedDecoder:
         """
         shape = self.card.shape
         sizes = (world_model.num_tokens, world_model.latent_dim, world_model.image_size)
+        fix = "Train one with `vjepa2-ac decoder CONFIG`, on the config of this model"
         if sizes != (shape.grid**2, shape.dim, shape.image_size):
-            raise InputError(
-                where=f"{self.where} {self.name}",
-                found=f"a decoder of {shape.grid**2}x{shape.dim} latents to images of {shape.image_size} px",
-                needed=f"{sizes[0]}x{sizes[1]} latents of images of {sizes[2]} px, as those of {subject}",
-                fix="Train one with `vjepa2-ac decoder CONFIG`, on the config of this model",
-            )
-        if world_model.encoder_fingerprint() != self.card.encoder:
-            raise InputError(
-                where=f"{self.where} {self.name}",
-                found=f"the decoder of another encoder than that of {subject}",
-                needed="one that was trained on the latents of this encoder: others would be read wrongly",
-                fix="Train one with `vjepa2-ac decoder CONFIG`, on the config of this model",
-            )
-        if crop != self.card.crop:
-            raise InputError(
-                where=f"{self.where} {self.name}",
-                found=f"a decoder of frames with data.crop {self.card.crop}",
-                needed=f"{crop}, as of {subject}: frames that are cut otherwise look otherwise to it",
-                fix="Train a decoder with this data.crop",
-            )
+            found = f"a decoder of {shape.grid**2}x{shape.dim} latents to images of {shape.image_size} px"
+            needed = f"{sizes[0]}x{sizes[1]} latents of images of {sizes[2]} px, as those of {subject}"
+        elif world_model.encoder_fingerprint() != self.card.encoder:
+            found = f"the decoder of another encoder than that of {subject}"
+            needed = "one that was trained on the latents of this encoder: others would be read wrongly"
+        elif crop != self.card.crop:
+            found = f"a decoder of frames with data.crop {self.card.crop}"
+            needed = f"{crop}, as of {subject}: frames that are cut otherwise look otherwise to it"
+        else:
+            return
+        raise InputError(where=f"{self.where} {self.name}", found=found, needed=needed, fix=fix)
 
 
 def save_decoder(folder: Path, card: DecoderCard, decoder: Mapping[str, Tensor], linear: Mapping[str, Tensor]) -> None:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -17,30 +15,24 @@ from vjepa2_ac.config import Config, DecoderConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
 from vjepa2_ac.data.clips.windows import require_stride
-from vjepa2_ac.decoding.decoder_folder import CARD, LINEAR, WEIGHTS, read_card
-from vjepa2_ac.decoding.frame_pairs import FramePairs, encode_pairs, require_space_for_pairs, wanted_frames
-from vjepa2_ac.decoding.loss import SMALLEST
-from vjepa2_ac.decoding.network import UPSAMPLED, DecoderShape
+from vjepa2_ac.data.sources.latents.cache_files import LatentFiles, Layout, bytes_per_frame
+from vjepa2_ac.data.sources.latents.cache_key import CacheKey, require_own_folder
+from vjepa2_ac.decoding.decoder_folder import CARD, read_card
+from vjepa2_ac.decoding.frame_pairs import wanted_frames
+from vjepa2_ac.decoding.network import UPSAMPLED, Decoder, DecoderShape
+from vjepa2_ac.decoding.steps import SMALLEST, Autocast, DecoderSteps
 from vjepa2_ac.distributed.device import autocast, computing_device
-from vjepa2_ac.distributed.preemption import StoppedError, StopRequest
 from vjepa2_ac.encoding.batch import encoding_of
-from vjepa2_ac.encoding.cache_lookup import key_for
-from vjepa2_ac.encoding.encode_dataset import encoder_on_device
-from vjepa2_ac.encoding.pipeline import EncoderOnDevice
-from vjepa2_ac.encoding.prefetch import FramesToEncode
-from vjepa2_ac.episode import Progress
+from vjepa2_ac.encoding.latent_cache import key_for, require_space
+from vjepa2_ac.encoding.pipeline import EncoderOnDevice, FramesToEncode
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import INDEXING, Reporter
-from vjepa2_ac.runs.folder import CHECKPOINTS, METRICS
-from vjepa2_ac.runs.lock import LOCK, RunLock
+from vjepa2_ac.runs.lock import RunLock
 from vjepa2_ac.storage import try_writing_at, user_can_write, write_atomically
-from vjepa2_ac.storage.structured import read_json_object
 
 KEY, PAIRS = "key.json", "pairs"
-_OF_A_KILLED_START = {WEIGHTS, LINEAR}  # which wrote them, and not yet the card
-_OWN = {KEY, PAIRS, LOCK, CHECKPOINTS, METRICS} | _OF_A_KILLED_START
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +47,8 @@ class Setup:
     dataset: Dataset
     on_device: EncoderOnDevice
     wanted: dict[Split, list[FramesToEncode]]
-    autocast: Callable[[], AbstractContextManager[object]]
+    pairs: LatentFiles  # frames and latents, while it is trained
+    autocast: Autocast
     is_done: bool  # the folder holds the decoder already
 
     @property
@@ -63,16 +56,9 @@ class Setup:
         """How it is trained."""
         return self.config.decoder
 
-    @property
-    def pairs(self) -> Path:
-        """Where frames and latents are, while it is trained."""
-        return self.folder / PAIRS
-
-
-def folder_of(config: Config) -> Path:
-    """Return the folder of a config's decoder."""
-    named = config.decoder.folder
-    return Path(config.run_dir).parent / "decoder" if named is None else Path(named)
+    def steps_from(self, linear: Decoder | None) -> DecoderSteps:
+        """Return its first optimizer steps, from the linear decoder or from fresh weights."""
+        return DecoderSteps(self.shape, self.decoder, self.config.seed, self.device, self.autocast, linear)
 
 
 @contextlib.contextmanager
@@ -82,77 +68,56 @@ def setup(config: Config, reporter: Reporter, *, check_only: bool) -> Iterator[S
     Raises:
         InputError: One of them cannot be used.
     """
-    folder = folder_of(config)
+    named = config.decoder.folder
+    folder = Path(config.run_dir).parent / "decoder" if named is None else Path(named)
     _require_frames(config)
-    _require_own(folder)
     device = computing_device(config.training)
     with user_can_write(folder):
         try_writing_at(folder)
     dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
     wanted = _wanted(dataset, config.decoder)
     model = load_base(config.model, seed=config.seed)
-    shape = _shape_for(model, config.decoder)
-    on_device = encoder_on_device(config, model, device)
-    if config.training.precision == "fp16":
-        precision: Callable[[], AbstractContextManager[object]] = contextlib.nullcontext  # no loss scale here
-    else:
-        precision = partial(autocast, config.training, device)
-    key = {
+    shape, encoding = _shape_for(model, config.decoder), encoding_of(model, config)
+    key = CacheKey({
         "decoder": config.decoder.model_dump(mode="json", exclude={"folder", "checkpoint_every"}),
         "seed": config.seed,
-        "latents": dict(key_for(dataset, encoding_of(model, config)).parts),
+        "latents": dict(key_for(dataset, encoding).parts),
         "data": config.data.model_dump(mode="json", include={"validation_share", "test_share", "split_by"}),
-    }
-    is_done = _compare_key(folder, key)
-    if not is_done:
-        everything = [one for some in wanted.values() for one in some]
-        taken = require_space_for_pairs(
-            everything, folder / PAIRS, tokens=model.num_tokens, dim=model.latent_dim, image_size=model.image_size,
-            kind=config.data.cache_dtype,
-        )  # fmt: skip
-        frames = sum(len(one.steps) for one in everything)
-        reporter.note(f"{frames:,} frames; {taken / 1e9:.3g} GB of disk for them and their latents, while training")
+    })  # fmt: skip
+    require_own_folder(folder / KEY, key, content="a decoder")
+    layout = Layout(key.digest, config.data.cache_dtype, encoding.tokens, encoding.dim)
+    ready = Setup(
+        config=config,
+        folder=folder,
+        shape=shape,
+        encoder=encoding.encoder,
+        device=device,
+        dataset=dataset,
+        on_device=EncoderOnDevice.of(config, model, device),
+        wanted=wanted,
+        pairs=LatentFiles(folder / PAIRS, layout),
+        autocast=_autocast(config, device),
+        is_done=(folder / CARD).is_file(),
+    )
     with RunLock(folder) as lock:
-        if not check_only and not is_done:
-            lock.take()
-            with user_can_write(folder):
-                write_atomically(folder / KEY, json.dumps(key, indent=1) + "\n")
-        if is_done:
+        if ready.is_done:
+            read_card(folder)
             reporter.note(f"The decoder is there already, in {folder}")
-        fingerprint = str(key["latents"]["encoder"])  # type: ignore[index]
-        yield Setup(
-            config, folder, shape, fingerprint, device, dataset, on_device, wanted, precision, is_done
-        )  # fmt: skip
-
-
-def prepare(ready: Setup, reporter: Reporter, stop: StopRequest) -> tuple[FramePairs, FramePairs | None]:
-    """Encode the frames to learn from, and the held-out ones, if there are any.
-
-    Raises:
-        InputError: A frame cannot be read, or written.
-        StoppedError: A signal asked to stop.
-    """
-    found: dict[Split, FramePairs] = {}
-    for split, wanted in ready.wanted.items():
-        progress = _interruptible(reporter.task(f"encoding {split} frames", "frames"), ready.folder, stop)
-        found[split] = encode_pairs(ready.dataset, wanted, ready.on_device, ready.pairs, progress)
-    return found["train"], found.get("test")
-
-
-def _interruptible(progress: Progress, folder: Path, stop: StopRequest) -> Progress:
-    def or_stop(done: int, total: int) -> None:
-        progress(done, total)
-        if stop.reason is not None:
-            raise StoppedError(folder, 0, stop.reason)
-
-    return or_stop
+        else:
+            _require_space(ready, reporter)
+            if not check_only:
+                lock.take()
+                with user_can_write(folder):
+                    write_atomically(folder / KEY, json.dumps({"key": dict(key.parts)}, indent=1) + "\n")
+        yield ready
 
 
 def _wanted(dataset: Dataset, decoder: DecoderConfig) -> dict[Split, list[FramesToEncode]]:
     """Return the frames of each split; the test split may be empty."""
-    found: dict[Split, list[FramesToEncode]] = {"train": wanted_frames(dataset, "train", frames=decoder.frames)}
-    if held_out := wanted_frames(dataset, "test", frames=decoder.held_out_frames):
-        found["test"] = held_out
+    found: dict[Split, list[FramesToEncode]] = {
+        "train": wanted_frames(dataset, "train", frames=decoder.frames),
+        "test": wanted_frames(dataset, "test", frames=decoder.held_out_frames),
+    }
     if not found["train"]:
         raise InputError(
             where=f"data.path: {dataset.config.path}",
@@ -163,11 +128,30 @@ def _wanted(dataset: Dataset, decoder: DecoderConfig) -> dict[Split, list[Frames
     return found
 
 
+def _require_space(ready: Setup, reporter: Reporter) -> None:
+    layout = ready.pairs.layout
+    per_frame = bytes_per_frame(layout.tokens, layout.dim, layout.kind) + 3 * ready.shape.image_size**2
+    everything = [one for some in ready.wanted.values() for one in some]
+    frames, left = (
+        sum(len(one.steps) for one in some)
+        for some in (everything, [one for one in everything if not ready.pairs.has(one.episode, one.camera)])
+    )
+    fix = "Lower decoder.frames, set data.cache_dtype: int8, or put decoder.folder on a larger disk"
+    require_space(ready.folder, left, per_frame, fix=fix)
+    taken = left * per_frame / 1e9
+    reporter.note(f"{frames:,} frames; {taken:.3g} GB of disk for them and their latents, while training")
+
+
+def _autocast(config: Config, device: torch.device) -> Autocast:
+    """Return the arithmetic of the network: fp16 needs a loss scale, and there is none here."""
+    return contextlib.nullcontext if config.training.precision == "fp16" else partial(autocast, config.training, device)
+
+
 def _require_frames(config: Config) -> None:
     if config.data.is_cache:
         raise InputError(
             where="data.source",
-            found="latents: a cache has no frames to learn from, only small ones to look at",
+            found="latents: a cache has no frames to learn from, only JPEGs to look at",
             needed="the data set itself",
             fix="Use the config of the data set; data.cache does not matter here",
         )
@@ -183,53 +167,3 @@ def _shape_for(model: WorldModel, decoder: DecoderConfig) -> DecoderShape:
             needed=f"{SMALLEST} px or more, and patches of a multiple of {UPSAMPLED} px",
         )
     return DecoderShape(decoder.size, model.latent_dim, model.image_size // patch, patch)
-
-
-def _require_own(folder: Path) -> None:
-    """Refuse a folder with other contents."""
-    if folder.is_dir():
-        strange = sorted(path.name for path in folder.iterdir() if path.name not in _OWN and path.name[0] != ".")
-        if strange and not (folder / CARD).is_file():
-            raise InputError(
-                where=f"decoder.folder {folder}",
-                found=f"a folder with other things in it, such as {strange[0]}",
-                needed="a new or empty one, or that of a decoder",
-                fix="Set another decoder.folder",
-            )
-
-
-def _compare_key(folder: Path, key: dict[str, Any]) -> bool:
-    """Return whether the folder holds this decoder, trained.
-
-    Raises:
-        InputError: It holds another one.
-    """
-    path = folder / KEY
-    if not path.is_file():
-        if any((folder / name).exists() for name in (CARD, PAIRS, CHECKPOINTS)):
-            raise _another(folder, "of unknown origin")
-        return False
-    there = read_json_object(path, fix="Delete this folder")
-    if differing := _differing(there, json.loads(json.dumps(key))):
-        raise _another(folder, f"made otherwise: {'; '.join(differing)}")
-    if (folder / CARD).is_file():
-        read_card(folder)
-        return True
-    return False
-
-
-def _differing(there: Any, key: Any, name: str = "") -> list[str]:
-    """Return what differs, by dotted names."""
-    if isinstance(there, dict) and isinstance(key, dict):
-        names = sorted(there.keys() | key.keys())
-        return [one for each in names for one in _differing(there.get(each), key.get(each), f"{name}.{each}")]
-    return [] if there == key else [f"{name[1:]}: {there}, not {key}"]
-
-
-def _another(folder: Path, how: str) -> InputError:
-    return InputError(
-        where=f"decoder.folder {folder}",
-        found=f"another decoder, {how}",
-        needed="a new folder, or the same decoder",
-        fix="Set another decoder.folder, or delete this one",
-    )

@@ -21,7 +21,7 @@ from vjepa2_ac.data.clips.transforms import frames_as_seen
 from vjepa2_ac.decoding.decoder_folder import load_decoder
 from vjepa2_ac.distributed.launch import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch
-from vjepa2_ac.encoding.training_cache import with_latents_if_there
+from vjepa2_ac.encoding.encode_dataset import with_latents_if_there
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.evaluation.decoded_rollouts.measure import measure_decoded
 from vjepa2_ac.evaluation.decoded_rollouts.metric_networks import load_metric_networks

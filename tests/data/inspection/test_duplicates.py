@@ -24,7 +24,7 @@ from vjepa2_ac.data.index.state_hash import UNKNOWN, hash_of_states
 from vjepa2_ac.data.inspection.check import check_data
 from vjepa2_ac.data.inspection.duplicates import Duplicates, find_duplicates
 from vjepa2_ac.data.inspection.statistics import inspect_dataset
-from vjepa2_ac.data.sources.latents.manifest import EPISODES
+from vjepa2_ac.data.sources.latents.cache_files import EPISODES
 from vjepa2_ac.data.sources.rlds import lookalikes
 from vjepa2_ac.episode import EpisodeInfo
 

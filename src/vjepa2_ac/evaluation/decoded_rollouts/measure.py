@@ -18,7 +18,7 @@ from torch import Tensor
 
 from vjepa2_ac.data.clips.transforms import images_to_input
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
-from vjepa2_ac.decoding.frame_pairs import as_images, as_pixels
+from vjepa2_ac.decoding.network import as_images, as_pixels
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.evaluation.decoded.hand import HandPositions, HandProbe
 from vjepa2_ac.evaluation.decoded.record import (

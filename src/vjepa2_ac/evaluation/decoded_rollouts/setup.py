@@ -13,7 +13,7 @@ from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.data.clips.loader import batches_of, validation_windows
 from vjepa2_ac.data.clips.transforms import input_to_pixels, pixels_to_input
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
-from vjepa2_ac.decoding.frame_pairs import as_images
+from vjepa2_ac.decoding.network import as_images
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.decoded.hand import HandPositions, HandProbe, fit_hand_probe
 from vjepa2_ac.evaluation.decoded_rollouts.measure import CACHE, Decoding, HandReader

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,28 +13,18 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.filters.idle_ranges import FoundRanges
 from vjepa2_ac.data.index.episode_table import EpisodeProblem
 from vjepa2_ac.data.sources.indexed_source import IndexedSource, Opened
+from vjepa2_ac.data.sources.latents.cache_files import CacheDescription, LatentFiles, read_description, read_tables
 from vjepa2_ac.data.sources.latents.cache_key import clip_parts
-from vjepa2_ac.data.sources.latents.episode_file import EpisodeFile
-from vjepa2_ac.data.sources.latents.manifest import (
-    KEPT,
-    MANIFEST,
-    Manifest,
-    path_of,
-    read_episodes,
-    read_manifest,
-    size_column,
-    size_of,
-)
-from vjepa2_ac.episode import Episode, Progress, StepRanges, StoredLatents
+from vjepa2_ac.episode import Episode, Progress, StepRanges
 from vjepa2_ac.errors import InputError
 
 _ENCODE = "Run `vjepa2-ac encode` again, as the cache was made: it encodes what is lacking; or copy the file again"
-_DELETE = "Delete this file, and then run `vjepa2-ac encode` again, as the cache was made; or copy the file again"
 
 
 @dataclass(frozen=True)
 class _Opened(Opened):
-    manifest: Manifest
+    about: CacheDescription
+    files: LatentFiles
     kept: FoundRanges | None
 
 
@@ -46,20 +35,15 @@ class LatentSource(IndexedSource[DataConfig, _Opened]):
     of the data set, in their order.
     """
 
-    def __init__(self, config: DataConfig) -> None:
-        super().__init__(config)
-        self._folder = Path(config.path)
-        self._checked: dict[tuple[int, str], bytearray] = {}  # frames whose CRC this process has checked
-
     @property
-    def manifest(self) -> Manifest:
-        """The manifest of the cache."""
-        return self._open().manifest
+    def about(self) -> CacheDescription:
+        """What the cache is."""
+        return self._open().about
 
     @property
     def cameras(self) -> tuple[str, ...]:
         """The cameras that clips are drawn from: the config's, or all of the cache."""
-        return self.manifest.cameras if self._config.camera is None else self._config.cameras
+        return self.about.cameras if self._config.camera is None else self._config.cameras
 
     @property
     def settled_config(self) -> DataConfig:
@@ -70,12 +54,11 @@ class LatentSource(IndexedSource[DataConfig, _Opened]):
         """Return the ranges that `data.idle` keeps, from the cache; its rule is not none.
 
         Raises:
-            InputError: No complete cache, or one of other clips than the config's.
+            InputError: No cache, or one of other clips than the config's.
         """
         kept = self._open().kept
         if kept is None:  # `_look` has compared the rules
-            where, found = str(self._folder / MANIFEST), f"damaged: no checksum of {KEPT}"
-            raise InputError(where=where, found=found, needed="one", fix=_ENCODE)
+            raise InputError(where=self._config.path, found="no kept.npz", needed="that of its idle rule", fix=_ENCODE)
         return kept
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:  # noqa: ARG002 - nothing is fetched
@@ -87,92 +70,74 @@ class LatentSource(IndexedSource[DataConfig, _Opened]):
         """
         opened, camera = self._open(), camera or self.cameras[0]
         info = opened.table[index]
-        if camera not in opened.manifest.cameras:
-            raise ValueError(f"camera {camera!r} is not one of {', '.join(opened.manifest.cameras)}")
-        if reason := opened.manifest.broken.get(info.id):
-            found = f"no latents: it could not be read when they were encoded ({reason.rstrip('.')})"
-            raise InputError(where=f"{self._folder}: episode {info.id}", found=found)
-        record = EpisodeFile(path_of(self._folder, index, camera), opened.manifest.layout)
-        name, its_camera, steps = record.id, record.camera, len(record["states"])
-        if (name, its_camera, steps) != (info.id, camera, info.num_steps):
-            text = f"episode {name} of {steps} steps, camera {its_camera}"
-            wanted = f"{info.id} of {info.num_steps} steps, camera {camera}"
-            raise InputError(where=record.path, found=text, needed=wanted, fix=_DELETE)
-        checked = self._checked.setdefault((index, camera), bytearray(len(record.frame_steps)))
+        if camera not in opened.about.cameras:
+            raise ValueError(f"camera {camera!r} is not one of {', '.join(opened.about.cameras)}")
+        record = opened.files.open(index, camera)
+        states = record.states
+        if (record.id, record.camera, len(states)) != (info.id, camera, info.num_steps):
+            found = f"episode {record.id} of {len(states)} steps, camera {record.camera}"
+            needed_text = f"{info.id} of {info.num_steps} steps, camera {camera}"
+            raise InputError(where=record.path, found=found, needed=needed_text, fix=_ENCODE)
         return Episode(
             info=info,
-            states=record["states"],
+            states=states,
             read_frames=lambda steps: record.pictures(record.places_of(steps)),
-            control_rate_hz=opened.manifest.control_rate_hz,
-            extrinsics=record["extrinsics"],
-            joint_velocities=record["joint_velocities"],
+            control_rate_hz=opened.about.control_rate_hz,
+            extrinsics=record.by_step("extrinsics"),
+            joint_velocities=record.by_step("joint_velocities"),
             metadata=record.metadata,
-            commands=record["commands"],
-            read_latents=partial(self._latents, record, checked),
+            commands=record.by_step("commands"),
+            read_latents=lambda steps: record.latents(record.places_of(steps)),
             frame_steps=record.frame_steps,
         )
 
-    def _latents(self, record: EpisodeFile, checked: bytearray, steps: Sequence[int]) -> StoredLatents:
-        """Return the latents at these control steps, in this order; `checked` has a byte for each frame of the file.
-
-        Raises:
-            InputError: A step has none, or they are damaged.
-        """
-        places = record.places_of(steps)
-        unchecked = [place for place in places if not checked[place]]
-        check = {"never": [], "once": unchecked, "always": places}[self._config.check_crc]
-        latents = record.latents(places, check=check)
-        for place in check:
-            checked[place] = 1
-        return latents
-
-    def wrong_files(self) -> list[EpisodeProblem]:
-        """Return the episodes with a missing file, or a file of another size than written."""
-        opened, problems = self._open(), []
-        for place, camera in enumerate(opened.manifest.cameras):
-            sizes = opened.table.locators[size_column(place)]
-            for number in np.flatnonzero(sizes).tolist():
-                path = path_of(self._folder, number, camera)
-                there = size_of(path)
-                if there != sizes[number]:
-                    found = "no such file" if there is None else f"{there:,} bytes"
-                    name, needed = opened.table.identity(number), f"{sizes[number]:,} bytes"
-                    problems.append(EpisodeProblem(name, f"{path} ({name})", found, needed, _ENCODE))
-        return problems
-
     def require_encoded(self, episodes: Int[np.ndarray, " episodes"]) -> None:
-        """Refuse to make clips of episodes that were skipped while encoding.
+        """Refuse a cache without the latents of these episodes: it is unfinished, or was made of others.
 
         Raises:
-            InputError: There are some.
+            InputError: Some are missing.
         """
-        opened = self._open()
-        table, broken = opened.table, opened.manifest.broken
-        absent = np.zeros(len(table), bool)
-        for camera in self.cameras:
-            absent |= table.locators[size_column(opened.manifest.cameras.index(camera))] == 0
-        unread = np.unique(episodes[absent[episodes]]).tolist()
-        lacking = [number for number in unread if table.identity(number) not in broken]
+        opened, wanted = self._open(), np.unique(episodes).tolist()
+        lacking = [one for one in wanted if any(self._is_absent(one, camera) for camera in self.cameras)]
         if lacking:
-            several = f"{len(lacking)} of {len(np.unique(episodes))} episodes, such as {table.identity(lacking[0])}"
+            several = f"{len(lacking)} of {len(wanted)} episodes, such as {opened.table.identity(lacking[0])}"
             raise InputError(
-                where=str(self._folder),
+                where=self._config.path,
                 found=f"no latents of {several}",
                 needed="those of every episode that takes part",
-                fix="Set data.outcome and data.exclude as they were when it was made, or run `vjepa2-ac encode` again",
+                fix="Run `vjepa2-ac encode` again, which goes on where it was stopped; or set data.outcome and"
+                " data.exclude as they were when it was made",
             )
 
+    def wrong_files(self) -> list[EpisodeProblem]:
+        """Return the episodes with a file that is truncated, or of another cache."""
+        opened, problems = self._open(), []
+        for number in range(len(opened.table)):
+            for camera in self.cameras:
+                path = opened.files.path(number, camera)
+                if path.is_file() and not opened.files.has(number, camera):
+                    name, found = opened.table.identity(number), "a file that is damaged, or of another cache"
+                    problems.append(EpisodeProblem(name, f"{path} ({name})", found, "", _ENCODE))
+        return problems
+
+    def _is_absent(self, number: int, camera: str) -> bool:
+        files = self._open().files
+        return not files.path(number, camera).is_file() and not files.is_done(number, camera)
+
     def _look(self, progress: Progress) -> _Opened:  # noqa: ARG002 - at once
-        manifest = read_manifest(self._folder)
+        folder = Path(self._config.path)
+        about = read_description(folder)
         parts = clip_parts(self._config)
-        differing = manifest.cache_key.differences(parts, parts)
+        differing = about.cache_key.differences(parts, parts)
         for camera in () if self._config.camera is None else self._config.cameras:
-            if camera not in manifest.cameras:
-                differing.append(f"data.camera: {', '.join(manifest.cameras)}, not {camera}")
+            if camera not in about.cameras:
+                differing.append(f"data.camera: {', '.join(about.cameras)}, not {camera}")
         if differing:  # of other clips than the config's
-            raise another_cache(self._folder, differing)
-        table, kept = read_episodes(self._folder, manifest)
-        return _Opened(table, manifest, kept)
+            raise another_cache(folder, differing)
+        table, kept = read_tables(folder)
+        texts = {"control_rate_hz": str(about.control_rate_hz), "widths": " ".join(map(str, about.widths))}
+        table = replace(table, texts={**table.texts, **texts}, locators={})
+        return _Opened(table, about, LatentFiles(folder, about.layout), kept)
 
 
 def another_cache(folder: Path, differing: Sequence[str]) -> InputError:

@@ -1,0 +1,362 @@
+"""The files of a latent cache, and the precision of its latents.
+
+cache.json     what the cache is: its key in full, the shape of its latents, cameras, control rate
+episodes.npz   every episode of the data set that it was made from, in its order, as `EpisodeTable.to_bytes` writes them
+kept.npz       the steps that `data.idle` leaves, as `FoundRanges.to_bytes` writes them; absent without an idle rule
+episodes/000/000123-CAMERA.safetensors   the latents of an episode, by its index, and a camera
+episodes/000/000123-CAMERA.broken        in its place: why the episode could not be read (`data.broken_episodes`)
+
+Every file gets its name when it is complete. A cache is finished when each episode that clips need has its file, of
+each camera. The tensors of such a file (control steps as in `episode`; `frames` are the steps that were encoded):
+
+latents        [frames, tokens, dim] bfloat16, float32 or int8
+scales         [frames, tokens] float32, with int8 only: a latent is its value times the scale of its token
+frame_steps    [frames] int32: the control step of each frame, ascending
+states         [steps, state_dim], and where the source has them commands, extrinsics, joint_velocities
+pictures       the frames as the encoder saw them, for people to look at: [bytes] uint8, JPEGs one after the other; or
+               [frames, size, size, 3] uint8, exact, for a decoder to learn from
+picture_ends   [frames] int64: where each JPEG ends
+
+The header's metadata (texts): id, camera, metadata (JSON), key (the digest of the cache's key).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal
+from urllib.parse import quote
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt8
+from pydantic import Field
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from vjepa2_ac import storage
+from vjepa2_ac.data.filters.idle_ranges import FoundRanges
+from vjepa2_ac.data.index.episode_table import EpisodeTable, NotATableError
+from vjepa2_ac.data.sources.latents.cache_key import CacheKey
+from vjepa2_ac.episode import Episode, StoredLatents
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.media.jpeg import decode_jpegs, encode_jpeg
+from vjepa2_ac.storage.structured import json_object, read_json_object, record_of
+
+CacheType = Literal["bf16", "fp32", "int8"]
+
+DTYPES: dict[CacheType, torch.dtype] = {"bf16": torch.bfloat16, "fp32": torch.float32, "int8": torch.int8}
+CACHE, EPISODES, KEPT = "cache.json", "episodes.npz", "kept.npz"
+
+_LARGEST = 127  # of int8
+_JPEG_QUALITY = 85
+_MOST_BYTES = 1 << 30  # of a table
+_BY_STEP = ("states", "commands", "extrinsics", "joint_velocities")
+_FIX = "Delete this file, and then run `vjepa2-ac encode` again, as the cache was made; or copy the file again"
+_ENCODE = "Run `vjepa2-ac encode`, which goes on where it was stopped; or copy the cache again"
+
+
+def pack_latents(latents: Float[Tensor, "*batch tokens dim"], kind: CacheType) -> StoredLatents:
+    """Return latents in their storage type.
+
+    bf16 rounds to nearest: the error is at most 2**-8 of the value. int8 divides each token by its largest value over
+    127, its scale: the error is at most half a scale. fp32 is exact.
+    """
+    if kind != "int8":
+        return StoredLatents(latents.to(DTYPES[kind]))
+    latents = latents.float()
+    scales = latents.abs().amax(dim=-1) / _LARGEST
+    divisor = torch.where(scales > 0, scales, torch.ones_like(scales))  # a token of zeros stays one
+    values = (latents / divisor[..., None]).round().clamp(-_LARGEST, _LARGEST)
+    return StoredLatents(values.to(torch.int8), scales)
+
+
+def unpack_latents(stored: StoredLatents) -> Float[Tensor, "*batch tokens dim"]:
+    """Return stored latents as float32: the encoder's output up to the rounding of `pack_latents`."""
+    values = stored.values.float()
+    return values if stored.scales is None else values * stored.scales[..., None]
+
+
+def bytes_per_frame(tokens: int, dim: int, kind: CacheType) -> int:
+    """Return the size of a frame's latents."""
+    return tokens * dim * DTYPES[kind].itemsize + (tokens * 4 if kind == "int8" else 0)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What all files of a cache share."""
+
+    key: str  # digest of the cache's key
+    kind: CacheType
+    tokens: Annotated[int, Field(ge=1, le=65_536)]
+    dim: Annotated[int, Field(ge=1, le=16_384)]
+
+
+@dataclass(frozen=True)
+class CacheDescription:
+    """What cache.json says."""
+
+    key: Mapping[str, Any]  # the parts of its `CacheKey`
+    layout: Layout
+    cameras: Annotated[tuple[str, ...], Field(min_length=1)]
+    control_rate_hz: Annotated[float, Field(gt=0.0, le=1000.0)]
+    widths: tuple[int, int]  # of states and actions
+    format: Literal["vjepa2-ac latent cache 2"] = "vjepa2-ac latent cache 2"
+
+    @property
+    def cache_key(self) -> CacheKey:
+        """Everything that determined the content of the cache."""
+        return CacheKey(self.key)
+
+    def write(self, folder: Path, table: EpisodeTable, kept: FoundRanges | None) -> None:
+        """Begin a cache in a folder: say what it is, and which episodes and steps it is of.
+
+        Raises:
+            InputError: The folder cannot be written.
+        """
+        with storage.user_can_write(folder):
+            storage.write_atomically(folder / CACHE, json.dumps(asdict(self), indent=1) + "\n")
+            if kept is not None:
+                storage.write_atomically(folder / KEPT, kept.to_bytes())
+            storage.write_atomically(folder / EPISODES, table.to_bytes())
+
+
+def read_description(folder: Path) -> CacheDescription:
+    """Read cache.json.
+
+    Raises:
+        InputError: It is missing, or invalid.
+    """
+    where = str(folder / CACHE)
+    try:
+        content = read_json_object(folder / CACHE, most_bytes=_MOST_BYTES, allow_nan=True, fix=_ENCODE)
+    except (FileNotFoundError, NotADirectoryError):
+        found = "no latent cache" if folder.is_dir() else f"no such folder, seen from {Path.cwd()}"
+        raise InputError(where=str(folder), found=found, needed=f"a folder with {CACHE}", fix=_ENCODE) from None
+    except OSError as error:
+        raise InputError(where=where, found=f"cannot be read ({error})", fix=_ENCODE) from None
+    return record_of(CacheDescription, content, where=where, needed="what a latent cache says of itself", fix=_ENCODE)
+
+
+def read_tables(folder: Path) -> tuple[EpisodeTable, FoundRanges | None]:
+    """Read the episodes of a cache and, if it has an idle rule, the ranges that the rule keeps.
+
+    Raises:
+        InputError: One of the files is missing or damaged.
+    """
+    try:
+        table = EpisodeTable.from_bytes(storage.read_bounded(folder / EPISODES, _MOST_BYTES))
+        has_kept = (folder / KEPT).is_file()
+        return table, FoundRanges.from_bytes(storage.read_bounded(folder / KEPT, _MOST_BYTES)) if has_kept else None
+    except (OSError, NotATableError) as error:
+        found = f"{EPISODES} or {KEPT} cannot be read ({error})"
+        raise InputError(where=str(folder), found=found, fix=_ENCODE) from None
+
+
+@dataclass(frozen=True, eq=False)
+class EncodedEpisode:
+    """An episode with latents of frames of one camera."""
+
+    episode: Episode  # its states and other data for clips; no frame is read
+    camera: str
+    steps: Sequence[int]  # control steps of the frames, ascending; there may be none
+    latents: StoredLatents  # of these frames, see `pack_latents`
+    pictures: UInt8[np.ndarray, "frames size size 3"]  # these frames, as the encoder saw them
+
+
+@dataclass(frozen=True)
+class LatentFiles:
+    """The files of the episodes in a cache's folder. Several processes may write into it."""
+
+    folder: Path
+    layout: Layout
+
+    def path(self, number: int, camera: str) -> Path:
+        """Return the file of an episode, by its index in the data set, and a camera."""
+        name = f"{number:06d}-{quote(camera, safe='')}.safetensors"
+        return self.folder / "episodes" / f"{number // 1000:03d}" / name
+
+    def has(self, number: int, camera: str) -> bool:
+        """Return whether a file is there, whole, and of this cache."""
+        try:
+            with safe_open(str(self.path(number, camera)), framework="pt") as file:  # type: ignore[no-untyped-call]
+                return bool((file.metadata() or {}).get("key") == self.layout.key)
+        except (SafetensorError, OSError):
+            return False
+
+    def size(self, number: int, camera: str) -> int:
+        """Return the size of a file in bytes; 0 if there is none."""
+        path = self.path(number, camera)
+        return path.stat().st_size if path.is_file() else 0
+
+    def is_done(self, number: int, camera: str) -> bool:
+        """Return whether a file is there, or in its place the reason why it cannot be."""
+        return self.has(number, camera) or self._note(number, camera).is_file()
+
+    def open(self, number: int, camera: str) -> EpisodeFile:
+        """Open a file.
+
+        Raises:
+            InputError: It is missing, damaged, or belongs to another cache; or the episode could not be read.
+        """
+        path = self.path(number, camera)
+        note = self._note(number, camera)
+        if not path.is_file() and note.is_file():
+            found = f"no latents: it could not be read when they were encoded ({_text_of(note).rstrip('.')})"
+            raise InputError(where=str(path), found=found)
+        return EpisodeFile(path, self.layout)
+
+    def write(self, number: int, encoded: EncodedEpisode, *, exact_pictures: bool = False) -> None:
+        """Write the file of an episode and camera.
+
+        Raises:
+            InputError: The file cannot be written, or the disk is full.
+        """
+        episode, latents, path = encoded.episode, encoded.latents, self.path(number, encoded.camera)
+        arrays = {
+            "frame_steps": np.array(encoded.steps, np.int32),
+            **{name: getattr(episode, name) for name in _BY_STEP},
+        }
+        if exact_pictures:
+            arrays["pictures"] = encoded.pictures
+        else:
+            jpegs = [encode_jpeg(frame, quality=_JPEG_QUALITY) for frame in encoded.pictures]
+            arrays["pictures"] = np.frombuffer(b"".join(jpegs), np.uint8)
+            arrays["picture_ends"] = np.cumsum([len(jpeg) for jpeg in jpegs], dtype=np.int64)
+        tensors = {name: torch.from_numpy(np.array(one, order="C")) for name, one in arrays.items() if one is not None}
+        tensors["latents"] = latents.values.contiguous()
+        if latents.scales is not None:
+            tensors["scales"] = latents.scales.contiguous()
+        metadata = json.dumps(dict(episode.metadata), sort_keys=True)
+        about = {"id": episode.info.id, "camera": encoded.camera, "metadata": metadata, "key": self.layout.key}
+        with storage.user_can_write(path):
+            storage.write_atomically(path, save(tensors, metadata=about))
+            self._note(number, encoded.camera).unlink(missing_ok=True)
+
+    def note_broken(self, number: int, camera: str, reason: str) -> None:
+        """Record that an episode cannot be read, for the other processes and for whoever reads the cache."""
+        path = self._note(number, camera)
+        with storage.user_can_write(path):
+            storage.write_atomically(path, reason)
+
+    @property
+    def broken(self) -> dict[int, str]:
+        """The episodes that could not be read, by their index, and why."""
+        notes = sorted(self.folder.glob("episodes/*/*.broken"))
+        return {int(note.name.partition("-")[0]): _text_of(note) for note in notes}
+
+    def _note(self, number: int, camera: str) -> Path:
+        return self.path(number, camera).with_suffix(".broken")
+
+
+def _text_of(note: Path) -> str:
+    return note.read_text(encoding="utf-8", errors="replace")
+
+
+class EpisodeFile:
+    """An open file; everything is read on request, latents and pictures frame by frame.
+
+    Args:
+        path: The file.
+        layout: The layout of the cache.
+
+    Raises:
+        InputError: The file is missing, damaged, or belongs to another cache.
+    """
+
+    def __init__(self, path: Path, layout: Layout) -> None:
+        self.path, self._layout = str(path), layout
+        with self._reading():
+            self._file: Any = safe_open(self.path, framework="pt").__enter__()  # type: ignore[no-untyped-call] # mapped until nobody has it any more
+            about = self._file.metadata() or {}
+            self._names = frozenset(self._file.keys())
+            self.id, self.camera = about["id"], about["camera"]
+            self.metadata = {name: str(text) for name, text in json_object(about["metadata"], where=self.path).items()}
+        if about.get("key") != layout.key:
+            raise self._damaged("a file of another cache", "a file that was made with this one's cache.json")
+
+    @cached_property
+    def frame_steps(self) -> Int[np.ndarray, " frames"]:
+        """The control steps that have a frame, ascending."""
+        return np.asarray(self._array("frame_steps"))
+
+    @property
+    def states(self) -> Float[np.ndarray, "steps state_dim"]:
+        """The states of all control steps."""
+        return np.asarray(self._array("states"))
+
+    def by_step(self, name: str) -> Float[np.ndarray, "steps numbers"] | None:
+        """Return commands, extrinsics or joint_velocities; None if there are none."""
+        return self._array(name) if name in self._names else None
+
+    def places_of(self, steps: Sequence[int]) -> list[int]:
+        """Return the indices of the frames at these control steps.
+
+        Raises:
+            InputError: The cache has no frame of one of them.
+        """
+        there = {step: place for place, step in enumerate(self.frame_steps.tolist())}
+        for step in steps:
+            if step not in there:
+                raise InputError(
+                    where=f"{self.path} ({self.id})",
+                    found=f"no frame of control step {step}",
+                    needed=f"one; there are {len(there)}, of every step that a clip needed",
+                    fix="Encode with the same data.stride, data.frames, data.start_every and data.idle as are used now",
+                )
+        return [there[step] for step in steps]
+
+    def latents(self, places: Sequence[int]) -> StoredLatents:
+        """Return the latents of frames by their index.
+
+        Raises:
+            InputError: They are of another type or shape than those of the cache.
+        """
+        layout = self._layout
+        scales = self._rows("scales", places) if layout.kind == "int8" else None
+        values = self._rows("latents", places)
+        if values.dtype != DTYPES[layout.kind] or values.shape[1:] != (layout.tokens, layout.dim):
+            found = f"latents of {values.dtype} and shape {list(values.shape)}"
+            raise self._damaged(found, f"{layout.tokens} x {layout.dim} numbers of {layout.kind} for each frame")
+        return StoredLatents(values, scales)
+
+    def pictures(self, places: Sequence[int]) -> UInt8[np.ndarray, "frames size size 3"]:
+        """Return frames as the encoder saw them, by their index.
+
+        Raises:
+            InputError: One is damaged.
+        """
+        with self._reading():
+            data = self._file.get_slice("pictures")
+            if len(data.get_shape()) > 1:
+                return np.asarray(self._rows("pictures", places).numpy())
+            ends = [0, *self._file.get_tensor("picture_ends").tolist()]
+            jpegs = [bytes(data[ends[place] : ends[place + 1]].numpy()) for place in places]
+        return decode_jpegs(jpegs, self.frame_steps[list(places)].tolist(), self.path)
+
+    def _array(self, name: str) -> np.ndarray:
+        with self._reading():
+            return np.array(self._file.get_tensor(name).numpy())
+
+    def _rows(self, name: str, places: Sequence[int]) -> Tensor:
+        with self._reading():
+            rows = self._file.get_slice(name)
+            return torch.stack([rows[place] for place in places])
+
+    @contextmanager
+    def _reading(self) -> Iterator[None]:
+        """Raise an error for the user if the file is missing, truncated, no safetensors file, or lacks something."""
+        try:
+            yield
+        except FileNotFoundError:
+            raise InputError(where=self.path, found="no such file", needed="latents of an episode", fix=_FIX) from None
+        except (SafetensorError, OSError, KeyError, IndexError, ValueError, TypeError) as error:
+            raise self._damaged(f"not a whole file of latents ({error})") from None
+
+    def _damaged(self, found: str, needed: str = "") -> InputError:
+        return InputError(where=self.path, found=found, needed=needed, fix=_FIX)
