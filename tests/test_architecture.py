@@ -74,11 +74,10 @@ ORDERS: dict[str, list[str]] = {
         "imagined",
     ],
     "decoding": [
-        "network loss",
+        "network",
         "decoder_folder frame_pairs",
-        "linear_fit held_out imagine optimizer_steps",
+        "baselines imagine steps",
         "imagined_plan",
-        "setup",
         "training",
     ],
     "reports": [
@@ -105,7 +104,7 @@ HOMES = {
     "accelerate": [
         "distributed/",
         "training/",
-        "encoding/training_cache.py",
+        "encoding/encode_dataset.py",
         "evaluation/stride_calibration/measure.py",
     ],
     "av": ["media/"],

@@ -21,7 +21,6 @@ from vjepa2_ac.cli import main
 from vjepa2_ac.config import Config, DecoderConfig, ModelSizes
 from vjepa2_ac.data.sources.latents.cache_files import LatentFiles
 from vjepa2_ac.data.sources.rlds.source import RldsSource
-from vjepa2_ac.decoding import setup as preparation
 from vjepa2_ac.decoding import steps as optimizer_steps
 from vjepa2_ac.decoding import training
 from vjepa2_ac.decoding.decoder_folder import CARD, LINEAR, WEIGHTS, load_decoder, read_card
@@ -98,7 +97,7 @@ def test_of_shuffled_pairs_it_learns_the_mean_image_at_best(
     assert min(gains("true").values()) > 3
     encode = training._encoded
 
-    def shuffled(ready: preparation.Setup, split: str, *more: object) -> FramePairs:
+    def shuffled(ready: training.Setup, split: str, *more: object) -> FramePairs:
         pairs = encode(ready, split, *more)  # type: ignore[arg-type]
         return Shuffled(pairs.files, pairs.frames, pairs.episode_ids) if split == "train" else pairs
 
@@ -174,7 +173,7 @@ def test_a_stop_while_frames_are_encoded_keeps_them_and_has_its_status(
     assert_same_decoder(whole_decoder, tmp_path / "decoder")
 
 
-@pytest.mark.parametrize("died_at", [(5, 12, 17), (40,), (65,), (86,)])
+@pytest.mark.parametrize("died_at", [(5, 12, 17), (35,), (55,), (65,)])
 def test_a_killed_training_goes_on_as_if_it_had_not(
     nursery: Nursery, make_decoder: MakeConfig, whole_decoder: Path, tmp_path: Path, died_at: tuple[int, ...]
 ) -> None:
@@ -191,8 +190,8 @@ def test_what_a_killed_start_left_in_a_finished_folder_is_removed(
     make_decoder: MakeConfig, whole_decoder: Path, tmp_path: Path
 ) -> None:
     shutil.copytree(whole_decoder, tmp_path / "decoder")
-    for name in ("pairs", "checkpoints"):
-        (tmp_path / "decoder" / name).mkdir()
+    (tmp_path / "decoder" / "pairs").mkdir()
+    (tmp_path / "decoder" / "training.pt").touch()
     train_decoder(make_decoder(), check_only=True)
     assert (tmp_path / "decoder" / "pairs").exists(), "--check changes nothing"
     train_decoder(make_decoder())
@@ -312,7 +311,7 @@ def test_the_learning_rate_rises_to_its_peak_and_falls_to_none(steps: int, warmu
 def test_noise_is_a_function_of_the_step(make_decoder: MakeConfig) -> None:
     """A step of a resumed training has the noise that it would have had; another step another one."""
     config = make_decoder()
-    with preparation.setup(config, SilentReporter(), check_only=True) as ready:
+    with training._setup(config, SilentReporter(), check_only=True) as ready:
         one, other = ready.steps_from(None), ready.steps_from(None)
         latents = torch.zeros(64, 4, 24)
         one._noise(1, latents)

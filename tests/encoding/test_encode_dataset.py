@@ -85,7 +85,6 @@ def test_every_needed_frame_is_encoded_once(
     assert reported[-1] == (frames, frames)
     assert (found.encoded, found.episodes, found.frames, found.is_finished) == (8, 8, frames, True)
     assert found.bytes == sum(path.stat().st_size for path in latents_in(tmp_path / "out"))
-    assert "GB per hour of robot data" in reporter.notes[0]
     assert "GB free on its disk" in reporter.notes[1]
     encoded_frames.clear()
     assert encode(config, tmp_path / "out") == found
@@ -204,9 +203,6 @@ def test_a_disk_that_is_too_small_is_refused_with_the_numbers_before_anything_is
         assert part in text
     assert not encoded_frames
     assert not (tmp_path / "out").exists()
-    with pytest.raises(InputError) as error:
-        encode(make_config(data__cache_dtype="int8", data__start_every=2), tmp_path / "out")
-    assert not any(way_out in str(error.value) for way_out in ways_out[:2])
 
 
 def test_a_folder_that_cannot_be_written_or_holds_other_things_is_refused(
@@ -361,7 +357,7 @@ def test_a_run_mends_the_cache_that_it_finds_damaged(
     sound, (cut, gone, *_) = contents(folder), latents_in(folder)
     cut.write_bytes(cut.read_bytes()[:-10])
     gone.unlink()
-    with pytest.raises(InputError, match=r"no latents of 1 of 8 episodes.*Run `vjepa2-ac encode`"):
+    with pytest.raises(InputError, match=r"no whole latents of 2 of 8 episodes.*Run `vjepa2-ac encode`"):
         train(make_config(run_dir=str(tmp_path / "x"), **knobs | {"data__cache": "require"}), reporter)
     again = make_config(run_dir=str(tmp_path / "again"), **knobs)
     reporter.notes.clear()

@@ -13,7 +13,7 @@ from memory_source import MemorySource
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.clips import dataset
 from vjepa2_ac.data.filters import broken_episodes
-from vjepa2_ac.data.sources.latents.cache_files import CacheType, LatentFiles, Layout, unpack_latents
+from vjepa2_ac.data.sources.latents.cache_files import CacheType, LatentFiles, unpack_latents
 from vjepa2_ac.encoding.pipeline import FRAMES_AT_ONCE, EncoderOnDevice, FramesToEncode, encode_files
 from vjepa2_ac.errors import UnreachableError
 
@@ -34,11 +34,11 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
 
     def encode(source: MemorySource, kind: CacheType = "fp32", workers: int = 2) -> LatentFiles:
         monkeypatch.setattr(dataset, "open_source", lambda _: source)
-        config = DataConfig(path="memory", crop="letterbox", workers=workers, broken_episodes="skip")
+        config = DataConfig(path="memory", crop="letterbox", workers=workers, broken_episodes="skip", cache_dtype=kind)
         wanted = [FramesToEncode(n, "left", np.arange(steps, dtype=np.int32)) for n, steps in enumerate(source.lengths)]
         model = SimpleNamespace(image_size=5, encode=colours)
         encoder = EncoderOnDevice(model, torch.device("cpu"), nullcontext, chunk=7)  # type: ignore[arg-type]
-        files = LatentFiles(tmp_path, Layout("key", kind, tokens=1, dim=3))
+        files = LatentFiles(tmp_path, "key")
         encode_files(dataset.open_dataset(config), wanted, encoder, files)
         return files
 

@@ -9,7 +9,7 @@ import torch
 from run_fixtures import MakeConfig, one_thread, tiny_config
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.clips.dataset import open_dataset
-from vjepa2_ac.data.sources.latents.cache_files import LatentFiles, Layout
+from vjepa2_ac.data.sources.latents.cache_files import LatentFiles
 from vjepa2_ac.decoding.frame_pairs import FramePairs, wanted_frames
 from vjepa2_ac.decoding.training import train_decoder
 from vjepa2_ac.encoding.pipeline import EncoderOnDevice, encode_files
@@ -51,8 +51,7 @@ def encode_split(tmp_path: Path) -> EncodeSplit:
         model = load_base(config.model, seed=config.seed)
         encoder = EncoderOnDevice.of(config, model, torch.device("cpu"))
         wanted = wanted_frames(dataset, split, frames=frames)  # type: ignore[arg-type]
-        layout = Layout("key", config.data.cache_dtype, model.num_tokens, model.latent_dim)
-        files = LatentFiles(tmp_path / folder, layout)
+        files = LatentFiles(tmp_path / folder, "key")
         encode_files(dataset, wanted, encoder, files, exact_pictures=True)
         return FramePairs.of(dataset, wanted, files)
 

@@ -29,7 +29,6 @@ from vjepa2_ac.storage.structured import read_json_object, record_of
 CARD, WEIGHTS, LINEAR = "decoder.json", "decoder.safetensors", "linear.safetensors"
 BUILTIN_DECODER = "decoder"  # the folder of a model of the package that holds its decoder
 
-_FORMAT = "vjepa2-ac decoder 1"
 _NEEDED = "the folder of a decoder, as `vjepa2-ac decoder` writes it"
 _FIX = "Copy the folder again, or train the decoder again"
 
@@ -134,11 +133,10 @@ def read_card(folder: Path, *, where: str = "--decoder") -> DecoderCard:
     path = folder / CARD
     try:
         values = read_json_object(path, needed=_NEEDED, fix=_FIX)
-    except (FileNotFoundError, NotADirectoryError):
-        fix = "Train one with `vjepa2-ac decoder CONFIG`; one that is unfinished goes on with the same command"
-        raise InputError(where=f"{where} {folder}", found=f"no {CARD} there", needed=_NEEDED, fix=fix) from None
     except OSError as error:
-        raise InputError(where=str(path), found=f"cannot be read ({error})", needed=_NEEDED, fix=_FIX) from None
+        fix = "Train one with `vjepa2-ac decoder CONFIG`; one that is unfinished goes on with the same command"
+        found = f"no {CARD} there ({error.strerror})"
+        raise InputError(where=f"{where} {folder}", found=found, needed=_NEEDED, fix=fix) from None
     return record_of(DecoderCard, values, where=str(path), needed=_NEEDED, fix=_FIX)
 
 

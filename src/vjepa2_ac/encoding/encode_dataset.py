@@ -26,7 +26,7 @@ from vjepa2_ac.data.clips.windows import require_stride
 from vjepa2_ac.distributed.collectives import value_of_first
 from vjepa2_ac.distributed.device import computing_device
 from vjepa2_ac.encoding.batch import encoding_of, require_same_encoder
-from vjepa2_ac.encoding.latent_cache import LatentCache, through_cache
+from vjepa2_ac.encoding.latent_cache import LatentCache, frames_in, through_cache
 from vjepa2_ac.encoding.pipeline import EncoderOnDevice, FramesToEncode, encode_files
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.checkpoints.loading import load_base
@@ -267,7 +267,7 @@ def _forecast(cache: LatentCache, left: Sequence[FramesToEncode], encoder: Encod
     """Return as text what a run would encode first, after a check that there is space for it."""
     cache.require_own()
     cache.require_space(left)
-    speed, frames = encoder.frames_per_second() * processes, sum(len(one.steps) for one in left)
+    speed, frames = encoder.frames_per_second() * processes, frames_in(left)
     return (
         f"A run would first encode {frames:,} of {cache.summary(())} as {cache.dataset.config.cache_dtype}, into"
         f" {cache.folder}. At the {speed:.3g} frames/s of one chunk just timed that takes"

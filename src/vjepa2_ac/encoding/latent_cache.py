@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -13,20 +14,12 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.clips.dataset import Dataset, through_latents
 from vjepa2_ac.data.filters.idle_ranges import find_ranges
 from vjepa2_ac.data.index.index_cache import cache_folder, fingerprints_of
-from vjepa2_ac.data.sources.latents.cache_files import (
-    CACHE,
-    EPISODES,
-    CacheDescription,
-    LatentFiles,
-    Layout,
-    bytes_per_frame,
-    read_description,
-)
+from vjepa2_ac.data.sources.latents.cache_files import CACHE, EPISODES, KEPT, LatentFiles, bytes_per_frame, read_key
 from vjepa2_ac.data.sources.latents.cache_key import CacheKey, Encoding, key_of_cache, require_own_folder
 from vjepa2_ac.data.sources.latents.source import LatentSource, another_cache
 from vjepa2_ac.encoding.pipeline import FramesToEncode
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage import free_bytes
+from vjepa2_ac.storage import free_bytes, user_can_write, write_atomically
 
 _GIGABYTE = 10**9
 
@@ -80,12 +73,10 @@ class LatentCache:
         parent = cache_folder(config.disk_cache) / "latents" if config.cache_dir is None else Path(config.cache_dir)
         return cls(dataset, encoding, key, parent / key.digest if folder is None else folder)
 
-    @cached_property
+    @property
     def files(self) -> LatentFiles:
         """Its files."""
-        encoding = self.encoding
-        layout = Layout(self.key.digest, self.dataset.config.cache_dtype, encoding.tokens, encoding.dim)
-        return LatentFiles(self.folder, layout)
+        return LatentFiles(self.folder, self.key.digest)
 
     @cached_property
     def wanted(self) -> tuple[FramesToEncode, ...]:
@@ -119,13 +110,10 @@ class LatentCache:
 
     def summary(self, left: Sequence[FramesToEncode]) -> str:
         """Return as text how large the whole is, and how much of it is left."""
-        frames, gigabytes = _frames(self.wanted), _frames(self.wanted) * self.bytes_per_frame / _GIGABYTE
-        table, rate = self.dataset.table, self.dataset.control_rate_hz
-        hours = int(table.num_steps[sorted({one.episode for one in self.wanted})].sum()) / rate / 3600
-        per_hour = f" ({gigabytes / hours:.3g} GB per hour of robot data)" if hours else ""
-        there = frames - _frames(left)
-        more = f"; {there:,} frames are there already, {_frames(left):,} are left" if there else ""
-        return f"{frames:,} frames, {gigabytes:.3g} GB{per_hour}{more}"
+        frames = frames_in(self.wanted)
+        there = f"; {frames - frames_in(left):,} are there already, {frames_in(left):,} are left"
+        size = f"{frames:,} frames, {frames * self.bytes_per_frame / _GIGABYTE:.3g} GB"
+        return size + there if len(left) < len(self.wanted) else size
 
     def require_own(self) -> None:
         """Refuse a folder of another cache, or of other things.
@@ -144,12 +132,15 @@ class LatentCache:
         self.require_own()
         if self.is_begun:
             return
-        dataset, config = self.dataset, self.dataset.config
-        idle = config.idle.rule != "none"
-        kept = find_ranges(dataset.source, dataset.table, config, None) if idle else None
-        layout, rate = self.files.layout, dataset.control_rate_hz
-        about = CacheDescription(self.key.parts, layout, config.cameras, rate, tuple(dataset.widths))
-        about.write(self.folder, dataset.table, kept)
+        dataset = self.dataset
+        texts = {"control_rate_hz": str(dataset.control_rate_hz), "widths": " ".join(map(str, dataset.widths))}
+        table = replace(dataset.table, texts={**dataset.table.texts, **texts}, locators={})
+        with user_can_write(self.folder):
+            write_atomically(self.folder / CACHE, json.dumps({"key": dict(self.key.parts)}, indent=1) + "\n")
+            if dataset.config.idle.rule != "none":
+                kept = find_ranges(dataset.source, dataset.table, dataset.config, None)
+                write_atomically(self.folder / KEPT, kept.to_bytes())
+            write_atomically(self.folder / EPISODES, table.to_bytes())
 
     def require_space(self, left: Sequence[FramesToEncode]) -> None:
         """Refuse to start if the disk has too little space for what is left.
@@ -157,13 +148,16 @@ class LatentCache:
         Raises:
             InputError: Says how much is free, how much is needed, and what to do.
         """
-        config = self.dataset.config
-        smaller = [] if config.cache_dtype == "int8" else ["data.cache_dtype: int8"]
-        if config.start_every % config.model_stride:
-            smaller.append(f"data.start_every: {config.model_stride}")
-        fix = f"Set {', '.join(smaller)}; " if smaller else ""
-        fix += "take fewer episodes (data.outcome, data.idle, data.exclude); or name a folder on a larger disk"
-        require_space(self.folder, _frames(left), self.bytes_per_frame, fix=f"{fix} (data.cache_dir)")
+        fix = (
+            f"Set data.cache_dtype: int8, or data.start_every: {self.dataset.config.model_stride}; take fewer episodes"
+            " (data.outcome, data.idle, data.exclude); or name a folder on a larger disk (data.cache_dir)"
+        )
+        require_space(self.folder, frames_in(left), self.bytes_per_frame, fix=fix)
+
+
+def frames_in(wanted: Sequence[FramesToEncode]) -> int:
+    """Return how many frames these are."""
+    return sum(len(one.steps) for one in wanted)
 
 
 def picture_bytes(image_size: int) -> int:
@@ -206,7 +200,7 @@ def require_encoding(dataset: Dataset, encoding: Encoding) -> None:
         InputError: Names what differs.
     """
     if isinstance(dataset.source, LatentSource):
-        differing = dataset.source.about.cache_key.differences_of(encoding)
+        differing = dataset.source.key.differences_of(encoding)
         if differing:
             raise another_cache(Path(dataset.config.path), differing)
 
@@ -215,7 +209,7 @@ def _no_cache(config: DataConfig, cache: LatentCache) -> InputError:
     parent, others = cache.folder.parent, []
     for other in sorted(parent.iterdir()) if parent.is_dir() else ():
         if (other / CACHE).is_file():
-            differing = read_description(other).cache_key.differences(cache.key.parts)
+            differing = read_key(other).differences(cache.key.parts)
             others.append((len(differing), f"{other.name} was made otherwise: {'; '.join(differing)}"))
     nearest = f". Other caches there: {len(others)}; {min(others)[1]}" if others else ""
     return InputError(
@@ -223,7 +217,3 @@ def _no_cache(config: DataConfig, cache: LatentCache) -> InputError:
         found=f"no latent cache of this model and these settings{nearest}",
         fix="Run `vjepa2-ac encode` with this config, or set data.cache: auto",
     )
-
-
-def _frames(wanted: Sequence[FramesToEncode]) -> int:
-    return sum(len(one.steps) for one in wanted)

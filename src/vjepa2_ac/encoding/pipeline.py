@@ -75,15 +75,8 @@ class EncoderOnDevice:
         return self.chunk / (time.perf_counter() - started)
 
 
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """Some neighbouring frames of a request, cropped."""
-
-    recording: Episode
-    frames: UInt8[Tensor, "frames height width 3"]
-
-
-_Parts = Iterator[tuple[FramesToEncode, Future[_Part]]]
+_Frames = UInt8[Tensor, "frames height width 3"]  # cropped
+_Parts = Iterator[tuple[FramesToEncode, Future[tuple[Episode, _Frames]]]]  # neighbouring frames of a request
 
 
 def encode_files(
@@ -116,10 +109,11 @@ def encode_files(
     done, total = 0, sum(len(one.steps) for one in wanted)
     progress(done, total)
     with ThreadPoolExecutor(threads, "decode") as decoders, ThreadPoolExecutor(1, "write") as writer:
+        parts_ahead = _ahead(_started(decoders, dataset, wanted, encoder), threads * _PREFETCHED_PARTS)
         try:
-            for one, parts in groupby(_read_ahead(decoders, threads, dataset, wanted, encoder), itemgetter(0)):
+            for one, parts in groupby(parts_ahead, itemgetter(0)):
                 try:
-                    encoded = _encode(encoder, one, parts, files.layout.kind)
+                    encoded = _encode(encoder, one, parts, dataset.config.cache_dtype)
                 except InputError as error:
                     dataset.leave_out(one.episode, error)
                     files.note_broken(one.episode, one.camera, str(error))
@@ -135,16 +129,9 @@ def encode_files(
             decoders.shutdown(cancel_futures=True)
 
 
-def _read_ahead(
-    pool: ThreadPoolExecutor,
-    threads: int,
-    dataset: Dataset,
-    wanted: Sequence[FramesToEncode],
-    encoder: EncoderOnDevice,
-) -> _Parts:
+def _ahead(started: _Parts, count: int) -> _Parts:
     """Yield parts in the requested order, while threads read the next ones."""
-    started = _started(pool, dataset, wanted, encoder)
-    waiting = deque(islice(started, threads * _PREFETCHED_PARTS))
+    waiting = deque(islice(started, count))
     while waiting:
         part = waiting.popleft()
         waiting.extend(islice(started, 1))
@@ -169,10 +156,10 @@ def _open(dataset: Dataset, one: FramesToEncode) -> Episode:
     return recording
 
 
-def _read(dataset: Dataset, opened: Future[Episode], steps: Sequence[int], *, pinned: bool) -> _Part:
+def _read(dataset: Dataset, opened: Future[Episode], steps: Sequence[int], *, pinned: bool) -> tuple[Episode, _Frames]:
     recording = opened.result()
     frames = torch.from_numpy(view(recording.read_frames(steps), dataset.config.crop))
-    return _Part(recording, frames.pin_memory() if pinned else frames)
+    return recording, frames.pin_memory() if pinned else frames
 
 
 def _encode(
@@ -180,13 +167,12 @@ def _encode(
 ) -> Callable[[], EncodedEpisode]:
     """Encode an episode, and return a function that waits for the results."""
     latents, pictures = list[StoredLatents](), list[Tensor]()
-    for _, future in parts:
-        part = future.result()
-        pixels = part.frames.to(encoder.device, non_blocking=True)
+    for _, part in parts:
+        recording, frames = part.result()
+        pixels = frames.to(encoder.device, non_blocking=True)
         inputs = pixels_to_input(pixels[None], encoder.world_model.image_size)[0]
         latents.append(pack_latents(encoder.latents(inputs), kind).mapped(_to_host))
         pictures.append(_to_host(input_to_pixels(inputs)))
-        recording = part.recording
 
     def fetched() -> EncodedEpisode:
         if encoder.device.type == "cuda":

@@ -234,8 +234,6 @@ def through_latents(dataset: Dataset, folder: Path) -> Dataset:
 def _of_latents(dataset: Dataset, source: LatentSource) -> Dataset:
     """Check that a cache has what the clips need, and set its cameras in the config."""
     source.require_encoded(dataset.starts.episode)
-    excluded = frozenset(dataset.config.exclude)
-    dataset.broken.found([problem for problem in source.wrong_files() if problem.name not in excluded])
     return replace(dataset, config=source.settled_config)
 
 

@@ -1,6 +1,6 @@
 """The files of a latent cache, and the precision of its latents.
 
-cache.json     what the cache is: its key in full, the shape of its latents, cameras, control rate
+cache.json     what the cache is: its key in full
 episodes.npz   every episode of the data set that it was made from, in its order, as `EpisodeTable.to_bytes` writes them
 kept.npz       the steps that `data.idle` leaves, as `FoundRanges.to_bytes` writes them; absent without an idle rule
 episodes/000/000123-CAMERA.safetensors   the latents of an episode, by its index, and a camera
@@ -23,18 +23,17 @@ The header's metadata (texts): id, camera, metadata (JSON), key (the digest of t
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 from urllib.parse import quote
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
-from pydantic import Field
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
@@ -42,21 +41,21 @@ from torch import Tensor
 from vjepa2_ac import storage
 from vjepa2_ac.data.filters.idle_ranges import FoundRanges
 from vjepa2_ac.data.index.episode_table import EpisodeTable, NotATableError
-from vjepa2_ac.data.sources.latents.cache_key import CacheKey
+from vjepa2_ac.data.sources.latents.cache_key import FORMAT, CacheKey
 from vjepa2_ac.episode import Episode, StoredLatents
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.jpeg import decode_jpegs, encode_jpeg
-from vjepa2_ac.storage.structured import json_object, read_json_object, record_of
+from vjepa2_ac.storage.structured import json_object, read_json_object
 
 CacheType = Literal["bf16", "fp32", "int8"]
 
 DTYPES: dict[CacheType, torch.dtype] = {"bf16": torch.bfloat16, "fp32": torch.float32, "int8": torch.int8}
 CACHE, EPISODES, KEPT = "cache.json", "episodes.npz", "kept.npz"
+OPTIONAL = ("commands", "extrinsics", "joint_velocities")
 
 _LARGEST = 127  # of int8
 _JPEG_QUALITY = 85
 _MOST_BYTES = 1 << 30  # of a table
-_BY_STEP = ("states", "commands", "extrinsics", "joint_velocities")
 _FIX = "Delete this file, and then run `vjepa2-ac encode` again, as the cache was made; or copy the file again"
 _ENCODE = "Run `vjepa2-ac encode`, which goes on where it was stopped; or copy the cache again"
 
@@ -87,60 +86,23 @@ def bytes_per_frame(tokens: int, dim: int, kind: CacheType) -> int:
     return tokens * dim * DTYPES[kind].itemsize + (tokens * 4 if kind == "int8" else 0)
 
 
-@dataclass(frozen=True)
-class Layout:
-    """What all files of a cache share."""
-
-    key: str  # digest of the cache's key
-    kind: CacheType
-    tokens: Annotated[int, Field(ge=1, le=65_536)]
-    dim: Annotated[int, Field(ge=1, le=16_384)]
-
-
-@dataclass(frozen=True)
-class CacheDescription:
-    """What cache.json says."""
-
-    key: Mapping[str, Any]  # the parts of its `CacheKey`
-    layout: Layout
-    cameras: Annotated[tuple[str, ...], Field(min_length=1)]
-    control_rate_hz: Annotated[float, Field(gt=0.0, le=1000.0)]
-    widths: tuple[int, int]  # of states and actions
-    format: Literal["vjepa2-ac latent cache 2"] = "vjepa2-ac latent cache 2"
-
-    @property
-    def cache_key(self) -> CacheKey:
-        """Everything that determined the content of the cache."""
-        return CacheKey(self.key)
-
-    def write(self, folder: Path, table: EpisodeTable, kept: FoundRanges | None) -> None:
-        """Begin a cache in a folder: say what it is, and which episodes and steps it is of.
-
-        Raises:
-            InputError: The folder cannot be written.
-        """
-        with storage.user_can_write(folder):
-            storage.write_atomically(folder / CACHE, json.dumps(asdict(self), indent=1) + "\n")
-            if kept is not None:
-                storage.write_atomically(folder / KEPT, kept.to_bytes())
-            storage.write_atomically(folder / EPISODES, table.to_bytes())
-
-
-def read_description(folder: Path) -> CacheDescription:
-    """Read cache.json.
+def read_key(folder: Path) -> CacheKey:
+    """Return the key of a cache: what it is.
 
     Raises:
-        InputError: It is missing, or invalid.
+        InputError: The folder has none, or one of another format.
     """
-    where = str(folder / CACHE)
+    where, needed = str(folder / CACHE), f"a folder with the {CACHE} of a latent cache, format {FORMAT}"
     try:
-        content = read_json_object(folder / CACHE, most_bytes=_MOST_BYTES, allow_nan=True, fix=_ENCODE)
+        key = read_json_object(folder / CACHE, fix=_ENCODE).get("key")
     except (FileNotFoundError, NotADirectoryError):
         found = "no latent cache" if folder.is_dir() else f"no such folder, seen from {Path.cwd()}"
-        raise InputError(where=str(folder), found=found, needed=f"a folder with {CACHE}", fix=_ENCODE) from None
+        raise InputError(where=str(folder), found=found, needed=needed, fix=_ENCODE) from None
     except OSError as error:
         raise InputError(where=where, found=f"cannot be read ({error})", fix=_ENCODE) from None
-    return record_of(CacheDescription, content, where=where, needed="what a latent cache says of itself", fix=_ENCODE)
+    if not isinstance(key, dict) or key.get("format") != FORMAT or not isinstance(key.get("data.camera"), list):
+        raise InputError(where=where, found="another file, or another format", needed=needed, fix=_ENCODE)
+    return CacheKey(key)
 
 
 def read_tables(folder: Path) -> tuple[EpisodeTable, FoundRanges | None]:
@@ -174,7 +136,7 @@ class LatentFiles:
     """The files of the episodes in a cache's folder. Several processes may write into it."""
 
     folder: Path
-    layout: Layout
+    key: str  # digest of the cache's key
 
     def path(self, number: int, camera: str) -> Path:
         """Return the file of an episode, by its index in the data set, and a camera."""
@@ -184,8 +146,8 @@ class LatentFiles:
     def has(self, number: int, camera: str) -> bool:
         """Return whether a file is there, whole, and of this cache."""
         try:
-            with safe_open(str(self.path(number, camera)), framework="pt") as file:  # type: ignore[no-untyped-call]
-                return bool((file.metadata() or {}).get("key") == self.layout.key)
+            with safe_open(str(self.path(number, camera)), framework="pt") as file:
+                return bool((file.metadata() or {}).get("key") == self.key)
         except (SafetensorError, OSError):
             return False
 
@@ -209,7 +171,7 @@ class LatentFiles:
         if not path.is_file() and note.is_file():
             found = f"no latents: it could not be read when they were encoded ({_text_of(note).rstrip('.')})"
             raise InputError(where=str(path), found=found)
-        return EpisodeFile(path, self.layout)
+        return EpisodeFile(path, self.key)
 
     def write(self, number: int, encoded: EncodedEpisode, *, exact_pictures: bool = False) -> None:
         """Write the file of an episode and camera.
@@ -220,7 +182,8 @@ class LatentFiles:
         episode, latents, path = encoded.episode, encoded.latents, self.path(number, encoded.camera)
         arrays = {
             "frame_steps": np.array(encoded.steps, np.int32),
-            **{name: getattr(episode, name) for name in _BY_STEP},
+            "states": episode.states,
+            **{name: getattr(episode, name) for name in OPTIONAL},
         }
         if exact_pictures:
             arrays["pictures"] = encoded.pictures
@@ -233,7 +196,7 @@ class LatentFiles:
         if latents.scales is not None:
             tensors["scales"] = latents.scales.contiguous()
         metadata = json.dumps(dict(episode.metadata), sort_keys=True)
-        about = {"id": episode.info.id, "camera": encoded.camera, "metadata": metadata, "key": self.layout.key}
+        about = {"id": episode.info.id, "camera": encoded.camera, "metadata": metadata, "key": self.key}
         with storage.user_can_write(path):
             storage.write_atomically(path, save(tensors, metadata=about))
             self._note(number, encoded.camera).unlink(missing_ok=True)
@@ -263,36 +226,36 @@ class EpisodeFile:
 
     Args:
         path: The file.
-        layout: The layout of the cache.
+        key: Digest of the key of its cache.
 
     Raises:
         InputError: The file is missing, damaged, or belongs to another cache.
     """
 
-    def __init__(self, path: Path, layout: Layout) -> None:
-        self.path, self._layout = str(path), layout
+    def __init__(self, path: Path, key: str) -> None:
+        self.path = str(path)
         with self._reading():
             self._file: Any = safe_open(self.path, framework="pt").__enter__()  # type: ignore[no-untyped-call] # mapped until nobody has it any more
             about = self._file.metadata() or {}
-            self._names = frozenset(self._file.keys())
+            self.names = frozenset(self._file.keys())
             self.id, self.camera = about["id"], about["camera"]
             self.metadata = {name: str(text) for name, text in json_object(about["metadata"], where=self.path).items()}
-        if about.get("key") != layout.key:
+        if about.get("key") != key:
             raise self._damaged("a file of another cache", "a file that was made with this one's cache.json")
 
     @cached_property
     def frame_steps(self) -> Int[np.ndarray, " frames"]:
         """The control steps that have a frame, ascending."""
-        return np.asarray(self._array("frame_steps"))
+        return self.array("frame_steps")
 
-    @property
-    def states(self) -> Float[np.ndarray, "steps state_dim"]:
-        """The states of all control steps."""
-        return np.asarray(self._array("states"))
+    def array(self, name: str) -> np.ndarray:
+        """Return a whole tensor, such as states.
 
-    def by_step(self, name: str) -> Float[np.ndarray, "steps numbers"] | None:
-        """Return commands, extrinsics or joint_velocities; None if there are none."""
-        return self._array(name) if name in self._names else None
+        Raises:
+            InputError: There is none of this name.
+        """
+        with self._reading():
+            return np.array(self._file.get_tensor(name).numpy())
 
     def places_of(self, steps: Sequence[int]) -> list[int]:
         """Return the indices of the frames at these control steps.
@@ -315,15 +278,10 @@ class EpisodeFile:
         """Return the latents of frames by their index.
 
         Raises:
-            InputError: They are of another type or shape than those of the cache.
+            InputError: There are no such latents.
         """
-        layout = self._layout
-        scales = self._rows("scales", places) if layout.kind == "int8" else None
-        values = self._rows("latents", places)
-        if values.dtype != DTYPES[layout.kind] or values.shape[1:] != (layout.tokens, layout.dim):
-            found = f"latents of {values.dtype} and shape {list(values.shape)}"
-            raise self._damaged(found, f"{layout.tokens} x {layout.dim} numbers of {layout.kind} for each frame")
-        return StoredLatents(values, scales)
+        scales = self._rows("scales", places) if "scales" in self.names else None
+        return StoredLatents(self._rows("latents", places), scales)
 
     def pictures(self, places: Sequence[int]) -> UInt8[np.ndarray, "frames size size 3"]:
         """Return frames as the encoder saw them, by their index.
@@ -338,10 +296,6 @@ class EpisodeFile:
             ends = [0, *self._file.get_tensor("picture_ends").tolist()]
             jpegs = [bytes(data[ends[place] : ends[place + 1]].numpy()) for place in places]
         return decode_jpegs(jpegs, self.frame_steps[list(places)].tolist(), self.path)
-
-    def _array(self, name: str) -> np.ndarray:
-        with self._reading():
-            return np.array(self._file.get_tensor(name).numpy())
 
     def _rows(self, name: str, places: Sequence[int]) -> Tensor:
         with self._reading():

@@ -14,6 +14,7 @@ from vjepa2_ac.config.effects import Affects, knobs_that_affect
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage.structured import read_json_object
 
+FORMAT = 2  # of the files of a cache
 NORMALISATION = 1  # of pixels, in `transforms.pixels_to_input`, and of features: increase it when one of them changes
 
 _OF_THE_FRAMES = {"source", "camera", "pose_frame", "cache_dtype"}  # the other knobs are of clips
@@ -62,6 +63,11 @@ class CacheKey:
         """A short hash of it: the name of a cache's folder, also in each of its files."""
         return hashlib.sha256(json.dumps(dict(self.parts), sort_keys=True).encode()).hexdigest()[:32]
 
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The cameras of a cache."""
+        return tuple(self.parts["data.camera"])
+
     def differences(self, wanted: Mapping[str, Any], names: Collection[str] | None = None) -> list[str]:
         """Return the differences from the wanted parts, as "data.stride: 8, not 4"; of these names, or of all."""
         wanted = json.loads(json.dumps(dict(wanted)))  # as a file has them
@@ -83,7 +89,7 @@ def key_of_cache(config: DataConfig, fingerprint: str, encoding: Encoding) -> Ca
         encoding: How frames become latents.
     """
     return CacheKey({
-        "format": 2,
+        "format": FORMAT,
         **encoding.parts,
         **clip_parts(config),
         "data.cache_dtype": config.cache_dtype,

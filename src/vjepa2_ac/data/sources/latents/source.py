@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +11,9 @@ from jaxtyping import Int
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.filters.idle_ranges import FoundRanges
-from vjepa2_ac.data.index.episode_table import EpisodeProblem
 from vjepa2_ac.data.sources.indexed_source import IndexedSource, Opened
-from vjepa2_ac.data.sources.latents.cache_files import CacheDescription, LatentFiles, read_description, read_tables
-from vjepa2_ac.data.sources.latents.cache_key import clip_parts
+from vjepa2_ac.data.sources.latents.cache_files import OPTIONAL, LatentFiles, read_key, read_tables
+from vjepa2_ac.data.sources.latents.cache_key import CacheKey, clip_parts
 from vjepa2_ac.episode import Episode, Progress, StepRanges
 from vjepa2_ac.errors import InputError
 
@@ -23,7 +22,7 @@ _ENCODE = "Run `vjepa2-ac encode` again, as the cache was made: it encodes what 
 
 @dataclass(frozen=True)
 class _Opened(Opened):
-    about: CacheDescription
+    key: CacheKey
     files: LatentFiles
     kept: FoundRanges | None
 
@@ -36,14 +35,14 @@ class LatentSource(IndexedSource[DataConfig, _Opened]):
     """
 
     @property
-    def about(self) -> CacheDescription:
+    def key(self) -> CacheKey:
         """What the cache is."""
-        return self._open().about
+        return self._open().key
 
     @property
     def cameras(self) -> tuple[str, ...]:
         """The cameras that clips are drawn from: the config's, or all of the cache."""
-        return self.about.cameras if self._config.camera is None else self._config.cameras
+        return self.key.cameras if self._config.camera is None else self._config.cameras
 
     @property
     def settled_config(self) -> DataConfig:
@@ -70,10 +69,10 @@ class LatentSource(IndexedSource[DataConfig, _Opened]):
         """
         opened, camera = self._open(), camera or self.cameras[0]
         info = opened.table[index]
-        if camera not in opened.about.cameras:
-            raise ValueError(f"camera {camera!r} is not one of {', '.join(opened.about.cameras)}")
+        if camera not in opened.key.cameras:
+            raise ValueError(f"camera {camera!r} is not one of {', '.join(opened.key.cameras)}")
         record = opened.files.open(index, camera)
-        states = record.states
+        states = record.array("states")
         if (record.id, record.camera, len(states)) != (info.id, camera, info.num_steps):
             found = f"episode {record.id} of {len(states)} steps, camera {record.camera}"
             needed_text = f"{info.id} of {info.num_steps} steps, camera {camera}"
@@ -82,62 +81,43 @@ class LatentSource(IndexedSource[DataConfig, _Opened]):
             info=info,
             states=states,
             read_frames=lambda steps: record.pictures(record.places_of(steps)),
-            control_rate_hz=opened.about.control_rate_hz,
-            extrinsics=record.by_step("extrinsics"),
-            joint_velocities=record.by_step("joint_velocities"),
+            control_rate_hz=float(opened.table.texts["control_rate_hz"]),
             metadata=record.metadata,
-            commands=record.by_step("commands"),
             read_latents=lambda steps: record.latents(record.places_of(steps)),
             frame_steps=record.frame_steps,
+            **{name: record.array(name) for name in OPTIONAL if name in record.names},
         )
 
     def require_encoded(self, episodes: Int[np.ndarray, " episodes"]) -> None:
-        """Refuse a cache without the latents of these episodes: it is unfinished, or was made of others.
+        """Refuse a cache without whole files of these episodes: it is unfinished, damaged, or was made of others.
 
         Raises:
             InputError: Some are missing.
         """
         opened, wanted = self._open(), np.unique(episodes).tolist()
-        lacking = [one for one in wanted if any(self._is_absent(one, camera) for camera in self.cameras)]
+        lacking = [one for one in wanted if not all(opened.files.is_done(one, camera) for camera in self.cameras)]
         if lacking:
-            several = f"{len(lacking)} of {len(wanted)} episodes, such as {opened.table.identity(lacking[0])}"
+            first = opened.table.identity(lacking[0])
             raise InputError(
                 where=self._config.path,
-                found=f"no latents of {several}",
+                found=f"no whole latents of {len(lacking)} of {len(wanted)} episodes, such as {first}",
                 needed="those of every episode that takes part",
-                fix="Run `vjepa2-ac encode` again, which goes on where it was stopped; or set data.outcome and"
-                " data.exclude as they were when it was made",
+                fix="Run `vjepa2-ac encode` again, as the cache was made: it encodes what is missing; or leave these"
+                " episodes out (data.outcome, data.exclude)",
             )
-
-    def wrong_files(self) -> list[EpisodeProblem]:
-        """Return the episodes with a file that is truncated, or of another cache."""
-        opened, problems = self._open(), []
-        for number in range(len(opened.table)):
-            for camera in self.cameras:
-                path = opened.files.path(number, camera)
-                if path.is_file() and not opened.files.has(number, camera):
-                    name, found = opened.table.identity(number), "a file that is damaged, or of another cache"
-                    problems.append(EpisodeProblem(name, f"{path} ({name})", found, "", _ENCODE))
-        return problems
-
-    def _is_absent(self, number: int, camera: str) -> bool:
-        files = self._open().files
-        return not files.path(number, camera).is_file() and not files.is_done(number, camera)
 
     def _look(self, progress: Progress) -> _Opened:  # noqa: ARG002 - at once
         folder = Path(self._config.path)
-        about = read_description(folder)
+        key = read_key(folder)
         parts = clip_parts(self._config)
-        differing = about.cache_key.differences(parts, parts)
+        differing = key.differences(parts, parts)
         for camera in () if self._config.camera is None else self._config.cameras:
-            if camera not in about.cameras:
-                differing.append(f"data.camera: {', '.join(about.cameras)}, not {camera}")
+            if camera not in key.cameras:
+                differing.append(f"data.camera: {', '.join(key.cameras)}, not {camera}")
         if differing:  # of other clips than the config's
             raise another_cache(folder, differing)
         table, kept = read_tables(folder)
-        texts = {"control_rate_hz": str(about.control_rate_hz), "widths": " ".join(map(str, about.widths))}
-        table = replace(table, texts={**table.texts, **texts}, locators={})
-        return _Opened(table, about, LatentFiles(folder, about.layout), kept)
+        return _Opened(table, key, LatentFiles(folder, key.digest), kept)
 
 
 def another_cache(folder: Path, differing: Sequence[str]) -> InputError:
