@@ -66,7 +66,7 @@ class CacheKey:
     @property
     def cameras(self) -> tuple[str, ...]:
         """The cameras of a cache."""
-        return tuple(self.parts["data.camera"])
+        return tuple(map(str, self.parts["data.camera"]))
 
     def differences(self, wanted: Mapping[str, Any], names: Collection[str] | None = None) -> list[str]:
         """Return the differences from the wanted parts, as "data.stride: 8, not 4"; of these names, or of all."""
