@@ -50,14 +50,6 @@ def test_it_finds_a_linear_truth_up_to_rounding_and_ridge() -> None:
     assert not any(one.requires_grad for one in found.parameters())
 
 
-def test_it_is_the_same_each_time_and_reports_its_progress() -> None:
-    reported: list[tuple[int, int]] = []
-    one = fit(Linear())
-    other = fit_linear(Linear(), SHAPE, torch.device("cpu"), lambda *of: reported.append(of))  # type: ignore[arg-type]
-    assert all(torch.equal(first, second) for first, second in zip(one.parameters(), other.parameters(), strict=True))
-    assert reported == [(64, 150), (128, 150), (150, 150)]
-
-
 def test_what_latents_do_not_say_is_the_mean() -> None:
     pairs = Linear()
     pairs.latents = torch.randn(pairs.latents.shape, generator=torch.Generator().manual_seed(5))  # of other frames

@@ -30,7 +30,6 @@ from vjepa2_ac.encoding.latent_cache import LatentCache, needed_frames
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.checkpoints.loading import load_base
-from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.storage import writing
 from vjepa2_ac.training.loop import train
 
@@ -106,14 +105,6 @@ def test_what_is_encoded_is_what_a_run_would_encode_bit_for_bit(
         with safe_open(tmp_path / f"out/episodes/000/{number:06d}-{CAMERA}.safetensors", framework="pt") as file:
             places = [file.get_tensor("frame_steps").tolist().index(step) for step in range(start, start + 8, 2)]
             assert torch.equal(file.get_tensor("latents")[places], live[clip])
-
-
-def test_of_several_cameras_each_is_encoded(make_config: MakeConfig, tmp_path: Path, encoded_frames: list[int]) -> None:
-    config = make_config(data__camera=["wrist_left", CAMERA], data__start_every=2)
-    encode(config, tmp_path / "out")
-    assert sum(encoded_frames) == 2 * 8 * 12
-    names = [path.name for path in latents_in(tmp_path / "out")]
-    assert sorted(names) == sorted(f"{n:06d}-{camera}.safetensors" for n in range(8) for camera in config.data.cameras)
 
 
 # ---- whatever happens --------------------------------------------------------------------------------------------
@@ -377,14 +368,6 @@ def test_a_run_on_latents_has_no_encoder_on_its_device_and_does_not_count_its_wo
     assert set_up(make_config(), reporter).encodes
 
 
-def test_a_required_cache_that_is_not_there_is_refused_with_the_command_that_makes_it(
-    make_config: MakeConfig, cache: Path, reporter: SilentReporter, encoded_frames: list[int]
-) -> None:
-    with pytest.raises(InputError, match="Run `vjepa2-ac encode`"):
-        train(make_config(data__cache="require", data__cache_dir=str(cache)), reporter)
-    assert not encoded_frames
-
-
 def test_check_says_what_would_be_encoded_and_tries_the_rest_on_frames(
     make_config: MakeConfig, cache: Path, reporter: SilentReporter, encoded_frames: list[int]
 ) -> None:
@@ -396,23 +379,6 @@ def test_check_says_what_would_be_encoded_and_tries_the_rest_on_frames(
     assert "frames/s" in reported
     assert "Everything is in place" in reporter.notes[-1]
     assert 16 < sum(encoded_frames) < needed(config)  # a timed chunk, and the clips that were tried
-
-
-def test_latents_of_another_encoder_are_never_used(
-    make_config: MakeConfig, tmp_path: Path, base_folder: Path, cache: Path, reporter: SilentReporter
-) -> None:
-    from vjepa2_ac.model.sizes import read_sizes
-
-    encode_config(make_config(data__cache_dir=str(cache)), reporter)
-    other = tmp_path / "other"
-    WorldModel.random(read_sizes(base_folder), seed=9).save_pretrained(other)
-    knobs = {"data__cache_dir": str(cache), "model__base": str(other)}
-    with pytest.raises(InputError, match=r"was made otherwise: encoder: "):
-        train(make_config(data__cache="require", **knobs), reporter)
-    (folder,) = cache.iterdir()
-    set_up(make_config(data__source="latents", data__path=str(folder)), reporter)
-    with pytest.raises(InputError, match="encoder"):
-        set_up(make_config(data__source="latents", data__path=str(folder), model__base=str(other)), reporter)
 
 
 def test_two_processes_of_a_run_share_the_encoding_before_the_first_step(

@@ -291,19 +291,6 @@ def test_a_cache_has_the_clips_of_its_data_set_in_their_order(
     assert by_itself.control_rate_hz == original.control_rate_hz
 
 
-def test_one_phase_needs_a_frame_in_every_stride(droid_with_rests: Path, tmp_path: Path) -> None:
-    for knobs in ({}, {"idle": IDLE | {"keep_share": 0.4}}):
-        frames, phases = [], []
-        for every in (1, 2):
-            dataset = open_dataset(config_of(droid_with_rests, tmp_path, start_every=every, **knobs))
-            needed = list(needed_frames(dataset))
-            frames.append(sum(len(one.steps) for one in needed))
-            phases.append({tuple(np.unique(one.steps % 2)) for one in needed})
-        assert frames[1] < 0.6 * frames[0]
-        assert phases[0] == {(0, 1)}
-        assert phases[1] <= {(0,), (1,)}
-
-
 def test_clips_start_at_multiples_of_start_every_from_the_first_kept_step() -> None:
     table = EpisodeTable.of([EpisodeInfo("a", 40), EpisodeInfo("b", 20)])
     kept = StepSelection(

@@ -47,7 +47,7 @@ class DecoderCard:
     episodes: int  # learned from
     frames: int
     steps: int
-    held_out: Mapping[str, Any] = field(default_factory=dict)  # by `decoding.held_out`
+    held_out: Mapping[str, Any] = field(default_factory=dict)  # by `baselines.measure_decoders`
     version: str = __version__
     time: str = ""  # UTC
 

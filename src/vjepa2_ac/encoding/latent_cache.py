@@ -73,7 +73,7 @@ class LatentCache:
         parent = cache_folder(config.disk_cache) / "latents" if config.cache_dir is None else Path(config.cache_dir)
         return cls(dataset, encoding, key, parent / key.digest if folder is None else folder)
 
-    @property
+    @cached_property
     def files(self) -> LatentFiles:
         """Its files."""
         return LatentFiles(self.folder, self.key.digest)

@@ -167,8 +167,7 @@ class LatentFiles:
         Raises:
             InputError: It is missing, damaged, or belongs to another cache; or the episode could not be read.
         """
-        path = self.path(number, camera)
-        note = self._note(number, camera)
+        path, note = self.path(number, camera), self._note(number, camera)
         if not path.is_file() and note.is_file():
             found = f"no latents: it could not be read when they were encoded ({_text_of(note).rstrip('.')})"
             raise InputError(where=str(path), found=found)
@@ -212,7 +211,8 @@ class LatentFiles:
     def broken(self) -> dict[int, str]:
         """The episodes that could not be read, by their index, and why."""
         notes = sorted(self.folder.glob("episodes/*/*.broken"))
-        return {int(note.name.partition("-")[0]): _text_of(note) for note in notes}
+        broken = [note for note in notes if not note.with_suffix(".safetensors").is_file()]  # else mended, and killed
+        return {int(note.name.partition("-")[0]): _text_of(note) for note in broken}
 
     def _note(self, number: int, camera: str) -> Path:
         return self.path(number, camera).with_suffix(".broken")
