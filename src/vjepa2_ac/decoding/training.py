@@ -160,7 +160,7 @@ def _setup(config: Config, reporter: Reporter, *, check_only: bool) -> Iterator[
         "latents": dict(key_for(dataset, encoding).parts),
         "data": config.data.model_dump(mode="json", include={"validation_share", "test_share", "split_by"}),
     })  # fmt: skip
-    require_own_folder(folder / KEY, key, content="a decoder")
+    require_own_folder(folder / KEY, key, where=f"decoder.folder {folder}")
     pairs, on_device = LatentFiles(folder / PAIRS, key.digest), EncoderOnDevice.of(config, model, device)
     ready = Setup(config, folder, shape, encoding, dataset, on_device, wanted, pairs)
     with RunLock(folder) as lock:

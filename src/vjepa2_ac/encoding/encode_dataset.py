@@ -193,7 +193,7 @@ def _encode_together(
     except BaseException as error:
         if attempt is not None:
             with contextlib.suppress(OSError):
-                write_atomically(attempt, f"process {share.rank}: {error or type(error).__name__}")
+                write_atomically(attempt, f"process {share.rank}: {str(error) or type(error).__name__}")
         raise
     if attempt is not None:
         _wait_for_others(cache, left, attempt)

@@ -121,7 +121,7 @@ class LatentCache:
         Raises:
             InputError: Says how the other cache differs.
         """
-        require_own_folder(self.folder / CACHE, self.key, content="a latent cache")
+        require_own_folder(self.folder / CACHE, self.key, where=f"latent cache {self.folder}")
 
     def begin(self) -> None:
         """Write what the cache is, if the folder does not say so yet.

@@ -109,13 +109,13 @@ def clip_parts(config: DataConfig) -> dict[str, Any]:
     return {f"data.{name}": knobs[name] for name in sorted(knobs.keys() - _OF_THE_FRAMES - config.own_section.keys())}
 
 
-def require_own_folder(path: Path, key: CacheKey, *, content: str) -> None:
+def require_own_folder(path: Path, key: CacheKey, *, where: str) -> None:
     """Refuse a folder that was begun with another key, or that holds other files; one that is not there passes.
 
     Args:
         path: Its JSON file with the key.
-        key: What is about to be written there.
-        content: What that is, for the message.
+        key: Of what is about to be written there.
+        where: The folder, for messages.
 
     Raises:
         InputError: Names what differs.
@@ -127,15 +127,11 @@ def require_own_folder(path: Path, key: CacheKey, *, content: str) -> None:
         others = sorted(one.name for one in folder.iterdir() if one.name[0] != ".") if folder.is_dir() else []
         if others:
             found = f"a folder with other things in it, such as {others[0]}"
-            raise InputError(where=str(folder), found=found, needed="a new or empty one", fix=fix) from None
+            raise InputError(where=where, found=found, needed="a new or empty one", fix=fix) from None
         return
     if differing := CacheKey(there.get("key") or {}).differences(key.parts):
-        raise InputError(
-            where=str(folder),
-            found=f"{content} that was made otherwise: {'; '.join(differing)}",
-            needed="a new or empty folder, or one that was made with these settings",
-            fix=fix,
-        )
+        found, needed = f"made otherwise: {'; '.join(differing)}", "a new folder, or one made with these settings"
+        raise InputError(where=where, found=found, needed=needed, fix=fix)
 
 
 def _differences(name: str, here: Any, there: Any) -> list[str]:
