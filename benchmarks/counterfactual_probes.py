@@ -19,8 +19,8 @@ from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import batches_of, validation_windows
 from vjepa2_ac.data.transforms import Crop, crop_box, frames_as_seen, input_to_pixels, pixels_to_input, view
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
-from vjepa2_ac.decoding.frame_pairs import as_images
 from vjepa2_ac.decoding.imagine import Start, imagined_latents
+from vjepa2_ac.decoding.network import as_images
 from vjepa2_ac.distributed.launch import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, encode_frames
 from vjepa2_ac.errors import InputError

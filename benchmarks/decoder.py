@@ -24,7 +24,7 @@ from timing import about, add_basics, add_repeats, introduction, prepare, ratio,
 from vjepa2_ac.config import DecoderConfig
 from vjepa2_ac.decoding.frame_pairs import Pairs
 from vjepa2_ac.decoding.network import Decoder, DecoderShape
-from vjepa2_ac.decoding.optimizer_steps import DecoderSteps
+from vjepa2_ac.decoding.steps import DecoderSteps
 
 QUICK = {"image_size": 32, "latent_dim": 8, "batch": 2, "size": ["tiny"], "repeats": 1, "warm_up": 0}
 PATCH = 16

@@ -17,8 +17,8 @@ from pathlib import Path
 
 from vjepa2_ac.config import Config, EncoderSizes, ModelSizes, PredictorSizes
 from vjepa2_ac.config.loading import parse_config
-from vjepa2_ac.data.sources.latents.dtypes import bytes_per_frame
-from vjepa2_ac.encoding.disk_space import small_frame_bytes
+from vjepa2_ac.data.sources.latents.cache_files import bytes_per_frame
+from vjepa2_ac.encoding.latent_cache import picture_bytes
 from vjepa2_ac.model.checkpoints.published import PUBLISHED
 from vjepa2_ac.storage import write_atomically
 from vjepa2_ac.training.cost.flops import frame_flops
@@ -97,7 +97,7 @@ def cost_of(
     }
     any_of = {side: next(iter(by_predictor.values())) for side, by_predictor in by_size.items()}
     first = any_of[str(image_sizes[0])]
-    per_frame = bytes_per_frame(first.tokens_per_frame, encoder.width, "bf16") + small_frame_bytes(first.image_size)
+    per_frame = bytes_per_frame(first.tokens_per_frame, encoder.width, "bf16") + picture_bytes(first.image_size)
     return Cost(
         encoder=name,
         downloads=downloads,

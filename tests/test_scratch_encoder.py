@@ -116,5 +116,5 @@ def test_latents_of_another_frame_path_are_not_taken(workshop: Path, capsys: pyt
     config = write_config(workshop, "image", {**MODEL, "encoder": {**ENCODER, "frame": "image"}})
     assert main(["train", config]) == 2
     error = capsys.readouterr().err
-    assert "no whole latent cache of this model" in error
+    assert "no latent cache of this model" in error
     assert "encoder.frame: tubelet, not image" in error

@@ -21,7 +21,7 @@ from vjepa2_ac.config.training import CheckpointConfig
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.loader import validation_batches
 from vjepa2_ac.encoding.batch import encode_batch
-from vjepa2_ac.encoding.training_cache import with_latents_if_there
+from vjepa2_ac.encoding.encode_dataset import with_latents_if_there
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.evaluation.measure import prediction_errors
 from vjepa2_ac.evaluation.result import PredictionErrors, Way

@@ -27,7 +27,7 @@ from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.transforms import draw
 from vjepa2_ac.decoding.frame_pairs import Pairs
 from vjepa2_ac.decoding.network import Decoder, DecoderShape
-from vjepa2_ac.decoding.optimizer_steps import DecoderSteps
+from vjepa2_ac.decoding.steps import DecoderSteps
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.model.adapter.lora import add_adapter
 from vjepa2_ac.model.network.world_model import WorldModel

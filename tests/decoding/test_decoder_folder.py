@@ -88,11 +88,9 @@ def test_damaged_weights_are_refused_and_named(
     ("changes", "found"),
     [
         ({"format": "vjepa2-ac decoder 2"}, "format"),
-        ({"steps": "six"}, "steps"),
         ({"more": 1}, "more: unknown"),
         ({"encoder": None}, "encoder"),
         ({"shape": {"size": "huge", "dim": 24, "grid": 2, "patch_size": 16}}, "shape.size"),
-        ({"shape": {"size": "tiny", "dim": 0, "grid": 2, "patch_size": 16}}, "shape.dim"),
         ({"shape": {"size": "tiny", "dim": 10**12, "grid": 2, "patch_size": 16}}, "shape.dim"),
         ({"shape": {"size": "tiny", "dim": 24, "grid": 10**6, "patch_size": 16}}, "shape.grid"),
         ({"shape": {"size": "tiny", "dim": 24, "grid": 2, "patch_size": 14}}, "shape.patch_size"),
@@ -107,9 +105,8 @@ def test_a_card_with_wrong_values_is_refused_and_names_them(folder: Path, change
     assert "train the decoder again" in str(caught.value)
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", '{"format": NaN}', "\x00"])
-def test_a_card_that_is_no_json_is_refused(folder: Path, text: str) -> None:
-    (folder / CARD).write_text(text)
+def test_a_card_that_is_no_json_is_refused(folder: Path) -> None:
+    (folder / CARD).write_text("{")
     with pytest.raises(InputError, match=re.escape(str(folder / CARD))):
         read_card(folder)
 
@@ -131,24 +128,15 @@ def test_the_weights_of_another_size_are_refused(folder: Path) -> None:
         load_decoder(folder)
 
 
-def test_the_latents_of_another_encoder_are_refused(whole_decoder: Path, base_folder: Path) -> None:
-    decoder = load_decoder(whole_decoder)
-    decoder.require_fit(WorldModel.from_pretrained(base_folder), "released", subject="run")
+def test_a_model_of_another_encoder_crop_or_size_is_refused(whole_decoder: Path, base_folder: Path) -> None:
+    decoder, model = load_decoder(whole_decoder), WorldModel.from_pretrained(base_folder)
+    decoder.require_fit(model, "released", subject="run")
     other = WorldModel.random(ModelSizes.model_validate(TINY), seed=4)
     with pytest.raises(InputError, match=r"another encoder than that of run.*vjepa2-ac decoder CONFIG"):
         decoder.require_fit(other, "released", subject="run")
-
-
-def test_frames_that_are_cut_otherwise_are_refused(whole_decoder: Path, base_folder: Path) -> None:
-    decoder = load_decoder(whole_decoder)
     with pytest.raises(InputError, match=r"data\.crop released.*square, as of run"):
-        decoder.require_fit(WorldModel.from_pretrained(base_folder), "square", subject="run")
-
-
-def test_a_model_of_other_sizes_is_refused_even_with_these_weights(whole_decoder: Path) -> None:
-    """The weights of an encoder do not tell the size of its images."""
+        decoder.require_fit(model, "square", subject="run")
     larger = WorldModel.random(ModelSizes.model_validate(TINY | {"image_size": 64}), seed=3)
-    decoder = load_decoder(whole_decoder)
-    same = replace(decoder, card=replace(decoder.card, encoder=larger.encoder_fingerprint()))
+    same = replace(decoder, card=replace(decoder.card, encoder=larger.encoder_fingerprint()))  # the same weights
     with pytest.raises(InputError, match="4x24 latents to images of 32 px"):
         same.require_fit(larger, "released", subject="run")

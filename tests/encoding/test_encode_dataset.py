@@ -1,11 +1,13 @@
 """Encoding: done once, also after interruptions; a run on cached latents equals the run on frames."""
 
 import errno
-import re
 import shutil
+import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,21 +15,21 @@ import torch
 from safetensors import safe_open
 
 from killable import KILLED, Nursery
+from latent_sets import NUMBERS, write_cache
 from ranks import finish, free_port, start_rank
 from run_fixtures import MakeConfig, SilentReporter, as_yaml, set_up
 from same_run import assert_same_run
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.loader import validation_batches
-from vjepa2_ac.data.sources.latents.manifest import is_whole, read_manifest
-from vjepa2_ac.encoding import disk_space
+from vjepa2_ac.distributed import collectives
+from vjepa2_ac.encoding import encode_dataset, latent_cache
 from vjepa2_ac.encoding.batch import encode_batch
-from vjepa2_ac.encoding.cache_lookup import needed_frames
-from vjepa2_ac.encoding.encode_dataset import encode_config
+from vjepa2_ac.encoding.encode_dataset import EncodedSet, encode_config
+from vjepa2_ac.encoding.latent_cache import LatentCache, needed_frames
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.checkpoints.loading import load_base
-from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.storage import files as writing
 from vjepa2_ac.training.loop import train
 
@@ -35,7 +37,8 @@ CAMERA = "exterior_1_left"
 
 
 def files_of(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+    whole = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.suffix != ".partial"]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in whole}
 
 
 def contents(folder: Path) -> dict[str, object]:
@@ -52,39 +55,39 @@ def opened(path: Path) -> object:
         return tensors, file.metadata()
 
 
-def encode(config: Config, out: Path, progress: Progress | None = None) -> list[str]:
-    reporter = SilentReporter()
+def latents_in(folder: Path) -> list[Path]:
+    return sorted(folder.rglob("*.safetensors"))
+
+
+def encode(
+    config: Config, out: Path, progress: Progress | None = None, reporter: SilentReporter | None = None
+) -> EncodedSet:
+    reporter = reporter or SilentReporter()
     if progress is not None:
         reporter.task = lambda *_: progress
-    encode_config(config, reporter, out=out)
-    return reporter.notes
+    return encode_config(config, reporter, out=out)
 
 
 def needed(config: Config) -> int:
-    dataset = open_dataset(config.data)
-    return sum(len(one.steps) for one in needed_frames(dataset)) * len(config.data.cameras)
+    return sum(len(one.steps) for one in needed_frames(open_dataset(config.data)))
 
 
-def chunks(frames: int, config: Config) -> int:
-    return -(-frames // config.model.encode_chunk)
-
-
-def test_every_needed_frame_is_encoded_once_in_whole_chunks(
-    make_config: MakeConfig, tmp_path: Path, encoded_frames: list[int]
+def test_every_needed_frame_is_encoded_once(
+    make_config: MakeConfig, tmp_path: Path, encoded_frames: list[int], reporter: SilentReporter
 ) -> None:
     config = make_config(model__encode_chunk=7, data__start_every=2)
     reported: list[tuple[int, int]] = []
-    notes = encode(config, tmp_path / "out", lambda *of: reported.append(of))
+    found = encode(config, tmp_path / "out", lambda *of: reported.append(of), reporter)
     frames = needed(config)
     assert frames == 8 * 12  # of 24 steps every second one
-    assert encoded_frames == [7] * chunks(frames, config)
+    assert sum(encoded_frames) == frames
     assert (0, frames) in reported
     assert reported[-1] == (frames, frames)
-    assert read_manifest(tmp_path / "out").frames == frames
-    assert "GB per hour of robot data" in notes[0]
-    assert "GB free on its disk" in notes[1]
+    assert (found.encoded, found.episodes, found.frames, found.is_finished) == (8, 8, frames, True)
+    assert found.bytes == sum(path.stat().st_size for path in latents_in(tmp_path / "out"))
+    assert "GB free on its disk" in reporter.notes[1]
     encoded_frames.clear()
-    assert encode(config, tmp_path / "out") == [f"Everything is encoded already, in {tmp_path / 'out'}"]
+    assert encode(config, tmp_path / "out") == found
     assert not encoded_frames
 
 
@@ -105,14 +108,6 @@ def test_what_is_encoded_is_what_a_run_would_encode_bit_for_bit(
             assert torch.equal(file.get_tensor("latents")[places], live[clip])
 
 
-def test_of_several_cameras_each_is_encoded(make_config: MakeConfig, tmp_path: Path, encoded_frames: list[int]) -> None:
-    config = make_config(data__camera=["wrist_left", CAMERA], data__start_every=2)
-    encode(config, tmp_path / "out")
-    assert sum(encoded_frames) == 2 * 8 * 12
-    names = [path.name for path in (tmp_path / "out" / "episodes" / "000").iterdir()]
-    assert sorted(names) == sorted(f"{n:06d}-{camera}.safetensors" for n in range(8) for camera in config.data.cameras)
-
-
 # ---- whatever happens --------------------------------------------------------------------------------------------
 
 
@@ -122,151 +117,108 @@ def test_a_kill_costs_one_episode_at_most(
     config = make_config(data__start_every=2)
     (tmp_path / "config.yaml").write_text(as_yaml(config))
     encode(config, tmp_path / "whole")
-    expected, per_episode, out = contents(tmp_path / "whole"), 12, tmp_path / "out"
-    before = 0
-    for die_at in (9, 17):
-        child = nursery.start(
-            "encode",
-            str(tmp_path / "config.yaml"),
-            "--out",
-            str(out),
-            folder=str(out),
-            die_at=die_at,  # type: ignore[arg-type]
-        )
-        assert child.wait() == KILLED
-        assert not is_whole(out)
-        done = [path for path in out.rglob("*.safetensors") if not path.name.startswith(".")]
+    expected, out, before = contents(tmp_path / "whole"), tmp_path / "out", 0
+    words = ("encode", str(tmp_path / "config.yaml"), "--out", str(out))
+    for die_at in (2, 9, 17, 25):
+        assert nursery.start(*words, folder=out, die_at=die_at).wait() == KILLED
+        done = [path for path in latents_in(out) if not path.name.startswith(".")]
         assert all(opened(path) == expected[str(path.relative_to(out))] for path in done)
-        assert len(done) >= before
+        assert before <= len(done) < 8
         before = len(done)
-    assert 0 < before < 8
+    assert before > 0
     encoded_frames.clear()
-    notes = encode(config, out)
-    assert sum(encoded_frames) == -(-(8 - before) * per_episode // 16) * 16  # whole chunks
-    assert f"{before * per_episode:,} frames are there already; {(8 - before) * per_episode:,} are left" in notes[2]
+    assert encode(config, out).is_finished
+    assert sum(encoded_frames) == (8 - before) * 12
     assert contents(out) == expected
 
 
-def test_two_processes_share_the_episodes_and_the_last_one_makes_the_cache_whole(
-    make_config: MakeConfig, tmp_path: Path
-) -> None:
-    config = make_config()
-    (tmp_path / "config.yaml").write_text(as_yaml(config))
-    words = ["-m", "vjepa2_ac.cli", "encode", str(tmp_path / "config.yaml"), "--out", str(tmp_path / "out")]
-    reported = finish([start_rank(words, rank, 2, free_port()) for rank in range(2)])
-    assert sum("This process has done its share" in out for out, _ in reported) <= 1
-    assert is_whole(tmp_path / "out"), reported
-    encode(config, tmp_path / "whole")
-    assert contents(tmp_path / "out") == contents(tmp_path / "whole")
-
-
-def test_a_process_does_its_own_share_only(
+def test_processes_share_the_episodes_without_waiting_for_one_another(
     make_config: MakeConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, encoded_frames: list[int]
 ) -> None:
     config = make_config(data__start_every=2)
+    encode(config, tmp_path / "whole")
     monkeypatch.setenv("WORLD_SIZE", "3")
-    shares = []
-    for rank in ("2", "0", "1"):
+    for rank, episodes, is_last in (("2", 2, False), ("0", 3, False), ("1", 3, True)):
+        encoded_frames.clear()
         monkeypatch.setenv("RANK", rank)
-        assert not is_whole(tmp_path / "out")
-        encode(config, tmp_path / "out")
-        shares.append(sum(encoded_frames) // 16 * 16)
-    assert is_whole(tmp_path / "out")
-    assert [len(list((tmp_path / "out").rglob("*.safetensors")))] == [8]
-    assert shares[-1] == 32 + 48 + 48  # of 2, 3 and 3 episodes of 12 frames
+        assert encode(config, tmp_path / "out").is_finished == is_last
+        assert sum(encoded_frames) == 12 * episodes
+    assert contents(tmp_path / "out") == contents(tmp_path / "whole")
 
 
 def test_ctrl_c_keeps_what_is_done(make_config: MakeConfig, tmp_path: Path, encoded_frames: list[int]) -> None:
-    config = make_config(data__start_every=2)
+    config, out = make_config(data__start_every=2), tmp_path / "out"
 
     def pressed(done: int, _total: int) -> None:
         if done >= 24:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        encode(config, tmp_path / "out", pressed)
-    done = len(list((tmp_path / "out").rglob("*.safetensors")))
+        encode(config, out, pressed)
+    done = len(latents_in(out))
     assert done >= 2
-    assert not list((tmp_path / "out").rglob("*.partial"))
+    assert not list(out.rglob("*.partial"))
     encoded_frames.clear()
-    encode(config, tmp_path / "out")
-    assert sum(encoded_frames) == -(-(8 - done) * 12 // 16) * 16
-    assert is_whole(tmp_path / "out")
+    assert encode(config, out).is_finished
+    assert sum(encoded_frames) == (8 - done) * 12
 
 
 def test_a_disk_that_fills_up_is_named_and_nothing_half_written_counts(
     make_config: MakeConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config, out = make_config(), tmp_path / "out"
-    whole = writing.atomic_writer
+    config, out, whole = make_config(), tmp_path / "out", writing.atomic_writer
 
     @contextmanager
     def full(path: Path) -> Iterator[object]:
         with whole(path) as file:
             yield file
-            if len(list(out.rglob("*.safetensors"))) >= 3:
+            if len(latents_in(out)) >= 3:
                 raise OSError(errno.ENOSPC, "No space left on device", str(path))
 
     with monkeypatch.context() as patch:
-        patch.setattr("vjepa2_ac.storage.atomic_writer", full)
+        patch.setattr("vjepa2_ac.storage.files.atomic_writer", full)
         with pytest.raises(InputError, match=r"safetensors: cannot be written: No space left"):
             encode(config, out)
-    assert not is_whole(out)
-    assert len(list(out.rglob("*.safetensors"))) == 3
-    encode(config, out)
-    assert is_whole(out)
+    assert len(latents_in(out)) == 3
+    assert encode(config, out).is_finished
 
 
 def test_a_disk_that_is_too_small_is_refused_with_the_numbers_before_anything_is_encoded(
     make_config: MakeConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, encoded_frames: list[int]
 ) -> None:
-    monkeypatch.setattr(disk_space, "free_bytes", lambda _: 100_000)
+    monkeypatch.setattr(latent_cache, "free_bytes", lambda _: 100_000)
     with pytest.raises(InputError) as error:
         encode(make_config(), tmp_path / "out")
     text = str(error.value)
-    assert "0.0001 GB free" in text
-    assert "GB for the latents of 192 frames" in text
-    for way_out in ("data.cache_dtype: int8", "data.start_every: 2", "fewer episodes", "data.cache_dir"):
-        assert way_out in text
+    ways_out = ("data.cache_dtype: int8", "data.start_every: 2", "fewer episodes", "data.cache_dir")
+    for part in ("0.0001 GB free", "GB for the latents of 192 frames", *ways_out):
+        assert part in text
     assert not encoded_frames
     assert not (tmp_path / "out").exists()
-    with pytest.raises(InputError) as error:
-        encode(make_config(data__cache_dtype="int8", data__start_every=2), tmp_path / "out")
-    assert "data.start_every" not in str(error.value)
-    assert "cache_dtype" not in str(error.value)
 
 
-def test_room_is_asked_for_on_the_disk_of_a_folder_that_is_not_there_yet(tmp_path: Path) -> None:
-    free = shutil.disk_usage(tmp_path).free
-    assert disk_space.free_bytes(tmp_path / "a" / "b") == pytest.approx(free, rel=0.1)
-
-
-def test_a_folder_that_cannot_be_written_is_refused(make_config: MakeConfig, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="cannot be written"):
-        encode(make_config(), tmp_path / "file" / "out")
-
-
-def test_a_folder_of_other_files_is_refused_and_not_changed(make_config: MakeConfig, tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_written_or_holds_other_things_is_refused(
+    make_config: MakeConfig, tmp_path: Path
+) -> None:
     (tmp_path / "config.yaml").touch()
-    with pytest.raises(InputError, match=r"other things in it, such as config\.yaml"):
-        encode(make_config(), tmp_path)
+    for folder, words in ((tmp_path / "config.yaml" / "out", "cannot be written"), (tmp_path, r"config\.yaml")):
+        with pytest.raises(InputError, match=words):
+            encode(make_config(), folder)
     assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["config.yaml"]
 
 
 def test_a_folder_of_another_cache_is_refused_and_what_differs_is_named(
-    make_config: MakeConfig, tmp_path: Path, encoded_frames: list[int]
+    make_config: MakeConfig, tmp_path: Path
 ) -> None:
-    encode(make_config(), tmp_path / "out")
-    before, frames = files_of(tmp_path / "out"), len(encoded_frames)
-    for unfinished in (False, True):
-        if unfinished:
-            (tmp_path / "out" / "cache.json").unlink()
-            before.pop("cache.json")
+    out = tmp_path / "out"
+    encode(make_config(), out)
+    for is_finished in (True, False):
+        if not is_finished:
+            latents_in(out)[0].unlink()
+        before = files_of(out)
         with pytest.raises(InputError, match=r"data\.crop: released, not square"):
-            encode(make_config(data__crop="square"), tmp_path / "out")
-        assert files_of(tmp_path / "out") == before
-    assert len(encoded_frames) == frames
+            encode(make_config(data__crop="square"), out)
+        assert files_of(out) == before
 
 
 @pytest.mark.parametrize(
@@ -282,6 +234,27 @@ def test_what_cannot_be_encoded_is_refused_before_the_data_is_opened(
 ) -> None:
     with pytest.raises(InputError, match=words):
         encode(make_config(data__path=str(tmp_path / "nowhere"), **changes), tmp_path / "out")
+
+
+def test_what_is_damaged_deleted_or_takes_part_from_now_on_is_encoded_by_the_next_start_and_only_that(
+    make_config: MakeConfig, tmp_path: Path, encoded_frames: list[int]
+) -> None:
+    out = tmp_path / "out"
+    few = make_config(data__exclude=[open_dataset(make_config().data).table.identity(0)])
+    assert encode(few, out).encoded == 7
+    encoded_frames.clear()
+    assert encode(make_config(), out).encoded == 8
+    assert sum(encoded_frames) == 24
+    sound, (cut, gone, zeros, foreign, *_) = contents(out), latents_in(out)
+    other = write_cache(open_dataset(make_config(data__cache_dir=str(tmp_path / "others")).data), NUMBERS)
+    cut.write_bytes(cut.read_bytes()[:-10])
+    gone.unlink()
+    zeros.write_bytes(bytes(zeros.stat().st_size))
+    shutil.copy(other / foreign.relative_to(out), foreign)
+    encoded_frames.clear()
+    encode(make_config(), out)
+    assert sum(encoded_frames) == 4 * 24
+    assert contents(out) == sound
 
 
 # ---- broken episodes ---------------------------------------------------------------------------------------------
@@ -315,92 +288,33 @@ def mend(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
     return mended
 
 
-@pytest.mark.usefixtures("mend")
-def test_a_broken_episode_is_left_out_and_named_or_stops_the_work_as_the_policy_says(
-    make_config: MakeConfig, tmp_path: Path
+def test_a_broken_episode_stops_the_work_or_is_left_out_named_and_tried_again(
+    make_config: MakeConfig, tmp_path: Path, mend: Callable[[], None]
 ) -> None:
-    out = tmp_path / "out"
+    skip, out = make_config(data__broken_episodes="skip"), tmp_path / "out"
     with pytest.raises(InputError, match=r"damaged JPEG.*data\.exclude"):
         encode(make_config(), out)
-    assert not is_whole(out)
-    encode(make_config(data__broken_episodes="skip"), out)
-    manifest = read_manifest(out)
-    (name,) = manifest.broken
-    assert name == open_dataset(make_config().data).table.identity(3)
-    assert "damaged JPEG" in manifest.broken[name]
-    assert manifest.encoded == 7
-
-
-def test_an_episode_that_was_mended_is_encoded_by_the_next_start(
-    make_config: MakeConfig, tmp_path: Path, mend: Callable[[], None], encoded_frames: list[int]
-) -> None:
-    config, out = make_config(data__broken_episodes="skip"), tmp_path / "out"
-    encode(config, out)
-    (out / "cache.json").unlink()  # as if another process had not been done
+    found = encode(skip, out)
+    ((name, reason),) = found.broken.items()
+    assert name == open_dataset(skip.data).table.identity(3)
+    assert "damaged JPEG" in reason
+    assert (found.encoded, found.is_finished) == (7, True)
     mend()
-    encoded_frames.clear()
-    encode(config, out)
-    assert sum(encoded_frames) == 32  # its 24
-    assert not read_manifest(out).broken
-
-
-def test_the_fix_for_a_damaged_file_repairs_the_cache(
-    make_config: MakeConfig, tmp_path: Path, encoded_frames: list[int]
-) -> None:
-    out = tmp_path / "out"
-    encode(make_config(), out)
-    sound, damaged = contents(out), sorted(out.rglob("*.safetensors"))[0]
-    alone = make_config(data__source="latents", data__path=str(out)).data
-    with damaged.open("r+b") as file:
-        file.truncate(100)
-    with pytest.raises(InputError, match=r"Run `vjepa2-ac encode` again, as the cache was made"):
-        open_dataset(alone)
-    encoded_frames.clear()
-    reported = encode(make_config(), out)
-    assert re.search(rf"episode.*{damaged.name}: 100 bytes instead of [\d,]+\)\. It is encoded again", reported[0])
-    assert contents(out) == sound
-    assert 0 < len(encoded_frames) < chunks(needed(make_config()), make_config())
-    damaged.write_bytes(bytes(damaged.stat().st_size))
-    with pytest.raises(InputError, match=r"000000.*Delete this file, and then run `vjepa2-ac encode` again"):
-        open_dataset(alone).source.read(0)
-    damaged.unlink()
-    encode(make_config(), out)
-    assert contents(out) == sound
-    open_dataset(alone)
-
-
-def test_episodes_that_take_part_from_now_on_are_added_to_a_cache(
-    make_config: MakeConfig, tmp_path: Path, encoded_frames: list[int]
-) -> None:
-    out = tmp_path / "out"
-    few = make_config(data__exclude=[open_dataset(make_config().data).table.identity(0)])
-    encode(few, out)
-    assert read_manifest(out).encoded == 7
-    encoded_frames.clear()
-    assert "not encoded yet" in encode(make_config(), out)[0]
-    assert read_manifest(out).encoded == 8
-    assert 0 < sum(encoded_frames) < needed(make_config()) / 4
-    sorted(out.rglob("*.safetensors"))[0].unlink()
-    encode(few, out)
-    assert read_manifest(out).encoded == 7, "one that takes no part is not encoded again"
+    assert encode(skip, out).broken == {}
 
 
 @pytest.mark.usefixtures("mend")
 def test_too_many_broken_episodes_of_all_processes_together_stop_the_last_one(
     make_config: MakeConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from vjepa2_ac.encoding.workload import note_broken
-
     out, config = tmp_path / "out", make_config(data__broken_episodes="skip")
     monkeypatch.setenv("WORLD_SIZE", "2")
     monkeypatch.setenv("RANK", "0")
     encode(config, out)  # 0, 2, 4, 6
-    table = open_dataset(config.data).table
-    note_broken(out, 2, table.identity(2), "damaged")
+    latents_in(out)[1].rename(latents_in(out)[1].with_suffix(".broken"))
     monkeypatch.setenv("RANK", "1")
     with pytest.raises(InputError, match="2 of 8 episodes are broken"):
         encode(config, out)
-    assert not is_whole(out)
 
 
 # ---- a run that encodes first ------------------------------------------------------------------------------------
@@ -427,56 +341,23 @@ def test_a_run_that_encodes_first_is_the_run_on_frames_bit_for_bit(
 
 
 def test_a_run_mends_the_cache_that_it_finds_damaged(
-    make_config: MakeConfig, tmp_path: Path, cache: Path, reporter: SilentReporter, encoded_frames: list[int]
+    make_config: MakeConfig, tmp_path: Path, cache: Path, reporter: SilentReporter
 ) -> None:
     knobs = {"data__cache": "auto", "data__cache_dir": str(cache), "training__steps": 1}
-    first = train(make_config(run_dir=str(tmp_path / "first"), **knobs), reporter)
+    train(make_config(run_dir=str(tmp_path / "first"), **knobs), reporter)
     (folder,) = cache.iterdir()
-    sound, (cut, gone, *_) = contents(folder), sorted(folder.rglob("*.safetensors"))
+    sound, (cut, gone, *_) = contents(folder), latents_in(folder)
     cut.write_bytes(cut.read_bytes()[:-10])
     gone.unlink()
-    with pytest.raises(InputError, match=r"000000.*bytes.*Run `vjepa2-ac encode`"):
+    with pytest.raises(InputError, match=r"no whole latents of 2 of 8 episodes.*Run `vjepa2-ac encode`"):
         train(make_config(run_dir=str(tmp_path / "x"), **knobs | {"data__cache": "require"}), reporter)
-    reporter.notes.clear()
-    encoded_frames.clear()
     again = make_config(run_dir=str(tmp_path / "again"), **knobs)
+    reporter.notes.clear()
     train(again, reporter, check_only=True)
-    (reported,) = [note for note in reporter.notes if "Missing in the latent cache" in note]
-    assert re.search(
-        rf"damaged: .*{cut.name}: .* bytes instead of .* and 1 more\. A run would encode it again", reported
-    )
+    assert any("would first encode 48 of 192 frames" in note for note in reporter.notes)
     assert not gone.exists(), "a check writes nothing"
-    assert is_whole(folder)
-    assert_same_run(first, train(again, reporter))
-    assert "It is encoded again." in "".join(reporter.notes)
+    train(again, reporter)
     assert contents(folder) == sound
-    encoded_frames.clear()
-    train(make_config(run_dir=str(tmp_path / "third"), **knobs), reporter)
-    assert not encoded_frames
-
-
-def test_a_kill_while_a_cache_is_mended_leaves_what_is_found_again(
-    make_config: MakeConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out = tmp_path / "out"
-    encode(make_config(), out)
-    sound, (cut, *_) = contents(out), sorted(out.rglob("*.safetensors"))
-    cut.write_bytes(cut.read_bytes()[:-10])
-    unlink, unlinked = Path.unlink, []
-
-    def killed(path: Path, missing_ok: bool = False) -> None:
-        if unlinked:
-            raise KeyboardInterrupt
-        unlinked.append(path.name)
-        unlink(path, missing_ok)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(Path, "unlink", killed)
-        with pytest.raises(KeyboardInterrupt):
-            encode(make_config(), out)
-    assert unlinked == [cut.name], "what makes it whole goes last"
-    encode(make_config(), out)
-    assert contents(out) == sound
 
 
 def test_a_run_on_latents_has_no_encoder_on_its_device_and_does_not_count_its_work(
@@ -486,14 +367,6 @@ def test_a_run_on_latents_has_no_encoder_on_its_device_and_does_not_count_its_wo
     assert not list(run.world_model.encoder.parameters())
     assert not run.encodes
     assert set_up(make_config(), reporter).encodes
-
-
-def test_a_required_cache_that_is_not_there_is_refused_with_the_command_that_makes_it(
-    make_config: MakeConfig, cache: Path, reporter: SilentReporter, encoded_frames: list[int]
-) -> None:
-    with pytest.raises(InputError, match="Run `vjepa2-ac encode`"):
-        train(make_config(data__cache="require", data__cache_dir=str(cache)), reporter)
-    assert not encoded_frames
 
 
 def test_check_says_what_would_be_encoded_and_tries_the_rest_on_frames(
@@ -509,23 +382,6 @@ def test_check_says_what_would_be_encoded_and_tries_the_rest_on_frames(
     assert 16 < sum(encoded_frames) < needed(config)  # a timed chunk, and the clips that were tried
 
 
-def test_latents_of_another_encoder_are_never_used(
-    make_config: MakeConfig, tmp_path: Path, base_folder: Path, cache: Path, reporter: SilentReporter
-) -> None:
-    from vjepa2_ac.model.base_model import read_sizes
-
-    encode_config(make_config(data__cache_dir=str(cache)), reporter)
-    other = tmp_path / "other"
-    WorldModel.random(read_sizes(base_folder), seed=9).save_pretrained(other)
-    knobs = {"data__cache_dir": str(cache), "model__base": str(other)}
-    with pytest.raises(InputError, match=r"was made otherwise: encoder: "):
-        train(make_config(data__cache="require", **knobs), reporter)
-    (folder,) = cache.iterdir()
-    set_up(make_config(data__source="latents", data__path=str(folder)), reporter)
-    with pytest.raises(InputError, match="encoder"):
-        set_up(make_config(data__source="latents", data__path=str(folder), model__base=str(other)), reporter)
-
-
 def test_two_processes_of_a_run_share_the_encoding_before_the_first_step(
     make_config: MakeConfig, tmp_path: Path, cache: Path
 ) -> None:
@@ -534,7 +390,8 @@ def test_two_processes_of_a_run_share_the_encoding_before_the_first_step(
     words, port = ["-m", "vjepa2_ac.cli", "train", str(tmp_path / "config.yaml")], free_port()
     reported = finish([start_rank(words, rank, 2, port) for rank in range(2)])
     (folder,) = cache.iterdir()
-    assert read_manifest(folder).frames == needed(config)
+    assert len(latents_in(folder)) == 8
+    assert not list(folder.glob(".attempt*"))
     assert "encoding frames 96/96" in reported[0][0]
     assert "Latents come from" in reported[0][0]
     assert not reported[1][0]
@@ -555,3 +412,113 @@ def test_no_latents_are_encoded_of_data_that_a_run_refuses(
     assert (files_of(cache), encoded_frames) == (before, [])
     train(others, SilentReporter(), allow_config_change=True)
     assert encoded_frames, "the change is meant"
+
+
+# ---- processes that wait for one another ---------------------------------------------------------------------------
+
+
+class Process(SimpleNamespace):
+    """What is used of an Accelerator: the first of two processes, whose collectives never end."""
+
+    process_index, num_processes, is_main_process, device = 0, 2, True, torch.device("cpu")
+
+
+@pytest.fixture
+def together(make_config: MakeConfig, cache: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[LatentCache, Callable]:
+    """A cache, and a function by which the first of two processes encodes its share and waits for the other one's."""
+    monkeypatch.setattr(collectives, "broadcast_object", lambda _, value: value)
+    monkeypatch.setattr(encode_dataset, "_LOOKS_EVERY_S", 0.01)
+    config = make_config(data__cache="auto", data__cache_dir=str(cache))
+    dataset, model = open_dataset(config.data), load_base(config.model, seed=config.seed)
+    encoding = encode_dataset.encoding_of(model, config)
+
+    def run() -> object:
+        return encode_dataset.with_latents(config, dataset, model, Process(), SilentReporter())  # type: ignore[arg-type]
+
+    return LatentCache.of(dataset, encoding), run
+
+
+def other_process(cache: LatentCache, act: Callable[[Path], None]) -> threading.Thread:
+    """Act as the second process, once the first one has done its share."""
+
+    def acting() -> None:
+        while len(latents_in(cache.folder)) < 4:
+            time.sleep(0.01)
+        act(next(cache.folder.glob(".attempt-*")))
+
+    thread = threading.Thread(target=acting, daemon=True)
+    thread.start()
+    return thread
+
+
+def test_a_process_waits_for_the_files_of_the_others_as_long_as_it_takes(
+    together: tuple[LatentCache, Callable], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A barrier would give up after two hours, whatever the others had done by then."""
+    cache, run = together
+    monkeypatch.setattr(encode_dataset, "_LONGEST_WITHOUT_A_FILE_S", 0.5)
+
+    def encode_slowly(_attempt: Path) -> None:
+        for number in (1, 3, 5, 7):
+            time.sleep(0.3)
+            path = cache.files.path(number, CAMERA)
+            shutil.copy(cache.files.path(number - 1, CAMERA), path.with_suffix(".partial"))
+            path.with_suffix(".partial").rename(path)
+
+    thread = other_process(cache, encode_slowly)
+    run()
+    thread.join()
+    assert len(latents_in(cache.folder)) == 8
+    assert not list(cache.folder.glob(".attempt-*"))
+
+
+def test_what_stops_another_process_stops_this_one_at_once(together: tuple[LatentCache, Callable]) -> None:
+    cache, run = together
+    other_process(cache, lambda attempt: attempt.write_text("process 1: the disk is full") and None)
+    with pytest.raises(InputError, match="stopped in process 1: the disk is full"):
+        run()
+
+
+def test_what_stops_this_process_is_told_to_the_others(
+    together: tuple[LatentCache, Callable], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cache, run = together
+
+    def full(*_: object, **__: object) -> None:
+        raise InputError(where="here", found="no space left")
+
+    monkeypatch.setattr(encode_dataset, "encode_files", full)
+    with pytest.raises(InputError, match="no space left"):
+        run()
+    assert "process 0: here: no space left" in next(cache.folder.glob(".attempt-*")).read_text()
+
+
+def test_a_process_that_is_gone_without_a_word_is_missed(
+    together: tuple[LatentCache, Callable], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(encode_dataset, "_LONGEST_WITHOUT_A_FILE_S", 0.1)
+    with pytest.raises(InputError, match=r"no latents of episode .* which another process"):
+        together[1]()
+
+
+def test_an_error_that_only_the_first_process_can_meet_is_told_to_all(
+    together: tuple[LatentCache, Callable], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cache, run = together
+    told: list[object] = []
+    monkeypatch.setattr(collectives, "broadcast_object", lambda _, value: told.append(value) or value)
+    cache.folder.mkdir(parents=True)
+    (cache.folder / "thesis.tex").touch()
+    with pytest.raises(InputError, match="other things in it"):
+        run()
+    assert [type(one) for one in told] == [InputError], "broadcast, so that each process raises it"
+
+
+def test_a_folder_that_processes_do_not_share_is_refused_before_the_work(
+    together: tuple[LatentCache, Callable], monkeypatch: pytest.MonkeyPatch, encoded_frames: list[int], tmp_path: Path
+) -> None:
+    monkeypatch.setattr(encode_dataset, "_LONGEST_UNSEEN_S", 0.0)
+    monkeypatch.setattr(collectives, "broadcast_object", lambda _, value: tmp_path / "elsewhere" / value.name)
+    with pytest.raises(InputError, match="all machines of the run share"):
+        together[1]()
+    assert not encoded_frames

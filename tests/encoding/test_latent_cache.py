@@ -1,11 +1,9 @@
 """The latent cache: same clips in the same order; a wrong or damaged cache is refused."""
 
-import json
 import os
-import pickle
 import shutil
-from collections.abc import Sequence
-from contextlib import closing, nullcontext
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -16,9 +14,8 @@ import pytest
 import torch
 from pydantic import ValidationError
 from safetensors import safe_open
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 
-from clips import clip_at
 from latent_sets import NUMBERS, as_numbers, write_cache
 from memory_source import MemorySource
 from synthetic import synthetic_episode, synthetic_states
@@ -30,12 +27,20 @@ from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.index.episode_table import EpisodeTable
 from vjepa2_ac.data.loader import batches_of, training_loader, validation_batches
 from vjepa2_ac.data.selection import BrokenEpisodes, StepSelection
-from vjepa2_ac.data.sources.latents.dtypes import CacheType, pack_latents, unpack_latents
-from vjepa2_ac.data.sources.latents.episode_file import EncodedEpisode, EpisodeFile, EpisodeLayout, write_episode_file
-from vjepa2_ac.data.sources.latents.manifest import EPISODES, KEPT, MANIFEST, path_of
+from vjepa2_ac.data.sources.latents.cache_files import (
+    CACHE,
+    EPISODES,
+    KEPT,
+    OPTIONAL,
+    CacheType,
+    EncodedEpisode,
+    LatentFiles,
+    pack_latents,
+    unpack_latents,
+)
 from vjepa2_ac.data.sources.rlds.writing.droid_writer import write_droid_rlds
 from vjepa2_ac.data.windows import clip_starts
-from vjepa2_ac.encoding.cache_lookup import needed_frames, require_encoding, through_cache
+from vjepa2_ac.encoding.latent_cache import LatentCache, needed_frames, require_encoding, through_cache
 from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, StoredLatents
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.inspection.check import check_data
@@ -69,20 +74,25 @@ def drawn_latents(frames: int = len(FRAMES), seed: int = 0) -> torch.Tensor:
     return latents
 
 
-def written(folder: Path, kind: CacheType = "fp32") -> tuple[Path, EpisodeLayout]:
-    path, layout = folder / "a" / "b.safetensors", EpisodeLayout("key", kind, TOKENS, DIM)
+def written(folder: Path, kind: CacheType = "fp32", *, exact: bool = False) -> LatentFiles:
+    """Write episode 0."""
+    files = LatentFiles(folder, "key")
     pictures = np.stack([np.full((16, 16, 3), 20 * step, np.uint8) for step in FRAMES])
     latents = pack_latents(drawn_latents(), kind)
-    write_episode_file(path, layout, EncodedEpisode(episode(), "left", FRAMES, latents, pictures))
-    return path, layout
+    files.write(0, EncodedEpisode(episode(), "left", FRAMES, latents, pictures), exact_pictures=exact)
+    return files
+
+
+def read_all(files: LatentFiles) -> tuple[StoredLatents, np.ndarray]:
+    file, everything = files.open(0, "left"), range(len(FRAMES))
+    return file.latents(everything), file.pictures(everything)
 
 
 @pytest.mark.parametrize(("kind", "largest_error"), [("fp32", 0.0), ("bf16", 2**-8), ("int8", 0.5)])
 def test_latents_come_back_in_the_precision_that_they_are_kept_in(
     tmp_path: Path, kind: CacheType, largest_error: float
 ) -> None:
-    record = EpisodeFile(*written(tmp_path, kind))
-    found = record.latents([3, 0], check=[3, 0])
+    found = written(tmp_path, kind).open(0, "left").latents([3, 0])
     true = drawn_latents()[[3, 0]]
     unit = {"fp32": 1.0, "bf16": true.abs(), "int8": true.abs().amax(-1, keepdim=True) / 127}[kind]
     assert unpack_latents(found).dtype == torch.float32
@@ -90,19 +100,20 @@ def test_latents_come_back_in_the_precision_that_they_are_kept_in(
     assert (found.scales is not None) == (kind == "int8")
 
 
-def test_everything_else_of_an_episode_comes_back_bit_for_bit(tmp_path: Path) -> None:
-    record, true = EpisodeFile(*written(tmp_path)), episode()
-    for name in ("states", "extrinsics", "joint_velocities", "commands"):
-        assert record[name].dtype == getattr(true, name).dtype
-        np.testing.assert_array_equal(record[name], getattr(true, name))
-    assert record.metadata == true.metadata
-    assert record.frame_steps.tolist() == list(FRAMES)
-    assert record.places_of([11, 0]) == [3, 0]
-    assert abs(record.pictures([3, 1]).mean(axis=(1, 2, 3)) - [220, 40]).max() < 3
+@pytest.mark.parametrize("exact", [False, True])
+def test_everything_else_of_an_episode_comes_back_bit_for_bit(tmp_path: Path, exact: bool) -> None:
+    file, true = written(tmp_path, exact=exact).open(0, "left"), episode()
+    for name in ("states", *OPTIONAL):
+        assert file.array(name).dtype == getattr(true, name).dtype
+        np.testing.assert_array_equal(file.array(name), getattr(true, name))
+    assert file.metadata == true.metadata
+    assert file.frame_steps.tolist() == list(FRAMES)
+    assert file.places_of([11, 0]) == [3, 0]
+    assert abs(file.pictures([3, 1]).mean(axis=(1, 2, 3)) - [220, 40]).max() < (1e-6 if exact else 3)
 
 
 def test_a_file_opens_with_plain_safetensors(tmp_path: Path) -> None:
-    with safe_open(written(tmp_path, "bf16")[0], framework="pt") as file:
+    with safe_open(written(tmp_path, "bf16").path(0, "left"), framework="pt") as file:
         assert file.get_slice("latents").get_shape() == [len(FRAMES), TOKENS, DIM]
         assert torch.equal(file.get_slice("latents")[2:3], drawn_latents()[2:3].bfloat16())
         assert file.metadata()["id"] == "lab/episode 1"
@@ -111,110 +122,67 @@ def test_a_file_opens_with_plain_safetensors(tmp_path: Path) -> None:
 # ---- a damaged file ----------------------------------------------------------------------------------------------
 
 
-def flipped(path: Path, place: int, bit: int = 4) -> None:
-    data = bytearray(path.read_bytes())
-    data[place] ^= 1 << bit
-    path.write_bytes(data)
-
-
-def place_of(path: Path, name: str, byte: int = 0) -> int:
-    """Return the position of a tensor's byte in a file."""
-    header = int.from_bytes(path.read_bytes()[:8], "little")
-    begin, end = json.loads(path.read_bytes()[8 : 8 + header])[name]["data_offsets"]
-    assert byte < end - begin
-    return 8 + header + begin + byte
-
-
-def test_a_flipped_bit_in_a_frame_is_found_when_that_frame_is_read_and_only_then(tmp_path: Path) -> None:
-    path, layout = written(tmp_path, "int8")
-    for name, size in (("latents", DIM * TOKENS), ("scales", 4 * TOKENS)):
-        flipped(path, place_of(path, name, byte=size + 1))
-        record = EpisodeFile(path, layout)
-        record.latents([0, 2, 3], check=[0, 2, 3])  # the others are sound
-        record.latents([1], check=[])
-        with pytest.raises(InputError, match=r"b\.safetensors: damaged: the CRC of control step 2 is wrong") as error:
-            record.latents([0, 1], check=[0, 1])
-        assert "encode" in error.value.fix
-        flipped(path, place_of(path, name, byte=size + 1))
-
-
-def test_a_flipped_bit_in_a_frame_is_found_when_it_is_read(tmp_path: Path) -> None:
-    path, layout = written(tmp_path)
-    flipped(path, place_of(path, "pictures", byte=40))
-    record = EpisodeFile(path, layout)
-    record.pictures([2])
-    with pytest.raises(InputError, match="CRC of the image of control step 0"):
-        record.pictures([0])
-
-
-@pytest.mark.parametrize("name", ["states", "commands", "extrinsics", "frame_steps", "frame_crc", "picture_ends"])
-def test_a_flipped_bit_in_anything_small_is_found_when_the_file_is_opened(tmp_path: Path, name: str) -> None:
-    path, layout = written(tmp_path)
-    flipped(path, place_of(path, name, byte=3))
-    with pytest.raises(InputError, match="damaged: its CRC"):
-        EpisodeFile(path, layout)
-
-
-def test_no_flipped_bit_in_a_header_passes(tmp_path: Path) -> None:
-    path, layout = written(tmp_path)
-    header = int.from_bytes(path.read_bytes()[:8], "little")
-    sound = EpisodeFile(path, layout)
-    everything = list(range(len(FRAMES)))
-    true = unpack_latents(sound.latents(everything, check=everything))
-    places, refused = range(0, 8 + header, 5), 0
-    for place in places:
-        flipped(path, place, bit=place % 8)
-        try:
-            record = EpisodeFile(path, layout)
-            found = unpack_latents(record.latents(everything, check=everything))
-        except InputError as error:
-            refused += str(path) in str(error)
-        else:  # white space after the JSON
-            assert torch.equal(found, true)
-            assert record.about == sound.about
-        flipped(path, place, bit=place % 8)
-    assert refused > 0.95 * len(places)
+def changed(path: Path, change: Callable[[dict[str, torch.Tensor], dict[str, str]], object]) -> None:
+    with safe_open(path, framework="pt") as file:
+        tensors, about = load_file(path), file.metadata()
+    change(tensors, about)
+    save_file({name: one.contiguous() for name, one in tensors.items()}, path, about)
 
 
 @pytest.mark.parametrize("left", [0, 5, 100, -1])
-def test_a_truncated_file_is_named(tmp_path: Path, left: int) -> None:
-    path, layout = written(tmp_path)
+def test_a_truncated_file_is_not_there_and_named_when_it_is_opened(tmp_path: Path, left: int) -> None:
+    files = written(tmp_path)
+    path = files.path(0, "left")
     path.write_bytes(path.read_bytes()[:left])
-    with pytest.raises(InputError, match=r"b\.safetensors: not a whole safetensors file"):
-        EpisodeFile(path, layout)
+    assert not files.has(0, "left")
+    with pytest.raises(InputError, match=r"000000-left\.safetensors: not a whole file.*encode"):
+        files.open(0, "left")
 
 
 def test_a_file_of_another_cache_is_refused(tmp_path: Path) -> None:
-    path, layout = written(tmp_path)
+    files = written(tmp_path)
+    other = replace(files, key="other")
+    assert files.has(0, "left")
+    assert not other.has(0, "left")
     with pytest.raises(InputError, match="a file of another cache"):
-        EpisodeFile(path, replace(layout, key="other"))
-    for other in (replace(layout, kind="bf16"), replace(layout, dim=DIM + 1)):
-        with pytest.raises(InputError, match="needed: latents of"):
-            EpisodeFile(path, other)
+        other.open(0, "left")
 
 
-def test_frames_of_another_type_are_damage(tmp_path: Path) -> None:
-    path, layout = written(tmp_path)
-    with safe_open(path, framework="pt") as file:
-        tensors, about = {name: file.get_tensor(name) for name in file.keys()}, file.metadata()  # noqa: SIM118
-    save_file(tensors | {"pictures": tensors["pictures"].to(torch.bfloat16)}, path, about)
-    with pytest.raises(InputError, match="values of BF16"):
-        EpisodeFile(path, layout)
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda tensors, _: tensors.pop("latents"),
+        lambda tensors, _: tensors.update(latents=tensors["latents"][1:]),
+        lambda tensors, _: tensors.pop("frame_steps"),
+        lambda tensors, _: tensors.update(picture_ends=tensors["picture_ends"][1:]),
+        lambda tensors, _: tensors.update(picture_ends=-tensors["picture_ends"]),
+        lambda tensors, _: tensors.update(pictures=torch.zeros_like(tensors["pictures"])),
+        lambda _, about: about.pop("metadata"),
+        lambda _, about: about.update(metadata="["),
+    ],
+)
+def test_a_strangers_file_that_is_not_what_it_should_be_is_an_error_for_the_user(
+    tmp_path: Path, change: Callable[..., object]
+) -> None:
+    files = written(tmp_path)
+    read_all(files)
+    changed(files.path(0, "left"), change)
+    with pytest.raises(InputError, match="000000-left"):
+        read_all(files)
 
 
 def test_a_step_that_was_not_encoded_is_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"lab/episode 1\): no frame of control step 3"):
-        EpisodeFile(*written(tmp_path)).places_of([2, 3])
+    with pytest.raises(InputError, match="no frame of control step 3"):
+        written(tmp_path).open(0, "left").places_of([2, 3])
 
 
 def test_only_the_frames_that_are_asked_for_are_read(tmp_path: Path) -> None:
-    path, layout = tmp_path / "large.safetensors", EpisodeLayout("key", "fp32", 64, 1024)
-    count = 200  # of 256 kB
+    files, count = LatentFiles(tmp_path, "key"), 200  # of 256 kB
     latents = StoredLatents(torch.zeros(1, 64, 1024).expand(count, -1, -1))
     pictures = np.zeros((count, 8, 8, 3), np.uint8)
-    write_episode_file(path, layout, EncodedEpisode(episode(count), "left", range(count), latents, pictures))
-    record = EpisodeFile(path, layout)
-    kept = record.latents([17, 190], check=[17, 190])
+    files.write(0, EncodedEpisode(episode(count), "left", range(count), latents, pictures))
+    record, path = files.open(0, "left"), files.path(0, "left")
+    kept = record.latents([17, 190])
     assert 2 * 256 << 10 <= resident_of(path) < path.stat().st_size / 5  # some kernels map 2 MB at once
     assert kept.values.shape == (2, 64, 1024)
 
@@ -322,17 +290,6 @@ def test_a_cache_has_the_clips_of_its_data_set_in_their_order(
     assert by_itself.control_rate_hz == original.control_rate_hz
 
 
-def test_one_phase_needs_a_frame_in_every_stride(droid_with_rests: Path, tmp_path: Path) -> None:
-    frames, phases = [], []
-    for every in (1, 2):
-        needed = list(needed_frames(open_dataset(config_of(droid_with_rests, tmp_path, start_every=every))))
-        frames.append(sum(len(one.steps) for one in needed))
-        phases.append({tuple(np.unique(one.steps % 2)) for one in needed})
-    assert frames[1] < 0.6 * frames[0]
-    assert phases[0] == {(0, 1)}
-    assert phases[1] <= {(0,), (1,)}
-
-
 def test_clips_start_at_multiples_of_start_every_from_the_first_kept_step() -> None:
     table = EpisodeTable.of([EpisodeInfo("a", 40), EpisodeInfo("b", 20)])
     kept = StepSelection(
@@ -346,23 +303,6 @@ def test_clips_start_at_multiples_of_start_every_from_the_first_kept_step() -> N
     assert found == [(0, 3), (0, 7), (0, 11), (0, 23), (1, 0), (1, 4), (1, 8), (1, 12)]
 
 
-@pytest.mark.parametrize(("when", "caught"), [("never", [0, 0]), ("once", [0, 1]), ("always", [1, 1])])
-def test_frames_are_checked_as_often_as_the_config_says(
-    droid_with_rests: Path, tmp_path: Path, when: str, caught: list[int]
-) -> None:
-    """A frame is damaged after it was read: `always` finds it, `once` does where another process reads it."""
-    _, through = cached(droid_with_rests, tmp_path, check_crc=when)
-    path = path_of(Path(through.config.path), 3, "exterior_1_left")
-    clip_at(through, 3, 0)
-    with path.open("r+b") as file:  # in place: the bytes that are mapped change, too
-        file.seek(place_of(path, "latents", byte=7))
-        file.write(b"\x55")
-    another_process = pickle.loads(pickle.dumps(through))  # noqa: S301 - our own
-    for reader, is_caught in zip((through, another_process), caught, strict=True):
-        with pytest.raises(InputError, match="control step 0 is wrong") if is_caught else nullcontext():
-            clip_at(reader, 3, 0)
-
-
 def test_needed_frames_are_those_of_the_clips_of_all_splits(droid_with_rests: Path, tmp_path: Path) -> None:
     for knobs in EVERYTHING.values():
         dataset = open_dataset(config_of(droid_with_rests, tmp_path, **knobs))
@@ -371,8 +311,12 @@ def test_needed_frames_are_those_of_the_clips_of_all_splits(droid_with_rests: Pa
             windows = dataset.windows(split)
             for episode, start in (windows[place] for place in range(len(windows))):
                 asked.setdefault(episode, set()).update(range(start, start + dataset.config.clip_steps, 2))
-        found = [(one.episode, one.steps.tolist()) for one in needed_frames(dataset)]
-        assert found == sorted((episode, sorted(steps)) for episode, steps in asked.items())
+        found = [(one.episode, one.camera, one.steps.tolist()) for one in needed_frames(dataset)]
+        assert found == [
+            (episode, camera, sorted(steps))
+            for episode, steps in sorted(asked.items())
+            for camera in dataset.config.cameras
+        ]
 
 
 def test_workers_change_nothing(droid_with_rests: Path, tmp_path: Path) -> None:
@@ -456,30 +400,24 @@ def test_an_episode_that_could_not_be_encoded_is_left_out_as_it_was_without_a_ca
     )
 
 
-@pytest.mark.parametrize("policy", ["error", "skip"])
-def test_damage_to_a_cache_is_handled_as_damage_to_the_data(with_a_broken_one: Dataset, policy: Any) -> None:
-    config = with_a_broken_one.config.model_copy(update={"broken_episodes": policy})
-    source = MemorySource([6] * 100)
-    original = replace(with_a_broken_one, config=config, source=source, broken=BrokenEpisodes(config, 100))
-    path = path_of(write_cache(original), 7, "exterior_1_left")
-    sound = path.read_bytes()
-    flipped(path, place_of(path, "states", byte=9))
-    through = through_cache(original, NUMBERS)
-    if policy == "error":
-        with pytest.raises(InputError, match=r"000007.*its CRC is wrong.*data\.broken_episodes"):
-            list(batches_of(through, [(6, 0), (7, 0)], batch_size=1))
-    else:
-        assert len(list(batches_of(through, [(6, 0), (7, 0)], batch_size=1))) == 1
-        assert list(through.broken.reasons) == ["episode 7"]
-    for left in (sound[:-10], None):
-        path.unlink() if left is None else path.write_bytes(left)
-        if policy == "error":
-            with pytest.raises(InputError, match=r"000007.*episode 7\): (no such file|[\d,]+ bytes)"):
-                through_cache(original, NUMBERS)
-        else:
-            broken = BrokenEpisodes(config, 100)
-            found = through_cache(replace(original, broken=broken), NUMBERS)
-            assert list(found.broken.reasons) == ["episode 7"]
+def test_damage_to_a_cache_is_handled_as_damage_to_the_data(with_a_broken_one: Dataset) -> None:
+    def opened(policy: str) -> Dataset:
+        config = with_a_broken_one.config.model_copy(update={"broken_episodes": policy})
+        source, broken = MemorySource([6] * 100), BrokenEpisodes(config, 100)
+        return replace(with_a_broken_one, config=config, source=source, broken=broken)
+
+    write_cache(opened("error"))
+    files = LatentCache.of(opened("error"), NUMBERS).files
+    path = files.path(7, "exterior_1_left")
+    changed(path, lambda tensors, _: tensors.pop("states"))  # found when it is read
+    with pytest.raises(InputError, match=r"000007.*data\.broken_episodes"):
+        list(batches_of(through_cache(opened("error"), NUMBERS), [(6, 0), (7, 0)], batch_size=1))
+    through = through_cache(opened("skip"), NUMBERS)
+    assert len(list(batches_of(through, [(6, 0), (7, 0)], batch_size=1))) == 1
+    assert list(through.broken.reasons) == ["episode 7"]
+    path.write_bytes(path.read_bytes()[:-10])  # found when the cache is opened
+    with pytest.raises(InputError, match=r"no whole latents of 1 of 100 episodes, such as episode 7"):
+        through_cache(opened("skip"), NUMBERS)
 
 
 # ---- what is refused ---------------------------------------------------------------------------------------------
@@ -503,7 +441,7 @@ def a_cache(droid_with_rests: Path, tmp_path_factory: pytest.TempPathFactory) ->
         ({"idle": IDLE | {"translation_m": 0.5}}, r"data\.idle\.translation_m: 0\.001, not 0\.5"),
         ({"idle": {}}, r"data\.idle\.rule: motion, not none"),
         ({"camera": "wrist_left"}, r"data\.camera: .*exterior_1_left.*, not .*wrist_left"),
-        ({"outcome": "all"}, r"no latents of \d+ of \d+ episodes.*data\.outcome"),
+        ({"outcome": "all"}, r"no whole latents of \d+ of \d+ episodes.*data\.outcome"),
     ],
     ids=lambda value: str(value)[:20],
 )
@@ -533,9 +471,7 @@ def test_a_cache_of_another_encoder_is_refused_and_the_difference_named(
 ) -> None:
     original, through, _ = a_cache
     encoding = replace(NUMBERS, **change)
-    with pytest.raises(
-        InputError, match=f"no whole latent cache.*Other caches there: 1; .*{reported}.*vjepa2-ac encode"
-    ):
+    with pytest.raises(InputError, match=f"no latent cache.*Other caches there: 1; .*{reported}.*vjepa2-ac encode"):
         through_cache(original, encoding)
     with pytest.raises(InputError, match=reported):
         require_encoding(alone(through), encoding)
@@ -556,27 +492,20 @@ def test_a_data_set_that_has_changed_has_another_cache(droid_with_rests: Path, t
 def test_an_unfinished_or_damaged_cache_is_refused(droid_with_rests: Path, tmp_path: Path) -> None:
     original, through = cached(droid_with_rests, tmp_path, idle=IDLE)
     folder = Path(through.config.path)
-    for name, place in ((EPISODES, 300), (KEPT, 300), (MANIFEST, 200)):
-        flipped(folder / name, place)
+    for name in (EPISODES, KEPT, CACHE):
+        sound = (folder / name).read_bytes()
+        (folder / name).write_bytes(sound[:-40])
         with pytest.raises(InputError, match=name):
-            through_cache(original, NUMBERS)
-        flipped(folder / name, place)
-    reported = (folder / MANIFEST).read_text()
-    (folder / MANIFEST).write_text(reported.replace(f'"{KEPT}"', '"kept.nqz"'))
-    with pytest.raises(InputError, match=r"cache\.json: damaged: no checksum of kept\.npz"):
+            alone(through)
+        (folder / name).write_bytes(sound)
+    (folder / KEPT).rename(folder / "other")
+    with pytest.raises(InputError, match=r"kept\.npz"):
         alone(through)
-    (folder / MANIFEST).write_text(reported)
-    sound = (folder / EPISODES).read_bytes()
-    table = EpisodeTable.from_bytes(sound)
-    (folder / EPISODES).write_bytes(replace(table, num_steps=table.num_steps + 1).to_bytes())
-    with pytest.raises(InputError, match=r"not the one in cache\.json"):  # sound, but not this cache's
-        alone(through)
-    (folder / EPISODES).write_bytes(sound)
-    (folder / MANIFEST).unlink()
-    with pytest.raises(InputError, match="it is unfinished"):
-        through_cache(original, NUMBERS)
-    with pytest.raises(InputError, match="an unfinished latent cache"):
-        alone(through)
+    (folder / "other").rename(folder / KEPT)
+    next(folder.rglob("*.safetensors")).unlink()
+    for read in (lambda: alone(through), lambda: through_cache(original, NUMBERS)):
+        with pytest.raises(InputError, match=r"no whole latents of 1 of \d+ episodes.*vjepa2-ac encode"):
+            read()
     with pytest.raises(InputError, match="no latent cache"):
         alone(through, path=str(tmp_path))
 

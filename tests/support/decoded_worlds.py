@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from vjepa2_ac.decoding.decoder_folder import DecoderCard, TrainedDecoder
-from vjepa2_ac.decoding.frame_pairs import as_pixels
-from vjepa2_ac.decoding.network import Decoder, DecoderShape
+from vjepa2_ac.decoding.network import Decoder, DecoderShape, as_pixels
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.evaluation.evaluate import Contender, RepeatableClips
 from worlds import DIM, TOKENS, in_batches, rows

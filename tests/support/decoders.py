@@ -9,10 +9,10 @@ import torch
 from run_fixtures import MakeConfig, one_thread, tiny_config
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.decoding.frame_pairs import FramePairs, encode_pairs, wanted_frames
+from vjepa2_ac.data.sources.latents.cache_files import LatentFiles
+from vjepa2_ac.decoding.frame_pairs import FramePairs, wanted_frames
 from vjepa2_ac.decoding.training import train_decoder
-from vjepa2_ac.encoding.encode_dataset import encoder_on_device
-from vjepa2_ac.episode import no_progress
+from vjepa2_ac.encoding.pipeline import EncoderOnDevice, encode_files
 from vjepa2_ac.model.checkpoints.loading import load_base
 
 KNOBS = {
@@ -48,8 +48,11 @@ def encode_split(tmp_path: Path) -> EncodeSplit:
 
     def encode(config: Config, split: str = "train", frames: int = 40, folder: str = "pairs") -> FramePairs:
         dataset = open_dataset(config.data)
-        encoder = encoder_on_device(config, load_base(config.model, seed=config.seed), torch.device("cpu"))
+        model = load_base(config.model, seed=config.seed)
+        encoder = EncoderOnDevice.of(config, model, torch.device("cpu"))
         wanted = wanted_frames(dataset, split, frames=frames)  # type: ignore[arg-type]
-        return encode_pairs(dataset, wanted, encoder, tmp_path / folder, no_progress)
+        files = LatentFiles(tmp_path / folder, "key")
+        encode_files(dataset, wanted, encoder, files, exact_pictures=True)
+        return FramePairs.of(dataset, wanted, files)
 
     return encode

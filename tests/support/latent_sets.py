@@ -11,13 +11,11 @@ from jaxtyping import UInt8
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.sources.latents.cache_files import EncodedEpisode, pack_latents
 from vjepa2_ac.data.sources.latents.cache_key import Encoding
-from vjepa2_ac.data.sources.latents.dtypes import pack_latents
-from vjepa2_ac.data.sources.latents.episode_file import EncodedEpisode
 from vjepa2_ac.data.transforms import pixels_to_input, view
 from vjepa2_ac.encoding.batch import encoding_of
-from vjepa2_ac.encoding.cache_lookup import folder_of, key_for, needed_frames
-from vjepa2_ac.encoding.cache_writer import CacheWriter
+from vjepa2_ac.encoding.latent_cache import LatentCache
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.world_model import WorldModel
 
@@ -35,23 +33,19 @@ def as_numbers(frames: np.ndarray) -> torch.Tensor:
 
 def write_cache(dataset: Dataset, encoding: Encoding = NUMBERS, encode: Encode = as_numbers) -> Path:
     """Write the cache of a data set where it is looked for, and return its folder."""
-    key = key_for(dataset, encoding)
-    writer = CacheWriter(folder_of(dataset.config, key), key, encoding)
-    broken, count = {}, 0
-    for needed in needed_frames(dataset):
-        for camera in dataset.config.cameras:
-            try:
-                episode = dataset.source.read(needed.episode, camera)
-                frames = view(episode.read_frames(needed.steps.tolist()), dataset.config.crop)
-            except InputError as error:
-                broken[dataset.table.identity(needed.episode)] = str(error)
-                continue
-            count += len(frames)
-            latents = pack_latents(encode(frames), key.kind)
-            encoded = EncodedEpisode(episode, camera, needed.steps.tolist(), latents, _squashed(frames, 16))
-            writer.write_episode(needed.episode, encoded)
-    writer.finish(dataset, broken=broken, frames=count)
-    return writer.folder
+    cache = LatentCache.of(dataset, encoding)
+    cache.begin()
+    for one in cache.wanted:
+        try:
+            episode = dataset.source.read(one.episode, one.camera)
+            frames = view(episode.read_frames(one.steps.tolist()), dataset.config.crop)
+        except InputError as error:
+            cache.files.note_broken(one.episode, one.camera, str(error))
+            continue
+        latents = pack_latents(encode(frames), dataset.config.cache_dtype)
+        encoded = EncodedEpisode(episode, one.camera, one.steps.tolist(), latents, _squashed(frames, 16))
+        cache.files.write(one.episode, encoded)
+    return cache.folder
 
 
 def encode_for(config: Config, world_model: WorldModel, dataset: Dataset) -> Path:

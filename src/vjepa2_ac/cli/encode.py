@@ -33,13 +33,12 @@ def _encode(options: argparse.Namespace) -> None:
         encoded = encode_config(config, reporter if is_first else SILENT, out=options.out)
         if config.replay is not None and options.out is None and not config.replay.data.is_cache:
             encode_config(config.for_replay(), reporter if is_first else SILENT)
-    manifest = encoded.manifest
-    if manifest is None:
+    if not encoded.is_finished:
         console.print(f"This process has done its share; others are still at work on {encoded.folder}")
         return
-    for name, reason in manifest.broken.items():
+    for name, reason in encoded.broken.items():
         console.print(f"left out: {name}: {reason}")
-    episodes = f"{manifest.encoded:,} of {manifest.episodes:,} episodes"
-    console.print(f"{episodes}, {manifest.frames:,} frames, {manifest.bytes / 1e9:.3g} GB are in {encoded.folder}")
+    episodes = f"{encoded.encoded:,} of {encoded.episodes:,} episodes"
+    console.print(f"{episodes}, {encoded.frames:,} frames, {encoded.bytes / 1e9:.3g} GB are in {encoded.folder}")
     knobs = f"data.source=latents data.path={encoded.folder}" if options.out else "data.cache=auto"
     console.print(f"Train on them with {knobs}")

@@ -198,8 +198,7 @@ class DataConfig(Section):
     """Folder for latent caches, one folder in it for each; null: `latents` in the folder of `disk_cache`."""
     check_crc: Annotated[Literal["once", "always", "never"], Affects.NOTHING] = "once"
     """When the CRC-32C of a local TFRecord's data is checked: the first time that it is read on this machine, every
-    time, or never. The CRC of a record's length is always checked. Likewise the CRC-32 of cached latents, frame by
-    frame; once is then once for each process."""
+    time, or never. The CRC of a record's length is always checked."""
     disk_cache: Annotated[DiskCacheConfig, Affects.NOTHING] = DiskCacheConfig()
     """The cache on this machine."""
     workers: Annotated[int, Field(ge=0, le=256), Affects.NOTHING] = 4

@@ -59,8 +59,8 @@ class EncodedSource(EpisodeSource, Protocol):
         """Return the ranges that `data.idle` keeps."""
         ...
 
-    def settle(self, episodes: Int[np.ndarray, " episodes"]) -> tuple[DataConfig, list[EpisodeProblem]]:
-        """Return the config with the cameras that there are, and the episodes whose files are not as written.
+    def settle(self, episodes: Int[np.ndarray, " episodes"]) -> DataConfig:
+        """Return the config with the cameras that there are.
 
         Raises:
             InputError: One of these episodes, that clips come from, was not encoded.
@@ -264,9 +264,7 @@ def _settled(dataset: Dataset) -> Dataset:
     """Check that a latent cache has what the clips need, and set its cameras in the config."""
     if not isinstance(dataset.source, EncodedSource):
         return dataset
-    config, wrong_files = dataset.source.settle(dataset.starts.episode)
-    dataset.broken.found(_not_excluded(wrong_files, config))
-    return replace(dataset, config=config)
+    return replace(dataset, config=dataset.source.settle(dataset.starts.episode))
 
 
 def _not_excluded(problems: Sequence[EpisodeProblem], config: DataConfig) -> list[EpisodeProblem]:

@@ -29,7 +29,6 @@ from vjepa2_ac.storage.structured import read_json_object, record_of
 CARD, WEIGHTS, LINEAR = "decoder.json", "decoder.safetensors", "linear.safetensors"
 BUILTIN_DECODER = "decoder"  # the folder of a model of the package that holds its decoder
 
-_FORMAT = "vjepa2-ac decoder 1"
 _NEEDED = "the folder of a decoder, as `vjepa2-ac decoder` writes it"
 _FIX = "Copy the folder again, or train the decoder again"
 
@@ -48,7 +47,7 @@ class DecoderCard:
     episodes: int  # learned from
     frames: int
     steps: int
-    held_out: Mapping[str, Any] = field(default_factory=dict)  # by `decoding.held_out`
+    held_out: Mapping[str, Any] = field(default_factory=dict)  # by `baselines.measure_decoders`
     version: str = __version__
     time: str = ""  # UTC
 
@@ -81,27 +80,19 @@ class TrainedDecoder:
         """
         shape = self.card.shape
         sizes = (world_model.num_tokens, world_model.latent_dim, world_model.image_size)
+        fix = "Train one with `vjepa2-ac decoder CONFIG`, on the config of this model"
         if sizes != (shape.grid**2, shape.dim, shape.image_size):
-            raise InputError(
-                where=f"{self.where} {self.name}",
-                found=f"a decoder of {shape.grid**2}x{shape.dim} latents to images of {shape.image_size} px",
-                needed=f"{sizes[0]}x{sizes[1]} latents of images of {sizes[2]} px, as those of {subject}",
-                fix="Train one with `vjepa2-ac decoder CONFIG`, on the config of this model",
-            )
-        if world_model.encoder_fingerprint() != self.card.encoder:
-            raise InputError(
-                where=f"{self.where} {self.name}",
-                found=f"the decoder of another encoder than that of {subject}",
-                needed="one that was trained on the latents of this encoder: others would be read wrongly",
-                fix="Train one with `vjepa2-ac decoder CONFIG`, on the config of this model",
-            )
-        if crop != self.card.crop:
-            raise InputError(
-                where=f"{self.where} {self.name}",
-                found=f"a decoder of frames with data.crop {self.card.crop}",
-                needed=f"{crop}, as of {subject}: frames that are cut otherwise look otherwise to it",
-                fix="Train a decoder with this data.crop",
-            )
+            found = f"a decoder of {shape.grid**2}x{shape.dim} latents to images of {shape.image_size} px"
+            needed = f"{sizes[0]}x{sizes[1]} latents of images of {sizes[2]} px, as those of {subject}"
+        elif world_model.encoder_fingerprint() != self.card.encoder:
+            found = f"the decoder of another encoder than that of {subject}"
+            needed = "one that was trained on the latents of this encoder: others would be read wrongly"
+        elif crop != self.card.crop:
+            found = f"a decoder of frames with data.crop {self.card.crop}"
+            needed = f"{crop}, as of {subject}: frames that are cut otherwise look otherwise to it"
+        else:
+            return
+        raise InputError(where=f"{self.where} {self.name}", found=found, needed=needed, fix=fix)
 
 
 def save_decoder(folder: Path, card: DecoderCard, decoder: Mapping[str, Tensor], linear: Mapping[str, Tensor]) -> None:
@@ -142,11 +133,10 @@ def read_card(folder: Path, *, where: str = "--decoder") -> DecoderCard:
     path = folder / CARD
     try:
         values = read_json_object(path, needed=_NEEDED, fix=_FIX)
-    except (FileNotFoundError, NotADirectoryError):
-        fix = "Train one with `vjepa2-ac decoder CONFIG`; one that is unfinished goes on with the same command"
-        raise InputError(where=f"{where} {folder}", found=f"no {CARD} there", needed=_NEEDED, fix=fix) from None
     except OSError as error:
-        raise InputError(where=str(path), found=f"cannot be read ({error})", needed=_NEEDED, fix=_FIX) from None
+        fix = "Train one with `vjepa2-ac decoder CONFIG`; one that is unfinished goes on with the same command"
+        found = f"no {CARD} there ({error.strerror})"
+        raise InputError(where=f"{where} {folder}", found=found, needed=_NEEDED, fix=fix) from None
     return record_of(DecoderCard, values, where=str(path), needed=_NEEDED, fix=_FIX)
 
 

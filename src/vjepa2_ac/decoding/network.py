@@ -12,9 +12,10 @@ import math
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
+import numpy as np
 import torch
 from einops import rearrange
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from pydantic import Field
 from torch import Generator, Tensor, nn
 
@@ -204,3 +205,14 @@ class _Unfold(nn.Module):
         return rearrange(
             patches, "n (rows columns) (c p q) -> n c (rows p) (columns q)", rows=self.grid, c=3, p=self.patch_size
         )
+
+
+def as_images(pixels: UInt8[Tensor, "*batch 3 size size"]) -> Float[Tensor, "*batch 3 size size"]:
+    """Return images as the decoder gives them: black 0, white 1."""
+    return pixels.float() / 255.0
+
+
+def as_pixels(images: Float[Tensor, "*batch 3 size size"]) -> UInt8[np.ndarray, "*batch size size 3"]:
+    """Return images between 0 and 1 for files: rounded to 8 bits, colours last."""
+    rounded = (images.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu()
+    return np.asarray(rearrange(rounded, "... c h w -> ... h w c").numpy())

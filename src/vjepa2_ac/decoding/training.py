@@ -1,43 +1,52 @@
 """Training of a decoder: from the first frame encoded to a folder that `--decoder` takes.
 
-The frames of a step and its noise are functions of (config, step), so a checkpoint holds weights, their average,
-AdamW's moments and the step; a training that was killed goes on as if it had not been.
+The frames of a step and its noise are functions of (config, step), so what is saved on the way is weights, their
+average, AdamW's moments and the step; a training that was killed goes on as if it had not been.
 """
 
 from __future__ import annotations
 
 import contextlib
+import json
 import shutil
-import signal
 from collections.abc import Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from vjepa2_ac.config import Config, DecoderConfig
-from vjepa2_ac.data.windows import permuted
-from vjepa2_ac.decoding.decoder_folder import CARD, DecoderCard, save_decoder
-from vjepa2_ac.decoding.frame_pairs import FramePairs, Pairs
-from vjepa2_ac.decoding.held_out import mean_image, measure_decoders
-from vjepa2_ac.decoding.linear_fit import fit_linear
-from vjepa2_ac.decoding.network import Decoder
-from vjepa2_ac.decoding.optimizer_steps import DecoderSteps
-from vjepa2_ac.decoding.setup import Setup, prepare, setup
+from vjepa2_ac.config.data import Split
+from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.sources.latents.cache_files import LatentFiles, bytes_per_frame
+from vjepa2_ac.data.sources.latents.cache_key import CacheKey, Encoding, require_own_folder
+from vjepa2_ac.data.windows import permuted, require_stride
+from vjepa2_ac.decoding.baselines import fit_linear, mean_image, measure_decoders
+from vjepa2_ac.decoding.decoder_folder import CARD, DecoderCard, read_card, save_decoder
+from vjepa2_ac.decoding.frame_pairs import FramePairs, Pairs, wanted_frames
+from vjepa2_ac.decoding.network import UPSAMPLED, Decoder, DecoderShape
+from vjepa2_ac.decoding.steps import SMALLEST, DecoderSteps
+from vjepa2_ac.distributed.device import autocast, computing_device
 from vjepa2_ac.distributed.preemption import StoppedError, StopRequest, stop_on_signals
+from vjepa2_ac.encoding.batch import encoding_of
+from vjepa2_ac.encoding.latent_cache import frames_in, key_for, require_space
+from vjepa2_ac.encoding.pipeline import EncoderOnDevice, FramesToEncode, encode_files
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.pretrained_folder import first_not_finite
-from vjepa2_ac.reporter import SILENT, Reporter
-from vjepa2_ac.runs.checkpoint import OPTIMIZER, RunState, newest_checkpoint, read_state, write_checkpoint
-from vjepa2_ac.runs.folder import CHECKPOINTS
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
+from vjepa2_ac.runs.lock import RunLock
 from vjepa2_ac.runs.metrics_log import MetricsLog
 from vjepa2_ac.runs.torch_file import read_torch, write_torch
+from vjepa2_ac.storage import atomic_writer, try_writing_at, user_can_write, write_atomically
 from vjepa2_ac.storage.structured import utc_now
 
-_WEIGHTS = "decoder.pt"
+KEY, PAIRS, STATE = "key.json", "pairs", "training.pt"
 _LOG_EVERY = 50  # steps
-_KEEP = 2  # checkpoints
 
 
 def train_decoder(config: Config, reporter: Reporter = SILENT, *, check_only: bool = False) -> Path:
@@ -55,141 +64,240 @@ def train_decoder(config: Config, reporter: Reporter = SILENT, *, check_only: bo
         InputError: An input cannot be used, or the folder holds something else.
         StoppedError: A signal asked to stop; the same command goes on.
     """
-    with setup(config, reporter, check_only=check_only) as ready:
+    with _setup(config, reporter, check_only=check_only) as ready:
         if check_only:
             return ready.folder
-        if ready.is_done:
-            _remove_temporary(ready)  # of a start that was killed by then
-            return ready.folder
-        with _out_of_memory_explained():
-            _try_one_step(ready)
-            with stop_on_signals() as stop:
-                train_pairs, held_out = prepare(ready, reporter, stop)
-                linear = fit_linear(train_pairs, ready.shape, ready.device, reporter.task("fitting the linear decoder"))
-                trained = _Training(ready, linear)
-                _train(trained, train_pairs, reporter, stop)
-            _finish(trained, linear, train_pairs, held_out, reporter)
+        if not ready.is_done:
+            with _out_of_memory_explained():
+                _try_one_step(ready)
+                _make(ready, reporter)
+            reporter.note(f"The decoder is in {ready.folder}: {ready.folder / CARD} says how good it is")
+        shutil.rmtree(ready.pairs.folder, ignore_errors=True)  # also after a start that was killed by then
+        (ready.folder / STATE).unlink(missing_ok=True)
     return ready.folder
 
 
-def _try_one_step(ready: Setup) -> None:
-    """Run out of memory now, not after the frames are encoded."""
-    if ready.device.type == "cuda":
-        steps = _steps_of(ready, None)
-        shape, count = ready.shape, ready.decoder.batch_size
-        latents = torch.zeros(count, shape.grid**2, shape.dim)
-        steps.do(1, Pairs(latents, torch.zeros(count, 3, shape.image_size, shape.image_size).byte(), ()))
-
-
-class _Training:
-    """The steps of a decoder, from its newest checkpoint if there is one."""
-
-    def __init__(self, ready: Setup, linear: Decoder) -> None:
-        self.ready, self.done = ready, 0
-        self.steps = _steps_of(ready, linear)
-        newest = newest_checkpoint(ready.folder / CHECKPOINTS)
-        if newest is not None:
-            self._restore(newest)
-
-    def save(self, step: int) -> None:
-        """Write a checkpoint."""
-
-        def write(folder: Path) -> None:
-            for name, value in ((_WEIGHTS, self.steps.weights()), (OPTIMIZER, self.steps.optimizer.state_dict())):
-                with (folder / name).open("wb") as file:
-                    write_torch(value, file)
-
-        state = RunState(step=step, clips_done=step * self.ready.decoder.batch_size)
-        write_checkpoint(self.ready.folder / CHECKPOINTS, state, write, keep=_KEEP)
-
-    def _restore(self, checkpoint: Path) -> None:
-        try:
-            self.steps.restore(read_torch(checkpoint / _WEIGHTS), read_torch(checkpoint / OPTIMIZER))
-        except (KeyError, ValueError, RuntimeError, TypeError) as error:
-            fix = "Delete this checkpoint, to use an older one"
-            raise InputError(where=str(checkpoint), found=f"not this decoder's ({error})", fix=fix) from None
-        self.done = read_state(checkpoint).step
-
-
-def _steps_of(ready: Setup, linear: Decoder | None) -> DecoderSteps:
-    return DecoderSteps(ready.shape, ready.decoder, ready.config.seed, ready.device, ready.autocast, linear)
-
-
-def _train(training: _Training, pairs: FramePairs, reporter: Reporter, stop: StopRequest) -> None:
-    config, first = training.ready.decoder, training.done
-    progress = reporter.task("training the decoder", "steps")
-    with (
-        MetricsLog(training.ready.folder, first_step=first) as log,
-        contextlib.closing(_batches(pairs, config, training.ready.config.seed, first)) as batches,
-    ):
-        for step, batch in batches:
-            metrics = training.steps.do(step, batch)
-            progress(step, config.steps)
-            is_last = step == config.steps
-            if step % _LOG_EVERY == 0 or is_last:
-                log.write("train", step, metrics)
-            if step % config.checkpoint_every == 0 or is_last or stop.number:
-                with log.before_a_checkpoint():
-                    training.save(step)
-            if stop.number and not is_last:
-                raise StoppedError(training.ready.folder, step, signal.Signals(stop.number).name)
-
-
-def _batches(
-    pairs: FramePairs, config: DecoderConfig, seed: int, done: int
-) -> Generator[tuple[int, Pairs], None, None]:
-    """Yield the frames of each further step; the next ones are read meanwhile."""
-
-    def read(step: int) -> Pairs:
-        places = range((step - 1) * config.batch_size, step * config.batch_size)
-        count = len(pairs)
-        return pairs.read([permuted(at % count, size=count, seed=seed, epoch=at // count) for at in places])
-
-    with ThreadPoolExecutor(1, thread_name_prefix="pairs") as pool:
-        ahead = pool.submit(read, done + 1) if done < config.steps else None
-        for step in range(done + 1, config.steps + 1):
-            batch = ahead.result() if ahead is not None else read(step)
-            ahead = pool.submit(read, step + 1) if step < config.steps else None
-            yield step, batch
-
-
-def _finish(
-    training: _Training, linear: Decoder, pairs: FramePairs, held_out: FramePairs | None, reporter: Reporter
-) -> None:
-    """Measure the averaged weights on held-out frames, write the decoder, and remove all else."""
-    ready = training.ready
-    if (name := first_not_finite(training.steps.average)) is not None:
+def _make(ready: Setup, reporter: Reporter) -> None:
+    """Encode, fit, train, measure, and write the decoder."""
+    with stop_on_signals() as stop:
+        pairs, held_out = (_encoded(ready, split, reporter, stop) for split in ("train", "test"))
+        linear = fit_linear(pairs, ready.shape, ready.on_device.device, reporter.task("fitting the linear decoder"))
+        steps = ready.steps_from(linear)
+        _train(ready, steps, pairs, reporter, stop)
+    if (name := first_not_finite(steps.average)) is not None:
         raise InputError(where=str(ready.folder), found=f"{name} holds NaN or infinity", fix="Lower the learning rate")
-    decoder = Decoder(ready.shape).to(ready.device).eval()
-    decoder.load_state_dict(training.steps.average)
+    decoder = Decoder(ready.shape).to(ready.on_device.device).eval()
+    decoder.load_state_dict(steps.average)
     found: dict[str, Any] = {}
-    if held_out is not None:
-        decoders = {"decoder": decoder, "linear": linear.to(ready.device)}
+    if len(held_out):
+        decoders = {"decoder": decoder, "linear": linear.to(ready.on_device.device)}
         found = measure_decoders(held_out, decoders, mean_image(pairs), reporter.task("measuring", "frames"))
     data = ready.config.data
     card = DecoderCard(
         format="vjepa2-ac decoder 1",
         shape=ready.shape,
-        encoder=ready.encoder,
+        encoder=ready.encoding.encoder,
         crop=data.crop,
         precision=ready.config.training.precision,
         data=data.path,
         cameras=tuple(data.cameras),
-        episodes=len({file.episode_id for file in pairs.files}),
+        episodes=len(set(pairs.episode_ids)),
         frames=len(pairs),
-        steps=training.ready.decoder.steps,
+        steps=ready.config.decoder.steps,
         held_out=found,
         time=utc_now(),
     )
     save_decoder(ready.folder, card, decoder.state_dict(), linear.state_dict())
-    _remove_temporary(ready)
-    reporter.note(f"The decoder is in {ready.folder}: {ready.folder / CARD} says how good it is")
 
 
-def _remove_temporary(ready: Setup) -> None:
-    """Remove what only training needs."""
-    for temporary in (ready.pairs, ready.folder / CHECKPOINTS):
-        shutil.rmtree(temporary, ignore_errors=True)
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """A decoder that can be trained."""
+
+    config: Config
+    folder: Path
+    shape: DecoderShape
+    encoding: Encoding
+    dataset: Dataset
+    on_device: EncoderOnDevice
+    wanted: dict[Split, list[FramesToEncode]]
+    pairs: LatentFiles  # frames and latents, while it is trained
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the folder holds the decoder already."""
+        return (self.folder / CARD).is_file()
+
+    def steps_from(self, linear: Decoder | None) -> DecoderSteps:
+        """Return its first optimizer steps, from the linear decoder or from fresh weights."""
+        config, device = self.config, self.on_device.device
+        needs_loss_scale = config.training.precision == "fp16"  # and there is none here
+        arithmetic = contextlib.nullcontext if needs_loss_scale else partial(autocast, config.training, device)
+        return DecoderSteps(self.shape, config.decoder, config.seed, device, arithmetic, linear)
+
+
+@contextlib.contextmanager
+def _setup(config: Config, reporter: Reporter, *, check_only: bool) -> Iterator[Setup]:
+    """Check config, folder, data, model and disk, and hold the folder's lock to the end of the block.
+
+    Raises:
+        InputError: One of them cannot be used.
+    """
+    named = config.decoder.folder
+    folder = Path(config.run_dir).parent / "decoder" if named is None else Path(named)
+    _require_frames(config)
+    device = computing_device(config.training)
+    with user_can_write(folder):
+        try_writing_at(folder)
+    dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
+    wanted = _wanted(dataset, config.decoder)
+    model = load_base(config.model, seed=config.seed)
+    shape, encoding = _shape_for(model, config.decoder), encoding_of(model, config)
+    key = CacheKey({
+        "decoder": config.decoder.model_dump(mode="json", exclude={"folder", "checkpoint_every"}),
+        "seed": config.seed,
+        "latents": dict(key_for(dataset, encoding).parts),
+        "data": config.data.model_dump(mode="json", include={"validation_share", "test_share", "split_by"}),
+    })  # fmt: skip
+    require_own_folder(folder / KEY, key, where=f"decoder.folder {folder}")
+    pairs, on_device = LatentFiles(folder / PAIRS, key.digest), EncoderOnDevice.of(config, model, device)
+    ready = Setup(config, folder, shape, encoding, dataset, on_device, wanted, pairs)
+    with RunLock(folder) as lock:
+        if ready.is_done:
+            read_card(folder)
+            reporter.note(f"The decoder is there already, in {folder}")
+        else:
+            _require_space(ready, reporter)
+            if not check_only:
+                lock.take()
+                with user_can_write(folder):
+                    write_atomically(folder / KEY, json.dumps({"key": dict(key.parts)}, indent=1) + "\n")
+        yield ready
+
+
+def _wanted(dataset: Dataset, decoder: DecoderConfig) -> dict[Split, list[FramesToEncode]]:
+    """Return the frames of each split; the test split may be empty."""
+    found: dict[Split, list[FramesToEncode]] = {
+        "train": wanted_frames(dataset, "train", frames=decoder.frames),
+        "test": wanted_frames(dataset, "test", frames=decoder.held_out_frames),
+    }
+    if not found["train"]:
+        raise InputError(
+            where=f"data.path: {dataset.config.path}",
+            found="no frames of train episodes",
+            needed="one episode or more that is as long as a clip",
+            fix="Lower data.validation_share or data.test_share",
+        )
+    return found
+
+
+def _require_space(ready: Setup, reporter: Reporter) -> None:
+    encoding, kind = ready.encoding, ready.config.data.cache_dtype
+    per_frame = bytes_per_frame(encoding.tokens, encoding.dim, kind) + 3 * encoding.image_size**2
+    everything = [one for some in ready.wanted.values() for one in some]
+    left = frames_in([one for one in everything if not ready.pairs.has(one.episode, one.camera)])
+    fix = "Lower decoder.frames, set data.cache_dtype: int8, or put decoder.folder on a larger disk"
+    require_space(ready.folder, left, per_frame, fix=fix)
+    taken = left * per_frame / 1e9
+    reporter.note(
+        f"{frames_in(everything):,} frames; {taken:.3g} GB of disk for them and their latents, while training"
+    )
+
+
+def _require_frames(config: Config) -> None:
+    if config.data.is_cache:
+        raise InputError(
+            where="data.source",
+            found="latents: a cache has no frames to learn from, only JPEGs to look at",
+            needed="the data set itself",
+            fix="Use the config of the data set; data.cache does not matter here",
+        )
+    require_stride(config.data, to="know which frames clips use")
+
+
+def _shape_for(model: WorldModel, decoder: DecoderConfig) -> DecoderShape:
+    patch = model.sizes.patch_size
+    if patch % UPSAMPLED or model.image_size < SMALLEST:
+        raise InputError(
+            where="model",
+            found=f"images of {model.image_size} px in patches of {patch} px",
+            needed=f"{SMALLEST} px or more, and patches of a multiple of {UPSAMPLED} px",
+        )
+    return DecoderShape(decoder.size, model.latent_dim, model.image_size // patch, patch)
+
+
+def _try_one_step(ready: Setup) -> None:
+    """Run out of memory now, not after the frames are encoded."""
+    if ready.on_device.device.type == "cuda":
+        shape, count = ready.shape, ready.config.decoder.batch_size
+        latents = torch.zeros(count, shape.grid**2, shape.dim)
+        images = torch.zeros(count, 3, shape.image_size, shape.image_size).byte()
+        ready.steps_from(None).do(1, Pairs(latents, images, ()))
+
+
+def _encoded(ready: Setup, split: Split, reporter: Reporter, stop: StopRequest) -> FramePairs:
+    """Encode the frames of a split that are not there yet; episodes that cannot be read are left out by policy."""
+    shown, wanted, files = reporter.task(f"encoding {split} frames", "frames"), ready.wanted[split], ready.pairs
+
+    def progress(done: int, total: int) -> None:
+        shown(done, total)
+        if stop.reason is not None:
+            raise StoppedError(ready.folder, 0, stop.reason)
+
+    left = [one for one in wanted if not files.is_done(one.episode, one.camera)]
+    encode_files(ready.dataset, left, ready.on_device, files, progress, exact_pictures=True)
+    pairs = FramePairs.of(ready.dataset, wanted, files)
+    if wanted and not len(pairs):
+        raise InputError(where=ready.config.data.path, found="no frame that can be read", needed="one or more")
+    return pairs
+
+
+def _train(ready: Setup, steps: DecoderSteps, pairs: FramePairs, reporter: Reporter, stop: StopRequest) -> None:
+    """Do the steps that are left after those that were saved."""
+    config, saved = ready.config.decoder, ready.folder / STATE
+    first = _restore(steps, saved) if saved.is_file() else 0
+    progress = reporter.task("training the decoder", "steps")
+    with (
+        MetricsLog(ready.folder, first_step=first) as log,
+        contextlib.closing(_batches(pairs, ready.config, first)) as batches,
+    ):
+        for step, batch in batches:
+            metrics = steps.do(step, batch)
+            progress(step, config.steps)
+            is_last = step == config.steps
+            if step % _LOG_EVERY == 0 or is_last:
+                log.write("train", step, metrics)
+            if step % config.checkpoint_every == 0 or is_last or stop.reason is not None:
+                with log.before_a_checkpoint(), user_can_write(saved), atomic_writer(saved) as file:
+                    write_torch({"step": step, **steps.state()}, file)
+            if stop.reason is not None and not is_last:
+                raise StoppedError(ready.folder, step, stop.reason)
+
+
+def _restore(steps: DecoderSteps, saved: Path) -> int:
+    """Continue from what was saved, and return how many steps were done."""
+    state = read_torch(saved)
+    try:
+        steps.restore(state)
+        return int(state["step"])
+    except (KeyError, ValueError, RuntimeError, TypeError) as error:
+        raise InputError(where=str(saved), found=f"not this decoder's ({error})", fix="Delete it") from None
+
+
+def _batches(pairs: FramePairs, config: Config, done: int) -> Generator[tuple[int, Pairs], None, None]:
+    """Yield the frames of each further step; the next ones are read meanwhile."""
+    size, count, seed = config.decoder.batch_size, len(pairs), config.seed
+
+    def read(step: int) -> Pairs:
+        places = range((step - 1) * size, step * size)
+        return pairs.read([permuted(at % count, size=count, seed=seed, epoch=at // count) for at in places])
+
+    with ThreadPoolExecutor(1, thread_name_prefix="pairs") as pool:
+        ahead = pool.submit(read, done + 1)
+        for step in range(done + 1, config.decoder.steps + 1):
+            batch = ahead.result()
+            ahead = pool.submit(read, step + 1)
+            yield step, batch
 
 
 @contextlib.contextmanager

@@ -7,7 +7,7 @@ model: a process may have no clip in a micro-batch (`data.broken_episodes: skip`
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeVar
 
 import torch
@@ -16,7 +16,7 @@ from accelerate.utils import broadcast_object_list, gather_object
 from torch import Tensor, nn
 from torch.distributed.tensor import DTensor
 
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, UserError
 
 _T = TypeVar("_T")
 
@@ -63,6 +63,24 @@ def broadcast_object(accelerator: Accelerator, value: _T) -> _T:
         return value
     holder: list[Any] = [value if accelerator.is_main_process else None]
     return broadcast_object_list(holder)[0]  # type: ignore[no-any-return]  # untyped
+
+
+def value_of_first(accelerator: Accelerator, make: Callable[[], _T]) -> _T:
+    """Return what the first process makes, in every process.
+
+    Raises:
+        UserError: In all processes, if the first one meets it: else the others would wait for a value.
+    """
+    made: _T | UserError | None = None
+    if accelerator.is_main_process:
+        try:
+            made = make()
+        except UserError as error:
+            made = error
+    made = broadcast_object(accelerator, made)
+    if isinstance(made, UserError):
+        raise made
+    return made  # type: ignore[return-value]
 
 
 def all_gather_object(accelerator: Accelerator, value: _T) -> list[_T]:

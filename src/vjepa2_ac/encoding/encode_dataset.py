@@ -1,36 +1,42 @@
-"""Encoding of a whole data set before training, as a command or at the start of a run.
+"""Encoding of a whole data set, as a command or at the start of a run.
 
 As a command, processes do not communicate: each encodes its share of the episodes and marks each finished one by a
-file.
+file. Those of a run wait for one another's files.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
+import time
+import uuid
+from collections import deque
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import timedelta
 from functools import partial
 from pathlib import Path
 
-import torch
+from accelerate import Accelerator
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import ProcessShare
-from vjepa2_ac.data.sources.latents.manifest import Manifest, is_whole, read_manifest
 from vjepa2_ac.data.windows import require_stride
-from vjepa2_ac.distributed.device import autocast, computing_device
-from vjepa2_ac.encoding.batch import encoding_of
-from vjepa2_ac.encoding.cache_lookup import folder_of, key_for
-from vjepa2_ac.encoding.cache_writer import CacheWriter
-from vjepa2_ac.encoding.disk_space import GIGABYTE, require_space
-from vjepa2_ac.encoding.pipeline import EncoderOnDevice, build
-from vjepa2_ac.encoding.repair import describe, missing_files, restart
-from vjepa2_ac.encoding.workload import Workload, claim_folder
+from vjepa2_ac.distributed.collectives import value_of_first
+from vjepa2_ac.distributed.device import computing_device
+from vjepa2_ac.encoding.batch import encoding_of, require_same_encoder
+from vjepa2_ac.encoding.latent_cache import LatentCache, frames_in, through_cache
+from vjepa2_ac.encoding.pipeline import EncoderOnDevice, FramesToEncode, encode_files
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
-from vjepa2_ac.storage import free_bytes
+from vjepa2_ac.storage import free_bytes, user_can_write, write_atomically
+
+_LOOKS_EVERY_S = 1.0  # for the files of other processes
+_LONGEST_WITHOUT_A_FILE_S = 2 * 3600.0
+_LONGEST_UNSEEN_S = 60.0  # of a new file in a folder of the network
 
 
 @dataclass(frozen=True)
@@ -38,11 +44,18 @@ class EncodedSet:
     """The result of encoding a cache."""
 
     folder: Path
-    manifest: Manifest | None  # None: other processes are still at work
+    episodes: int  # of the data set
+    encoded: int  # episodes, of all cameras
+    frames: int  # of all cameras
+    bytes: int
+    broken: Mapping[str, str]  # episodes that could not be read, and why
+    is_finished: bool  # else other processes are still at work
 
 
 def encode_config(config: Config, reporter: Reporter = SILENT, *, out: Path | None = None) -> EncodedSet:
     """Write the latents of every frame that the clips of a config need, or this process's share of them.
+
+    Episodes that could not be read are tried again.
 
     Args:
         config: The data, the model whose encoder is used, device and precision.
@@ -56,17 +69,15 @@ def encode_config(config: Config, reporter: Reporter = SILENT, *, out: Path | No
     device = computing_device(config.training)
     dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
     model = load_base(config.model, seed=config.seed)
-    writer = writer_for(config, dataset, model, out)
-    if is_whole(writer.folder):
-        claim_folder(writer)
-        if not (missing := missing_files(dataset, writer)):
-            reporter.note(f"Everything is encoded already, in {writer.folder}")
-            return EncodedSet(writer.folder, read_manifest(writer.folder))
-        reporter.note(f"{describe(missing)}. It is encoded again.")
-        restart(writer, missing)
-    share = ProcessShare(int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1")))
-    at_work = encoder_on_device(config, model, device)
-    return EncodedSet(writer.folder, encode_share(dataset, writer, at_work, share, reporter))
+    cache = LatentCache.of(dataset, encoding_of(model, config), out)
+    cache.require_own()
+    if left := cache.missing(retry=True):
+        share = ProcessShare(int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1")))
+        encode_share(cache, left, EncoderOnDevice.of(config, model, device), share, reporter)
+    else:
+        cache.begin()
+        reporter.note(f"Everything is encoded already, in {cache.folder}")
+    return _result(cache)
 
 
 def require_encodable(config: Config) -> None:
@@ -89,34 +100,176 @@ def require_encodable(config: Config) -> None:
         )
 
 
-def writer_for(config: Config, dataset: Dataset, model: WorldModel, out: Path | None = None) -> CacheWriter:
-    """Return the cache writer of an open data set, for the encoder of this model."""
-    encoding = encoding_of(model, config)
-    key = key_for(dataset, encoding)
-    return CacheWriter(folder_of(config.data, key) if out is None else out, key, encoding)
-
-
-def encoder_on_device(config: Config, model: WorldModel, device: torch.device) -> EncoderOnDevice:
-    """Move the encoder of a model, and only the encoder, to a device."""
-    model.present_encoder.to(device)
-    return EncoderOnDevice(model, device, partial(autocast, config.training, device), config.model.encode_chunk)
-
-
 def encode_share(
-    dataset: Dataset, writer: CacheWriter, encoder: EncoderOnDevice, share: ProcessShare, reporter: Reporter
-) -> Manifest | None:
-    """Report the work, check the disk space, and encode the share of one process.
+    cache: LatentCache,
+    left: Sequence[FramesToEncode],
+    encoder: EncoderOnDevice,
+    share: ProcessShare,
+    reporter: Reporter,
+) -> None:
+    """Report the work, check the disk space, and encode the share of one process: every so-many-th episode.
 
     Raises:
-        InputError: As `encode_config`.
+        InputError: As of `encode_files`; or too many episodes are broken, by all processes together.
     """
-    work, config = Workload.of(dataset, writer, share), dataset.config
-    free = free_bytes(writer.folder) / GIGABYTE
-    reporter.note(f"Encoding {config.path}: {work.room} as {config.cache_dtype}")
-    reporter.note(f"The latents go into {writer.folder}, with {free:.4g} GB free on its disk")
-    if work.left_in_total < work.frames:
-        reporter.note(f"{work.frames - work.left_in_total:,} frames are there already; {work.left_in_total:,} are left")
-    require_space(work.room, writer.folder, config)
-    claim_folder(writer)
-    progress = reporter.task("encoding frames", "frames")
-    return build(work, encoder, threads=max(1, config.workers), progress=progress)
+    dataset, config = cache.dataset, cache.dataset.config
+    reporter.note(f"Encoding {config.path} as {config.cache_dtype}: {cache.summary(left)}")
+    free = free_bytes(cache.folder) / 1e9
+    reporter.note(f"The latents go into {cache.folder}, with {free:.4g} GB free on its disk")
+    cache.require_space(left)
+    cache.begin()
+    mine = [one for one in left if one.episode % share.processes == share.rank]
+    encode_files(dataset, mine, encoder, cache.files, reporter.task("encoding frames", "frames"))
+    for number, reason in cache.broken.items():
+        dataset.broken.met(dataset.table.identity(number), reason)
+
+
+def with_latents(
+    config: Config,
+    dataset: Dataset,
+    model: WorldModel,
+    accelerator: Accelerator,
+    reporter: Reporter,
+    *,
+    check_only: bool = False,
+) -> Dataset:
+    """Return the data set of a run, with its clips from the latent cache if the config has one.
+
+    Args:
+        config: The config of the run.
+        dataset: The open data set, at its stride.
+        model: The model whose encoder is used.
+        accelerator: Its processes share the encoding.
+        reporter: Receives messages for the user.
+        check_only: Encode nothing: report what would be encoded, and leave the clips as frames.
+
+    Raises:
+        InputError: The cache is another encoder's, is required and missing, or cannot be made.
+    """
+    if config.data.is_cache or config.data.cache == "off":
+        require_same_encoder(model, dataset, config)
+        return dataset
+    cache = LatentCache.of(dataset, encoding_of(model, config))
+    if config.data.cache == "auto":
+        make_encoder = partial(EncoderOnDevice.of, config, model, accelerator.device)
+        if not check_only:
+            _encode_together(cache, make_encoder, accelerator, reporter)
+        elif left := cache.missing():
+            reporter.note(_forecast(cache, left, make_encoder(), accelerator.num_processes))
+            return dataset
+    found = through_cache(dataset, cache.encoding)
+    reporter.note(f"Latents come from {cache.folder}: the encoder is not needed")
+    return found
+
+
+def with_latents_if_there(config: Config, dataset: Dataset, model: WorldModel) -> Dataset:
+    """Return a data set with its clips from a finished latent cache of this encoder if there is one, else unchanged.
+
+    Raises:
+        InputError: The data set is itself a cache, of another encoder.
+    """
+    if config.data.is_cache or config.data.cache == "off":
+        require_same_encoder(model, dataset, config)
+        return dataset
+    cache = LatentCache.of(dataset, encoding_of(model, config))
+    return dataset if cache.missing() else through_cache(dataset, cache.encoding)
+
+
+def _encode_together(
+    cache: LatentCache, make_encoder: partial[EncoderOnDevice], accelerator: Accelerator, reporter: Reporter
+) -> None:
+    """Encode what is missing, by all processes of a run.
+
+    None of them waits for another one's encoding in a collective, which would give up after some time: they look for
+    its files. What stops one of them is written into a file of this attempt, and stops the others.
+    """
+    share = ProcessShare(accelerator.process_index, accelerator.num_processes)
+    attempt = None if share.processes == 1 else value_of_first(accelerator, partial(_begin_attempt, cache))
+    try:
+        if attempt is not None:
+            _require_seen(attempt, share)
+        if left := cache.missing():
+            encode_share(cache, left, make_encoder(), share, reporter)
+    except BaseException as error:
+        if attempt is not None:
+            with contextlib.suppress(OSError):
+                write_atomically(attempt, f"process {share.rank}: {str(error) or type(error).__name__}")
+        raise
+    if attempt is not None:
+        _wait_for_others(cache, left, attempt)
+        if accelerator.is_main_process:
+            attempt.unlink(missing_ok=True)
+
+
+def _begin_attempt(cache: LatentCache) -> Path:
+    cache.require_own()
+    attempt = cache.folder / f".attempt-{uuid.uuid4().hex}"
+    with user_can_write(cache.folder):
+        write_atomically(attempt, "")
+    return attempt
+
+
+def _require_seen(attempt: Path, share: ProcessShare) -> None:
+    """Refuse a folder that the processes do not share, before each of them waits for the others' files."""
+    end = time.monotonic() + _LONGEST_UNSEEN_S
+    while not attempt.is_file():
+        if time.monotonic() > end:
+            raise InputError(
+                where=f"data.cache_dir: {attempt.parent.parent}",
+                found=f"a folder in which process {share.rank} does not see what process 0 wrote",
+                needed="one that all machines of the run share",
+                fix="Set data.cache_dir to a shared folder; or run `vjepa2-ac encode` once on every machine",
+            )
+        time.sleep(_LOOKS_EVERY_S)
+
+
+def _wait_for_others(cache: LatentCache, left: Sequence[FramesToEncode], attempt: Path) -> None:
+    """Wait until nothing is missing.
+
+    Raises:
+        InputError: Another process was stopped, and why; or there was no new file for two hours.
+    """
+    waiting, last_change = deque(left), time.monotonic()
+    while waiting:
+        if cache.files.is_done(waiting[0].episode, waiting[0].camera):
+            waiting.popleft()
+            last_change = time.monotonic()
+            continue
+        with contextlib.suppress(FileNotFoundError):  # process 0 has seen everything, and removed it
+            if stopped := attempt.read_text(encoding="utf-8"):
+                raise InputError(where=str(cache.folder), found=f"the encoding was stopped in {stopped}")
+        if time.monotonic() - last_change > _LONGEST_WITHOUT_A_FILE_S:
+            name = cache.dataset.table.identity(waiting[0].episode)
+            raise InputError(
+                where=str(cache.folder),
+                found=f"for two hours no latents of episode {name}, which another process of the run is to encode",
+                fix="Look whether all processes are at work, and start the run again: it goes on where it was",
+            )
+        time.sleep(_LOOKS_EVERY_S)
+
+
+def _result(cache: LatentCache) -> EncodedSet:
+    table, broken = cache.dataset.table, cache.broken
+    sizes = [(one, cache.files.size(one.episode, one.camera)) for one in cache.wanted]
+    absent = {one.episode for one, size in sizes if not size}
+    return EncodedSet(
+        folder=cache.folder,
+        episodes=len(table),
+        encoded=len({one.episode for one in cache.wanted} - absent),
+        frames=sum(len(one.steps) for one, size in sizes if size),
+        bytes=sum(size for _, size in sizes),
+        broken={table.identity(number): reason for number, reason in broken.items()},
+        is_finished=absent <= broken.keys(),
+    )
+
+
+def _forecast(cache: LatentCache, left: Sequence[FramesToEncode], encoder: EncoderOnDevice, processes: int) -> str:
+    """Return as text what a run would encode first, after a check that there is space for it."""
+    cache.require_own()
+    cache.require_space(left)
+    speed, frames = encoder.frames_per_second() * processes, frames_in(left)
+    return (
+        f"A run would first encode {frames:,} of {cache.summary(())} as {cache.dataset.config.cache_dtype}, into"
+        f" {cache.folder}. At the {speed:.3g} frames/s of one chunk just timed that takes"
+        f" {timedelta(seconds=round(frames / speed))}"
+    )

@@ -1,35 +1,45 @@
-"""The encoding pipeline: prefetched frames, encoded in chunks, written as one file per episode.
-
-An episode is complete once its file has its final name: a process that is killed loses only the episodes in progress.
-The process that finds nothing missing finalizes the cache.
-"""
+"""Encoding of frames into files: threads decode ahead, the encoder computes, and a thread writes file after file."""
 
 from __future__ import annotations
 
 import contextlib
-import itertools
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
+from itertools import groupby, islice
+from operator import itemgetter
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from einops import rearrange
+from jaxtyping import Float, Int32, UInt8
 from torch import Tensor
 
-from vjepa2_ac.data.sources.latents.dtypes import pack_latents
-from vjepa2_ac.data.sources.latents.episode_file import EncodedEpisode
-from vjepa2_ac.data.sources.latents.manifest import Manifest
-from vjepa2_ac.data.streams import copies_for
-from vjepa2_ac.encoding.batching import Chunks, Encoded
-from vjepa2_ac.encoding.disk_space import small_frame_side
-from vjepa2_ac.encoding.prefetch import Unreadable, prefetched
-from vjepa2_ac.encoding.workload import Workload, broken_in, forget_broken, note_broken
-from vjepa2_ac.episode import Progress, no_progress
+from vjepa2_ac.config import Config
+from vjepa2_ac.data.clips import joined_latents
+from vjepa2_ac.data.dataset import Dataset, require_widths
+from vjepa2_ac.data.sources.latents.cache_files import CacheType, EncodedEpisode, LatentFiles, pack_latents
+from vjepa2_ac.data.transforms import input_to_pixels, pixels_to_input, view
+from vjepa2_ac.distributed.device import autocast
+from vjepa2_ac.episode import Episode, Progress, StoredLatents, no_progress
+from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.world_model import WorldModel
 
+FRAMES_AT_ONCE = 64  # decoded in one go: a run of a video, and 180 MB of 720p at most
+_PREFETCHED_PARTS = 2  # per thread: one in progress, and one ready
 _WRITES_UNDER_WAY = 2  # files: limits the memory
+
+
+@dataclass(frozen=True, eq=False)
+class FramesToEncode:
+    """Frames to encode, of one camera of one episode."""
+
+    episode: int  # index into the data set's table
+    camera: str
+    steps: Int32[np.ndarray, " frames"]  # control steps, ascending
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,90 +51,143 @@ class EncoderOnDevice:
     autocast: Callable[[], contextlib.AbstractContextManager[object]]
     chunk: int  # frames at once
 
+    @classmethod
+    def of(cls, config: Config, model: WorldModel, device: torch.device) -> EncoderOnDevice:
+        """Move the encoder of a model, and only the encoder, to a device."""
+        model.present_encoder.to(device)
+        return cls(model, device, partial(autocast, config.training, device), config.model.encode_chunk)
+
     @torch.no_grad()
     def latents(self, inputs: Float[Tensor, "time 3 size size"]) -> Float[Tensor, "time tokens dim"]:
         """Return the latents of normalised frames."""
         with self.autocast():
             return self.world_model.encode(inputs[None], chunk=self.chunk)[0]
 
+    def frames_per_second(self) -> float:
+        """Measure the speed on a chunk of black frames, after a warm-up chunk where a device needs one."""
+        size = self.world_model.image_size
+        black = torch.zeros(self.chunk, 3, size, size, device=self.device)
+        if self.device.type != "cpu":
+            self.latents(black).cpu()
+        started = time.perf_counter()
+        self.latents(black).cpu()
+        return self.chunk / (time.perf_counter() - started)
 
-def build(
-    work: Workload, encoder: EncoderOnDevice, *, threads: int, progress: Progress = no_progress
-) -> Manifest | None:
-    """Encode the share of this process, and finalize the cache if nothing is missing by then.
+
+_Frames = UInt8[Tensor, "frames height width 3"]  # cropped
+_Parts = Iterator[tuple[FramesToEncode, Future[tuple[Episode, _Frames]]]]  # neighbouring frames of a request
+
+
+def encode_files(
+    dataset: Dataset,
+    wanted: Sequence[FramesToEncode],
+    encoder: EncoderOnDevice,
+    files: LatentFiles,
+    progress: Progress = no_progress,
+    *,
+    exact_pictures: bool = False,
+) -> None:
+    """Write the file of each request; an episode that cannot be read is left out by `data.broken_episodes`, and noted.
+
+    A file gets its name when it is complete: a kill loses only those in progress.
 
     Args:
-        work: The work.
-        encoder: The encoder.
-        threads: Number of threads that decode frames in advance.
-        progress: Called with (done, total) in frames of this process.
-
-    Returns:
-        The manifest of the cache; None while other processes are still encoding.
+        dataset: Source of the frames.
+        wanted: The requests.
+        encoder: Makes the latents.
+        files: Where they go.
+        progress: Called with (done, total) in frames.
+        exact_pictures: Store the frames as the encoder saw them bit for bit, not as JPEGs.
 
     Raises:
-        InputError: An episode cannot be read and `data.broken_episodes` does not skip it, or too many are; or the
-            folder cannot be written. Written files stay.
+        InputError: An episode cannot be read and the policy does not skip it, or too many are; or a file cannot be
+            written. Written files stay.
+        UnreachableError: A failure of the connection, not of the episode.
     """
-    folder, dataset = work.writer.folder, work.dataset
-    for episode in sorted({one.episode for one in work.left}):
-        forget_broken(folder, episode)
-    if work.left:
-        for done in itertools.accumulate(_written(work, encoder, threads), initial=0):
-            progress(done, work.frames_left)
-    if work.is_incomplete:
-        return None
-    broken = broken_in(folder)
-    for name, reason in broken.items():
-        dataset.broken.met(name, reason)  # of the other processes, too: together they may be too many
-    return work.writer.finish(dataset, broken=broken, frames=work.frames)
+    threads, writes = max(1, dataset.config.workers), deque[Future[None]]()
+    done, total = 0, sum(len(one.steps) for one in wanted)
+    progress(done, total)
+    with ThreadPoolExecutor(threads, "decode") as decoders, ThreadPoolExecutor(1, "write") as writer:
+        parts_ahead = _ahead(_started(decoders, dataset, wanted, encoder), threads * _PREFETCHED_PARTS)
+        try:
+            for one, parts in groupby(parts_ahead, itemgetter(0)):
+                try:
+                    encoded = _encode(encoder, one, parts, dataset.config.cache_dtype)
+                except InputError as error:
+                    dataset.leave_out(one.episode, error)
+                    files.note_broken(one.episode, one.camera, str(error))
+                else:
+                    writes.append(writer.submit(_write, files, one.episode, encoded, exact_pictures=exact_pictures))
+                while len(writes) > _WRITES_UNDER_WAY:
+                    writes.popleft().result()
+                done += len(one.steps)
+                progress(done, total)
+            for write in writes:
+                write.result()
+        finally:
+            decoders.shutdown(cancel_futures=True)
 
 
-def _written(work: Workload, encoder: EncoderOnDevice, threads: int) -> Iterator[int]:
-    """Write episode after episode; yield the number of frames of each one, also of an unreadable one."""
-    image_size, kind = encoder.world_model.image_size, work.writer.key.kind
-    chunks = Chunks(
-        lambda inputs: pack_latents(encoder.latents(inputs), kind),
-        chunk=encoder.chunk,
-        image_size=image_size,
-        copies=copies_for(encoder.device),
-    )
-    under_way = deque[Future[int]]()
-    decoded = prefetched(work.dataset, work.left, threads=threads, side=small_frame_side(image_size))
-    with contextlib.closing(decoded), ThreadPoolExecutor(1, thread_name_prefix="write") as pool:
-        for one in chunks.encoded(decoded):
-            if isinstance(one, Unreadable):
-                _leave_out(work, one)
-                yield len(one.wanted.steps)
-            else:
-                under_way.append(pool.submit(_write, work, one))
-            while len(under_way) > _WRITES_UNDER_WAY or (under_way and under_way[0].done()):
-                yield under_way.popleft().result()
-        for written in under_way:
-            yield written.result()
+def _ahead(started: _Parts, count: int) -> _Parts:
+    """Yield parts in the requested order, while threads read the next ones."""
+    waiting = deque(islice(started, count))
+    while waiting:
+        part = waiting.popleft()
+        waiting.extend(islice(started, 1))
+        yield part
 
 
-def _write(work: Workload, one: Encoded) -> int:
-    """Write the file of an episode, and return its number of frames."""
-    wanted, steps = one.wanted, one.wanted.steps.tolist()
-    encoded = EncodedEpisode(one.recording, wanted.camera, steps, one.latents, one.small_frames)
-    work.writer.write_episode(wanted.episode, encoded)
-    return len(steps)
+def _started(
+    pool: ThreadPoolExecutor, dataset: Dataset, wanted: Sequence[FramesToEncode], encoder: EncoderOnDevice
+) -> _Parts:
+    """Start to read part after part; an episode is opened once, before the first of its parts."""
+    frames = encoder.chunk * max(1, FRAMES_AT_ONCE // encoder.chunk)  # whole chunks, but for the last of an episode
+    for one in wanted:
+        recording = pool.submit(_open, dataset, one)
+        for first in range(0, len(one.steps), frames):
+            steps = one.steps[first : first + frames].tolist()
+            yield one, pool.submit(_read, dataset, recording, steps, pinned=encoder.device.type == "cuda")
 
 
-def _leave_out(work: Workload, one: Unreadable) -> None:
-    """Apply `data.broken_episodes`, and record the episode for the other processes."""
-    work.dataset.leave_out(one.wanted.episode, one.error)
-    name = work.dataset.table.identity(one.wanted.episode)
-    note_broken(work.writer.folder, one.wanted.episode, name, str(one.error))
+def _open(dataset: Dataset, one: FramesToEncode) -> Episode:
+    recording = dataset.source.read(one.episode, one.camera, dataset.needed_steps(one.episode))
+    require_widths(recording, dataset.widths)
+    return recording
 
 
-def frames_per_second(encoder: EncoderOnDevice) -> float:
-    """Measure the encoding speed on a chunk of black frames, after a warm-up chunk where a device needs one."""
-    size = encoder.world_model.image_size
-    black = torch.zeros(encoder.chunk, 3, size, size, device=encoder.device)
-    if encoder.device.type != "cpu":
-        encoder.latents(black).cpu()
-    started = time.perf_counter()
-    encoder.latents(black).cpu()
-    return encoder.chunk / (time.perf_counter() - started)
+def _read(dataset: Dataset, opened: Future[Episode], steps: Sequence[int], *, pinned: bool) -> tuple[Episode, _Frames]:
+    recording = opened.result()
+    frames = torch.from_numpy(view(recording.read_frames(steps), dataset.config.crop))
+    return recording, frames.pin_memory() if pinned else frames
+
+
+def _encode(
+    encoder: EncoderOnDevice, one: FramesToEncode, parts: _Parts, kind: CacheType
+) -> Callable[[], EncodedEpisode]:
+    """Encode an episode, and return a function that waits for the results."""
+    latents, pictures = list[StoredLatents](), list[Tensor]()
+    for _, part in parts:
+        recording, frames = part.result()
+        pixels = frames.to(encoder.device, non_blocking=True)
+        inputs = pixels_to_input(pixels[None], encoder.world_model.image_size)[0]
+        latents.append(pack_latents(encoder.latents(inputs), kind).mapped(_to_host))
+        pictures.append(_to_host(input_to_pixels(inputs)))
+
+    def fetched() -> EncodedEpisode:
+        if encoder.device.type == "cuda":
+            torch.cuda.synchronize(encoder.device)
+        seen = np.ascontiguousarray(rearrange(torch.cat(pictures), "n c h w -> n h w c").numpy())
+        return EncodedEpisode(recording, one.camera, one.steps.tolist(), joined_latents(latents, torch.cat), seen)
+
+    return fetched
+
+
+def _to_host(tensor: Tensor) -> Tensor:
+    """Return a copy in the host's memory; from a GPU it is only enqueued: the next part need not wait."""
+    if not tensor.is_cuda:
+        return tensor.cpu()
+    return torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True).copy_(tensor, non_blocking=True)
+
+
+def _write(files: LatentFiles, number: int, encoded: Callable[[], EncodedEpisode], *, exact_pictures: bool) -> None:
+    files.write(number, encoded(), exact_pictures=exact_pictures)

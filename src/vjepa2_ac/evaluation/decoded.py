@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
-from vjepa2_ac.decoding.frame_pairs import as_images, as_pixels
+from vjepa2_ac.decoding.network import as_images, as_pixels
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.evaluate import ClipName, Contender, FramesOfRow, RepeatableClips

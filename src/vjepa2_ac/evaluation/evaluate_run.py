@@ -22,7 +22,7 @@ from vjepa2_ac.data.transforms import frames_as_seen
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
 from vjepa2_ac.distributed.launch import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, require_widths
-from vjepa2_ac.encoding.training_cache import with_latents_if_there
+from vjepa2_ac.encoding.encode_dataset import with_latents_if_there
 from vjepa2_ac.episode import Batch, LatentBatch, Progress, Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.decoded import NEIGHBOURS, TRUE_FRAMES, Decoding, load_lpips, measure_decoded

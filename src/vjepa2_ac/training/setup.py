@@ -24,7 +24,7 @@ from vjepa2_ac.distributed.device import PRECISIONS
 from vjepa2_ac.distributed.launch import make_accelerator
 from vjepa2_ac.distributed.shared_memory import warn_if_shared_memory_is_small
 from vjepa2_ac.encoding.batch import encode_batch, extrinsics_for
-from vjepa2_ac.encoding.training_cache import with_latents
+from vjepa2_ac.encoding.encode_dataset import with_latents
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.model.adapter.lora import add_adapter, save_trained, trainable_report
 from vjepa2_ac.model.adapter.low_rank import CastMatrices

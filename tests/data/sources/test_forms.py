@@ -226,9 +226,8 @@ def test_every_form_is_encoded_whole(forms: Path, form: str, tmp_path: Path) -> 
         {"run_dir": "none", "data": data, "model": {"random": sizes, "dtype": "float32", "encode_chunk": 9},
          "adapter": {"kind": "none"}, "training": {"device": "cpu", "precision": "fp32"}},
     )  # fmt: skip
-    manifest = encode_config(config, out=tmp_path / "latents").manifest
-    assert manifest is not None
-    assert (manifest.encoded, manifest.frames, dict(manifest.broken)) == (len(LENGTHS), sum(LENGTHS), {})
+    encoded = encode_config(config, out=tmp_path / "latents")
+    assert (encoded.encoded, encoded.frames, encoded.broken) == (len(LENGTHS), sum(LENGTHS), {})
     through = data.as_kind("latents", path=str(tmp_path / "latents"), camera=None)
     expected_order, expected = clips(opened(forms, form), 8)
     order, found = clips(open_dataset(through), 8)

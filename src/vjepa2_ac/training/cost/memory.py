@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from vjepa2_ac.config import Config, ModelSizes
-from vjepa2_ac.encoding.disk_space import FRAMES_AT_ONCE
+from vjepa2_ac.encoding.pipeline import FRAMES_AT_ONCE
 from vjepa2_ac.training.cost.fake_model import Kind
 from vjepa2_ac.training.cost.fake_step import StepBytes, measure_step
 from vjepa2_ac.training.cost.parameters import Parameters, count_parameters

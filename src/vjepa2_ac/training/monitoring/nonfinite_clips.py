@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vjepa2_ac.data.sources.latents.dtypes import unpack_latents
+from vjepa2_ac.data.sources.latents.cache_files import unpack_latents
 from vjepa2_ac.episode import Batch, StoredLatents
 from vjepa2_ac.storage import atomic_writer
 

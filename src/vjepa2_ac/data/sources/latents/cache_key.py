@@ -6,21 +6,19 @@ import hashlib
 import json
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.section import Affects, knobs_that_affect
-from vjepa2_ac.data.sources.latents.dtypes import DTYPES, CacheType
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage.structured import shown
+from vjepa2_ac.storage.structured import read_json_object
 
+FORMAT = 2  # of the files of a cache
 NORMALISATION = 1  # of pixels, in `transforms.pixels_to_input`, and of features: increase it when one of them changes
 
 _OF_THE_FRAMES = {"source", "camera", "pose_frame", "cache_dtype"}  # the other knobs are of clips
-OF_ENCODING = (
-    "encoder", "image_size", "patch_size", "normalisation", "model.dtype", "training.precision",
-    "encoder.family", "encoder.frame", "encoder.heads",
-)  # fmt: skip
+_NOT_OF_ENCODING = ("data", "format")  # how the names of the other parts begin
 
 
 @dataclass(frozen=True)
@@ -56,38 +54,30 @@ class Encoding:
 
 @dataclass(frozen=True)
 class CacheKey:
-    """What determines the content of a cache, as {name: JSON value}; with the names of knobs where they exist."""
+    """What determines the content of a folder, as {name: JSON value}; with the names of knobs where they exist."""
 
     parts: Mapping[str, Any]
 
     @property
     def digest(self) -> str:
-        """A short hash of it: the name of the cache's folder, also in each of its files."""
+        """A short hash of it: the name of a cache's folder, also in each of its files."""
         return hashlib.sha256(json.dumps(dict(self.parts), sort_keys=True).encode()).hexdigest()[:32]
 
     @property
-    def kind(self) -> CacheType:
-        """The storage type of latents."""
-        kind: CacheType = self.parts["data.cache_dtype"]
-        return kind
-
-    def require_whole(self, *, where: str, fix: str) -> None:
-        """Refuse a key from a file without the parts needed to read a cache.
-
-        Raises:
-            InputError: A part is missing.
-        """
-        cameras, kind = self.parts.get("data.camera"), self.parts.get("data.cache_dtype")
-        named = isinstance(cameras, list) and cameras and all(isinstance(camera, str) for camera in cameras)
-        if not named or not isinstance(kind, str) or kind not in DTYPES:
-            found = f"a key with data.camera {shown(cameras)} and data.cache_dtype {shown(kind)}"
-            needed = f"names of cameras, and one of {', '.join(DTYPES)}"
-            raise InputError(where=where, found=found, needed=needed, fix=fix)
+    def cameras(self) -> tuple[str, ...]:
+        """The cameras of a cache."""
+        return tuple(map(str, self.parts["data.camera"]))
 
     def differences(self, wanted: Mapping[str, Any], names: Collection[str] | None = None) -> list[str]:
-        """Return the differences from the wanted key, as "data.stride: 8, not 4"; of these names, or of all."""
+        """Return the differences from the wanted parts, as "data.stride: 8, not 4"; of these names, or of all."""
+        wanted = json.loads(json.dumps(dict(wanted)))  # as a file has them
         names = sorted(self.parts.keys() | wanted) if names is None else names
         return [text for name in names for text in _differences(name, self.parts.get(name), wanted.get(name))]
+
+    def differences_of(self, encoding: Encoding) -> list[str]:
+        """Return the differences in how frames became latents."""
+        names = sorted(self.parts.keys() | encoding.parts)
+        return self.differences(encoding.parts, [one for one in names if not one.startswith(_NOT_OF_ENCODING)])
 
 
 def key_of_cache(config: DataConfig, fingerprint: str, encoding: Encoding) -> CacheKey:
@@ -99,7 +89,7 @@ def key_of_cache(config: DataConfig, fingerprint: str, encoding: Encoding) -> Ca
         encoding: How frames become latents.
     """
     return CacheKey({
-        "format": 1,
+        "format": FORMAT,
         **encoding.parts,
         **clip_parts(config),
         "data.cache_dtype": config.cache_dtype,
@@ -117,6 +107,31 @@ def clip_parts(config: DataConfig) -> dict[str, Any]:
     """Return the parts that determine which frames and other data clips need: checked when a cache is used alone."""
     knobs = knobs_that_affect(Affects.LATENTS, config) | {"stride": config.model_stride}
     return {f"data.{name}": knobs[name] for name in sorted(knobs.keys() - _OF_THE_FRAMES - config.own_section.keys())}
+
+
+def require_own_folder(path: Path, key: CacheKey, *, where: str) -> None:
+    """Refuse a folder that was begun with another key, or that holds other files; one that is not there passes.
+
+    Args:
+        path: Its JSON file with the key.
+        key: Of what is about to be written there.
+        where: The folder, for messages.
+
+    Raises:
+        InputError: Names what differs.
+    """
+    folder, fix = path.parent, "Name another folder, or delete this one"
+    try:
+        there = read_json_object(path, fix=fix)
+    except (FileNotFoundError, NotADirectoryError):
+        others = sorted(one.name for one in folder.iterdir() if one.name[0] != ".") if folder.is_dir() else []
+        if others:
+            found = f"a folder with other things in it, such as {others[0]}"
+            raise InputError(where=where, found=found, needed="a new or empty one", fix=fix) from None
+        return
+    if differing := CacheKey(there.get("key") or {}).differences(key.parts):
+        found, needed = f"made otherwise: {'; '.join(differing)}", "a new folder, or one made with these settings"
+        raise InputError(where=where, found=found, needed=needed, fix=fix)
 
 
 def _differences(name: str, here: Any, there: Any) -> list[str]:

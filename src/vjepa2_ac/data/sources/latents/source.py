@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,30 +11,17 @@ from jaxtyping import Int
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.idle import FoundRanges
-from vjepa2_ac.data.index.episode_table import EpisodeProblem
 from vjepa2_ac.data.sources.indexed_source import IndexedSource, Opened
-from vjepa2_ac.data.sources.latents.cache_key import clip_parts
-from vjepa2_ac.data.sources.latents.episode_file import EpisodeFile
-from vjepa2_ac.data.sources.latents.manifest import (
-    KEPT,
-    MANIFEST,
-    Manifest,
-    path_of,
-    read_episodes,
-    read_manifest,
-    size_column,
-    size_of,
-)
-from vjepa2_ac.episode import Episode, Progress, StepRanges, StoredLatents
+from vjepa2_ac.data.sources.latents.cache_files import OPTIONAL, LatentFiles, read_key, read_tables
+from vjepa2_ac.data.sources.latents.cache_key import CacheKey, clip_parts
+from vjepa2_ac.episode import Episode, Progress, StepRanges
 from vjepa2_ac.errors import InputError
-
-_ENCODE = "Run `vjepa2-ac encode` again, as the cache was made: it encodes what is lacking; or copy the file again"
-_DELETE = "Delete this file, and then run `vjepa2-ac encode` again, as the cache was made; or copy the file again"
 
 
 @dataclass(frozen=True)
 class _Opened(Opened):
-    manifest: Manifest
+    key: CacheKey
+    files: LatentFiles
     kept: FoundRanges | None
 
 
@@ -46,20 +32,15 @@ class LatentSource(IndexedSource[DataConfig, _Opened]):
     of the data set, in their order.
     """
 
-    def __init__(self, config: DataConfig) -> None:
-        super().__init__(config)
-        self._folder = Path(config.path)
-        self._checked: dict[tuple[int, str], bytearray] = {}  # frames whose CRC this process has checked
-
     @property
-    def manifest(self) -> Manifest:
-        """The manifest of the cache."""
-        return self._open().manifest
+    def key(self) -> CacheKey:
+        """What the cache is."""
+        return self._open().key
 
     @property
     def cameras(self) -> tuple[str, ...]:
         """The cameras that clips are drawn from: the config's, or all of the cache."""
-        return self.manifest.cameras if self._config.camera is None else self._config.cameras
+        return self.key.cameras if self._config.camera is None else self._config.cameras
 
     @property
     def settled_config(self) -> DataConfig:
@@ -67,15 +48,14 @@ class LatentSource(IndexedSource[DataConfig, _Opened]):
         return self._config.model_copy(update={"camera": self.cameras})
 
     def kept_ranges(self) -> FoundRanges:
-        """Return the ranges that `data.idle` keeps, from the cache; its rule is not none.
+        """Return the ranges that `data.idle` keeps, from the cache.
 
         Raises:
-            InputError: No complete cache, or one of other clips than the config's.
+            InputError: No cache, or one of other clips than the config's.
+            ValueError: The rule is none.
         """
-        kept = self._open().kept
-        if kept is None:  # `_look` has compared the rules
-            where, found = str(self._folder / MANIFEST), f"damaged: no checksum of {KEPT}"
-            raise InputError(where=where, found=found, needed="one", fix=_ENCODE)
+        if (kept := self._open().kept) is None:
+            raise ValueError("no idle rule")
         return kept
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:  # noqa: ARG002 - nothing is fetched
@@ -86,102 +66,59 @@ class LatentSource(IndexedSource[DataConfig, _Opened]):
             ValueError: A camera that the cache does not have.
         """
         opened, camera = self._open(), camera or self.cameras[0]
-        info = opened.table[index]
-        if camera not in opened.manifest.cameras:
-            raise ValueError(f"camera {camera!r} is not one of {', '.join(opened.manifest.cameras)}")
-        if reason := opened.manifest.broken.get(info.id):
-            found = f"no latents: it could not be read when they were encoded ({reason.rstrip('.')})"
-            raise InputError(where=f"{self._folder}: episode {info.id}", found=found)
-        record = EpisodeFile(path_of(self._folder, index, camera), opened.manifest.layout)
-        name, its_camera, steps = record.id, record.camera, len(record["states"])
-        if (name, its_camera, steps) != (info.id, camera, info.num_steps):
-            text = f"episode {name} of {steps} steps, camera {its_camera}"
-            wanted = f"{info.id} of {info.num_steps} steps, camera {camera}"
-            raise InputError(where=record.path, found=text, needed=wanted, fix=_DELETE)
-        checked = self._checked.setdefault((index, camera), bytearray(len(record.frame_steps)))
+        if camera not in opened.key.cameras:
+            raise ValueError(f"camera {camera!r} is not one of {', '.join(opened.key.cameras)}")
+        record = opened.files.open(index, camera)
         return Episode(
-            info=info,
-            states=record["states"],
+            info=opened.table[index],
+            states=record.array("states"),
             read_frames=lambda steps: record.pictures(record.places_of(steps)),
-            control_rate_hz=opened.manifest.control_rate_hz,
-            extrinsics=record["extrinsics"],
-            joint_velocities=record["joint_velocities"],
+            control_rate_hz=float(opened.table.texts["control_rate_hz"]),
             metadata=record.metadata,
-            commands=record["commands"],
-            read_latents=partial(self._latents, record, checked),
+            read_latents=lambda steps: record.latents(record.places_of(steps)),
             frame_steps=record.frame_steps,
+            **{name: record.array(name) for name in OPTIONAL if name in record.names},
         )
 
-    def _latents(self, record: EpisodeFile, checked: bytearray, steps: Sequence[int]) -> StoredLatents:
-        """Return the latents at these control steps, in this order; `checked` has a byte for each frame of the file.
+    def settle(self, episodes: Int[np.ndarray, " episodes"]) -> DataConfig:
+        """Return the config with the cameras that there are.
 
         Raises:
-            InputError: A step has none, or they are damaged.
-        """
-        places = record.places_of(steps)
-        unchecked = [place for place in places if not checked[place]]
-        check = {"never": [], "once": unchecked, "always": places}[self._config.check_crc]
-        latents = record.latents(places, check=check)
-        for place in check:
-            checked[place] = 1
-        return latents
-
-    def wrong_files(self) -> list[EpisodeProblem]:
-        """Return the episodes with a missing file, or a file of another size than written."""
-        opened, problems = self._open(), []
-        for place, camera in enumerate(opened.manifest.cameras):
-            sizes = opened.table.locators[size_column(place)]
-            for number in np.flatnonzero(sizes).tolist():
-                path = path_of(self._folder, number, camera)
-                there = size_of(path)
-                if there != sizes[number]:
-                    found = "no such file" if there is None else f"{there:,} bytes"
-                    name, needed = opened.table.identity(number), f"{sizes[number]:,} bytes"
-                    problems.append(EpisodeProblem(name, f"{path} ({name})", found, needed, _ENCODE))
-        return problems
-
-    def settle(self, episodes: Int[np.ndarray, " episodes"]) -> tuple[DataConfig, list[EpisodeProblem]]:
-        """Return the config with the cameras of the cache, and the episodes whose files are not as written.
-
-        Raises:
-            InputError: One of these episodes, that clips come from, was skipped while encoding.
+            InputError: As `require_encoded`.
         """
         self.require_encoded(episodes)
-        return self.settled_config, self.wrong_files()
+        return self.settled_config
 
     def require_encoded(self, episodes: Int[np.ndarray, " episodes"]) -> None:
-        """Refuse to make clips of episodes that were skipped while encoding.
+        """Refuse a cache without whole files of these episodes: it is unfinished, damaged, or was made of others.
 
         Raises:
-            InputError: There are some.
+            InputError: Some are missing.
         """
-        opened = self._open()
-        table, broken = opened.table, opened.manifest.broken
-        absent = np.zeros(len(table), bool)
-        for camera in self.cameras:
-            absent |= table.locators[size_column(opened.manifest.cameras.index(camera))] == 0
-        unread = np.unique(episodes[absent[episodes]]).tolist()
-        lacking = [number for number in unread if table.identity(number) not in broken]
+        opened, wanted = self._open(), np.unique(episodes).tolist()
+        lacking = [one for one in wanted if not all(opened.files.is_done(one, camera) for camera in self.cameras)]
         if lacking:
-            several = f"{len(lacking)} of {len(np.unique(episodes))} episodes, such as {table.identity(lacking[0])}"
+            first = opened.table.identity(lacking[0])
             raise InputError(
-                where=str(self._folder),
-                found=f"no latents of {several}",
+                where=self._config.path,
+                found=f"no whole latents of {len(lacking)} of {len(wanted)} episodes, such as {first}",
                 needed="those of every episode that takes part",
-                fix="Set data.outcome and data.exclude as they were when it was made, or run `vjepa2-ac encode` again",
+                fix="Run `vjepa2-ac encode` again, as the cache was made: it encodes what is missing; or leave these"
+                " episodes out (data.outcome, data.exclude)",
             )
 
     def _look(self, progress: Progress) -> _Opened:  # noqa: ARG002 - at once
-        manifest = read_manifest(self._folder)
+        folder = Path(self._config.path)
+        key = read_key(folder)
         parts = clip_parts(self._config)
-        differing = manifest.cache_key.differences(parts, parts)
+        differing = key.differences(parts, parts)
         for camera in () if self._config.camera is None else self._config.cameras:
-            if camera not in manifest.cameras:
-                differing.append(f"data.camera: {', '.join(manifest.cameras)}, not {camera}")
+            if camera not in key.cameras:
+                differing.append(f"data.camera: {', '.join(key.cameras)}, not {camera}")
         if differing:  # of other clips than the config's
-            raise another_cache(self._folder, differing)
-        table, kept = read_episodes(self._folder, manifest)
-        return _Opened(table, manifest, kept)
+            raise another_cache(folder, differing)
+        table, kept = read_tables(folder, has_idle_rule=self._config.idle.rule != "none")
+        return _Opened(table, key, LatentFiles(folder, key.digest), kept)
 
 
 def another_cache(folder: Path, differing: Sequence[str]) -> InputError:

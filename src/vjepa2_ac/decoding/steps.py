@@ -1,4 +1,4 @@
-"""Optimizer steps of a decoder: its weights, their moving average, and AdamW."""
+"""Optimizer steps of a decoder: its loss, its weights, their moving average, and AdamW."""
 
 from __future__ import annotations
 
@@ -8,17 +8,48 @@ from contextlib import AbstractContextManager
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from vjepa2_ac.config import DecoderConfig
-from vjepa2_ac.decoding.frame_pairs import Pairs, as_images
-from vjepa2_ac.decoding.loss import decoder_loss
-from vjepa2_ac.decoding.network import Decoder, DecoderShape
+from vjepa2_ac.decoding.frame_pairs import Pairs
+from vjepa2_ac.decoding.network import Decoder, DecoderShape, as_images
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.media.image_similarity import ms_ssim
 
+STRUCTURE, EDGES = 0.2, 0.1  # weights of the second and the third part of the loss
+SMALLEST = 11  # pixels of an image's side: a window has to fit
+_SCALES = 3
 _BETAS = (0.9, 0.95)
 _YOUNG = 9.0  # steps: the average of fewer forgets the first ones faster
 Autocast = Callable[[], AbstractContextManager[object]]
+
+
+def decoder_loss(
+    images: Float[Tensor, "frames 3 size size"], targets: Float[Tensor, "frames 3 size size"]
+) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
+    """Return L1 + 0.2 (1 - MS-SSIM) + 0.1 L1 of the gradients along both axes; and the parts.
+
+    Args:
+        images: What the decoder gives, not clipped.
+        targets: What the encoder saw, between 0 and 1.
+    """
+    scales = sum(images.shape[-1] >= SMALLEST << scale for scale in range(_SCALES))
+    absolute = (images - targets).abs().mean()
+    structure = 1.0 - ms_ssim(images, targets, scales=scales).mean()
+    rows, columns = ((images.diff(dim=axis) - targets.diff(dim=axis)).abs().mean() for axis in (-2, -1))
+    edges = rows + columns
+    parts = {"l1": absolute, "structure": structure, "edges": edges}
+    return absolute + STRUCTURE * structure + EDGES * edges, parts
+
+
+def learning_rate_at(step: int, config: DecoderConfig) -> float:
+    """Return the learning rate of step 1 .. steps: a linear warm-up, then half a cosine down to none."""
+    warmup = min(config.warmup_steps, config.steps - 1)
+    if step <= warmup:
+        return config.learning_rate * step / warmup
+    done = (step - warmup) / max(1, config.steps - warmup)
+    return config.learning_rate * 0.5 * (1.0 + math.cos(math.pi * done))
 
 
 class DecoderSteps:
@@ -85,19 +116,19 @@ class DecoderSteps:
         self._add_to_average(step)
         return metrics | {"learning_rate": learning_rate}
 
-    def weights(self) -> dict[str, Any]:
-        """Return the weights and their average, for a checkpoint."""
-        return {"decoder": self.decoder.state_dict(), "average": self.average}
+    def state(self) -> dict[str, Any]:
+        """Return weights, their average and AdamW's moments, for a checkpoint."""
+        return {"decoder": self.decoder.state_dict(), "average": self.average, "optimizer": self.optimizer.state_dict()}
 
-    def restore(self, weights: Mapping[str, Any], optimizer: dict[str, Any]) -> None:
+    def restore(self, state: Mapping[str, Any]) -> None:
         """Continue from a checkpoint.
 
         Raises:
             KeyError, ValueError, RuntimeError, TypeError: It is of another decoder.
         """
-        self.decoder.load_state_dict(weights["decoder"])
-        self.average = {name: weights["average"][name].to(self._device) for name in self.average}
-        self.optimizer.load_state_dict(optimizer)
+        self.decoder.load_state_dict(state["decoder"])
+        self.average = {name: state["average"][name].to(self._device) for name in self.average}
+        self.optimizer.load_state_dict(state["optimizer"])
 
     def _noise(self, step: int, latents: Tensor) -> Tensor:
         """Return noise of a strength that is drawn for each frame, up to `decoder.noise`."""
@@ -110,12 +141,3 @@ class DecoderSteps:
         decay = min(self._config.average, step / (step + _YOUNG))
         for name, one in self.decoder.state_dict().items():
             self.average[name].lerp_(one, 1.0 - decay)
-
-
-def learning_rate_at(step: int, config: DecoderConfig) -> float:
-    """Return the learning rate of step 1 .. steps: a linear warm-up, then half a cosine down to none."""
-    warmup = min(config.warmup_steps, config.steps - 1)
-    if step <= warmup:
-        return config.learning_rate * step / warmup
-    done = (step - warmup) / max(1, config.steps - warmup)
-    return config.learning_rate * 0.5 * (1.0 + math.cos(math.pi * done))

@@ -1,11 +1,12 @@
-"""The linear decoder is the least squared error: it finds a linear truth, and finds it again."""
+"""The linear decoder is the least squared error; how well decoders show frames is a mean that is a number."""
 
 from dataclasses import dataclass
 
+import pytest
 import torch
 
+from vjepa2_ac.decoding.baselines import fit_linear, measure_decoders
 from vjepa2_ac.decoding.frame_pairs import Pairs
-from vjepa2_ac.decoding.linear_fit import fit_linear
 from vjepa2_ac.decoding.network import Decoder, DecoderShape
 from vjepa2_ac.episode import no_progress
 
@@ -49,14 +50,6 @@ def test_it_finds_a_linear_truth_up_to_rounding_and_ridge() -> None:
     assert not any(one.requires_grad for one in found.parameters())
 
 
-def test_it_is_the_same_each_time_and_reports_its_progress() -> None:
-    reported: list[tuple[int, int]] = []
-    one = fit(Linear())
-    other = fit_linear(Linear(), SHAPE, torch.device("cpu"), lambda *of: reported.append(of))  # type: ignore[arg-type]
-    assert all(torch.equal(first, second) for first, second in zip(one.parameters(), other.parameters(), strict=True))
-    assert reported == [(64, 150), (128, 150), (150, 150)]
-
-
 def test_what_latents_do_not_say_is_the_mean() -> None:
     pairs = Linear()
     pairs.latents = torch.randn(pairs.latents.shape, generator=torch.Generator().manual_seed(5))  # of other frames
@@ -69,3 +62,17 @@ def test_latents_that_never_change_are_no_problem() -> None:
     pairs = Linear()
     pairs.latents = torch.ones_like(pairs.latents)
     assert all(torch.isfinite(one).all() for one in fit(pairs).parameters())
+
+
+def test_a_frame_that_is_shown_exactly_has_no_decibels_but_is_counted() -> None:
+    """Its PSNR is infinite, and so would be the mean, which JSON cannot hold."""
+    pairs, black = Linear(frames=9), torch.zeros(3, 16, 16)
+    pairs.images[:2] = 0  # as the mean image shows them
+    pairs.images[2:] = 51
+    found = measure_decoders(pairs, {"decoder": pairs.truth}, black, no_progress)["mean_image"]  # type: ignore[arg-type]
+    assert found["exact_frames"] == 2
+    assert found["psnr_db"]["value"] == pytest.approx(13.979, abs=1e-3)  # -20 log10(51 / 255)
+    assert found["ssim"]["value"] is not None
+    pairs.images[:] = 0
+    found = measure_decoders(pairs, {"decoder": pairs.truth}, black, no_progress)["mean_image"]  # type: ignore[arg-type]
+    assert (found["exact_frames"], found["psnr_db"]["value"]) == (9, None)

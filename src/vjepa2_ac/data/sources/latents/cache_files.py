@@ -1,0 +1,311 @@
+"""The files of a latent cache, and the precision of its latents.
+
+cache.json     what the cache is: its key in full
+episodes.npz   every episode of the data set that it was made from, in its order, as `EpisodeTable.to_bytes` writes them
+kept.npz       the steps that `data.idle` leaves, as `FoundRanges.to_bytes` writes them; absent without an idle rule
+episodes/000/000123-CAMERA.safetensors   the latents of an episode, by its index, and a camera
+episodes/000/000123-CAMERA.broken        in its place: why the episode could not be read (`data.broken_episodes`)
+
+Every file gets its name when it is complete. A cache is finished when each episode that clips need has its file, of
+each camera. The tensors of such a file (control steps as in `episode`; `frames` are the steps that were encoded):
+
+latents        [frames, tokens, dim] bfloat16, float32 or int8
+scales         [frames, tokens] float32, with int8 only: a latent is its value times the scale of its token
+frame_steps    [frames] int32: the control step of each frame, ascending
+states         [steps, state_dim], and where the source has them commands, extrinsics, joint_velocities
+pictures       the frames as the encoder saw them, for people to look at: [bytes] uint8, JPEGs one after the other; or
+               [frames, size, size, 3] uint8, exact, for a decoder to learn from
+picture_ends   [frames] int64: where each JPEG ends
+
+The header's metadata (texts): id, camera, metadata (JSON), key (the digest of the cache's key).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+from urllib.parse import quote
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt8
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from vjepa2_ac import storage
+from vjepa2_ac.data.idle import FoundRanges
+from vjepa2_ac.data.index.episode_table import EpisodeTable, NotATableError
+from vjepa2_ac.data.sources.latents.cache_key import FORMAT, CacheKey
+from vjepa2_ac.episode import Episode, StoredLatents
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.media.jpeg import decode_jpegs, encode_jpeg
+from vjepa2_ac.storage.structured import json_object, read_json_object
+
+CacheType = Literal["bf16", "fp32", "int8"]
+
+DTYPES: dict[CacheType, torch.dtype] = {"bf16": torch.bfloat16, "fp32": torch.float32, "int8": torch.int8}
+CACHE, EPISODES, KEPT = "cache.json", "episodes.npz", "kept.npz"
+OPTIONAL = ("commands", "extrinsics", "joint_velocities")
+
+_LARGEST = 127  # of int8
+_JPEG_QUALITY = 85
+_MOST_BYTES = 1 << 30  # of a table
+_FIX = "Delete this file, and then run `vjepa2-ac encode` again, as the cache was made; or copy the file again"
+_ENCODE = "Run `vjepa2-ac encode`, which goes on where it was stopped; or copy the cache again"
+
+
+def pack_latents(latents: Float[Tensor, "*batch tokens dim"], kind: CacheType) -> StoredLatents:
+    """Return latents in their storage type.
+
+    bf16 rounds to nearest: the error is at most 2**-8 of the value. int8 divides each token by its largest value over
+    127, its scale: the error is at most half a scale. fp32 is exact.
+    """
+    if kind != "int8":
+        return StoredLatents(latents.to(DTYPES[kind]))
+    latents = latents.float()
+    scales = latents.abs().amax(dim=-1) / _LARGEST
+    divisor = torch.where(scales > 0, scales, torch.ones_like(scales))  # a token of zeros stays one
+    values = (latents / divisor[..., None]).round().clamp(-_LARGEST, _LARGEST)
+    return StoredLatents(values.to(torch.int8), scales)
+
+
+def unpack_latents(stored: StoredLatents) -> Float[Tensor, "*batch tokens dim"]:
+    """Return stored latents as float32: the encoder's output up to the rounding of `pack_latents`."""
+    values = stored.values.float()
+    return values if stored.scales is None else values * stored.scales[..., None]
+
+
+def bytes_per_frame(tokens: int, dim: int, kind: CacheType) -> int:
+    """Return the size of a frame's latents."""
+    return tokens * dim * DTYPES[kind].itemsize + (tokens * 4 if kind == "int8" else 0)
+
+
+def read_key(folder: Path) -> CacheKey:
+    """Return the key of a cache: what it is.
+
+    Raises:
+        InputError: The folder has none, or one of another format.
+    """
+    where, needed = str(folder / CACHE), f"a folder with the {CACHE} of a latent cache, format {FORMAT}"
+    try:
+        key = read_json_object(folder / CACHE, fix=_ENCODE).get("key")
+    except (FileNotFoundError, NotADirectoryError):
+        found = "no latent cache" if folder.is_dir() else f"no such folder, seen from {Path.cwd()}"
+        raise InputError(where=str(folder), found=found, needed=needed, fix=_ENCODE) from None
+    except OSError as error:
+        raise InputError(where=where, found=f"cannot be read ({error})", fix=_ENCODE) from None
+    if not isinstance(key, dict) or key.get("format") != FORMAT or not isinstance(key.get("data.camera"), list):
+        raise InputError(where=where, found="another file, or another format", needed=needed, fix=_ENCODE)
+    return CacheKey(key)
+
+
+def read_tables(folder: Path, *, has_idle_rule: bool) -> tuple[EpisodeTable, FoundRanges | None]:
+    """Read the episodes of a cache and, if it has an idle rule, the ranges that the rule keeps.
+
+    Raises:
+        InputError: One of the files is missing or damaged.
+    """
+    try:
+        table = EpisodeTable.from_bytes(storage.read_bounded(folder / EPISODES, _MOST_BYTES))
+        if not has_idle_rule:
+            return table, None
+        return table, FoundRanges.from_bytes(storage.read_bounded(folder / KEPT, _MOST_BYTES))
+    except (OSError, NotATableError) as error:
+        found = f"{EPISODES} or {KEPT} cannot be read ({error})"
+        raise InputError(where=str(folder), found=found, fix=_ENCODE) from None
+
+
+@dataclass(frozen=True, eq=False)
+class EncodedEpisode:
+    """An episode with latents of frames of one camera."""
+
+    episode: Episode  # its states and other data for clips; no frame is read
+    camera: str
+    steps: Sequence[int]  # control steps of the frames, ascending; there may be none
+    latents: StoredLatents  # of these frames, see `pack_latents`
+    pictures: UInt8[np.ndarray, "frames size size 3"]  # these frames, as the encoder saw them
+
+
+@dataclass(frozen=True)
+class LatentFiles:
+    """The files of the episodes in a cache's folder. Several processes may write into it."""
+
+    folder: Path
+    key: str  # digest of the cache's key
+
+    def path(self, number: int, camera: str) -> Path:
+        """Return the file of an episode, by its index in the data set, and a camera."""
+        name = f"{number:06d}-{quote(camera, safe='')}.safetensors"
+        return self.folder / "episodes" / f"{number // 1000:03d}" / name
+
+    def has(self, number: int, camera: str) -> bool:
+        """Return whether a file is there, whole, and of this cache."""
+        try:
+            with safe_open(str(self.path(number, camera)), framework="pt") as file:
+                return bool((file.metadata() or {}).get("key") == self.key)
+        except (SafetensorError, OSError):
+            return False
+
+    def size(self, number: int, camera: str) -> int:
+        """Return the size of a file in bytes; 0 if there is none."""
+        path = self.path(number, camera)
+        return path.stat().st_size if path.is_file() else 0
+
+    def is_done(self, number: int, camera: str) -> bool:
+        """Return whether a file is there, or in its place the reason why it cannot be."""
+        return self.has(number, camera) or self._note(number, camera).is_file()
+
+    def open(self, number: int, camera: str) -> EpisodeFile:
+        """Open a file.
+
+        Raises:
+            InputError: It is missing, damaged, or belongs to another cache; or the episode could not be read.
+        """
+        path, note = self.path(number, camera), self._note(number, camera)
+        if not path.is_file() and note.is_file():
+            found = f"no latents: it could not be read when they were encoded ({_text_of(note).rstrip('.')})"
+            raise InputError(where=str(path), found=found)
+        return EpisodeFile(path, self.key)
+
+    def write(self, number: int, encoded: EncodedEpisode, *, exact_pictures: bool = False) -> None:
+        """Write the file of an episode and camera.
+
+        Raises:
+            InputError: The file cannot be written, or the disk is full.
+        """
+        episode, latents, path = encoded.episode, encoded.latents, self.path(number, encoded.camera)
+        arrays = {
+            "frame_steps": np.array(encoded.steps, np.int32),
+            "states": episode.states,
+            **{name: getattr(episode, name) for name in OPTIONAL},
+        }
+        if exact_pictures:
+            arrays["pictures"] = encoded.pictures
+        else:
+            jpegs = [encode_jpeg(frame, quality=_JPEG_QUALITY) for frame in encoded.pictures]
+            arrays["pictures"] = np.frombuffer(b"".join(jpegs), np.uint8)
+            arrays["picture_ends"] = np.cumsum([len(jpeg) for jpeg in jpegs], dtype=np.int64)
+        tensors = {name: torch.from_numpy(np.array(one, order="C")) for name, one in arrays.items() if one is not None}
+        tensors["latents"] = latents.values.contiguous()
+        if latents.scales is not None:
+            tensors["scales"] = latents.scales.contiguous()
+        metadata = json.dumps(dict(episode.metadata), sort_keys=True)
+        about = {"id": episode.info.id, "camera": encoded.camera, "metadata": metadata, "key": self.key}
+        with storage.user_can_write(path):
+            storage.write_atomically(path, save(tensors, metadata=about))
+            self._note(number, encoded.camera).unlink(missing_ok=True)
+
+    def note_broken(self, number: int, camera: str, reason: str) -> None:
+        """Record that an episode cannot be read, for the other processes and for whoever reads the cache."""
+        path = self._note(number, camera)
+        with storage.user_can_write(path):
+            storage.write_atomically(path, reason)
+
+    @property
+    def broken(self) -> dict[int, str]:
+        """The episodes that could not be read, by their index, and why."""
+        notes = sorted(self.folder.glob("episodes/*/*.broken"))
+        broken = [note for note in notes if not note.with_suffix(".safetensors").is_file()]  # else mended, and killed
+        return {int(note.name.partition("-")[0]): _text_of(note) for note in broken}
+
+    def _note(self, number: int, camera: str) -> Path:
+        return self.path(number, camera).with_suffix(".broken")
+
+
+def _text_of(note: Path) -> str:
+    return note.read_text(encoding="utf-8", errors="replace")
+
+
+class EpisodeFile:
+    """An open file; everything is read on request, latents and pictures frame by frame.
+
+    Args:
+        path: The file.
+        key: Digest of the key of its cache.
+
+    Raises:
+        InputError: The file is missing, damaged, or belongs to another cache.
+    """
+
+    def __init__(self, path: Path, key: str) -> None:
+        self.path = str(path)
+        with self._reading():
+            self._file: Any = safe_open(self.path, framework="pt").__enter__()  # type: ignore[no-untyped-call] # mapped until nobody has it any more
+            about = self._file.metadata() or {}
+            self.names = frozenset(self._file.keys())
+            self.metadata = {name: str(text) for name, text in json_object(about["metadata"], where=self.path).items()}
+        if about.get("key") != key:
+            raise self._damaged("a file of another cache", "a file that was made with this one's cache.json")
+
+    @cached_property
+    def frame_steps(self) -> Int[np.ndarray, " frames"]:
+        """The control steps that have a frame, ascending."""
+        return self.array("frame_steps")
+
+    def array(self, name: str) -> np.ndarray:
+        """Return a whole tensor, such as states.
+
+        Raises:
+            InputError: There is none of this name.
+        """
+        with self._reading():
+            return np.array(self._file.get_tensor(name).numpy())
+
+    def places_of(self, steps: Sequence[int]) -> list[int]:
+        """Return the indices of the frames at these control steps.
+
+        Raises:
+            InputError: The cache has no frame of one of them.
+        """
+        there = {step: place for place, step in enumerate(self.frame_steps.tolist())}
+        if absent := [step for step in steps if step not in there]:
+            needed = f"one of the {len(there)} that clips of the cache's data.stride and data.frames need"
+            raise InputError(where=self.path, found=f"no frame of control step {absent[0]}", needed=needed)
+        return [there[step] for step in steps]
+
+    def latents(self, places: Sequence[int]) -> StoredLatents:
+        """Return the latents of frames by their index.
+
+        Raises:
+            InputError: There are no such latents.
+        """
+        scales = self._rows("scales", places) if "scales" in self.names else None
+        return StoredLatents(self._rows("latents", places), scales)
+
+    def pictures(self, places: Sequence[int]) -> UInt8[np.ndarray, "frames size size 3"]:
+        """Return frames as the encoder saw them, by their index.
+
+        Raises:
+            InputError: One is damaged.
+        """
+        with self._reading():
+            data = self._file.get_slice("pictures")
+            if len(data.get_shape()) > 1:
+                return np.asarray(self._rows("pictures", places).numpy())
+            ends = [0, *self._file.get_tensor("picture_ends").tolist()]
+            jpegs = [bytes(data[ends[place] : ends[place + 1]].numpy()) for place in places]
+        return decode_jpegs(jpegs, self.frame_steps[list(places)].tolist(), self.path)
+
+    def _rows(self, name: str, places: Sequence[int]) -> Tensor:
+        with self._reading():
+            rows = self._file.get_slice(name)
+            return torch.stack([rows[place] for place in places])
+
+    @contextmanager
+    def _reading(self) -> Iterator[None]:
+        """Raise an error for the user if the file is missing, truncated, no safetensors file, or lacks something."""
+        try:
+            yield
+        except FileNotFoundError:
+            raise InputError(where=self.path, found="no such file", needed="latents of an episode", fix=_FIX) from None
+        except (SafetensorError, OSError, KeyError, IndexError, ValueError, TypeError) as error:
+            raise self._damaged(f"not a whole file of latents ({error})") from None
+
+    def _damaged(self, found: str, needed: str = "") -> InputError:
+        return InputError(where=self.path, found=found, needed=needed, fix=_FIX)

@@ -1,0 +1,218 @@
+"""The latent cache of an open data set: the frames that clips need, its key and folder, and what it lacks."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.dataset import Dataset, through_latents
+from vjepa2_ac.data.idle import find_ranges
+from vjepa2_ac.data.index.index_cache import cache_folder, fingerprints_of
+from vjepa2_ac.data.sources.latents.cache_files import CACHE, EPISODES, KEPT, LatentFiles, bytes_per_frame, read_key
+from vjepa2_ac.data.sources.latents.cache_key import CacheKey, Encoding, key_of_cache, require_own_folder
+from vjepa2_ac.data.sources.latents.source import LatentSource, another_cache
+from vjepa2_ac.encoding.pipeline import FramesToEncode
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage import free_bytes, user_can_write, write_atomically
+
+_GIGABYTE = 10**9
+
+
+def needed_frames(dataset: Dataset) -> Iterator[FramesToEncode]:
+    """Yield, in the data set's order, the frames that clips of any split use, of every episode with clips and camera.
+
+    Episodes that are shorter than a clip, left out or wholly idle are not included.
+    """
+    starts, config = dataset.starts, dataset.config
+    within = np.arange(config.frames) * config.model_stride
+    order = np.argsort(starts.episode, kind="stable")
+    for runs in np.split(order, np.flatnonzero(np.diff(starts.episode[order])) + 1):
+        if not len(runs):
+            return  # a data set without clips
+        first = np.concatenate([starts.steps_of(int(run)) for run in runs])
+        steps = np.unique(first[:, None] + within).astype(np.int32)
+        for camera in config.cameras:
+            yield FramesToEncode(int(starts.episode[runs[0]]), camera, steps)
+
+
+def key_for(dataset: Dataset, encoding: Encoding) -> CacheKey:
+    """Return the cache key of an open data set that is not itself a cache."""
+    return key_of_cache(dataset.config, fingerprints_of(dataset.table)[0], encoding)
+
+
+@dataclass(frozen=True, eq=False)
+class LatentCache:
+    """The cache of an open data set, finished or not. Several processes may write into its folder.
+
+    It is finished when nothing is missing. So a kill, a deleted file or a further episode needs no repair: the next
+    encoding writes what is missing.
+    """
+
+    dataset: Dataset
+    encoding: Encoding
+    key: CacheKey
+    folder: Path
+
+    @classmethod
+    def of(cls, dataset: Dataset, encoding: Encoding, folder: Path | None = None) -> LatentCache:
+        """Return the cache of a data set and an encoder.
+
+        Args:
+            dataset: Frames, not itself a cache.
+            encoding: How they become latents.
+            folder: Its folder; None: in `data.cache_dir`, or with the other caches of this machine.
+        """
+        key, config = key_for(dataset, encoding), dataset.config
+        parent = cache_folder(config.disk_cache) / "latents" if config.cache_dir is None else Path(config.cache_dir)
+        return cls(dataset, encoding, key, parent / key.digest if folder is None else folder)
+
+    @cached_property
+    def files(self) -> LatentFiles:
+        """Its files."""
+        return LatentFiles(self.folder, self.key.digest)
+
+    @cached_property
+    def wanted(self) -> tuple[FramesToEncode, ...]:
+        """The frames of the whole cache."""
+        return tuple(needed_frames(self.dataset))
+
+    def missing(self, *, retry: bool = False) -> list[FramesToEncode]:
+        """Return what is not there; with `retry`, also what could not be read."""
+        if not self.is_begun:
+            return list(self.wanted)
+        is_there = self.files.has if retry else self.files.is_done
+        return [one for one in self.wanted if not is_there(one.episode, one.camera)]
+
+    @property
+    def is_begun(self) -> bool:
+        """Whether its folder says what it is."""
+        return (self.folder / CACHE).is_file() and (self.folder / EPISODES).is_file()
+
+    @property
+    def broken(self) -> dict[int, str]:
+        """The episodes that could not be read, by their index, and why; found by any process."""
+        found, wanted = self.files.broken, {one.episode for one in self.wanted}
+        return {number: reason for number, reason in found.items() if number in wanted}
+
+    @property
+    def bytes_per_frame(self) -> int:
+        """The approximate size of a frame, with its picture."""
+        encoding = self.encoding
+        latents = bytes_per_frame(encoding.tokens, encoding.dim, self.dataset.config.cache_dtype)
+        return latents + picture_bytes(encoding.image_size)
+
+    def summary(self, left: Sequence[FramesToEncode]) -> str:
+        """Return as text how large the whole is, and how much of it is left."""
+        frames = frames_in(self.wanted)
+        there = f"; {frames - frames_in(left):,} are there already, {frames_in(left):,} are left"
+        size = f"{frames:,} frames, {frames * self.bytes_per_frame / _GIGABYTE:.3g} GB"
+        return size + there if len(left) < len(self.wanted) else size
+
+    def require_own(self) -> None:
+        """Refuse a folder of another cache, or of other things.
+
+        Raises:
+            InputError: Says how the other cache differs.
+        """
+        require_own_folder(self.folder / CACHE, self.key, where=f"latent cache {self.folder}")
+
+    def begin(self) -> None:
+        """Write what the cache is, if the folder does not say so yet.
+
+        Raises:
+            InputError: The folder has another cache or other things, or cannot be written.
+        """
+        self.require_own()
+        if self.is_begun:
+            return
+        dataset = self.dataset
+        texts = {"control_rate_hz": str(dataset.control_rate_hz), "widths": " ".join(map(str, dataset.widths))}
+        table = replace(dataset.table, texts={**dataset.table.texts, **texts}, locators={})
+        with user_can_write(self.folder):
+            write_atomically(self.folder / CACHE, json.dumps({"key": dict(self.key.parts)}, indent=1) + "\n")
+            if dataset.config.idle.rule != "none":
+                kept = find_ranges(dataset.source, dataset.table, dataset.config, None)
+                write_atomically(self.folder / KEPT, kept.to_bytes())
+            write_atomically(self.folder / EPISODES, table.to_bytes())
+
+    def require_space(self, left: Sequence[FramesToEncode]) -> None:
+        """Refuse to start if the disk has too little space for what is left.
+
+        Raises:
+            InputError: Says how much is free, how much is needed, and what to do.
+        """
+        fix = (
+            f"Set data.cache_dtype: int8, or data.start_every: {self.dataset.config.model_stride}; take fewer episodes"
+            " (data.outcome, data.idle, data.exclude); or name a folder on a larger disk (data.cache_dir)"
+        )
+        require_space(self.folder, frames_in(left), self.bytes_per_frame, fix=fix)
+
+
+def frames_in(wanted: Sequence[FramesToEncode]) -> int:
+    """Return how many frames these are."""
+    return sum(len(one.steps) for one in wanted)
+
+
+def picture_bytes(image_size: int) -> int:
+    """Return the approximate size of a frame's picture as JPEG, with a share of the states."""
+    return 1000 + image_size**2 // 3
+
+
+def require_space(folder: Path, frames: int, per_frame: int, *, fix: str) -> None:
+    """Refuse to encode frames for which the disk has too little space.
+
+    Raises:
+        InputError: Says how much is free, and how much is needed.
+    """
+    needed, free = frames * per_frame, free_bytes(folder)
+    if needed > free:
+        raise InputError(
+            where=str(folder),
+            found=f"{free / _GIGABYTE:.4g} GB free on its disk",
+            needed=f"{needed / _GIGABYTE:.4g} GB for the latents of {frames:,} frames ({per_frame / 1e6:.3g} MB each)",
+            fix=fix,
+        )
+
+
+def through_cache(dataset: Dataset, encoding: Encoding) -> Dataset:
+    """Return the same data set, with the same clips in the same order, read as latents from its cache.
+
+    Raises:
+        InputError: There is no finished cache of this encoder and these settings; says how the others differ.
+    """
+    cache = LatentCache.of(dataset, encoding)
+    if not cache.is_begun:
+        raise _no_cache(dataset.config, cache)
+    return through_latents(dataset, cache.folder)
+
+
+def require_encoding(dataset: Dataset, encoding: Encoding) -> None:
+    """Refuse cached latents of another encoder, image size or precision; other data sets pass.
+
+    Raises:
+        InputError: Names what differs.
+    """
+    if isinstance(dataset.source, LatentSource):
+        differing = dataset.source.key.differences_of(encoding)
+        if differing:
+            raise another_cache(Path(dataset.config.path), differing)
+
+
+def _no_cache(config: DataConfig, cache: LatentCache) -> InputError:
+    parent, others = cache.folder.parent, []
+    for other in sorted(parent.iterdir()) if parent.is_dir() else ():
+        if (other / CACHE).is_file():
+            differing = read_key(other).differences(cache.key.parts)
+            others.append((len(differing), f"{other.name} was made otherwise: {'; '.join(differing)}"))
+    nearest = f". Other caches there: {len(others)}; {min(others)[1]}" if others else ""
+    return InputError(
+        where=f"data.cache: {config.cache}: {cache.folder}",
+        found=f"no latent cache of this model and these settings{nearest}",
+        fix="Run `vjepa2-ac encode` with this config, or set data.cache: auto",
+    )

@@ -1,0 +1,77 @@
+"""The encoding pipeline: each episode gets its own frames, and an unreadable one does not affect others."""
+
+from collections.abc import Callable
+from contextlib import nullcontext
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from memory_source import MemorySource
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data import dataset
+from vjepa2_ac.data import selection as broken_episodes
+from vjepa2_ac.data.sources.latents.cache_files import CacheType, LatentFiles, unpack_latents
+from vjepa2_ac.encoding.pipeline import FRAMES_AT_ONCE, EncoderOnDevice, FramesToEncode, encode_files
+from vjepa2_ac.errors import UnreachableError
+
+LENGTHS = [FRAMES_AT_ONCE + 1, 3, 2 * FRAMES_AT_ONCE]
+Run = Callable[..., LatentFiles]
+
+
+def colours(inputs: torch.Tensor, chunk: int) -> torch.Tensor:
+    """Return latents of one token that hold the colour of a frame, which is episode and step."""
+    del chunk
+    return inputs[..., 2, 2][..., None, :]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
+    """Encode every step of a source."""
+    monkeypatch.setattr(broken_episodes, "MOST_BROKEN", 1.0)
+
+    def encode(source: MemorySource, kind: CacheType = "fp32", workers: int = 2) -> LatentFiles:
+        monkeypatch.setattr(dataset, "open_source", lambda _: source)
+        config = DataConfig(path="memory", crop="letterbox", workers=workers, broken_episodes="skip", cache_dtype=kind)
+        wanted = [FramesToEncode(n, "left", np.arange(steps, dtype=np.int32)) for n, steps in enumerate(source.lengths)]
+        model = SimpleNamespace(image_size=5, encode=colours)
+        encoder = EncoderOnDevice(model, torch.device("cpu"), nullcontext, chunk=7)  # type: ignore[arg-type]
+        files = LatentFiles(tmp_path, "key")
+        encode_files(dataset.open_dataset(config), wanted, encoder, files)
+        return files
+
+    return encode
+
+
+@pytest.mark.parametrize(("kind", "workers"), [("fp32", 0), ("bf16", 3), ("int8", 2)])
+def test_each_episode_gets_its_own_frames_which_are_read_once(run: Run, kind: CacheType, workers: int) -> None:
+    source = MemorySource(LENGTHS)
+    files = run(source, kind, workers)
+    assert sorted(source.decoded) == [(number, step) for number, steps in enumerate(LENGTHS) for step in range(steps)]
+    assert sorted(index for index, _, _ in source.reads) == [0, 1, 2]
+    for number, steps in enumerate(LENGTHS):
+        file = files.open(number, "left")
+        assert file.frame_steps.tolist() == list(range(steps))
+        pixels = unpack_latents(file.latents(range(steps)))[:, 0] * 255 * torch.tensor([0.229, 0.224, 0.225])
+        found = (pixels + 255 * torch.tensor([0.485, 0.456, 0.406])).numpy()
+        expected = np.stack([np.full(steps, number), np.arange(steps)], axis=1)
+        np.testing.assert_allclose(found[:, :2], expected, atol={"fp32": 1e-3, "bf16": 0.6, "int8": 0.6}[kind])
+
+
+def test_unreadable_episodes_are_noted_and_the_others_are_whole(run: Run) -> None:
+    long = 3 * FRAMES_AT_ONCE
+    files = run(MemorySource([long, long, 2], unreadable=frozenset({0}), pictureless=frozenset({1})))
+    assert [files.has(number, "left") for number in range(3)] == [False, False, True]
+    assert ["memory: episode 0" in files.broken[0], "pictures of episode 1" in files.broken[1]] == [True, True]
+    assert all(files.is_done(number, "left") for number in range(3))
+
+
+def test_a_network_that_is_gone_is_no_fault_of_an_episode(run: Run, tmp_path: Path) -> None:
+    unreachable = MemorySource(
+        [2], unreadable=frozenset({0}), fault=lambda where: UnreachableError(where=where, found="gone")
+    )
+    with pytest.raises(UnreachableError):
+        run(unreachable)
+    assert not list(tmp_path.rglob("*.broken"))
