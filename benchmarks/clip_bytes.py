@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -29,13 +29,13 @@ FRAMES, STRIDE = 16, 4
 SPAN = (FRAMES - 1) * STRIDE + 1
 
 
-def main() -> None:
+def main(options: Sequence[str] | None = None) -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--episodes", type=int, default=4, help="of three cameras (default: %(default)s)")
     parser.add_argument("--steps", type=int, default=290, help="of each episode (default: %(default)s)")
     parser.add_argument("--clips", type=int, default=24, help="later clips (default: %(default)s)")
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(options)
 
     import pytest
 

@@ -1,6 +1,7 @@
 """RLDS on Google Cloud Storage: read like local RLDS, with few bytes, over networks that fail."""
 
 import pickle
+import re
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benches import imported
 from gcs import Gcs
 from synthetic import write_synthetic_droid
 from tfrecords import in_any_order, index_records
@@ -232,3 +234,13 @@ def test_many_threads_and_another_process_read_the_same(long: Path, far: Callabl
     gcs.forget()
     assert same(pickle.loads(pickle.dumps(source)).read(3), here.read(3), [7, 67])  # noqa: S301 - our own bytes
     assert not gcs.requests
+
+
+def test_a_later_clip_costs_its_frames_and_numbers_whatever_the_size_of_the_disk_cache(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for benchmark in imported("clip_bytes", monkeypatch):
+        benchmark.main(["--episodes", "1", "--steps", "90", "--clips", "3"])
+    rows = re.findall(r"^(?:by name|drawn) .* (\d+) \( *[\d.]+\)$", capsys.readouterr().out, re.MULTILINE)
+    frames_kb = 16 * 22  # the largest of its JPEGs
+    assert [int(kb) <= limit for kb, limit in zip(rows, [frames_kb, frames_kb, 0] * 2, strict=True)] == [True] * 6
