@@ -34,9 +34,8 @@ from vjepa2_ac.data.clips.dataset import open_dataset
 from vjepa2_ac.data.clips.loader import training_loader
 from vjepa2_ac.data.clips.windows import ClipOrder, windows_of
 from vjepa2_ac.data.filters.step_ranges import StepSelection, clip_starts
-from vjepa2_ac.data.index.episode_table import FORMAT, EpisodeTable
-from vjepa2_ac.data.index.index_cache import get_or_build
-from vjepa2_ac.data.sources.rlds.writing.droid_writer import write_droid_rlds
+from vjepa2_ac.data.index import EpisodeTable, get_or_build
+from vjepa2_ac.data.sources.rlds.droid_writer import write_droid_rlds
 from vjepa2_ac.episode import EpisodeInfo
 
 DROID_EPISODES = 95_658
@@ -175,11 +174,11 @@ def measure_index(config: DataConfig) -> None:
     ]
     columns = {"shard": np.int32, "record": np.int32, "offset": np.int64, "length": np.int64}
     locators = {name: np.arange(DROID_EPISODES, dtype=kind) for name, kind in columns.items()}
-    get_or_build(config.disk_cache, "synthetic", lambda: EpisodeTable.of(infos, locators=locators))
+    get_or_build(config.disk_cache, "synthetic", config.path, lambda: EpisodeTable.of(infos, locators=locators))
     del infos
     with multiprocessing.get_context("spawn").Pool(1) as fresh:  # memory freed by this process would be used again
         clips, opened, taken, memory = fresh.apply(_open_index, (config,))
-    size = (Path(str(config.disk_cache.dir)) / "index" / f"synthetic.table{FORMAT}.index").stat().st_size / 1e6
+    size = (Path(str(config.disk_cache.dir)) / "index" / "synthetic.index").stat().st_size / 1e6
     print(f"\nindex of {DROID_EPISODES:,} episodes, {size:.1f} MB: opened in {opened:.2f} s;", end="")
     print(f" with the order of {clips:,} clips {taken:.2f} s, {memory:.0f} MB")
 
@@ -187,7 +186,7 @@ def measure_index(config: DataConfig) -> None:
 def _open_index(config: DataConfig) -> tuple[int, float, float, float]:
     process = psutil.Process()
     before, start = process.memory_info().rss, time.perf_counter()
-    table = get_or_build(config.disk_cache, "synthetic", _never)
+    table = get_or_build(config.disk_cache, "synthetic", config.path, _never)
     opened = time.perf_counter() - start
     everyone = np.ones(len(table), bool)
     kept = StepSelection.whole(table, everyone)

@@ -11,7 +11,7 @@ from jaxtyping import Int32
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.clips.dataset import Dataset, through_latents
-from vjepa2_ac.data.index.index_cache import cache_folder, fingerprints_of
+from vjepa2_ac.data.index import cache_folder, fingerprint_of
 from vjepa2_ac.data.sources.latents.cache_key import OF_ENCODING, CacheKey, Encoding, key_of_cache
 from vjepa2_ac.data.sources.latents.manifest import is_whole, read_manifest
 from vjepa2_ac.data.sources.latents.source import LatentSource, another_cache
@@ -45,12 +45,8 @@ def needed_frames(dataset: Dataset) -> Iterator[NeededFrames]:
 
 
 def key_for(dataset: Dataset, encoding: Encoding) -> CacheKey:
-    """Return the cache key of an open data set that is not itself a cache: of one that is there, if there is one.
-
-    A cache that an earlier version made has the fingerprint that the episodes had then.
-    """
-    keys = [key_of_cache(dataset.config, one, encoding) for one in fingerprints_of(dataset.table)]
-    return next((key for key in keys if folder_of(dataset.config, key).is_dir()), keys[0])
+    """Return the cache key of an open data set that is not itself a cache."""
+    return key_of_cache(dataset.config, fingerprint_of(dataset.table), encoding)
 
 
 def folder_of(config: DataConfig, key: CacheKey) -> Path:

@@ -17,7 +17,7 @@ from vjepa2_ac.data.clips import dataset as opening
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
 from vjepa2_ac.data.filters.broken_episodes import BrokenEpisodes
 from vjepa2_ac.data.filters.idle_ranges import FoundRanges
-from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable
+from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable
 from vjepa2_ac.errors import InputError
 
 Open = Callable[..., Dataset]
@@ -169,8 +169,7 @@ def droid_sized() -> EpisodeTable:
     return EpisodeTable(
         num_steps=generator.integers(60, 520, count).astype(np.int32),
         success=np.ones(count, np.int8),
-        id_ends=np.arange(1, count + 1) * 228,
-        id_bytes=np.frombuffer(names.tobytes(), np.uint8),
+        ids=names,
         id_hash=np.array([int.from_bytes(hashlib.sha256(name).digest()[:8], "big") for name in names], np.uint64),
         id_rank=np.argsort(np.argsort(names)).astype(np.int32),
     )

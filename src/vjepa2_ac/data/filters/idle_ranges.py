@@ -18,8 +18,7 @@ from vjepa2_ac.config import DataConfig, LeRobotFields, RawDroidOptions, RldsFie
 from vjepa2_ac.config.section import Affects, knobs_that_affect
 from vjepa2_ac.data.filters.broken_episodes import as_error, as_problem
 from vjepa2_ac.data.filters.idle_rules import kept_ranges
-from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable, NotATableError
-from vjepa2_ac.data.index.index_cache import fingerprints_of, get_or_make, key_of
+from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable, NotATableError, fingerprint_of, get_or_make, key_of
 from vjepa2_ac.episode import EpisodeSource, Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage.npz_reader import read_arrays
@@ -111,7 +110,7 @@ def find_ranges(
     knobs = _sections_as_written_before() | knobs_that_affect(Affects.IDLE, config)
     if storage.is_url(config.path):  # its fingerprint is what it was, and so is this key
         knobs["path"] = config.path
-    parts: dict[str, object] = {"found": "idle ranges", "table": fingerprints_of(table)[0], "data": knobs}
+    parts: dict[str, object] = {"found": "idle ranges", "table": fingerprint_of(table), "data": knobs}
     make = partial(_computed, source, table, config, progress)
     if config.idle.rule == "published":
         path = str(config.idle.ranges)

@@ -15,11 +15,15 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import RawDroidData
 from vjepa2_ac.config.section import Affects, knobs_that_affect
 from vjepa2_ac.data.filters.broken_episodes import as_error, as_problem
-from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable
-from vjepa2_ac.data.index.index_cache import IndexKeys, get_or_build, key_of
-from vjepa2_ac.data.index.labels import labels_of
-from vjepa2_ac.data.index.packed_text import pack_texts, text_of
-from vjepa2_ac.data.index.state_hash import hash_of_states
+from vjepa2_ac.data.index import (
+    EpisodeProblem,
+    EpisodeTable,
+    get_or_build,
+    hash_of_states,
+    index_key,
+    key_of,
+    labels_of,
+)
 from vjepa2_ac.data.sources.droid_raw.episode_folders import (
     TRAJECTORY,
     VIDEOS,
@@ -82,7 +86,7 @@ class RawDroidSource(IndexedSource[RawDroidData, Opened]):
             OSError: Data behind a URL cannot be read.
         """
         table = self.infos()
-        info, place = table[index], _Place(**json_object(text_of("place", table.locators, index), where="the index"))
+        info, place = table[index], _Place(**json_object(table.locators["place"][index].decode(), where="the index"))
         metadata = self._metadata(place)
         serial = metadata.serial(camera or self._config.cameras[0])
         trajectory = self._trajectory(place, (serial,))
@@ -126,8 +130,8 @@ class RawDroidSource(IndexedSource[RawDroidData, Opened]):
             "pose_frame": config.pose_frame,
             "listed": listed,
         }
-        keys = IndexKeys.of(parts, root, named=identity_of(root, folders[0]))
-        return Opened(get_or_build(config.disk_cache, keys, root, lambda: self._scan_all(folders, progress)))
+        key = index_key(parts, root, named=identity_of(root, folders[0]))
+        return Opened(get_or_build(config.disk_cache, key, root, lambda: self._scan_all(folders, progress)))
 
     def _scan_all(self, folders: list[str], progress: Progress) -> EpisodeTable:
         usable: dict[str, _Found] = {}
@@ -146,7 +150,7 @@ class RawDroidSource(IndexedSource[RawDroidData, Opened]):
         return EpisodeTable.of(
             [one.info for one in usable.values()],
             problems=problems,
-            locators=pack_texts("place", [json.dumps(vars(one.place)) for one in usable.values()]),
+            locators={"place": np.array([json.dumps(vars(one.place)).encode() for one in usable.values()])},
             texts={"control_rate_hz": str(self._config.droid_raw.control_rate_hz)},
             state_hashes=[one.state_hash for one in usable.values()],
             labels=labels_of([one.labels for one in usable.values()]),

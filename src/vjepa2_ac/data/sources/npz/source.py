@@ -14,10 +14,7 @@ from jaxtyping import UInt8
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.filters.broken_episodes import as_error, as_problem
-from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable
-from vjepa2_ac.data.index.index_cache import IndexKeys, get_or_build
-from vjepa2_ac.data.index.labels import labels_of
-from vjepa2_ac.data.index.state_hash import hash_of_states
+from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable, get_or_build, hash_of_states, index_key, labels_of
 from vjepa2_ac.data.sources.indexed_source import FramesByStep, IndexedSource, Opened, require_as_indexed
 from vjepa2_ac.data.sources.listing import in_parallel, walk, within
 from vjepa2_ac.data.sources.npz.npz_episode import FORMAT_HELP, NpzEpisode, opened_npz, read_episode, require_frames
@@ -85,10 +82,10 @@ class NpzSource(IndexedSource[DataConfig, _Opened]):
         knobs: dict[str, object] = {"cameras": config.cameras, "pose_frame": config.pose_frame}
         if config.states == "vector":
             knobs |= {"states": config.states, "actions": config.actions}
-        keys = IndexKeys.of({"source": "npz", **knobs, "listed": listed}, root)
+        key = index_key({"source": "npz", **knobs, "listed": listed}, root)
         ids = [path.removesuffix(_SUFFIX) for path, _, _ in listed]
-        build = partial(self._scan_all, ids, keys.now, progress)
-        return _Opened(get_or_build(config.disk_cache, keys, root, build), keys.now)
+        build = partial(self._scan_all, ids, key, progress)
+        return _Opened(get_or_build(config.disk_cache, key, root, build), key)
 
     def _scan_all(self, ids: list[str], version: str, progress: Progress) -> EpisodeTable:
         found: dict[str, NpzEpisode] = {}
