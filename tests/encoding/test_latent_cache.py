@@ -30,13 +30,13 @@ from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
 from vjepa2_ac.data.clips.loader import batches_of, training_loader, validation_batches
 from vjepa2_ac.data.filters.broken_episodes import BrokenEpisodes
 from vjepa2_ac.data.filters.step_ranges import StepSelection, clip_starts
-from vjepa2_ac.data.index.episode_table import EpisodeTable
+from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.data.inspection.check import check_data
 from vjepa2_ac.data.inspection.statistics import inspect_dataset
 from vjepa2_ac.data.sources.latents.dtypes import CacheType, pack_latents, unpack_latents
 from vjepa2_ac.data.sources.latents.episode_file import EncodedEpisode, EpisodeFile, EpisodeLayout, write_episode_file
 from vjepa2_ac.data.sources.latents.manifest import EPISODES, KEPT, MANIFEST, path_of
-from vjepa2_ac.data.sources.rlds.writing.droid_writer import write_droid_rlds
+from vjepa2_ac.data.sources.rlds.droid_writer import write_droid_rlds
 from vjepa2_ac.encoding.cache_lookup import needed_frames, require_encoding, through_cache
 from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, StoredLatents
 from vjepa2_ac.errors import InputError

@@ -4,7 +4,7 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.clips.clip_reader import ClipRequest, read_clip
 from vjepa2_ac.data.clips.dataset import Dataset
-from vjepa2_ac.data.index.episode_table import identity_hash
+from vjepa2_ac.data.index import identity_hash
 from vjepa2_ac.episode import Clip
 
 

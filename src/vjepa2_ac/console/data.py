@@ -9,8 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from vjepa2_ac.console.progress import MetricsTable, console, with_interval
-from vjepa2_ac.data.index.episode_table import EpisodeTable
-from vjepa2_ac.data.index.index_cache import Usage
+from vjepa2_ac.data.index import EpisodeTable, Usage
 from vjepa2_ac.data.inspection.finding import Finding
 from vjepa2_ac.data.inspection.statistics import PERCENTILES, Inspection
 from vjepa2_ac.evaluation.axis_fit import AxisFit

@@ -21,7 +21,7 @@ from vjepa2_ac.data.clips.windows import ClipOrder, Windows, far_neighbours, spr
 from vjepa2_ac.data.clips.windows import windows_of as windows_of_starts
 from vjepa2_ac.data.filters.exclusion import included
 from vjepa2_ac.data.filters.step_ranges import StepSelection, clip_starts
-from vjepa2_ac.data.index.episode_table import EpisodeTable
+from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.episode import EpisodeInfo
 from vjepa2_ac.errors import InputError
 

@@ -16,7 +16,7 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.clips import dataset as opening
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
 from vjepa2_ac.data.filters.grouping import split_hash
-from vjepa2_ac.data.index.episode_table import EpisodeTable
+from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.data.inspection.check import check_data
 from vjepa2_ac.data.inspection.statistics import inspect_dataset
 from vjepa2_ac.episode import EpisodeInfo
@@ -162,14 +162,14 @@ def test_check_says_how_many_groups_there_are_and_inspect_counts_the_splits_of_t
 
 
 def test_a_damaged_label_is_no_table() -> None:
-    from vjepa2_ac.data.index.labels import Labels
+    from vjepa2_ac.data.index import Labels
 
     with pytest.raises(ValueError, match="numbers up to 3"):
         Labels(("a",), np.array([0, 3], np.int32))
 
 
 def test_labels_come_back_from_a_file() -> None:
-    from vjepa2_ac.data.index.labels import Labels
+    from vjepa2_ac.data.index import Labels
 
     infos = [EpisodeInfo(name, 20) for name in "abc"]
     table = EpisodeTable.of(infos, labels={"scene": Labels.of(["x", None, "y"])}, state_hashes=[1, 0, 2])

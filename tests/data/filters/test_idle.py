@@ -21,7 +21,7 @@ from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
 from vjepa2_ac.data.filters.idle_ranges import FoundRanges
 from vjepa2_ac.data.filters.idle_rules import idle_by_commands, idle_by_motion, kept_ranges, moving_ranges
 from vjepa2_ac.data.filters.step_ranges import drawn
-from vjepa2_ac.data.index.episode_table import EpisodeProblem, NotATableError
+from vjepa2_ac.data.index import EpisodeProblem, NotATableError
 from vjepa2_ac.errors import InputError, UnreachableError
 
 COMMANDS = IdleConfig(rule="commands")

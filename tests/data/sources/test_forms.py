@@ -23,7 +23,7 @@ from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
 from vjepa2_ac.data.clips.loader import training_loader
 from vjepa2_ac.data.inspection.excerpts import excerpts_of
 from vjepa2_ac.data.inspection.statistics import inspect_dataset
-from vjepa2_ac.data.sources.rlds.writing.droid_writer import write_droid_rlds
+from vjepa2_ac.data.sources.rlds.droid_writer import write_droid_rlds
 from vjepa2_ac.encoding.encode_dataset import encode_config
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import UnreachableError

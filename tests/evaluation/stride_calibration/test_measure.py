@@ -11,7 +11,7 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.data.filters.broken_episodes import BrokenEpisodes
 from vjepa2_ac.data.filters.step_ranges import StepSelection
-from vjepa2_ac.data.index.episode_table import EpisodeTable
+from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, LatentBatch, Progress, StepRanges, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.measure import ClipSample

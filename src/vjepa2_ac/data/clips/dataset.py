@@ -20,7 +20,7 @@ from vjepa2_ac.data.filters.exclusion import included, with_way_out
 from vjepa2_ac.data.filters.grouping import split_hash
 from vjepa2_ac.data.filters.idle_ranges import FoundRanges, find_ranges
 from vjepa2_ac.data.filters.step_ranges import ClipStarts, StepSelection, clip_starts
-from vjepa2_ac.data.index.episode_table import EpisodeTable
+from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.data.sources.configured_spaces import spaces_of
 from vjepa2_ac.data.sources.latents.source import LatentSource
 from vjepa2_ac.data.sources.registry import open_source

@@ -21,7 +21,7 @@ from vjepa2_ac.data.clips.permutation import permuted
 from vjepa2_ac.data.clips.splits import in_split
 from vjepa2_ac.data.filters.exclusion import NAMED, named
 from vjepa2_ac.data.filters.step_ranges import ClipStarts
-from vjepa2_ac.data.index.episode_table import EpisodeTable
+from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.errors import InputError
 
 logger = logging.getLogger(__name__)

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.filters.exclusion import named, with_way_out
-from vjepa2_ac.data.index.episode_table import EpisodeProblem
+from vjepa2_ac.data.index import EpisodeProblem
 from vjepa2_ac.errors import InputError
 
 logger = logging.getLogger(__name__)

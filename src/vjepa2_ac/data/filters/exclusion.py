@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.index.episode_table import EpisodeTable, identity_hash
+from vjepa2_ac.data.index import EpisodeTable, identity_hash
 from vjepa2_ac.errors import InputError
 
 NAMED = 10  # episodes in one message, at most

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Int, UInt64
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.filters.exclusion import named
-from vjepa2_ac.data.index.episode_table import EpisodeTable, identity_hash
+from vjepa2_ac.data.index import EpisodeTable, identity_hash
 from vjepa2_ac.errors import InputError
 
 # For DROID, whose identities contain .../LAB/success|failure/DATE/..., and for any data in folders.

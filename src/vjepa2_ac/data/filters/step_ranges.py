@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int, Int32, UInt64
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.index.episode_table import EpisodeTable
+from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.episode import StepRanges
 
 _WINDOWS_AT_ONCE = 1 << 17  # idle windows that are drawn at once

@@ -22,7 +22,7 @@ from urllib.parse import quote
 from pydantic import Field
 
 from vjepa2_ac.data.filters.idle_ranges import FoundRanges
-from vjepa2_ac.data.index.episode_table import EpisodeTable, NotATableError
+from vjepa2_ac.data.index import EpisodeTable, NotATableError
 from vjepa2_ac.data.sources.latents.cache_key import CacheKey
 from vjepa2_ac.data.sources.latents.episode_file import EpisodeLayout
 from vjepa2_ac.errors import InputError

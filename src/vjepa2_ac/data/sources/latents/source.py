@@ -12,7 +12,7 @@ from jaxtyping import Int
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.filters.idle_ranges import FoundRanges
-from vjepa2_ac.data.index.episode_table import EpisodeProblem
+from vjepa2_ac.data.index import EpisodeProblem
 from vjepa2_ac.data.sources.indexed_source import IndexedSource, Opened
 from vjepa2_ac.data.sources.latents.cache_key import clip_parts
 from vjepa2_ac.data.sources.latents.episode_file import EpisodeFile
