@@ -31,12 +31,11 @@ from synthetic_droid import draw_episodes
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.clips import ClipRequest, read_clip
 from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.data.index.episode_table import FORMAT, EpisodeTable
-from vjepa2_ac.data.index.index_cache import get_or_build
+from vjepa2_ac.data.index import EpisodeTable, get_or_build
 from vjepa2_ac.data.loader import training_loader
 from vjepa2_ac.data.selection import StepSelection
-from vjepa2_ac.data.sources.rlds.writing.droid_writer import write_droid_rlds
-from vjepa2_ac.data.windows import ClipOrder, clip_starts, in_split, windows_of
+from vjepa2_ac.data.sources.rlds.droid_writer import write_droid_rlds
+from vjepa2_ac.data.windows import ClipOrder, clip_starts, windows_of
 from vjepa2_ac.episode import EpisodeInfo
 
 DROID_EPISODES = 95_658
@@ -175,11 +174,11 @@ def measure_index(config: DataConfig) -> None:
     ]
     columns = {"shard": np.int32, "record": np.int32, "offset": np.int64, "length": np.int64}
     locators = {name: np.arange(DROID_EPISODES, dtype=kind) for name, kind in columns.items()}
-    get_or_build(config.disk_cache, "synthetic", lambda: EpisodeTable.of(infos, locators=locators))
+    get_or_build(config.disk_cache, "synthetic", config.path, lambda: EpisodeTable.of(infos, locators=locators))
     del infos
     with multiprocessing.get_context("spawn").Pool(1) as fresh:  # memory freed by this process would be used again
         clips, opened, taken, memory = fresh.apply(_open_index, (config,))
-    size = (Path(str(config.disk_cache.dir)) / "index" / f"synthetic.table{FORMAT}.index").stat().st_size / 1e6
+    size = (Path(str(config.disk_cache.dir)) / "index" / "synthetic.index").stat().st_size / 1e6
     print(f"\nindex of {DROID_EPISODES:,} episodes, {size:.1f} MB: opened in {opened:.2f} s;", end="")
     print(f" with the order of {clips:,} clips {taken:.2f} s, {memory:.0f} MB")
 
@@ -187,13 +186,12 @@ def measure_index(config: DataConfig) -> None:
 def _open_index(config: DataConfig) -> tuple[int, float, float, float]:
     process = psutil.Process()
     before, start = process.memory_info().rss, time.perf_counter()
-    table = get_or_build(config.disk_cache, "synthetic", _never)
+    table = get_or_build(config.disk_cache, "synthetic", config.path, _never)
     opened = time.perf_counter() - start
     everyone = np.ones(len(table), bool)
     kept = StepSelection.whole(table, everyone)
     order = ClipOrder(
-        windows_of(table, in_split(table.id_hash, config, "train"), clip_starts(table, kept, config), config, "train"),
-        seed=0,
+        windows_of(table, everyone, clip_starts(table, kept, config), config, "train", table.id_hash), seed=0
     )
     order.window(123_456)
     taken, memory = time.perf_counter() - start, (process.memory_info().rss - before) / 1e6

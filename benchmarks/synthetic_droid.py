@@ -6,12 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from vjepa2_ac.data.sources.rlds.writing.droid_writer import (
-    CAMERAS,
-    DroidCommands,
-    DroidEpisode,
-    DroidMeasurements,
-)
+from vjepa2_ac.data.sources.rlds.droid_writer import CAMERAS, DroidCommands, DroidEpisode, DroidMeasurements
 from vjepa2_ac.media.jpeg import encode_jpeg
 
 

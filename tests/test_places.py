@@ -12,7 +12,7 @@ from vjepa2_ac.cli.options import as_local, as_model, as_path, as_place, as_plan
 from vjepa2_ac.cli.program import _parser, main
 from vjepa2_ac.config import DiskCacheConfig
 from vjepa2_ac.config.loading import all_keys, config_as_flat_dict, parse_config
-from vjepa2_ac.data.index.index_cache import cache_folder
+from vjepa2_ac.data.index import cache_folder
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.runs.folder import read_run_config
 

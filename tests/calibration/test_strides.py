@@ -11,7 +11,7 @@ from vjepa2_ac.calibration.strides import Calibration, calibrate
 from vjepa2_ac.calibration.variants import is_certainly_better
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.data.index.episode_table import EpisodeTable
+from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.data.selection import BrokenEpisodes, StepSelection
 from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, LatentBatch, Progress, StepRanges, no_progress
 from vjepa2_ac.errors import InputError

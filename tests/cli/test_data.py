@@ -92,7 +92,7 @@ def test_index_shows_the_kept_one_without_reading_the_data(
 ) -> None:
     assert main(["data", "index", config]) == 0
     del droid
-    monkeypatch.setattr("vjepa2_ac.data.index.index_cache.EpisodeTable.to_bytes", lambda _: pytest.fail("built again"))
+    monkeypatch.setattr("vjepa2_ac.data.index.EpisodeTable.to_bytes", lambda _: pytest.fail("built again"))
     assert main(["data", "index", config]) == 0
     assert "looking through" not in capsys.readouterr().out.split("8 episodes")[-1]
 

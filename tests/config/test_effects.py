@@ -15,8 +15,7 @@ from vjepa2_ac.config import Config, DataConfig, EncoderConfig, ModelSizes
 from vjepa2_ac.config.loading import changed_keys, config_as_yaml, parse_config
 from vjepa2_ac.config.section import Affects, Section, knobs_that_affect, mark_of, marks_of, names_that_affect
 from vjepa2_ac.data import idle as idle_ranges
-from vjepa2_ac.data.index.episode_table import EpisodeInfo, EpisodeTable
-from vjepa2_ac.data.index.index_cache import IndexKeys
+from vjepa2_ac.data.index import EpisodeInfo, EpisodeTable
 from vjepa2_ac.data.sources.latents.cache_key import key_of_cache
 from vjepa2_ac.data.sources.registry import open_source
 from vjepa2_ac.encoding.batch import encoding_of
@@ -142,13 +141,13 @@ def keys_of(monkeypatch: pytest.MonkeyPatch) -> Callable[[Config], dict[str, str
 
     def keys(config: Config) -> dict[str, str | None]:
         try:
-            index: IndexKeys = found(lambda: open_source(config.data).infos())
+            index: str = found(lambda: open_source(config.data).infos())
         except InputError:
             return dict.fromkeys(("index", "idle", "latents"))
-        table = EpisodeTable.of([EpisodeInfo("one", 9, None)], texts={"index": index.now})
+        table = EpisodeTable.of([EpisodeInfo("one", 9, None)], texts={"index": index})
         ranges = found(lambda: idle_ranges.find_ranges(open_source(config.data), table, config.data, None))
-        latents = key_of_cache(config.data, index.now, encoding_of(world_model(), config))
-        return {"index": index.now, "idle": ranges, "latents": latents.digest}
+        latents = key_of_cache(config.data, index, encoding_of(world_model(), config))
+        return {"index": index, "idle": ranges, "latents": latents.digest}
 
     return keys
 

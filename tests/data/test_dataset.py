@@ -15,7 +15,7 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data import dataset as opening
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.idle import FoundRanges
-from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable
+from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable
 from vjepa2_ac.data.selection import BrokenEpisodes
 from vjepa2_ac.errors import InputError
 
@@ -145,8 +145,7 @@ def droid_sized() -> EpisodeTable:
     return EpisodeTable(
         num_steps=generator.integers(60, 520, count).astype(np.int32),
         success=np.ones(count, np.int8),
-        id_ends=np.arange(1, count + 1) * 228,
-        id_bytes=np.frombuffer(names.tobytes(), np.uint8),
+        ids=names,
         id_hash=np.array([int.from_bytes(hashlib.sha256(name).digest()[:8], "big") for name in names], np.uint64),
         id_rank=np.argsort(np.argsort(names)).astype(np.int32),
     )

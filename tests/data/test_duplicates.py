@@ -17,8 +17,7 @@ from synthetic import synthetic_states
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.duplicates import Duplicates, find_duplicates
-from vjepa2_ac.data.index.episode_table import EpisodeTable
-from vjepa2_ac.data.index.state_hash import UNKNOWN, hash_of_states
+from vjepa2_ac.data.index import UNKNOWN, EpisodeTable, hash_of_states
 from vjepa2_ac.data.sources.latents.cache_files import EPISODES
 from vjepa2_ac.inspection.check import check_data
 from vjepa2_ac.inspection.statistics import inspect_dataset

@@ -14,7 +14,7 @@ from latent_sets import write_cache
 from memory_source import MemorySource
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.data.index.episode_table import EpisodeTable
+from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.data.selection import groups_of
 from vjepa2_ac.episode import EpisodeInfo
 from vjepa2_ac.errors import InputError
@@ -155,7 +155,7 @@ def test_check_says_how_many_groups_there_are_and_inspect_counts_the_splits_of_t
 
 
 def test_labels_come_back_from_a_file() -> None:
-    from vjepa2_ac.data.index.labels import Labels
+    from vjepa2_ac.data.index import Labels
 
     infos = [EpisodeInfo(name, 20) for name in "abc"]
     table = EpisodeTable.of(infos, labels={"scene": Labels.of(["x", None, "y"])}, state_hashes=[1, 0, 2])

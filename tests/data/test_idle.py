@@ -18,7 +18,7 @@ from synthetic import synthetic_states
 from vjepa2_ac.config import DataConfig, IdleConfig
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.idle import FoundRanges, idle_by_commands, idle_by_motion, kept_ranges, moving_ranges
-from vjepa2_ac.data.index.episode_table import EpisodeProblem, NotATableError
+from vjepa2_ac.data.index import EpisodeProblem, NotATableError
 from vjepa2_ac.errors import InputError, UnreachableError
 
 COMMANDS = IdleConfig(rule="commands")

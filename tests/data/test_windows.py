@@ -15,7 +15,7 @@ from memory_source import MemorySource
 from paths import GOLDEN, ROOT
 from vjepa2_ac.config.data import DataConfig, Split
 from vjepa2_ac.config.loading import load_config
-from vjepa2_ac.data.index.episode_table import EpisodeTable
+from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.data.selection import StepSelection, included
 from vjepa2_ac.data.windows import ClipOrder, Windows, clip_starts, far_neighbours, in_split, permuted, spread
 from vjepa2_ac.data.windows import windows_of as windows_of_starts

@@ -24,7 +24,7 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.clips import frames_of
 from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.data.index.episode_table import EpisodeTable
+from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.data.loader import batches_of, training_loader, validation_batches
 from vjepa2_ac.data.selection import BrokenEpisodes, StepSelection
 from vjepa2_ac.data.sources.latents.cache_files import (
@@ -38,7 +38,7 @@ from vjepa2_ac.data.sources.latents.cache_files import (
     pack_latents,
     unpack_latents,
 )
-from vjepa2_ac.data.sources.rlds.writing.droid_writer import write_droid_rlds
+from vjepa2_ac.data.sources.rlds.droid_writer import write_droid_rlds
 from vjepa2_ac.data.windows import clip_starts
 from vjepa2_ac.encoding.latent_cache import LatentCache, needed_frames, require_encoding, through_cache
 from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, StoredLatents

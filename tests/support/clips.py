@@ -10,7 +10,7 @@ from vjepa2_ac.config.data import Split
 from vjepa2_ac.data import dataset as opening
 from vjepa2_ac.data.clips import ClipRequest, read_clip
 from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.data.index.episode_table import EpisodeTable, identity_hash
+from vjepa2_ac.data.index import EpisodeTable, identity_hash
 from vjepa2_ac.data.selection import BrokenEpisodes, StepSelection
 from vjepa2_ac.episode import Clip, EpisodeSource
 

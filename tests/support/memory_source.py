@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from synthetic import synthetic_states
-from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable
+from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError
 

@@ -4,9 +4,21 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from vjepa2_ac.data.sources.rlds.dataset_info import find_shards
-from vjepa2_ac.data.sources.rlds.tfrecord import HEADER_BYTES, Kind, RecordSpan, decode_feature, require_intact, span_at
-from vjepa2_ac.data.sources.rlds.wire_format import iterate_features
+import numpy as np
+
+from vjepa2_ac.data.sources.rlds.shards import find_shards
+from vjepa2_ac.data.sources.rlds.tfrecord import (
+    HEADER_BYTES,
+    Kind,
+    RecordSpan,
+    decode_feature,
+    encode_entry,
+    encode_field,
+    iterate_features,
+    require_intact,
+    span_at,
+    write_record,
+)
 
 
 def index_records(path: str | Path) -> list[RecordSpan]:
@@ -35,7 +47,25 @@ def read_record(span: RecordSpan) -> bytes:
     return data[HEADER_BYTES:][: span.length]
 
 
-def decode_example(data: bytes) -> dict[str, tuple[Kind | None, Sequence[Any]]]:
+def decode_example(data: bytes) -> dict[str, tuple[Kind | None, Sequence[Any] | np.ndarray]]:
     """Return kind and values of every feature of a serialised tf.train.Example."""
-    located = dict(iterate_features(lambda offset, length: data[offset : offset + length], 0, len(data)))
-    return {name: decode_feature(data[start : start + size], where=name) for name, (start, size) in located.items()}
+    located = iterate_features(lambda offset, length: data[offset : offset + length], 0, len(data))
+    return {name: decode_feature(data[start : start + size]) for name, (start, size) in located}
+
+
+def in_any_order(folder: Path, target: Path, seed: int) -> Path:
+    """Write a data set again with the features of every record in a drawn order, as TFDS leaves it to a hash."""
+    target.mkdir()
+    generator = np.random.default_rng(seed)
+    for file in folder.iterdir():
+        if ".tfrecord-" not in file.name:
+            (target / file.name).write_bytes(file.read_bytes())
+            continue
+        with (target / file.name).open("wb") as stream:
+            for span in index_records(file):
+                features = decode_example(read_record(span))
+                entries = b"".join(
+                    encode_entry(name, *features[name]) for name in generator.permutation(list(features))
+                )
+                write_record(stream, encode_field(0x0A, entries))
+    return target

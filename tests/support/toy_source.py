@@ -7,7 +7,7 @@ import numpy as np
 
 from vjepa2_ac.config import DataConfig, Section
 from vjepa2_ac.config.section import Affects
-from vjepa2_ac.data.index.episode_table import EpisodeTable
+from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 
 

@@ -146,7 +146,7 @@ def _index(options: argparse.Namespace) -> None:
     from vjepa2_ac.console.data import index_lines
     from vjepa2_ac.console.progress import ConsoleReporter, console
     from vjepa2_ac.data.dataset import open_dataset
-    from vjepa2_ac.data.index.index_cache import record_usage
+    from vjepa2_ac.data.index import record_usage
     from vjepa2_ac.reporter import INDEXING
 
     started = time.perf_counter()

@@ -11,8 +11,7 @@ from vjepa2_ac.calibration.axes import AxisFit
 from vjepa2_ac.calibration.data import VariantProbe, rows_of
 from vjepa2_ac.calibration.strides import Calibration
 from vjepa2_ac.console.progress import MetricsTable, console, with_interval
-from vjepa2_ac.data.index.episode_table import EpisodeTable
-from vjepa2_ac.data.index.index_cache import Usage
+from vjepa2_ac.data.index import EpisodeTable, Usage
 from vjepa2_ac.inspection.excerpts import Finding
 from vjepa2_ac.inspection.statistics import CHANGED, MOVED, TURNED, StepSizes
 

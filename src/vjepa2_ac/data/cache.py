@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig, DiskCacheConfig
-from vjepa2_ac.data.index.index_cache import cache_folder
+from vjepa2_ac.data.index import cache_folder
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage.block_file import BlockCachedFile, DiskCache
 

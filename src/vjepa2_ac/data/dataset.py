@@ -15,7 +15,7 @@ from jaxtyping import Bool, Int, UInt64
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.idle import FoundRanges, find_ranges
-from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable
+from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable
 from vjepa2_ac.data.selection import (
     BrokenEpisodes,
     StepSelection,

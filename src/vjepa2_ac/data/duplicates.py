@@ -10,7 +10,7 @@ import numpy as np
 
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.data.index.state_hash import UNKNOWN
+from vjepa2_ac.data.index import UNKNOWN
 
 _SPLITS: tuple[Split, ...] = ("train", "validation", "test")
 WAY_OUT = "Leave copies out with data.exclude, or keep in one split what belongs together with data.split_by"

@@ -18,8 +18,7 @@ from scipy.spatial.transform import Rotation
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig, IdleConfig
 from vjepa2_ac.config.section import Affects, knobs_that_affect
-from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable, NotATableError
-from vjepa2_ac.data.index.index_cache import fingerprints_of, get_or_make, key_of
+from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable, NotATableError, fingerprint_of, get_or_make, key_of
 from vjepa2_ac.data.selection import as_error, as_problem
 from vjepa2_ac.episode import Episode, EpisodeSource, Progress, no_progress
 from vjepa2_ac.errors import InputError
@@ -98,7 +97,7 @@ def find_ranges(
         InputError: The list of ranges cannot be read or belongs to another data set; or the rule fits no episode.
     """
     knobs = knobs_that_affect(Affects.IDLE, config)
-    parts: dict[str, object] = {"found": "idle ranges", "table": fingerprints_of(table)[0], "data": knobs}
+    parts: dict[str, object] = {"found": "idle ranges", "table": fingerprint_of(table), "data": knobs}
     make = partial(_computed, source, table, config, progress or no_progress)
     if config.idle.rule == "published":
         path = str(config.idle.ranges)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Int32, UInt64
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable, identity_hash
+from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable, identity_hash
 from vjepa2_ac.episode import StepRanges
 from vjepa2_ac.errors import InputError
 

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int, Int32, Int64, UInt64
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.index.episode_table import EpisodeTable
+from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.data.selection import NAMED, StepSelection, named
 from vjepa2_ac.errors import InputError
 

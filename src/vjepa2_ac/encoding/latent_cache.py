@@ -13,7 +13,7 @@ import numpy as np
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import Dataset, through_latents
 from vjepa2_ac.data.idle import find_ranges
-from vjepa2_ac.data.index.index_cache import cache_folder, fingerprints_of
+from vjepa2_ac.data.index import cache_folder, fingerprint_of
 from vjepa2_ac.data.sources.latents.cache_files import CACHE, EPISODES, KEPT, LatentFiles, bytes_per_frame, read_key
 from vjepa2_ac.data.sources.latents.cache_key import CacheKey, Encoding, key_of_cache, require_own_folder
 from vjepa2_ac.data.sources.latents.source import LatentSource, another_cache
@@ -43,7 +43,7 @@ def needed_frames(dataset: Dataset) -> Iterator[FramesToEncode]:
 
 def key_for(dataset: Dataset, encoding: Encoding) -> CacheKey:
     """Return the cache key of an open data set that is not itself a cache."""
-    return key_of_cache(dataset.config, fingerprints_of(dataset.table)[0], encoding)
+    return key_of_cache(dataset.config, fingerprint_of(dataset.table), encoding)
 
 
 @dataclass(frozen=True, eq=False)

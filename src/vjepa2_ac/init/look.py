@@ -13,7 +13,7 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.loading import config_from
 from vjepa2_ac.config.plugins import admit_forms_of_data
-from vjepa2_ac.data.index.episode_table import EpisodeTable
+from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.data.sources.droid_raw.episode_folders import find_episodes
 from vjepa2_ac.data.sources.lerobot.info import INFO
 from vjepa2_ac.data.sources.listing import walk, within

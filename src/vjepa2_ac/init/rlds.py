@@ -8,7 +8,7 @@ from math import prod
 from typing import Any
 
 from vjepa2_ac import storage
-from vjepa2_ac.data.sources.rlds.dataset_info import dataset_name, find_shards
+from vjepa2_ac.data.sources.rlds.shards import dataset_name, find_shards
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.init.found import FoundData, Knob, Knobs
 from vjepa2_ac.init.names import Column, find_pose, pick_camera, short_name

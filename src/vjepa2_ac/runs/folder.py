@@ -176,7 +176,7 @@ def start_folders(folder: Path) -> list[Path]:
 
 def environment() -> dict[str, object]:
     """Return what a figure should be read with: versions, machine, command, time."""
-    packages = ("vjepa2-ac", "torch", "transformers", "peft", "accelerate", "numpy", "scipy", "simplejpeg", "protobuf")
+    packages = ("vjepa2-ac", "torch", "transformers", "peft", "accelerate", "numpy", "scipy", "simplejpeg")
     return {
         "time": utc_now(),
         "command": sys.argv,

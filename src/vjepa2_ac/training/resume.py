@@ -10,7 +10,7 @@ import torch
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.data.index.index_cache import fingerprints_of
+from vjepa2_ac.data.index import fingerprint_of
 from vjepa2_ac.distributed.collectives import broadcast_object, broadcast_tensors, require_same
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.lora import load_trained
@@ -133,7 +133,7 @@ def require_same_data(config: Config, dataset: Dataset, replayed: Dataset | None
             continue
         state = written_state(checkpoint)
         seen = (state.data, state.replayed_data)[number]
-        if seen in fingerprints_of(one.table):
+        if seen == fingerprint_of(one.table):
             continue
         raise InputError(
             where=f"{key}: {now.path}",

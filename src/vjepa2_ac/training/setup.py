@@ -15,7 +15,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.duplicates import find_duplicates
-from vjepa2_ac.data.index.index_cache import fingerprints_of
+from vjepa2_ac.data.index import fingerprint_of
 from vjepa2_ac.data.loader import Batches, Mixed, ProcessShare, training_loader, validation_batches
 from vjepa2_ac.data.streams import Copies, copies_for
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
@@ -268,10 +268,10 @@ def save_checkpoint(run: Run, folder: Path) -> None:
         run.state,
         broken=broken,
         windows=len(run.dataset.windows("train")),
-        data=fingerprints_of(run.dataset.table)[0],
+        data=fingerprint_of(run.dataset.table),
         replayed_broken=broken_replayed,
         replayed_windows=len(run.replayed.windows("train")) if run.replayed else None,
-        replayed_data=fingerprints_of(run.replayed.table)[0] if run.replayed else None,
+        replayed_data=fingerprint_of(run.replayed.table) if run.replayed else None,
         clips_per_step=run.clips_per_step,
         clips_asked=run.config.training.batch_size * run.config.training.accumulation,
         processes=run.accelerator.num_processes,

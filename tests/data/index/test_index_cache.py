@@ -2,9 +2,7 @@
 
 import errno
 import logging
-import os
 import random
-import threading
 from pathlib import Path
 
 import numpy as np
@@ -12,60 +10,61 @@ import pytest
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DiskCacheConfig
-from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable
-from vjepa2_ac.data.index.index_cache import IndexKeys, cache_folder, fingerprints_of, get_or_build, record_usage
+from vjepa2_ac.data.index import (
+    EpisodeProblem,
+    EpisodeTable,
+    fingerprint_of,
+    get_or_build,
+    index_key,
+    labels_of,
+    record_usage,
+)
 from vjepa2_ac.episode import EpisodeInfo
 
 TABLE = EpisodeTable.of(
     [EpisodeInfo(f"küche/{number}", 10 + number) for number in range(5)],
     problems=[EpisodeProblem("bad", "here", "damaged")],
     locators={"offset": np.arange(5)},
+    labels=labels_of([{"task": task} for task in (None, "lift", "push", "", "lift")]),
 )
 
 
-KEYS = IndexKeys.of({"files": 3}, "/data/set")
+KEY = index_key({"files": 3}, "/data/set")
 
 
 def ids(table: EpisodeTable) -> list[str]:
     return [info.id for info in table]
 
 
-def test_a_table_is_built_once(tmp_path: Path) -> None:
-    config, built = DiskCacheConfig(dir=str(tmp_path)), []
-    for _ in range(2):
-        table = get_or_build(config, KEYS, "/data/set", lambda: built.append(1) or TABLE)
-        assert (ids(table), table.problems) == (ids(TABLE), TABLE.problems)
-    assert built == [1]
+def kept(tmp_path: Path, key: str = KEY, place: str = "/data/set", table: EpisodeTable | None = None) -> EpisodeTable:
+    """Return the cached table; without one to build it must be there."""
+    return get_or_build(DiskCacheConfig(dir=str(tmp_path)), key, place, lambda: table or pytest.fail("built again"))
+
+
+def test_a_table_is_built_once_and_again_when_that_is_asked_for(tmp_path: Path) -> None:
+    for table in (TABLE, None):
+        found = kept(tmp_path, table=table)
+        assert (ids(found), found.problems, fingerprint_of(found)) == (ids(TABLE), TABLE.problems, KEY)
+        assert found.labels["task"].of_episode(2) == "push"
+        assert np.array_equal(found.id_rank, TABLE.id_rank)
+    with record_usage(rebuild=True) as usage:
+        assert ids(kept(tmp_path, table=EpisodeTable.of([EpisodeInfo("other", 1)]))) == ["other"]
+    assert usage.files == list((tmp_path / "index").iterdir())
 
 
 def test_an_index_of_a_folder_is_found_wherever_it_is_moved_and_its_problems_are_there(tmp_path: Path) -> None:
-    config = DiskCacheConfig(dir=str(tmp_path))
     broken = EpisodeTable.of([EpisodeInfo("one", 3)], problems=[EpisodeProblem("bad", "/data/set/a.npz: x", "damaged")])
-    get_or_build(config, KEYS, "/data/set", lambda: broken)
-    moved = IndexKeys.of({"files": 3}, "/mnt/set")
-    table = get_or_build(config, moved, "/mnt/set", lambda: pytest.fail("built again"))
+    kept(tmp_path, table=broken)
+    table = kept(tmp_path, index_key({"files": 3}, "/mnt/set"), "/mnt/set")
     assert [problem.where for problem in table.problems] == ["/mnt/set/a.npz: x"]
-    assert fingerprints_of(table)[0] == KEYS.now == moved.now
-    assert IndexKeys.of({"files": 4}, "/data/set").now != KEYS.now
-    assert IndexKeys.of({"files": 3}, "/data/set", named="other/success").now != KEYS.now
-    far = IndexKeys.of({"files": 3}, "gs://a/set")
-    assert far.now == far.before != IndexKeys.of({"files": 3}, "gs://b/set").now, "servers say little of versions"
+    others = [index_key({"files": 4}, "/data/set"), index_key({"files": 3}, "/data/set", named="other/success")]
+    others += [index_key({"files": 3}, f"gs://{bucket}/set") for bucket in "ab"]  # servers say little of versions
+    assert len({KEY, *others}) == 5
 
 
-def test_an_index_of_an_earlier_version_is_found_and_so_is_what_was_made_by_its_key(tmp_path: Path) -> None:
-    config, old = DiskCacheConfig(dir=str(tmp_path)), IndexKeys(KEYS.before, KEYS.before)
-    get_or_build(config, old, "/data/set", lambda: TABLE)
-    table = get_or_build(config, KEYS, "/data/set", lambda: pytest.fail("built again"))
-    assert fingerprints_of(table) == (KEYS.now, KEYS.before)
-    moved = get_or_build(config, IndexKeys.of({"files": 3}, "/mnt"), "/mnt", lambda: pytest.fail("built again"))
-    assert fingerprints_of(moved) == (KEYS.now, KEYS.before), "also when it has moved since"
-    with record_usage(rebuild=True):
-        assert ids(get_or_build(config, KEYS, "/data/set", lambda: TABLE)) == ids(TABLE)
-
-
-def test_whatever_is_damaged_the_table_is_built_again(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    config, chance = DiskCacheConfig(dir=str(tmp_path)), random.Random(0)  # noqa: S311 - no secret
-    whole = get_or_build(config, KEYS, "/data/set", lambda: TABLE).to_bytes()
+def test_whatever_is_damaged_the_table_is_right(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    chance, rebuilt = random.Random(0), 0  # noqa: S311 - no secret
+    whole = kept(tmp_path, table=TABLE).to_bytes()
     [path] = (tmp_path / "index").iterdir()
     content = path.read_bytes()
     with caplog.at_level(logging.CRITICAL):
@@ -73,13 +72,10 @@ def test_whatever_is_damaged_the_table_is_built_again(tmp_path: Path, caplog: py
             damaged = bytearray(content)
             damaged[chance.randrange(len(damaged))] ^= 1 << chance.randrange(8)
             path.write_bytes(damaged[: len(damaged) if chance.random() < 0.9 else chance.randrange(len(damaged))])
-            built: list[int] = []
-            assert (
-                get_or_build(config, KEYS, "/data/set", lambda built=built: built.append(1) or TABLE).to_bytes()
-                == whole
-            )
-            assert built == [1]
-            assert path.read_bytes() == content
+            assert kept(tmp_path, table=TABLE).to_bytes() == whole
+            rebuilt += path.read_bytes() == content
+            path.write_bytes(content)
+    assert rebuilt > 150
 
 
 def test_a_folder_that_cannot_be_written_costs_a_warning(
@@ -89,35 +85,17 @@ def test_a_folder_that_cannot_be_written_costs_a_warning(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(storage, "write_atomically", refuse)
-    assert len(get_or_build(DiskCacheConfig(dir=str(tmp_path)), KEYS, "/data/set", lambda: TABLE)) == 5
+    assert len(kept(tmp_path, table=TABLE)) == 5
     assert "No space left on device" in caplog.text
 
 
 def test_two_that_write_one_index_at_once_do_not_meet(tmp_path: Path) -> None:
-    here, there = threading.Barrier(2, timeout=120), threading.Barrier(2, timeout=120)
-
-    def write(text: str) -> None:
-        with storage.atomic_writer(tmp_path / "index") as file:
-            file.write(text.encode())
-            here.wait()
-            if text == "second":
-                there.wait()
-        if text == "first":
-            assert (tmp_path / "index").read_bytes() == b"first"
-            there.wait()
-
-    other = threading.Thread(target=write, args=["second"])
-    other.start()
-    write("first")
-    other.join()
-    assert (tmp_path / "index").read_bytes() == b"second"
-    assert [path.name for path in tmp_path.iterdir()] == ["index"]
-
-
-@pytest.mark.parametrize("named", ["config", "environment"])
-def test_the_users_home_is_meant_by_a_tilde(named: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HOME", "/somewhere")
-    monkeypatch.setenv("VJEPA2_AC_CACHE", "~/kept")
-    config = DiskCacheConfig(dir="~/kept" if named == "config" else None)
-    assert cache_folder(config) == Path("/somewhere/kept")
-    assert not os.path.lexists("~")
+    path = tmp_path / "index"
+    with storage.atomic_writer(path) as first:
+        first.write(b"fir")
+        with storage.atomic_writer(path) as second:
+            second.write(b"second")
+        assert path.read_bytes() == b"second"
+        first.write(b"st")
+    assert path.read_bytes() == b"first"
+    assert list(tmp_path.iterdir()) == [path]

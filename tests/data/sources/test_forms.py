@@ -21,7 +21,7 @@ from synthetic import draw_frame, synthetic_episode
 from vjepa2_ac.config import Config, DataConfig
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import training_loader
-from vjepa2_ac.data.sources.rlds.writing.droid_writer import write_droid_rlds
+from vjepa2_ac.data.sources.rlds.droid_writer import write_droid_rlds
 from vjepa2_ac.encoding.encode_dataset import encode_config
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import UnreachableError

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.index.episode_table import EpisodeTable
+from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.data.sources.npz.source import NpzSource
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage.npz_reader import NpzFile

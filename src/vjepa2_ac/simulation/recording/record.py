@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from vjepa2_ac.data.sources.rlds.writing.droid_writer import (
+from vjepa2_ac.data.sources.rlds.droid_writer import (
     CAMERAS,
     DroidCommands,
     DroidEpisode,

@@ -40,7 +40,7 @@ from torch import Tensor
 
 from vjepa2_ac import storage
 from vjepa2_ac.data.idle import FoundRanges
-from vjepa2_ac.data.index.episode_table import EpisodeTable, NotATableError
+from vjepa2_ac.data.index import EpisodeTable, NotATableError
 from vjepa2_ac.data.sources.latents.cache_key import FORMAT, CacheKey
 from vjepa2_ac.episode import Episode, StoredLatents
 from vjepa2_ac.errors import InputError

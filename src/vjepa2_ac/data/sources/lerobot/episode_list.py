@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 from vjepa2_ac import storage
-from vjepa2_ac.data.index.state_hash import UNKNOWN, hash_of_bytes
+from vjepa2_ac.data.index import UNKNOWN, hash_of_bytes
 from vjepa2_ac.data.sources.lerobot.info import DatasetInfo
 from vjepa2_ac.data.sources.lerobot.parquet import Opener, read_table
 from vjepa2_ac.data.sources.lerobot.path_templates import filled

@@ -11,8 +11,7 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import LeRobotData
 from vjepa2_ac.config.section import Affects, knobs_that_affect
 from vjepa2_ac.data.cache import fetched_data
-from vjepa2_ac.data.index.episode_table import EpisodeTable
-from vjepa2_ac.data.index.index_cache import IndexKeys, get_or_build
+from vjepa2_ac.data.index import EpisodeTable, get_or_build, index_key
 from vjepa2_ac.data.sources.indexed_source import FramesByStep, IndexedSource, Opened
 from vjepa2_ac.data.sources.lerobot import episode_list
 from vjepa2_ac.data.sources.lerobot.episode_list import EpisodeRow
@@ -117,10 +116,9 @@ class LeRobotSource(IndexedSource[LeRobotData, _Opened]):
             "info": repr(replace(info, root="")),
             "files": [(path, file.size, file.version) for path, file in [*tables.items(), *files.items()]],
         }
-        index = IndexKeys.of(parts, config.path)
-        self._version = index.now
+        self._version = index_key(parts, config.path)
         build = partial(self._built, list(tables), files.keys(), keys, progress)
-        return _Opened(get_or_build(config.disk_cache, index, config.path, build), info)
+        return _Opened(get_or_build(config.disk_cache, self._version, config.path, build), info)
 
     def _built(self, tables: list[str], files: Set[str], keys: list[str], progress: Progress) -> EpisodeTable:
         info, fields = self._info, self._config.lerobot

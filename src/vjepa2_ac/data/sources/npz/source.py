@@ -13,10 +13,7 @@ from jaxtyping import UInt8
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable
-from vjepa2_ac.data.index.index_cache import IndexKeys, get_or_build
-from vjepa2_ac.data.index.labels import labels_of
-from vjepa2_ac.data.index.state_hash import hash_of_states
+from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable, IndexKeys, get_or_build, hash_of_states, labels_of
 from vjepa2_ac.data.selection import as_error, as_problem
 from vjepa2_ac.data.sources.indexed_source import FramesByStep, IndexedSource, Opened, require_as_indexed
 from vjepa2_ac.data.sources.listing import in_parallel, walk, within

@@ -3,30 +3,41 @@
 A file is a sequence of records: u64 little-endian length, masked CRC-32C of the length, data, masked CRC-32C of the
 data. The data of each record is one tf.train.Example: a map from feature names to lists of bytes, floats or integers.
 
-Source: tensorflow/tensorflow, tensorflow/core/lib/io/record_writer.h and core/example/{example,feature}.proto (the
-formats; no code).
+A DROID episode is 18 MB, nearly all of it images; its identity and length are a few hundred bytes. Hopping over tags
+and lengths finds them in a file, and finds single images in a feature. The features of a record have no fixed order:
+TFDS uses that of a hash, which differs between the processes that wrote. But for that order every writer of protobuf
+gives the same bytes, and only these are read: of an entry the name, then the feature; numbers as one packed list.
+
+Source: tensorflow/tensorflow, tensorflow/core/lib/io/record_writer.h and core/example/{example,feature}.proto, and
+protobuf.dev/programming-guides/encoding (the formats; no code).
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, BinaryIO, Literal
 
 import google_crc32c
 import numpy as np
-from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, text_format
-from google.protobuf.message import DecodeError
 
 from vjepa2_ac.errors import InputError
 
+Read = Callable[[int, int], bytes]  # (offset, length) -> those bytes; fewer if the file ends
+Place = tuple[int, int]  # of a part of a file: offset and length
 Kind = Literal["bytes_list", "float_list", "int64_list"]
 
 HEADER_BYTES = 12
 _FOOTER_BYTES = 4
 _PIECE_BYTES = 1 << 18  # small enough to stay in the processor's cache between reading and checking
 _MASK_DELTA = 0xA282EAD8
+
+_KINDS: tuple[Kind, ...] = ("bytes_list", "float_list", "int64_list")  # fields 1, 2, 3 of tf.train.Feature
+_FIRST, _SECOND, _THIRD = 0x0A, 0x12, 0x1A  # tags of fields with a length
+_VARINT_BYTES = 10  # at most
+_HEAD_BYTES = 1 + _VARINT_BYTES
+_ENTRY_HEAD_BYTES = 400  # the headers and the name of a feature
 
 
 @dataclass(frozen=True)
@@ -78,12 +89,8 @@ def span_at(header: bytes, path: str, number: int, offset: int, size: int) -> Re
     return span
 
 
-def require_intact(read: Callable[[int, int], bytes], span: RecordSpan) -> None:
-    """Check the CRC of a record's data, read in chunks.
-
-    Args:
-        read: Returns bytes of the file: (offset, length) -> those bytes, fewer if the file ends.
-        span: The record.
+def require_intact(read: Read, span: RecordSpan) -> None:
+    """Check the CRC of a record's data, read in pieces.
 
     Raises:
         InputError: The file ends within the record, or its CRC does not match.
@@ -103,6 +110,78 @@ def require_intact(read: Callable[[int, int], bytes], span: RecordSpan) -> None:
         raise InputError(where=str(span), found=found, fix="Download the file again")
 
 
+class NotAnExampleError(ValueError):
+    """The bytes are not a serialised tf.train.Example."""
+
+
+def iterate_features(read: Read, start: int, length: int) -> Iterator[tuple[str, Place]]:
+    """Yield the name and position of each feature in file order, reading only as far as the caller iterates.
+
+    A position is that of the serialised tf.train.Feature. No CRC is checked.
+
+    Raises:
+        NotAnExampleError: The bytes are not an Example.
+    """
+    end = start + length
+    position = _content(read(start, _HEAD_BYTES), start, end, _FIRST) if length else end
+    while position < end:
+        head = read(position, _ENTRY_HEAD_BYTES)
+        size, used = _delimited(head, 0, _FIRST)
+        name_length, name_start = _delimited(head, used, _FIRST)
+        name_end = name_start + name_length
+        feature_length, feature_start = _delimited(head, name_end, _SECOND)
+        entry_end = position + used + size
+        if position + feature_start + feature_length != entry_end or entry_end > end:
+            raise NotAnExampleError(f"the parts of the feature at byte {position} do not fit together")
+        try:
+            yield head[name_start:name_end].decode(), (position + feature_start, feature_length)
+        except UnicodeDecodeError:
+            raise NotAnExampleError(f"the name of a feature at byte {position} is not text") from None
+        position = entry_end
+
+
+def item_places(read: Read, feature: Place, count: int | None = None) -> list[Place]:
+    """Return the position of each image or text of a feature, without reading them; or of the first `count`.
+
+    Raises:
+        NotAnExampleError: It is not a list of bytes, or damaged.
+    """
+    places: list[Place] = []
+    start, end = feature[0], sum(feature)
+    position = _content(read(start, _HEAD_BYTES), start, end, _FIRST) if start < end else end
+    while position < end and len(places) != count:
+        length, used = _delimited(read(position, _HEAD_BYTES), 0, _FIRST)
+        places.append((position + used, length))
+        position += used + length
+    if position > end:
+        raise NotAnExampleError(f"the item at byte {places[-1][0]} reaches beyond its list")
+    return places
+
+
+def decode_feature(data: bytes, texts: int | None = None) -> tuple[Kind | None, Sequence[Any] | np.ndarray]:
+    """Return kind and values of one serialised tf.train.Feature: bytes, float32 or integers; None: it has no values.
+
+    Args:
+        data: The feature.
+        texts: How many are wanted, if it has texts; None: all.
+
+    Raises:
+        NotAnExampleError: The bytes are not a Feature.
+    """
+    if not data:
+        return None, ()
+    if data[0] == _FIRST:
+        places = item_places(lambda offset, length: data[offset : offset + length], (0, len(data)), texts)
+        return "bytes_list", [data[offset : offset + length] for offset, length in places]
+    content = data[_content(data, 0, len(data), _SECOND if data[0] == _SECOND else _THIRD) :]
+    packed = content[_content(content, 0, len(content), _FIRST) :] if content else b""
+    if data[0] == _THIRD:
+        return "int64_list", _integers(packed)
+    if len(packed) % 4:
+        raise NotAnExampleError(f"{len(packed)} bytes of floats")
+    return "float_list", np.frombuffer(packed, "<f4")
+
+
 def write_record(file: BinaryIO, data: bytes) -> None:
     """Append one record to a file."""
     header = struct.pack("<Q", len(data))
@@ -112,26 +191,22 @@ def write_record(file: BinaryIO, data: bytes) -> None:
 
 
 def encode_example(features: Mapping[str, tuple[Kind, Sequence[Any] | np.ndarray]]) -> bytes:
-    """Return a serialised tf.train.Example; equal features give equal bytes."""
-    example = _Example()
-    for name, (kind, values) in features.items():
-        values = values.tolist() if isinstance(values, np.ndarray) else values
-        getattr(example.features.feature[name], kind).value.extend(values)
-    return bytes(example.SerializeToString(deterministic=True))
+    """Return a serialised tf.train.Example: features by name, one that begins another behind it, as protobuf does."""
+    names = sorted(features, key=lambda name: name.encode() + b"\xff")
+    entries = [encode_entry(name, *features[name]) for name in names]
+    return encode_field(_FIRST, b"".join(entries))
 
 
-def decode_feature(data: bytes, *, where: str) -> tuple[Kind | None, Sequence[Any]]:
-    """Return kind and values of one serialised tf.train.Feature.
-
-    Raises:
-        InputError: The bytes are not a Feature.
-    """
-    try:
-        feature = _Feature.FromString(data)
-    except DecodeError:
-        raise InputError(where=where, found="not a tf.train.Feature", needed="an RLDS data set") from None
-    kind = feature.WhichOneof("kind")
-    return kind, getattr(feature, kind).value if kind else ()
+def encode_entry(name: str, kind: Kind, values: Sequence[Any] | np.ndarray) -> bytes:
+    """Return one feature with its name, as it lies in an Example."""
+    if kind == "bytes_list":
+        content = b"".join(encode_field(_FIRST, value) for value in values)
+    elif kind == "float_list":
+        content = encode_field(_FIRST, np.asarray(values, "<f4").tobytes()) if len(values) else b""
+    else:
+        content = encode_field(_FIRST, b"".join(_varint_of(int(value)) for value in values)) if len(values) else b""
+    feature = encode_field((_KINDS.index(kind) + 1) << 3 | 2, content)
+    return encode_field(_FIRST, encode_field(_FIRST, name.encode()) + encode_field(_SECOND, feature))
 
 
 def _truncated(where: str, size: int, needed: int) -> InputError:
@@ -147,29 +222,52 @@ def _mask(crc: int) -> int:
     return ((crc >> 15 | crc << 17) + _MASK_DELTA) & 0xFFFFFFFF
 
 
-# The message types, in their own pool: no generated file, and no conflict with TensorFlow's declaration.
-_PROTO = """
-name: "example.proto" package: "tensorflow" syntax: "proto3"
-message_type { name: "BytesList" field { name: "value" number: 1 label: LABEL_REPEATED type: TYPE_BYTES } }
-message_type { name: "FloatList" field { name: "value" number: 1 label: LABEL_REPEATED type: TYPE_FLOAT } }
-message_type { name: "Int64List" field { name: "value" number: 1 label: LABEL_REPEATED type: TYPE_INT64 } }
-message_type { name: "Feature" oneof_decl { name: "kind" }
-  field { name: "bytes_list" number: 1 label: LABEL_OPTIONAL type_name: ".tensorflow.BytesList" oneof_index: 0 }
-  field { name: "float_list" number: 2 label: LABEL_OPTIONAL type_name: ".tensorflow.FloatList" oneof_index: 0 }
-  field { name: "int64_list" number: 3 label: LABEL_OPTIONAL type_name: ".tensorflow.Int64List" oneof_index: 0 }
-}
-message_type { name: "Features"
-  nested_type { name: "FeatureEntry" options { map_entry: true }
-    field { name: "key" number: 1 label: LABEL_OPTIONAL type: TYPE_STRING }
-    field { name: "value" number: 2 label: LABEL_OPTIONAL type_name: ".tensorflow.Feature" }
-  }
-  field { name: "feature" number: 1 label: LABEL_REPEATED type_name: ".tensorflow.Features.FeatureEntry" }
-}
-message_type { name: "Example"
-  field { name: "features" number: 1 label: LABEL_OPTIONAL type_name: ".tensorflow.Features" }
-}
-"""
-_POOL = descriptor_pool.DescriptorPool()
-_POOL.Add(text_format.Parse(_PROTO, descriptor_pb2.FileDescriptorProto()))
-_Example: Any = message_factory.GetMessageClass(_POOL.FindMessageTypeByName("tensorflow.Example"))
-_Feature: Any = message_factory.GetMessageClass(_POOL.FindMessageTypeByName("tensorflow.Feature"))
+def _delimited(data: bytes, place: int, tag: int) -> tuple[int, int]:
+    """Return the length of a field with a tag at a place, and where its content starts."""
+    if place < len(data) and data[place] == tag:
+        return _varint(data, place + 1)
+    raise NotAnExampleError(f"no field {tag >> 3} where one must start")
+
+
+def _content(head: bytes, start: int, end: int, tag: int) -> int:
+    """Return where the content of a field starts, which must fill a message from its start to its end."""
+    length, used = _delimited(head, 0, tag)
+    if start + used + length != end:
+        raise NotAnExampleError(f"the field at byte {start} does not end where its message does")
+    return start + used
+
+
+def _integers(packed: bytes) -> Sequence[int] | np.ndarray:
+    """Return packed varints as signed integers of 64 bits."""
+    if packed.isascii():  # each in one byte, as flags are
+        return np.frombuffer(packed, np.uint8)
+    found, place = [], 0
+    while place < len(packed):
+        value, place = _varint(packed, place)
+        value &= (1 << 64) - 1
+        found.append(value - (1 << 64) if value >> 63 else value)
+    return found
+
+
+def _varint(data: bytes, start: int) -> tuple[int, int]:
+    """Return a varint, and the offset of its end."""
+    value = 0
+    for place, byte in enumerate(data[start : start + _VARINT_BYTES]):
+        value |= (byte & 0x7F) << 7 * place
+        if byte < 0x80:
+            return value, start + place + 1
+    raise NotAnExampleError("a number does not end")
+
+
+def _varint_of(value: int) -> bytes:
+    value &= (1 << 64) - 1
+    digits = bytearray()
+    while value >= 0x80:
+        digits.append(value & 0x7F | 0x80)
+        value >>= 7
+    return bytes([*digits, value])
+
+
+def encode_field(tag: int, content: bytes) -> bytes:
+    """Return a field with a length."""
+    return bytes([tag]) + _varint_of(len(content)) + content

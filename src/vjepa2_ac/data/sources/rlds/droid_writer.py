@@ -5,10 +5,11 @@ Source: measured on files that TFDS wrote in DROID's schema (layout, kinds of li
 
 from __future__ import annotations
 
+import importlib.resources
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +19,14 @@ from jaxtyping import Float
 
 from vjepa2_ac import storage
 from vjepa2_ac.data.sources.rlds.tfrecord import Kind, encode_example, write_record
-from vjepa2_ac.data.sources.rlds.writing.droid_schema import dataset_info, droid_features
 from vjepa2_ac.errors import InputError
 
 CAMERAS = ("exterior_image_1_left", "exterior_image_2_left", "wrist_image_left")
 
-_INFO = "dataset_info.json"
+_NAME = "r2d2_faceblur"
+_INFO, _FEATURES = "dataset_info.json", "features.json"
+_ASSETS = Path(str(importlib.resources.files("vjepa2_ac"))) / "assets" / "droid"
+_WIDTHS = {"action": 7, "cartesian": 6, "gripper": 1, "joint": 7}  # by the first word of a name
 
 
 @dataclass(frozen=True)
@@ -67,14 +70,20 @@ class DroidEpisode:
         """Control steps."""
         return len(self.action)
 
+    @property
+    def arrays(self) -> dict[str, Float[np.ndarray, "steps width"]]:
+        """Every array, by the name of its feature."""
+        found = {"action": self.action}
+        for group, recorded in (("action_dict", self.action_dict), ("observation", self.observation)):
+            found |= {f"{group}/{name}": array for name, array in vars(recorded).items()}
+        return found
+
 
 def write_droid_rlds(
     folder: str | Path,
     episodes: Iterable[DroidEpisode],
     *,
     shards: int,
-    name: str = "r2d2_faceblur",
-    version: str = "1.0.0",
     notes: Mapping[str, str] | None = None,
 ) -> Path:
     """Write episodes as a data set in DROID's RLDS schema and return its folder; one episode is in memory at a time.
@@ -85,8 +94,6 @@ def write_droid_rlds(
         folder: New or empty.
         episodes: What is written.
         shards: TFRecord files.
-        name: Of the data set.
-        version: Of the data set.
         notes: Other text files beside the shards, by name; TFDS and our reader use only those that they know.
 
     Raises:
@@ -96,23 +103,47 @@ def write_droid_rlds(
     folder = Path(folder)
     storage.require_new_folder(folder)
     with storage.folder_writer(folder, _INFO) as partial:
-        counts, num_bytes, sizes = _write_shards(partial, episodes, shards, name)
+        counts, num_bytes, sizes = _write_shards(partial, episodes, shards)
         if min(counts) == 0:
             found, needed = f"{sum(counts)} episodes", f"at least one for each of {shards} shards"
             raise InputError(where=str(folder), found=found, needed=needed)
-        for file, text in (notes or {}).items():
+        texts = {
+            _FEATURES: json.dumps(_features_json(sizes), indent=4, sort_keys=True),
+            _INFO: json.dumps(dataset_info(_NAME, "1.0.0", counts, num_bytes), indent=2, sort_keys=True),
+        }
+        for file, text in {**(notes or {}), **texts}.items():
             storage.write_atomically(partial / file, text)
-        _write_json(partial / "features.json", droid_features(sizes), indent=4)
-        _write_json(partial / _INFO, dataset_info(name, version, counts, num_bytes), indent=2)
     return folder
 
 
+def dataset_info(name: str, version: str, counts: Sequence[int], num_bytes: int) -> dict[str, Any]:
+    """Return dataset_info.json of one `train` split with these numbers of episodes per shard."""
+    split = {
+        "filepathTemplate": "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}",
+        "name": "train",
+        "numBytes": str(num_bytes),
+        "shardLengths": [str(count) for count in counts],
+    }
+    return {"fileFormat": "tfrecord", "moduleName": "__main__", "name": name, "splits": [split], "version": version}
+
+
+def _features_json(sizes: Mapping[str, tuple[int, int]]) -> dict[str, Any]:
+    """Return features.json of DROID's schema, for images of these heights and widths."""
+    described: dict[str, Any] = json.loads((_ASSETS / _FEATURES).read_text())
+    steps = described["featuresDict"]["features"]["steps"]["sequence"]["feature"]["featuresDict"]["features"]
+    cameras = steps["observation"]["featuresDict"]["features"]
+    for camera, (height, width) in sizes.items():
+        cameras[camera]["image"]["shape"]["dimensions"] = [str(height), str(width), "3"]
+    return described
+
+
 def _write_shards(
-    folder: Path, episodes: Iterable[DroidEpisode], shards: int, name: str
+    folder: Path, episodes: Iterable[DroidEpisode], shards: int
 ) -> tuple[list[int], int, dict[str, tuple[int, int]]]:
+    """Return the number of episodes of each shard, the bytes of all records, and the sizes of the cameras' images."""
     counts, num_bytes, sizes = [0] * shards, 0, dict[str, tuple[int, int]]()
     with ExitStack() as stack:
-        names = [f"{name}-train.tfrecord-{shard:05d}-of-{shards:05d}" for shard in range(shards)]
+        names = [f"{_NAME}-train.tfrecord-{shard:05d}-of-{shards:05d}" for shard in range(shards)]
         files = [stack.enter_context(storage.atomic_writer(folder / name)) for name in names]
         for number, episode in enumerate(episodes):
             _check(episode, sizes)
@@ -126,14 +157,10 @@ def _write_shards(
 def _check(episode: DroidEpisode, sizes: dict[str, tuple[int, int]]) -> None:
     """Refuse an episode whose parts differ in length or shape; the images of a camera share one size."""
     steps = episode.num_steps
-    arrays = {"action": (episode.action, 7)}
-    for group in (episode.action_dict, episode.observation):
-        for item in fields(group):
-            width = {"cart": 6, "grip": 1, "join": 7}[item.name[:4]]
-            arrays[f"{type(group).__name__}.{item.name}"] = (getattr(group, item.name), width)
-    for label, (array, width) in arrays.items():
+    for name, array in episode.arrays.items():
+        width = _WIDTHS[name.rsplit("/")[-1].split("_")[0]]
         if array.shape != (steps, width) or not np.isfinite(array).all():
-            raise ValueError(f"{episode.file_path}: {label} must be {steps} x {width} finite numbers, is {array.shape}")
+            raise ValueError(f"{episode.file_path}: {name} must be {steps} x {width} finite numbers, is {array.shape}")
     if steps == 0 or sorted(episode.images) != sorted(CAMERAS):
         raise ValueError(f"{episode.file_path}: {steps} steps, cameras {sorted(episode.images)}; needed: {CAMERAS}")
     for camera, images in episode.images.items():
@@ -147,26 +174,16 @@ def _check(episode: DroidEpisode, sizes: dict[str, tuple[int, int]]) -> None:
 def _features_of(episode: DroidEpisode) -> dict[str, tuple[Kind, Sequence[Any] | np.ndarray]]:
     steps = episode.num_steps
     first, last = np.eye(1, steps, 0, dtype=int)[0], np.eye(1, steps, steps - 1, dtype=int)[0]
-    features: dict[str, tuple[Kind, Sequence[Any] | np.ndarray]] = {
+    texts = {"": episode.language_instruction.encode(), "_2": b"", "_3": b""}
+    return {
         "episode_metadata/file_path": ("bytes_list", [episode.file_path.encode()]),
         "episode_metadata/recording_folderpath": ("bytes_list", [episode.recording_folderpath.encode()]),
-        "steps/action": ("float_list", episode.action.ravel()),
         "steps/discount": ("float_list", np.ones(steps)),
         "steps/reward": ("float_list", last * float("/success/" in episode.file_path)),
         "steps/is_first": ("int64_list", first),
         "steps/is_last": ("int64_list", last),
         "steps/is_terminal": ("int64_list", last),
-        "steps/language_instruction": ("bytes_list", [episode.language_instruction.encode()] * steps),
-        "steps/language_instruction_2": ("bytes_list", [b""] * steps),
-        "steps/language_instruction_3": ("bytes_list", [b""] * steps),
+        **{f"steps/language_instruction{end}": ("bytes_list", [text] * steps) for end, text in texts.items()},
+        **{f"steps/{name}": ("float_list", array.ravel()) for name, array in episode.arrays.items()},
+        **{f"steps/observation/{camera}": ("bytes_list", images) for camera, images in episode.images.items()},
     }
-    for prefix, group in (("action_dict", episode.action_dict), ("observation", episode.observation)):
-        for item in fields(group):
-            features[f"steps/{prefix}/{item.name}"] = ("float_list", getattr(group, item.name).ravel())
-    for camera, images in episode.images.items():
-        features[f"steps/observation/{camera}"] = ("bytes_list", images)
-    return features
-
-
-def _write_json(path: Path, value: Mapping[str, Any], *, indent: int) -> None:
-    storage.write_atomically(path, json.dumps(value, indent=indent, sort_keys=True))

@@ -1,23 +1,120 @@
-"""An episode's identity, steps and states, from the record features named in `data.fields`."""
+"""An episode in a record: its identity, steps and states, from the features named in `data.fields`."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import difflib
+from collections.abc import Iterable, Sequence
+from functools import cached_property
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 
 from vjepa2_ac.config import RldsData, RldsFields
-from vjepa2_ac.data.sources.rlds.example import ExampleRecord
+from vjepa2_ac.data.sources.indexed_source import require_as_indexed
+from vjepa2_ac.data.sources.rlds.tfrecord import (
+    Kind,
+    NotAnExampleError,
+    Place,
+    Read,
+    RecordSpan,
+    decode_feature,
+    iterate_features,
+)
 from vjepa2_ac.episode import STATE_DIM, Episode, EpisodeInfo, FrameReader
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.spaces import POSE, require_finite, zero_steps
 
 IDENTITY_SEPARATOR = "--"  # as in the published lists of DROID's idle ranges
 STEP_FLAG = "steps/is_first"
+_MOST_BYTES = 1 << 28  # of a feature that is read whole: numbers and texts
 
 
-def identity_of(record: ExampleRecord, fields: RldsFields) -> str:
+class Record:
+    """The features of one record, read on request.
+
+    Args:
+        read: Returns bytes of the file.
+        span: The record's position in it.
+        located: The position of each feature, if known already.
+    """
+
+    def __init__(self, read: Read, span: RecordSpan, located: dict[str, Place] | None = None) -> None:
+        self._read, self._span = read, span
+        if located is not None:
+            self.located = located
+
+    @cached_property
+    def located(self) -> dict[str, Place]:
+        """The position of each feature."""
+        return self.locate()
+
+    def locate(self, enough: Sequence[set[str]] = ()) -> dict[str, Place]:
+        """Return the position of the features up to where all of one of these sets are found.
+
+        Raises:
+            InputError: The record is no Example.
+        """
+        found: dict[str, Place] = {}
+        try:
+            for name, place in iterate_features(self._read, self._span.data_offset, self._span.length):
+                found[name] = place
+                if any(found.keys() >= names for names in enough):
+                    break
+        except NotAnExampleError as error:
+            found_text = f"not a tf.train.Example ({error})"
+            raise InputError(where=str(self._span), found=found_text, needed="an RLDS data set") from None
+        return found
+
+    def require(self, names: Iterable[str]) -> None:
+        """Refuse a record that lacks a feature.
+
+        Raises:
+            InputError: It does; names the features that it has.
+        """
+        for name in names:
+            if name not in self.located:
+                known = sorted(self.located)
+                close = difflib.get_close_matches(name, known, n=1)
+                raise InputError(
+                    where=str(self._span),
+                    found=f"no feature {name}; the record has {', '.join(known) or 'none'}",
+                    needed="the features that data.fields names",
+                    fix=f"Did you mean {close[0]}? Set data.fields" if close else "Set data.fields",
+                )
+
+    def floats(self, name: str) -> Float32[np.ndarray, " values"]:
+        """Return the numbers of a feature.
+
+        Raises:
+            InputError: There is no such feature, or it has no floats.
+        """
+        return np.asarray(self.values(name, "float_list"), np.float32)
+
+    def values(self, name: str, *kinds: Kind, texts: int | None = None) -> Sequence[Any] | np.ndarray:
+        """Return a feature's values; of texts the first so many.
+
+        Raises:
+            InputError: There is no such feature, it has values of another type or too many, or the file ends within it.
+        """
+        self.require([name])
+        offset, length = self.located[name]
+        where = f"{self._span}: {name}"
+        if length > _MOST_BYTES:
+            raise InputError(where=where, found=f"{length:,} bytes", needed=f"at most {_MOST_BYTES:,}")
+        data = self._read(offset, length)
+        if len(data) < length:
+            raise InputError(where=where, found=f"{len(data)} bytes at {offset}", needed=f"{length} bytes")
+        try:
+            found, values = decode_feature(data, texts)
+        except NotAnExampleError as error:
+            raise InputError(where=where, found=f"not a feature ({error})", needed="an RLDS data set") from None
+        if found is not None and found not in kinds:
+            raise InputError(where=where, found=f"a {found}", needed=f"a {' or '.join(kinds)}", fix="Check data.fields")
+        return values
+
+
+def identity_of(record: Record, fields: RldsFields) -> str:
     """Return the identity of an episode, which does not depend on the order of records.
 
     Raises:
@@ -41,7 +138,7 @@ def step_features(config: RldsData) -> tuple[str, ...]:
     return config.fields.state + (config.fields.action if config.actions == "recorded" else ())
 
 
-def num_steps_of(record: ExampleRecord, config: RldsData) -> int:
+def num_steps_of(record: Record, config: RldsData) -> int:
     """Count the steps by their first flag; without it by the states, if these are poses.
 
     Raises:
@@ -50,13 +147,11 @@ def num_steps_of(record: ExampleRecord, config: RldsData) -> int:
     if config.states == "vector":  # of any width: only the flag gives the count
         record.require([STEP_FLAG])
     if STEP_FLAG in record.located:
-        return record.count_integers(STEP_FLAG)
+        return len(record.values(STEP_FLAG, "int64_list"))
     return sum(len(record.floats(name)) for name in config.fields.state) // STATE_DIM
 
 
-def episode_of(
-    record: ExampleRecord, config: RldsData, info: EpisodeInfo, read_frames: FrameReader, where: str
-) -> Episode:
+def episode_of(record: Record, config: RldsData, info: EpisodeInfo, read_frames: FrameReader, where: str) -> Episode:
     """Return the episode in a record; without joint velocities and instruction if the record has none.
 
     Args:
@@ -69,11 +164,7 @@ def episode_of(
     Raises:
         InputError: The record does not match the index, lacks a feature, or has implausible numbers.
     """
-    found = info_of(identity_of(record, config.fields), num_steps_of(record, config))
-    if found != info:
-        text = f"the episode {found.id} of {found.num_steps} steps"
-        needed = f"{info.num_steps} steps of {info.id}, says the index"
-        raise InputError(where=where, found=text, needed=needed, fix="Start again")
+    require_as_indexed(num_steps_of(record, config), info, where)
     steps, velocity, language = info.num_steps, config.fields.joint_velocity, config.fields.language
     return Episode(
         info=info,
@@ -81,13 +172,13 @@ def episode_of(
         read_frames=read_frames,
         control_rate_hz=config.fields.control_rate_hz,
         joint_velocities=_of_every_step(record, velocity, steps, where) if velocity in record.located else None,
-        metadata={"language": record.first_text(language)} if language in record.located else {},
+        metadata={"language": _first_text(record, language)} if language in record.located else {},
         commands=commands_of(record, config, steps, where),
     )
 
 
 def check_record(
-    record: ExampleRecord, config: RldsData, cameras: Sequence[str], where: str
+    record: Record, config: RldsData, cameras: Sequence[str], where: str
 ) -> tuple[int, Float[np.ndarray, "steps state_dim"]]:
     """Return number of steps and states of a record that has everything an episode needs.
 
@@ -107,7 +198,7 @@ def check_record(
     return steps, states
 
 
-def states_of(record: ExampleRecord, config: RldsData, steps: int, where: str) -> Float[np.ndarray, "steps state_dim"]:
+def states_of(record: Record, config: RldsData, steps: int, where: str) -> Float[np.ndarray, "steps state_dim"]:
     """Return the measured states (legend: `vjepa2_ac.episode`), checked for plausibility.
 
     Raises:
@@ -132,7 +223,7 @@ def states_of(record: ExampleRecord, config: RldsData, steps: int, where: str) -
 
 
 def commands_of(
-    record: ExampleRecord, config: RldsData, steps: int, where: str
+    record: Record, config: RldsData, steps: int, where: str
 ) -> Float[np.ndarray, "steps action_dim"] | None:
     """Return the recorded actions, if `data.actions` requests them.
 
@@ -146,7 +237,11 @@ def commands_of(
     return commands
 
 
-def _of_every_step(record: ExampleRecord, name: str, steps: int, where: str) -> Float[np.ndarray, "steps width"]:
+def _first_text(record: Record, name: str) -> str:
+    return "".join(text.decode(errors="replace") for text in record.values(name, "bytes_list", texts=1))
+
+
+def _of_every_step(record: Record, name: str, steps: int, where: str) -> Float[np.ndarray, "steps width"]:
     values = record.floats(name).astype(np.float64)
     if len(values) == 0 or len(values) % steps:
         found, needed = f"{len(values)} numbers", f"as many for each of {steps} steps"

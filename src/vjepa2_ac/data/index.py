@@ -1,0 +1,336 @@
+"""The index of a data set: facts about every episode, as columns, and their cache, so that a set is scanned once.
+
+DROID has 95,658 episodes: a list of as many objects is slow to load and to send to workers. A table takes a few bytes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import json
+import logging
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextvars import ContextVar
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TypeVar, overload
+
+import numpy as np
+from jaxtyping import Float, Int8, Int32, UInt64
+
+from vjepa2_ac import places, storage
+from vjepa2_ac.config import DiskCacheConfig
+from vjepa2_ac.episode import EpisodeInfo
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage.npz_reader import read_arrays
+
+logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
+
+UNKNOWN = 0  # hash of an episode whose states were not read, since no other is similar
+
+_NOT_KNOWN = -1  # number of a label, or success
+_COLUMNS = ("num_steps", "success", "ids", "id_hash", "id_rank")
+_HASH, _LOCATOR, _LABEL = "state_hash", "locator.", "label."
+_HASH_BYTES = 8
+_CACHE = "VJEPA2_AC_CACHE"
+_VERSION = 4  # of the cache: another number makes all of it be rebuilt
+
+
+class NotATableError(ValueError):
+    """The bytes are not a table by `to_bytes`."""
+
+
+@dataclass(frozen=True)
+class EpisodeProblem:
+    """An unusable episode, and the reason."""
+
+    name: str  # its identity; if that cannot be read, its position
+    where: str
+    found: str
+    needed: str = ""
+    fix: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Labels:
+    """One name for each episode, as an index into a list of all names."""
+
+    names: tuple[str, ...]
+    number: Int32[np.ndarray, " episodes"]  # into the names; -1: unknown
+
+    def __post_init__(self) -> None:
+        """Refuse numbers without a name, which a damaged file may contain."""
+        if len(self.number) and not _NOT_KNOWN <= self.number.min() <= self.number.max() < len(self.names):
+            raise ValueError(f"labels of {len(self.names)} names with numbers up to {self.number.max()}")
+
+    @classmethod
+    def of(cls, values: Sequence[str | None]) -> Labels:
+        """Make labels; None or an empty name: unknown."""
+        names = sorted({value for value in values if value})
+        place = {name: number for number, name in enumerate(names)}
+        return cls(tuple(names), np.array([place.get(value or "", _NOT_KNOWN) for value in values], np.int32))
+
+    def of_episode(self, index: int) -> str | None:
+        """Return the name of one episode, or None if unknown."""
+        number = int(self.number[index])
+        return None if number == _NOT_KNOWN else self.names[number]
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeTable(Sequence[EpisodeInfo]):
+    """The usable episodes of a data set, in the source's order, as columns.
+
+    `locators` are columns of the source (the position of an episode); `labels` are an episode's groups, such as its
+    scene; `texts` are small values of the whole data set.
+    """
+
+    num_steps: Int32[np.ndarray, " episodes"]
+    success: Int8[np.ndarray, " episodes"]  # 1, 0, or -1: unknown
+    ids: np.ndarray  # the identities as UTF-8, of type S
+    id_hash: UInt64[np.ndarray, " episodes"]  # the first 8 bytes of the identity's SHA-256
+    id_rank: Int32[np.ndarray, " episodes"]  # rank of the identity in alphabetical order
+    problems: tuple[EpisodeProblem, ...] = ()
+    locators: Mapping[str, np.ndarray] = field(default_factory=dict)
+    texts: Mapping[str, str] = field(default_factory=dict)
+    state_hash: UInt64[np.ndarray, " episodes"] | None = None  # `hash_of_states`; None: unknown for all
+    labels: Mapping[str, Labels] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls,
+        infos: Sequence[EpisodeInfo],
+        *,
+        problems: Sequence[EpisodeProblem] = (),
+        locators: Mapping[str, np.ndarray] | None = None,
+        texts: Mapping[str, str] | None = None,
+        state_hashes: Sequence[int] | None = None,
+        labels: Mapping[str, Labels] | None = None,
+    ) -> EpisodeTable:
+        """Make a table; a given table is returned unchanged."""
+        if isinstance(infos, EpisodeTable):
+            return infos
+        ids = np.array([info.id.encode() for info in infos] or [b""])[: len(infos)]
+        return cls(
+            num_steps=np.array([info.num_steps for info in infos], np.int32),
+            success=np.array([_NOT_KNOWN if info.success is None else info.success for info in infos], np.int8),
+            ids=ids,
+            id_hash=np.array([identity_hash(info.id) for info in infos], np.uint64),
+            id_rank=np.argsort(np.argsort(ids, kind="stable")).astype(np.int32),
+            problems=tuple(problems),
+            locators=dict(locators or {}),
+            texts=dict(texts or {}),
+            state_hash=None if state_hashes is None else np.array(state_hashes, np.uint64),
+            labels=dict(labels or {}),
+        )
+
+    def __len__(self) -> int:
+        return len(self.num_steps)
+
+    @overload
+    def __getitem__(self, index: int) -> EpisodeInfo: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[EpisodeInfo]: ...
+
+    def __getitem__(self, index: int | slice) -> EpisodeInfo | Sequence[EpisodeInfo]:
+        """Return the facts about one episode, or several."""
+        if isinstance(index, slice):
+            return [self[number] for number in range(*index.indices(len(self)))]
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"episode {index} of {len(self)}")
+        index %= len(self)
+        success = int(self.success[index])
+        return EpisodeInfo(
+            id=self.identity(index),
+            num_steps=int(self.num_steps[index]),
+            success=None if success == _NOT_KNOWN else bool(success),
+        )
+
+    def identity(self, index: int) -> str:
+        """Return the identity of one episode."""
+        return bytes(self.ids[index]).decode(errors="replace")
+
+    def find(self, identity: str) -> int | None:
+        """Return the index of an episode, or None if the identity is unknown."""
+        for index in np.flatnonzero(self.id_hash == np.uint64(identity_hash(identity))):
+            if self.identity(int(index)) == identity:
+                return int(index)
+        return None
+
+    def to_bytes(self) -> bytes:
+        """Return the table as a file's content; equal tables give equal bytes, and each array has a checksum."""
+        text = json.dumps({
+            "problems": [vars(problem) for problem in self.problems],
+            "texts": dict(self.texts),
+            "labels": {name: labels.names for name, labels in self.labels.items()},
+        })  # fmt: skip
+        arrays = {name: getattr(self, name) for name in _COLUMNS}
+        arrays |= {} if self.state_hash is None else {_HASH: self.state_hash}
+        arrays |= {f"{_LOCATOR}{name}": column for name, column in self.locators.items()}
+        arrays |= {f"{_LABEL}{name}": labels.number for name, labels in self.labels.items()}
+        file = io.BytesIO()
+        np.savez(file, text=np.frombuffer(text.encode(), np.uint8), **arrays)
+        return file.getvalue()
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> EpisodeTable:
+        """Read the result of `to_bytes`.
+
+        Raises:
+            NotATableError: It is another kind of file, or damaged.
+        """
+        try:
+            arrays = read_arrays(data)
+            text = json.loads(arrays["text"].tobytes())
+            columns = {name: arrays[name] for name in _COLUMNS}
+            locators = {name.removeprefix(_LOCATOR): one for name, one in arrays.items() if name.startswith(_LOCATOR)}
+            table = cls(
+                **columns,
+                problems=tuple(EpisodeProblem(**problem) for problem in text["problems"]),
+                locators=locators,
+                texts=text["texts"],
+                state_hash=arrays.get(_HASH),
+                labels={name: Labels(tuple(names), arrays[_LABEL + name]) for name, names in text["labels"].items()},
+            )
+        except (InputError, LookupError, TypeError, ValueError, AttributeError) as error:
+            raise NotATableError(str(error)) from None
+        if len({len(column) for column in (*columns.values(), *locators.values())}) != 1:
+            raise NotATableError("columns of several lengths")
+        return table
+
+
+def identity_hash(identity: str) -> int:
+    """Return 64 bits of the identity's SHA-256: as a share of 2**64 it determines the episode's split."""
+    return int.from_bytes(hashlib.sha256(identity.encode()).digest()[:8], "big")
+
+
+def labels_of(values: Sequence[Mapping[str, str | None]]) -> dict[str, Labels]:
+    """Return the labels of episodes, each given as {label: name}; unused labels are dropped."""
+    every = {label for of_one in values for label in of_one}
+    found = {label: Labels.of([of_one.get(label) for of_one in values]) for label in sorted(every)}
+    return {label: labels for label, labels in found.items() if labels.names}
+
+
+def hash_of_states(states: Float[np.ndarray, "steps state_dim"]) -> int:
+    """Return 64 bits of the BLAKE2b of the states as float32, never `UNKNOWN`.
+
+    As float32, since the same recording is float64 in one file and float32 in another. Rounding further would not make
+    other roundings agree: a value at an edge of any grid may be rounded to either side.
+    """
+    return hash_of_bytes(f"{states.shape} ".encode() + (states.astype("<f4") + np.float32(0)).tobytes())  # -0 is 0
+
+
+def hash_of_bytes(content: bytes) -> int:
+    """Return 64 bits of the BLAKE2b of data that represents an episode's states, never `UNKNOWN`."""
+    return int.from_bytes(hashlib.blake2b(content, digest_size=_HASH_BYTES).digest(), "big") or 1
+
+
+@dataclass
+class Usage:
+    """The index files used while they were recorded."""
+
+    rebuild: bool
+    files: list[Path] = field(default_factory=list)
+
+
+_usage: ContextVar[Usage | None] = ContextVar("usage", default=None)
+
+
+@contextlib.contextmanager
+def record_usage(*, rebuild: bool = False) -> Iterator[Usage]:
+    """Record which files of the index are used within the block; with `rebuild`, none is read, and all are rebuilt."""
+    token = _usage.set(usage := Usage(rebuild))
+    try:
+        yield usage
+    finally:
+        _usage.reset(token)
+
+
+def cache_folder(config: DiskCacheConfig) -> Path:
+    """Return the cache folder on this machine: the config's, $VJEPA2_AC_CACHE, or the user's.
+
+    Raises:
+        InputError: The environment names none.
+    """
+    if config.dir is not None:
+        return Path(config.dir)
+    if named := os.environ.get(_CACHE):
+        try:
+            return Path(places.on_this_machine(named))
+        except ValueError as error:
+            raise InputError(where=_CACHE, found=f"{named!r} {error}", needed="a folder of this machine") from None
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vjepa2-ac"
+
+
+def key_of(parts: Mapping[str, object]) -> str:
+    """Return a short key of everything that a cached result depends on."""
+    text = json.dumps({"version": _VERSION, **parts}, sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def index_key(parts: Mapping[str, object], place: str, *, named: str = "") -> str:
+    """Return the key of an index: what else is cached of these episodes depends on it.
+
+    A folder of this machine is known by what it holds, wherever it lies. At a URL the place counts, too, for servers
+    say little of versions.
+
+    Args:
+        parts: The files of the data set, and how they are read.
+        place: Its folder.
+        named: An episode's identity, where that depends on the name of the folder.
+    """
+    return key_of({**parts, "path": place} if storage.is_url(place) else {**parts, "named": named})
+
+
+def fingerprint_of(table: EpisodeTable) -> str:
+    """Return everything that the episodes depend on, as one text: the key of their index, or a hash of the table."""
+    return table.texts.get("index") or hashlib.sha256(table.to_bytes()).hexdigest()
+
+
+def get_or_build(config: DiskCacheConfig, key: str, place: str, build: Callable[[], EpisodeTable]) -> EpisodeTable:
+    """Return the table cached under a key, which is among its `texts`; build and cache it if it is missing or damaged.
+
+    Problems name files where they lay when they were found: as far as that was in `place`, they name them where they
+    lie now.
+    """
+    now = storage.absolute(place)
+
+    def build_marked() -> EpisodeTable:
+        table = build()
+        return replace(table, texts={**table.texts, "index": key, "place": now})
+
+    table = get_or_make(config, key, build_marked, to_bytes=EpisodeTable.to_bytes, from_bytes=EpisodeTable.from_bytes)
+    problems = [replace(one, where=one.where.replace(table.texts["place"], now, 1)) for one in table.problems]
+    return replace(table, problems=tuple(problems))
+
+
+def get_or_make(
+    config: DiskCacheConfig,
+    key: str,
+    make: Callable[[], T],
+    *,
+    to_bytes: Callable[[T], bytes],
+    from_bytes: Callable[[bytes], T],
+) -> T:
+    """Return the object cached under a key; make and cache it if it is missing or damaged (a NotATableError)."""
+    path = cache_folder(config) / "index" / f"{key}.index"
+    usage = _usage.get()
+    if usage:
+        usage.files.append(path)
+    try:
+        if not (usage and usage.rebuild):
+            return from_bytes(path.read_bytes())
+    except FileNotFoundError:
+        pass
+    except (OSError, NotATableError) as error:
+        logger.warning("%s: cannot be used (%s); the index is built again", path, error)
+    made = make()
+    try:
+        storage.write_atomically(path, to_bytes(made))
+    except OSError as error:
+        logger.warning("%s: cannot be written (%s); the index will be built again next time", path, error)
+    return made

@@ -1,1 +1,0 @@
-"""The index of a data set: facts about every episode, and their cache."""

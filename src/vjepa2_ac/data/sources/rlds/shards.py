@@ -1,0 +1,176 @@
+"""The shards of an RLDS data set: which there are, as its dataset_info.json says, and how parts of them are read."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+from vjepa2_ac import storage
+from vjepa2_ac.data.sources.rlds.tfrecord import Read
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage.structured import read_json_object
+
+_INFO = "dataset_info.json"
+_DEFAULT_TEMPLATE = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"
+_MOST_NAMES = 5
+_MOST_EPISODES = 100_000  # of a shard; DROID's have some 50
+_WINDOW_BYTES = 1 << 15  # a read behind a URL costs as much time as so many bytes
+_WINDOWS = 8  # read last: behind the images of one record is the head of the next
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One TFRecord file of a data set, and its expected number of episodes."""
+
+    path: str
+    episodes: int
+    size: int  # bytes
+    version: str  # as from `storage.list_files`: changes with the content
+
+    @property
+    def name(self) -> str:
+        """The file's name."""
+        return self.path.rsplit("/", 1)[-1]
+
+
+def find_shards(folder: str) -> list[Shard]:
+    """Return the shards of every split that dataset_info.json lists, in its order; without empty shards.
+
+    Raises:
+        InputError: No data set, an unreadable or unsupported description, or missing shards (names them).
+    """
+    where = storage.join(folder, _INFO)
+    info = _read_info(folder, where)
+    if (form := info.get("fileFormat", "tfrecord")) != "tfrecord":
+        raise InputError(where=where, found=f"fileFormat {form}", needed="tfrecord", fix="Convert it with TFDS")
+    try:
+        listed = [pair for split in info["splits"] for pair in _listed(split, str(info["name"]))]
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        found = f"not a description of a data set ({error!r})"
+        raise InputError(where=where, found=found, needed="TFDS's own") from None
+    if not listed:
+        raise InputError(where=where, found="no episodes in any split", needed="a data set with episodes")
+    if len(dict(listed)) < len(listed):
+        needed = "a filepathTemplate that numbers them"
+        raise InputError(where=where, found="shards of one name", needed=needed)
+    present = {file.name: file for file in storage.list_files(folder)}
+    if missing := [name for name, _ in listed if name not in present]:
+        found = f"{len(missing)} of {len(listed)} shards are missing: {_shorten(missing)}"
+        raise InputError(where=folder, found=found, needed=f"every shard that {_INFO} lists", fix="Download them")
+    return [
+        Shard(storage.join(folder, name), count, present[name].size, present[name].version) for name, count in listed
+    ]
+
+
+def dataset_name(folder: str) -> str:
+    """Return the name that a data set gives itself, whatever its folder is called.
+
+    Raises:
+        InputError: As of `find_shards`.
+    """
+    return str(_read_info(folder, storage.join(folder, _INFO)).get("name", ""))
+
+
+def _read_info(folder: str, where: str) -> dict[str, Any]:
+    try:
+        return read_json_object(where, needed="a description as TFDS writes it")
+    except FileNotFoundError:
+        fix = "Set data.path to the data set; docs/QUICKSTART.md says how to get DROID"
+        found, needed = _nothing_in(folder), f"a folder with {_INFO}"
+        raise InputError(where="data.path", found=found, needed=needed, fix=fix) from None
+    except OSError as error:
+        raise storage.unreadable(where, error) from None
+
+
+def _nothing_in(folder: str) -> str:
+    names = storage.list_names(folder)
+    if not names:
+        return f"{folder} {'is empty' if storage.exists(folder) else 'does not exist'}"
+    inner = [name for name in names if storage.exists(storage.join(storage.join(folder, name), _INFO))]
+    if inner:
+        return f"no {_INFO} in {folder}; did you mean {storage.join(folder, inner[0])}?"
+    return f"no {_INFO} in {folder}, only {_shorten(names)}"
+
+
+def _listed(split: dict[str, Any], dataset: str) -> Iterator[tuple[str, int]]:
+    """Yield name and number of episodes of each shard of a split; TFDS writes a number as one, or as a string."""
+    counts = [int(str(count)) for count in split.get("shardLengths", [])]
+    for number, count in enumerate(counts):
+        if not 0 <= count <= _MOST_EPISODES:
+            raise ValueError(f"a shard of {count:,} episodes")
+        index, total = f"{number:05d}", f"{len(counts):05d}"
+        values = {
+            "DATASET": dataset,
+            "SPLIT": str(split["name"]),
+            "FILEFORMAT": "tfrecord",
+            "SHARD_INDEX": index,
+            "NUM_SHARDS": total,
+            "SHARD_X_OF_Y": f"{index}-of-{total}",
+        }
+        template = split.get("filepathTemplate") or _DEFAULT_TEMPLATE
+        if count:
+            yield re.sub(r"\{(\w+)\}", lambda found, of=values: of.get(found[1], found[0]), template), count
+
+
+def _shorten(names: list[str]) -> str:
+    more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
+    return ", ".join(names[:_MOST_NAMES]) + more
+
+
+@contextmanager
+def open_shard(shard: Shard) -> Iterator[Read]:
+    """Open a shard for reads of small parts; of a local one from several threads, of a remote one from one.
+
+    Nothing is mapped into memory: a local file that is truncated during use gives short reads, not a crash.
+
+    Raises:
+        InputError: The file cannot be read, or a local one has changed since the data set was opened.
+        UnreachableError: The network fails.
+    """
+    with naming(shard):
+        if storage.is_url(shard.path):
+            yield _RemoteWindows(shard)
+            return
+        handle = os.open(shard.path, os.O_RDONLY)
+        try:
+            found = os.fstat(handle)
+            if (found.st_size, str(found.st_mtime_ns)) != (shard.size, shard.version):
+                changed = f"{found.st_size:,} bytes: it has changed since the data set was opened"
+                needed = f"the file of {shard.size:,} bytes that was there"
+                raise InputError(where=shard.path, found=changed, needed=needed, fix="Start again")
+            yield lambda offset, length: os.pread(handle, length, offset)
+        finally:
+            os.close(handle)
+
+
+@contextmanager
+def naming(shard: Shard) -> Iterator[None]:
+    """Turn the errors of the system and of servers into ones that name the shard."""
+    try:
+        yield
+    except OSError as error:
+        raise storage.unreadable(shard.path, error, needed="a TFRecord file") from None
+
+
+class _RemoteWindows:
+    """Reads a shard behind a URL by requests of a window each, of which the last are kept."""
+
+    def __init__(self, shard: Shard) -> None:
+        self._shard = shard
+        self._windows: deque[tuple[int, bytes]] = deque(maxlen=_WINDOWS)
+
+    def __call__(self, offset: int, length: int) -> bytes:
+        length = min(length, self._shard.size - offset)
+        for start, window in self._windows:
+            if start <= offset and offset + length <= start + len(window):
+                return window[offset - start : offset - start + length]
+        if length <= 0:
+            return b""
+        wanted = min(max(length, _WINDOW_BYTES), self._shard.size - offset)
+        self._windows.append((offset, storage.read_range(self._shard.path, offset, wanted)))
+        return self._windows[-1][1][:length]

@@ -1,1 +1,0 @@
-"""Writing RLDS: a data set in DROID's schema, field for field."""
