@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from vjepa2_ac.errors import InputError, pip_install
 from vjepa2_ac.storage import atomic_writer
+from vjepa2_ac.storage.libraries import require_library
 
 _QUALITY = "20"  # x264's constant rate factor: text stays sharp
 
@@ -25,7 +25,7 @@ def write_video(path: str | Path, frames: Iterable[UInt8[np.ndarray, "height wid
         rate_hz: Frames per second.
 
     Raises:
-        InputError: PyAV is not installed.
+        UnreachableError: PyAV is not installed.
         ValueError: No frames, or of different sizes.
     """
     av = video_library()
@@ -54,14 +54,6 @@ def video_library() -> Any:
     """Return PyAV.
 
     Raises:
-        InputError: It is not installed.
+        UnreachableError: It is not installed.
     """
-    try:
-        import av
-    except ImportError:
-        raise InputError(
-            where="video",
-            found="PyAV, which writes videos, is not installed",
-            fix=f"Run `{pip_install('video')}`, or ask for no video",
-        ) from None
-    return av
+    return require_library("av", where="video", called="PyAV, which writes videos", extra="video")

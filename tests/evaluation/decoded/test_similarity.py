@@ -20,7 +20,7 @@ def test_every_similarity_is_of_both_regions_and_a_change_elsewhere_does_not_cou
     shown = true.clone()
     shown[..., 40:, 40:] = 0.0
     found = similarities(shown, true, moving)
-    assert set(found) == {(region, metric) for region in REGIONS for metric in SIMILARITIES}
+    assert set(found) == {(region, metric) for region in REGIONS for metric in SIMILARITIES if metric != "ms_ssim"}
     assert np.isinf(found["moving", "psnr_db"]).all()
     np.testing.assert_allclose(found["moving", "ssim"], 1.0, atol=1e-6)
     assert (found["whole", "ssim"] < 0.99).all()

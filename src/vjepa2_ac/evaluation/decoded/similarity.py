@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from vjepa2_ac.evaluation.decoded.record import Region, Similarity
-from vjepa2_ac.media.image_similarity import psnr, structure
+from vjepa2_ac.media.image_similarity import mean_where, psnr, ssim_map
 
 _WINDOW = 11  # pixels, which fit into the coarsest scale
 _SCALES_OF_LARGE, _SCALES_OF_SMALL, _LARGE = 5, 3, 176
@@ -48,9 +48,8 @@ def similarities(
     }
     scales = scales_for(shown.shape[-1])
     if scales:
-        pairs = structure(shown, true, scales, list(regions.values()))
-        for region, (one, of_scales) in zip(regions, pairs, strict=True):
-            found[region, "ssim"], found[region, "ms_ssim"] = one, of_scales
+        similar = ssim_map(shown, true)
+        found |= {(region, "ssim"): mean_where(similar, where) for region, where in regions.items()}
     return {key: one.double().cpu().numpy() for key, one in found.items()}
 
 

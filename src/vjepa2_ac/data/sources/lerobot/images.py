@@ -14,7 +14,7 @@ from vjepa2_ac.data.sources.lerobot.parquet import Opener
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media import video_reader
 from vjepa2_ac.media.image_file import decode_image
-from vjepa2_ac.media.image_size import require_bounded
+from vjepa2_ac.media.jpeg import require_bounded
 
 
 def video_frames(open_file: Opener, path: str, clock: video_reader.Clock, num_steps: int, where: str) -> FramesByStep:
