@@ -37,7 +37,7 @@ from vjepa2_ac.data.sources.droid_raw.source import RawDroidSource
 from vjepa2_ac.data.sources.latents.cache_key import CacheKey
 from vjepa2_ac.data.sources.latents.source import LatentSource
 from vjepa2_ac.data.sources.lerobot.source import LeRobotSource
-from vjepa2_ac.data.sources.npz.source import NpzSource
+from vjepa2_ac.data.sources.npz import NpzSource
 from vjepa2_ac.data.sources.rlds.source import RldsSource
 from vjepa2_ac.evaluation.evaluate_run import training_curves
 from vjepa2_ac.media.image_file import read_image

@@ -12,7 +12,7 @@ from recordings import write_raw_droid
 from synthetic import draw_frame, synthetic_states
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.droid_raw.source import RawDroidSource
-from vjepa2_ac.data.sources.npz.source import NpzSource
+from vjepa2_ac.data.sources.npz import NpzSource
 from vjepa2_ac.errors import InputError
 
 STEPS = 6

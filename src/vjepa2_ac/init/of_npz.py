@@ -6,7 +6,7 @@ import numpy as np
 
 from vjepa2_ac import storage
 from vjepa2_ac.data.sources.listing import walk, within
-from vjepa2_ac.data.sources.npz.npz_episode import FORMAT_HELP, opened_npz
+from vjepa2_ac.data.sources.npz import FORMAT_HELP, opened_npz
 from vjepa2_ac.episode import STATE_DIM
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.init.found import FoundData

@@ -11,7 +11,7 @@ import pytest
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.index.episode_table import EpisodeTable
-from vjepa2_ac.data.sources.npz.source import NpzSource
+from vjepa2_ac.data.sources.npz import NpzSource
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage.npz_reader import NpzFile
 
@@ -51,18 +51,18 @@ BOMBS: dict[str, tuple[Callable[[Path], None], str]] = {
     ),
     "a text without end": (
         lambda path: add(without(path, ""), "language", described((), f"<U{4 * _MB}"), 16 * _MB),
-        r"language: 4,194,304 letters\. needed: at most 65,536",
+        r"language: a text of 16,777,216 bytes\. needed: at most 262,144",
     ),
     "a head without end": (
         lambda path: add(without(path, "states"), "states", described((STEPS, 7), "<f8", claimed=32 * _MB), 32 * _MB),
-        r"states: cannot be read \(a header of 33,554,432 bytes\)",
+        r"states: cannot be read \(an array in another format",
     ),
     "a packing without a bound": (
         lambda path: add(
             without(path, "frames"), "frames", described((STEPS, 999, 999, 3), "|u1"), STEPS * 999 * 999 * 3,
             zipfile.ZIP_BZIP2,
         ),
-        "frames: cannot be read .*in another way than numpy",
+        "frames: no such array",
     ),
     "frames that are not there": (
         lambda path: add(without(path, "frames"), "frames", described((STEPS, 4_000_000, 4_000_000, 3), "|u1"), 1000),
