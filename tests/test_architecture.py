@@ -113,7 +113,7 @@ HOMES = {
     "fsspec": ["storage/remote/"],
     "google": ["data/sources/rlds/tfrecord.py"],
     "google_crc32c": ["data/sources/rlds/tfrecord.py"],
-    "h5py": ["data/sources/droid_raw/trajectory.py"],
+    "h5py": ["data/sources/droid_raw/source.py"],
     "huggingface_hub": ["export/", "storage/remote/hub.py"],
     "jinja2": ["export/", "reports/"],
     "markupsafe": ["reports/html/"],

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Generic, TypeVar
@@ -15,9 +17,11 @@ from jaxtyping import UInt8
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.cache.cached_reads import EpisodeFiles
+from vjepa2_ac.data.cache.disk_cache import DiskCache
 from vjepa2_ac.data.index.episode_table import EpisodeTable
 from vjepa2_ac.episode import EpisodeInfo, Progress, no_progress
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage.npz_reader import read_arrays
 
 
 @dataclass(frozen=True)
@@ -111,3 +115,18 @@ def require_as_indexed(found: int, info: EpisodeInfo, where: str) -> None:
     if found != info.num_steps:
         needed, fix = f"the {info.num_steps} that were indexed", "Do not change files while a run reads them"
         raise InputError(where=where, found=f"{found} steps", needed=needed, fix=fix)
+
+
+def stored_arrays(cache: DiskCache, key: str) -> dict[str, np.ndarray] | None:
+    """Return the arrays that `store_arrays` wrote; None if there are none, or they are damaged."""
+    data = cache.read(key)
+    with suppress(InputError):
+        return None if data is None else read_arrays(data)
+    return None
+
+
+def store_arrays(cache: DiskCache, key: str, arrays: Mapping[str, np.ndarray]) -> None:
+    """Keep what was parsed of an episode on this machine, within the limit of the disk cache."""
+    content = io.BytesIO()
+    np.savez(content, **arrays)  # type: ignore[arg-type] # none is called allow_pickle
+    cache.write(key, content.getvalue())
