@@ -252,7 +252,7 @@ class RawDroidSource(IndexedSource[RawDroidData, Opened]):
 
 
 def parse_trajectory(data: bytes, where: str, serials: Sequence[str]) -> dict[str, Float[np.ndarray, "steps _"]]:
-    """Return the numbers of a trajectory.h5 for each control step: pose, gripper; skipped, velocities, if there are any.
+    """Return the numbers of a trajectory.h5 per step: pose, gripper; skipped and velocities if there are any.
 
     Args:
         data: The content of the file.
