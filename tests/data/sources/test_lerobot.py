@@ -380,7 +380,7 @@ def test_a_depth_map_is_no_camera(mark: dict[str, object], copy: Path) -> None:
     change_feature(copy, KEY, info={"is_depth_map": False, "video.pix_fmt": "gray"})
     assert len(source_of(copy).infos()) == len(LENGTHS)
     change_feature(copy, KEY, **({"info": {}} | mark))
-    with pytest.raises(InputError, match=rf"{KEY}, which is a depth map in .*needed: images of a camera\. It has: obs"):
+    with pytest.raises(InputError, match=rf"no camera {KEY} in .*It has: obs"):
         source_of(copy).infos()
     assert len(source_of(copy, camera="wrist_left").infos()) == len(LENGTHS)
 
@@ -396,7 +396,7 @@ def test_language_columns_are_left_alone_and_are_no_numbers(copy: Path) -> None:
             table = table.append_column(name, pa.array([row] * len(table)))
         pq.write_table(table, path)
     assert len(source_of(copy).read(0).states) == LENGTHS[0]
-    with pytest.raises(InputError, match=r"language_events, which is a column of language .*needed: a column of num"):
+    with pytest.raises(InputError, match="no column of numbers language_events in "):
         source_of(copy, lerobot={"state": ["language_events"]}).infos()
 
 

@@ -96,17 +96,22 @@ def read_episodes(
     """
     statistics = [f"stats/{name}/{kind}" for name in states for kind in _STATISTICS]
     outcome = f"stats/{success}/max"
-    rows: list[EpisodeRow] = []
-    if info.version == "v2.1":
-        rows += [_checked(where, _row_of_line, info, line, videos) for where, line in _lines(info)]
-    for table in tables if info.version == "v3.0" else ():
+    own = {"episode_index", "length", "tasks", "data/chunk_index", "data/file_index", outcome, *statistics}
+    prefixes = tuple(f"videos/{key}/" for key in videos)
+    rows = []
+    for table in tables:
         path = storage.join(info.root, table)
-        own = {"episode_index", "length", "tasks", "data/chunk_index", "data/file_index", outcome, *statistics}
-        prefixes = tuple(f"videos/{key}/" for key in videos)
-        columns = read_table(open_file(path), path, lambda name: name in own or name.startswith(prefixes))  # noqa: B023 - called at once
-        for number, values in enumerate(zip(*columns.values(), strict=True)):
-            row = dict(zip(columns, values, strict=True))
-            rows.append(_checked(f"{path}: row {number}", _row_of_table, row, videos, row.get(outcome), statistics))
+        if info.version == "v2.1":
+            values = list(_lines(path))
+        else:
+            columns = read_table(open_file(path), path, lambda name: name in own or name.startswith(prefixes))
+            values = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+        for number, row in enumerate(values):
+            try:
+                rows.append(_row_of(info, row, videos, row.get(outcome), statistics))
+            except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
+                found, needed = f"not an episode ({error!r})", "LeRobot's own tables"
+                raise InputError(where=f"{path}: row {number}", found=found, needed=needed, fix=_FIX_TABLES) from None
     rows.sort(key=lambda row: row.index)
     numbers = {row.index for row in rows}
     if len(numbers) != len(rows) or len(rows) != info.episodes:
@@ -117,41 +122,34 @@ def read_episodes(
     return rows
 
 
-def _lines(info: DatasetInfo) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the lines of meta/episodes.jsonl, each with its place for messages."""
-    where = storage.join(info.root, TABLES["v2.1"])
-    try:
-        lines = storage.read_bounded(where, _MOST_BYTES).splitlines()
-    except FileNotFoundError:
-        needed = "one line for each episode"
-        raise InputError(where=where, found="no such file", needed=needed, fix=_FIX_TABLES) from None
-    for number, line in enumerate(lines, start=1):
+def _lines(path: str) -> Iterator[dict[str, Any]]:
+    """Yield what each line of meta/episodes.jsonl says."""
+    for number, line in enumerate(storage.read_bounded(path, _MOST_BYTES).splitlines(), start=1):
         if line.strip():
-            at = f"{where}: line {number}"
-            yield at, json_object(line, where=at, needed="an episode", fix=_FIX_TABLES, allow_nan=True)
+            where = f"{path}: line {number}"
+            yield json_object(line, where=where, needed="an episode", fix=_FIX_TABLES, allow_nan=True)
 
 
-def _row_of_line(info: DatasetInfo, row: Mapping[str, Any], videos: Sequence[str]) -> EpisodeRow:
-    index = _count(row["episode_index"])
-    chunk = index // info.chunk_episodes
-    places = {key: VideoPlace(chunk, index, 0.0) for key in videos}
-    return EpisodeRow(index, _count(row["length"]), chunk, index, _texts(row.get("tasks")), places)
-
-
-def _row_of_table(
-    row: Mapping[str, Any], videos: Sequence[str], outcome: object, statistics: Sequence[str]
+def _row_of(
+    info: DatasetInfo, row: Mapping[str, Any], videos: Sequence[str], outcome: object, statistics: Sequence[str]
 ) -> EpisodeRow:
+    index = _count(row["episode_index"])
+    if info.version == "v2.1":  # a file for each episode
+        places = ("data", *(f"videos/{key}" for key in videos))
+        row = {**row, **{f"{place}/chunk_index": index // info.chunk_episodes for place in places}}
+        row |= {f"{place}/file_index": index for place in places} | {f"{place}/from_timestamp": 0 for place in places}
     while isinstance(outcome, list) and outcome:
         outcome = outcome[0]
     of_states = [row.get(name) for name in statistics]
     is_known = bool(of_states) and None not in of_states
     hashed = json.dumps([row["length"], *of_states], default=str).encode()
+    tasks = row.get("tasks") or ()
     return EpisodeRow(
-        index=_count(row["episode_index"]),
+        index=index,
         length=_count(row["length"]),
         chunk=_count(row["data/chunk_index"]),
         file=_count(row["data/file_index"]),
-        tasks=_texts(row.get("tasks")),
+        tasks=tuple(map(str, tasks)) if isinstance(tasks, list | tuple) else (str(tasks),),
         videos={key: _place(row, f"videos/{key}") for key in videos},
         success=bool(outcome) if isinstance(outcome, bool | int | float) else None,
         state_hash=hash_of_bytes(hashed) if is_known else UNKNOWN,
@@ -166,24 +164,11 @@ def _place(row: Mapping[str, Any], name: str) -> VideoPlace:
     return VideoPlace(_count(row[f"{name}/chunk_index"]), _count(row[f"{name}/file_index"]), start, length)
 
 
-def _checked(where: str, read: Any, *arguments: Any) -> EpisodeRow:
-    try:
-        row: EpisodeRow = read(*arguments)
-    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
-        found = f"not an episode ({error!r})"
-        raise InputError(where=where, found=found, needed="LeRobot's own tables", fix=_FIX_TABLES) from None
-    return row
-
-
 def _count(value: object) -> int:
     """Return a count; unlike for `int`, True, 1.5 and "1" are none."""
     if isinstance(value, bool) or not isinstance(value, int | float) or value != int(value) or not 0 <= value < 2**31:
         raise ValueError(f"{value!r} is no count")
     return int(value)
-
-
-def _texts(value: object) -> tuple[str, ...]:
-    return tuple(map(str, value)) if isinstance(value, list) else () if value is None else (str(value),)
 
 
 def problem_of(info: DatasetInfo, row: EpisodeRow, files: Set[str], keys: Sequence[str]) -> InputError | None:

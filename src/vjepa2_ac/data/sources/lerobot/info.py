@@ -56,13 +56,6 @@ class Feature:
         """Whether it is a column of numbers."""
         return self.dtype.startswith(("float", "int", "uint", "bool"))
 
-    @property
-    def kind(self) -> str:
-        """What it is, in words."""
-        if self.is_depth:
-            return "a depth map"
-        return "a camera" if self.is_camera else f"a column of {'numbers' if self.is_numbers else self.dtype}"
-
 
 @dataclass(frozen=True)
 class DatasetInfo:
@@ -94,7 +87,7 @@ class DatasetInfo:
         for knob, names in wanted.items():
             for name in names:
                 if name not in columns:
-                    raise self._missing(f"data.lerobot.{knob}", "column", name, columns)
+                    raise missing(f"data.lerobot.{knob}", "column of numbers", name, self.where, columns)
         self._require_state(config)
         for camera in config.cameras:
             self.camera_key(fields, camera)
@@ -110,21 +103,10 @@ class DatasetInfo:
         key = fields.cameras[camera]
         cameras = [name for name, feature in self.features.items() if feature.is_camera]
         if key not in cameras:
-            raise self._missing(f"data.lerobot.cameras.{camera}", "camera", key, cameras)
+            raise missing(f"data.lerobot.cameras.{camera}", "camera", key, self.where, cameras)
         if self.features[key].dtype == "video" and self.video_path is None:
             raise InputError(where=self.where, found=f"no video_path, and {key} is a video", needed="one", fix=_FIX)
         return key
-
-    def _missing(self, where: str, kind: str, name: str, known: Iterable[str]) -> InputError:
-        """Return the error of a name that the data set has not, or has for something else."""
-        if name not in self.features:
-            return missing(where, kind, name, self.where, known)
-        return InputError(
-            where=where,
-            found=f"{name}, which is {self.features[name].kind} in {self.where}",
-            needed="images of a camera" if kind == "camera" else "a column of numbers",
-            fix=f"It has: {', '.join(known) or 'none'}",
-        )
 
     def _require_state(self, config: LeRobotData) -> None:
         fields, described = config.lerobot, []
@@ -154,7 +136,7 @@ def missing(where: str, kind: str, name: str, place: str, known: Iterable[str]) 
     close = difflib.get_close_matches(name, known, n=1)
     hint = f"Did you mean {close[0]}? " if close else ""
     fix = f"{hint}It has: {', '.join(known) or 'none'}"
-    return InputError(where=where, found=f"no {kind} {name} in {place}", needed=f"one of its {kind}s", fix=fix)
+    return InputError(where=where, found=f"no {kind} {name} in {place}", needed="one that it has", fix=fix)
 
 
 def read_info(root: str) -> DatasetInfo:

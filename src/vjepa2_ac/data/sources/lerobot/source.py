@@ -219,7 +219,7 @@ def _stored_images(
     for step in steps:
         at = f"{where}: step {step}"
         frame = decode_image(images[step], at)
-        require_bounded(*frame.shape[:2], at, count=len(steps))
+        require_bounded(frame.shape[0], frame.shape[1], at, count=len(steps))
         if frames and frame.shape != frames[0].shape:
             found, needed = (f"an image of {one.shape[0]}x{one.shape[1]}" for one in (frame, frames[0]))
             raise InputError(where=at, found=found, needed=f"{needed}, as at step {steps[0]}")
