@@ -39,7 +39,7 @@ ORDERS: dict[str, list[str]] = {
         "cli",
     ],
     "data": ["picture_file", "index", "cache filters", "sources", "clips", "inspection"],
-    "data.sources": ["listing configured_spaces indexed_source", "rlds droid_raw lerobot npz latents", "registry"],
+    "data.sources": ["listing configured_spaces", "indexed_source", "rlds droid_raw lerobot npz latents", "registry"],
     "serving": [
         "wire worker prometheus access",
         "client request waypoints bounds kept_goals recording",

@@ -67,17 +67,6 @@ def test_lists_without_end_are_refused_by_what_the_footer_says(tmp_path: Path, m
         rows_of(path).rows(str(path), 0)
 
 
-@pytest.mark.parametrize("row_group", [None, 30])
-def test_rows_without_end_are_refused_in_one_group_and_in_many(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, row_group: int | None
-) -> None:
-    path = write(tmp_path / "rows.parquet", 100, row_group=row_group)
-    assert len(rows_of(path).rows(str(path), 0)[STATE]) == 100
-    monkeypatch.setattr(parquet, "MOST_ROWS", 50)
-    with pytest.raises(InputError, match=r"damaged: row groups of \[(60|100)\] rows"):
-        rows_of(path).rows(str(path), 0)
-
-
 def test_images_that_repeat_without_end_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, picture = tmp_path / "rows.parquet", b"\xff\xd8" + bytes(99_998)
     table = pa.table({"episode_index": np.repeat([0, 1], 50), "image": repeated(picture, 100)})

@@ -18,7 +18,9 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.cache.cached_reads import EpisodeFiles
 from vjepa2_ac.data.cache.disk_cache import DiskCache
-from vjepa2_ac.data.index.episode_table import EpisodeTable
+from vjepa2_ac.data.filters.broken_episodes import as_error, as_problem
+from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable
+from vjepa2_ac.data.sources.listing import in_parallel
 from vjepa2_ac.episode import EpisodeInfo, Progress, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage.npz_reader import read_arrays
@@ -33,6 +35,7 @@ class Opened:
 
 Config = TypeVar("Config", bound=DataConfig)
 State = TypeVar("State", bound=Opened)
+Found = TypeVar("Found")
 
 
 class IndexedSource(ABC, Generic[Config, State]):
@@ -73,6 +76,41 @@ class IndexedSource(ABC, Generic[Config, State]):
             if self._known is None:
                 self._known = self._look(progress)
             return self._known
+
+    def _scanned(
+        self, scan: Callable[[str], Found], identities: Mapping[str, str], progress: Progress
+    ) -> tuple[list[tuple[str, Found]], list[EpisodeProblem]]:
+        """Return the identity and content of every episode that can be used, and the problems of the others.
+
+        Args:
+            scan: Reads an episode, given by its key among the identities.
+            identities: Of the episodes.
+            progress: Called after each.
+
+        Raises:
+            InputError: No episode can be used: the first one's error.
+            OSError: Data behind a URL cannot be read.
+        """
+
+        def scan_one(key: str) -> Found | EpisodeProblem:
+            try:
+                return scan(key)
+            except InputError as error:
+                return as_problem(error, identities[key])
+
+        found: list[tuple[str, Found]] = []
+        problems: list[EpisodeProblem] = []
+        for identity, one in zip(
+            identities.values(), in_parallel(scan_one, [*identities], self._connections), strict=True
+        ):
+            if isinstance(one, EpisodeProblem):
+                problems.append(one)
+            else:
+                found.append((identity, one))
+            progress(len(found) + len(problems), len(identities))
+        if not found:
+            raise as_error(problems[0])
+        return found, problems
 
     @abstractmethod
     def _look(self, progress: Progress) -> State:

@@ -40,14 +40,13 @@ from jaxtyping import Float, Float64, UInt8
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.cache.block_cached_file import BlockCachedFile
-from vjepa2_ac.data.filters.broken_episodes import as_error, as_problem
 from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable
 from vjepa2_ac.data.index.index_cache import IndexKeys, get_or_build
 from vjepa2_ac.data.index.labels import labels_of
 from vjepa2_ac.data.index.state_hash import hash_of_states
 from vjepa2_ac.data.sources.configured_spaces import measured_space
 from vjepa2_ac.data.sources.indexed_source import FramesByStep, IndexedSource, Opened, require_as_indexed
-from vjepa2_ac.data.sources.listing import in_parallel, walk, within
+from vjepa2_ac.data.sources.listing import walk, within
 from vjepa2_ac.episode import EXTRINSICS_DIM, STATE_DIM, Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.jpeg import require_bounded
@@ -148,20 +147,14 @@ class NpzSource(IndexedSource[DataConfig, _Opened]):
         return _Opened(get_or_build(config.disk_cache, keys, root, build), keys.now)
 
     def _scan_all(self, ids: list[str], version: str, progress: Progress) -> EpisodeTable:
-        found: dict[str, _Content] = {}
-        problems: list[EpisodeProblem] = []
-        results = in_parallel(partial(self._scan, version=version), ids, self._connections)
-        for done, (identity, one) in enumerate(zip(ids, results, strict=True), start=1):
-            progress(done, len(ids))
-            if isinstance(one, EpisodeProblem):
-                problems.append(one)
-            else:
-                found[identity] = one
-        if not found:
-            raise as_error(problems[0])
-        usual = Counter(one.kind for one in found.values()).most_common(1)[0][0]
-        problems += [self._unlike(name, one.kind, usual) for name, one in found.items() if one.kind != usual]
-        usable = {name: one for name, one in found.items() if one.kind == usual}
+        found, problems = self._scanned(
+            lambda name: self._content(self._path(name), version, self._config.cameras),
+            dict(zip(ids, ids, strict=True)),
+            progress,
+        )
+        usual = Counter(one.kind for _, one in found).most_common(1)[0][0]
+        problems += [self._unlike(name, one.kind, usual) for name, one in found if one.kind != usual]
+        usable = {name: one for name, one in found if one.kind == usual}
         logger.info("%s: %d episodes, %d that cannot be used", self._config.path, len(usable), len(problems))
         return EpisodeTable.of(
             [EpisodeInfo(name, len(one.states), one.success) for name, one in usable.items()],
@@ -170,12 +163,6 @@ class NpzSource(IndexedSource[DataConfig, _Opened]):
             state_hashes=[hash_of_states(one.states) for one in usable.values()],
             labels=labels_of([{"task": one.language, **one.labels} for one in usable.values()]),
         )
-
-    def _scan(self, identity: str, version: str) -> _Content | EpisodeProblem:
-        try:
-            return self._content(self._path(identity), version, self._config.cameras)
-        except InputError as error:
-            return as_problem(error, identity)
 
     def _unlike(self, identity: str, kind: str, usual: str) -> EpisodeProblem:
         fix = "Resample the episode, or keep the recordings of different robots in different folders"

@@ -18,7 +18,6 @@ from vjepa2_ac.config import RawDroidData
 from vjepa2_ac.config.effects import Affects, knobs_that_affect
 from vjepa2_ac.config.sources import RAW_CAMERAS
 from vjepa2_ac.data.cache.disk_cache import DiskCache, fetched_data
-from vjepa2_ac.data.filters.broken_episodes import as_error, as_problem
 from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable
 from vjepa2_ac.data.index.index_cache import IndexKeys, get_or_build, key_of
 from vjepa2_ac.data.index.labels import labels_of
@@ -41,7 +40,6 @@ from vjepa2_ac.data.sources.indexed_source import (
     store_arrays,
     stored_arrays,
 )
-from vjepa2_ac.data.sources.listing import in_parallel
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.video_reader import count_frames, frame_times, read_frames
@@ -164,18 +162,14 @@ class RawDroidSource(IndexedSource[RawDroidData, Opened]):
         return Opened(get_or_build(config.disk_cache, keys, root, lambda: self._scan_all(folders, progress)))
 
     def _scan_all(self, folders: list[str], progress: Progress) -> EpisodeTable:
+        identities = {folder: identity_of(self._config.path, folder) for folder in folders}
+        found, problems = self._scanned(self._scan, identities, progress)
         usable: dict[str, _Found] = {}
-        problems = []
-        for done, found in enumerate(in_parallel(self._scan, folders, self._connections), start=1):
-            progress(done, len(folders))
-            if isinstance(found, EpisodeProblem):
-                problems.append(found)
-            elif found.info.id in usable:
-                problems.append(_twice(found.info.id, self._path(found.place.folder, TRAJECTORY)))
-            else:
-                usable[found.info.id] = found
-        if not usable:
-            raise as_error(problems[0])
+        for identity, one in found:
+            if usable.setdefault(identity, one) is not one:
+                wrong, fix = f"a second episode of the same identity: {identity}", "Name a smaller folder in data.path"
+                where = self._path(one.place.folder, TRAJECTORY)
+                problems.append(EpisodeProblem(identity, where, wrong, "episodes that can be told apart", fix))
         logger.info("%s: %d episodes, %d that cannot be used", self._config.path, len(usable), len(problems))
         return EpisodeTable.of(
             [one.info for one in usable.values()],
@@ -186,23 +180,20 @@ class RawDroidSource(IndexedSource[RawDroidData, Opened]):
             labels=labels_of([one.labels for one in usable.values()]),
         )
 
-    def _scan(self, folder: str) -> _Found | EpisodeProblem:
+    def _scan(self, folder: str) -> _Found:
         identity = identity_of(self._config.path, folder)
         listed = list_episode(self._config.path, folder)
         if not listed.has_trajectory or listed.metadata is None:
             found = f"episode {identity} has no {'metadata_*.json' if listed.has_trajectory else TRAJECTORY}"
-            return EpisodeProblem(identity, self._path(folder, ""), found, "one", _FIX)
-        try:
-            version, path = key_of({"files": listed}), self._path(folder, listed.metadata)
-            data = self._files.read(path, version=version, where=path)
-            metadata = json_object(data, where=path, needed="the metadata of an episode", allow_nan=True)
-            named = {camera: _named(metadata, camera) for camera in RAW_CAMERAS}
-            known = {camera: serial for camera, serial in named.items() if serial}
-            serials = tuple(_serial(known, camera, path) for camera in self._config.cameras)
-            place = _Place(folder, version, known, self._counted(folder, listed, serials))
-            states = _states_of(self._numbers(place, serials))
-        except InputError as error:
-            return as_problem(error, identity)
+            raise InputError(where=self._path(folder, ""), found=found, needed="one", fix=_FIX)
+        version, path = key_of({"files": listed}), self._path(folder, listed.metadata)
+        data = self._files.read(path, version=version, where=path)
+        metadata = json_object(data, where=path, needed="the metadata of an episode", allow_nan=True)
+        named = {camera: _named(metadata, camera) for camera in RAW_CAMERAS}
+        known = {camera: serial for camera, serial in named.items() if serial}
+        serials = tuple(_serial(known, camera, path) for camera in self._config.cameras)
+        place = _Place(folder, version, known, self._counted(folder, listed, serials))
+        states = _states_of(self._numbers(place, serials))
         success = metadata.get("success")
         outcome = success if isinstance(success, bool) else success_of(identity)
         return _Found(EpisodeInfo(identity, len(states), outcome), place, hash_of_states(states), _labels(metadata))
@@ -333,8 +324,3 @@ def _labels(metadata: Mapping[str, Any]) -> dict[str, str | None]:
         "operator": short("user_id", "user"),
         "task": task if isinstance(task, str) else None,
     }
-
-
-def _twice(identity: str, where: str) -> EpisodeProblem:
-    found, fix = f"a second episode of the same identity: {identity}", "Name a smaller folder in data.path"
-    return EpisodeProblem(identity, where, found, "episodes that can be told apart", fix)

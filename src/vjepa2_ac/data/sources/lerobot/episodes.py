@@ -133,7 +133,7 @@ def _lines(path: str) -> Iterator[dict[str, Any]]:
 def _row_of(
     info: DatasetInfo, row: Mapping[str, Any], videos: Sequence[str], outcome: object, statistics: Sequence[str]
 ) -> EpisodeRow:
-    index = _count(row["episode_index"])
+    index = int(row["episode_index"])
     if info.version == "v2.1":  # a file for each episode
         places = ("data", *(f"videos/{key}" for key in videos))
         row = {**row, **{f"{place}/chunk_index": index // info.chunk_episodes for place in places}}
@@ -146,9 +146,9 @@ def _row_of(
     tasks = row.get("tasks") or ()
     return EpisodeRow(
         index=index,
-        length=_count(row["length"]),
-        chunk=_count(row["data/chunk_index"]),
-        file=_count(row["data/file_index"]),
+        length=int(row["length"]),
+        chunk=int(row["data/chunk_index"]),
+        file=int(row["data/file_index"]),
         tasks=tuple(map(str, tasks)) if isinstance(tasks, list | tuple) else (str(tasks),),
         videos={key: _place(row, f"videos/{key}") for key in videos},
         success=bool(outcome) if isinstance(outcome, bool | int | float) else None,
@@ -161,14 +161,7 @@ def _place(row: Mapping[str, Any], name: str) -> VideoPlace:
     if not math.isfinite(start) or start < 0:
         raise ValueError(f"{name}/from_timestamp {start}")
     length = None if end is None else float(end) - start
-    return VideoPlace(_count(row[f"{name}/chunk_index"]), _count(row[f"{name}/file_index"]), start, length)
-
-
-def _count(value: object) -> int:
-    """Return a count; unlike for `int`, True, 1.5 and "1" are none."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or value != int(value) or not 0 <= value < 2**31:
-        raise ValueError(f"{value!r} is no count")
-    return int(value)
+    return VideoPlace(int(row[f"{name}/chunk_index"]), int(row[f"{name}/file_index"]), start, length)
 
 
 def problem_of(info: DatasetInfo, row: EpisodeRow, files: Set[str], keys: Sequence[str]) -> InputError | None:

@@ -32,8 +32,7 @@ Opener = Callable[[str], "str | BlockCachedFile"]  # a path, or a remote file
 EPISODE = "episode_index"
 
 # All limits are far beyond any data set.
-MOST_ROWS = 5_000_000  # of one row group, or of one episode
-MOST_NUMBERS = 1 << 27  # of one column in a row group
+MOST_NUMBERS = 1 << 25  # of one column in a row group
 MOST_TABLE_BYTES = 1 << 28  # of a table of episodes or tasks
 MOST_IMAGE_BYTES = 1 << 32  # in one row group
 _ROWS_AT_ONCE = 64  # where one value may be as large as an image
@@ -76,7 +75,6 @@ class ParquetRows:
                 of_episode = group[EPISODE][:, 0] == episode
                 are_shared |= not of_episode.all()
                 parts.append({name: column[of_episode] for name, column in group.items()})
-                _require_sane([sum(len(part[EPISODE]) for part in parts)], path)
         rows = {name: np.concatenate([part[name] for part in parts]) for name in (parts[0] if parts else ())}
         if are_shared:
             store_arrays(self._cache, key, rows)
@@ -175,7 +173,6 @@ def _opened(opened: str | BlockCachedFile, path: str) -> Iterator[parquet.Parque
         with parquet.ParquetFile(
             opened, page_checksum_verification=True, pre_buffer=not isinstance(opened, str), memory_map=False
         ) as file:
-            _require_sane([file.metadata.row_group(n).num_rows for n in range(file.num_row_groups)], path)
             yield file
     except FileNotFoundError:
         raise InputError(where=path, found="no such file", needed="one, says the data set", fix=_FIX) from None
@@ -186,12 +183,6 @@ def _opened(opened: str | BlockCachedFile, path: str) -> Iterator[parquet.Parque
             raise storage.unreadable(path, error, fix=_FIX) from None
         found = f"damaged: {' '.join(str(error).strip().splitlines()[:1])[:200]}"
         raise InputError(where=path, found=found, needed="a whole Parquet file", fix=_FIX) from None
-
-
-def _require_sane(rows: Sequence[int], path: str) -> None:
-    if any(not 0 <= count <= MOST_ROWS for count in rows):
-        found = f"damaged: row groups of {list(rows[:5])} rows"
-        raise InputError(where=path, found=found, needed="a whole Parquet file", fix=_FIX)
 
 
 def _episodes_of_groups(
