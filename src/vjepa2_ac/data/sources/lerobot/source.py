@@ -196,13 +196,7 @@ class LeRobotSource(IndexedSource[LeRobotData, _Opened]):
         self, path: str, clock: Clock, where: str, steps: Sequence[int]
     ) -> UInt8[np.ndarray, "time height width 3"]:
         """Return frames of an episode's part of a video: step k is shown at the part's start + k / fps."""
-        opened = self._open_file(path)
-        try:
-            return read_frames(opened, steps, where=where, clock=clock)
-        except InputError:
-            if isinstance(opened, BlockCachedFile) and opened.failure is not None:
-                raise opened.failure from None
-            raise
+        return read_frames(self._open_file(path), steps, where=where, clock=clock)
 
     def _where(self, row: EpisodeRow) -> str:
         return f"{storage.join(self._info.root, data_file(self._info, row))}: {row.id}"
