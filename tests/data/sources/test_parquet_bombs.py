@@ -41,12 +41,20 @@ def test_texts_that_repeat_without_end_are_refused_before_python_has_them(
     assert read_table(str(path), str(path), lambda name: name == "length") == {"length": list(range(3000))}
 
 
-def test_a_footer_that_contradicts_itself_is_damage_and_does_not_end_the_process(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("contradicting_footer", "Definition level histogram"),
+        ("mistyped_footer", "ColumnMetaData type does not match"),
+    ],
+)
+def test_a_footer_that_contradicts_itself_is_damage_and_does_not_end_the_process(
+    name: str, message: str, tmp_path: Path
+) -> None:
     """Asked for this column's account in the footer, pyarrow 26 would abort this very process."""
-    path = str(GOLDEN / "contradicting_footer.parquet")
-    rows = rows_of(tmp_path, "observation.state.cartesian_position", "action.joint_velocity")
-    with pytest.raises(InputError, match=r"contradicting_footer\.parquet: damaged: Definition level histogram"):
-        rows.rows(path, 0)
+    columns = ("frame_index", "timestamp", "observation.state.cartesian_position", "action.joint_velocity")
+    with pytest.raises(InputError, match=rf"{name}\.parquet: damaged: {message}"):
+        rows_of(tmp_path, *columns).rows(str(GOLDEN / f"{name}.parquet"), 0)
 
 
 def rows_of(path: Path, *columns: str) -> ParquetRows:

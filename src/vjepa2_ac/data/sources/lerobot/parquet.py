@@ -216,12 +216,14 @@ def _require_consistent(file: parquet.ParquetFile, opened: str | BlockCachedFile
     """Refuse an inconsistent footer entry of some columns, in any row group.
 
     Reading such an entry with pyarrow (`row_group(n).column(p)`) ends the process: a C++ exception that its binding
-    does not expect. A reader of no rows makes the same checks, reads nothing, and raises.
+    does not expect. A reader of one row makes the same checks, and raises. Of a remote file it reads none, and
+    finds less: the blocks of every row group would be fetched.
     """
     _, parquet = _library(str(opened))
+    rows = 1 if isinstance(opened, str) else 0
     with parquet.ParquetFile(opened, metadata=file.metadata, buffer_size=_BUFFER_BYTES, pre_buffer=False) as light:
         for group in range(file.num_row_groups):
-            next(light.reader.iter_batches(0, row_groups=[group], column_indices=places, use_threads=False), None)
+            next(light.reader.iter_batches(rows, row_groups=[group], column_indices=places, use_threads=False), None)
 
 
 def _parts_of(

@@ -19,9 +19,7 @@ FRAME, TIME = "frame_index", "timestamp"
 
 _FIX = "Copy the file again, or leave the episode out"
 _FIX_STATES = "Check data.lerobot: state, select, rotation, gripper_open and gripper_closed"
-_FIX_VECTORS = (
-    "Leave the episode out, check data.lerobot: state, action, or set data.lerobot.joint_velocity: null"
-)
+_FIX_VECTORS = "Leave the episode out, check data.lerobot: state, action, or set data.lerobot.joint_velocity: null"
 _UNIT_TOLERANCE = 1e-2
 
 
