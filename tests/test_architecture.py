@@ -51,7 +51,7 @@ ORDERS: dict[str, list[str]] = {
         "loader duplicates",
         "coverage",
     ],
-    "data.sources": ["listing configured_spaces indexed_source", "rlds droid_raw lerobot npz latents", "registry"],
+    "data.sources": ["listing configured_spaces", "indexed_source", "rlds droid_raw lerobot npz latents", "registry"],
     "serving": [
         "wire access motion",
         "client request recording",
@@ -108,7 +108,7 @@ HOMES = {
     "fsspec": ["storage/remote.py"],
     "google": [],
     "google_crc32c": ["data/sources/rlds/tfrecord.py"],
-    "h5py": ["data/sources/droid_raw/trajectory.py"],
+    "h5py": ["data/sources/droid_raw/source.py"],
     "huggingface_hub": ["export.py", "storage/hub.py"],
     "jinja2": ["export.py", "reports/"],
     "markupsafe": ["reports/"],

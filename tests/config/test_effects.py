@@ -131,7 +131,8 @@ def keys_of(monkeypatch: pytest.MonkeyPatch) -> Callable[[Config], dict[str, str
         raise Found(keys)
 
     for source in WRITERS:
-        monkeypatch.setattr(f"vjepa2_ac.data.sources.{source}.source.get_or_build", stop)
+        module = source if source == "npz" else f"{source}.source"
+        monkeypatch.setattr(f"vjepa2_ac.data.sources.{module}.get_or_build", stop)
     monkeypatch.setattr(idle_ranges, "get_or_make", stop)
 
     def found(action: Callable[[], Any]) -> Any:

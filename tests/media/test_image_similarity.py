@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vjepa2_ac.media.image_similarity import mean_where, moving_region, ms_ssim, psnr, ssim, ssim_map, structure
+from vjepa2_ac.media.image_similarity import mean_where, moving_region, ms_ssim, psnr, ssim, ssim_map
 
 # size, case, PSNR, SSIM, MS-SSIM by scales: torchmetrics 1.9.0 on torch 2.13.0, data_range 1, `betas` the first scales'
 # default weights divided by their sum; images of `pair`.
@@ -18,8 +18,6 @@ RECORDED = [
     ((176, 192), 3, 4.948193, -0.4814432263, {1: 0.0, 2: 0.0, 3: 0.0, 5: 0.0}),
     ((97, 64), 0, 24.929602, 0.9578150511, {1: 0.9578150511, 2: 0.9639894962, 3: 0.9740152955}),
     ((97, 64), 1, 20.423635, 0.7375175953, {1: 0.7375175953, 2: 0.8657351732, 3: 0.9162175655}),
-    ((97, 64), 2, 7.413724, 0.0073526669, {1: 0.0073526669, 2: 0.0106577622, 3: 0.0150039932}),
-    ((97, 64), 3, 4.941878, -0.4780655801, {1: 0.0, 2: 0.0, 3: 0.0}),
 ]
 
 
@@ -127,37 +125,3 @@ def test_a_smeared_object_scores_better_than_a_sharp_one_elsewhere() -> None:
         smeared[:, 20:40, 20 + shift : 30 + shift] += 0.4 / 25
     assert psnr(smeared, true) > psnr(off, true) + 2
     assert ssim(smeared, true) > ssim(off, true)
-
-
-@pytest.mark.parametrize(("size", "scales"), [(43, 3), (64, 6), (64, 0)])
-def test_too_small_images_and_unknown_scales_are_refused(size: int, scales: int) -> None:
-    image = torch.zeros(3, size, size)
-    with pytest.raises(ValueError, match="scales"):
-        ms_ssim(image, image, scales)
-
-
-def test_ms_ssim_of_a_region_is_that_of_the_whole_if_all_pixels_count_and_of_none_nan() -> None:
-    predicted, true = pair(1, (97, 64))
-    every, nothing = torch.ones(97, 64, dtype=torch.bool), torch.zeros(97, 64, dtype=torch.bool)
-    torch.testing.assert_close(ms_ssim(predicted, true, 3, every), ms_ssim(predicted, true, 3))
-    assert math.isnan(ms_ssim(predicted, true, 3, nothing))
-
-
-def test_ms_ssim_of_a_region_does_not_see_what_is_far_from_it() -> None:
-    predicted, true = pair(1, (176, 176))
-    where = torch.zeros(176, 176, dtype=torch.bool)
-    where[20:40, 20:40] = True
-    changed = predicted.clone()
-    changed[:, 120:, 120:] = 0.0
-    torch.testing.assert_close(ms_ssim(changed, true, 3, where), ms_ssim(predicted, true, 3, where))
-    assert ms_ssim(changed, true, 3) < ms_ssim(predicted, true, 3) - 0.01
-
-
-def test_structure_of_several_regions_is_that_of_each() -> None:
-    predicted, true = pair(1, (97, 64))
-    where = torch.zeros(97, 64, dtype=torch.bool)
-    where[20:60, 10:50] = True
-    whole, region = structure(predicted, true, 3, [None, where])
-    torch.testing.assert_close(whole, (ssim(predicted, true), ms_ssim(predicted, true, 3)))
-    expected = mean_where(ssim_map(predicted, true), where), ms_ssim(predicted, true, 3, where)
-    torch.testing.assert_close(region, expected)

@@ -15,8 +15,7 @@ from recordings import write_mp4
 from synthetic import draw_frame, synthetic_states
 from vjepa2_ac.errors import InputError, UnreachableError
 from vjepa2_ac.media import video_reader
-from vjepa2_ac.media.frame_targets import FrameTargets
-from vjepa2_ac.media.video_reader import Clock, count_frames, read_frames
+from vjepa2_ac.media.video_reader import Clock, count_frames, frame_times, read_frames
 
 STEPS = 40
 FRAMES = [draw_frame(state, size=(36, 64)) for state in synthetic_states(STEPS)]
@@ -104,13 +103,33 @@ def test_only_what_the_asked_frames_need_is_decoded(tmp_path: Path, monkeypatch:
     decoded: list[int] = []
     keep = video_reader._Video._keep
 
-    def counted(self: video_reader._Video, frames: Sequence[Any], wanted: FrameTargets) -> None:
+    def counted(self: video_reader._Video, frames: Sequence[Any], *others: Any) -> None:
         decoded.extend(frame.pts for frame in frames)
-        keep(self, frames, wanted)
+        keep(self, frames, *others)
 
     monkeypatch.setattr(video_reader._Video, "_keep", counted)
     read_frames(path, [14, 38], where="a")
     assert [time // 1024 for time in decoded] == [12, 13, 14, 36, 37, 38]
+
+
+def test_libav_itself_makes_no_room_for_an_image_beyond_the_bound(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_mp4(tmp_path / "a.mp4", FRAMES)
+    monkeypatch.setitem(video_reader._STRICT, "max_pixels", "1000")
+    with pytest.raises(InputError, match=r"a\.mp4: (cannot be read as a video|no image)"):
+        read_frames(path, [0, 2], where="a.mp4")
+
+
+@pytest.mark.parametrize("b_frames", [0, 3])
+def test_with_its_times_at_hand_a_video_is_not_walked(
+    tmp_path: Path, b_frames: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_mp4(tmp_path / "a.mp4", FRAMES, gop=8, b_frames=b_frames)
+    times, expected = frame_times(path, where="a"), read_frames(path, [31, 2], where="a")
+    assert len(times) == count_frames(path, where="a") == STEPS
+    monkeypatch.setattr(video_reader._Video, "times", None)
+    np.testing.assert_array_equal(read_frames(path, [31, 2], where="a", times=times), expected)
 
 
 def test_a_file_that_is_open_is_read_and_stays_open(tmp_path: Path) -> None:

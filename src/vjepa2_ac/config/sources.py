@@ -167,7 +167,7 @@ class LeRobotData(DataConfig):
 class NpzData(DataConfig):
     """A folder of .npz episodes."""
 
-    reader: ClassVar[str] = "vjepa2_ac.data.sources.npz.source:NpzSource"
+    reader: ClassVar[str] = "vjepa2_ac.data.sources.npz:NpzSource"
 
     source: Annotated[Literal["npz"], Affects.FORM] = "npz"
     """npz: a folder of .npz episodes."""

@@ -7,8 +7,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from vjepa2_ac import storage
-from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, read_info
-from vjepa2_ac.data.sources.lerobot.path_templates import filled
+from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, filled, read_info
 from vjepa2_ac.errors import InputError, UserError
 from vjepa2_ac.init.found import FoundData, Knob, Knobs
 from vjepa2_ac.init.names import Column, Pose, find_pose, pick_camera, short_name

@@ -17,7 +17,7 @@ from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.data.sources.droid_raw.episode_folders import find_episodes
 from vjepa2_ac.data.sources.lerobot.info import INFO
 from vjepa2_ac.data.sources.listing import walk, within
-from vjepa2_ac.data.sources.npz.npz_episode import FORMAT_HELP, opened_npz
+from vjepa2_ac.data.sources.npz import FORMAT_HELP, opened_npz
 from vjepa2_ac.data.sources.registry import open_source
 from vjepa2_ac.episode import STATE_DIM, Progress
 from vjepa2_ac.errors import InputError, UserError

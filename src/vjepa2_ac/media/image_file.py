@@ -14,11 +14,9 @@ from PIL import Image
 from PIL.PngImagePlugin import PngImageFile
 
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.image_size import require_bounded, require_few_scans
+from vjepa2_ac.media.jpeg import require_bounded
 from vjepa2_ac.storage import read_bytes, unreadable
 
-_JPEG = b"\xff\xd8"
-_TIFF = (b"II*\0", b"MM\0*")
 _EIGHT_BIT = {"1", "L", "LA", "P", "RGB", "RGBA"}  # Pillow's modes of at most 8 bits a channel
 
 
@@ -42,10 +40,10 @@ def decode_image(data: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]
         InputError: They are neither, damaged, too large, or of more than 8 bits a channel.
     """
     try:
-        if data.startswith(_JPEG):
-            return _jpeg(data, where)
-        if data.startswith(_TIFF):
-            raise InputError(where=where, found="a TIFF, as depth is stored", needed="a camera's image: PNG or JPEG")
+        if data.startswith(b"\xff\xd8"):
+            height, width, _, _ = simplejpeg.decode_jpeg_header(data)
+            require_bounded(height, width, where)
+            return np.asarray(simplejpeg.decode_jpeg(data, colorspace="RGB"))
         with PngImageFile(io.BytesIO(data)) as image:  # reads the header only
             require_bounded(image.height, image.width, where)
             return _as_rgb(image)
@@ -53,15 +51,8 @@ def decode_image(data: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]
         raise InputError(
             where=where,
             found=f"{len(data)} bytes that are no image, starting with {data[:4]!r} ({error})",
-            needed="PNG or JPEG",
+            needed="PNG or JPEG, as a camera's images are stored; depth, as TIFF, is not used",
         ) from None
-
-
-def _jpeg(data: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]:
-    height, width, _, _ = simplejpeg.decode_jpeg_header(data)
-    require_bounded(height, width, where)
-    require_few_scans(data, height, width, where)
-    return np.asarray(simplejpeg.decode_jpeg(data, colorspace="RGB"))
 
 
 def _as_rgb(image: Image.Image) -> UInt8[np.ndarray, "height width 3"]:

@@ -1,16 +1,14 @@
-"""How alike are two images, pixel by pixel: PSNR, SSIM and MS-SSIM, of whole images or of where something moves.
+"""How alike are two images, pixel by pixel: PSNR and SSIM, of whole images or of where something moves.
 
 Images are RGB in 0 .. 1 (data range 1), channels first; every function returns one value per image, in float32 and
-without autocast, and can be differentiated. All three reward blur: an object smeared over every place where it may be
-scores better than a sharp one 12 pixels off. State them beside LPIPS, and inside the moving region.
+without autocast, and can be differentiated. All reward blur: an object smeared over every place where it may be scores
+better than a sharp one 12 pixels off. State them beside LPIPS, and inside the moving region.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from functools import lru_cache, reduce
-from operator import mul
+from functools import lru_cache
 
 import torch
 from jaxtyping import Bool, Float
@@ -62,51 +60,34 @@ def ssim_map(
     Source: Wang, Bovik, Sheikh, Simoncelli (2004), Image Quality Assessment, equation 13; borders are reflected, as in
     torchmetrics 1.9.0, whose values it equals to 1e-5.
     """
-    similarity, _ = _terms(predicted, true)
-    return similarity.mean(dim=-3)
+    return _terms(predicted, true)[0].mean(dim=-3)
 
 
 def ms_ssim(
-    predicted: Float[Tensor, "*batch 3 height width"],
-    true: Float[Tensor, "*batch 3 height width"],
-    scales: int = 5,
-    where: Bool[Tensor, "*batch height width"] | None = None,
+    predicted: Float[Tensor, "*batch 3 height width"], true: Float[Tensor, "*batch 3 height width"], scales: int
 ) -> Float[Tensor, "*batch"]:
-    """Return the multi-scale structural similarity of each image.
+    """Return the multi-scale structural similarity of each image, for a loss.
 
     It is the product over scales of mean contrast (of the coarsest one: of mean similarity) to the power of a weight,
-    each at least 0. The weights are the first `scales` of the paper's five, divided by their sum. torchmetrics takes
-    its `betas` as they are: pass it the same divided weights for the same value. Where a factor is 0, the gradient of
-    the whole is 0: put a pixel loss beside it.
+    each at least 0. The weights are the first `scales` of the paper's five, divided by their sum. Where a factor is 0,
+    the gradient of the whole is 0: put a pixel loss beside it.
 
     Args:
-        predicted: Images in 0 .. 1.
+        predicted: Images in 0 .. 1, of at least 11 pixels a side at the coarsest scale.
         true: Likewise.
-        scales: Each halves the image; 3 suit images of 96 pixels, 5 those of 256.
-        where: The pixels that count, at a coarser scale those that hold one of them; None: all. Where none is left
-            (finer scales leave out a border of 5 pixels), the image has NaN. There is no reference for it but ours.
-
-    Raises:
-        ValueError: Scales other than 1 to 5, or an image of fewer than 11 pixels at the coarsest one.
+        scales: 1 to 5; each halves the image.
 
     Source: Wang, Simoncelli, Bovik (2003), Multiscale structural similarity, equation 7.
     """
-    return _product(_maps(predicted, true, scales), where)
-
-
-def structure(
-    predicted: Float[Tensor, "*batch 3 height width"],
-    true: Float[Tensor, "*batch 3 height width"],
-    scales: int,
-    regions: Sequence[Bool[Tensor, "*batch height width"] | None],
-) -> list[tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]]:
-    """Return SSIM and MS-SSIM of each image in several regions (None: the whole image); nothing is computed twice.
-
-    Raises:
-        ValueError: As of `ms_ssim`.
-    """
-    maps = _maps(predicted, true, scales)
-    return [(mean_where(maps[0][0], where), _product(maps, where)) for where in regions]
+    product: Tensor | float = 1.0
+    for scale, weight in enumerate(_SCALE_WEIGHTS[:scales]):
+        if scale:
+            predicted, true = _halved(predicted), _halved(true)
+        similarity, contrast = _terms(predicted, true)
+        inside = contrast[..., _RADIUS:-_RADIUS, _RADIUS:-_RADIUS]  # where the window sees no reflection
+        factor = (similarity if scale == scales - 1 else inside).mean(dim=-3).mean(dim=(-2, -1))
+        product = product * _power(factor, weight / sum(_SCALE_WEIGHTS[:scales]))
+    return torch.as_tensor(product)
 
 
 def moving_region(true: Float[Tensor, "*batch time 3 height width"]) -> Bool[Tensor, "*batch time-1 height width"]:
@@ -120,40 +101,6 @@ def moving_region(true: Float[Tensor, "*batch time 3 height width"]) -> Bool[Ten
     flat = moved.reshape(-1, 1, *moved.shape[-2:]).float()
     dilated = torch.nn.functional.max_pool2d(flat, 2 * DILATED_BY + 1, stride=1, padding=DILATED_BY)
     return (dilated > 0).reshape(moved.shape)
-
-
-def _maps(
-    predicted: Float[Tensor, "*batch 3 height width"], true: Float[Tensor, "*batch 3 height width"], scales: int
-) -> list[tuple[Tensor, Tensor]]:
-    """Return similarity and contrast at each pixel of each scale, as means over R, G and B."""
-    if not 1 <= scales <= len(_SCALE_WEIGHTS):
-        raise ValueError(f"{scales} scales; there are weights for 1 to {len(_SCALE_WEIGHTS)}")
-    if min(predicted.shape[-2:]) >> (scales - 1) < 2 * _RADIUS + 1:
-        size = " x ".join(str(side) for side in predicted.shape[-2:])
-        least = (2 * _RADIUS + 1) << (scales - 1)
-        raise ValueError(f"images of {size} px are too small for {scales} scales, which need {least} px a side")
-    maps = []
-    for scale in range(scales):
-        if scale:
-            predicted, true = _halved(predicted), _halved(true)
-        similarity, contrast = _terms(predicted, true)
-        maps.append((similarity.mean(dim=-3), contrast.mean(dim=-3)))
-    return maps
-
-
-def _product(
-    maps: Sequence[tuple[Tensor, Tensor]], where: Bool[Tensor, "*batch height width"] | None
-) -> Float[Tensor, "*batch"]:
-    """Return the MS-SSIM of a region from the maps of each scale."""
-    weights = [weight / sum(_SCALE_WEIGHTS[: len(maps)]) for weight in _SCALE_WEIGHTS[: len(maps)]]
-    *finer, (coarsest, _) = maps
-    factors = []
-    for _, contrast in finer:  # without the border, where the window sees reflections
-        inside = (..., slice(_RADIUS, -_RADIUS), slice(_RADIUS, -_RADIUS))
-        factors.append(mean_where(contrast[inside], None if where is None else where[inside]))
-        where = None if where is None else _halved(where[..., None, :, :].float())[..., 0, :, :] > 0
-    factors.append(mean_where(coarsest, where))
-    return reduce(mul, (_power(one, weight) for one, weight in zip(factors, weights, strict=True)))
 
 
 def mean_where(

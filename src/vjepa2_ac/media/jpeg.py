@@ -1,4 +1,4 @@
-"""JPEG decoding of the requested camera images, and JPEG encoding."""
+"""JPEG decoding of the requested camera images, JPEG encoding, and the size limit of all decoders."""
 
 from __future__ import annotations
 
@@ -9,7 +9,30 @@ import simplejpeg
 from jaxtyping import UInt8
 
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.image_size import require_bounded, require_few_scans
+
+MOST_PIXELS = 100_000_000  # a robot's camera has a tenth; a file of 600 bytes may claim forty times as many
+_MOST_BYTES = 1 << 32  # of images that are decoded together
+
+
+def require_bounded(height: int, width: int, where: str, *, count: int = 1) -> None:
+    """Refuse images that are too large, or too many of that size to be decoded together, before memory is allocated.
+
+    Args:
+        height: Of each, in pixels.
+        width: Likewise.
+        where: The file, and its episode and step, for messages.
+        count: How many are decoded together.
+
+    Raises:
+        InputError: They are.
+    """
+    if not 0 < height * width <= MOST_PIXELS or count * height * width * 3 > _MOST_BYTES:
+        raise InputError(
+            where=where,
+            found=f"{count} images of {height} x {width} pixels at once",
+            needed=f"at most {MOST_PIXELS // 10**6} megapixels each, and {_MOST_BYTES // 10**9} GB together",
+            fix="Make the images smaller, leave the episode out, or set data.frames lower",
+        )
 
 
 def decode_jpegs(images: Sequence[bytes], steps: Sequence[int], where: str) -> UInt8[np.ndarray, "time height width 3"]:
@@ -34,7 +57,6 @@ def decode_jpegs(images: Sequence[bytes], steps: Sequence[int], where: str) -> U
                 found=f"an image of {size[0]}x{size[1]}",
                 needed=f"{height}x{width} as at step {steps[0]}",
             )
-        require_few_scans(image, height, width, f"{where}: step {step}")
         try:
             simplejpeg.decode_jpeg(image, colorspace="RGB", fastdct=True, buffer=frame)
         except ValueError as error:

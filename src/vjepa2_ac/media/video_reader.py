@@ -7,6 +7,7 @@ A frame is identified by its presentation time, never by counting at the rate in
 from __future__ import annotations
 
 import re
+from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -18,25 +19,22 @@ from jaxtyping import UInt8
 
 from vjepa2_ac import storage
 from vjepa2_ac.errors import InputError, require_library
-from vjepa2_ac.media.frame_targets import FrameTargets, QuietFile
-from vjepa2_ac.media.image_size import MOST_PIXELS, require_bounded
+from vjepa2_ac.media.jpeg import MOST_PIXELS, require_bounded
 from vjepa2_ac.storage import ByteReader
 
 if TYPE_CHECKING:
-    from av.container import InputContainer
     from av.packet import Packet
     from av.video.frame import VideoFrame
-    from av.video.reformatter import VideoReformatter
     from av.video.stream import VideoStream
 
-_DEMUXER = "mp4"  # by name: otherwise libav follows playlists to other files
 _STRICT = {
     "err_detect": "crccheck+bitstream+buffer+explode",  # an error rather than a guessed frame
     "max_pixels": str(MOST_PIXELS),
 }
 _START = -(1 << 40)  # before every frame
-_DEEP_GREY = re.compile(r"gray(9|1\d|f)")
 _FIX = "Copy the file again, or leave the episode out"
+
+Frame = UInt8[np.ndarray, "height width 3"]
 
 
 @dataclass(frozen=True)
@@ -48,7 +46,12 @@ class Clock:
 
 
 def read_frames(
-    file: str | Path | ByteReader, steps: Sequence[int], *, where: str, clock: Clock | None = None
+    file: str | Path | ByteReader,
+    steps: Sequence[int],
+    *,
+    where: str,
+    clock: Clock | None = None,
+    times: Sequence[int] | None = None,
 ) -> UInt8[np.ndarray, "time height width 3"]:
     """Return the RGB frames at these positions of a video, in this order; positions may repeat.
 
@@ -59,6 +62,7 @@ def read_frames(
         steps: Positions in display order, from 0; with a clock, its steps.
         where: The file and its episode, for messages.
         clock: The times of the steps, where positions do not identify the frames.
+        times: What `frame_times` returned for the file: of a video with B-frames it reads every packet.
 
     Raises:
         InputError: Not a video, damaged, without such frames, or of a codec that cannot be decoded.
@@ -68,12 +72,32 @@ def read_frames(
     if not steps or min(steps) < 0:
         raise ValueError(f"{where}: steps {list(steps)}")
     with _opened(file, where) as video:
-        targets = video.targets_at(steps) if clock is None else video.targets_by(clock, steps)
-        frames = video.decode(sorted(set(targets)), clock)
+        if clock is None:
+            targets, tolerance = _shown_at(steps, video.times() if times is None else times, where), 0
+        else:
+            targets, tolerance = _shown_by(clock, steps, video.unit_s, where)
+        frames = video.decode(sorted(set(targets)), tolerance)
         if len(sizes := {frame.shape for frame in frames.values()}) > 1:
             found = f"frames of {' and '.join(f'{height}x{width}' for height, width, _ in sorted(sizes))}"
             raise _unusable(where, found, "frames of one size")
         return np.stack([frames[target] for target in targets])
+
+
+def _shown_at(steps: Sequence[int], times: Sequence[int], where: str) -> list[int]:
+    if max(steps) >= len(times):
+        raise _unusable(where, f"{len(times)} frames", f"at least {max(steps) + 1}")
+    if len(set(times)) < len(times):
+        raise _unusable(where, "frames shown at the same time", "a time for each")
+    return [times[step] for step in steps]
+
+
+def _shown_by(clock: Clock, steps: Sequence[int], unit_s: float, where: str) -> tuple[list[int], int]:
+    """Return the times that a clock gives to these steps, and how far from each a frame may be shown."""
+    targets = [round((clock.start_s + step / clock.rate_hz) / unit_s) for step in steps]
+    if len(set(targets)) < len(set(steps)):
+        found = f"times in units of {unit_s:g} s for {clock.rate_hz:g} frames a second"
+        raise _unusable(where, found, "a time for each")
+    return targets, max(0, int(0.49 / clock.rate_hz / unit_s))
 
 
 def count_frames(file: str | Path | ByteReader, *, where: str) -> int:
@@ -84,48 +108,50 @@ def count_frames(file: str | Path | ByteReader, *, where: str) -> int:
         OSError: A file behind a URL cannot be read.
     """
     with _opened(file, where) as video:
-        return len(video.stored_times() if video.is_indexed else video.shown_times())
+        return len(video.stored_times() if video.is_indexed else video.times())
+
+
+def frame_times(file: str | Path | ByteReader, *, where: str) -> list[int]:
+    """Return when each frame of a video is shown, in order, in the video's units of time; errors as `count_frames`."""
+    with _opened(file, where) as video:
+        return video.times()
 
 
 def is_deep_grey(pixel_format: str) -> bool:
     """Return whether a pixel format has one channel of more than 8 bits, such as gray12le: a depth map's."""
-    return _DEEP_GREY.match(pixel_format) is not None
+    return re.match(r"gray(9|1\d|f)", pixel_format) is not None
 
 
 @contextmanager
 def _opened(file: str | Path | ByteReader, where: str) -> Iterator[_Video]:
     """Open a video for decoding in one thread: the loader's workers are the parallelism."""
     av = _library(where)
-    if isinstance(file, (str, Path)) and storage.is_url(file):
-        with closing(storage.open_to_read(file)) as opened, _opened(opened, where) as video:
+    if isinstance(file, (str, Path)):
+        try:
+            opened = storage.open_to_read(file)
+        except OSError as error:
+            if storage.is_url(file):
+                raise
+            raise storage.unreadable(where, error, needed="a whole, undamaged MP4", fix=_FIX) from None
+        with closing(opened), _opened(opened, where) as video:
             yield video
         return
-    if isinstance(file, (str, Path)):
-        _require_readable(file, where)
-    source = f"file:{file}" if isinstance(file, (str, Path)) else QuietFile(file)
+    source = _QuietFile(file)
     try:
-        with av.open(source, format=_DEMUXER, metadata_errors="replace") as container:
-            yield _video_of(container, av.video.reformatter.VideoReformatter(), where)
+        # The demuxer by name: otherwise libav follows playlists to other files.
+        with av.open(source, format="mp4", metadata_errors="replace") as container:
+            yield _Video(container, _stream_of(container, where), av.video.reformatter.VideoReformatter(), where)
     except (av.FFmpegError, InputError) as error:
-        if isinstance(source, QuietFile) and source.error is not None:
+        if source.error is not None:
             raise source.error from None
         if isinstance(error, InputError):
             raise
-        found = f"cannot be read as a video: {error.strerror}"
-        raise _unusable(where, found, "a whole, undamaged MP4") from None
-    if isinstance(source, QuietFile) and source.error is not None:
+        raise _unusable(where, f"cannot be read as a video: {error.strerror}", "a whole, undamaged MP4") from None
+    if source.error is not None:
         raise source.error
 
 
-def _require_readable(path: str | Path, where: str) -> None:
-    """Raise the system's error for a local file, before libav reports it as damage."""
-    try:
-        storage.open_to_read(path).close()
-    except OSError as error:
-        raise storage.unreadable(where, error, needed="a whole, undamaged MP4", fix=_FIX) from None
-
-
-def _video_of(container: InputContainer, converter: VideoReformatter, where: str) -> _Video:
+def _stream_of(container: Any, where: str) -> VideoStream:
     stream = container.streams.best("video")
     if stream is None:
         raise _unusable(where, "no video in the file", "an MP4 with frames")
@@ -136,23 +162,49 @@ def _video_of(container: InputContainer, converter: VideoReformatter, where: str
             needed="H.264, H.265 or AV1",
             fix="Install PyAV from PyPI, or convert the video",
         )
-    video = cast("VideoStream", stream)
-    if is_deep_grey(str(video.pix_fmt)):
-        found = f"frames of {video.pix_fmt}: one channel of more than 8 bits, as depth is stored"
+    if is_deep_grey(str(stream.pix_fmt)):
+        found = f"frames of {stream.pix_fmt}: one channel of more than 8 bits, as depth is stored"
         raise InputError(where=where, found=found, needed="what a camera saw", fix="Name another camera")
     stream.codec_context.thread_count = 1
     stream.codec_context.options = _STRICT
-    return _Video(container, video, converter, where)
+    return cast("VideoStream", stream)
+
+
+class _QuietFile:
+    """A file for libav that seems to end where reading fails: PyAV would print the error and treat it as damage."""
+
+    def __init__(self, file: Any) -> None:
+        self._file = file
+        self.tell = file.tell
+        self.error: Exception | None = None
+
+    def read(self, size: int) -> bytes:
+        if self.error is None:
+            try:
+                return bytes(self._file.read(size))
+            except Exception as error:  # any error is raised again after libav has returned
+                self.error = error
+        return b""
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        try:
+            return int(self._file.seek(offset, whence))
+        except (OSError, ValueError):  # an offset of a damaged file
+            return -1
 
 
 @dataclass(frozen=True)
 class _Video:
     """An open video. Times are in units of the stream; its index has decoding times, not presentation times."""
 
-    container: InputContainer
+    container: Any
     stream: VideoStream
-    converter: VideoReformatter  # one for all frames: creating one takes as long as using it
+    converter: Any  # one for all frames: creating one takes as long as using it
     where: str
+
+    @property
+    def unit_s(self) -> float:
+        return float(self.stream.time_base or 1)
 
     @property
     def is_indexed(self) -> bool:
@@ -163,8 +215,12 @@ class _Video:
         """Return the decoding time of each frame, from the header; it is the presentation time if none is reordered."""
         return [entry.timestamp for entry in self.stream.index_entries if not entry.is_discard]
 
-    def shown_times(self) -> list[int]:
-        """Return the presentation time of each frame, in order; reads the whole file without decoding."""
+    def times(self) -> list[int]:
+        """Return the presentation time of each frame, in order; of reordered ones from every packet of the file."""
+        if self.is_indexed:
+            first = next(self.packets(), None)
+            if first is not None and first.pts == first.dts and not self.stream.codec_context.has_b_frames:
+                return self.stored_times()
         return sorted(int(packet.pts) for packet in self.packets() if packet.pts is not None and not packet.is_discard)
 
     def packets(self, seek_to: int = _START) -> Iterator[Packet[VideoStream]]:
@@ -172,56 +228,33 @@ class _Video:
         self.container.seek(seek_to, stream=self.stream, backward=True)
         yield from (packet for packet in self.container.demux(self.stream) if packet.dts is not None)
 
-    def is_reordered(self) -> bool:
-        """Return whether frames are shown in another order than stored, judged by the start of the file."""
-        first = next(self.packets(), None)
-        return bool(self.stream.codec_context.has_b_frames) or first is None or first.pts != first.dts
-
-    def targets_at(self, steps: Sequence[int]) -> list[int]:
-        """Return the presentation times of the frames at these positions."""
-        in_header = self.is_indexed and not self.is_reordered()
-        times = self.stored_times() if in_header else self.shown_times()
-        if max(steps) >= len(times):
-            raise _unusable(self.where, f"{len(times)} frames", f"at least {max(steps) + 1}")
-        if len(set(times)) < len(times):
-            raise _unusable(self.where, "frames shown at the same time", "a time for each")
-        return [times[step] for step in steps]
-
-    def targets_by(self, clock: Clock, steps: Sequence[int]) -> list[int]:
-        """Return the times that a clock gives to these steps."""
-        times = {step: round((clock.start_s + step / clock.rate_hz) / self._unit_s) for step in steps}
-        if len(set(times.values())) < len(times):
-            found = f"times in units of {self._unit_s:g} s for {clock.rate_hz:g} frames a second"
-            raise _unusable(self.where, found, "a time for each")
-        return [times[step] for step in steps]
-
-    def decode(self, targets: list[int], clock: Clock | None) -> dict[int, UInt8[np.ndarray, "height width 3"]]:
-        """Return the frames shown at these ascending times; with a clock, the first within half a step of each."""
+    def decode(self, targets: list[int], tolerance: int) -> dict[int, Frame]:
+        """Return the frames shown at these ascending times, or the first within the tolerance of each."""
         require_bounded(self.stream.height or 1, self.stream.width or 1, self.where, count=len(targets))
-        wanted = FrameTargets(targets, 0 if clock is None else max(0, int(0.49 / clock.rate_hz / self._unit_s)))
-        while (target := wanted.first) is not None:
-            before = len(wanted.frames)
-            self._decode_run(target, wanted)
-            if len(wanted.frames) == before:
-                needed = f"one for each of {len(targets)} times from {targets[0] * self._unit_s:.3f} s on"
-                raise _unusable(self.where, f"no frame at {target * self._unit_s:.3f} s", needed)
-        return wanted.frames
+        found: dict[int, Frame] = {}
+        while missing := [target for target in targets if target not in found]:
+            self._decode_run(_Targets(missing, tolerance), found)
+            if missing[0] not in found:
+                needed = f"one for each of {len(targets)} times from {targets[0] * self.unit_s:.3f} s on"
+                raise _unusable(self.where, f"no frame at {missing[0] * self.unit_s:.3f} s", needed)
+        return found
 
-    def _decode_run(self, target: int, wanted: FrameTargets) -> None:
-        """Decode from the key frame before a target for as long as that costs less than the next seek."""
+    def _decode_run(self, targets: _Targets, found: dict[int, Frame]) -> None:
+        """Decode from the key frame before the first target for as long as that costs less than the next seek."""
         decoder = self.stream.codec_context
+        sent: set[int | None] = set()
         delay: int | None = None
-        for packet in self._packets_before(target):
+        for packet in self._packets_before(targets.times[0]):
             decoded = int(packet.dts or 0)
             shown = decoded if packet.pts is None else int(packet.pts)
             delay = shown - decoded if delay is None else delay  # of the key frame; all of the file have the same
-            wanted.feed(shown)
-            self._keep(decoder.decode(packet), wanted)
-            if wanted.is_fed(target):
-                following = wanted.next_to_feed
+            sent.add(targets.nearest(shown))
+            self._keep(decoder.decode(packet), targets, found)
+            if targets.times[0] in sent:
+                following = next((time for time in targets.times if time not in sent), None)
                 if following is None or self._key_frame_before(following - delay) > decoded + int(packet.duration or 0):
                     break
-        self._keep(decoder.decode(None), wanted)
+        self._keep(decoder.decode(None), targets, found)
 
     def _packets_before(self, target: int) -> Iterator[Packet[VideoStream]]:
         """Yield packets from the last key frame that is shown no later than the target."""
@@ -241,20 +274,29 @@ class _Video:
         place = self.stream.index_entries.search_timestamp(time, backward=True, any_frame=False)
         return int(self.stream.index_entries[place].timestamp) if place >= 0 else _START
 
-    def _keep(self, frames: Sequence[VideoFrame], wanted: FrameTargets) -> None:
+    def _keep(self, frames: Sequence[VideoFrame], targets: _Targets, found: dict[int, Frame]) -> None:
         for frame in frames:
-            target = None if frame.pts is None else wanted.target_of(int(frame.pts))
-            if target is None or target in wanted.frames:
+            target = None if frame.pts is None else targets.nearest(int(frame.pts))
+            if target is None or target in found:
                 continue
             if frame.is_corrupt:
-                raise _unusable(self.where, f"a damaged frame at {target * self._unit_s:.3f} s", "a whole MP4")
-            require_bounded(frame.height, frame.width, self.where, count=wanted.count)
-            converted = self.converter.reformat(frame, format="rgb24", threads=1)
-            wanted.frames[target] = np.asarray(converted.to_ndarray())
+                raise _unusable(self.where, f"a damaged frame at {target * self.unit_s:.3f} s", "a whole MP4")
+            require_bounded(frame.height, frame.width, self.where, count=len(targets.times))
+            found[target] = np.asarray(self.converter.reformat(frame, format="rgb24", threads=1).to_ndarray())
 
-    @property
-    def _unit_s(self) -> float:
-        return float(self.stream.time_base or 1)
+
+@dataclass(frozen=True)
+class _Targets:
+    """Ascending times whose frames are wanted."""
+
+    times: list[int]
+    tolerance: int  # how far from a target a frame's time may lie
+
+    def nearest(self, time: int) -> int | None:
+        """Return the first target within the tolerance of a time, or None."""
+        place = bisect_left(self.times, time - self.tolerance)
+        matches = place < len(self.times) and self.times[place] <= time + self.tolerance
+        return self.times[place] if matches else None
 
 
 def _unusable(where: str, found: str, needed: str) -> InputError:

@@ -1,8 +1,8 @@
-"""Video files that every player shows: H.264 in an MP4, written completely or not at all."""
+"""Films that every player and page shows: H.264 in an MP4, or a GIF; written completely or not at all."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,8 @@ from vjepa2_ac.errors import InputError, pip_install
 from vjepa2_ac.storage import atomic_writer
 
 _QUALITY = "20"  # x264's constant rate factor: text stays sharp
+_COLOURS = 255  # of a GIF
+_SAMPLED = 4  # every so many-th pixel decides about the palette
 
 
 def write_video(path: str | Path, frames: Iterable[UInt8[np.ndarray, "height width 3"]], *, rate_hz: float) -> Path:
@@ -59,9 +61,36 @@ def video_library() -> Any:
     try:
         import av
     except ImportError:
-        raise InputError(
-            where="video",
-            found="PyAV, which writes videos, is not installed",
-            fix=f"Run `{pip_install('video')}`, or ask for no video",
-        ) from None
+        found, fix = "PyAV, which writes videos, is not installed", f"Run `{pip_install('video')}`, or ask for no video"
+        raise InputError(where="video", found=found, fix=fix) from None
     return av
+
+
+def write_gif(
+    path: str | Path, frames: Sequence[UInt8[np.ndarray, "height width 3"]], *, seconds: Sequence[float]
+) -> Path:
+    """Write RGB frames as an endless GIF, and return its path.
+
+    Colours are rounded to 255 without dithering, which would flicker and take several times the room.
+
+    Args:
+        path: A local file; missing folders are created.
+        frames: Of one size, at least one.
+        seconds: How long each is shown; GIFs know hundredths.
+
+    Raises:
+        ValueError: No frames, of different sizes, or other than one duration for each.
+    """
+    from PIL import Image
+
+    if not frames or len({frame.shape for frame in frames}) > 1 or len(seconds) != len(frames):
+        raise ValueError(f"{len(frames)} frames of one size, and {len(seconds)} durations")
+    sample = np.concatenate([frame[::_SAMPLED, ::_SAMPLED].reshape(-1, 3) for frame in frames])
+    palette = Image.fromarray(sample[None]).quantize(_COLOURS)
+    images = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    milliseconds = [max(20, round(100 * one) * 10) for one in seconds]
+    with atomic_writer(path) as file:
+        images[0].save(
+            file, "GIF", save_all=True, append_images=images[1:], duration=milliseconds, loop=0, optimize=True
+        )
+    return Path(path)

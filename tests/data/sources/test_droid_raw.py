@@ -3,22 +3,21 @@
 import pickle
 import re
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 import pytest
-import simplejpeg
 
 from gcs import Gcs
 from recordings import write_mp4, write_raw_droid
-from synthetic import draw_frame, synthetic_episode, synthetic_states
+from synthetic import draw_frame, synthetic_states
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.droid_raw.source import RawDroidSource
 from vjepa2_ac.errors import InputError, UnreachableError
-from vjepa2_ac.geometry import actions_from_states
+from vjepa2_ac.media import video_reader
 
 STEPS, SIZE = 24, (72, 128)
 LEFT, RIGHT, WRIST = "23404442", "29838012", "16787047"
@@ -59,17 +58,6 @@ def test_an_episode_holds_the_measured_states_its_task_and_its_outcome(tree: Pat
     episode = raw.read(1)
     np.testing.assert_array_equal(episode.states, STATES)
     assert (episode.control_rate_hz, episode.metadata) == (15.0, {"language": "move to place 0"})
-
-
-def test_frames_and_actions_equal_those_of_rlds_within_what_the_codecs_lose(tree: Path) -> None:
-    drawn = synthetic_episode(0, steps=STEPS, size=SIZE)
-    pictures = np.stack([simplejpeg.decode_jpeg(jpeg) for jpeg in drawn.images["exterior_image_1_left"]])
-    episode = source(tree).read(1)
-    states = np.concatenate([drawn.observation.cartesian_position, drawn.observation.gripper_position], axis=1)
-    np.testing.assert_array_equal(actions_from_states(episode.states), actions_from_states(states))
-    steps = [5, 0, 23, 5]
-    assert psnr(episode.read_frames(steps), pictures[steps]) > 30
-    assert psnr(episode.read_frames([5]), pictures[[8]]) < 30
 
 
 def test_every_camera_is_found_by_its_name_or_serial_number(tmp_path: Path) -> None:
@@ -148,6 +136,29 @@ def test_what_was_found_out_is_kept_until_a_file_changes(tmp_path: Path, monkeyp
     assert source(tmp_path).infos()[0].num_steps == STEPS - 1
 
 
+@pytest.mark.parametrize("b_frames", [0, 2])
+def test_an_episode_is_parsed_and_its_video_walked_once_on_a_machine(
+    tmp_path: Path, b_frames: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write(tmp_path / "raw", pictures={LEFT: FRAMES[LEFT]}, b_frames=b_frames)
+    cache = {"dir": str(tmp_path / "cache")}
+    first = source(tmp_path / "raw", disk_cache=cache).read(0)
+    frames = first.read_frames([3, 17])
+    monkeypatch.setattr(h5py.h5f, "open_file_image", lambda _: pytest.fail("parsed again"))
+    packets, walked = video_reader._Video.packets, []
+
+    def counted(self: video_reader._Video, *given: int) -> Iterator[object]:
+        for packet in packets(self, *given):
+            walked.append(packet.pts)
+            yield packet
+
+    monkeypatch.setattr(video_reader._Video, "packets", counted)
+    again = source(tmp_path / "raw", disk_cache=cache).read(0)
+    np.testing.assert_array_equal(again.states, first.states)
+    np.testing.assert_array_equal(again.read_frames([3, 17]), frames)
+    assert len(walked) < STEPS
+
+
 def test_a_source_travels_to_a_worker(tree: Path) -> None:
     raw, here = pickle.loads(pickle.dumps(source(tree))), source(tree)  # noqa: S301 - our own
     reader = pickle.loads(pickle.dumps(raw.read(1).read_frames))  # noqa: S301
@@ -189,24 +200,16 @@ BROKEN = {
     "no metadata": (lambda folder: next(folder.glob("*.json")).unlink(), "metadata"),
     "no video": (lambda folder: (folder / MP4).unlink(), f"{LEFT}.mp4: no such file"),
     "no key": (put(GRIPPER, None), "gripper_position: no such array"),
-    "wrong shape": (put(POSE, STATES[:, :5]), r"shape \(24, 5\)"),
     "text for numbers": (put(POSE, np.full((STEPS, 6), b"x")), "kind"),
-    "group for an array": (lambda folder: put(f"{POSE}/x", STATES)(put(POSE, None)(folder) or folder), "shape"),
-    "shorter gripper": (put(GRIPPER, STATES[:-1, 6]), r"shape \(23,\)"),
+    "shorter gripper": (put(GRIPPER, STATES[:-1, 6]), "gripper: 23 of 24 steps"),
     "no steps": (put(POSE, np.zeros((0, 6))), "no steps"),
     "not a number": (put(POSE, ONE_NAN), "step 3"),
-    "not a number for a camera": (put(f"observation/camera_extrinsics/{LEFT}_left", ONE_NAN), "step 3"),
     "out of reach": (put(POSE, STATES[:, :6] + [6, 0, 0, 0, 0, 0]), "5 m"),
-    "gripper outside its range": (put(GRIPPER, STATES[:, 6] * 0 + 1.2), "gripper"),
     "all steps skipped": (put("observation/timestamp/skip_action", np.ones(STEPS, bool)), "no steps"),
     "cut trajectory": (cut("trajectory.h5", 0.5), "trajectory.h5: .*HDF5"),
-    "empty trajectory": (cut("trajectory.h5", 0.0), "trajectory.h5: 0 bytes"),
     "cut metadata": (cut("*.json", 0.5), "not JSON"),
-    "metadata of another kind": (lambda folder: next(folder.glob("*.json")).write_text("[]"), "a JSON list"),
     "no such camera": (lambda folder: next(folder.glob("*.json")).write_text("{}"), "left_mp4_path"),
     "cut video": (cut(MP4, 0.5), f"{LEFT}.mp4"),
-    "empty video": (cut(MP4, 0.0), f"{LEFT}.mp4"),
-    "no video in it": (lambda folder: (folder / MP4).write_text("a page that says 404" * 99), f"{LEFT}.mp4"),
     "video two frames short": (lambda folder: write_mp4(folder / MP4, FRAMES[LEFT][:-2]), "but 22 frames"),
 }  # fmt: skip
 
@@ -231,11 +234,6 @@ def test_two_episodes_of_one_identity_are_a_problem(tree: Path, tmp_path: Path) 
     infos = source(tmp_path).infos()
     assert len(infos) == 2
     assert [problem.name for problem in infos.problems] == [info.id for info in infos]
-
-
-def test_no_episodes_are_an_error_that_says_where_they_are(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"no episodes under .*droid_raw"):
-        source(tmp_path / "nothing").infos()
 
 
 def test_a_video_that_was_cut_after_indexing_is_named(tmp_path: Path) -> None:
@@ -300,10 +298,3 @@ def test_a_video_in_the_cloud_that_became_shorter_is_no_frame(noisy: Path, gcs: 
     gcs.put(f"bucket/raw/{PLACE}/{MP4}", (noisy / PLACE / MP4).read_bytes()[:900_000])
     with pytest.raises((InputError, OSError), match=f"{LEFT}.mp4"):
         frames([80])
-
-
-def test_a_network_that_is_down_is_not_a_broken_episode(tree: Path, gcs: Gcs, tmp_path: Path) -> None:
-    url = gcs.upload(tree, "bucket/droid_raw")
-    gcs.fail_next(503, times=99, match="trajectory.h5|mp4")
-    with pytest.raises(UnreachableError):
-        source(url, disk_cache={"dir": str(tmp_path)}).infos()

@@ -67,12 +67,6 @@ def test_a_data_set_on_the_hub_is_the_one_that_was_written(
 
 
 @pytest.mark.parametrize("version", ["v30", "v21"])
-def test_the_index_reads_nothing_but_what_lies_in_meta(version: str, hub: Hub, tmp_path: Path) -> None:
-    source_of(version, tmp_path).infos()
-    assert {path.split("/")[0] for path, _, _ in hub.ranges} == {"meta"}
-
-
-@pytest.mark.parametrize("version", ["v30", "v21"])
 def test_a_bucket_gives_the_same(version: str, folder: Path, gcs: Gcs, tmp_path: Path) -> None:
     far = source_of(gcs.upload(folder / version, f"robots/{version}"), tmp_path)
     here = LeRobotSource(DataConfig(source="lerobot", path=str(folder / version)))
@@ -138,21 +132,7 @@ def test_a_passing_fault_is_tried_again(hub: Hub, tmp_path: Path, monkeypatch: p
     hub.faults += [503] * 3
     with pytest.raises(UnreachableError, match=r"hf://datasets/lab/v30/data/.*3 attempts"):
         source.read(4)
-    hub.faults, hub.faulty = [503] * 3, ".mp4"
-    with pytest.raises(UnreachableError, match=r"hf://datasets/lab/v30/videos/.*3 attempts"):
-        source.read(4).read_frames([1])
     assert not hub.faults
-
-
-def test_what_the_network_did_is_never_booked_as_a_broken_episode(
-    hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(retries, "DEFAULT", retries.RetryPolicy(attempts=2, first_wait_s=0.001))
-    hub.faults, hub.faulty = [503] * 2, "episode_000002.parquet"
-    source = source_of("v21", tmp_path, outcome="success", connections=1)
-    with pytest.raises(UnreachableError, match="episode_000002"):
-        source.infos()
-    assert len(source.infos()) == 5, "it is asked again"
 
 
 def test_a_data_set_that_is_not_there_says_how_to_log_in(hub: Hub, tmp_path: Path) -> None:

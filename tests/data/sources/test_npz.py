@@ -1,5 +1,6 @@
 """.npz episodes: any robot as plain arrays."""
 
+import io
 import pickle
 import shutil
 from collections.abc import Callable
@@ -10,12 +11,11 @@ import numpy as np
 import pytest
 
 from gcs import Gcs
-from synthetic import draw_frame, synthetic_episode, synthetic_states
+from synthetic import draw_frame, synthetic_states
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.sources.npz.source import NpzSource
+from vjepa2_ac.data.sources.npz import NpzSource
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.geometry import actions_from_states
 
 STEPS, SIZE = 20, (36, 64)
 STATES = synthetic_states(STEPS)
@@ -50,54 +50,29 @@ def test_an_episode_is_what_was_written(tmp_path: Path, compressed: bool) -> Non
     assert episode.joint_velocities is None
 
 
-def test_states_and_actions_equal_those_of_rlds(tmp_path: Path) -> None:
-    measured = synthetic_episode(0, steps=STEPS, size=SIZE).observation
-    write(tmp_path / "one.npz")
-    states = np.concatenate([measured.cartesian_position, measured.gripper_position], axis=1)
-    np.testing.assert_array_equal(actions_from_states(source(tmp_path).read(0).states), actions_from_states(states))
-
-
-def test_a_camera_has_its_own_poses_or_those_of_all(tmp_path: Path) -> None:
+def test_a_camera_has_its_own_poses_or_those_of_all_and_commands_are_read(tmp_path: Path) -> None:
     moving = np.arange(STEPS * 6.0).reshape(STEPS, 6)
-    write(tmp_path / "one.npz", wrist=WRIST, extrinsics=np.arange(6.0), extrinsics_wrist=moving)
+    more = {"extrinsics": np.arange(6.0), "extrinsics_wrist": moving, "joint_velocities": STATES}
+    write(tmp_path / "one.npz", wrist=WRIST, **more)
     plain = source(tmp_path, pose_frame="camera")
     np.testing.assert_array_equal(plain.read(0).extrinsics, np.tile(np.arange(6.0), (STEPS, 1)))
     np.testing.assert_array_equal(plain.read(0, "wrist").extrinsics, moving)
-
-
-def test_joint_velocities_reach_the_idle_filter(tmp_path: Path) -> None:
-    velocities = np.arange(STEPS * 7.0).reshape(STEPS, 7)
-    write(tmp_path / "one.npz", joint_velocities=velocities)
-    np.testing.assert_array_equal(source(tmp_path).read(0).joint_velocities, velocities)
-
-
-class CountedFile:
-    """Notes how much is read of it."""
-
-    def __init__(self, path: str | Path) -> None:
-        self.file, self.count = Path(path).open("rb"), 0  # noqa: SIM115 - closed by its reader
-
-    def read(self, size: int = -1) -> bytes:
-        data = self.file.read(size)
-        self.count += len(data)
-        return data
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.file, name)
+    np.testing.assert_array_equal(plain.read(0).joint_velocities, STATES)
 
 
 def test_of_a_plain_file_only_the_asked_frames_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write(tmp_path / "one.npz")
     episode = source(tmp_path).read(0)
-    opened: list[CountedFile] = []
+    read: list[int] = []
 
-    def open_counted(path: str | Path) -> CountedFile:
-        opened.append(CountedFile(path))
-        return opened[-1]
+    class CountedFile(io.FileIO):
+        def readinto(self, buffer: Any) -> int:
+            read.append(count := super().readinto(buffer) or 0)
+            return count
 
-    monkeypatch.setattr(storage, "open_to_read", open_counted)
+    monkeypatch.setattr(storage, "open_to_read", lambda path: io.BufferedReader(CountedFile(path)))
     episode.read_frames([5, 6])
-    assert sum(file.count for file in opened) < FRAMES[:2].nbytes + 16384 < FRAMES.nbytes / 2
+    assert sum(read) < FRAMES[:2].nbytes + 4 * io.DEFAULT_BUFFER_SIZE < FRAMES.nbytes / 2
 
 
 def test_a_source_travels_to_a_worker(tmp_path: Path) -> None:
@@ -128,11 +103,6 @@ def test_a_file_that_changed_after_indexing_is_named(tmp_path: Path) -> None:
         plain.read(0)
 
 
-def test_states_may_lie_in_columns(tmp_path: Path) -> None:
-    write(tmp_path / "one.npz", states=np.asfortranarray(STATES))
-    np.testing.assert_array_equal(source(tmp_path).read(0).states, STATES)
-
-
 def cut(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-200])
 
@@ -147,28 +117,22 @@ NAN = np.where(np.arange(STEPS)[:, None] == 3, np.nan, STATES)
 
 BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
     "no states": (lambda path: write(path, without="states"), "states: no such array"),
-    "no rate": (lambda path: write(path, without="fps_hz"), "fps_hz: no such array"),
     "no rate worth the name": (lambda path: write(path, fps_hz=0.0), "fps_hz: 0"),
-    "another rate": (lambda path: write(path, fps_hz=30.0), "fps_hz: 30. needed: 15"),
+    "another rate": (lambda path: write(path, fps_hz=30.0), "30 steps a second.*needed: 15 steps a second"),
     "no such camera": (lambda path: write(path, without="frames", wrist=WRIST), "frames: no such array"),
     "too few frames": (lambda path: write(path, frames=FRAMES[:-1]), r"frames: shape \(19, 36, 64, 3\)"),
     "float frames": (lambda path: write(path, frames=FRAMES / 255), "frames: shape .* float64"),
-    "wide frames": (lambda path: write(path, frames=FRAMES.astype(np.uint16)), "frames of uint16"),
-    "grey frames": (lambda path: write(path, frames=FRAMES[..., 0]), "frames: shape"),
     "pickled frames": (lambda path: write(path, frames=np.array([{}, []], object)), "frames: .*objects"),
     "turned frames": (
         lambda path: write(path, frames=np.asfortranarray(FRAMES)),
-        r"frames: an array in Fortran order.*needed: C order.*ascontiguousarray",
+        r"frames: frames in Fortran order.*needed: C order.*ascontiguousarray",
     ),
     "states of another width": (lambda path: write(path, states=STATES[:, :6]), r"states: shape \(20, 6\)"),
     "no steps": (lambda path: write(path, states=STATES[:0], frames=FRAMES[:0]), "no steps"),
     "not a number": (lambda path: write(path, states=NAN), "step 3"),
-    "out of reach": (lambda path: write(path, states=STATES + 6), "5 m"),
-    "gripper outside its range": (lambda path: write(path, states=STATES + np.eye(7)[6] * 2), "gripper"),
     "poses of another length": (lambda path: write(path, extrinsics=NAN[:4, :6]), r"extrinsics: shape \(4, 6\)"),
     "numbers for words": (lambda path: write(path, language=3), "language: shape"),
     "cut": (cut, "one.npz: cannot be read"),
-    "empty": (lambda path: path.write_bytes(b""), "one.npz: cannot be read"),
     "not an archive": (lambda path: path.write_text("<html>404</html>" * 99), "one.npz: cannot be read"),
     "a flipped bit in the states": (flip_in_states, "states: cannot be read .*CRC"),
 }
@@ -216,20 +180,6 @@ def test_an_identity_may_be_long_and_of_any_letters(tmp_path: Path) -> None:
     made, kept = source(tmp_path).infos(), source(tmp_path).infos()
     assert [info.id for info in made] == [info.id for info in kept] == [name]
     assert kept.find(name) == 0
-
-
-def test_a_folder_without_episodes_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"no \.npz files"):
-        source(tmp_path).infos()
-
-
-def test_a_folder_in_the_cloud_reads_as_here(tmp_path: Path, gcs: Gcs) -> None:
-    for name in ("one", "two"):
-        write(tmp_path / f"{name}.npz")
-    plain = source(gcs.upload(tmp_path, "bucket/own"))
-    assert [info.id for info in plain.infos()] == ["one", "two"]
-    np.testing.assert_array_equal(plain.read(1).states, STATES)
-    np.testing.assert_array_equal(plain.read(1).read_frames([3, 2]), FRAMES[[3, 2]])
 
 
 def test_of_a_file_in_the_cloud_nothing_is_fetched_twice(tmp_path: Path, gcs: Gcs) -> None:

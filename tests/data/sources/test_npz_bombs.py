@@ -11,9 +11,8 @@ import pytest
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.index import EpisodeTable
-from vjepa2_ac.data.sources.npz.source import NpzSource
+from vjepa2_ac.data.sources.npz import NpzSource
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage.npz_reader import NpzFile
 
 STEPS = 20
 ARRAYS = {
@@ -51,26 +50,22 @@ BOMBS: dict[str, tuple[Callable[[Path], None], str]] = {
     ),
     "a text without end": (
         lambda path: add(without(path, ""), "language", described((), f"<U{4 * _MB}"), 16 * _MB),
-        r"language: 4,194,304 letters\. needed: at most 65,536",
+        r"language: a text of 16,777,216 bytes\. needed: at most 262,144",
     ),
     "a head without end": (
         lambda path: add(without(path, "states"), "states", described((STEPS, 7), "<f8", claimed=32 * _MB), 32 * _MB),
-        r"states: cannot be read \(a header of 33,554,432 bytes\)",
+        r"states: cannot be read \(an array in another format",
     ),
     "a packing without a bound": (
         lambda path: add(
             without(path, "frames"), "frames", described((STEPS, 999, 999, 3), "|u1"), STEPS * 999 * 999 * 3,
             zipfile.ZIP_BZIP2,
         ),
-        "frames: cannot be read .*in another way than numpy",
+        "frames: no such array",
     ),
     "frames that are not there": (
         lambda path: add(without(path, "frames"), "frames", described((STEPS, 4_000_000, 4_000_000, 3), "|u1"), 1000),
         "frames: cannot be read .*in 1128 bytes",
-    ),
-    "sizes below nothing": (
-        lambda path: add(without(path, "states"), "states", described((-1, 7), "<f8"), 1000),
-        "states: cannot be read",
     ),
     "rows of nothing": (
         lambda path: add(without(path, "states"), "states", described((1 << 40, 0), "<f8"), 0),
@@ -102,13 +97,3 @@ def test_what_claims_more_than_an_episode_holds_is_refused_before_it_is_unpacked
     with pytest.raises(InputError, match=message):
         raise InputError(where=problem.where, found=problem.found, needed=problem.needed, fix=problem.fix)
     assert peak < 6 * _MB
-
-
-def test_an_archive_of_very_many_members_is_an_archive(tmp_path: Path) -> None:
-    path = without(tmp_path / "many.npz", "")
-    with zipfile.ZipFile(path, "a") as archive:
-        for number in range(2000):
-            archive.writestr(f"{number}.npy", b"")
-    with path.open("rb") as file:
-        assert len(NpzFile(file, "many").names) == 2003
-        np.testing.assert_array_equal(NpzFile(file, "many").array("states"), ARRAYS["states"])

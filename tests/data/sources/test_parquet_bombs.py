@@ -9,9 +9,10 @@ import pytest
 from pyarrow import parquet as pq
 
 from paths import GOLDEN
-from vjepa2_ac.data.sources.lerobot import bounds, parquet
+from vjepa2_ac.data.sources.lerobot import parquet
 from vjepa2_ac.data.sources.lerobot.parquet import ParquetRows, read_table
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage.block_file import DiskCache
 
 _MB = 1 << 20
 STATE = "observation.state"
@@ -40,16 +41,24 @@ def test_texts_that_repeat_without_end_are_refused_before_python_has_them(
     assert read_table(str(path), str(path), lambda name: name == "length") == {"length": list(range(3000))}
 
 
-def test_a_footer_that_contradicts_itself_is_damage_and_does_not_end_the_process() -> None:
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("contradicting_footer", "Definition level histogram"),
+        ("mistyped_footer", "ColumnMetaData type does not match"),
+    ],
+)
+def test_a_footer_that_contradicts_itself_is_damage_and_does_not_end_the_process(
+    name: str, message: str, tmp_path: Path
+) -> None:
     """Asked for this column's account in the footer, pyarrow 26 would abort this very process."""
-    path = str(GOLDEN / "contradicting_footer.parquet")
-    rows = ParquetRows(lambda name: name, ["observation.state.cartesian_position", "action.joint_velocity"])
-    with pytest.raises(InputError, match=r"contradicting_footer\.parquet: damaged: Definition level histogram"):
-        rows.rows(path, 0)
+    columns = ("frame_index", "timestamp", "observation.state.cartesian_position", "action.joint_velocity")
+    with pytest.raises(InputError, match=rf"{name}\.parquet: damaged: {message}"):
+        rows_of(tmp_path, *columns).rows(str(GOLDEN / f"{name}.parquet"), 0)
 
 
-def rows_of(_: Path) -> ParquetRows:
-    return ParquetRows(lambda name: name, [STATE])
+def rows_of(path: Path, *columns: str) -> ParquetRows:
+    return ParquetRows(str, columns or [STATE], DiskCache(path, 0), "")
 
 
 def write(path: Path, rows: int, width: int = 7, row_group: int | None = None) -> Path:
@@ -61,19 +70,8 @@ def write(path: Path, rows: int, width: int = 7, row_group: int | None = None) -
 def test_lists_without_end_are_refused_by_what_the_footer_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write(tmp_path / "rows.parquet", 10, width=70)
     assert rows_of(path).rows(str(path), 0)[STATE].shape == (10, 70)
-    monkeypatch.setattr(bounds, "MOST_NUMBERS", 600)
+    monkeypatch.setattr(parquet, "MOST_NUMBERS", 600)
     with pytest.raises(InputError, match=r"observation\.state.*: 700 numbers in a row group\. needed: at most 600"):
-        rows_of(path).rows(str(path), 0)
-
-
-@pytest.mark.parametrize("row_group", [None, 30])
-def test_rows_without_end_are_refused_in_one_group_and_in_many(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, row_group: int | None
-) -> None:
-    path = write(tmp_path / "rows.parquet", 100, row_group=row_group)
-    assert len(rows_of(path).rows(str(path), 0)[STATE]) == 100
-    monkeypatch.setattr(bounds, "MOST_ROWS", 50)
-    with pytest.raises(InputError, match=r"damaged: row groups of \[(60|100)\] rows"):
         rows_of(path).rows(str(path), 0)
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Generic, TypeVar
@@ -15,9 +17,13 @@ from jaxtyping import UInt8
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.cache import EpisodeFiles
-from vjepa2_ac.data.index import EpisodeTable
+from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable
+from vjepa2_ac.data.selection import as_error, as_problem
+from vjepa2_ac.data.sources.listing import in_parallel
 from vjepa2_ac.episode import EpisodeInfo, Progress, no_progress
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage.block_file import DiskCache
+from vjepa2_ac.storage.npz_reader import read_arrays
 
 
 @dataclass(frozen=True)
@@ -29,6 +35,7 @@ class Opened:
 
 Config = TypeVar("Config", bound=DataConfig)
 State = TypeVar("State", bound=Opened)
+Found = TypeVar("Found")
 
 
 class IndexedSource(ABC, Generic[Config, State]):
@@ -69,6 +76,41 @@ class IndexedSource(ABC, Generic[Config, State]):
             if self._known is None:
                 self._known = self._look(progress)
             return self._known
+
+    def _scanned(
+        self, scan: Callable[[str], Found], identities: Mapping[str, str], progress: Progress
+    ) -> tuple[list[tuple[str, Found]], list[EpisodeProblem]]:
+        """Return the identity and content of every episode that can be used, and the problems of the others.
+
+        Args:
+            scan: Reads an episode, given by its key among the identities.
+            identities: Of the episodes.
+            progress: Called after each.
+
+        Raises:
+            InputError: No episode can be used: the first one's error.
+            OSError: Data behind a URL cannot be read.
+        """
+
+        def scan_one(key: str) -> Found | EpisodeProblem:
+            try:
+                return scan(key)
+            except InputError as error:
+                return as_problem(error, identities[key])
+
+        found: list[tuple[str, Found]] = []
+        problems: list[EpisodeProblem] = []
+        for identity, one in zip(
+            identities.values(), in_parallel(scan_one, [*identities], self._connections), strict=True
+        ):
+            if isinstance(one, EpisodeProblem):
+                problems.append(one)
+            else:
+                found.append((identity, one))
+            progress(len(found) + len(problems), len(identities))
+        if not found:
+            raise as_error(problems[0])
+        return found, problems
 
     @abstractmethod
     def _look(self, progress: Progress) -> State:
@@ -111,3 +153,18 @@ def require_as_indexed(found: int, info: EpisodeInfo, where: str) -> None:
     if found != info.num_steps:
         needed, fix = f"the {info.num_steps} that were indexed", "Do not change files while a run reads them"
         raise InputError(where=where, found=f"{found} steps", needed=needed, fix=fix)
+
+
+def stored_arrays(cache: DiskCache, key: str) -> dict[str, np.ndarray] | None:
+    """Return the arrays that `store_arrays` wrote; None if there are none, or they are damaged."""
+    data = cache.read(key)
+    with suppress(InputError):
+        return None if data is None else read_arrays(data)
+    return None
+
+
+def store_arrays(cache: DiskCache, key: str, arrays: Mapping[str, np.ndarray]) -> None:
+    """Keep what was parsed of an episode on this machine, within the limit of the disk cache."""
+    content = io.BytesIO()
+    np.savez(content, **arrays)  # type: ignore[arg-type] # none is called allow_pickle
+    cache.write(key, content.getvalue())

@@ -4,27 +4,29 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import PurePosixPath
+from typing import Any
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, Shaped, UInt8
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import RawDroidData
 from vjepa2_ac.config.section import Affects, knobs_that_affect
+from vjepa2_ac.config.sources import RAW_CAMERAS
+from vjepa2_ac.data.cache import fetched_data
 from vjepa2_ac.data.index import (
     EpisodeProblem,
     EpisodeTable,
-    IndexKeys,
     get_or_build,
     hash_of_states,
+    index_key,
     key_of,
     labels_of,
 )
-from vjepa2_ac.data.index.packed_text import pack_texts, text_of
-from vjepa2_ac.data.selection import as_error, as_problem
 from vjepa2_ac.data.sources.droid_raw.episode_folders import (
     TRAJECTORY,
     VIDEOS,
@@ -34,29 +36,45 @@ from vjepa2_ac.data.sources.droid_raw.episode_folders import (
     list_episode,
     success_of,
 )
-from vjepa2_ac.data.sources.droid_raw.metadata import DroidMetadata
-from vjepa2_ac.data.sources.droid_raw.trajectory import Trajectory, parse_trajectory
-from vjepa2_ac.data.sources.indexed_source import FramesByStep, IndexedSource, Opened, require_as_indexed
-from vjepa2_ac.data.sources.listing import in_parallel
+from vjepa2_ac.data.sources.indexed_source import (
+    FramesByStep,
+    IndexedSource,
+    Opened,
+    require_as_indexed,
+    store_arrays,
+    stored_arrays,
+)
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
-from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.video_reader import count_frames, read_frames
-from vjepa2_ac.spaces import POSE
+from vjepa2_ac.errors import InputError, require_library
+from vjepa2_ac.media.video_reader import count_frames, frame_times, read_frames
+from vjepa2_ac.spaces import POSE, zero_steps
+from vjepa2_ac.storage.block_file import DiskCache
 from vjepa2_ac.storage.structured import json_object
 
 logger = logging.getLogger(__name__)
 
 _FIX = "Copy the episode again"
+_MOST_STEPS = 1_000_000  # a damaged header may claim any number
+_REQUIRED = {
+    "pose": ("observation/robot_state/cartesian_position", 6),
+    "gripper": ("observation/robot_state/gripper_position", 1),
+}
+_OPTIONAL = {
+    "skipped": ("observation/timestamp/skip_action", 1),  # the operator was not in control
+    "velocities": ("action/joint_velocity", 7),  # commanded
+}
+
+Arrays = Mapping[str, Shaped[np.ndarray, "steps *numbers"]]  # pose, gripper ...: of control steps
 
 
 @dataclass(frozen=True)
 class _Place:
-    """Location of an episode, and the inputs of its index entry."""
+    """Location of an episode, and what its metadata and videos say."""
 
     folder: str
-    metadata: str
     version: str
-    pictures: dict[str, int]  # number of frames of each of the config's cameras, by serial number
+    serials: dict[str, str]  # of each camera that the metadata name
+    frames: dict[str, int]  # how many the MP4 of each of the config's cameras has, by serial number
 
 
 @dataclass(frozen=True)
@@ -74,7 +92,8 @@ class RawDroidSource(IndexedSource[RawDroidData, Opened]):
 
     `infos` reads every trajectory and the headers of the MP4s of the config's cameras, once; data behind a URL is not
     checked again until folders are added or removed. An episode's identity is LAB/outcome/DATE/TIME
-    (`episode_folders.identity_of`).
+    (`episode_folders.identity_of`). The numbers of a trajectory and the times of a video's frames are kept in the disk
+    cache, so that HDF5 is parsed, and the packets of a video with B-frames are read, once on a machine.
 
     An MP4 holds one frame per control step, in order, whatever rate its header states, and may lack the last step's.
     """
@@ -87,27 +106,39 @@ class RawDroidSource(IndexedSource[RawDroidData, Opened]):
             OSError: Data behind a URL cannot be read.
         """
         table = self.infos()
-        info, place = table[index], _Place(**json_object(text_of("place", table.locators, index), where="the index"))
-        metadata = self._metadata(place)
-        serial = metadata.serial(camera or self._config.cameras[0])
-        trajectory = self._trajectory(place, (serial,))
-        require_as_indexed(len(trajectory.states), info, self._path(place.folder, TRAJECTORY))
+        info, place = table[index], _Place(**json_object(table.locators["place"][index].decode(), where="the index"))
+        serial = _serial(place.serials, camera or self._config.cameras[0], info.id)
+        numbers = self._numbers(place, (serial,))
+        states = _states_of(numbers)
+        require_as_indexed(len(states), info, self._path(place.folder, TRAJECTORY))
         video = self._path(place.folder, f"{VIDEOS}/{serial}.mp4")
+        tasks = table.labels.get("task")
+        task = None if tasks is None else tasks.of_episode(index)
+        frames = partial(self._frames, video, place.version, numbers["frame"].tolist())
         return Episode(
             info=info,
-            states=trajectory.states,
-            read_frames=FramesByStep(info.num_steps, video, partial(self._frames, video, place.version, trajectory)),
+            states=states,
+            read_frames=FramesByStep(info.num_steps, video, frames),
             control_rate_hz=self._config.droid_raw.control_rate_hz,
-            extrinsics=trajectory.extrinsics[serial],
-            joint_velocities=trajectory.joint_velocities,
-            metadata={} if metadata.language is None else {"language": metadata.language},
+            extrinsics=numbers.get(serial),
+            joint_velocities=numbers.get("velocities"),
+            metadata={} if task is None else {"language": task},
         )
 
+    @cached_property
+    def _cache(self) -> DiskCache:
+        return fetched_data(self._config.disk_cache)
+
     def _frames(
-        self, video: str, version: str, trajectory: Trajectory, steps: Sequence[int]
+        self, video: str, version: str, frames: Sequence[int], steps: Sequence[int]
     ) -> UInt8[np.ndarray, "time height width 3"]:
-        places = trajectory.frame_places[list(steps)].tolist()
-        return read_frames(self._files.open(video, version=version), places, where=video)
+        key = f"times {video} {version}"
+        known = stored_arrays(self._cache, key)
+        if known is None:
+            times = frame_times(self._files.open(video, version=version), where=video)
+            store_arrays(self._cache, key, known := {"times": np.array(times, np.int64)})
+        opened = self._files.open(video, version=version)
+        return read_frames(opened, [frames[step] for step in steps], where=video, times=known["times"].tolist())
 
     def _look(self, progress: Progress) -> Opened:
         """Return the cached table, or scan every episode; a changed local file changes the key."""
@@ -129,85 +160,171 @@ class RawDroidSource(IndexedSource[RawDroidData, Opened]):
             "cameras": config.cameras,
             "droid_raw": " ".join(f"{name}={value!r}" for name, value in own.items()),
             "pose_frame": config.pose_frame,
-            "listed": listed,
+            "folders": listed,
         }
-        keys = IndexKeys.of(parts, root, named=identity_of(root, folders[0]))
-        return Opened(get_or_build(config.disk_cache, keys, root, lambda: self._scan_all(folders, progress)))
+        key = index_key(parts, root, named=identity_of(root, folders[0]))
+        return Opened(get_or_build(config.disk_cache, key, root, lambda: self._scan_all(folders, progress)))
 
     def _scan_all(self, folders: list[str], progress: Progress) -> EpisodeTable:
+        identities = {folder: identity_of(self._config.path, folder) for folder in folders}
+        found, problems = self._scanned(self._scan, identities, progress)
         usable: dict[str, _Found] = {}
-        problems = []
-        for done, found in enumerate(in_parallel(self._scan, folders, self._connections), start=1):
-            progress(done, len(folders))
-            if isinstance(found, EpisodeProblem):
-                problems.append(found)
-            elif found.info.id in usable:
-                problems.append(_twice(found.info.id, self._path(found.place.folder, TRAJECTORY)))
-            else:
-                usable[found.info.id] = found
-        if not usable:
-            raise as_error(problems[0])
+        for identity, one in found:
+            if usable.setdefault(identity, one) is not one:
+                wrong, fix = f"a second episode of the same identity: {identity}", "Name a smaller folder in data.path"
+                where = self._path(one.place.folder, TRAJECTORY)
+                problems.append(EpisodeProblem(identity, where, wrong, "episodes that can be told apart", fix))
         logger.info("%s: %d episodes, %d that cannot be used", self._config.path, len(usable), len(problems))
         return EpisodeTable.of(
             [one.info for one in usable.values()],
             problems=problems,
-            locators=pack_texts("place", [json.dumps(vars(one.place)) for one in usable.values()]),
+            locators={"place": np.array([json.dumps(vars(one.place)).encode() for one in usable.values()])},
             texts={"control_rate_hz": str(self._config.droid_raw.control_rate_hz)},
             state_hashes=[one.state_hash for one in usable.values()],
             labels=labels_of([one.labels for one in usable.values()]),
         )
 
-    def _scan(self, folder: str) -> _Found | EpisodeProblem:
+    def _scan(self, folder: str) -> _Found:
         identity = identity_of(self._config.path, folder)
         listed = list_episode(self._config.path, folder)
         if not listed.has_trajectory or listed.metadata is None:
             found = f"episode {identity} has no {'metadata_*.json' if listed.has_trajectory else TRAJECTORY}"
-            return EpisodeProblem(identity, self._path(folder, ""), found, "one", _FIX)
-        try:
-            place = _Place(folder, listed.metadata, key_of({"files": listed}), {})
-            metadata = self._metadata(place)
-            serials = tuple(metadata.serial(camera) for camera in self._config.cameras)
-            place = replace(place, pictures=self._counted(place, listed, serials))
-            states = self._trajectory(place, serials).states
-        except InputError as error:
-            return as_problem(error, identity)
-        success = success_of(identity) if metadata.success is None else metadata.success
-        info = EpisodeInfo(identity, len(states), success)
-        return _Found(info, place, hash_of_states(states), metadata.labels)
+            raise InputError(where=self._path(folder, ""), found=found, needed="one", fix=_FIX)
+        version, path = key_of({"files": listed}), self._path(folder, listed.metadata)
+        data = self._files.read(path, version=version, where=path)
+        metadata = json_object(data, where=path, needed="the metadata of an episode")
+        named = {camera: _named(metadata, camera) for camera in RAW_CAMERAS}
+        known = {camera: serial for camera, serial in named.items() if serial}
+        serials = tuple(_serial(known, camera, path) for camera in self._config.cameras)
+        place = _Place(folder, version, known, self._counted(folder, listed, serials))
+        states = _states_of(self._numbers(place, serials))
+        success = metadata.get("success")
+        outcome = success if isinstance(success, bool) else success_of(identity)
+        return _Found(EpisodeInfo(identity, len(states), outcome), place, hash_of_states(states), _labels(metadata))
 
-    def _counted(self, place: _Place, listed: EpisodeFolder, serials: tuple[str, ...]) -> dict[str, int]:
+    def _counted(self, folder: str, listed: EpisodeFolder, serials: tuple[str, ...]) -> dict[str, int]:
         """Return the number of frames of each camera."""
         counts = {}
         for serial in serials:
-            path = self._path(place.folder, f"{VIDEOS}/{serial}.mp4")
+            path = self._path(folder, f"{VIDEOS}/{serial}.mp4")
             if not any(video.name == f"{serial}.mp4" for video in listed.videos):
                 there = ", ".join(video.name for video in listed.videos) or "none"
-                needed = f"the MP4 that {place.metadata} or data.camera names; there are {there}"
+                needed = f"the MP4 that {listed.metadata} or data.camera names; there are {there}"
                 raise InputError(where=path, found="no such file", needed=needed, fix=_FIX)
             counts[serial] = count_frames(path, where=path)
         return counts
 
-    def _metadata(self, place: _Place) -> DroidMetadata:
-        path = self._path(place.folder, place.metadata)
-        return DroidMetadata.parse(self._files.read(path, version=place.version, where=path), path)
+    def _numbers(self, place: _Place, serials: tuple[str, ...]) -> Arrays:
+        """Return what is known of the steps that are used, with the poses of some cameras and the place of each frame.
 
-    def _trajectory(self, place: _Place, serials: tuple[str, ...]) -> Trajectory:
+        Raises:
+            InputError: The trajectory is damaged, incomplete, implausible, or of another length than an MP4.
+        """
         path = self._path(place.folder, TRAJECTORY)
-        data = self._files.read(path, version=place.version, where=path)
-        trajectory = parse_trajectory(data, where=path, serials=serials, frame_counts=place.pictures)
-        if self._config.pose_frame == "camera" and any(trajectory.extrinsics[serial] is None for serial in serials):
-            needed = "observation/camera_extrinsics of the camera"
-            raise InputError(where=path, found="no poses of the camera", needed=needed, fix="Set data.pose_frame: base")
-        if self._config.droid_raw.skip_action == "drop":
-            trajectory = trajectory.at(np.flatnonzero(~trajectory.skipped))
-        POSE.require_plausible(trajectory.states, path, fix=_FIX)
-        return trajectory
+        key = f"trajectory {path} {place.version} {serials}"
+        found: Arrays | None = stored_arrays(self._cache, key)
+        if found is None:
+            found = parse_trajectory(self._files.read(path, version=place.version, where=path), path, serials)
+            store_arrays(self._cache, key, found)
+        steps = len(found["pose"])
+        for serial, count in place.frames.items():
+            if abs(steps - count) > 1:
+                wrong, needed = f"{steps} steps, but {count} frames in {serial}.mp4", "a frame for every step"
+                raise InputError(where=path, found=wrong, needed=f"{needed}; the last one may be missing", fix=_FIX)
+        if self._config.pose_frame == "camera" and not found.keys() >= set(serials):
+            needed, fix = "observation/camera_extrinsics of the camera", "Set data.pose_frame: base"
+            raise InputError(where=path, found="no poses of the camera", needed=needed, fix=fix)
+        used = np.arange(min(steps, *place.frames.values()))
+        if self._config.droid_raw.skip_action == "drop" and "skipped" in found:
+            used = used[found["skipped"][used, 0] == 0]
+        numbers = {name: values[used] for name, values in found.items()} | {"frame": used}
+        POSE.require_plausible(_states_of(numbers), path, fix=_FIX)
+        return numbers
 
     def _path(self, folder: str, name: str) -> str:
         path = storage.join(self._config.path, folder) if folder else self._config.path
         return storage.join(path, name) if name else path
 
 
-def _twice(identity: str, where: str) -> EpisodeProblem:
-    found, fix = f"a second episode of the same identity: {identity}", "Name a smaller folder in data.path"
-    return EpisodeProblem(identity, where, found, "episodes that can be told apart", fix)
+def parse_trajectory(data: bytes, where: str, serials: Sequence[str]) -> dict[str, Float[np.ndarray, "steps _"]]:
+    """Return the numbers of a trajectory.h5 per step: pose, gripper; skipped and velocities if there are any.
+
+    Args:
+        data: The content of the file.
+        where: The file, for messages.
+        serials: Cameras whose poses are returned under this name, if there are any.
+
+    Raises:
+        InputError: Not HDF5, damaged or incomplete.
+    """
+    h5py = require_library("h5py", where=where, called="h5py, which reads trajectory.h5", extra="raw")
+    poses = {serial: (f"observation/camera_extrinsics/{serial}_left", 6) for serial in serials}
+    found: dict[str, Float[np.ndarray, "steps _"]] = {}
+    try:
+        # From memory: HDF5 then never waits for a network, nor crashes on a file that is being truncated.
+        with h5py.File(h5py.h5f.open_file_image(data)) as file:
+            for name, (place, width) in (_REQUIRED | _OPTIONAL | poses).items():
+                if place in file:
+                    found[name] = _array(file[place], width, f"{where}: {place}")
+                elif name in _REQUIRED:
+                    there = ", ".join(sorted(file))[:200]
+                    raise InputError(where=f"{where}: {place}", found=f"no such array; there are {there}", fix=_FIX)
+    except (OSError, KeyError, ValueError, TypeError, RuntimeError, MemoryError, OverflowError) as error:
+        wrong = f"{len(data)} bytes that cannot be read as HDF5 ({str(error)[:200]})"
+        raise InputError(where=where, found=wrong, needed="an undamaged trajectory.h5", fix=_FIX) from None
+    steps = len(found["pose"])
+    if steps == 0:
+        raise zero_steps(where)
+    for name, values in found.items():
+        if len(values) != steps:
+            raise InputError(where=f"{where}: {name}", found=f"{len(values)} of {steps} steps", fix=_FIX)
+    return found
+
+
+def _array(data: Any, width: int, where: str) -> Float[np.ndarray, "steps width"]:
+    """Return `width` finite numbers per step; for one number, the second axis may be missing."""
+    shape, kind = tuple(getattr(data, "shape", None) or ()), getattr(getattr(data, "dtype", None), "kind", "?")
+    fits = shape[1:] == (width,) or (width == 1 and len(shape) == 1)
+    if not fits or shape[0] > _MOST_STEPS or kind not in "fiub":
+        found, needed = f"shape {shape} of kind {kind!r}", f"{width} numbers for each step"
+        raise InputError(where=where, found=found, needed=needed, fix=_FIX)
+    values = np.asarray(data[()], dtype=np.float64).reshape(-1, width)
+    if not np.isfinite(values).all():
+        step = int((~np.isfinite(values)).any(axis=1).argmax())
+        raise InputError(where=where, found=f"{values[step]} at step {step}", needed="finite numbers", fix=_FIX)
+    return values
+
+
+def _states_of(numbers: Arrays) -> Float[np.ndarray, "steps 7"]:
+    return np.concatenate([numbers["pose"], numbers["gripper"]], axis=1)
+
+
+def _named(metadata: Mapping[str, Any], camera: str) -> str | None:
+    """Return the serial number of a camera, which is the name of its MP4; None if the metadata do not name it."""
+    path = metadata.get(f"{camera}_mp4_path")
+    name = PurePosixPath(path).name if isinstance(path, str) else ""
+    return name.removesuffix(".mp4") if name.endswith(".mp4") else None
+
+
+def _serial(serials: Mapping[str, str], camera: str, where: str) -> str:
+    """Return the serial number of a camera: left, right, wrist, ext1, ext2, or a serial number itself."""
+    if camera in RAW_CAMERAS and camera not in serials:
+        found, fix = f"no {camera}_mp4_path with an MP4", "Set data.camera to one that every episode has"
+        raise InputError(where=where, found=found, needed="the path of one in the metadata", fix=fix)
+    return serials.get(camera, camera)
+
+
+def _labels(metadata: Mapping[str, Any]) -> dict[str, str | None]:
+    """Return the episode's labels, as far as known: scene, building, operator, task."""
+
+    def short(*keys: str) -> str | None:
+        values = (metadata.get(key) for key in keys)
+        return next((str(one) for one in values if isinstance(one, str | int) and not isinstance(one, bool)), None)
+
+    task = metadata.get("current_task")
+    return {
+        "scene": short("scene_id"),
+        "building": short("building"),
+        "operator": short("user_id", "user"),
+        "task": task if isinstance(task, str) else None,
+    }

@@ -3,25 +3,58 @@
 from __future__ import annotations
 
 import difflib
+import glob
+import math
+import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 from typing import Any
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import LeRobotData, LeRobotFields
-from vjepa2_ac.data.sources.lerobot.features import Feature, feature_of
-from vjepa2_ac.data.sources.lerobot.other_forms import FILES, way_from_storage, way_from_version
-from vjepa2_ac.data.sources.lerobot.path_templates import require_template
+from vjepa2_ac.data.sources.listing import in_parallel
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.media.video_reader import is_deep_grey
+from vjepa2_ac.storage import FileInfo
 from vjepa2_ac.storage.structured import read_json_object
 
 INFO = "meta/info.json"
 VERSIONS = ("v2.1", "v3.0")
 
-_QUATERNION = (8, "a quaternion's 4")
-_STATE_NUMBERS = {"euler_xyz": (7, "3 Euler angles"), "quaternion_wxyz": _QUATERNION, "quaternion_xyzw": _QUATERNION}
+_PLACE = re.compile(r"\{(?:(video_key)|(?:chunk_index|file_index|episode_chunk|episode_index)(?::0\dd)?)\}")
 _FIX = "Get meta/info.json again"
+_FIX_VERSION = (
+    "lerobot 0.3.3's convert_dataset_v1_to_v2.py and convert_dataset_v20_to_v21.py make v2.1 of older ones; for newer "
+    "ones update vjepa2-ac"
+)
+_FIX_STORAGE = "`vjepa2-ac data converter lance_to_files` prints a script that writes the files a Lance table is of"
 _WAY_TO_HUB = "Check the name in hf://datasets/owner/name; for a private data set, `hf auth login` or set HF_TOKEN"
+
+
+@dataclass(frozen=True)
+class Feature:
+    """One column, or one camera."""
+
+    dtype: str
+    shape: tuple[int, ...]
+    names: tuple[str, ...] = ()
+    is_depth: bool = field(default=False, repr=False)  # not in the key of stored indexes
+
+    @property
+    def width(self) -> int:
+        """Its width: numbers per step."""
+        return math.prod(self.shape)
+
+    @property
+    def is_camera(self) -> bool:
+        """Whether it contains frames that show what a camera saw."""
+        return self.dtype in {"video", "image"} and not self.is_depth
+
+    @property
+    def is_numbers(self) -> bool:
+        """Whether it is a column of numbers."""
+        return self.dtype.startswith(("float", "int", "uint", "bool"))
 
 
 @dataclass(frozen=True)
@@ -54,8 +87,8 @@ class DatasetInfo:
         for knob, names in wanted.items():
             for name in names:
                 if name not in columns:
-                    raise self._missing(f"data.lerobot.{knob}", "column", name, columns)
-        _require_state(self, config)
+                    raise missing(f"data.lerobot.{knob}", "column of numbers", name, self.where, columns)
+        self._require_state(config)
         for camera in config.cameras:
             self.camera_key(fields, camera)
 
@@ -70,21 +103,31 @@ class DatasetInfo:
         key = fields.cameras[camera]
         cameras = [name for name, feature in self.features.items() if feature.is_camera]
         if key not in cameras:
-            raise self._missing(f"data.lerobot.cameras.{camera}", "camera", key, cameras)
+            raise missing(f"data.lerobot.cameras.{camera}", "camera", key, self.where, cameras)
         if self.features[key].dtype == "video" and self.video_path is None:
             raise InputError(where=self.where, found=f"no video_path, and {key} is a video", needed="one", fix=_FIX)
         return key
 
-    def _missing(self, where: str, kind: str, name: str, known: Iterable[str]) -> InputError:
-        """Return the error of a name that the data set has not, or has for something else."""
-        if name not in self.features:
-            return missing(where, kind, name, self.where, known)
-        return InputError(
-            where=where,
-            found=f"{name}, which is {self.features[name].kind} in {self.where}",
-            needed="images of a camera" if kind == "camera" else "a column of numbers",
-            fix=f"It has: {', '.join(known) or 'none'}",
-        )
+    def _require_state(self, config: LeRobotData) -> None:
+        fields, described = config.lerobot, []
+        for name in fields.state:
+            of = self.features[name]
+            described.append(f"{name} [{', '.join(of.names) if len(of.names) == of.width else of.width}]")
+        source, where = " + ".join(described), "data.lerobot.state"
+        count = width = sum(self.features[name].width for name in fields.state)
+        if fields.select is not None:
+            where, count = "data.lerobot.select", len(fields.select)
+            if beyond := [number for number in fields.select if number >= width]:
+                found = f"{beyond[0]}, of {width} numbers in {source}"
+                raise InputError(where=where, found=found, needed=f"0 to {width - 1}")
+        needed, rotation = (7, "3 Euler angles") if fields.rotation == "euler_xyz" else (8, "a quaternion's 4")
+        if config.states == "pose" and count != needed:
+            raise InputError(
+                where=where,
+                found=f"{count} numbers a step from {source}",
+                needed=f"{needed}: x, y, z, {rotation} (data.lerobot.rotation: {fields.rotation}), the gripper",
+                fix="Name other columns in data.lerobot.state, or choose among their numbers with data.lerobot.select",
+            )
 
 
 def missing(where: str, kind: str, name: str, place: str, known: Iterable[str]) -> InputError:
@@ -93,7 +136,7 @@ def missing(where: str, kind: str, name: str, place: str, known: Iterable[str]) 
     close = difflib.get_close_matches(name, known, n=1)
     hint = f"Did you mean {close[0]}? " if close else ""
     fix = f"{hint}It has: {', '.join(known) or 'none'}"
-    return InputError(where=where, found=f"no {kind} {name} in {place}", needed=f"one of its {kind}s", fix=fix)
+    return InputError(where=where, found=f"no {kind} {name} in {place}", needed="one that it has", fix=fix)
 
 
 def read_info(root: str) -> DatasetInfo:
@@ -113,19 +156,19 @@ def read_info(root: str) -> DatasetInfo:
     except OSError as error:
         raise storage.unreadable(where, error) from None
     if (version := content.get("codebase_version")) not in VERSIONS:
-        found, fix = f"codebase_version {version!r}", way_from_version(version)
-        raise InputError(where=where, found=found, needed=" or ".join(VERSIONS), fix=fix)
-    if (stored_as := content.get("storage_format") or FILES) != FILES:
-        found, fix = f"storage_format {stored_as!r}", way_from_storage(stored_as)
-        raise InputError(where=where, found=found, needed="Parquet files and MP4 videos", fix=fix)
+        found = f"codebase_version {version!r}"
+        raise InputError(where=where, found=found, needed=" or ".join(VERSIONS), fix=_FIX_VERSION)
+    if (stored_as := content.get("storage_format") or "parquet") != "parquet":
+        found = f"storage_format {stored_as!r}"
+        raise InputError(where=where, found=found, needed="Parquet files and MP4 videos", fix=_FIX_STORAGE)
     try:
-        return _parsed(root, where, content)
+        return _parsed(root, content)
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
         found = f"not a description of a data set ({error!r})"
         raise InputError(where=where, found=found, needed="LeRobot's own", fix=_FIX) from None
 
 
-def _parsed(root: str, where: str, content: Mapping[str, Any]) -> DatasetInfo:
+def _parsed(root: str, content: Mapping[str, Any]) -> DatasetInfo:
     video_path = content.get("video_path")
     fps, episodes, chunk = float(content["fps"]), content["total_episodes"], content.get("chunks_size", 1000)
     if not 0 < fps <= 1000 or type(episodes) is not int or type(chunk) is not int or episodes < 0 or chunk < 1:
@@ -136,29 +179,55 @@ def _parsed(root: str, where: str, content: Mapping[str, Any]) -> DatasetInfo:
         fps=fps,
         episodes=episodes,
         chunk_episodes=chunk,
-        data_path=require_template(content["data_path"], f"{where}: data_path"),
-        video_path=None if video_path is None else require_template(video_path, f"{where}: video_path"),
-        features={name: feature_of(feature) for name, feature in content["features"].items()},
+        data_path=_template(content["data_path"]),
+        video_path=None if video_path is None else _template(video_path),
+        features={name: _feature(feature) for name, feature in content["features"].items()},
     )
 
 
-def _require_state(info: DatasetInfo, config: LeRobotData) -> None:
-    fields = config.lerobot
-    described = " + ".join(_described(name, info.features[name]) for name in fields.state)
-    where = "data.lerobot.select" if fields.select is not None else "data.lerobot.state"
-    joined = sum(info.features[name].width for name in fields.state)
-    if fields.select is not None and (beyond := [number for number in fields.select if number >= joined]):
-        found = f"{beyond[0]}, of {joined} numbers in {described}"
-        raise InputError(where=where, found=found, needed=f"0 to {joined - 1}")
-    width, (needed, rotation) = len(fields.select or range(joined)), _STATE_NUMBERS[fields.rotation]
-    if config.states == "pose" and width != needed:
-        raise InputError(
-            where=where,
-            found=f"{width} numbers a step from {described}",
-            needed=f"{needed}: x, y, z, {rotation} (data.lerobot.rotation: {fields.rotation}), the gripper",
-            fix="Name other columns in data.lerobot.state, or choose among their numbers with data.lerobot.select",
-        )
+def _feature(content: Mapping[str, Any]) -> Feature:
+    """Return a feature; a depth map is marked in one of the ways of LeRobot's versions, or by its pixels.
+
+    Source: huggingface/lerobot @ 7427f31, src/lerobot/configs/video.py, is_depth_map.
+    """
+    dtype, shape, names = content["dtype"], tuple(content["shape"]), content.get("names")
+    if not isinstance(dtype, str) or not all(type(size) is int and size > 0 for size in shape):
+        raise TypeError(f"a feature of dtype {dtype!r} and shape {shape!r}")
+    if isinstance(names, dict) and len(names) == 1:  # {"motors": ["x", "y", ...]}, as in older ports
+        names = next(iter(names.values()))
+    marks = [one for one in (content.get("info"), content.get("video_info")) if isinstance(one, Mapping)]
+    is_depth = any(
+        one.get("is_depth_map") or one.get("video.is_depth_map") or is_deep_grey(str(one.get("video.pix_fmt")))
+        for one in marks
+    )
+    return Feature(dtype, shape, tuple(map(str, names)) if isinstance(names, list) else (), is_depth)
 
 
-def _described(name: str, feature: Feature) -> str:
-    return f"{name} [{', '.join(feature.names) if len(feature.names) == feature.width else feature.width}]"
+def _template(template: str) -> str:
+    """Return a path template such as `chunk-{chunk_index:03d}`, which must not lead out of the data set."""
+    rest = _PLACE.sub("", template)
+    if not template or template.startswith("/") or ".." in template.split("/") or "{" in rest or "}" in rest:
+        raise ValueError(f"the path template {template!r}")
+    return template
+
+
+def filled(template: str, chunk: int, file: int, key: str = "") -> str:
+    """Return the path, within the data set, of a file: in v3.0 by chunk and file, in v2.1 by chunk and episode."""
+    return template.format(chunk_index=chunk, episode_chunk=chunk, file_index=file, episode_index=file, video_key=key)
+
+
+def list_by_template(root: str, template: str, key: str = "", *, connections: int = 1) -> dict[str, FileInfo]:
+    """Return the files whose paths fit a template, sorted by path within the data set.
+
+    Raises:
+        OSError: A folder cannot be listed.
+    """
+    pattern = _PLACE.sub(lambda place: glob.escape(key) if place[1] else "[0-9]*", template)
+    *folders, name = pattern.split("/")
+    found = [""]
+    for part in folders:
+        names = {folder: storage.list_names(storage.join(root, folder)) if "[" in part else [part] for folder in found}
+        found = [f"{folder}{one}/" for folder in found for one in names[folder] if fnmatchcase(one, part)]
+    listings = in_parallel(lambda folder: storage.list_files(storage.join(root, folder)), found, connections)
+    files = [(folder, file) for folder, inside in zip(found, listings, strict=True) for file in inside]
+    return dict(sorted((f"{folder}{file.name}", file) for folder, file in files if fnmatchcase(file.name, name)))

@@ -1,30 +1,24 @@
-"""Reading the rows of one episode from a Parquet file of many: only its row groups, and the needed columns."""
+"""Reading the rows of one episode from a Parquet file of many: only its row groups, and the needed columns.
+
+A stranger's file cannot take all memory: equal values compress so well that a few KB may claim any size, so the numbers
+of rows and values are checked in the footer, and tables of text or images are read a few rows at a time.
+"""
 
 from __future__ import annotations
 
-import io
-import math
 import threading
-from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
+from math import inf
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Shaped
 
 from vjepa2_ac import storage
-from vjepa2_ac.data.sources.lerobot.bounds import (
-    FIX,
-    MOST_IMAGE_BYTES,
-    MOST_TABLE_BYTES,
-    parts_of,
-    require_few,
-    require_sane,
-)
+from vjepa2_ac.data.sources.indexed_source import store_arrays, stored_arrays
 from vjepa2_ac.errors import InputError, require_library
 from vjepa2_ac.storage.block_file import BlockCachedFile, DiskCache
-from vjepa2_ac.storage.npz_reader import read_arrays
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -35,13 +29,17 @@ Opener = Callable[[str], "str | BlockCachedFile"]  # a path, or a remote file
 
 EPISODE = "episode_index"
 
-_CACHED_BYTES = 64 << 20  # of decoded row groups, in a process
+# All limits are far beyond any data set.
+MOST_NUMBERS = 1 << 25  # of one column in a row group
+MOST_TABLE_BYTES = 1 << 28  # of a table of episodes or tasks
+MOST_IMAGE_BYTES = 1 << 32  # in one row group
+_ROWS_AT_ONCE = 64  # where one value may be as large as an image
 _BUFFER_BYTES = 4096  # of a column that is not read
-_CACHED_FOOTERS = 256
+_FIX = "Copy the file again, or leave its episodes out"
 
 
 class ParquetRows:
-    """Reads rows of Parquet files; decoded row groups, and which episodes are in which, are cached. Thread-safe.
+    """Reads rows of Parquet files; each thread keeps the row group that it decoded last.
 
     Args:
         open_file: Returns the path or file to open for a path.
@@ -51,14 +49,11 @@ class ParquetRows:
         version: Of the cached rows: changes with the data set or the wanted columns.
     """
 
-    def __init__(
-        self, open_file: Opener, columns: Sequence[str], cache: DiskCache | None = None, version: str = ""
-    ) -> None:
+    def __init__(self, open_file: Opener, columns: Sequence[str], cache: DiskCache, version: str) -> None:
         self._cache, self._version = cache, version
         self._open, self._columns = open_file, list(dict.fromkeys([EPISODE, *columns]))
-        self._lock = threading.Lock()
-        self._ranges: OrderedDict[str, list[tuple[float, float]]] = OrderedDict()
-        self._groups: OrderedDict[tuple[str, int], Columns] = OrderedDict()
+        self._ranges: dict[str, list[tuple[float, float]]] = {}  # of each file that was opened: of each row group
+        self._last = threading.local()
 
     def rows(self, path: str, episode: int) -> Columns:
         """Return the rows of one episode, as columns of shape [rows, numbers].
@@ -68,22 +63,19 @@ class ParquetRows:
             OSError: A remote file cannot be read.
         """
         key = f"rows {self._version} {path} {episode}"
-        if (known := self._cached(key)) is not None:
+        if (known := stored_arrays(self._cache, key)) is not None:
             return known
-        parts, shared = [], False
-        opened = self._open(path)
+        parts: list[Columns] = []
+        are_shared, opened = False, self._open(path)
         with _opened(opened, path) as file:
             for number in self._groups_with(path, file, opened, episode):
                 group = self._group(path, file, number)
-                chosen = _places_of(group, episode)
-                parts.append({name: column[chosen] for name, column in group.items()})
-                shared |= len(parts[-1][EPISODE]) < len(group[EPISODE])
-                require_sane([sum(len(part[EPISODE]) for part in parts)], path)
+                of_episode = group[EPISODE][:, 0] == episode
+                are_shared |= not of_episode.all()
+                parts.append({name: column[of_episode] for name, column in group.items()})
         rows = {name: np.concatenate([part[name] for part in parts]) for name in (parts[0] if parts else ())}
-        if self._cache is not None and shared:
-            content = io.BytesIO()
-            np.savez(content, **rows)  # type: ignore[arg-type] # names are columns, none is called allow_pickle
-            self._cache.write(key, content.getvalue())
+        if are_shared:
+            store_arrays(self._cache, key, rows)
         return rows
 
     def images(self, path: str, column: str, episode: int) -> list[bytes]:
@@ -93,52 +85,33 @@ class ParquetRows:
             InputError: The file is missing or damaged, or the column does not contain images.
             OSError: A remote file cannot be read.
         """
-        found: list[bytes] = []
+        found: list[Any] = []
         opened = self._open(path)
         with _opened(opened, path) as file:
             for number in self._groups_with(path, file, opened, episode):
-                for part in parts_of(file, path, [EPISODE, column], MOST_IMAGE_BYTES, row_groups=[number]):
-                    found += _images_in(part[column], part[EPISODE], episode, f"{path}: {column}")
+                for part in _parts_of(file, path, [EPISODE, column], MOST_IMAGE_BYTES, row_groups=[number]):
+                    rows = zip(part[column], part[EPISODE], strict=True)
+                    found += [row.get("bytes") if isinstance(row, dict) else row for row, its in rows if its == episode]
+        if not all(isinstance(image, bytes) for image in found):
+            wrong, needed = "no images, or names of files in their place", "PNG or JPEG bytes in the column"
+            raise InputError(where=f"{path}: {column}", found=wrong, needed=needed)
         return found
-
-    def _cached(self, key: str) -> Columns | None:
-        data = None if self._cache is None else self._cache.read(key)
-        with suppress(InputError):  # damaged: read again
-            return None if data is None else read_arrays(data)
-        return None
 
     def _groups_with(
         self, path: str, file: parquet.ParquetFile, opened: str | BlockCachedFile, episode: int
     ) -> list[int]:
         """Return the row groups that may have rows of an episode, as far as the file's statistics say."""
-        with self._lock:
-            ranges = self._ranges.get(path)
-        if ranges is None:
-            _require_consistent(file, opened, self._columns)
-            ranges = _episodes_of_groups(file, path)
-            with self._lock:
-                self._ranges[path] = ranges
-                if len(self._ranges) > _CACHED_FOOTERS:
-                    self._ranges.popitem(last=False)
-        return [number for number, (first, last) in enumerate(ranges) if first <= episode <= last]
+        if path not in self._ranges:
+            self._ranges[path] = _episodes_of_groups(file, path, opened, self._columns)
+        return [number for number, (first, last) in enumerate(self._ranges[path]) if first <= episode <= last]
 
     def _group(self, path: str, file: parquet.ParquetFile, number: int) -> Columns:
-        with self._lock:
-            if (path, number) in self._groups:
-                self._groups.move_to_end((path, number))
-                return self._groups[path, number]
-        present = [name for name in self._columns if name in file.schema_arrow.names]
-        require_few(file, number, present, path)
-        table = file.read_row_group(number, columns=present, use_threads=False)
-        group = {name: numbers_in(table.column(name), f"{path}: {name}") for name in present}
-        if EPISODE not in group:
-            raise InputError(where=path, found=f"no column {EPISODE}", needed="one", fix=FIX)
-        with self._lock:
-            self._groups[path, number] = group
-            sizes = [sum(column.nbytes for column in columns.values()) for columns in self._groups.values()]
-            while len(sizes) > 1 and sum(sizes) > _CACHED_BYTES:
-                sizes.pop(0)
-                self._groups.popitem(last=False)
+        if getattr(self._last, "place", None) != (path, number):
+            present = [name for name in self._columns if name in file.schema_arrow.names]
+            table = file.read_row_group(number, columns=present, use_threads=False)
+            self._last.group = {name: numbers_in(table.column(name), f"{path}: {name}") for name in present}
+            self._last.place = path, number
+        group: Columns = self._last.group
         return group
 
 
@@ -150,10 +123,9 @@ def read_table(opened: str | BlockCachedFile, path: str, wanted: Callable[[str],
         OSError: A remote file cannot be read.
     """
     with _opened(opened, path) as file:
-        _require_sane_groups(file, path)
         present = [name for name in file.schema_arrow.names if wanted(name)]
         values: dict[str, list[Any]] = {name: [] for name in present}
-        for part in parts_of(file, path, present, MOST_TABLE_BYTES):
+        for part in _parts_of(file, path, present, MOST_TABLE_BYTES):
             for name in part:
                 values[name] += part[name]
         return values
@@ -186,6 +158,11 @@ def numbers_in(column: pa.ChunkedArray, where: str) -> Shaped[np.ndarray, "rows 
     return np.asarray(array.to_numpy(zero_copy_only=False)).reshape(rows, width)
 
 
+def _no_numbers(where: str, kind: str, gaps: int) -> InputError:
+    found = f"{gaps} rows without a value" if gaps else f"values of type {kind}"
+    return InputError(where=where, found=found, needed="numbers, as many in each row", fix=_FIX)
+
+
 @contextmanager
 def _opened(opened: str | BlockCachedFile, path: str) -> Iterator[parquet.ParquetFile]:
     """Open a Parquet file with verified page checksums; its errors become errors for the user."""
@@ -196,73 +173,81 @@ def _opened(opened: str | BlockCachedFile, path: str) -> Iterator[parquet.Parque
         ) as file:
             yield file
     except FileNotFoundError:
-        raise InputError(where=path, found="no such file", needed="one, says the data set", fix=FIX) from None
+        raise InputError(where=path, found="no such file", needed="one, says the data set", fix=_FIX) from None
     except (pa.ArrowException, OSError, ValueError, KeyError, MemoryError, OverflowError) as error:
         if isinstance(opened, BlockCachedFile) and opened.failure is not None:
             raise opened.failure from None
         if isinstance(error, OSError) and error.errno is not None:  # a system error, not one of the content
-            raise storage.unreadable(path, error, fix=FIX) from None
+            raise storage.unreadable(path, error, fix=_FIX) from None
         found = f"damaged: {' '.join(str(error).strip().splitlines()[:1])[:200]}"
-        raise InputError(where=path, found=found, needed="a whole Parquet file", fix=FIX) from None
+        raise InputError(where=path, found=found, needed="a whole Parquet file", fix=_FIX) from None
 
 
-def _places_of(group: Columns, episode: int) -> slice | Shaped[np.ndarray, " rows"]:
-    """Return the rows of an episode in a row group: as a slice if they are contiguous, as they should be."""
-    places = np.flatnonzero(group[EPISODE][:, 0] == episode)
-    together = len(places) > 0 and places[-1] - places[0] == len(places) - 1
-    return slice(int(places[0]), int(places[-1]) + 1) if together else places
+def _episodes_of_groups(
+    file: parquet.ParquetFile, path: str, opened: str | BlockCachedFile, columns: Sequence[str]
+) -> list[tuple[float, float]]:
+    """Return the least and the greatest episode of each row group; infinite ones if the file does not say.
 
-
-def _episodes_of_groups(file: parquet.ParquetFile, path: str) -> list[tuple[float, float]]:
-    """Return the least and the greatest episode of each row group; infinite ones if the file does not say."""
-    _require_sane_groups(file, path)
-    metadata = file.metadata
-    if EPISODE not in file.schema_arrow.names:
-        raise InputError(where=path, found=f"no column {EPISODE}", needed="one", fix=FIX)
-    place = [metadata.schema.column(number).path for number in range(metadata.num_columns)].index(EPISODE)
+    Raises:
+        InputError: There are no episodes, or a column has more numbers than any robot's.
+        pyarrow.ArrowException, OSError: The footer contradicts itself.
+    """
+    paths = [file.metadata.schema.column(place).path for place in range(file.metadata.num_columns)]
+    places = [n for n, one in enumerate(paths) if any(f"{one}.".startswith(f"{name}.") for name in columns)]
+    _require_consistent(file, opened, places)
+    if EPISODE not in paths:
+        raise InputError(where=path, found=f"no column {EPISODE}", needed="one", fix=_FIX)
     ranges: list[tuple[float, float]] = []
-    for number in range(metadata.num_row_groups):
-        statistics = metadata.row_group(number).column(place).statistics
-        known = statistics is not None and statistics.has_min_max and isinstance(statistics.min, int)
-        ranges.append((statistics.min, statistics.max) if known else (-math.inf, math.inf))
+    for number in range(file.num_row_groups):
+        group = file.metadata.row_group(number)
+        for place in places:
+            if (count := group.column(place).num_values) > MOST_NUMBERS:
+                found, needed = f"{count:,} numbers in a row group", f"at most {MOST_NUMBERS:,}"
+                raise InputError(where=f"{path}: {paths[place]}", found=found, needed=needed, fix=_FIX)
+        known = group.column(paths.index(EPISODE)).statistics
+        is_known = known is not None and known.has_min_max and isinstance(known.min, int)
+        ranges.append((known.min, known.max) if is_known else (-inf, inf))
     return ranges
 
 
-def _require_consistent(file: parquet.ParquetFile, opened: str | BlockCachedFile, columns: Sequence[str]) -> None:
+def _require_consistent(file: parquet.ParquetFile, opened: str | BlockCachedFile, places: list[int]) -> None:
     """Refuse an inconsistent footer entry of some columns, in any row group.
 
     Reading such an entry with pyarrow (`row_group(n).column(p)`) ends the process: a C++ exception that its binding
-    does not expect. A reader of no rows makes the same checks, reads nothing, and raises.
-
-    Raises:
-        pyarrow.ArrowException, OSError: It is damaged.
+    does not expect. A reader of one row makes the same checks, and raises. Of a remote file it reads none, and
+    finds less: the blocks of every row group would be fetched.
     """
     _, parquet = _library(str(opened))
-    paths = [file.metadata.schema.column(number).path + "." for number in range(file.metadata.num_columns)]
-    places = [number for number, path in enumerate(paths) if any(path.startswith(f"{name}.") for name in columns)]
+    rows = 1 if isinstance(opened, str) else 0
     with parquet.ParquetFile(opened, metadata=file.metadata, buffer_size=_BUFFER_BYTES, pre_buffer=False) as light:
-        for group in range(file.metadata.num_row_groups):
-            next(light.reader.iter_batches(0, row_groups=[group], column_indices=places, use_threads=False), None)
+        for group in range(file.num_row_groups):
+            next(light.reader.iter_batches(rows, row_groups=[group], column_indices=places, use_threads=False), None)
 
 
-def _require_sane_groups(file: parquet.ParquetFile, path: str) -> None:
-    metadata = file.metadata
-    require_sane([metadata.row_group(n).num_rows for n in range(metadata.num_row_groups)], path, metadata.num_rows)
+def _parts_of(
+    file: parquet.ParquetFile, path: str, columns: list[str], most_bytes: int, **which: list[int]
+) -> Iterator[dict[str, list[Any]]]:
+    """Yield some columns a few rows at a time, as Python values, of which all together have a limit.
+
+    Sizes are counted as Python values: the table stores equal ones once, Python a copy of each.
+    """
+    total = 0
+    for part in file.iter_batches(_ROWS_AT_ONCE, columns=columns, use_threads=False, **which):
+        values = part.to_pydict()
+        total += _bytes_in(values)
+        if total > most_bytes:
+            found = f"more than {most_bytes:,} bytes of {', '.join(columns)[:200]}"
+            raise InputError(where=path, found=found, needed="a table that fits into memory", fix=_FIX)
+        yield values
 
 
-def _images_in(rows: list[Any], episodes: list[Any], episode: int, where: str) -> list[bytes]:
-    chosen = [row for row, its in zip(rows, episodes, strict=True) if its == episode]
-    stored = [row.get("bytes") if isinstance(row, dict) else row for row in chosen]
-    images = [image for image in stored if isinstance(image, bytes)]
-    if len(images) != len(stored):
-        found, needed = "no images, or names of files in their place", "PNG or JPEG bytes in the column"
-        raise InputError(where=where, found=found, needed=needed)
-    return images
-
-
-def _no_numbers(where: str, kind: str, gaps: int) -> InputError:
-    found = f"{gaps} rows without a value" if gaps else f"values of type {kind}"
-    return InputError(where=where, found=found, needed="numbers, as many in each row", fix=FIX)
+def _bytes_in(value: Any) -> int:
+    """Return the approximate size in bytes of nested lists and dicts of numbers, texts and images."""
+    if isinstance(value, str | bytes):
+        return len(value)
+    if isinstance(value, dict):
+        return sum(map(_bytes_in, value.values()))
+    return sum(map(_bytes_in, value)) if isinstance(value, list) else 8
 
 
 def _library(where: str) -> tuple[Any, Any]:

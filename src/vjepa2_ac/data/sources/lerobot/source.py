@@ -3,27 +3,38 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Set
+from collections.abc import Callable, Sequence, Set
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
+
+import numpy as np
+from jaxtyping import UInt8
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import LeRobotData
 from vjepa2_ac.config.section import Affects, knobs_that_affect
 from vjepa2_ac.data.cache import fetched_data
-from vjepa2_ac.data.index import EpisodeTable, get_or_build, index_key
+from vjepa2_ac.data.index import EpisodeTable, get_or_build, hash_of_states, index_key
 from vjepa2_ac.data.sources.indexed_source import FramesByStep, IndexedSource, Opened
-from vjepa2_ac.data.sources.lerobot import episode_list
-from vjepa2_ac.data.sources.lerobot.episode_list import EpisodeRow
-from vjepa2_ac.data.sources.lerobot.episode_rows import EpisodeContent, content_of, wanted_columns
-from vjepa2_ac.data.sources.lerobot.images import stored_images, video_frames
-from vjepa2_ac.data.sources.lerobot.index_build import check_rows, find_problems, row_of, table_of
-from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, read_info
+from vjepa2_ac.data.sources.lerobot.episodes import (
+    TABLES,
+    EpisodeRow,
+    data_file,
+    problem_of,
+    read_episodes,
+    row_of,
+    table_of,
+    video_file,
+)
+from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, list_by_template, read_info
 from vjepa2_ac.data.sources.lerobot.parquet import ParquetRows
-from vjepa2_ac.data.sources.lerobot.path_templates import list_by_template
+from vjepa2_ac.data.sources.lerobot.states import EpisodeContent, content_of, wanted_columns
+from vjepa2_ac.data.sources.listing import in_parallel
 from vjepa2_ac.episode import Episode, Progress, StepRanges
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.video_reader import Clock, require_decoder
+from vjepa2_ac.media.image_file import decode_image
+from vjepa2_ac.media.jpeg import require_bounded
+from vjepa2_ac.media.video_reader import Clock, read_frames, require_decoder
 from vjepa2_ac.storage.block_file import BlockCachedFile
 from vjepa2_ac.storage.structured import json_list
 
@@ -100,7 +111,7 @@ class LeRobotSource(IndexedSource[LeRobotData, _Opened]):
         keys = [info.camera_key(config.lerobot, camera) for camera in config.cameras]
         if any(info.features[key].dtype == "video" for key in keys):
             require_decoder(info.where)
-        tables = list_by_template(info.root, episode_list.EPISODES[info.version], connections=self._connections)
+        tables = list_by_template(info.root, TABLES[info.version], connections=self._connections)
         files = list_by_template(info.root, info.data_path, connections=self._connections)
         for key in keys:
             if info.features[key].dtype == "video":
@@ -122,13 +133,15 @@ class LeRobotSource(IndexedSource[LeRobotData, _Opened]):
 
     def _built(self, tables: list[str], files: Set[str], keys: list[str], progress: Progress) -> EpisodeTable:
         info, fields = self._info, self._config.lerobot
-        statistics = episode_list.StatisticsColumns(tuple(fields.state) if self._is_far else (), fields.success)
-        known = [key for key in dict.fromkeys(fields.cameras.values()) if key in info.features]
-        rows = episode_list.read_episodes(info, tables, known, statistics, self._open_file)
-        problems = find_problems(info, rows, files, keys)
+        of_config = [key for key in dict.fromkeys(fields.cameras.values()) if key in info.features]
+        videos = [key for key in of_config if info.features[key].dtype == "video"]
+        states = fields.state if self._is_far else ()  # of local rows the states themselves are hashed
+        rows = read_episodes(info, tables, videos, states, fields.success, self._open_file)
+        found = {row.index: problem_of(info, row, files, keys) for row in rows}
+        problems = {index: problem for index, problem in found.items() if problem is not None}
         outcome_unknown = any(row.success is None for row in rows) and fields.success in info.features
         if not self._is_far or (self._config.outcome != "all" and outcome_unknown):
-            rows = check_rows(info, rows, problems, self._content, connections=self._connections, progress=progress)
+            rows = self._with_content(rows, problems, progress)
         if not rows:
             raise InputError(where=info.where, found="no episodes", needed="a data set with episodes")
         texts = {"version": self._version, "control_rate_hz": str(self._control_rate_hz)}
@@ -136,20 +149,70 @@ class LeRobotSource(IndexedSource[LeRobotData, _Opened]):
         logger.info("%s: %d episodes, %d steps", info.root, len(table), int(table.num_steps.sum()))
         return table
 
+    def _with_content(
+        self, rows: list[EpisodeRow], problems: dict[int, InputError], progress: Progress
+    ) -> list[EpisodeRow]:
+        """Return the episodes with the facts in their rows; those that turn out unusable are added to `problems`."""
+        by_file: dict[str, list[EpisodeRow]] = {}
+        for row in rows:
+            if row.index not in problems:
+                by_file.setdefault(data_file(self._info, row), []).append(row)
+
+        def checked(row: EpisodeRow) -> EpisodeRow:
+            try:
+                content = self._content(row)
+            except InputError as error:
+                problems[row.index] = error
+                return row
+            success = row.success if content.success is None else content.success
+            return replace(row, success=success, state_hash=hash_of_states(content.states))
+
+        read, done = [row for row in rows if row.index in problems], 0
+        for of_file in in_parallel(lambda some: [checked(row) for row in some], [*by_file.values()], self._connections):
+            read += of_file
+            done += len(of_file)
+            progress(done, len(rows))
+        return sorted(read, key=lambda row: row.index)
+
     def _content(self, row: EpisodeRow) -> EpisodeContent:
-        rows = self._parquet.rows(storage.join(self._info.root, episode_list.data_file(self._info, row)), row.index)
+        rows = self._parquet.rows(storage.join(self._info.root, data_file(self._info, row)), row.index)
         return content_of(rows, row.length, self._info, self._config, self._where(row))
 
     def _frames(self, row: EpisodeRow, key: str) -> FramesByStep:
         info = self._info
         if info.features[key].dtype == "image":
-            path = storage.join(info.root, episode_list.data_file(info, row))
-            read = partial(self._parquet.images, path, key, row.index)
-            return stored_images(read, row.length, f"{self._where(row)}: {key}")
+            path, where = storage.join(info.root, data_file(info, row)), f"{self._where(row)}: {key}"
+            read = cache(partial(self._parquet.images, path, key, row.index))
+            return FramesByStep(row.length, where, partial(_stored_images, read, row.length, where))
         place = row.videos[key]
-        path = storage.join(info.root, episode_list.video_file(info, place, key))
-        clock = Clock(start_s=place.start_s, rate_hz=info.fps)
-        return video_frames(self._open_file, path, clock, row.length, f"{path}: {row.id}")
+        path = storage.join(info.root, video_file(info, place, key))
+        clock, where = Clock(start_s=place.start_s, rate_hz=info.fps), f"{path}: {row.id}"
+        return FramesByStep(row.length, where, partial(self._video_frames, path, clock, where))
+
+    def _video_frames(
+        self, path: str, clock: Clock, where: str, steps: Sequence[int]
+    ) -> UInt8[np.ndarray, "time height width 3"]:
+        """Return frames of an episode's part of a video: step k is shown at the part's start + k / fps."""
+        return read_frames(self._open_file(path), steps, where=where, clock=clock)
 
     def _where(self, row: EpisodeRow) -> str:
-        return f"{storage.join(self._info.root, episode_list.data_file(self._info, row))}: {row.id}"
+        return f"{storage.join(self._info.root, data_file(self._info, row))}: {row.id}"
+
+
+def _stored_images(
+    read: Callable[[], list[bytes]], num_steps: int, where: str, steps: Sequence[int]
+) -> UInt8[np.ndarray, "time height width 3"]:
+    """Return frames from an episode's PNG or JPEG images in the table, all of which are read."""
+    images = read()
+    if len(images) != num_steps:
+        raise InputError(where=where, found=f"{len(images)} images", needed=f"one for each of {num_steps} steps")
+    frames: list[UInt8[np.ndarray, "height width 3"]] = []
+    for step in steps:
+        at = f"{where}: step {step}"
+        frame = decode_image(images[step], at)
+        require_bounded(frame.shape[0], frame.shape[1], at, count=len(steps))
+        if frames and frame.shape != frames[0].shape:
+            found, needed = (f"an image of {one.shape[0]}x{one.shape[1]}" for one in (frame, frames[0]))
+            raise InputError(where=at, found=found, needed=f"{needed}, as at step {steps[0]}")
+        frames.append(frame)
+    return np.stack(frames)

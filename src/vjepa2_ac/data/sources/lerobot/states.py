@@ -1,4 +1,4 @@
-"""The rows of one LeRobot episode, checked for completeness: states in our convention, commands, outcome."""
+"""The numbers of one LeRobot episode, checked for completeness: states in our convention, commands, outcome."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FRAME, TIME = "frame_index", "timestamp"
 
 _FIX = "Copy the file again, or leave the episode out"
 _FIX_STATES = "Check data.lerobot: state, select, rotation, gripper_open and gripper_closed"
-_FIX_VECTORS = "Leave the episode out, or check data.lerobot: state, select and action"
+_FIX_VECTORS = "Leave the episode out, check data.lerobot: state, action, or set data.lerobot.joint_velocity: null"
 _UNIT_TOLERANCE = 1e-2
 
 
@@ -57,40 +57,33 @@ def content_of(rows: Columns, length: int, info: DatasetInfo, config: LeRobotDat
     _require_rows(rows, length, info.fps, where)
     fields = config.lerobot
 
-    def joined(names: Sequence[str], select: Sequence[int] | None) -> Float[np.ndarray, "steps width"]:
-        columns = [_column(rows, name, info, where).astype(np.float64) for name in names]
-        return np.concatenate(columns, axis=1)[:, slice(None) if select is None else list(select)]
+    def joined(names: Sequence[str]) -> Float[np.ndarray, "steps width"]:
+        numbers = np.concatenate([_column(rows, name, info, where).astype(np.float64) for name in names], axis=1)
+        require_finite(numbers, where, fix=_FIX_VECTORS)
+        return numbers
 
-    states, commands = joined(fields.state, fields.select), None
-    if config.states == "pose":
-        states = _poses(states, fields, where)
-    else:
-        require_finite(states, where, fix=_FIX_VECTORS)
-    if config.actions == "recorded":
-        commands = joined(fields.action, None)
-        require_finite(commands, where, fix=_FIX_VECTORS)
-    for name in (fields.joint_velocity, fields.success):
+    def has(name: str | None) -> bool:
         if name is not None and name in info.features and name not in rows:
             raise missing("data.lerobot", "column", name, where, rows)
-    velocities = None
-    if fields.joint_velocity is not None and fields.joint_velocity in rows:
-        velocities = _column(rows, fields.joint_velocity, info, where).astype(np.float64)
-        if not np.isfinite(velocities).all():
-            step = int((~np.isfinite(velocities)).any(axis=1).argmax())
-            at, fix = f"{where}: step {step}: {fields.joint_velocity}", "set data.lerobot.joint_velocity: null"
-            fix = f"Leave the episode out, or {fix}"
-            raise InputError(where=at, found=f"{velocities[step]}", needed="finite numbers", fix=fix)
-    success = bool(rows[fields.success].any()) if fields.success is not None and fields.success in rows else None
-    return EpisodeContent(states, velocities, success, commands)
+        return name is not None and name in rows
+
+    states = joined(fields.state)
+    if fields.select is not None:
+        states = states[:, list(fields.select)]
+    return EpisodeContent(
+        states=_poses(states, fields, where) if config.states == "pose" else states,
+        commands=joined(fields.action) if config.actions == "recorded" else None,
+        joint_velocities=joined([str(fields.joint_velocity)]) if has(fields.joint_velocity) else None,
+        success=bool(rows[str(fields.success)].any()) if has(fields.success) else None,
+    )
 
 
 def _poses(numbers: Float[np.ndarray, "steps _"], fields: LeRobotFields, where: str) -> Float[np.ndarray, "steps 7"]:
     """Return states (legend: `vjepa2_ac.episode`) from the numbers of an episode.
 
     Raises:
-        InputError: They are implausible under these settings: NaN, no unit quaternion, out of reach.
+        InputError: They are implausible under these settings: no unit quaternion, out of reach.
     """
-    require_finite(numbers, where, fix=_FIX_STATES)
     gripper = (numbers[:, -1:] - fields.gripper_open) / (fields.gripper_closed - fields.gripper_open)
     states = np.concatenate([numbers[:, POSE.position], _euler(numbers[:, 3:-1], fields, where), gripper], axis=1)
     POSE.require_plausible(states, where, fix=_FIX_STATES)
@@ -106,7 +99,7 @@ def _euler(rotation: Float[np.ndarray, "steps _"], fields: LeRobotFields, where:
         found = f"the quaternion {np.array2string(rotation[step], precision=4)} of length {lengths[step]:.4g}"
         raise InputError(where=f"{where}: step {step}", found=found, needed="a unit quaternion", fix=_FIX_STATES)
     x_first = rotation if fields.rotation == "quaternion_xyzw" else np.roll(rotation, -1, axis=1)
-    return np.asarray(Rotation.from_quat(x_first).as_euler("xyz")) if len(rotation) else np.zeros((0, 3))
+    return np.asarray(Rotation.from_quat(x_first).as_euler("xyz"))
 
 
 def _require_rows(rows: Columns, length: int, fps: float, where: str) -> None:
@@ -132,12 +125,11 @@ def _column(rows: Columns, name: str, info: DatasetInfo, where: str) -> Shaped[n
     if name not in rows:
         raise missing("data.lerobot", "column", name, where, rows)
     column, feature = rows[name], info.features.get(name)
-    if feature is None:
-        return column
-    if column.shape[1] != feature.width:
-        found, needed = f"{column.shape[1]} numbers a row", f"{feature.width}, says {info.where}"
-        raise InputError(where=f"{where}: {name}", found=found, needed=needed, fix=_FIX)
-    if feature.dtype.startswith("float") and column.dtype.kind != "f":
-        found, needed = f"values of type {column.dtype}", f"{feature.dtype}, says {info.where}"
-        raise InputError(where=f"{where}: {name}", found=found, needed=needed, fix=_FIX)
+    found = needed = ""
+    if feature is not None and column.shape[1] != feature.width:
+        found, needed = f"{column.shape[1]} numbers a row", f"{feature.width}"
+    elif feature is not None and feature.dtype.startswith("float") and column.dtype.kind != "f":
+        found, needed = f"values of type {column.dtype}", feature.dtype
+    if found:
+        raise InputError(where=f"{where}: {name}", found=found, needed=f"{needed}, says {info.where}", fix=_FIX)
     return column

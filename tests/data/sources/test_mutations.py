@@ -1,0 +1,114 @@
+"""Damaged files of LeRobot, raw DROID and npz: the damage is named, or has no effect."""
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lerobot_sets import recorded, write_v21, write_v30
+from recordings import write_raw_droid
+from synthetic import draw_frame, synthetic_states
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.sources.registry import open_source
+from vjepa2_ac.errors import InputError
+
+MUTATIONS = int(os.environ.get("VJEPA2_AC_MUTATIONS", "40"))  # of each kind of file; more in a longer run
+STATES = synthetic_states(6)
+FRAMES = np.stack([draw_frame(state, size=(36, 64)) for state in STATES])
+
+
+def mutated(data: bytes, generator: np.random.Generator) -> bytes:
+    """Return bytes after one accident: a flipped bit, a foreign, lost, repeated or blank stretch, an early end."""
+    start = int(generator.integers(len(data)))
+    end = min(len(data), start + int(2 ** generator.uniform(0, 12)))
+    middle = {
+        "flip": bytes([data[start] ^ 1 << int(generator.integers(8))]) + data[start + 1 : end],
+        "foreign": generator.bytes(end - start),
+        "lost": b"",
+        "twice": data[start:end] * 2,
+        "blank": bytes(end - start),
+        "cut": None,
+    }[str(generator.choice(["flip", "foreign", "lost", "twice", "blank", "cut"]))]
+    return data[:start] if middle is None else data[:start] + middle + data[end:]
+
+
+def write(form: str, root: Path) -> DataConfig:
+    """Write a data set of a form and return its config."""
+    if form.startswith("v"):
+        episodes = [recorded(number, steps) for number, steps in enumerate((7, 9, 8))]
+        (write_v30 if form == "v30" else write_v21)(root, episodes)
+    elif form == "raw":
+        folder = root / "LAB/success/2023-07-07/one"
+        write_raw_droid(folder, STATES, pictures={"1": FRAMES}, extrinsics={"1": STATES[:, :6]}, gop=3, b_frames=1)
+    else:
+        root.mkdir()
+        save = np.savez if form == "npz" else np.savez_compressed
+        save(
+            root / "one.npz", states=STATES, frames=FRAMES, fps_hz=15.0, language="pick it up", extrinsics=STATES[0, :6]
+        )
+    source = {"v": "lerobot", "r": "droid_raw", "n": "npz"}[form[0]]
+    config = {"source": source, "path": str(root), "disk_cache": {"dir": str(root.parent / "cache")}}
+    return DataConfig.model_validate_json(json.dumps(config))
+
+
+def everything(config: DataConfig) -> dict[str, Any]:
+    """Return the numbers and frames of each episode, or what is said of it; only InputError may be raised."""
+    source = open_source(config)
+    try:
+        infos = source.infos()
+    except InputError as error:
+        return {"the set": str(error)}
+    seen: dict[str, Any] = {problem.name: f"{problem.where}: {problem.found}" for problem in infos.problems}
+    for number, info in enumerate(infos):
+        try:
+            episode = source.read(number)
+            assert episode.states.shape == (info.num_steps, 7)
+            assert np.isfinite(episode.states).all()
+            frames = episode.read_frames([0, info.num_steps // 2, info.num_steps - 1])
+            assert frames.dtype == np.uint8
+            velocities = None if episode.joint_velocities is None else episode.joint_velocities.tobytes()
+            numbers = info.success, episode.states.tobytes(), velocities, episode.control_rate_hz
+            seen[info.id] = numbers, frames.tobytes()
+        except InputError as error:
+            seen[info.id] = str(error)
+    return seen
+
+
+@pytest.mark.parametrize(
+    ("form", "pattern", "equal"),
+    [
+        ("v30", "data/**/*.parquet", 2),
+        ("v30", "meta/episodes/**/*.parquet", 2),
+        ("v30", "videos/observation.images.exterior_1_left/**/*.mp4", 1),  # H.264 has no checksums
+        ("v21", "data/**/*.parquet", 2),
+        ("v21", "meta/*.json*", 2),
+        ("raw", "**/trajectory.h5", 0),
+        ("raw", "**/metadata_*.json", 0),
+        ("raw", "**/1.mp4", 0),
+        ("npz", "one.npz", 1),
+        ("npz compressed", "one.npz", 1),
+    ],
+)
+def test_damage_is_named_or_does_not_matter(form: str, pattern: str, equal: int, tmp_path: Path) -> None:
+    root = tmp_path / "set"
+    config, generator = write(form, root), np.random.default_rng(0)
+    before, files, named = everything(config), sorted(root.glob(pattern)), 0
+    assert not any(isinstance(content, str) for content in before.values())
+    for number in range(MUTATIONS):
+        path = files[int(generator.integers(len(files)))]
+        data = path.read_bytes()
+        path.write_bytes(mutated(data, generator))
+        after = everything(config)
+        case = f"mutation {number}: {path.name}"
+        assert "the set" in after or len(after) == len(before), f"{case}: an episode was lost, or counted twice"
+        for name, content in after.items():
+            if isinstance(content, str):
+                assert str(root) in content or "data.lerobot" in content, f"{case}: {content}"
+                named += 1
+            else:
+                assert content[:equal] == before[name][:equal], f"{case}: {name} is another"
+        path.write_bytes(data)
+    assert named > MUTATIONS / 20

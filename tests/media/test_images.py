@@ -1,0 +1,120 @@
+"""Images: decoded to RGB pixels, or an error that describes them; one size limit for every form of data."""
+
+import io
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import simplejpeg
+from PIL import Image
+
+from lerobot_sets import recorded, write_v30
+from synthetic import write_synthetic_droid
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.sources.registry import open_source
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.media import jpeg
+from vjepa2_ac.media.image_file import decode_image, read_image
+
+PIXELS = np.random.default_rng(0).integers(0, 256, (20, 30, 3), dtype=np.uint8)
+
+
+def png(image: Image.Image, form: str = "PNG") -> bytes:
+    file = io.BytesIO()
+    image.save(file, format=form)
+    return file.getvalue()
+
+
+def test_images_are_their_pixels_in_rgb(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(png(Image.fromarray(PIXELS)))
+    np.testing.assert_array_equal(read_image(tmp_path / "a.png"), PIXELS)
+    seen_through = Image.fromarray(np.dstack([PIXELS, PIXELS[..., :1]]))
+    np.testing.assert_array_equal(decode_image(png(seen_through), "here"), PIXELS)
+    grey = Image.fromarray(PIXELS[..., 0])
+    np.testing.assert_array_equal(decode_image(png(grey), "here"), PIXELS[..., :1].repeat(3, axis=-1))
+    red = np.zeros((16, 16, 3), np.uint8)
+    red[..., 0] = 200
+    found = decode_image(simplejpeg.encode_jpeg(red, colorspace="RGB", quality=95), "here")
+    np.testing.assert_allclose(found.astype(int), red, atol=6)
+
+
+@pytest.mark.parametrize(
+    ("data", "complaint"),
+    [
+        (b"", "0 bytes that are no image"),
+        (b"x,y,z\n1,2,3\n", "no image, starting with b'x,y,'"),
+        (png(Image.fromarray(PIXELS))[:60], "no image"),
+        (simplejpeg.encode_jpeg(PIXELS)[:60], "no image"),
+        (png(Image.fromarray(PIXELS[..., 0].astype(np.uint16))), "not 8 bits a channel"),
+        (png(Image.fromarray(PIXELS[..., 0].astype(np.uint16)), "TIFF"), "no image, .*depth, as TIFF, is not used"),
+    ],
+)
+def test_what_is_no_image_is_refused(data: bytes, complaint: str, tmp_path: Path) -> None:
+    (tmp_path / "goal.png").write_bytes(data)
+    with pytest.raises(InputError, match=rf"goal\.png.*{complaint}"):
+        read_image(tmp_path / "goal.png")
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"goal\.png: cannot be read: No such file"):
+        read_image(tmp_path / "goal.png")
+
+
+def claimed_png(height: int, width: int) -> bytes:
+    """Return a PNG of a few hundred bytes that says to be of a size."""
+    data = png(Image.fromarray(PIXELS))
+    header = data[12:16] + struct.pack(">II", width, height) + data[24:29]
+    return data[:12] + header + struct.pack(">I", zlib.crc32(header)) + data[33:]
+
+
+def claimed_jpeg(height: int, width: int) -> bytes:
+    """Return a JPEG likewise."""
+    data = simplejpeg.encode_jpeg(PIXELS)
+    place = data.index(b"\xff\xc0") + 5
+    return data[:place] + struct.pack(">HH", height, width) + data[place + 4 :]
+
+
+@pytest.mark.parametrize("size", [(65_500, 65_500), (10_001, 10_000)])
+def test_an_image_that_claims_to_be_huge_is_refused_before_anything_is_made(
+    size: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(simplejpeg, "decode_jpeg", None)
+    monkeypatch.setattr(Image.Image, "convert", None)
+    huge: list[Callable[[], object]] = [
+        lambda: decode_image(claimed_png(*size), "goal"),
+        lambda: decode_image(claimed_jpeg(*size), "goal"),
+        lambda: jpeg.decode_jpegs([claimed_jpeg(*size)], [5], "goal"),
+    ]
+    for decode in huge:
+        with pytest.raises(InputError, match=f"goal.*: 1 images of {size[0]} x {size[1]} pixels.*100 megapixels"):
+            decode()
+
+
+FORMS = ("rlds", "lerobot videos", "lerobot images", "npz")
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_every_form_of_data_refuses_images_beyond_the_bound(
+    tmp_path: Path, form: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "set"
+    if form == "rlds":
+        write_synthetic_droid(path, steps=[3], size=(32, 64), shards=1)
+    elif form == "npz":
+        path.mkdir()
+        frames = np.zeros((3, 32, 64, 3), np.uint8)
+        np.savez(path / "one.npz", states=np.zeros((3, 7)), frames=frames, fps_hz=15.0)
+    else:
+        write_v30(path, [recorded(0, 3, size=(32, 64))], pictures="video" if form == "lerobot videos" else "png")
+    source = open_source(DataConfig(source=form.split(maxsplit=1)[0], path=str(path)))
+    source.infos()
+    read = source.read(0).read_frames
+    assert read([0, 2]).shape == (2, 32, 64, 3)
+    for bound, most, message in (("MOST_PIXELS", 2_000, "32 x 64"), ("_MOST_BYTES", 10_000, "2 images of 32 x 64")):
+        monkeypatch.setattr(jpeg, bound, most)
+        with pytest.raises(InputError, match=message):
+            read([0, 2])
+        monkeypatch.undo()
