@@ -60,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     clips = draw(options)
     plain = rows.attempt(partial(plain_curve, options, clips, rows), way=PLAIN)
     beyond = []
-    for way in our_ways(options.ways, compiled=options.compile, graphs=False) if plain else ():
+    for way in our_ways(options.ways, compiled=options.compile) if plain else ():
         beyond.append(rows.attempt(partial(learns_otherwise, options, clips, way, plain, rows), way=way))
         let_go(options.device)
     beyond.append(rows.attempt(partial(rounds_too_much, options, rows), way="bfloat16"))

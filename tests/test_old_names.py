@@ -9,7 +9,6 @@ OLD = [
     ("vjepa2_ac.model.load", "load_base", "vjepa2_ac.model.checkpoints.loading", "load_base"),
     ("vjepa2_ac.model.lora", "load_trained", "vjepa2_ac.model.adapter.lora", "load_trained"),
     ("vjepa2_ac.model.heads", "fit_heads", "vjepa2_ac.model.network.input_heads", "fit_heads"),
-    ("vjepa2_ac.training.planning", "load_to_plan", "vjepa2_ac.planning.session", "load_to_plan"),
     ("vjepa2_ac.data.picture_file", "read_picture", "vjepa2_ac.media.image_file", "read_image"),
 ]
 

@@ -47,8 +47,7 @@ from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reports.comparison import compare
 from vjepa2_ac.reports.metrics_json import write_metrics
 from vjepa2_ac.runs.checkpoint import ADAPTER, OPTIMIZER, RunState, newest_checkpoint, read_state, write_checkpoint
-from vjepa2_ac.runs.manifest import write_manifest
-from vjepa2_ac.runs.torch_file import write_torch
+from vjepa2_ac.runs.files import write_manifest, write_torch
 from vjepa2_ac.training.optim import make_optimizer, trained_parameters
 from vjepa2_ac.training.resume import _read as read_checkpoint
 

@@ -26,7 +26,7 @@ from vjepa2_ac.decoding.decoder_folder import CARD, LINEAR, WEIGHTS, load_decode
 from vjepa2_ac.decoding.frame_pairs import FramePairs, Pairs, as_images
 from vjepa2_ac.decoding.optimizer_steps import DecoderSteps, learning_rate_at
 from vjepa2_ac.decoding.training import train_decoder
-from vjepa2_ac.distributed.preemption import EXIT_STATUS, StoppedError
+from vjepa2_ac.distributed.signals import EXIT_STATUS, StoppedError
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.image_similarity import psnr
 from vjepa2_ac.model.network.world_model import WorldModel

@@ -29,7 +29,9 @@ def measures_otherwise() -> None:
         found = measure(*given)
         times[0] += 1
         predicted = 0.5 * (1 - 1e-7 * RANK * times[0])
-        arrays = {key: np.full_like(one, 1.0 if key[0] == "persistence" else predicted) for key, one in found.arrays.items()}
+        arrays = {
+            key: np.full_like(one, 1.0 if key[0] == "persistence" else predicted) for key, one in found.arrays.items()
+        }
         return replace(found, arrays=arrays)
 
     validation.prediction_errors = measured
@@ -38,7 +40,7 @@ def measures_otherwise() -> None:
 def disk_is_full() -> None:
     if RANK == 0:
         full = InputError(where="checkpoints", found="the checkpoint cannot be written (No space left on device)")
-        setup.write_checkpoint = mock.Mock(side_effect=full)
+        resume.write_checkpoint = mock.Mock(side_effect=full)
 
 
 def run_is_of_another_config() -> None:
@@ -75,7 +77,7 @@ def each_meets_another_broken_episode() -> None:
 if __name__ == "__main__":
     globals()[sys.argv[2]]()
     try:
-        print("done in", train(load_config(sys.argv[1]), SILENT))
+        train(load_config(sys.argv[1]), SILENT)
     except Exception as error:
-        print(f"{type(error).__name__}: {error}")
+        sys.stdout.write(f"{type(error).__name__}: {error}\n")
         sys.exit(3)

@@ -11,18 +11,19 @@ import torch
 from run_fixtures import set_up
 from vjepa2_ac.config.loading import load_config
 from vjepa2_ac.data.clips.loader import training_loader
-from vjepa2_ac.distributed.collectives import (
+from vjepa2_ac.distributed.processes import (
     all_gather_object,
     all_reduce_max,
     all_reduce_sum,
     broadcast_object,
+    make_accelerator,
     require_same,
 )
-from vjepa2_ac.distributed.launch import make_accelerator
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.reporter import SILENT
-from vjepa2_ac.training.setup import Run, save_checkpoint
+from vjepa2_ac.training.resume import save_checkpoint
+from vjepa2_ac.training.setup import Run
 from vjepa2_ac.training.step import gradients, training_step
 
 

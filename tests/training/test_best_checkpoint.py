@@ -9,8 +9,8 @@ from vjepa2_ac.config.loading import config_as_dict, parse_config
 from vjepa2_ac.data.clips.dataset import open_dataset
 from vjepa2_ac.runs.checkpoint import RunState, newest_checkpoint, read_state
 from vjepa2_ac.training import loop, validation
-from vjepa2_ac.training.best_checkpoint import best_so_far, measured_on
 from vjepa2_ac.training.loop import train
+from vjepa2_ac.training.resume import best_so_far, measured_on
 
 BEST = RunState(20, best_step=10, best_error=0.5)
 

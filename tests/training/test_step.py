@@ -11,12 +11,13 @@ import torch
 from run_fixtures import set_up
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.clips.loader import training_loader
-from vjepa2_ac.distributed.launch import make_accelerator
+from vjepa2_ac.distributed.processes import make_accelerator
 from vjepa2_ac.encoding.batch import extrinsics_for
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.training import optim
-from vjepa2_ac.training.setup import Run, save_checkpoint
+from vjepa2_ac.training.resume import save_checkpoint
+from vjepa2_ac.training.setup import Run
 from vjepa2_ac.training.step import Gradients, gradients, training_step
 
 

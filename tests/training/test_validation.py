@@ -10,8 +10,7 @@ from same_run import assert_same_run
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_from
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.runs.checkpoint import checkpoint_name, newest_checkpoint, read_state
-from vjepa2_ac.runs.checkpoint_selection import select_checkpoint
+from vjepa2_ac.runs.checkpoint import checkpoint_name, newest_checkpoint, read_state, select_checkpoint
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.training import loop, validation
 from vjepa2_ac.training.loop import train

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from vjepa2_ac.config.effects import Affects
 from vjepa2_ac.config.section import (
@@ -18,11 +18,6 @@ from vjepa2_ac.config.section import (
     Section,
     ZeroToOne,
 )
-
-
-def _earlier_keep_best(value: object) -> object:
-    """Accept what earlier versions wrote: true was by error. YAML reads off as false."""
-    return {True: "error", False: "off"}[value] if isinstance(value, bool) else value
 
 
 def _usual_warmup(values: dict[str, Any]) -> int:
@@ -78,9 +73,6 @@ class TrainingConfig(Section):
     compile: Annotated[Literal["off", "blocks"], OFF] = "off"
     """blocks: torch.compile for the predictor's blocks, in training steps only; needs a C compiler, and a minute before
     the first step. The same losses and gradients to rounding; dropout draws other masks."""
-    cuda_graph: bool = False
-    """Ask the GPU for a whole micro-batch at once instead of kernel by kernel, which at one or two clips takes longer
-    than computing. Not measured yet. Keeps the memory of a step all the time; not with fp16, dropout or FSDP."""
     attention: Literal["auto", "per_step"] = "auto"
     """auto: FlexAttention in training steps on CUDA, which is compiled for each size of a batch. per_step: one plain
     attention for each model step, which compiles nothing. The same losses and gradients to rounding."""
@@ -144,13 +136,11 @@ class CheckpointConfig(Section):
     """Minutes after which a checkpoint is written in any case; null: by steps only."""
     keep: PositiveInt = 5
     """Number of newest checkpoints that are kept."""
-    keep_best: Annotated[Literal["ranking", "error", "off"], BeforeValidator(_earlier_keep_best), Affects.MEASURED] = (
-        "ranking"
-    )
+    keep_best: Annotated[Literal["ranking", "error", "off"], OFF, Affects.MEASURED] = "ranking"
     """By what the best checkpoint is selected; it is written and kept, and evaluated, exported and planned with unless
     another is asked for. ranking: the lowest mean rank of the true action (`validation.ranking_clips`), and of ranks
     within 0.005 of it the lowest error; the base is a candidate, for a lower error may go with worse plans. error: the
-    rollout error over persistence at the last horizon, as earlier versions did. off: the newest counts."""
+    rollout error over persistence at the last horizon. off: the newest counts."""
     remote: Place | None = None
     """Where the run is copied to during training: gs://bucket/folder, another URL of fsspec that can be written, or a
     folder (a mounted disk). A start with an empty run_dir resumes from there; null: nowhere. Same keep and best as

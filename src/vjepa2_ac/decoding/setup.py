@@ -22,7 +22,7 @@ from vjepa2_ac.decoding.frame_pairs import FramePairs, encode_pairs, require_spa
 from vjepa2_ac.decoding.loss import SMALLEST
 from vjepa2_ac.decoding.network import UPSAMPLED, DecoderShape
 from vjepa2_ac.distributed.device import autocast, computing_device
-from vjepa2_ac.distributed.preemption import StoppedError, StopRequest
+from vjepa2_ac.distributed.signals import StoppedError, StopRequest
 from vjepa2_ac.encoding.batch import encoding_of
 from vjepa2_ac.encoding.cache_lookup import key_for
 from vjepa2_ac.encoding.encode_dataset import encoder_on_device
@@ -33,8 +33,8 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import INDEXING, Reporter
-from vjepa2_ac.runs.folder import CHECKPOINTS, METRICS
-from vjepa2_ac.runs.lock import LOCK, RunLock
+from vjepa2_ac.runs.checkpoint import CHECKPOINTS
+from vjepa2_ac.runs.folder import LOCK, METRICS, RunLock
 from vjepa2_ac.storage import try_writing_at, user_can_write, write_atomically
 from vjepa2_ac.storage.structured import read_json_object
 

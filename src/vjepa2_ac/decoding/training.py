@@ -25,14 +25,13 @@ from vjepa2_ac.decoding.linear_fit import fit_linear
 from vjepa2_ac.decoding.network import Decoder
 from vjepa2_ac.decoding.optimizer_steps import DecoderSteps
 from vjepa2_ac.decoding.setup import Setup, prepare, setup
-from vjepa2_ac.distributed.preemption import StoppedError, StopRequest, stop_on_signals
+from vjepa2_ac.distributed.signals import StoppedError, StopRequest, stop_on_signals
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.finite import first_not_finite
 from vjepa2_ac.reporter import SILENT, Reporter
-from vjepa2_ac.runs.checkpoint import OPTIMIZER, RunState, newest_checkpoint, read_state, write_checkpoint
-from vjepa2_ac.runs.folder import CHECKPOINTS
+from vjepa2_ac.runs.checkpoint import CHECKPOINTS, OPTIMIZER, RunState, newest_checkpoint, read_state, write_checkpoint
+from vjepa2_ac.runs.files import read_torch, write_torch
 from vjepa2_ac.runs.metrics_log import MetricsLog
-from vjepa2_ac.runs.torch_file import read_torch, write_torch
 from vjepa2_ac.storage.structured import utc_now
 
 _WEIGHTS = "decoder.pt"

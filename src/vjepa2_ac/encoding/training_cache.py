@@ -11,7 +11,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.data.clips.loader import WHOLE, ProcessShare
 from vjepa2_ac.data.sources.latents.manifest import is_whole
-from vjepa2_ac.distributed.collectives import broadcast_object
+from vjepa2_ac.distributed.processes import broadcast_object
 from vjepa2_ac.encoding.batch import require_same_encoder
 from vjepa2_ac.encoding.cache_lookup import through_cache
 from vjepa2_ac.encoding.cache_writer import CacheWriter

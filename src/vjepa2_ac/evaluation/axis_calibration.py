@@ -14,7 +14,7 @@ from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
 from vjepa2_ac.data.clips.loader import validation_batches
 from vjepa2_ac.data.clips.streams import copies_for
-from vjepa2_ac.distributed.launch import make_accelerator
+from vjepa2_ac.distributed.processes import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, require_same_encoder, require_widths
 from vjepa2_ac.evaluation.action_use.inferred_moves import infer_axes
 from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, start_of

@@ -19,7 +19,7 @@ from vjepa2_ac.data.clips.loader import batches_of, validation_windows
 from vjepa2_ac.data.clips.streams import copies_for
 from vjepa2_ac.data.clips.transforms import frames_as_seen
 from vjepa2_ac.decoding.decoder_folder import load_decoder
-from vjepa2_ac.distributed.launch import make_accelerator
+from vjepa2_ac.distributed.processes import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.encoding.training_cache import with_latents_if_there
 from vjepa2_ac.episode import Batch, LatentBatch
@@ -34,7 +34,7 @@ from vjepa2_ac.evaluation.stride_calibration.measure import calibrate_model
 from vjepa2_ac.evaluation.subject import load_subject
 from vjepa2_ac.model.quantization import require_8_bits
 from vjepa2_ac.reporter import SILENT, Reporter
-from vjepa2_ac.runs.checkpoint_selection import select_checkpoint
+from vjepa2_ac.runs.checkpoint import select_checkpoint
 from vjepa2_ac.runs.folder import METRICS, is_run
 from vjepa2_ac.runs.loading import TrainedRun
 from vjepa2_ac.runs.metrics_log import read_metrics_log, warnings_of

@@ -25,7 +25,7 @@ from vjepa2_ac.data.clips.transforms import frames_as_seen, view
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
 from vjepa2_ac.decoding.frame_pairs import as_images
 from vjepa2_ac.decoding.imagine import Start, imagined_latents
-from vjepa2_ac.distributed.launch import make_accelerator
+from vjepa2_ac.distributed.processes import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, encode_frames
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.decoded.hand import HandPositions, HandProbe

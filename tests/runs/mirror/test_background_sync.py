@@ -426,14 +426,6 @@ def test_damaged_checkpoints_there_are_replaced_or_removed(bucket: Gcs, run: Pat
     assert there() == names(10), "nobody is to try the other one again"
 
 
-@pytest.mark.usefixtures("bucket")
-def test_a_damaged_checkpoint_of_this_machine_is_not_sent(run: Path) -> None:
-    write(run, 10)
-    (write(run, 20) / "optimizer.pt").write_bytes(b"damaged")
-    send(run)
-    assert there() == names(10)
-
-
 def test_what_a_killed_process_held_is_let_go(run: Path, place: str) -> None:
     (run / HELD / checkpoint_name(10)).mkdir(parents=True)
     mirror_of(run, place)

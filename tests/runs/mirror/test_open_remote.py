@@ -15,8 +15,7 @@ from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.errors import InputError, UnreachableError
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.checkpoint import RunState, checkpoint_name, newest_checkpoint, read_state, write_checkpoint
-from vjepa2_ac.runs.folder import check_run_folder
-from vjepa2_ac.runs.lock import RunLock
+from vjepa2_ac.runs.folder import RunLock, check_run_folder
 from vjepa2_ac.runs.mirror.open_remote import Remote, open_remote
 from vjepa2_ac.storage.remote import filesystems
 

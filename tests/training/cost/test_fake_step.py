@@ -19,8 +19,9 @@ from vjepa2_ac.model.adapter.lora import with_adapter
 from vjepa2_ac.model.adapter.low_rank import CastMatrices
 from vjepa2_ac.model.network.rotary import TokenLayout, rotary_tables
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.training.cost import fake_model, fake_step
-from vjepa2_ac.training.cost.fake_step import StepBytes, measure_step
+from vjepa2_ac.training.cost import step as fake_model
+from vjepa2_ac.training.cost import step as fake_step
+from vjepa2_ac.training.cost.step import StepBytes, measure_step
 from vjepa2_ac.training.loss import Objective
 
 TOLERANCE = 0.015

@@ -8,8 +8,8 @@ from sized_runs import LORA, built, model_sizes, run_config
 from vjepa2_ac.config import Config, EncoderSizes, ModelSizes
 from vjepa2_ac.model.adapter.lora import trainable_report
 from vjepa2_ac.model.adapter.targets import adapter_ranks
-from vjepa2_ac.training.cost.fake_model import meta_network
-from vjepa2_ac.training.cost.parameters import count_parameters
+from vjepa2_ac.training.cost.memory import count_parameters
+from vjepa2_ac.training.cost.step import meta_network
 
 HEADS = ["action_encoder", "state_encoder"]
 ADAPTERS: dict[str, dict[str, Any]] = {

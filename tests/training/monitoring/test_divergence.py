@@ -14,7 +14,7 @@ from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.runs.metrics_log import read_metrics_log, warnings_of
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.monitoring.divergence import Watch, WatchedMetricsLog
+from vjepa2_ac.training.monitoring import Watch, WatchedMetricsLog
 
 HUGE = {
     "adapter__rank": 16, "adapter__alpha": 64, "training__learning_rate": 0.05, "training__accumulation": 1,
@@ -164,7 +164,7 @@ def test_a_resumed_run_reports_the_same_as_an_uninterrupted_one(make_diverging, 
 
 
 def _stop_behind(step: int) -> Callable[..., None]:
-    from vjepa2_ac.training.setup import save_checkpoint
+    from vjepa2_ac.training.resume import save_checkpoint
 
     def save(run: Any, folder: Path) -> None:
         save_checkpoint(run, folder)

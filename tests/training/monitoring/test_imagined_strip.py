@@ -17,9 +17,8 @@ from vjepa2_ac.media.image_file import read_image
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.runs.metrics_log import MetricsLog
-from vjepa2_ac.training import setup
+from vjepa2_ac.training import imagined_strip, setup
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.monitoring import imagined_strip
 from vjepa2_ac.training.validation import validate
 
 

@@ -12,10 +12,10 @@ from run_fixtures import set_up
 from vjepa2_ac.data.clips import loader
 from vjepa2_ac.episode import Batch, Clip
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.training import step as nonfinite_clips
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.monitoring import nonfinite_clips
-from vjepa2_ac.training.monitoring.nonfinite_clips import MOST_CLIPS, ClipRecorder
 from vjepa2_ac.training.setup import batches_from
+from vjepa2_ac.training.step import MOST_CLIPS, ClipRecorder
 
 
 def batch(first: int, clips: int = 2, bad: int | None = None) -> Batch:

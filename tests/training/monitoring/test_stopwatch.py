@@ -10,8 +10,7 @@ import torch
 from recording_cuda import RecordingCuda
 from vjepa2_ac.data.clips.clip_reader import no_clips
 from vjepa2_ac.episode import POSE_WIDTHS, Batch
-from vjepa2_ac.training.monitoring.stopwatch import IdleStopwatch, Stopwatch, stopwatch_for
-from vjepa2_ac.training.monitoring.throughput import TimedBatches
+from vjepa2_ac.training.monitoring import IdleStopwatch, Stopwatch, TimedBatches, stopwatch_for
 
 
 class Machine(RecordingCuda):

@@ -19,13 +19,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.training.cost.flops import clip_flops
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.monitoring.throughput import (
-    MEASURED,
-    Throughput,
-    TimedBatches,
-    Update,
-    peak_memory_gb,
-)
+from vjepa2_ac.training.monitoring import MEASURED, Throughput, TimedBatches, Update, peak_memory_gb
 
 CPU = torch.device("cpu")
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.clips.dataset import open_dataset
-from vjepa2_ac.distributed.launch import make_accelerator
+from vjepa2_ac.distributed.processes import make_accelerator
 from vjepa2_ac.encoding.batch import require_same_encoder, require_widths
 from vjepa2_ac.evaluation.measure import ClipSample
 from vjepa2_ac.evaluation.stride_calibration.measure import Calibration, calibrate_model, require_learned

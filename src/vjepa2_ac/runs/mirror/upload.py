@@ -15,8 +15,9 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.runs.checkpoint import find_damage, listed, step_of, written_state
-from vjepa2_ac.runs.folder import CALIBRATION, CHANGES, CHECKPOINTS, CONFIG, ENVIRONMENT, HELD, METRICS, RUN_ID
+from vjepa2_ac.runs.checkpoint import CHECKPOINTS, listed, step_of, written_state
+from vjepa2_ac.runs.files import MANIFEST
+from vjepa2_ac.runs.folder import CALIBRATION, CHANGES, CONFIG, ENVIRONMENT, HELD, METRICS, RUN_ID
 from vjepa2_ac.runs.mirror.remote_checkpoints import Listing, RemoteCheckpoints, complete
 from vjepa2_ac.storage import join, read_bounded, upload
 from vjepa2_ac.storage.structured import MOST_BYTES, json_list, shown
@@ -143,7 +144,7 @@ class RemoteUpdate:
             shutil.copytree(self.folder / CHECKPOINTS / str(name), held, copy_function=_link)
         except (FileNotFoundError, shutil.Error):
             return None
-        return held if find_damage(held) is None else None
+        return held if (held / MANIFEST).is_file() else None
 
     def _remove(self, names: Collection[str], go_on: GoOn) -> None:
         for name in sorted(names):
