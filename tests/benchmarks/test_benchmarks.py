@@ -16,7 +16,6 @@ import pytest
 import torch
 
 from benches import ELSEWHERE, drawn_on, imported
-from vjepa2_ac.errors import InputError
 
 
 @pytest.fixture

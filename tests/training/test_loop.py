@@ -8,22 +8,18 @@ from pathlib import Path
 
 import pytest
 import torch
-import yaml
 
 from copied_sets import write_rlds
 from run_fixtures import set_up
 from same_run import assert_same_run, metrics, trained_weights
 from vjepa2_ac.config import CheckpointConfig, Config
-from vjepa2_ac.config.loading import config_as_dict, config_as_yaml
+from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.data.clips import loader
 from vjepa2_ac.data.clips.clip_reader import ClipRequest
 from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.episode import Clip
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.request import EvaluationOptions, settle
-from vjepa2_ac.export.export import export_run
 from vjepa2_ac.model.checkpoints.loading import load_base
-from vjepa2_ac.planning.settings import planning_settings
 from vjepa2_ac.runs.checkpoint import CheckpointClock, checkpoint_name, newest_checkpoint, read_state
 from vjepa2_ac.runs.folder import read_run_config
 from vjepa2_ac.runs.loading import load_run
@@ -62,7 +58,6 @@ def test_a_run_that_died_and_went_on_equals_the_one_that_did_not(
 
 KINDS = {
     "dora": {"adapter__dora": True, "adapter__dropout": 0.2},
-    "pissa": {"adapter__init": "pissa"},
     "whole predictor": {"adapter__kind": "none"},
     "8 bit": {"training__optimizer": "adamw_8bit"},
 }
@@ -268,30 +263,6 @@ def test_an_allowed_config_change_is_written_and_reported(make_config, reporter)
     assert [start.get("config_changes") for start in starts] == [None, reported]
     assert reporter.steps == [*range(1, 7), 7, 8]
     train(changed, reporter)
-
-
-@pytest.mark.parametrize("weight", [0.0, 1.0], ids=["off", "on"])
-def test_a_run_made_with_a_knob_that_is_gone_can_be_used_and_goes_on_where_it_was_off(
-    make_config, reporter, tmp_path, weight: float
-) -> None:
-    config = make_config(training__steps=2, checkpoint__every=1)
-    folder = train(config, reporter)
-    of_before = config_as_dict(config)
-    of_before["training"]["action_contrast"] = {"weight": weight, "margin": 0.3}
-    (folder / "config.yaml").write_text(yaml.safe_dump(of_before))
-    assert load_run(folder).world_model.adaptation is not None
-    assert planning_settings(str(folder)).planning == config.planning
-    assert settle(str(folder), EvaluationOptions())[1] == config.planning
-    export_run(folder, tmp_path / "exported", "hub")
-    if not weight:
-        train(read_run_config(folder), reporter, check_only=True)  # --resume
-        return
-    for again in (read_run_config(folder), config):
-        with pytest.raises(InputError, match=r"was trained with training\.action_contrast.*is gone"):
-            train(again, reporter, check_only=True)
-    reporter.notes.clear()
-    train(config, reporter, check_only=True, allow_config_change=True)
-    assert any('training.action_contrast: {"margin": 0.3, "weight": 1.0} -> null' in note for note in reporter.notes)
 
 
 def test_allowed_changes_of_the_optimizer_take_effect(make_config, reporter) -> None:

@@ -286,9 +286,10 @@ class RunLock:
             try:
                 self._lock.acquire(blocking=False)
             except Timeout:
-                needed, fix = "a folder that no other process writes to", "Wait until it ends, stop it, or set another"
                 found = f"a run that is being trained right now, by {_last_start(self._folder)}"
-                raise InputError(where=str(self._folder), found=found, needed=needed, fix=f"{fix} run_dir") from None
+                needed = "a folder that no other process writes to"
+                fix = "Wait until it ends, stop it, or set another run_dir"
+                raise InputError(where=str(self._folder), found=found, needed=needed, fix=fix) from None
             except OSError as error:
                 if error.errno not in _NO_LOCKS:
                     raise
@@ -306,4 +307,6 @@ class RunLock:
 
 def _last_start(folder: Path) -> str:
     last: dict[str, Any] = (_earlier_starts(folder / ENVIRONMENT) or [{}])[-1]
-    return "process {process} on {host}, since {time}".format_map(last) if "host" in last else "another process"
+    if "host" not in last:
+        return "another process"
+    return f"process {last.get('process')} on {last['host']}, since {last.get('time')}"

@@ -43,8 +43,8 @@ def open_replay(replay: ReplayConfig, dataset: Dataset, reporter: Reporter) -> D
             f" {found_s:.3g} s",
             needed=f"{needed_s:.3g} s, as those of data (stride {dataset.config.stride} at"
             f" {dataset.control_rate_hz:g} a second)",
-            fix="Choose data.stride and replay.data.stride so that both steps last equally long:"
-            f" {needed_s * replayed.control_rate_hz:.3g} control steps here",
+            fix="Choose strides whose steps last equally long:"
+            f" replay.data.stride={needed_s * replayed.control_rate_hz:.3g} would",
         )
     windows = replayed.windows("train")
     reporter.note(f"Replay: {replay.share:.0%} of the clips are from {replay.data.path}, which has {len(windows):,}.")
