@@ -104,6 +104,7 @@ HOMES = {
     "PIL": ["media/"],
     "accelerate": [
         "distributed/",
+        "runs/trackers.py",
         "training/",
         "encoding/training_cache.py",
         "evaluation/stride_calibration/measure.py",

@@ -173,4 +173,5 @@ def require_same(accelerator: Accelerator, value: object, *, what: str, fix: str
 @cache
 def _patient_group() -> torch.distributed.ProcessGroup:
     """Return a group without a time-out: NCCL's is minutes. A process that dies breaks the others' connections."""
-    return torch.distributed.new_group(backend="gloo", timeout=_AS_LONG_AS_IT_TAKES)
+    group: torch.distributed.ProcessGroup = torch.distributed.new_group(backend="gloo", timeout=_AS_LONG_AS_IT_TAKES)
+    return group

@@ -33,7 +33,7 @@ CHECKPOINTS = "checkpoints"  # of a run's folder
 STATE = "state.json"
 ADAPTER = "adapter"  # a folder: what `model.adapter.lora.save_trained` writes
 OPTIMIZER = "optimizer.pt"
-FETCHING = ".fetching-"  # a checkpoint being fetched, see `runs.mirror.fetch`
+FETCHING = ".fetching-"  # a checkpoint being fetched, see `runs.mirror.open_remote`
 
 _WRITING = ".writing-"
 SELECTED, NEWEST, BEST = "selected", "newest", "best"
@@ -63,7 +63,7 @@ class RunState:
     best_error: Finite | None = None  # its rollout error
     best_rank: Finite | None = None  # its mean rank of the true action, if that selects
     lowest_rank: Finite | None = None  # of all validations
-    measured_on: Mapping[str, str] | None = None  # what validation errors depend on, see `training.best_checkpoint`
+    measured_on: Mapping[str, str] | None = None  # what validation errors depend on, see `training.resume`
     loss_scale: Mapping[str, int | float] | None = None  # of fp16: state of the gradient scaler
     data: str | None = None  # the fingerprint of the episodes
     replayed_broken: Mapping[str, str] = field(default_factory=dict)  # the same of the second data set

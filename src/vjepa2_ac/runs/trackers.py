@@ -202,7 +202,7 @@ def _trackio(config: Config, run_id: str) -> Any:
     import trackio
     from accelerate.tracking import TrackioTracker
 
-    class WithImages(TrackioTracker):
+    class WithImages(TrackioTracker):  # type: ignore[misc]  # untyped
         def log_images(self, values: Mapping[str, Any], step: int) -> None:
             self.log({name: trackio.Image(images[0]) for name, images in values.items()}, step=step)
 

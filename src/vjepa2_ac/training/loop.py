@@ -185,7 +185,7 @@ def _loop(
         if is_done and run.state.step < training.steps:
             reporter.note(_out_of_patience(run))
         # All wait: the launcher ends all processes once one has ended.
-        agreed(run.accelerator, lambda: mirror and mirror.finish(lambda: not is_done or bool(stop.number)))
+        agreed(run.accelerator, lambda: mirror.finish(lambda: not is_done or bool(stop.number)) if mirror else None)
     if not is_done:
         raise StoppedError(run.folder, run.state.step, signal.Signals(stopped_by).name)
 

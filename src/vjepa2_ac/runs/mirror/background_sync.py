@@ -73,13 +73,13 @@ class Mirror:
         """
         self._is_ending.set()
         is_short, until_s = False, time.monotonic() + LONGEST_WAIT_S
-        for begin in (lambda: None, self._begin):  # the current upload ends, or breaks off if there is a newer one
-            if not self.is_sending:
-                begin()
-            while self.is_sending and time.monotonic() < until_s:
+        for is_last in (False, True):  # the current upload ends, or breaks off if there is a newer one
+            if is_last and not self.is_sending:
+                self._begin()
+            while self._thread and self.is_sending and time.monotonic() < until_s:
                 if not is_short and is_asked_to_stop():
                     is_short, until_s = True, time.monotonic() + self._config.remote_wait_seconds
-                time.sleep(_LOOK_EVERY_S)
+                self._thread.join(_LOOK_EVERY_S)
         in_time = not self.is_sending
         self._has_ended.set()
         if not self._is_lost and not (in_time and self._sent == self._update.newest_here()):

@@ -217,7 +217,7 @@ def _pass(model: _FakeModel, config: Config, sizes: ModelSizes, storages: LiveSt
     with _autocast(config):
         loss = torch.stack(Objective(model, config.training)(batch)).sum()
     model.end_phase()
-    loss.backward()
+    loss.backward()  # type: ignore[no-untyped-call]  # torch
     model.end_phase()
     return tuple(model.peaks)
 
