@@ -66,10 +66,6 @@ def test_a_run_under_nohup_outlives_its_terminal(make_config, reporter, tmp_path
     assert_same_run(whole_run, tmp_path / "run")
 
 
-def test_a_run_asked_to_stop_after_its_last_step_is_done(make_config, reporter) -> None:
-    train(make_config(), signalled_reporter(reporter, 6, signal.SIGTERM))
-
-
 def test_a_signal_to_the_whole_group_stops_the_run_and_its_workers_in_good_order(
     make_config, reporter, tmp_path
 ) -> None:

@@ -46,24 +46,6 @@ def write(folder: Path, step: int, keep: int = 5) -> Path:
     return write_checkpoint(folder, RunState(step), write_weights, keep=keep)
 
 
-def test_what_is_written_is_found_again(tmp_path: Path) -> None:
-    path = write(tmp_path, 20)
-    assert newest_checkpoint(tmp_path) == path
-    assert read_state(path) == RunState(20)
-    assert find_damage(path) is None
-
-
-def test_a_folder_without_checkpoints_has_none(tmp_path: Path) -> None:
-    assert newest_checkpoint(tmp_path) is None
-    assert newest_checkpoint(tmp_path / "missing") is None
-
-
-def test_only_the_newest_are_kept(tmp_path: Path) -> None:
-    for step in (10, 20, 30, 100, 110):
-        write(tmp_path, step, keep=2)
-    assert sorted(path.name for path in tmp_path.iterdir()) == [checkpoint_name(100), checkpoint_name(110)]
-
-
 @pytest.mark.parametrize("name", ["adapter/weights.bin", "optimizer.pt", "state.json", "manifest.json"])
 @pytest.mark.parametrize("fault", ["truncate", "flip", "remove"])
 def test_a_damaged_checkpoint_is_passed_over_with_a_warning(
@@ -82,19 +64,6 @@ def test_a_damaged_checkpoint_is_passed_over_with_a_warning(
     with caplog.at_level(logging.WARNING):
         assert newest_checkpoint(tmp_path) == older
     assert str(newer) in caplog.text
-
-
-def test_a_full_disk_leaves_the_older_checkpoints_and_no_debris(tmp_path: Path) -> None:
-    older = write(tmp_path, 10)
-
-    def disk_is_full(folder: Path) -> None:
-        (folder / "half").write_bytes(b"x")
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    with pytest.raises(InputError, match="No space left"):
-        write_checkpoint(tmp_path, RunState(step=20), disk_is_full, keep=1)
-    assert list(tmp_path.iterdir()) == [older]
-    assert find_damage(older) is None
 
 
 @pytest.mark.parametrize("step", [30, 40])
@@ -207,7 +176,7 @@ class Faults:
         return operation
 
 
-@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS, errno.EIO])
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EIO])
 def test_whatever_operation_fails_older_checkpoints_stay_and_nothing_half_is_left(tmp_path, monkeypatch, code) -> None:
     faults = Faults(monkeypatch)
     write(tmp_path / "count", 10)

@@ -21,14 +21,6 @@ def steps(folder: Path) -> list[int]:
     return [row["step"] for row in read_metrics_log(folder / "metrics.jsonl")]
 
 
-def test_rows_read_back(tmp_path: Path) -> None:
-    with MetricsLog(tmp_path, first_step=0) as log:
-        log.write("train", 1, {"loss": 0.5, "by_horizon": [1.0, 2.0]})
-    assert list(read_metrics_log(tmp_path / "metrics.jsonl")) == [
-        {"kind": "train", "step": 1, "loss": 0.5, "by_horizon": [1.0, 2.0]}
-    ]
-
-
 def test_steps_that_will_be_done_again_are_dropped_on_resume(tmp_path: Path) -> None:
     with MetricsLog(tmp_path, first_step=0) as log:
         for step in range(6):

@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vjepa2_ac.config import Config, TrackingConfig
+from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import parse_config
-from vjepa2_ac.errors import InputError
 from vjepa2_ac.runs import trackers as tracker_threads
 from vjepa2_ac.runs.metrics_log import read_metrics_log
-from vjepa2_ac.runs.trackers import Trackers, open_trackers, require_installed
+from vjepa2_ac.runs.trackers import Trackers, open_trackers
 from vjepa2_ac.training import loop
 from vjepa2_ac.training.loop import train
 
@@ -170,23 +169,6 @@ def test_one_that_takes_minutes_holds_up_nothing_and_gets_all_in_the_end(caplog,
     assert slow.closed == 1
 
 
-def test_what_waits_for_a_tracker_is_bounded_and_the_rest_counted(caplog, monkeypatch) -> None:
-    monkeypatch.setattr(tracker_threads, "MOST_ROWS", 5)
-    never, slow = threading.Event(), Kept()
-
-    def opened() -> Kept:
-        never.wait(120)
-        return slow
-
-    trackers = Trackers({"slow": opened}, closing_s=120.0)
-    for step in range(12):
-        trackers.log("train", step, {"loss": 0.5})
-    never.set()
-    trackers.close()
-    assert [step for step, _ in slow.rows] == [0, 1, 2, 3, 4]
-    assert warnings_in(caplog) == ["slow was too slow for 7 rows, which are missing there"]
-
-
 def test_a_run_does_not_wait_for_a_tracker_that_never_opens(make_config, reporter, monkeypatch, caplog) -> None:
     never = threading.Event()
 
@@ -198,15 +180,6 @@ def test_a_run_does_not_wait_for_a_tracker_that_never_opens(make_config, reporte
     never.set()
     assert [row["step"] for row in read_metrics_log(folder / "metrics.jsonl") if row["kind"] == "train"] == [1, 2]
     assert [text.split(" (")[0] for text in warnings_in(caplog)] == ["stuck cannot be opened"]
-
-
-@pytest.mark.parametrize("library", ["wandb", "trackio"])
-def test_one_that_is_not_installed_is_an_error_that_says_how_to_install_it(monkeypatch, library: str) -> None:
-    monkeypatch.setitem(sys.modules, library, None)
-    require_installed(TrackingConfig())
-    asked = TrackingConfig(wandb="offline") if library == "wandb" else TrackingConfig(trackio=True)
-    with pytest.raises(InputError, match=rf"tracking\.{library}.*pip install .*\[{library}\]"):
-        require_installed(asked)
 
 
 def test_tensorboard_gets_the_numbers_and_forgets_steps_that_are_done_again(tmp_path: Path) -> None:
@@ -305,11 +278,3 @@ def test_tensorboard_gets_images(tmp_path: Path) -> None:
     events.Reload()
     (event,) = events.Images("validation/imagined")
     assert (event.step, event.height, event.width) == (3, 4, 5)
-
-
-def test_weights_and_biases_gets_images_without_a_network(tmp_path: Path) -> None:
-    pytest.importorskip("wandb")
-    trackers = open_trackers(run_config(tmp_path, wandb="offline"), tmp_path, run_id="abc", first_step=0)
-    trackers.log_image("validation", "imagined", 3, IMAGE)
-    trackers.close()
-    assert len(list((tmp_path / "wandb").rglob("imagined_*.png"))) == 1

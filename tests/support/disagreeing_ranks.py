@@ -5,11 +5,14 @@ Arguments: a config, and what happens (a function below).
 
 import os
 import sys
+import time
 from dataclasses import replace
+from datetime import timedelta
 from pathlib import Path
 from unittest import mock
 
 import numpy as np
+import torch
 
 from vjepa2_ac.config.loading import load_config
 from vjepa2_ac.data.clips.loader import training_loader
@@ -56,6 +59,13 @@ def checkpoint_cannot_be_read() -> None:
 def index_cannot_be_made() -> None:
     if RANK == 0:
         setup.open_dataset = mock.Mock(side_effect=InputError(where="data.path", found="no data set"))
+
+
+def indexing_takes_longer_than_the_time_out() -> None:
+    torch.distributed.init_process_group("gloo", timeout=timedelta(seconds=6))
+    if RANK == 0:
+        make = setup.open_dataset
+        setup.open_dataset = lambda *given, **named: (time.sleep(9), make(*given, **named))[1]
 
 
 def each_meets_another_broken_episode() -> None:

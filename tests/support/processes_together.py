@@ -16,6 +16,8 @@ from vjepa2_ac.distributed.processes import (
     all_reduce_max,
     all_reduce_sum,
     broadcast_object,
+    first_of_machine,
+    first_only,
     make_accelerator,
     require_same,
 )
@@ -63,6 +65,10 @@ def main() -> None:
     require_same(accelerator, "one", what="it", fix="none")
     with pytest.raises(InputError, match="in process 1 than in process 0"):
         require_same(accelerator, rank, what="it", fix="none")
+
+    index = Path(config.run_dir).parent / "index"
+    assert first_of_machine(accelerator, lambda: index.exists() or bool(index.write_text("made"))) or rank == 0
+    assert first_only(accelerator, lambda: "done") == (None if rank else "done")
 
     run = set_up(config, SILENT, accelerator=accelerator)
     first = run.world_model.predictor.state_dict()

@@ -67,16 +67,6 @@ def test_constant_rises_to_the_peak_and_stays() -> None:
         TrainingConfig(schedule="constant", final_learning_rate=1e-5)
 
 
-def test_a_schedule_without_warmup_starts_near_the_peak() -> None:
-    training = TrainingConfig(steps=1000, warmup_steps=0, learning_rate=1e-3)
-    assert learning_rate_at(1, training) == pytest.approx(1e-3, rel=1e-3)
-
-
-def test_steps_count_from_one() -> None:
-    with pytest.raises(ValueError, match="count from 1"):
-        learning_rate_at(0, TrainingConfig())
-
-
 def test_weight_decay_spares_biases_and_norms_and_frozen_weights_are_left_out() -> None:
     module = torch.nn.Sequential(torch.nn.Linear(3, 4), torch.nn.LayerNorm(4), torch.nn.Linear(4, 2))
     module[2].requires_grad_(requires_grad=False)

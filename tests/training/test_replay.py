@@ -5,12 +5,11 @@ import shutil
 from pathlib import Path
 
 import pytest
-import yaml
 
 from run_fixtures import set_up
 from same_run import assert_same_run
 from synthetic import write_synthetic_droid
-from vjepa2_ac.config import Config, DataConfig, ReplayConfig
+from vjepa2_ac.config import Config
 from vjepa2_ac.config.effects import Affects, knobs_that_affect, marks_of, names_that_affect
 from vjepa2_ac.config.loading import config_as_dict, config_as_yaml, parse_config
 from vjepa2_ac.data.clips import loader
@@ -176,16 +175,6 @@ def test_a_second_data_set_that_cannot_fit_is_refused_when_the_config_is_read(re
         replaying(**changes)
 
 
-def test_poses_in_another_frame_and_commands_joined_otherwise_are_misfits() -> None:
-    in_camera = ReplayConfig(data=DataConfig(source="droid_raw", path="x", pose_frame="camera"))
-    assert in_camera.misfits(DataConfig(path="y")) == ["replay.data.pose_frame camera is not data.pose_frame base"]
-    summed, last = (
-        DataConfig(path="x", states="vector", actions="recorded", join_actions=how) for how in ("sum", "last")
-    )
-    assert ReplayConfig(data=summed).misfits(last) == ["replay.data.join_actions sum is not data.join_actions last"]
-    assert not ReplayConfig(data=last).misfits(last)
-
-
 def test_steps_of_another_length_are_refused_with_the_stride_that_fits(replaying, reporter) -> None:
     with pytest.raises(InputError, match=r"(?s)replay.data.stride: 3 at 15 .*0.2 s.*0.133 s.*replay.data.stride=2"):
         train(replaying(replay__data__stride=3), reporter)
@@ -251,8 +240,3 @@ def test_replay_is_part_of_what_decides_a_run_and_of_nothing_else(replaying, mak
         assert "replay" not in knobs_that_affect(what, config)
         assert not [name for name in names_that_affect(what, Config) if name.startswith("replay")]
     assert knobs_that_affect(Affects.LATENTS, config.for_replay().data)["frames"] == 4
-
-
-def test_a_config_with_replay_is_written_and_read_back(replaying) -> None:
-    config = replaying()
-    assert parse_config(yaml.safe_load(config_as_yaml(config)), where="test") == config

@@ -9,7 +9,6 @@ import torch
 from sized_runs import LORA, built, model_sizes, run_config
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import Config, DataConfig, EncoderSizes, ModelSizes, ReplayConfig
-from vjepa2_ac.console.memory import memory_lines
 from vjepa2_ac.model.adapter.lora import trainable_report
 from vjepa2_ac.model.network.kv_cache import KeyValueCache
 from vjepa2_ac.training.cost.memory import USUAL_GPU, count_parameters, estimate_memory, ways_to_fit
@@ -105,13 +104,6 @@ def test_doctor_says_whether_it_fits_and_what_it_has_not_been_compared_with(
     assert f"vjepa2-ac data check {path}" in reported
 
 
-@pytest.mark.parametrize(("optimizer", "words"), [("adamw", "float32"), ("adamw_8bit", "8 bits")])
-def test_doctor_says_how_moments_are_kept(optimizer: str, words: str) -> None:
-    config = run_config(training__optimizer=optimizer)
-    (line,) = [line for line in memory_lines(config, estimate_memory(config, ModelSizes())) if "moments" in line]
-    assert words in line
-
-
 def test_a_run_on_latents_has_no_encoder_beside_the_predictor() -> None:
     sizes = ModelSizes()
     config = run_config(data__frames=16)
@@ -136,19 +128,6 @@ def test_the_next_batch_is_there_in_the_type_of_the_cache_or_as_pixels(cache_dty
     assert latents.arriving == frames * 256 * 1408 * number
     without = replace(latents, arriving=0)
     assert latents.total(checkpointing=True) - without.total(checkpointing=True) == latents.arriving
-
-
-def test_encoding_a_cache_is_the_peak_where_the_predictor_is_small() -> None:
-    sizes = model_sizes(width=48)
-    estimate = estimate_memory(run_config(data__cache="auto", model__encode_chunk=256), sizes)
-    assert estimate.total(checkpointing=True) == estimate.caching
-
-
-def test_doctor_says_that_latents_come_from_a_cache() -> None:
-    config = run_config(data__cache="auto")
-    printed = "\n".join(memory_lines(config, estimate_memory(config, ModelSizes())))
-    assert "none: latents come from a cache" in printed
-    assert "encoding the cache" in printed
 
 
 # Parameter counts are exact: tensor by tensor those of a built model

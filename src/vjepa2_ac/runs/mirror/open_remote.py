@@ -24,11 +24,11 @@ from vjepa2_ac.runs.checkpoint import (
     step_of,
     written_state,
 )
-from vjepa2_ac.runs.folder import check_run_folder, with_settled_stride
+from vjepa2_ac.runs.folder import CONFIG, check_run_folder, with_settled_stride
 from vjepa2_ac.runs.mirror.background_sync import Mirror, reason_of
 from vjepa2_ac.runs.mirror.remote_checkpoints import Listing, RemoteCheckpoints, complete
 from vjepa2_ac.runs.mirror.upload import SMALL_FILES, RemoteUpdate
-from vjepa2_ac.storage import download, is_url, join, place, sync, try_writing, write_atomically
+from vjepa2_ac.storage import download, is_url, join, place, sync, try_writing
 from vjepa2_ac.storage.remote.retries import quietly
 
 logger = logging.getLogger(__name__)
@@ -185,59 +185,46 @@ def _fetch_newest(
         InputError: The run there has another config; nothing is downloaded then.
         UnreachableError: The place cannot be reached.
     """
-    folder = Path(config.run_dir)
-    with tempfile.TemporaryDirectory() as temporary:
-        small = Path(temporary)
-        for name in SMALL_FILES:
-            with suppress(FileNotFoundError):
-                download(join(remote.place, name), small / name)
-        _require_this_config(config, small, remote.place, allow_config_change=allow_config_change)
-        claim()
-        for name in SMALL_FILES:  # config.yaml first: without it the folder would be no run's
-            if (small / name).is_file():
-                write_atomically(folder / name, (small / name).read_bytes())
-    checkpoints = folder / CHECKPOINTS
+    folder, checkpoints = Path(config.run_dir), Path(config.run_dir, CHECKPOINTS)
+    _require_this_config(config, remote.place, allow_config_change=allow_config_change)
+    claim()
+    for name in SMALL_FILES:  # config.yaml first: without it the folder would be no run's
+        with suppress(FileNotFoundError):
+            download(join(remote.place, name), folder / name)
     remove_leavings(checkpoints)
     for number, name in enumerate(names):
-        if fetched := _fetch(remote, name, checkpoints):
-            _fetch_best(remote, written_state(fetched).best_name, name, checkpoints)
-            _give_name(fetched, checkpoints / name)
+        if _fetch(remote, name, checkpoints):
             reporter.note(f"Fetched {name} from {remote.place}.")
             return list(names[:number])
     return list(names)
 
 
-def _require_this_config(config: Config, fetched: Path, place: str, *, allow_config_change: bool) -> None:
+def _require_this_config(config: Config, place: str, *, allow_config_change: bool) -> None:
     """Check that the run there is the requested one, as for a local folder."""
-    try:
-        there = with_settled_stride(config.model_copy(update={"run_dir": str(fetched)}))
-        check_run_folder(there, allow_config_change=allow_config_change)
-    except InputError as error:
-        fix = "Set another checkpoint.remote for a new run; where the change is meant, add --allow-config-change"
-        where = f"checkpoint.remote {place}"
-        raise InputError(where=where, found=error.found, needed=error.needed, fix=fix) from None
+    with tempfile.TemporaryDirectory() as folder:
+        with suppress(FileNotFoundError):
+            download(join(place, CONFIG), Path(folder, CONFIG))
+        try:
+            there = with_settled_stride(config.model_copy(update={"run_dir": folder}))
+            check_run_folder(there, allow_config_change=allow_config_change)
+        except InputError as error:
+            fix = "Set another checkpoint.remote for a new run; where the change is meant, add --allow-config-change"
+            where = f"checkpoint.remote {place}"
+            raise InputError(where=where, found=error.found, needed=error.needed, fix=fix) from None
 
 
-def _fetch(remote: RemoteCheckpoints, name: str, checkpoints: Path) -> Path | None:
-    """Download a checkpoint under a temporary name; None, and a warning, if it is damaged."""
-    fetched = checkpoints / f"{FETCHING}{name}"
-    problem = remote.fetch(name, fetched)
-    if problem is None:
-        return fetched
-    shutil.rmtree(fetched)
-    logger.warning("%s: %s: %s; passed over", remote.place, name, problem)
-    return None
-
-
-def _fetch_best(remote: RemoteCheckpoints, best: str | None, newest: str, checkpoints: Path) -> None:
-    if best is not None and best != newest and not (checkpoints / best).is_dir():
-        fetched = _fetch(remote, best, checkpoints)
-        if fetched is not None:
-            _give_name(fetched, checkpoints / best)
-
-
-def _give_name(fetched: Path, name: Path) -> None:
-    if name.is_dir():  # a damaged local one
-        shutil.rmtree(name)
-    fetched.rename(name)
-    sync(name.parent)
+def _fetch(remote: RemoteCheckpoints, name: str, checkpoints: Path) -> bool:
+    """Download a checkpoint, after the best one that it names; return False, with a warning, if it is damaged."""
+    fetched, final = checkpoints / f"{FETCHING}{name}", checkpoints / name
+    if problem := remote.fetch(name, fetched):
+        shutil.rmtree(fetched)
+        logger.warning("%s: %s: %s; passed over", remote.place, name, problem)
+        return False
+    best = written_state(fetched).best_name
+    if best is not None and best != name and not (checkpoints / best).is_dir():
+        _fetch(remote, best, checkpoints)
+    if final.is_dir():  # a damaged local one
+        shutil.rmtree(final)
+    fetched.rename(final)
+    sync(checkpoints)
+    return True
