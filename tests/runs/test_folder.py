@@ -80,12 +80,6 @@ def test_a_start_that_was_killed_at_any_file_stands_in_nobodys_way(make_config, 
     check_run_folder(config)
 
 
-def test_a_machine_that_had_but_a_later_process_may_have_the_first_one_next_time(make_config, tmp_path) -> None:
-    """Clips of a step that could not be done are all that a process other than the first leaves in its folder."""
-    (tmp_path / "run" / "not_finite" / "step-00000003").mkdir(parents=True)
-    check_run_folder(make_config())
-
-
 def test_a_folder_of_other_things_stays_refused_though_a_lock_lies_in_it(make_config, tmp_path) -> None:
     config = make_config()
     with RunLock(Path(config.run_dir)) as lock:

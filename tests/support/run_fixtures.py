@@ -68,6 +68,23 @@ class SilentReporter(NullReporter):
         self.steps.append(step)
 
 
+class KilledError(Exception):
+    """Simulates the end of the process."""
+
+
+def dying_reporter(reporter: SilentReporter, last_step: int) -> SilentReporter:
+    """Return a reporter at whose step the process ends."""
+    stepped = reporter.stepped
+
+    def die(step: int, figures: object) -> None:
+        stepped(step, figures)
+        if step == last_step:
+            raise KilledError
+
+    reporter.stepped = die  # type: ignore[method-assign]
+    return reporter
+
+
 def set_up(config: Config, reporter: TrainingReporter = SILENT, accelerator: Accelerator | None = None) -> Run:
     """Return a run as `train` has it before its first step."""
     from vjepa2_ac.training.resume import restore

@@ -1,16 +1,18 @@
 """Properties of the loop: exact, resumable, and only the adapter changes."""
 
 import importlib.util
+import itertools
 import json
 import re
 import shutil
+import time
 from pathlib import Path
 
 import pytest
 import torch
 
 from copied_sets import write_rlds
-from run_fixtures import set_up
+from run_fixtures import KilledError, dying_reporter, set_up
 from same_run import assert_same_run, metrics, trained_weights
 from vjepa2_ac.config import CheckpointConfig, Config
 from vjepa2_ac.config.loading import config_as_yaml
@@ -27,22 +29,6 @@ from vjepa2_ac.training import loop, validation
 from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.setup import batches_from
 from vjepa2_ac.training.step import training_step
-
-
-class KilledError(Exception):
-    """Simulates the end of the process."""
-
-
-def dying_reporter(reporter, last_step: int):
-    stepped = reporter.stepped
-
-    def die(step: int, seen: dict) -> None:
-        stepped(step, seen)
-        if step == last_step:
-            raise KilledError
-
-    reporter.stepped = die
-    return reporter
 
 
 @pytest.mark.parametrize("died_at", [1, 3, 4])
@@ -321,3 +307,22 @@ def test_an_episode_may_be_left_out_within_a_run(make_config, reporter) -> None:
     train(make_config(training__steps=2, data__exclude=[broken]), reporter)
     reported = "\n".join(reporter.notes)
     assert re.search("Going on from .*\nThe data has changed: [0-9]+ training clips instead of [0-9]+", reported)
+
+
+def test_a_run_whose_clock_jumps_to_and_fro_is_the_same_run(
+    make_config, reporter, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    changes = {
+        "training__steps": 4, "checkpoint__every": 3, "checkpoint__every_minutes": 60.0, "checkpoint__keep_best": False,
+        "checkpoint__remote_every_minutes": 60.0,
+    }  # fmt: skip
+    train(make_config(run_dir=str(tmp_path / "whole"), **changes), reporter)
+    real, jumps = time.time, itertools.cycle([0.0, 86_400.0, -86_400.0])
+    monkeypatch.setattr(time, "time", lambda: real() + next(jumps))
+    changes["checkpoint__remote"] = str(tmp_path / "disk")
+    run = train(make_config(run_dir=str(tmp_path / "jumping"), **changes), reporter)
+    assert_same_run(tmp_path / "whole", run)
+    names = ["step-00000003", "step-00000004"]
+    assert sorted(path.name for path in (run / "checkpoints").iterdir()) == names
+    mirrored = sorted(path.name for path in (tmp_path / "disk/checkpoints").iterdir())
+    assert mirrored in (names, names[1:])  # in the background: the first may be outdated before its turn comes

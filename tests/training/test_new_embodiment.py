@@ -9,6 +9,7 @@ import pytest
 import torch
 import yaml
 
+from run_fixtures import KilledError, dying_reporter
 from same_run import assert_same_run
 from vector_sets import write_vectors
 from vjepa2_ac.config import Config, ModelConfig
@@ -95,14 +96,8 @@ def test_a_run_with_new_heads_resumes_bit_for_bit(make_robot: MakeConfig, report
     whole, stopped = ({"run_dir": str(tmp_path / name), "training__steps": 4} for name in ("whole", "stopped"))
     train(make_robot(**whole), type(reporter)())
 
-    class Interrupts(type(reporter)):  # type: ignore[misc]
-        def stepped(self, step: int, metrics: object) -> None:
-            super().stepped(step, metrics)
-            if step == 3:
-                raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train(make_robot(**stopped), Interrupts())
+    with pytest.raises(KilledError):
+        train(make_robot(**stopped), dying_reporter(type(reporter)(), 3))
     train(make_robot(**stopped), reporter)
     assert any(note.startswith("Going on from") for note in reporter.notes)
     assert_same_run(tmp_path / "whole", tmp_path / "stopped")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from run_fixtures import set_up
+from run_fixtures import KilledError, dying_reporter, set_up
 from same_run import assert_same_run
 from synthetic import write_synthetic_droid
 from vjepa2_ac.config import Config
@@ -84,13 +84,9 @@ def test_every_position_has_its_clip_whoever_asks_and_from_wherever(replaying) -
     assert clips_of(in_workers, 4) == whole[:16]
 
 
-class KilledError(Exception):
-    """Simulates the end of the process."""
-
-
 @pytest.mark.parametrize("cache", ["off", "auto"])
 def test_a_run_that_replays_died_and_went_on_equals_the_one_that_did_not(
-    replaying, reporter, tmp_path, monkeypatch, cache: str
+    replaying, reporter, tmp_path, cache: str
 ) -> None:
     changes = {
         "training__steps": 4, "data__cache": cache,
@@ -98,17 +94,9 @@ def test_a_run_that_replays_died_and_went_on_equals_the_one_that_did_not(
         "replay__data__cache_dir": str(tmp_path / "b"),
     }  # fmt: skip
     train(replaying(run_dir=str(tmp_path / "whole"), **changes), reporter)
-    config, stepped = replaying(run_dir=str(tmp_path / "broken"), **changes), reporter.stepped
-
-    def die(step: int, seen: dict) -> None:
-        if step == 3:
-            raise KilledError
-        stepped(step, seen)
-
-    monkeypatch.setattr(reporter, "stepped", die)
+    config = replaying(run_dir=str(tmp_path / "broken"), **changes)
     with pytest.raises(KilledError):
-        train(config, reporter)
-    monkeypatch.setattr(reporter, "stepped", stepped)
+        train(config, dying_reporter(type(reporter)(), 3))
     train(config, reporter)
     assert_same_run(tmp_path / "whole", tmp_path / "broken")
     assert any("Replay: 25% of the clips are from" in note for note in reporter.notes)

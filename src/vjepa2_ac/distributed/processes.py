@@ -20,6 +20,7 @@ import torch
 import torch.distributed
 from accelerate import Accelerator
 from accelerate.state import AcceleratorState
+from accelerate.utils import InitProcessGroupKwargs
 from torch import Tensor, nn
 
 from vjepa2_ac.config import Config
@@ -29,6 +30,7 @@ from vjepa2_ac.errors import InputError
 _T = TypeVar("_T")
 
 _OTHER_LAUNCHES = ("FSDP", "DEEPSPEED", "MEGATRON_LM", "PARALLELISM_CONFIG")
+_LONGEST_STEP = timedelta(hours=2)  # until a process is given up that does not come to a sum: its disk may have stalled
 _AS_LONG_AS_IT_TAKES = timedelta(days=7)
 
 
@@ -46,7 +48,9 @@ def make_accelerator(config: Config) -> Accelerator:
     training, on_cpu = config.training, computing_device(config.training).type == "cpu"
     _patient_group.cache_clear()
     AcceleratorState._reset_state(reset_partial_state=False)  # or a second run keeps the first's precision
-    return Accelerator(mixed_precision="no" if training.precision == "fp32" else training.precision, cpu=on_cpu)
+    precision = "no" if training.precision == "fp32" else training.precision
+    waits = InitProcessGroupKwargs(timeout=_LONGEST_STEP)
+    return Accelerator(mixed_precision=precision, cpu=on_cpu, kwargs_handlers=[waits])
 
 
 def first_only(accelerator: Accelerator, work: Callable[[], _T]) -> _T | None:

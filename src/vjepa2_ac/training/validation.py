@@ -7,7 +7,7 @@ from typing import Any
 
 from vjepa2_ac.data.clips.loader import batches_of, validation_windows
 from vjepa2_ac.data.clips.windows import spread
-from vjepa2_ac.distributed.processes import broadcast_object
+from vjepa2_ac.distributed.processes import agreed, broadcast_object
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, moves_of
@@ -87,17 +87,20 @@ def validate(run: Run, reporter: TrainingReporter) -> Validation:
     Each process measures, and what the first one found counts in all: with other kernels the last digits differ, and
     processes that disagree about the best would not end together.
     """
-    config = run.config
     run.world_model.eval()
-    windows = validation_windows(run.dataset, "validation", clips=config.validation.clips)
-    batches = batches_of(run.dataset, windows, batch_size=config.validation.batch_size, copies=run.copies)
-    moves: list[RolloutStart] = []
     with run.accelerator.autocast():
-        encoded = (run.strip.seen(batch, encode(run, batch)) if run.strip else encode(run, batch) for batch in batches)
-        errors = prediction_errors(run.world_model, _moves_kept(run, encoded, len(windows), moves))
-        found = broadcast_object(run.accelerator, Validation(errors, _ranking(run, moves) if moves else None))
+        found = broadcast_object(run.accelerator, agreed(run.accelerator, lambda: _measured(run)))
     reporter.validated(run.state.step, found)
     return found
+
+
+def _measured(run: Run) -> Validation:
+    windows = validation_windows(run.dataset, "validation", clips=run.config.validation.clips)
+    batches = batches_of(run.dataset, windows, batch_size=run.config.validation.batch_size, copies=run.copies)
+    moves: list[RolloutStart] = []
+    encoded = (run.strip.seen(batch, encode(run, batch)) if run.strip else encode(run, batch) for batch in batches)
+    errors = prediction_errors(run.world_model, _moves_kept(run, encoded, len(windows), moves))
+    return Validation(errors, _ranking(run, moves) if moves else None)
 
 
 def _moves_kept(

@@ -294,15 +294,6 @@ def test_in_the_end_the_newest_is_sent_instead_of_the_one_that_was_on_its_way(
     assert sorted(RemoteCheckpoints(PLACE).listing()) == names(20)
 
 
-def test_what_is_only_here_in_the_end_is_said(bucket: Gcs, run: Path, caplog: pytest.LogCaptureFixture) -> None:
-    mirror = mirror_of(run, outage_reported=True)
-    write(run, 10)
-    bucket.fail_next(503, times=99)
-    mirror.finish(lambda: False)
-    assert [record.levelno for record in caplog.records] == [logging.WARNING]
-    assert "is on this machine only. A next start sends it" in caplog.text
-
-
 def test_a_place_of_another_run_is_never_written(bucket: Gcs, run: Path, caplog: pytest.LogCaptureFixture) -> None:
     write(run, 10)
     send(run)
