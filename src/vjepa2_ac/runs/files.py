@@ -12,8 +12,6 @@ from collections.abc import Set
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO
 
-import torch
-
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage import read_bounded, sha256_of_file, sync
 from vjepa2_ac.storage.structured import MOST_BYTES, json_object, shown
@@ -83,6 +81,8 @@ def write_torch(value: object, file: BinaryIO) -> None:
     Raises:
         OSError: The disk is full, or another system error, which torch itself would hide.
     """
+    import torch  # checkpoints are listed without it
+
     try:
         torch.save(value, file)
     except RuntimeError as error:
@@ -97,6 +97,8 @@ def read_torch(path: Path) -> Any:
     Raises:
         InputError: The file cannot be read, or contains more than tensors and plain values.
     """
+    import torch
+
     try:
         _require_as_written(path)
         return torch.load(path, weights_only=True, map_location="cpu")
