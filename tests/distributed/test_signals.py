@@ -13,6 +13,7 @@ import pytest
 from ranks import Rank
 from same_run import assert_same_run
 from vjepa2_ac.config.loading import config_as_yaml
+from vjepa2_ac.distributed import signals
 from vjepa2_ac.distributed.signals import EXIT_STATUS, SIGNALS, StoppedError, stop_on_signals
 from vjepa2_ac.runs.checkpoint import newest_checkpoint, read_state
 from vjepa2_ac.runs.metrics_log import read_metrics_log
