@@ -23,10 +23,9 @@ class Way(NamedTuple):
     at_once: int
 
     @classmethod
-    def ours(cls, at_once: int, *, compiled: bool = False, quantize: str = "off", adapter: bool = False) -> Way:
-        """Return ours, perhaps with compiled blocks, in 8 bits, or with an adapter on, as a trained run has one."""
-        kind = "" if quantize == "off" else f"+{quantize}"
-        return cls(f"{_OURS}{at_once}{ADAPTER * adapter}{kind}{COMPILED * compiled}", at_once)
+    def ours(cls, at_once: int, *, compiled: bool = False, adapter: bool = False) -> Way:
+        """Return ours, perhaps with compiled blocks, or with an adapter on, as a trained run has one."""
+        return cls(f"{_OURS}{at_once}{ADAPTER * adapter}{COMPILED * compiled}", at_once)
 
     @property
     def has_adapter(self) -> bool:
@@ -34,15 +33,9 @@ class Way(NamedTuple):
         return ADAPTER in self.name
 
     @property
-    def is_in_8_bits(self) -> bool:
-        """Whether it computes in 8 bits, and so chooses other actions."""
-        return self.settings["quantize"] != "off"
-
-    @property
     def settings(self) -> dict[str, str]:
         """What `planning` says of it."""
-        quantize = next((kind for kind in ("int8", "fp8") if f"+{kind}" in self.name), "off")
-        return {"compile": "blocks" if self.name.endswith(COMPILED) else "off", "quantize": quantize}
+        return {"compile": "blocks" if self.name.endswith(COMPILED) else "off"}
 
 
 @dataclass(frozen=True)

@@ -75,11 +75,8 @@ def published() -> dict[str, tuple[EncoderSizes, tuple[str, ...]]]:
     for one in sorted(PUBLISHED, key=lambda one: one.encoder.width):
         if one.holds != "encoder":
             continue
-        shape = one.encoder
-        sizes = EncoderSizes(
-            width=shape.width, depth=shape.depth, heads=shape.heads, mlp_ratio=shape.mlp_ratio, family=one.family
-        )
-        name = f"{'2.1' if one.family == 'v2.1' else '2.0'} {shape.name}"
+        sizes = one.encoder.sizes(one.family, "tubelet")
+        name = f"{'2.1' if one.family == 'v2.1' else '2.0'} {one.encoder.name}"
         found[name] = (sizes, (*found.get(name, (sizes, ()))[1], one.name))
     return found
 

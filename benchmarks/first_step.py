@@ -19,10 +19,10 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from vjepa2_ac.config.planning import LimitsConfig
+from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig
+from vjepa2_ac.demonstrations.key_frames import OF_MODEL_STEPS, gripper_key_frames
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.energy import distance
-from vjepa2_ac.planning.goals.key_frames import OF_MODEL_STEPS, gripper_key_frames
 from vjepa2_ac.planning.session import load_to_plan
 from vjepa2_ac.simulation.closed_loop.rollout import put
 from vjepa2_ac.simulation.closed_loop.sub_goals import DemonstrationSpec, demonstrate
@@ -72,7 +72,7 @@ def choices(controller: Controller, arm: SimulatedArm, problem: TaskProblem) -> 
     for frame in (grasp, 1):
         yield shown.states[frame, :3] - start[:3]
         goal = controller.encoded(shown.frames[frame])
-        yield STEPS[int(distance(torch.stack(latents), goal, "l1").argmin())]
+        yield STEPS[int(distance(torch.stack(latents), goal, EnergyConfig()).argmin())]
         controller.reset(shown.frames[frame])
         controller.act(shown.frames[0], start)
         assert controller.decision is not None

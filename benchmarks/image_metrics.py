@@ -23,7 +23,7 @@ from rich.console import Console
 from rich.table import Table
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.clips.dataset import open_dataset
+from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.evaluation.distribution.mmd import discrepancy
 from vjepa2_ac.media.image_similarity import mean_where, moving_region, ms_ssim, psnr, ssim, ssim_map
 from vjepa2_ac.simulation.counterfactual import resimulate

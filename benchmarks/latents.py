@@ -38,8 +38,8 @@ from torch import Tensor
 
 from vjepa2_ac.config import Config, DataConfig, EncoderSizes, ModelConfig, ModelSizes, PredictorSizes
 from vjepa2_ac.config.loading import parse_config
-from vjepa2_ac.data.clips.dataset import open_dataset
-from vjepa2_ac.data.clips.loader import validation_batches
+from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.data.loader import validation_batches
 from vjepa2_ac.data.sources.latents.dtypes import DTYPES, bytes_per_frame, pack_latents, unpack_latents
 from vjepa2_ac.distributed.device import autocast, matmul_speed
 from vjepa2_ac.encoding.batch import encode_batch

@@ -2,7 +2,8 @@
 
     python benchmarks/load_memory.py FOLDER [--small] [--keep]
 
-FOLDER needs room for 11.8 GB. Each load runs in a process of its own; the peak is the process's maximum resident set.
+FOLDER needs room for 11.8 GB. Each load runs in a process of its own; the peak is the process's maximum resident set,
+in which pages of the mapped file count that the system could take back.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from pathlib import Path
 import torch
 
 from vjepa2_ac.config import EncoderSizes, ModelSizes, PredictorSizes
-from vjepa2_ac.model.checkpoints.official import load_official, to_official
+from vjepa2_ac.model.checkpoints.loading import load_official, to_official
 from vjepa2_ac.model.network.world_model import WorldModel
 
 SMALL = ModelSizes(encoder=EncoderSizes(depth=4), predictor=PredictorSizes(depth=2))

@@ -29,14 +29,14 @@ import video
 from synthetic_droid import draw_episodes
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.clips.clip_reader import ClipRequest, read_clip
-from vjepa2_ac.data.clips.dataset import open_dataset
-from vjepa2_ac.data.clips.loader import training_loader
-from vjepa2_ac.data.clips.windows import ClipOrder, windows_of
-from vjepa2_ac.data.filters.step_ranges import StepSelection, clip_starts
+from vjepa2_ac.data.clips import ClipRequest, read_clip
+from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.index.episode_table import FORMAT, EpisodeTable
 from vjepa2_ac.data.index.index_cache import get_or_build
+from vjepa2_ac.data.loader import training_loader
+from vjepa2_ac.data.selection import StepSelection
 from vjepa2_ac.data.sources.rlds.writing.droid_writer import write_droid_rlds
+from vjepa2_ac.data.windows import ClipOrder, clip_starts, in_split, windows_of
 from vjepa2_ac.episode import EpisodeInfo
 
 DROID_EPISODES = 95_658
@@ -192,7 +192,8 @@ def _open_index(config: DataConfig) -> tuple[int, float, float, float]:
     everyone = np.ones(len(table), bool)
     kept = StepSelection.whole(table, everyone)
     order = ClipOrder(
-        windows_of(table, everyone, clip_starts(table, kept, config), config, "train", table.id_hash), seed=0
+        windows_of(table, in_split(table.id_hash, config, "train"), clip_starts(table, kept, config), config, "train"),
+        seed=0,
     )
     order.window(123_456)
     taken, memory = time.perf_counter() - start, (process.memory_info().rss - before) / 1e6

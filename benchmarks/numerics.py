@@ -60,9 +60,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     clips = draw(options)
     plain = rows.attempt(partial(plain_curve, options, clips, rows), way=PLAIN)
     beyond = []
-    for way in our_ways(options.ways, compiled=options.compile) if plain else ():
-        beyond.append(rows.attempt(partial(learns_otherwise, options, clips, way, plain, rows), way=way))
-        let_go(options.device)
+    if plain is not None:
+        for way in our_ways(options.ways, compiled=options.compile):
+            beyond.append(rows.attempt(partial(learns_otherwise, options, clips, way, plain, rows), way=way))
+            let_go(options.device)
     beyond.append(rows.attempt(partial(rounds_too_much, options, rows), way="bfloat16"))
     if any(beyond):
         sys.exit("beyond its tolerance")
@@ -136,8 +137,8 @@ def draw(options: argparse.Namespace) -> list[LatentBatch]:
         latents = torch.randn(1, options.frames, tokens, options.latent_dim, generator=generator)
         latents = torch.nn.functional.layer_norm(latents, latents.shape[-1:])
         poses = torch.randn(1, options.frames, 7, generator=generator)
-        given = (value.to(options.device) for value in (latents, poses, poses[:, 1:] - poses[:, :-1]))
-        batches.append(LatentBatch(*given, None, ("a",), (0,)))
+        latents, poses = latents.to(options.device), poses.to(options.device)
+        batches.append(LatentBatch(latents, poses, poses[:, 1:] - poses[:, :-1], None, ("a",), (0,)))
     return batches
 
 
@@ -176,10 +177,10 @@ def bfloat16_error(options: argparse.Namespace) -> float:
     first = torch.randn(2, 1, model.num_tokens, model.latent_dim, generator=generator)
     first = torch.nn.functional.layer_norm(first, first.shape[-1:])
     poses = torch.randn(2, _ROLLOUT_STEPS, 7, generator=generator) * 0.3
-    given = [value.to(options.device) for value in (first, poses, poses)]
+    first, poses = first.to(options.device), poses.to(options.device)
     with torch.autocast(options.device, torch.bfloat16):
-        rounded = model.rollout(*given)[:, -1]
-    exact = model.float().rollout(*given)[:, -1]  # of the same weights
+        rounded = model.rollout(first, poses, poses)[:, -1]
+    exact = model.float().rollout(first, poses, poses)[:, -1]  # of the same weights
     return float((rounded - exact).abs().mean() / exact.abs().mean())
 
 

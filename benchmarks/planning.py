@@ -11,11 +11,10 @@ plain      the same planner with everything computed again for each step, and po
 official   the planner of the official notebook on the official predictor, where a checkout of facebookresearch/vjepa2
            is at --official (`official_planner.py`)
 ours/N     ours, N samples through the predictor at once; plain takes as many as the first of these. With --compile
-           once more with compiled blocks (`planning.compile`): N+compiled. With --quantize once more in 8 bits
-           (`planning.quantize`), of bfloat16 weights: N+fp8, and by how much the energy of its plan changes. The first
-           N once more with a float32 LoRA on, made ready as `plan RUN` does it: N+adapter (--no-adapter: not)
+           once more with compiled blocks (`planning.compile`): N+compiled. The first N once
+           more with a float32 LoRA on, made ready as `plan RUN` does it: N+adapter (--no-adapter: not)
 
-Before anything is timed all but those in 8 bits must choose the same actions, on the same weights with the same seed,
+Before anything is timed all must choose the same actions, on the same weights with the same seed,
 in float32: what chooses others, or finds other energies, gets no ratio. A ratio over 1 means faster than plain, or than
 the official one. All take turns; on a CPU the process's own time over its threads counts, else wall time; the median,
 and the fastest. MFU: the model FLOPs of `training.cost.flops` over what the device does in a product of matrices,
@@ -40,7 +39,7 @@ from decision_ways import OFFICIAL, PLAIN, Way
 from memory import is_expandable, let_go, peak_alone, peak_gb
 from official_planner import PLANNER
 from planning_variants import Bench
-from rows import Row, Rows, cell, problem_of
+from rows import Row, Rows, cell
 from timing import Turns, about, add_options, introduction, prepare, profiled, ratio, rounds, settle
 
 from vjepa2_ac.distributed.device import matmul_speed
@@ -113,9 +112,7 @@ def time_horizon(bench: Bench, horizon: int, same: Sequence[Way], ceiling: float
     for so_far in rounds(decisions, bench.options, partial(let_go, device)):
         seen = so_far
         rows.so_far(*rows_so_far())
-    for way, row in zip(same, rows_so_far(), strict=True):
-        if way.is_in_8_bits and row["problem"] is None:
-            row["added_energy"] = energy_of(bench, way, horizon)
+    for row in rows_so_far():
         rows.add(row)
         print(time_line(row), flush=True)
     if bench.options.profile:
@@ -136,27 +133,13 @@ def time_row(bench: Bench, horizon: int, way: Way, seen: Mapping[str, Turns], ce
     }  # fmt: skip
 
 
-def energy_of(bench: Bench, way: Way, horizon: int) -> float | str:
-    """Return by what share the energy of its plan is more than that of ours, or how asking failed."""
-    try:
-        return bench.added_energy(way, horizon)
-    except Exception as error:
-        return problem_of(error)
-
-
 def time_line(row: Row) -> str:
     """Return a row of the table of times."""
     if row["problem"]:
         return f"{names_of(row)}{row['problem']}"
     text = f"{names_of(row)}{row['s']:12.3f}{row['min_s']:12.3f}{row['samples_per_s']:12.2f}{row['mfu']:12.1%}"
-    text += f"{row['alloc_retries']:12}" + "".join(
-        cell(row[f"ratio_to_{base}"], 12, ".2f") for base in (PLAIN, OFFICIAL)
-    )
-    added = row.get("added_energy")
-    if added is None:
-        return text
-    told = added if isinstance(added, str) else f"changes by {added:+.2%}, as the plain model sees it"
-    return f"{text}  [the plan's energy: {told}]"
+    ratios = "".join(cell(row[f"ratio_to_{base}"], 12, ".2f") for base in (PLAIN, OFFICIAL))
+    return f"{text}{row['alloc_retries']:12}{ratios}"
 
 
 def profile_decision(decide: Callable[[], object], bench: Bench, rows: Rows, named: Row) -> None:
@@ -213,7 +196,6 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--at-once", type=int, nargs="+", help="samples at once: a line each (default: 64; 8 on a CPU)")
     parser.add_argument("--dtype", nargs="+", choices=("float32", "bfloat16"), help="default: bfloat16; CPU: float32")
     add_options(parser)
-    parser.add_argument("--quantize", nargs="+", choices=("int8", "fp8"), default=[], help="ours once more in 8 bits")
     parser.add_argument("--compile", action="store_true", help="ours once more with compiled blocks")
     parser.add_argument(
         "--adapter", action=argparse.BooleanOptionalAction, default=True, help="ours once more with an adapter on"
@@ -229,13 +211,9 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
 
 
 def same_ways(bench: Bench, horizon: int, rows: Rows) -> list[Way]:
-    """Return the ways to compare: those that choose the same actions, and those in 8 bits, which choose others."""
+    """Return the ways to compare: those that choose the same actions."""
     same = []
     for way in candidates(bench):
-        if way.is_in_8_bits:
-            print(f"horizon {horizon}, {way.name}: not compared, for it chooses others")
-            same.append(way)
-            continue
         named = {"measured": "same actions", "horizon": horizon, "way": way.name}
         if rows.attempt(partial(chooses_the_same, bench, way, horizon, rows, named), **named):
             same.append(way)
@@ -255,12 +233,7 @@ def candidates(bench: Bench) -> list[Way]:
     """Return all ways that are asked for."""
     options = bench.options
     kinds = (False, True) if options.compile else (False,)
-    ours = [
-        Way.ours(count, compiled=compiled, quantize=quantize)
-        for count in options.at_once
-        for quantize in ("off", *options.quantize)
-        for compiled in kinds
-    ]
+    ours = [Way.ours(count, compiled=compiled) for count in options.at_once for compiled in kinds]
     adapted = [Way.ours(options.at_once[0], compiled=compiled, adapter=True) for compiled in kinds]
     official = [Way(OFFICIAL, options.samples)] if bench.has_official else []
     if not official:

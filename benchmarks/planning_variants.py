@@ -20,10 +20,10 @@ from vjepa2_ac.config import AdapterConfig, EncoderSizes, ModelSizes, PredictorS
 from vjepa2_ac.config.planning import CemConfig, EnergyConfig, PlanningConfig
 from vjepa2_ac.geometry import apply_action
 from vjepa2_ac.model.adapter.lora import add_adapter, lora_layers
-from vjepa2_ac.model.checkpoints.official import to_official
+from vjepa2_ac.model.checkpoints.loading import to_official
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.energy import Scene, WorldModelCost, distance
-from vjepa2_ac.planning.goals.goal import Goal
+from vjepa2_ac.planning.goals import Goal
 from vjepa2_ac.planning.interfaces import Cost, Plan
 from vjepa2_ac.planning.model_setup import prepare_for_planning
 from vjepa2_ac.planning.planner import Planner
@@ -59,7 +59,7 @@ class PlainCost:
             following = self._model.predict(latents, tried[:, :end], states.to(self._model.device))[:, -1:]
             latents = torch.cat([latents, following], dim=1)
             states = torch.cat([states, _poses_one_by_one(states[:, -1], actions[:, end - 1])[:, None]], dim=1)
-        return distance(latents[:, -1], self._goal, self._config.distance)
+        return distance(latents[:, -1], self._goal, self._config)
 
 
 class Bench:
@@ -77,7 +77,7 @@ class Bench:
         drawn = torch.randn(1, tokens, width, generator=torch.Generator().manual_seed(1))
         self._scene = Scene(layer_norm(drawn, drawn.shape[-1:]), torch.tensor([POSE]), torch.zeros(0, 7))
         self._goals = self._reachable()
-        self._made_ready: dict[tuple[str, bool, torch.dtype], WorldModel] = {}
+        self._made_ready: dict[torch.dtype, WorldModel] = {}
         self._plans: dict[int, Plan] = {}  # of ours in float32, by their horizon
         self.has_official = all((options.official / path).is_file() for path in (PREDICTOR, PLANNER))
 
@@ -101,7 +101,7 @@ class Bench:
         """Return how the decision of a way differs from that of ours, in float32 and with few samples.
 
         Args:
-            way: Any that is not in 8 bits.
+            way: Any.
             horizon: Model steps of the plan.
         """
         return Difference.between(self._expected(horizon), self._decided_in_float32(way, horizon))
@@ -117,18 +117,6 @@ class Bench:
         config = self.config(horizon, at_once=way.at_once, samples=_COMPARED_SAMPLES, iterations=_COMPARED_ITERATIONS)
         with mock.patch("torch.randn", _drawn_on_the_cpu(torch.randn)):
             return self._decide(way, config, torch.float32)
-
-    @torch.no_grad()
-    def added_energy(self, way: Way, horizon: int) -> float:
-        """Return by what share the energy of its plan is more than that of ours, both as the plain model sees them."""
-        options, plain = self.options, Way.ours(way.at_once)
-        config = self.config(horizon, at_once=way.at_once, samples=options.samples, iterations=options.iterations)
-        cost = WorldModelCost(prepare_for_planning(self.model, config), self._scene, self._goal(horizon), config.energy)
-        found, ours = (self._decide(one, config, self.dtype) for one in (way, plain))
-        assert isinstance(found, Plan)
-        assert isinstance(ours, Plan)
-        energy, least = cost(torch.stack([found.actions, ours.actions])).tolist()
-        return energy / least - 1  # type: ignore[no-any-return]  # of a tensor's list
 
     def config(self, horizon: int, *, at_once: int, samples: int, iterations: int) -> PlanningConfig:
         """Return upstream's planner with so much to try."""
@@ -203,24 +191,20 @@ class Bench:
         return model.eval()
 
     def _ready(self, way: Way, config: PlanningConfig, dtype: torch.dtype) -> WorldModel:
-        """Return the model as a way plans with it; what becomes of an adapter, or in 8 bits, is made once."""
-        kind, model = way.settings["quantize"], self.model
-        if way.is_in_8_bits or way.has_adapter:
-            key = kind, way.has_adapter, dtype
-            if key not in self._made_ready:
-                model = self.adapted if way.has_adapter else model
-                if way.is_in_8_bits and model.base_predictor.predictor_norm.weight.dtype != torch.bfloat16:
-                    model = _copy(model, torch.bfloat16)  # fp8 takes no other type
+        """Return the model as a way plans with it; what becomes of an adapter is made once."""
+        model = self.model
+        if way.has_adapter:
+            if dtype not in self._made_ready:
                 with no_fingerprints():
-                    self._made_ready[key] = prepare_for_planning(model, config.model_copy(update={"quantize": kind}))
-            model = self._made_ready[key]
+                    self._made_ready[dtype] = prepare_for_planning(self.adapted, config)
+            model = self._made_ready[dtype]
         return prepare_for_planning(model, config.model_copy(update={"compile": way.settings["compile"]}))
 
 
-def _copy(model: WorldModel, dtype: torch.dtype | None = None) -> WorldModel:
-    """Return a model with a predictor of its own, perhaps in another type."""
+def _copy(model: WorldModel) -> WorldModel:
+    """Return a model with a predictor of its own."""
     other = WorldModel.empty(model.sizes)
-    other.encoder, other.predictor = model.encoder, copy.deepcopy(model.predictor).to(dtype)
+    other.encoder, other.predictor = model.encoder, copy.deepcopy(model.predictor)
     other.adaptation = model.adaptation
     return other
 

@@ -5,7 +5,7 @@
 
 Some episodes are read, spoiled, and written as .npz; of each such set `data check` says what it would say to anybody.
 Counted is what it does not say of the same set as it is: refused (an error, or a set that cannot be opened), warned,
-hinted (a line that raises no alarm), missed. The probe is what `data check --model` adds: named (the variant in which
+missed. The probe is what `data check --model` adds: named (the variant in which
 the fault is mended fits better), misled (another one does), missed. Of the set as it is, any alarm is a false one.
 """
 
@@ -22,17 +22,17 @@ from faults import CLEAN, FAULTS, Fault, Recording, spoiled
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import load_config, parse_config
-from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
-from vjepa2_ac.data.inspection.check import at_some_stride, check_data
-from vjepa2_ac.data.inspection.finding import Finding
-from vjepa2_ac.data.inspection.statistics import sample_of
+from vjepa2_ac.data.coverage import sample_of
+from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.data_variants.from_config import probe_config
 from vjepa2_ac.evaluation.data_variants.measure import VariantProbe
+from vjepa2_ac.inspection.check import check_data
+from vjepa2_ac.inspection.excerpts import Finding
+from vjepa2_ac.inspection.statistics import at_some_stride
 from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
 
 HELD_OUT = 0.7  # of the episodes: the probe measures these
-_HINT = "hint: "
 _SAID = 68  # letters of a finding
 
 
@@ -116,8 +116,8 @@ def _asked(
     findings: list[Finding] = []
     with tempfile.TemporaryDirectory(dir=temporary) as folder:
         for number, one in enumerate(spoiled(fault, recordings)):
-            arrays = {"states": one.states, "frames": one.frames, "fps_hz": one.rate_hz}
-            np.savez(Path(folder) / f"{number:03d}.npz", **arrays)
+            path = Path(folder) / f"{number:03d}.npz"
+            np.savez(path, states=one.states, frames=one.frames, fps_hz=np.array(one.rate_hz))
         config = _config(Path(folder), temporary, options.model, {"source": "npz", "stride": stride})
         try:
             findings.extend(check_data(config.data))
@@ -129,16 +129,13 @@ def _asked(
 
 def _alarms(outcome: Outcome) -> set[tuple[str, str]]:
     """Return the alarms; narrow data are none: nothing is wrong with them."""
-    hints = {(one.about, "hint") for one in outcome.findings if one.text.startswith(_HINT)}
-    return hints | {(one.about, one.level) for one in outcome.findings if one.level != "ok" and one.about != "coverage"}
+    return {(one.about, one.level) for one in outcome.findings if one.level != "ok" and one.about != "coverage"}
 
 
 def _print(fault: Fault, outcome: Outcome, usual: set[tuple[str, str]]) -> None:
     new = usual if fault.name == CLEAN else _alarms(outcome) - usual
     levels = {level for _, level in new}
     checked = "refused" if "error" in levels or outcome.refusal else "warned" if "warning" in levels else "missed"
-    if checked == "missed" and levels:
-        checked = "hinted"
     if fault.name == CLEAN and checked == "missed":
         checked = "quiet"
     first, *others = _said(fault, outcome, new)
@@ -163,11 +160,10 @@ def _said(fault: Fault, outcome: Outcome, new: set[tuple[str, str]]) -> Iterator
         better = "" if probe.better is None else f"; {probe.better.ratio.value:.3f} with {probe.better.name}"
         yield f"{probe.ratio}{better}"
     for one in outcome.findings:
-        level = "hint" if one.text.startswith(_HINT) else one.level
         is_answer = one.about == "agreement" and fault.name == CLEAN
-        if (one.about, level) in new or is_answer:
+        if (one.about, one.level) in new or is_answer:
             text = one.text if len(one.text) <= _SAID else one.text[:_SAID].rsplit(" ", 1)[0] + " …"
-            yield f"{level} {one.about}: {text}"
+            yield f"{one.level} {one.about}: {text}"
 
 
 if __name__ == "__main__":

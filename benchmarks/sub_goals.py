@@ -26,13 +26,11 @@ from typing import Any
 
 import torch
 
-from vjepa2_ac.planning.goals.sub_goals import SubGoal
+from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.planning.session import load_to_plan
 from vjepa2_ac.reporter import SILENT
-from vjepa2_ac.simulation.closed_loop.oracles import oracle_for
-from vjepa2_ac.simulation.closed_loop.policies import GoalsOf, Policy
-from vjepa2_ac.simulation.closed_loop.result import ClosedLoopResult
-from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, run_task
+from vjepa2_ac.simulation.closed_loop.policies import GoalsOf, Policy, oracle_for
+from vjepa2_ac.simulation.closed_loop.rollout import ClosedLoopResult, RolloutSpec, run_task
 from vjepa2_ac.simulation.closed_loop.steering import Steering, of_session
 from vjepa2_ac.simulation.closed_loop.sub_goals import DemonstratedGoals, DemonstrationSpec, every_step
 from vjepa2_ac.simulation.closed_loop.tasks import STEPS, TaskProblem, arm_for

@@ -30,12 +30,12 @@ from vjepa2_ac.config import (
     PredictorSizes,
     TrainingConfig,
 )
-from vjepa2_ac.data.clips.dataset import Dataset
-from vjepa2_ac.data.clips.transforms import pixels_to_input
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.transforms import pixels_to_input
 from vjepa2_ac.distributed.processes import make_accelerator
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.model.adapter.lora import add_adapter
-from vjepa2_ac.model.checkpoints.official import to_official
+from vjepa2_ac.model.checkpoints.loading import to_official
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.runs.checkpoint import RunState
 from vjepa2_ac.training.cost.flops import clip_flops

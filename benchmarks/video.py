@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -73,7 +74,7 @@ def draw(path: Path, recording: Recording) -> Path:
     ground = np.kron(small, np.ones((10, 10, 1), np.uint8))
     square = generator.integers(0, 255, (recording.height // 4, recording.height // 4, 3), dtype=np.uint8)
     with av.open(str(path), "w") as file:
-        stream = file.add_stream(recording.codec, rate=RATE)
+        stream: Any = file.add_stream(recording.codec, rate=RATE)
         stream.height, stream.width, stream.pix_fmt = recording.height, recording.width, "yuv420p"
         fast = {"preset": "veryfast"} if recording.codec == "libx264" else {"preset": "12", "svtav1-params": "lp=1"}
         stream.codec_context.options = fast | {"g": str(recording.gop), "bf": str(recording.b_frames)}
@@ -97,7 +98,7 @@ def measure(path: Path, recording: Recording, clips: int) -> None:
         clock = Clock(start_s=start / RATE, rate_hz=RATE)
         return read_frames(path, range(0, WINDOW, STRIDE), where=path.name, clock=clock)
 
-    ways = {
+    ways: dict[str, Callable[[int], np.ndarray]] = {
         "from the file's start": lambda start: everything(path, start, 0),
         "every frame of the window": lambda start: everything(path, start, start),
         "ours": ours,
@@ -117,11 +118,11 @@ def everything(path: Path, start: int, seek_to: int) -> np.ndarray:
     with av.open(str(path)) as file:
         stream = file.streams.video[0]
         stream.codec_context.thread_count = 1
-        tick = 1 / (RATE * stream.time_base)
+        tick = float(1 / (RATE * (stream.time_base or 1)))
         file.seek(int(seek_to * tick), stream=stream)
         for frame in file.decode(stream):
-            frames[round(frame.pts / tick)] = frame.to_ndarray(format="rgb24")
-            if frame.pts >= (start + WINDOW - 1) * tick:
+            frames[round((frame.pts or 0) / tick)] = frame.to_ndarray(format="rgb24")
+            if (frame.pts or 0) >= (start + WINDOW - 1) * tick:
                 break
     return np.stack([frames[step] for step in range(start, start + WINDOW, STRIDE)])
 

@@ -9,8 +9,8 @@ import sys
 from pathlib import Path
 
 from vjepa2_ac import UserError, open_dataset, read_clips
-from vjepa2_ac.data.inspection.statistics import inspect_dataset
-from vjepa2_ac.reports.figures.dataset import plot_dataset
+from vjepa2_ac.inspection.sheet import plot_dataset
+from vjepa2_ac.inspection.statistics import inspect_dataset
 from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
 
 RECORDED, SHEET = Path("demo/examples/data"), Path("demo/examples/contact_sheet.png")
@@ -37,7 +37,7 @@ def main(data: str | None = None) -> None:
     SHEET.parent.mkdir(parents=True, exist_ok=True)
     x, y, z = (inspection.range_of(axis) for axis in range(3))
     print(f"The hand was at x {x[0]:.2f} to {x[1]:.2f}, y {y[0]:.2f} to {y[1]:.2f}, z {z[0]:.2f} to {z[1]:.2f} m.")
-    print(f"Look at {plot_dataset(dataset, inspection, SHEET, rows=4)}")
+    print(f"Look at {plot_dataset(inspection, SHEET, rows=4)}")
 
 
 if __name__ == "__main__":

@@ -15,13 +15,11 @@ import missing
 CHECKED = [
     "vjepa2_ac.geometry",
     "vjepa2_ac.media",
-    "vjepa2_ac.data.clips.actions",
-    "vjepa2_ac.data.clips.augmentation",
-    "vjepa2_ac.data.clips.clip_reader",
-    "vjepa2_ac.data.clips.transforms",
+    "vjepa2_ac.data.clips",
+    "vjepa2_ac.data.transforms",
     "vjepa2_ac.planning",
     "vjepa2_ac.evaluation.action_use",
-    "vjepa2_ac.simulation.world.kinematics",
+    "vjepa2_ac.simulation.world.motion",
 ]
 ABSENT = missing.absent(os.environ)
 if missing.SHAPES not in ABSENT:
@@ -107,7 +105,7 @@ def _gcs() -> Iterator[gcs_server.Gcs]:
 @pytest.fixture
 def gcs(_gcs: gcs_server.Gcs, monkeypatch: pytest.MonkeyPatch) -> gcs_server.Gcs:
     """A local Google Cloud Storage, empty; gs:// means it. What fails is tried again at once, 5 times in all."""
-    from vjepa2_ac.storage.remote import retries
+    from vjepa2_ac.storage import retries
 
     _gcs.wipe()
     monkeypatch.setenv("STORAGE_EMULATOR_HOST", _gcs.url)

@@ -30,7 +30,7 @@ from vjepa2_ac import (
     read_clips,
     train,
 )
-from vjepa2_ac.export.export import export_run
+from vjepa2_ac.export import export_run
 
 PAGE = (ROOT / "docs/python.md").read_text()
 BLOCKS = re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)
@@ -119,7 +119,7 @@ def test_a_model_is_ready_to_predict() -> None:
         ({"name": "nowhere"}, "vjepa2-ac download"),
         ({"name": ""}, "is empty"),
         ({"name": "gs://bucket/model"}, "URL"),
-        ({"name": TINY, "dtype": "float64"}, "auto, float32, bfloat16"),
+        ({"name": TINY, "dtype": "float64"}, "dtype: .*float32"),
         ({"name": TINY, "device": "gpu"}, "auto, cpu, cuda"),
         ({"name": TINY, "adapter": "nowhere"}, "nowhere"),
     ],
@@ -155,13 +155,6 @@ def test_a_run_and_its_exported_adapter_predict_alike(make_config: MakeConfig, t
 # Data.
 
 
-def test_clips_of_a_split_are_the_same_each_time(simulated: Path) -> None:
-    dataset = open_dataset(simulated, frames=3, test_share=0.3)
-    first, again = ([batch.actions for batch in read_clips(dataset, "test", clips=5, batch_size=2)] for _ in range(2))
-    assert [len(one) for one in first] == [2, 2, 1]
-    assert all(torch.equal(one, other) for one, other in zip(first, again, strict=True))
-
-
 def test_a_config_opens_its_data_and_knobs_change_it(simulated: Path) -> None:
     values = {"run_dir": "none", "data": {"path": simulated, "frames": 3}, "model": {"base": TINY}}
     config = load_config(values, ["data.stride=auto"])
@@ -171,16 +164,6 @@ def test_a_config_opens_its_data_and_knobs_change_it(simulated: Path) -> None:
     assert (dataset.config.frames, dataset.config.stride) == (3, 2)
     with pytest.raises(UserError, match="train, validation, test"):
         read_clips(dataset, "tset")  # type: ignore[arg-type]
-
-
-def test_a_config_file_is_no_data_set() -> None:
-    with pytest.raises(UserError, match="load_config"):
-        open_dataset(ROOT / "configs/demo.yaml")
-
-
-def test_a_value_that_a_config_cannot_hold_is_told() -> None:
-    with pytest.raises(UserError, match="a value that a config cannot hold"):
-        load_config({"run_dir": "run", "data": {"path": object()}})
 
 
 # Latents.

@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 
 from paths import ROOT
-from vjepa2_ac.storage.partial import remove_abandoned
+from vjepa2_ac.storage.files import remove_abandoned
 
 SOURCE = ROOT / "src/vjepa2_ac"
 DAY_S = 86_400.0
 WALL = {"time", "time_ns", "now", "today", "utcnow"}
-AGES_OF_FILES = {"storage/partial.py", "data/cache/disk_cache.py"}  # which only the wall clock tells
+AGES_OF_FILES = {"storage/files.py", "storage/block_file.py"}  # which only the wall clock tells
 
 
 def asks_for_the_wall_clock(node: ast.AST) -> bool:
@@ -36,7 +36,7 @@ def test_nothing_waits_or_is_due_by_the_wall_clock() -> None:
 def test_what_another_machine_is_writing_stays_though_our_clock_has_jumped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, jump_s: float
 ) -> None:
-    path = tmp_path / ".file.00000000-abcdef01.partial"
+    path = tmp_path / ".file.abcdef01.partial"
     path.write_bytes(b"half")
     now = time.time()
     os.utime(path, (now, now))

@@ -10,8 +10,7 @@ import yaml
 
 import vjepa2_ac
 from paths import ROOT
-from vjepa2_ac.config.diagnostics import all_keys
-from vjepa2_ac.config.loading import parse_config
+from vjepa2_ac.config.loading import all_keys, parse_config
 
 BLOCKS = re.findall(r"```yaml\n(.*?)```", (ROOT / "docs/data.md").read_text(), flags=re.DOTALL)
 

@@ -12,8 +12,8 @@ import yaml
 from paths import ROOT
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import Config
-from vjepa2_ac.config.effects import marks_of
 from vjepa2_ac.config.planning import PlanningConfig
+from vjepa2_ac.config.section import marks_of
 from vjepa2_ac.media.image_file import read_image
 
 PAGE = (ROOT / "docs/planning.md").read_text()

@@ -1,96 +1,119 @@
-"""A toy of each thing that people add, by the doors of docs/extending.md; data and metrics have their own files."""
+"""Every recipe of docs/extending.md as a stranger uses it: a module outside the package, YAML, and the commands."""
 
-from typing import get_args
+import json
+import subprocess
+import sys
+from pathlib import Path
 
-import numpy as np
 import pytest
-import torch
-from torch import Tensor
+import yaml
+from PIL import Image
 
-from solver_problems import parabola, space
-from tiny_models import tiny_model
-from vjepa2_ac.config.planning import CemConfig, LimitsConfig, PlanningConfig
-from vjepa2_ac.config.training import TrainingConfig
-from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.strata import clips_of
-from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.planner import SOLVERS, Planner
-from vjepa2_ac.planning.solvers.base import EvaluatedPlans
-from vjepa2_ac.spaces import ActionSpace, Spaces, StateSpace
-from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.loss import LOSSES
+from paths import ROOT
+from run_fixtures import as_yaml
+
+PAGE = (ROOT / "docs/extending.md").read_text()
 
 
-def test_every_name_of_a_config_has_something_behind_it_and_nothing_is_without_a_name() -> None:
-    assert set(get_args(TrainingConfig.model_fields["loss"].annotation)) == set(LOSSES)
-    assert set(get_args(PlanningConfig.model_fields["planner"].annotation)) == set(SOLVERS)
+def recipes(*headings: str) -> str:
+    """Return the first Python block below each heading of the page."""
+    return "\n".join(PAGE.split(f"## {heading}\n")[1].split("```python\n")[1].split("```")[0] for heading in headings)
 
 
-def _log_cosh(predicted: Tensor, true: Tensor) -> Tensor:
-    return torch.log(torch.cosh(predicted.float() - true.float()))
+@pytest.fixture
+def at_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working directory with a module of the user's."""
+    folder = tmp_path / "home"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    (folder / "my_module.py").write_text(recipes("A loss", "A planner", "An energy"))
+    return folder
 
 
-def test_a_loss(make_config, reporter, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(LOSSES, "log_cosh", lambda _: _log_cosh)
-    asked: list[int] = []
-    monkeypatch.setitem(LOSSES, "counted", lambda _: lambda *given: asked.append(1) or _log_cosh(*given))
-    config = make_config(training__steps=1)
-    for name in ("log_cosh", "counted"):
-        training = config.training.model_copy(update={"loss": name})
-        changed = config.model_copy(update={"training": training, "run_dir": f"{config.run_dir}-{name}"})
-        train(changed, reporter)
-    assert asked
+def command(*words: str) -> subprocess.CompletedProcess[str]:
+    code = "import sys; from vjepa2_ac.cli import main; sys.exit(main())"  # without the folder on the path
+    return subprocess.run([sys.executable, "-P", "-c", code, *words], capture_output=True, text=True, check=False)
 
 
-class RandomSearch:
-    """Uniform samples; the best of all is taken."""
-
-    elites, uses_gradients = 8, False
-
-    def __init__(self, where, config, generator, start=None) -> None:
-        del start
-        self._space, self._samples, self._generator = where, config.samples, generator
-        self.mean, self.std = torch.zeros_like(where.lower), where.first_std
-
-    def sample(self) -> Tensor:
-        share = torch.rand(self._samples, *self._space.lower.shape, generator=self._generator)
-        return self._space.allowed(self._space.lower + share * (self._space.upper - self._space.lower))
-
-    def update(self, evaluated: EvaluatedPlans) -> None:
-        """Learn nothing."""
-
-    def result(self) -> None:
-        return None
+def test_every_recipe_is_short() -> None:
+    for block in PAGE.split("```python\n")[1:]:
+        assert len([line for line in block.split("```")[0].splitlines() if line.strip()]) <= 40
 
 
-def test_a_planner(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(SOLVERS, "random", RandomSearch)
-    target = torch.tensor([[0.3, -0.2]])
-    settings = PlanningConfig(samples=2000, iterations=5).model_copy(update={"planner": "random"})
-    plan = Planner(settings, space()).plan(parabola(target), torch.Generator().manual_seed(0))
-    torch.testing.assert_close(plan.actions, target, atol=0.05, rtol=0)
-    assert (plan.planner, plan.stopped, len(plan.iterations)) == ("random", "finished", 5)
-    far = Planner(settings, space()).plan(parabola(torch.tensor([[3.0, 0.0]])), torch.Generator().manual_seed(0))
-    assert (far.actions.abs() <= 1).all()
+def test_a_loss_trains_and_a_planner_and_an_energy_plan_by_yaml(at_home: Path, make_config) -> None:
+    values = yaml.safe_load(as_yaml(make_config(training__steps=1, run_dir=at_home / "run")))
+    values["plugins"] = ["my_module"]
+    values["training"] |= {"loss": "log_cosh", "loss_options": {"scale": 2.0}}
+    values["planning"] |= {"planner": "random", "samples": 16, "iterations": 2}
+    values["planning"]["energy"] |= {"distance": "largest"}
+    (at_home / "own.yaml").write_text(yaml.safe_dump(values))
+    trained = command("train", "own.yaml")
+    assert trained.returncode == 0, trained.stderr
+    assert yaml.safe_load((at_home / "run/config.yaml").read_text())["plugins"] == ["my_module"]
+
+    for name, brightness in (("now", 90), ("goal", 160)):
+        Image.new("RGB", (48, 48), (brightness,) * 3).save(f"{name}.png")
+    words = [
+        "plan",
+        "run",
+        "--start",
+        "now.png",
+        "--goal",
+        "goal.png",
+        "--state",
+        "0.4,0,0.4,3.1,0,0,0",
+        "--nodes",
+        "0",
+        "--out",
+        "out",
+    ]
+    words.append("planning.limits.xyz=[0.05,0.05,0.05]")
+    planned = command(*words, "--plugin", "my_module")
+    assert planned.returncode == 0, planned.stderr
+    assert json.loads((at_home / "out/plan.json").read_text())["settings"]["planner"] == "random"
+
+    # a run may be a stranger's: its config imports nothing that lies beside it
+    refused = command(*words)
+    assert refused.returncode == 2
+    assert "no such module" in refused.stderr
+    assert "--plugin my_module" in refused.stderr
 
 
-def test_a_robot_whose_numbers_have_parts() -> None:
-    """A mobile base: a place on the floor, and a heading that is one angle."""
-    base = StateSpace(("x", "y", "heading"), ("m", "m", "rad"), position=slice(0, 2))
-    drive = ActionSpace(("dx", "dy", "turn"), ("m", "m", "rad"), position=slice(0, 2))
-    sizes = tiny_model().sizes
-    predictor = sizes.predictor.model_copy(update={"state_dim": 3, "action_dim": 3})
-    model = WorldModel.random(sizes.model_copy(update={"predictor": predictor}), seed=0)
-    limits = LimitsConfig(axes=(0.1, 0.1, 0.5))
-    settings = PlanningConfig(samples=8, iterations=2, cem=CemConfig(elites=3), limits=limits)
-    controller = Controller(model, settings, spaces=Spaces(base, drive))
-    image = np.zeros((48, 48, 3), np.uint8)
-    controller.reset(image + 90)
-    action = controller.act(image, np.array([0.2, 0.1, 3.0]))
-    assert action.shape == (3,)
-    assert (np.abs(action) <= [0.1, 0.1, 0.5]).all()
-    with pytest.raises(InputError, match=r"state: .*look like millimetres"):
-        controller.act(image, np.array([200.0, 0.1, 3.0]))
-    clips = clips_of(np.array([[[0.03, 0.04, 2.0]]]), ("a",), (0,), space=drive, seconds_per_step=0.5)
-    assert clips.action_size[0, 0] == pytest.approx(5.0), "centimetres, without the turn"
+def test_options_and_names_are_checked_when_the_config_is_read(at_home: Path, make_config) -> None:
+    (at_home / "own.yaml").write_text(as_yaml(make_config()))
+    wrong = (
+        ("training.loss=log_cosch", "did you mean 'log_cosh'"),
+        ("training.loss_options={scale: much}", "scale"),
+        ("planning.energy.distance=larges", "did you mean 'largest'"),
+        ("planning.planner_options={a: 1}", "no options of its own"),
+    )
+    for override, told in wrong:
+        words = ["config", "show", "own.yaml", "--plugin", "my_module", "training.loss=log_cosh", override]
+        shown = command(*words)
+        assert shown.returncode == 2, override
+        assert told in shown.stderr, shown.stderr
+    missing = command("config", "show", "own.yaml", "--plugin", "my_modul")
+    assert (missing.returncode, "no such module" in missing.stderr) == (2, True)
+
+
+@pytest.mark.usefixtures("at_home")
+def test_the_schema_has_what_a_plug_in_brings() -> None:
+    schema = json.loads(command("config", "schema", "--plugin", "my_module").stdout)
+    training = schema["$defs"]["TrainingConfig"]["properties"]
+    assert {"l1", "log_cosh"} <= set(training["loss"]["enum"])
+    assert "scale" in training["loss_options"]["anyOf"][0]["properties"]
+
+
+def test_an_installed_package_is_known_without_being_named(at_home: Path, make_config) -> None:
+    """Its metadata is what an installation leaves on the path."""
+    about = at_home / "site/my_package-1.0.dist-info"
+    about.mkdir(parents=True)
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: my-package\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text("[vjepa2_ac.losses]\nlog_cosh = my_package:LogCosh\n")
+    (at_home / "site/my_package.py").write_text(recipes("A loss"))
+    (at_home / "own.yaml").write_text(as_yaml(make_config()))
+    code = "import sys; sys.path.append('site'); from vjepa2_ac.cli import main; sys.exit(main())"
+    words = ["config", "show", "own.yaml", "training.loss=log_cosh", "training.loss_options={scale: 3}"]
+    done = subprocess.run([sys.executable, "-P", "-c", code, *words], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert yaml.safe_load(done.stdout)["training"]["loss_options"] == {"scale": 3}

@@ -10,7 +10,7 @@ import pytest
 
 from paths import ROOT
 from vjepa2_ac.cli import main, program
-from vjepa2_ac.config.packaged import packaged_configs
+from vjepa2_ac.config.loading import packaged_configs
 
 PAGE = (ROOT / "docs/QUICKSTART.md").read_text()
 SECTIONS = {

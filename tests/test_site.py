@@ -11,7 +11,7 @@ from browser import open_page
 from made_pages import commands_page, keys_page
 from paths import ROOT
 from site_links import on_site
-from vjepa2_ac.config.diagnostics import all_keys
+from vjepa2_ac.config.loading import all_keys
 
 
 @pytest.fixture(scope="module")

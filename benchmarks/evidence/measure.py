@@ -17,8 +17,8 @@ from prepare import base_model, data_a, data_shifted, training_episodes
 from vjepa2_ac.config import Config, DataConfig, ModelConfig, PlanningConfig, ValidationConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.training import CheckpointConfig
-from vjepa2_ac.data.clips.dataset import open_dataset
-from vjepa2_ac.data.clips.loader import validation_batches
+from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.data.loader import validation_batches
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.encoding.training_cache import with_latents_if_there
 from vjepa2_ac.episode import LatentBatch
@@ -30,7 +30,7 @@ from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.axes.mapping import Axes
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.model_setup import Fingerprints
+from vjepa2_ac.planning.session import Fingerprints
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.checkpoint import NEWEST
 from vjepa2_ac.runs.loading import load_run

@@ -24,7 +24,7 @@ from torch.utils._python_dispatch import _disable_current_modes
 
 from vjepa2_ac.config import AdapterConfig, AugmentConfig, Config, DecoderConfig, ModelSizes
 from vjepa2_ac.config.planning import PlanningConfig
-from vjepa2_ac.data.clips.augmentation import draw
+from vjepa2_ac.data.transforms import draw
 from vjepa2_ac.decoding.frame_pairs import Pairs
 from vjepa2_ac.decoding.network import Decoder, DecoderShape
 from vjepa2_ac.decoding.optimizer_steps import DecoderSteps

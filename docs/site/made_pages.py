@@ -14,8 +14,7 @@ from typing import Any
 import vjepa2_ac
 from site_links import ROOT, on_site
 from vjepa2_ac.cli.program import _parser
-from vjepa2_ac.config.loading import config_schema
-from vjepa2_ac.config.packaged import config_path, packaged_configs
+from vjepa2_ac.config.loading import config_path, config_schema, packaged_configs
 
 _COLUMNS = "88"  # of a help text
 _BOUNDS = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}

@@ -10,9 +10,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from vjepa2_ac.api.data import encode, open_dataset, read_clips
-    from vjepa2_ac.api.models import load_model, load_run
-    from vjepa2_ac.api.runs import evaluate, train
+    from vjepa2_ac.api import encode, evaluate, load_model, load_run, open_dataset, read_clips, train
     from vjepa2_ac.config.loading import load_config
     from vjepa2_ac.errors import UserError
     from vjepa2_ac.model.network.world_model import WorldModel
@@ -36,14 +34,14 @@ _MODULES = {  # the same as above, for the time of use
     "Controller": "vjepa2_ac.planning.controller",
     "UserError": "vjepa2_ac.errors",
     "WorldModel": "vjepa2_ac.model.network.world_model",
-    "encode": "vjepa2_ac.api.data",
-    "evaluate": "vjepa2_ac.api.runs",
+    "encode": "vjepa2_ac.api",
+    "evaluate": "vjepa2_ac.api",
     "load_config": "vjepa2_ac.config.loading",
-    "load_model": "vjepa2_ac.api.models",
-    "load_run": "vjepa2_ac.api.models",
-    "open_dataset": "vjepa2_ac.api.data",
-    "read_clips": "vjepa2_ac.api.data",
-    "train": "vjepa2_ac.api.runs",
+    "load_model": "vjepa2_ac.api",
+    "load_run": "vjepa2_ac.api",
+    "open_dataset": "vjepa2_ac.api",
+    "read_clips": "vjepa2_ac.api",
+    "train": "vjepa2_ac.api",
 }
 
 

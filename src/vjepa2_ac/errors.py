@@ -1,6 +1,7 @@
 """Error types, and their messages for the user: unusable input, or a machine that lacks what is needed."""
 
 import errno
+import importlib
 import json
 import re
 import resource
@@ -11,6 +12,7 @@ import unicodedata
 from functools import partial
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote, urlsplit
 
 _PACKAGE = "vjepa2-ac"
@@ -115,6 +117,24 @@ def pip_install(extra: str = "") -> str:
     if "archive_info" in origin:  # a wheel's file
         return f'{_pip()} install "{_PACKAGE}{wanted} @ {origin["url"]}"'
     return f'{_pip()} install "{_PACKAGE}{wanted}"' if extra else f"{_pip()} install {_PACKAGE}"
+
+
+def require_library(module: str, *, where: str, called: str, extra: str) -> Any:
+    """Return a module of an extra.
+
+    Args:
+        module: Its name.
+        where: What needs it, for the message.
+        called: What the library is called and does, such as "PyAV, which decodes video".
+        extra: Of this package, which installs it.
+
+    Raises:
+        UnreachableError: It is not installed, which says nothing of the data: they are not broken.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        raise UnreachableError(where=where, found=f"{called}, is not installed", fix=pip_install(extra)) from None
 
 
 def _pip() -> str:

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from paths import ROOT
-from vjepa2_ac.data.clips.dataset import open_dataset
+from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.simulation.recording.record import RecordingSpec
 from vjepa2_ac.simulation.world.domains import DOMAIN_A
 

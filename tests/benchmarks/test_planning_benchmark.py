@@ -13,7 +13,6 @@ from torch._dynamo.utils import counters
 
 from benches import ELSEWHERE, drawn_on, imported
 from tracing import tracing
-from vjepa2_ac.model.quantization import has_int8
 
 
 @pytest.fixture
@@ -56,38 +55,6 @@ def test_decisions_with_compiled_blocks_are_timed_beside_those_without(
         "plain", "ours/4", "ours/4+compiled", "ours/2", "ours/2+compiled", "ours/4+adapter", "ours/4+adapter+compiled",
     ]  # fmt: skip
     assert counters["stats"]["unique_graphs"]
-
-
-@pytest.mark.skipif(not has_int8(), reason="this CPU's products in 8 bits are wrong")
-def test_decisions_in_8_bits_are_timed_and_say_what_they_cost(
-    planning: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    pytest.importorskip("torchao", reason="the extra quantize is not installed")
-    planning.main(["--quick", "--no-memory", "--no-adapter", "--official", str(tmp_path), "--quantize", "int8"])
-    printed = capsys.readouterr().out
-    ways = [way for _, way, *_ in DECISION.findall(printed)]
-    assert ways == ["plain", "ours/4", "ours/4+int8", "ours/2", "ours/2+int8"]
-    changes = re.findall(r"ours/[42]\+int8 .*\[the plan's energy: changes by (\S+)%", printed)
-    assert len(changes) == 2
-    assert all(abs(float(change)) < 10 for change in changes)
-
-
-def test_8_bits_are_made_of_bfloat16_only_and_never_compared(
-    planning: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    decisions = sys.modules["planning_variants"]
-    usual, types = decisions.prepare_for_planning, []
-
-    def prepare_for_planning(model: Any, config: Any) -> Any:
-        if config.quantize != "off":
-            types.append(model.predictor.dtype)
-        return usual(model, config.model_copy(update={"quantize": "off"}))
-
-    monkeypatch.setattr(decisions, "prepare_for_planning", prepare_for_planning)
-    given = ["--quick", "--no-memory", "--no-adapter", "--official", str(tmp_path), "--quantize", "fp8"]
-    planning.main([*given, "--dtype", "float32", "bfloat16"])
-    assert types == [torch.bfloat16] * 2  # once for each type that is timed
-    assert "ours/4+fp8: not compared" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("changed", ["ready", "failing"])

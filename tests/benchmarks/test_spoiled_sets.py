@@ -51,7 +51,7 @@ def test_pictures_are_late_early_and_of_another_episode(faults: Any) -> None:
     clean, by_name = recordings(faults), {fault.name: fault for fault in faults.FAULTS}
     late, early, foreign = (
         faults.spoiled(by_name[name], clean)[0]
-        for name in ("pictures 8 steps late", "pictures 2 steps early", "of another episode")
+        for name in ("frames 8 steps late", "frames 2 steps early", "of another episode")
     )
     np.testing.assert_array_equal(late.frames[8:], spot_frames(late.states)[:-8])
     np.testing.assert_array_equal(early.frames[:-2], spot_frames(early.states)[2:])
@@ -79,7 +79,7 @@ def outcomes(printed: str) -> dict[str, tuple[str, str]]:
     return {name.strip(): (checked, probed) for name, checked, probed in rows}
 
 
-def test_a_table_says_what_was_refused_warned_hinted_and_missed(
+def test_a_table_says_what_was_refused_warned_and_missed(
     spoiled_sets: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     better = VariantResult("y negated", "negate y", Estimate(0.5, 0.4, 0.6), Estimate(-0.4, -0.5, -0.3))
@@ -93,13 +93,13 @@ def test_a_table_says_what_was_refused_warned_hinted_and_missed(
         return probes[len(calls) in {2, 3}]  # of those in their order: clean, y, reversed, stale, BGR
 
     monkeypatch.setattr(spoiled_sets, "probe_config", probe)
-    chosen = ["pictures reversed", "stale poses, every 5th", "BGR", "y negated"]
+    chosen = ["frames reversed", "stale poses, every 5th", "BGR", "y negated"]
     spoiled_sets.main(["--data", write_config(tmp_path), "--faults", *chosen])
     printed = capsys.readouterr().out
     assert f"{EPISODES} episodes, {EPISODES * STEPS} steps; stride 4" in printed
     assert outcomes(printed) == {
-        "as it is": ("quiet", "quiet"), "y negated": ("missed", "named"), "pictures reversed": ("refused", "misled"),
-        "stale poses, every 5th": ("warned", "missed"), "BGR": ("hinted", "missed"),
+        "as it is": ("quiet", "quiet"), "y negated": ("missed", "named"), "frames reversed": ("refused", "misled"),
+        "stale poses, every 5th": ("warned", "missed"), "BGR": ("missed", "missed"),
     }  # fmt: skip
     assert "error agreement: frames and states run against each other" in printed
     assert "0.500 with y negated" in printed

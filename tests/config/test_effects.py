@@ -12,13 +12,12 @@ from pydantic import BaseModel
 from copied_sets import WRITERS
 from run_fixtures import TINY
 from vjepa2_ac.config import Config, DataConfig, EncoderConfig, ModelSizes
-from vjepa2_ac.config.effects import Affects, knobs_that_affect, mark_of, marks_of, names_that_affect
 from vjepa2_ac.config.loading import changed_keys, config_as_yaml, parse_config
-from vjepa2_ac.config.section import Section
-from vjepa2_ac.data.filters import idle_ranges
+from vjepa2_ac.config.section import Affects, Section, knobs_that_affect, mark_of, marks_of, names_that_affect
+from vjepa2_ac.data import idle as idle_ranges
 from vjepa2_ac.data.index.episode_table import EpisodeInfo, EpisodeTable
 from vjepa2_ac.data.index.index_cache import IndexKeys
-from vjepa2_ac.data.sources.latents.cache_key import Encoding, key_of_cache
+from vjepa2_ac.data.sources.latents.cache_key import key_of_cache
 from vjepa2_ac.data.sources.registry import open_source
 from vjepa2_ac.encoding.batch import encoding_of
 from vjepa2_ac.errors import InputError
@@ -219,27 +218,6 @@ def test_a_data_set_that_was_moved_is_the_same_and_one_that_changed_is_another(
     largest = max((tmp_path / "moved").rglob("*.*"), key=lambda path: path.stat().st_size)
     largest.touch()
     assert keys_of(there)["index"] != keys_of(here)["index"]
-
-
-@pytest.mark.parametrize(
-    ("source", "latents", "idle"),
-    [
-        ("npz", "8733bf13f17bdb7d18f7c91f4dced507", "01d97e62723a44195379ef084c2f9fd1"),
-        ("rlds", "266875e071205b8bbdffa719239ca168", "64bb797f637370c1d7e99f023a6dac43"),
-        ("lerobot", "8a7568c9ab2312810c135537668964cf", "761010c91690ec93fa54fbf426d6282b"),
-        ("droid_raw", "53364cf8f0b2bfffb2ab632019693358", "8ba9de77fe6d7ec27d8e3b18cdfe82b2"),
-    ],
-)
-def test_keys_are_those_of_the_versions_before_knobs_were_marked(
-    source: str, latents: str, idle: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Days of encoding and hours of reading are found under these keys."""
-    data = config_of(source, "gs://b/set", tmp_path, idle={"rule": "motion"}).data
-    encoding = Encoding("e", 256, 16, 256, 1408, "bfloat16", "bf16")
-    assert key_of_cache(data, "f", encoding).digest == latents
-    monkeypatch.setattr(idle_ranges, "get_or_make", lambda _, key, *__, **___: key)
-    table = EpisodeTable.of([EpisodeInfo("one", 9)], texts={"index": "f"})
-    assert idle_ranges.find_ranges(None, table, data, None) == idle
 
 
 def test_a_run_goes_on_only_where_no_knob_that_decides_it_has_changed(tmp_path: Path) -> None:

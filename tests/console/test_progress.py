@@ -17,9 +17,9 @@ from vjepa2_ac.console import data, training
 from vjepa2_ac.console import progress as console_module
 from vjepa2_ac.console.progress import ConsoleReporter, ProgressBar
 from vjepa2_ac.console.training import TrainingConsole
-from vjepa2_ac.data.inspection.finding import Finding
 from vjepa2_ac.evaluation.measure import VALIDATED
 from vjepa2_ac.evaluation.result import PredictionErrors, Validation
+from vjepa2_ac.inspection.excerpts import Finding
 
 PACKAGE = Path(vjepa2_ac.__file__).parent
 FIGURES = {"loss": 0.51234, "samples_per_second": 1.5, "data_wait_share": 0.1}

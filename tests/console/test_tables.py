@@ -15,16 +15,16 @@ from vjepa2_ac.console.data import calibration_table, motion_table, probe_table
 from vjepa2_ac.console.evaluation import comparison_table, evaluation_tables
 from vjepa2_ac.console.plan import plan_table
 from vjepa2_ac.console.progress import PlainConsole
-from vjepa2_ac.data.inspection.statistics import Inspection
 from vjepa2_ac.evaluation.data_variants.measure import VariantProbe, VariantResult
 from vjepa2_ac.evaluation.evaluate import Contender, evaluate
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.stride_calibration.measure import Calibration, StrideResult
+from vjepa2_ac.inspection.statistics import CHANGED, MOVED, TURNED, StepSizes
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.planning.decision import PlanResult
 from vjepa2_ac.reports.comparison import Comparison
 from vjepa2_ac.simulation.closed_loop.benchmark import ClosedLoopBenchmark
-from vjepa2_ac.simulation.closed_loop.result import ClosedLoopResult
+from vjepa2_ac.simulation.closed_loop.rollout import ClosedLoopResult
 from vjepa2_ac.spaces import POSE, vector_states
 from worlds import Copier, Halfway, about, again, clips_batch
 
@@ -46,9 +46,9 @@ def probes() -> list[Table]:
 
 
 def motions() -> list[Table]:
-    one = Mock(stride=15, seconds=1.0, percentiles=lambda _: (1234.5, 2345.6, 3456.7, 4567.8))
-    both = [Mock(spec=Inspection, has_poses=poses, motions=[one], changes=[one]) for poses in (True, False)]
-    return [motion_table(inspection) for inspection in both]
+    sizes = np.array([1234.5, 2345.6, 3456.7, 4567.8])
+    kinds = [{MOVED: sizes, TURNED: sizes}, {CHANGED: sizes}]
+    return [motion_table([StepSizes(15, 1.0, kind)]) for kind in kinds]
 
 
 def evaluations() -> list[Table]:

@@ -9,22 +9,20 @@ import numpy as np
 import pytest
 import torch
 
-from clips import clip_at
+from clips import clip_at, open_in_memory
 from gcs import Gcs
 from lerobot_sets import Recorded, recorded, write_v21, write_v30
 from memory_source import MemorySource
 from vector_sets import vectors, write_vectors
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.loading import parse_config
-from vjepa2_ac.data.clips.actions import actions_of, joined
-from vjepa2_ac.data.clips.dataset import open_dataset
-from vjepa2_ac.data.inspection.check import check_data, findings_in
-from vjepa2_ac.data.inspection.statistics import inspect_dataset
+from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.sources.registry import open_source
 from vjepa2_ac.episode import Batch, Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.geometry import actions_from_states
-from vjepa2_ac.reports.figures.dataset import plot_dataset
+from vjepa2_ac.inspection.check import check_data, findings_in
+from vjepa2_ac.inspection.sheet import plot_dataset
+from vjepa2_ac.inspection.statistics import CHANGED, inspect_dataset
 from vjepa2_ac.spaces import Spaces
 
 JOINTS = ("steps/observation/joint_position", "steps/observation/gripper_position")
@@ -68,18 +66,6 @@ def test_at_stride_one_there_is_nothing_to_join(tmp_path: Path) -> None:
     config = knobs(write_vectors(tmp_path, width=8, action_width=8), stride=1, actions="recorded")
     clip = clip_at(open_dataset(config), 0, 0)
     np.testing.assert_array_equal(clip.actions, vectors(24, 8, seed=1000)[:2].astype(np.float32))
-
-
-def test_summed_deltas_of_absolute_commands_equal_the_difference_of_the_commands() -> None:
-    targets = vectors(13, 6, seed=0)
-    deltas = np.diff(targets, axis=0)
-    np.testing.assert_allclose(joined(deltas, 4, "sum"), np.diff(targets[::4], axis=0), atol=1e-12)
-
-
-def test_poses_keep_their_own_actions() -> None:
-    states = vectors(4, 7, seed=1)
-    pose = DataConfig(path="nowhere", source="npz")
-    np.testing.assert_array_equal(actions_of(states, None, range(4), pose), actions_from_states(states))
 
 
 def test_a_pose_that_is_read_as_a_vector_is_not_turned_into_rotations(droid: Path) -> None:
@@ -128,14 +114,6 @@ def test_rlds_without_a_flag_for_each_step_cannot_say_how_wide_a_vector_is(
         open_dataset(knobs(folder, source="rlds", fields={"state": JOINTS}))
 
 
-def test_a_number_that_is_not_finite_is_named(spoiled: Callable[[Callable[[Any], None]], Path]) -> None:
-    def spoil(features: Any) -> None:
-        features[JOINTS[0]][1][9] = float("nan")
-
-    with pytest.raises(InputError, match=r"step 1.*finite numbers"):
-        open_dataset(knobs(spoiled(spoil), source="rlds", fields={"state": JOINTS}))
-
-
 def bimanual(number: int, steps: int) -> Recorded:
     columns = {
         "observation.state": vectors(steps, 14, seed=number).astype(np.float32),
@@ -169,18 +147,10 @@ def test_a_robot_of_another_width_is_a_broken_episode(tmp_path: Path) -> None:
 
 def test_an_episode_of_another_width_that_no_index_saw_is_named_when_it_is_read() -> None:
     source = MemorySource([9, 9], states=lambda index: vectors(9, 14 - index, seed=index))
-    dataset = open_dataset_of(source)
+    dataset = open_in_memory(source, source="npz", states="vector")
     assert clip_at(dataset, 0, 0).states.shape == (3, 14)
     with pytest.raises(InputError, match=r"episode 1.*states of 13.*14 and 14, as in the others"):
         clip_at(dataset, 1, 0)
-
-
-def open_dataset_of(source: MemorySource) -> Any:
-    import vjepa2_ac.data.clips.dataset as module
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "open_source", lambda _: source)
-        return open_dataset(knobs("memory"))
 
 
 def test_commands_that_are_asked_for_must_be_there_for_every_step(tmp_path: Path) -> None:
@@ -260,32 +230,25 @@ def test_the_check_tells_numbers_that_teach_nothing(states: np.ndarray, about: s
     assert words in found[about].text
 
 
-def test_frames_that_never_change_while_a_number_does_are_an_error() -> None:
-    moving = batch(vectors(9, 5, seed=0))
-    stuck = Batch(torch.zeros_like(moving.frames), moving.states, moving.actions, None, ("e",), (0,))
-    found = {one.about: one for one in findings_in([stuck], FIVE)}
-    assert found["pictures"].level == "error"
-
-
 def test_inspection_and_frame_of_vectors(tmp_path: Path) -> None:
-    from vjepa2_ac.console.data import inspection_lines, motion_table
+    from vjepa2_ac.console.data import motion_table
 
     dataset = open_dataset(knobs(write_vectors(tmp_path / "set", width=14)))
     found = inspect_dataset(dataset)
-    figures = json.loads(json.dumps(found.as_dict()))
+    figures = json.loads(json.dumps(found.values))
     assert (figures["state_dim"], figures["action_dim"], len(figures["ranges"])) == (14, 14, 14)
     assert "gripper" not in figures
     assert [one["stride"] for one in figures["per_model_step"]] == [3, 5, 10]
-    assert any(line.startswith("states") and "14 numbers: -" in line for line in inspection_lines(found))
-    assert motion_table(found).row_count == 3
-    assert plot_dataset(dataset, found, tmp_path / "sheet.png").stat().st_size > 10_000
+    assert found.summary["states"].startswith("14 numbers: -")
+    assert motion_table(found.steps).row_count == 3
+    assert plot_dataset(found, tmp_path / "sheet.png").stat().st_size > 10_000
 
 
 def test_a_number_changes_by_a_share_of_its_range(tmp_path: Path) -> None:
     ramp = np.stack([np.linspace(0, 1, 24), np.linspace(0, 460, 24) / 2], axis=1)
     ramp[:, 1] = np.minimum(ramp[:, 1], 115.0)  # twice as fast, over half the time
     dataset = open_dataset(knobs(write_vectors(tmp_path, width=2, states=ramp), stride_candidates=[1, 5]))
-    one, five = inspect_dataset(dataset).changes
-    assert one.percent.max() == pytest.approx(100 / 11.5)
-    assert one.percent.min() == pytest.approx(100 / 23)
-    assert five.percent.max() == pytest.approx(500 / 11.5)
+    one, five = (step.sizes[CHANGED] for step in inspect_dataset(dataset).steps)
+    assert one.max() == pytest.approx(100 / 11.5)
+    assert one.min() == pytest.approx(100 / 23)
+    assert five.max() == pytest.approx(500 / 11.5)

@@ -11,8 +11,8 @@ import torch
 from decoders import EncodeSplit
 from run_fixtures import MakeConfig
 from vjepa2_ac.config import Config
-from vjepa2_ac.data.clips.dataset import open_dataset
-from vjepa2_ac.data.clips.transforms import input_to_pixels, pixels_to_input, view
+from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.data.transforms import input_to_pixels, pixels_to_input, view
 from vjepa2_ac.decoding import frame_pairs
 from vjepa2_ac.decoding.frame_pairs import as_images, as_pixels, require_space_for_pairs, wanted_frames
 from vjepa2_ac.encoding.cache_lookup import needed_frames
@@ -131,7 +131,7 @@ def test_a_disk_that_is_too_small_is_refused_and_what_is_there_counts(
 
 def broken(monkeypatch: pytest.MonkeyPatch, config: Config) -> str:
     """Break the last frames of a training episode; return its name."""
-    from vjepa2_ac.data.filters import broken_episodes
+    from vjepa2_ac.data import selection as broken_episodes
     from vjepa2_ac.data.sources.rlds.source import RldsSource
 
     dataset, read = open_dataset(config.data), RldsSource.read

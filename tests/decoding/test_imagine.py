@@ -7,7 +7,8 @@ from torch import Tensor
 
 from vjepa2_ac.decoding.imagine import Start, imagined_latents, rolled_out, shown
 from vjepa2_ac.decoding.network import Decoder, DecoderShape
-from vjepa2_ac.planning.counterfactual.named_actions import counterfactual_states, named_actions
+from vjepa2_ac.planning import counterfactual as named_actions
+from vjepa2_ac.planning.counterfactual import counterfactual_states
 from vjepa2_ac.spaces import POSE
 
 STEPS, TOKENS, DIM = 4, 4, 12

@@ -9,7 +9,7 @@ import torch
 from decisions import asked, image
 from random_decoder import write_decoder
 from tiny_models import tiny_model
-from vjepa2_ac.data.clips.transforms import frames_as_seen, view
+from vjepa2_ac.data.transforms import frames_as_seen, view
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
 from vjepa2_ac.decoding.imagine import shown
 from vjepa2_ac.decoding.imagined_plan import imagine_plan, imagined_next

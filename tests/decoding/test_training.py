@@ -116,7 +116,7 @@ def test_the_card_says_what_the_decoder_is(whole_decoder: Path, make_decoder: Ma
 
 
 def len_of_training(config: Config) -> int:
-    from vjepa2_ac.data.clips.dataset import open_dataset
+    from vjepa2_ac.data.dataset import open_dataset
     from vjepa2_ac.decoding.frame_pairs import wanted_frames
 
     return sum(len(one.steps) for one in wanted_frames(open_dataset(config.data), "train", frames=40))

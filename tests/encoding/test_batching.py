@@ -10,8 +10,8 @@ import torch
 from memory_source import MemorySource
 from recording_cuda import RecordingCuda, recorded_copies
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.clips import dataset
-from vjepa2_ac.data.clips.streams import NO_COPIES
+from vjepa2_ac.data import dataset
+from vjepa2_ac.data.streams import NO_COPIES
 from vjepa2_ac.encoding.batching import Chunks, Encoded
 from vjepa2_ac.encoding.disk_space import FRAMES_AT_ONCE
 from vjepa2_ac.encoding.prefetch import FramesToEncode, Part, Unreadable, prefetched

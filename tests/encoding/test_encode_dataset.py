@@ -17,8 +17,8 @@ from ranks import finish, free_port, start_rank
 from run_fixtures import MakeConfig, SilentReporter, as_yaml, set_up
 from same_run import assert_same_run
 from vjepa2_ac.config import Config
-from vjepa2_ac.data.clips.dataset import open_dataset
-from vjepa2_ac.data.clips.loader import validation_batches
+from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.data.loader import validation_batches
 from vjepa2_ac.data.sources.latents.manifest import is_whole, read_manifest
 from vjepa2_ac.encoding import disk_space
 from vjepa2_ac.encoding.batch import encode_batch
@@ -28,7 +28,7 @@ from vjepa2_ac.episode import Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.storage import writing
+from vjepa2_ac.storage import files as writing
 from vjepa2_ac.training.loop import train
 
 CAMERA = "exterior_1_left"
@@ -290,7 +290,7 @@ def test_what_cannot_be_encoded_is_refused_before_the_data_is_opened(
 @pytest.fixture
 def mend(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
     """Episode 3 has a frame that cannot be decoded; a call repairs it."""
-    from vjepa2_ac.data.filters import broken_episodes
+    from vjepa2_ac.data import selection as broken_episodes
     from vjepa2_ac.data.sources.rlds.source import RldsSource
 
     read, is_broken = RldsSource.read, True
@@ -512,7 +512,7 @@ def test_check_says_what_would_be_encoded_and_tries_the_rest_on_frames(
 def test_latents_of_another_encoder_are_never_used(
     make_config: MakeConfig, tmp_path: Path, base_folder: Path, cache: Path, reporter: SilentReporter
 ) -> None:
-    from vjepa2_ac.model.sizes import read_sizes
+    from vjepa2_ac.model.base_model import read_sizes
 
     encode_config(make_config(data__cache_dir=str(cache)), reporter)
     other = tmp_path / "other"

@@ -25,22 +25,22 @@ from synthetic import synthetic_episode, synthetic_states
 from vector_sets import write_vectors
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.clips.clip_reader import frames_of
-from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
-from vjepa2_ac.data.clips.loader import batches_of, training_loader, validation_batches
-from vjepa2_ac.data.filters.broken_episodes import BrokenEpisodes
-from vjepa2_ac.data.filters.step_ranges import StepSelection, clip_starts
+from vjepa2_ac.data.clips import frames_of
+from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.index.episode_table import EpisodeTable
-from vjepa2_ac.data.inspection.check import check_data
-from vjepa2_ac.data.inspection.statistics import inspect_dataset
+from vjepa2_ac.data.loader import batches_of, training_loader, validation_batches
+from vjepa2_ac.data.selection import BrokenEpisodes, StepSelection
 from vjepa2_ac.data.sources.latents.dtypes import CacheType, pack_latents, unpack_latents
 from vjepa2_ac.data.sources.latents.episode_file import EncodedEpisode, EpisodeFile, EpisodeLayout, write_episode_file
 from vjepa2_ac.data.sources.latents.manifest import EPISODES, KEPT, MANIFEST, path_of
 from vjepa2_ac.data.sources.rlds.writing.droid_writer import write_droid_rlds
+from vjepa2_ac.data.windows import clip_starts
 from vjepa2_ac.encoding.cache_lookup import needed_frames, require_encoding, through_cache
 from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, StoredLatents
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.reports.figures.dataset import plot_dataset
+from vjepa2_ac.inspection.check import check_data
+from vjepa2_ac.inspection.sheet import plot_dataset
+from vjepa2_ac.inspection.statistics import inspect_dataset
 
 STEPS, FRAMES, TOKENS, DIM = 12, (0, 2, 5, 11), 4, 24
 
@@ -239,10 +239,9 @@ IDLE = {"rule": "motion", "shortest_idle_steps": 3, "shortest_kept_steps": 4, "c
 EVERYTHING = {
     "plain": {},
     "idle": {"idle": IDLE},
-    "some idle clips stay": {"idle": IDLE | {"keep_share": 0.4}},
     "two cameras": {"camera": ("exterior_1_left", "wrist_left")},
     "one phase": {"start_every": 2},
-    "one phase of idle": {"start_every": 2, "idle": IDLE | {"keep_share": 0.4}, "camera": ("wrist_left",)},
+    "one phase of idle": {"start_every": 2, "idle": IDLE, "camera": ("wrist_left",)},
     "one outcome": {"outcome": "success"},
     "another crop": {"crop": "square"},
 }
@@ -324,16 +323,14 @@ def test_a_cache_has_the_clips_of_its_data_set_in_their_order(
 
 
 def test_one_phase_needs_a_frame_in_every_stride(droid_with_rests: Path, tmp_path: Path) -> None:
-    for knobs in ({}, {"idle": IDLE | {"keep_share": 0.4}}):
-        frames, phases = [], []
-        for every in (1, 2):
-            dataset = open_dataset(config_of(droid_with_rests, tmp_path, start_every=every, **knobs))
-            needed = list(needed_frames(dataset))
-            frames.append(sum(len(one.steps) for one in needed))
-            phases.append({tuple(np.unique(one.steps % 2)) for one in needed})
-        assert frames[1] < 0.6 * frames[0]
-        assert phases[0] == {(0, 1)}
-        assert phases[1] <= {(0,), (1,)}
+    frames, phases = [], []
+    for every in (1, 2):
+        needed = list(needed_frames(open_dataset(config_of(droid_with_rests, tmp_path, start_every=every))))
+        frames.append(sum(len(one.steps) for one in needed))
+        phases.append({tuple(np.unique(one.steps % 2)) for one in needed})
+    assert frames[1] < 0.6 * frames[0]
+    assert phases[0] == {(0, 1)}
+    assert phases[1] <= {(0,), (1,)}
 
 
 def test_clips_start_at_multiples_of_start_every_from_the_first_kept_step() -> None:
@@ -344,9 +341,7 @@ def test_clips_start_at_multiples_of_start_every_from_the_first_kept_step() -> N
     config = DataConfig(path="nowhere", frames=3, stride=2, start_every=4)
     starts = clip_starts(table, kept, config)
     found = [
-        (int(starts.episode[run]), step)
-        for run in range(len(starts.first))
-        for step in starts.steps_of(run, table.id_hash, 0.0).tolist()
+        (int(starts.episode[run]), step) for run in range(len(starts.first)) for step in starts.steps_of(run).tolist()
     ]
     assert found == [(0, 3), (0, 7), (0, 11), (0, 23), (1, 0), (1, 4), (1, 8), (1, 12)]
 
@@ -619,5 +614,5 @@ def test_a_cache_can_be_checked_and_inspected(a_cache: tuple[Dataset, Dataset, P
     assert "camera exterior_1_left" in found["source"].text
     assert "error" not in {finding.level for finding in found.values()}
     dataset = open_dataset(config)
-    sheet = plot_dataset(dataset, inspect_dataset(dataset), tmp_path / "sheet.png", rows=2)
+    sheet = plot_dataset(inspect_dataset(dataset), tmp_path / "sheet.png", rows=2)
     assert sheet.stat().st_size > 10_000

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from decoders import whole_decoder  # noqa: F401 - a fixture
 from run_fixtures import MakeConfig
-from vjepa2_ac.data.clips.dataset import open_dataset
-from vjepa2_ac.data.clips.loader import validation_windows
+from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.data.loader import validation_windows
 from vjepa2_ac.decoding.imagine import AS_RECORDED, Imagination, Imagined
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation import imagined

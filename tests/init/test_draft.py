@@ -9,8 +9,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.init import draft
 from vjepa2_ac.init.draft import choose_model, make_draft
-from vjepa2_ac.init.found import FoundData
-from vjepa2_ac.init.knob import Knob, plain
+from vjepa2_ac.init.found import FoundData, Knob, plain
 from vjepa2_ac.init.machine import Machine, duration
 from vjepa2_ac.storage.structured import parse_yaml
 
@@ -19,7 +18,8 @@ FOUND = FoundData(
     "npz", "data/mine", {"camera": Knob("frames")}, Knob(30.0), episodes=20, steps=6_000, usual_steps=300,
     short_steps=200, idle={"rule": Knob("motion")}, about=("twenty",),
 )  # fmt: skip
-MACHINE = Machine("NVIDIA GeForce RTX 3090", 24 * GB, has_bf16=True, cores=8, free_bytes=500 * GB)
+FLOPS = 7e13
+MACHINE = Machine("NVIDIA GeForce RTX 3090", 24 * GB, has_bf16=True, cores=8, free_bytes=500 * GB, flops=FLOPS)
 
 
 @pytest.fixture(autouse=True)
@@ -58,17 +58,26 @@ def test_the_text_is_the_config() -> None:
 
 
 def test_without_a_gpu_the_batch_is_of_a_usual_one_and_no_hours_are_promised() -> None:
-    made = of(machine=replace(MACHINE, gpu=None))
+    made = of(machine=replace(MACHINE, gpu=None, flops=None))
     assert made.config.training.batch_size == 4
     assert made.hours is None
     assert any("not known without the GPU" in line for line in made.costs(replace(MACHINE, gpu=None)))
 
 
-def test_hours_follow_from_the_card() -> None:
-    slow, fast = of(), of(machine=replace(MACHINE, gpu="NVIDIA GeForce RTX 4090"))
+def test_hours_follow_from_the_measured_speed_and_not_from_the_cards_name() -> None:
+    slow, fast = of(), of(machine=replace(MACHINE, gpu="Quadro T400", flops=2 * FLOPS))
     assert slow.hours is not None
-    assert fast.hours == pytest.approx(slow.hours * 71 / 165)
-    assert of(machine=replace(MACHINE, gpu="Something else")).hours is None
+    assert fast.hours == pytest.approx(slow.hours / 2)
+    assert of(machine=replace(MACHINE, flops=None)).hours is None
+
+
+@pytest.mark.parametrize(("name", "width"), [("vjepa2.1-vitb-384", 768), ("vjepa2-vitl", 1024)])
+def test_a_fresh_predictor_and_its_cache_are_as_wide_as_the_encoders_latents(name: str, width: int) -> None:
+    model = choose_model("scratch", f"checkpoints/{name}.pt")
+    made = make_draft(FOUND, MACHINE, model, run_dir="run")
+    assert made.config.model.random is not None
+    assert made.config.model.random.predictor.width == width
+    assert model.bytes_a_frame == 2 * 256 * width
 
 
 @pytest.mark.parametrize("path", [None, "builtin:sim-tiny"], ids=["released", "tiny"])
@@ -112,7 +121,7 @@ def test_a_trial_takes_its_share_of_the_steps_and_all_of_the_encoding() -> None:
     assert 0 < made.encoding_hours < made.hours
     assert made.time_of(made.config.training.steps) == duration(made.hours)
     assert made.time_of(0) == duration(made.encoding_hours)
-    assert of(machine=replace(MACHINE, gpu="Something else")).time_of(100) is None
+    assert of(machine=replace(MACHINE, flops=None)).time_of(100) is None
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vjepa2_ac.init.knob import GUESSED, Knob, as_yaml, guesses, plain
+from vjepa2_ac.init.found import GUESSED, Knob, as_yaml, guesses, plain
 from vjepa2_ac.storage.structured import parse_yaml
 
 WORDS = st.text(alphabet=st.characters(exclude_categories=("C", "Zl", "Zp")), max_size=12)

@@ -11,10 +11,8 @@ from decisions import QUICK, STATE, asked, image
 from tiny_models import tiny_model
 from vjepa2_ac.config.planning import EnergyConfig, GradientConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.decision import PlanRequest, PlanResult, decide
+from vjepa2_ac.planning.decision import PlanRequest, PlanResult, axes_at_limit, decide, summarize, write_plan
 from vjepa2_ac.planning.energy import WorldModelCost
-from vjepa2_ac.planning.plan_json import write_plan
-from vjepa2_ac.planning.summary import axes_at_limit, summarize
 
 
 def read(found: PlanResult, folder: Path) -> dict:

@@ -9,10 +9,10 @@ from tiny_models import DIM, TOKENS, actions, cost, draw, goal, scene, tiny_mode
 from vjepa2_ac.config.planning import EnergyConfig, GradientConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.geometry import apply_action
-from vjepa2_ac.model.network.kv_cache import KeyValueCache
+from vjepa2_ac.model.network.predictor_network import KeyValueCache
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.energy import Scene, WorldModelCost, distance
-from vjepa2_ac.planning.goals.goal import Goal, patch_weights
+from vjepa2_ac.planning.goals import Goal, patch_weights
 from vjepa2_ac.planning.planner import Planner
 from vjepa2_ac.spaces import Spaces
 
@@ -113,12 +113,14 @@ def test_a_sum_over_steps_adds_the_energies_of_shorter_plans(kind: str) -> None:
 
 def test_each_distance_is_its_formula() -> None:
     found, wanted = draw(5, TOKENS, DIM, seed=1), draw(TOKENS, DIM, seed=2)
-    torch.testing.assert_close(distance(found, wanted, "l1"), (found - wanted).abs().mean(dim=(1, 2)))
-    torch.testing.assert_close(distance(found, wanted, "l2"), ((found - wanted) ** 2).mean(dim=(1, 2)))
+    torch.testing.assert_close(distance(found, wanted, EnergyConfig()), (found - wanted).abs().mean(dim=(1, 2)))
+    torch.testing.assert_close(
+        distance(found, wanted, EnergyConfig(distance="l2")), ((found - wanted) ** 2).mean(dim=(1, 2))
+    )
     cosine = torch.einsum("std,td->st", found, wanted) / found.norm(dim=-1) / wanted.norm(dim=-1)
-    torch.testing.assert_close(distance(found, wanted, "cosine"), 1 - cosine.mean(dim=1))
+    torch.testing.assert_close(distance(found, wanted, EnergyConfig(distance="cosine")), 1 - cosine.mean(dim=1))
     for kind in ("l1", "l2", "cosine"):
-        assert float(distance(wanted, wanted, kind)) == pytest.approx(0, abs=1e-6)  # type: ignore[arg-type]
+        assert float(distance(wanted, wanted, EnergyConfig(distance=kind))) == pytest.approx(0, abs=1e-6)
 
 
 @pytest.mark.parametrize("kind", ["l1", "l2", "cosine"])
@@ -126,8 +128,9 @@ def test_patches_without_weight_do_not_count(kind) -> None:
     found, wanted = draw(5, TOKENS, DIM, seed=1), draw(TOKENS, DIM, seed=2)
     weights = torch.zeros(TOKENS)
     weights[[2, 5]] = 3.0
-    torch.testing.assert_close(distance(found, wanted, kind, weights), distance(found[:, [2, 5]], wanted[[2, 5]], kind))
-    torch.testing.assert_close(distance(found, wanted, kind, torch.ones(TOKENS)), distance(found, wanted, kind))
+    by = EnergyConfig(distance=kind)
+    torch.testing.assert_close(distance(found, wanted, by, weights), distance(found[:, [2, 5]], wanted[[2, 5]], by))
+    torch.testing.assert_close(distance(found, wanted, by, torch.ones(TOKENS)), distance(found, wanted, by))
 
 
 def test_a_mask_over_the_image_weighs_its_patches_row_by_row() -> None:
@@ -145,7 +148,7 @@ def test_the_goals_weights_are_used() -> None:
     weights = torch.arange(float(TOKENS))
     measure = WorldModelCost(model, scene(), goal(weights=weights), EnergyConfig())
     predicted, _ = measure.imagine(tried)
-    torch.testing.assert_close(measure(tried), distance(predicted[:, 0], goal().latents[0], "l1", weights))
+    torch.testing.assert_close(measure(tried), distance(predicted[:, 0], goal().latents[0], EnergyConfig(), weights))
 
 
 def test_goals_follow_one_another_after_their_durations() -> None:

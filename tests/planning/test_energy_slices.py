@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
-from vjepa2_ac.planning.energy_slices import energy_slices, fitting_nodes, sequences_of_slices
+from vjepa2_ac.planning.energy import energy_slices, fitting_nodes, sequences_of_slices
 from vjepa2_ac.planning.search_space import pose_space
 
 CHOSEN = torch.arange(28.0).reshape(4, 7) / 1000

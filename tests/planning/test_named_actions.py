@@ -8,12 +8,12 @@ import pytest
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.geometry import actions_from_states
-from vjepa2_ac.planning.counterfactual.actions_file import read_actions
-from vjepa2_ac.planning.counterfactual.named_actions import (
+from vjepa2_ac.planning.counterfactual import (
     ACTION_NAMES,
     counterfactual_states,
     feasible_actions,
     named_actions,
+    read_actions,
 )
 from vjepa2_ac.spaces import vector_states
 
@@ -93,18 +93,14 @@ def test_actions_are_read_from_arrays_and_tables(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("a.csv", "0,0,0,0,0,0\n", "line 1: 6 values"),
-        ("a.csv", "0,0,0,0,0,0,0\n\n0,0,up,0,0,0,0\n", "line 3: could not convert string to float: 'up'"),
-        ("a.csv", "0,0,0,0,0,0,nan\n", "action 0: the numbers"),
-        ("a.csv", "0,0,0,0,0,0,0\n50,0,0,0,0,0,0\n", "action 1: the numbers .* 1 m"),
-        ("a.csv", "", r"shape \(0, 7\)"),
-        ("a.csv", b"\xff\xfe\x00", "not text"),
-        ("a.npy", b"PK\x03\x04", "another kind of file"),
+        ("a.csv", "0,0,0,0,0,0\n", r"shape \(1, 6\)"),
+        ("a.csv", "0,0,0,0,0,0,0\n\n0,0,up,0,0,0,0\n", "'up'"),
+        ("a.csv", "0,0,0,0,0,0,nan\n", "action 0 is"),
+        ("a.csv", "0,0,0,0,0,0,0\n50,0,0,0,0,0,0\n", "action 1 is .*metres"),
+        ("a.csv", b"\xff\xfe\x00", "cannot be read"),
+        ("a.npy", b"PK\x03\x04", "cannot be read"),
         ("a.npy", np.zeros((3, 6)), r"shape \(3, 6\)"),
-        ("a.npy", np.full((1, 7), np.inf), "action 0"),
-        ("a.npy", np.array(["a"] * 7)[None], "values of type <U1"),
-        ("a.npy", np.array([[None] * 7]), "not an array of numbers"),
-        ("a.txt", "0", "a file .txt. needed: a .npy or .csv"),
+        ("a.npy", np.array([[None] * 7]), "cannot be read"),
     ],
 )
 def test_files_of_something_else_are_refused(
@@ -119,11 +115,6 @@ def test_files_of_something_else_are_refused(
         read_actions(path)
 
 
-def test_a_huge_claim_and_a_missing_file_are_refused(tmp_path: Path) -> None:
-    np.save(tmp_path / "a.npy", np.zeros((100, 7)))
-    data = (tmp_path / "a.npy").read_bytes()
-    (tmp_path / "a.npy").write_bytes(data.replace(b"(100, 7)", b"(9**9,7)").replace(b"9**9", b"9999"))
-    with pytest.raises(InputError, match="not an array of numbers"):
-        read_actions(tmp_path / "a.npy")
-    with pytest.raises(InputError, match="cannot be read: No such file"):
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"b\.npy: cannot be read \(.*No such file"):
         read_actions(tmp_path / "b.npy")

@@ -220,23 +220,6 @@ def test_how_a_run_was_trained_does_not_keep_it_from_planning_here(make_config) 
     assert load_to_plan(str(run)).world_model.device.type == "cpu"
 
 
-@pytest.mark.parametrize("kind", ["int8", "fp8"])
-def test_8_bits_in_float32_are_refused_before_a_model_is_loaded(make_config, kind: str, tmp_path: Path) -> None:
-    path = tmp_path / "its.yaml"
-    path.write_text(config_as_yaml(make_config(planning__quantize=kind)))
-    reported = rf"planning\.quantize: {kind}, with weights in float32\. needed: bfloat16.*Set model\.dtype=bfloat16"
-    with pytest.raises(InputError, match=reported):
-        load_to_plan("no such model", config=path)
-
-
-def test_fp8_that_the_device_has_not_is_refused_before_a_model_is_loaded(make_config, tmp_path: Path) -> None:
-    pytest.importorskip("torchao", reason="the extra quantize is not installed")
-    path = tmp_path / "its.yaml"
-    path.write_text(config_as_yaml(make_config(planning__quantize="fp8", training__precision="bf16")))
-    with pytest.raises(InputError, match=r"planning\.quantize: fp8, on cpu"):
-        load_to_plan("no such model", config=path, overrides=["model.dtype=bfloat16"])
-
-
 def test_a_run_from_before_the_planning_section_resumes_unchanged(make_config) -> None:
     config = make_config()
     folder = open_run_folder(config, "name")

@@ -16,10 +16,7 @@ from vjepa2_ac.evaluation.action_score.protocol import SCORED
 from vjepa2_ac.planning.interfaces import Plan, PlanStart
 from vjepa2_ac.planning.planner import Planner
 from vjepa2_ac.planning.search_space import Ball, SearchSpace
-from vjepa2_ac.planning.solvers.base import EvaluatedPlans, white_noise
-from vjepa2_ac.planning.solvers.gradient import GradientSolver
-from vjepa2_ac.planning.solvers.icem import coloured_noise
-from vjepa2_ac.planning.solvers.mppi import MppiSolver
+from vjepa2_ac.planning.solvers import EvaluatedPlans, GradientSolver, MppiSolver, coloured_noise, white_noise
 
 
 @pytest.mark.parametrize("planner", PLANNERS)
@@ -313,7 +310,9 @@ def test_icems_elites_take_part_again() -> None:
 
 
 def test_mppi_tries_its_mean_and_weighs_by_energy() -> None:
-    search = MppiSolver(space(), MppiConfig(temperature=0.5, std_decay=0.5), 3, torch.Generator(), None)
+    search = MppiSolver(
+        space(), config("mppi", samples=3, mppi=MppiConfig(temperature=0.5, std_decay=0.5)), torch.Generator()
+    )
     assert torch.equal(search.sample()[0], search.mean)
     tried = torch.tensor([[[0.0, 0.0]], [[1.0, 0.0]], [[0.0, 1.0]]])
     energies = torch.tensor([1.0, 3.0, 2.0])
@@ -338,7 +337,9 @@ def test_descents_survive_a_cost_that_once_says_nothing() -> None:
 
 
 def test_a_descent_at_the_limits_turns_back_at_once() -> None:
-    search = GradientSolver(space(), GradientConfig(starts=1, learning_rate=0.1), 1000, torch.Generator(), None)
+    search = GradientSolver(
+        space(), config("gradient", iterations=1000, gradient=GradientConfig(starts=1)), torch.Generator()
+    )
     nothing, slope = torch.zeros(0, 1, 2), torch.ones(1, 1, 2)
     for towards in [-1.0] * 40 + [1.0] * 20:
         search.update(EvaluatedPlans(nothing, torch.zeros(0), towards * slope))

@@ -28,7 +28,6 @@ ADAPTERS = {
     "lora": AdapterConfig(rank=4, alpha=8.0, dropout=0.1),
     "heads": AdapterConfig(rank=4, alpha=8.0, modules_to_save=("predictor_embed", "predictor_proj", "action_encoder")),
     "dora": AdapterConfig(rank=4, alpha=8.0, dora=True),
-    "pissa": AdapterConfig(rank=4, alpha=8.0, init="pissa"),
     "none": AdapterConfig(kind="none"),
 }
 every_adapter = pytest.mark.parametrize("adapter", ADAPTERS.values(), ids=ADAPTERS)

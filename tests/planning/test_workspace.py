@@ -13,8 +13,7 @@ from tiny_models import tiny_model
 from vjepa2_ac.config.planning import CemConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.search_space import pose_space
-from vjepa2_ac.planning.workspace import Workspace
+from vjepa2_ac.planning.search_space import Workspace, pose_space
 from vjepa2_ac.spaces import CAMERA_POSE, POSE, vector_states
 
 CORNERS = ((0.3, -0.2, 0.1), (0.6, 0.2, 0.5))
@@ -108,6 +107,13 @@ def test_a_robot_slightly_outside_goes_back_and_one_far_outside_goes_nowhere() -
     assert not action.any()
     assert run.decision.why == "outside the workspace"
     assert run.decision.plan is None
+
+
+def test_the_energy_of_a_plan_that_was_kept_inside_is_that_of_its_own_actions() -> None:
+    run = controller(workspace=CORNERS)
+    run.act(image(0), position(0.63, 0.0, 0.3))
+    plan = run.decision.plan
+    assert plan.energy == pytest.approx(float(run.decision.cost(plan.actions[None]).detach()), rel=1e-6)
 
 
 def test_without_a_model_that_answers_nobody_moves_even_outside() -> None:

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from paths import ROOT
 from served import controller, image
 from vjepa2_ac.config.planning import LimitsConfig
-from vjepa2_ac.planning.goals.sub_goals import SubGoal
+from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.serving.session import Session, SessionOptions
 from vjepa2_ac.serving.wire import pack, unpack
 

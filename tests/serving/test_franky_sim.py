@@ -12,7 +12,7 @@ import pytest
 from paths import ROOT
 from served import controller, image, serving
 from vjepa2_ac.config.planning import LimitsConfig
-from vjepa2_ac.planning.goals.sub_goals import SubGoal
+from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.serving.session import Session, SessionOptions
 
 ARM = ["franky-control==2.0.0", "franky-sim==1.0.4", "scipy"]

@@ -7,7 +7,7 @@ import pytest
 
 from paths import ROOT
 from served import STATE, session
-from vjepa2_ac.planning.goals.sub_goals import SubGoal
+from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.serving.session import Session
 from vjepa2_ac.serving.wire import pack, unpack
 

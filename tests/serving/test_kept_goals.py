@@ -8,9 +8,9 @@ from PIL import Image
 
 from served import image
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.planning.goals.folder import write_goals
-from vjepa2_ac.planning.goals.sub_goals import SubGoal
-from vjepa2_ac.serving.kept_goals import read_kept_goals
+from vjepa2_ac.planning.goal_folder import write_goals
+from vjepa2_ac.planning.goals import SubGoal
+from vjepa2_ac.serving.about import read_kept_goals
 
 
 def pick(folder: Path) -> Path:

@@ -12,7 +12,7 @@ from PIL import Image
 from served import STATE, controller, ended, image, serving, session, started
 from tiny_models import tiny_model
 from vjepa2_ac.geometry import apply_action
-from vjepa2_ac.planning.goals.sub_goals import SubGoal
+from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.serving.about import roboarena_metadata
 from vjepa2_ac.serving.access import Access
 from vjepa2_ac.serving.session import SessionOptions

@@ -11,7 +11,7 @@ import pytest
 from served import STATE, controller, image, request, session
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.image_file import read_image
-from vjepa2_ac.planning.goals.sub_goals import SubGoal
+from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.serving import recording
 from vjepa2_ac.serving.recording import DECISIONS, IMAGES, Recorder, require_new_record
 from vjepa2_ac.serving.session import Session, SessionOptions

@@ -5,7 +5,7 @@ import pytest
 
 from served import STATE, image
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.planning.goals.sub_goals import SubGoal
+from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.serving.client import goal_keys
 from vjepa2_ac.serving.request import GivenGoal, NamedGoal, read_request
 

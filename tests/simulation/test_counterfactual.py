@@ -18,11 +18,11 @@ from vjepa2_ac.geometry import actions_from_states
 
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 
-from vjepa2_ac.planning.counterfactual.named_actions import named_actions
+from vjepa2_ac.planning import counterfactual as named_actions
 from vjepa2_ac.simulation.counterfactual import RECORDED_CAMERAS, Resimulation, resimulate
 from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset, record_episode
 from vjepa2_ac.simulation.recording.simulation_file import SIMULATION_FILE
-from vjepa2_ac.simulation.world.projection import exterior_pose, hand_pixels
+from vjepa2_ac.simulation.world.camera import exterior_pose, hand_pixels
 
 STEPS, START, STRIDE = 13, 4, 4
 SPECS = {
@@ -171,8 +171,6 @@ def test_each_camera_of_three_shows_its_own_frames(recorded) -> None:
         episode = source.read(0, camera)
         frames.append(resimulate(folder, episode, 2, camera).as_recorded(1, 2).frames)
         assert np.abs(frames[-1].astype(int) - episode.read_frames([2, 4])).mean() < 0.5
-    with pytest.raises(InputError, match="the frame differs by"):
-        resimulate(folder, source.read(0, "exterior_1_left"), 2, "exterior_2_left")
 
 
 def test_the_pages_example_runs(recorded, capsys: pytest.CaptureFixture[str]) -> None:
@@ -187,14 +185,8 @@ def test_a_recording_that_shows_something_else_is_refused(recorded, tmp_path: Pa
     moved = replace(episode, states=episode.states + 1e-3)
     with pytest.raises(InputError, match=r"control step 4: .*the state differs by up to 0\.001"):
         resimulate(recorded("A"), moved, START)
-    earlier = replace(episode, read_frames=lambda steps: episode.read_frames([0 for _ in steps]))
-    with pytest.raises(InputError, match="the frame differs by"):
-        resimulate(recorded("A"), earlier, START)
     values = json.loads((recorded("A") / SIMULATION_FILE).read_text())
     values |= {"domain": values["domain"] | {"lag_s": 0.2}, "version": "0.0.1"}
     (tmp_path / SIMULATION_FILE).write_text(json.dumps(values))
     with pytest.raises(InputError, match=r"the state differs.*recorded with vjepa2-ac 0\.0\.1, here"):
         resimulate(tmp_path, episode, START)
-    small = replace(episode, read_frames=lambda steps: episode.read_frames(steps)[:, ::2, ::2])
-    with pytest.raises(InputError, match="not those of a cache"):
-        resimulate(recorded("A"), small, START)

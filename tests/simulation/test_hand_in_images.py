@@ -8,8 +8,8 @@ import pytest
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.clips.dataset import open_dataset
-from vjepa2_ac.data.clips.transforms import view
+from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.data.transforms import view
 from vjepa2_ac.simulation.hand_in_images import as_seen, hand_positions
 
 

@@ -9,8 +9,7 @@ from fsspec import AbstractFileSystem, register_implementation
 from gcs import Failure, Gcs
 from vjepa2_ac import storage
 from vjepa2_ac.errors import RefusedError, UnreachableError
-from vjepa2_ac.storage import transfer
-from vjepa2_ac.storage.remote import filesystems, retries
+from vjepa2_ac.storage import remote, retries
 
 SMALL, LARGE = 3000, 6 << 20  # gcsfs sends more than 5 MB in pieces
 PLACE = "gs://bucket/run/file"
@@ -57,7 +56,7 @@ def test_an_upload_survives_what_passes(bucket: Gcs, tmp_path: Path, size: int, 
 def test_a_failure_between_two_pieces_leaves_nothing_and_is_sent_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(filesystems, "_PIECE_BYTES", 2 << 20)
+    monkeypatch.setattr(remote, "_PIECE_BYTES", 2 << 20)
     source = source_of(tmp_path, LARGE)
     begun = []
     answer = Gcs._failure_of
@@ -88,13 +87,6 @@ def test_an_upload_that_stalls_is_cut_off_and_begun_again(
     with pytest.raises(UnreachableError, match="2 attempts over") as raised:
         storage.upload(source, PLACE)
     assert not isinstance(raised.value, RefusedError)
-
-
-def test_a_large_file_has_longer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    allowed = []
-    monkeypatch.setattr(transfer, "send", lambda source, url, timeout_s: allowed.append((source, url, timeout_s)))
-    storage.upload(source_of(tmp_path, LARGE), PLACE)
-    assert allowed == [(tmp_path / "source", PLACE, retries.DEFAULT.timeout_s + 6)]
 
 
 @pytest.mark.parametrize(
@@ -209,8 +201,8 @@ def test_failures_are_said_below_warnings_where_that_is_asked_for(
 
 @pytest.mark.usefixtures("bucket")
 def test_reading_asks_for_no_right_to_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(filesystems, "_filesystems", {})
+    monkeypatch.setattr(remote, "_filesystems", {})
     storage.file_sizes("gs://bucket/run")
-    assert [system.credentials.access for system in filesystems._filesystems.values()] == ["read_only"]
+    assert [system.credentials.access for system in remote._filesystems.values()] == ["read_only"]
     storage.upload(source_of(tmp_path, SMALL), PLACE)
-    assert [system.credentials.access for system in filesystems._filesystems.values()] == ["read_only", "read_write"]
+    assert [system.credentials.access for system in remote._filesystems.values()] == ["read_only", "read_write"]

@@ -1,11 +1,35 @@
-"""Single clips of a data set, and the split of a single name."""
+"""Data sets in memory, single clips, and the split of a single name."""
+
+from typing import Any
+
+import numpy as np
+import pytest
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.clips.clip_reader import ClipRequest, read_clip
-from vjepa2_ac.data.clips.dataset import Dataset
-from vjepa2_ac.data.index.episode_table import identity_hash
-from vjepa2_ac.episode import Clip
+from vjepa2_ac.data import dataset as opening
+from vjepa2_ac.data.clips import ClipRequest, read_clip
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.index.episode_table import EpisodeTable, identity_hash
+from vjepa2_ac.data.selection import BrokenEpisodes, StepSelection
+from vjepa2_ac.episode import Clip, EpisodeSource
+
+
+def open_in_memory(source: Any, /, **knobs: Any) -> Dataset:
+    """Open the data set of a source, with all episodes in training unless the knobs say otherwise."""
+    all_train = {"validation_share": 0.0, "test_share": 0.0, "workers": 0}
+    values = {"path": "the set", "frames": 3, "stride": 2} | all_train | knobs
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(opening, "open_source", lambda _: source)
+        return opening.open_dataset(DataConfig.model_validate(values))
+
+
+def dataset_in_memory(source: EpisodeSource, /, **knobs: Any) -> Dataset:
+    """Return the data set of a source as it is: no filter looks at it."""
+    config = DataConfig.model_validate({"path": "memory", "frames": 3, **knobs})
+    table = EpisodeTable.of(source.infos())
+    kept = StepSelection.whole(table, np.ones(len(table), bool))
+    return Dataset(config, source, table, kept, BrokenEpisodes(config, len(table)))
 
 
 def clip_at(dataset: Dataset, episode: int, start: int, *, camera: str | None = None) -> Clip:

@@ -8,7 +8,7 @@ import torch
 
 from run_fixtures import MakeConfig, one_thread, tiny_config
 from vjepa2_ac.config import Config
-from vjepa2_ac.data.clips.dataset import open_dataset
+from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.decoding.frame_pairs import FramePairs, encode_pairs, wanted_frames
 from vjepa2_ac.decoding.training import train_decoder
 from vjepa2_ac.encoding.encode_dataset import encoder_on_device

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from vjepa2_ac.config.loading import load_config
-from vjepa2_ac.data.clips.loader import training_loader
+from vjepa2_ac.data.loader import training_loader
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.training import loop, resume, setup, validation
@@ -70,7 +70,7 @@ def indexing_takes_longer_than_the_time_out() -> None:
 
 def each_meets_another_broken_episode() -> None:
     """One broken episode would be below the limit, two are not."""
-    from vjepa2_ac.data.filters import broken_episodes
+    from vjepa2_ac.data import selection as broken_episodes
 
     broken_episodes.MOST_BROKEN = 1.5 / 8
     make = training_loader

@@ -16,7 +16,7 @@ from urllib.parse import unquote, urlsplit
 
 import pytest
 
-from vjepa2_ac.storage.remote import filesystems
+from vjepa2_ac.storage import remote as filesystems
 
 _URL_TEMPLATE = "/{repo_id}/resolve/{revision}/{filename}"
 _API = re.compile(r"/api/(datasets|models)/(?P<name>[^/]+/[^/]+)(/revision/(?P<revision>[^/]+))?")

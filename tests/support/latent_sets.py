@@ -10,11 +10,11 @@ import torch
 from jaxtyping import UInt8
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.data.clips.dataset import Dataset
-from vjepa2_ac.data.clips.transforms import pixels_to_input, view
+from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.sources.latents.cache_key import Encoding
 from vjepa2_ac.data.sources.latents.dtypes import pack_latents
 from vjepa2_ac.data.sources.latents.episode_file import EncodedEpisode
+from vjepa2_ac.data.transforms import pixels_to_input, view
 from vjepa2_ac.encoding.batch import encoding_of
 from vjepa2_ac.encoding.cache_lookup import folder_of, key_for, needed_frames
 from vjepa2_ac.encoding.cache_writer import CacheWriter

@@ -8,14 +8,14 @@ from dataclasses import dataclass, field
 import pytest
 import torch
 
-from vjepa2_ac.data.clips.streams import Copies, Cuda, ToDevice, ToHost
+from vjepa2_ac.data.streams import Copies, Cuda, ToDevice, ToHost
 
 COMPUTING = "computing"
 
 
 @dataclass
 class RecordingCuda(Cuda):
-    """Takes the place of `vjepa2_ac.data.clips.streams.Cuda`: streams have names, and events numbers."""
+    """Takes the place of `vjepa2_ac.data.streams.Cuda`: streams have names, and events numbers."""
 
     calls: list[str] = field(default_factory=list)
     streams: int = 0

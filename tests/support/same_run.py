@@ -17,7 +17,7 @@ def trained_weights(run: Path) -> dict[str, torch.Tensor]:
 
 
 def all_weights(run: Path) -> dict[str, torch.Tensor]:
-    """Return what is trained of any kind of run, and where PiSSA began."""
+    """Return what is trained of any kind of run."""
     folder = newest_checkpoint(run / "checkpoints") / "adapter"
     files = sorted(folder.rglob("*.safetensors"))
     return {f"{file.name} {name}": value for file in files for name, value in load_file(file).items()}

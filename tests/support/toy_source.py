@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 
 from vjepa2_ac.config import DataConfig, Section
-from vjepa2_ac.config.effects import Affects
+from vjepa2_ac.config.section import Affects
 from vjepa2_ac.data.index.episode_table import EpisodeTable
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 

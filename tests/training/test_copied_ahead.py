@@ -12,11 +12,10 @@ from torch.utils.data import DataLoader
 from recording_cuda import RecordingCuda, recorded_copies
 from run_fixtures import set_up
 from same_run import assert_same_run
-from vjepa2_ac.data.clips import loader
-from vjepa2_ac.data.clips.clip_reader import ClipRequest
-from vjepa2_ac.data.clips.dataset import Dataset
-from vjepa2_ac.data.clips.loader import training_loader
-from vjepa2_ac.data.clips.prefetch import Batches, MicroBatch
+from vjepa2_ac.data import loader
+from vjepa2_ac.data.clips import ClipRequest
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.loader import Batches, MicroBatch, training_loader
 from vjepa2_ac.episode import Clip
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.runs.checkpoint import read_state
@@ -116,7 +115,7 @@ def test_a_checkpoint_knows_nothing_of_the_clips_of_the_next_step(make_config, r
             raise InputError(where="here", found="damaged")
         return read(dataset, wish)
 
-    monkeypatch.setattr("vjepa2_ac.data.filters.broken_episodes.MOST_BROKEN", 0.2)
+    monkeypatch.setattr("vjepa2_ac.data.selection.MOST_BROKEN", 0.2)
     monkeypatch.setattr(loader, "read_clip", read_some)
     request.getfixturevalue("on_device")
     train(config, reporter)
@@ -138,7 +137,7 @@ def test_a_clip_that_cannot_be_read_stops_the_run_at_its_own_step(
     del on_device
     run = set_up(config, reporter)
     monkeypatch.setattr(loader, "read_clip", read_some)
-    monkeypatch.setattr("vjepa2_ac.data.clips.clip_reader.read_clip", read_some)
+    monkeypatch.setattr("vjepa2_ac.data.clips.read_clip", read_some)
     batches = batches_from(run)
     for step in (1, 2):
         training_step(run, batches, step)

@@ -9,7 +9,7 @@ import torch
 from random_decoder import write_decoder
 from run_fixtures import set_up
 from same_run import assert_same_run
-from vjepa2_ac.data.clips.loader import validation_windows
+from vjepa2_ac.data.loader import validation_windows
 from vjepa2_ac.decoding.decoder_folder import load_decoder
 from vjepa2_ac.decoding.imagine import AS_RECORDED
 from vjepa2_ac.errors import InputError

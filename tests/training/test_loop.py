@@ -16,9 +16,9 @@ from run_fixtures import KilledError, dying_reporter, set_up
 from same_run import assert_same_run, metrics, trained_weights
 from vjepa2_ac.config import CheckpointConfig, Config
 from vjepa2_ac.config.loading import config_as_yaml
-from vjepa2_ac.data.clips import loader
-from vjepa2_ac.data.clips.clip_reader import ClipRequest
-from vjepa2_ac.data.clips.dataset import Dataset
+from vjepa2_ac.data import loader
+from vjepa2_ac.data.clips import ClipRequest
+from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.episode import Clip
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.checkpoints.loading import load_base
@@ -292,7 +292,7 @@ def test_a_resumed_run_still_counts_the_broken_episodes_that_it_met(make_config,
             raise InputError(where="here", found="damaged")
         return read(dataset, wish)
 
-    monkeypatch.setattr("vjepa2_ac.data.filters.broken_episodes.MOST_BROKEN", 0.2)
+    monkeypatch.setattr("vjepa2_ac.data.selection.MOST_BROKEN", 0.2)
     monkeypatch.setattr(loader, "read_clip", read_some)
     train(config, reporter)
     monkeypatch.setattr(loader, "read_clip", read)

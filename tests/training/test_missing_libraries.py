@@ -7,8 +7,6 @@ import pytest
 
 from vjepa2_ac.cli import main
 from vjepa2_ac.errors import InputError, pip_install
-from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
-from vjepa2_ac.reports.write import evaluate_subject
 from vjepa2_ac.training.loop import train
 
 
@@ -29,18 +27,6 @@ def test_missing_libraries_are_reported_before_mirror_or_data_are_opened(
     config = make_config(data__path="nowhere", checkpoint__remote="nothing://reads/this", **{knob: value})
     with pytest.raises(InputError, match=rf"{library} is not installed.*{re.escape(pip_install(extra))}"):
         train(config, reporter)
-
-
-def test_an_evaluation_says_what_its_plans_lack_before_it_opens_the_data(
-    make_config, base_folder, monkeypatch, tmp_path
-) -> None:
-    monkeypatch.setitem(sys.modules, "torchao.quantization", None)
-    asked = EvaluationOptions(
-        data=make_config(data__path="nowhere", data__frames=16, model__dtype="bfloat16", training__precision="bf16"),
-        probes=ProbeOptions(planning_clips=1), planning=("planning.quantize=int8",), out=tmp_path / "out",
-    )  # fmt: skip
-    with pytest.raises(InputError, match=r"torchao is not installed.*\[quantize\]"):
-        evaluate_subject(str(base_folder), asked)
 
 
 def needing(library: str):

@@ -16,7 +16,7 @@ from same_run import assert_same_run
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.config.loading import parse_config
-from vjepa2_ac.data.clips.clip_reader import no_clips
+from vjepa2_ac.data.clips import no_clips
 from vjepa2_ac.distributed import device
 from vjepa2_ac.distributed.device import matmul_speed
 from vjepa2_ac.episode import POSE_WIDTHS, Batch

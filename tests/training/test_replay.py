@@ -10,11 +10,11 @@ from run_fixtures import KilledError, dying_reporter, set_up
 from same_run import assert_same_run
 from synthetic import write_synthetic_droid
 from vjepa2_ac.config import Config
-from vjepa2_ac.config.effects import Affects, knobs_that_affect, marks_of, names_that_affect
 from vjepa2_ac.config.loading import config_as_dict, config_as_yaml, parse_config
-from vjepa2_ac.data.clips import loader
-from vjepa2_ac.data.clips.dataset import open_dataset
-from vjepa2_ac.data.clips.loader import Mixed, ProcessShare, training_loader
+from vjepa2_ac.config.section import Affects, knobs_that_affect, marks_of, names_that_affect
+from vjepa2_ac.data import loader
+from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.data.loader import Mixed, ProcessShare, training_loader
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.runs.checkpoint import newest_checkpoint, read_state

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from vjepa2_ac.config.loading import config_as_dict, parse_config
-from vjepa2_ac.data.clips.dataset import open_dataset
+from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.runs.checkpoint import RunState, newest_checkpoint, read_state
 from vjepa2_ac.training import loop, validation
 from vjepa2_ac.training.loop import train

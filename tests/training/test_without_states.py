@@ -17,7 +17,7 @@ from vjepa2_ac.config.planning import CemConfig
 from vjepa2_ac.episode import STATE_DIM
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
-from vjepa2_ac.export.export import export_run
+from vjepa2_ac.export import export_run
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
@@ -96,7 +96,7 @@ def test_from_training_to_a_plan(make_config: MakeConfig, reporter: Any, tmp_pat
         expected = run.world_model.eval().predict(latents, actions, states)
         torch.testing.assert_close(loaded.predict(latents, actions, states), expected, atol=1e-5, rtol=1e-5)
     drive(load_to_plan(str(merged), overrides=["planning.samples=6", "planning.cem.elites=3"]).controller(), STATE)
-    with pytest.raises(InputError, match=r"predictor without states .*Meta's code has no other.* --to merged"):
+    with pytest.raises(InputError, match=r"predictor without states.*Meta's code has no other.* --to merged"):
         export_run(folder, tmp_path / "official.pt", "official")
 
 

@@ -107,7 +107,7 @@ def check_and_print(config: Config, *, clips: int = 32) -> int:
     """Look at the data of a config and print what is found; return 1 where training would learn nothing."""
     from vjepa2_ac.console.data import print_finding
     from vjepa2_ac.console.progress import ConsoleReporter
-    from vjepa2_ac.data.inspection.check import check_data
+    from vjepa2_ac.inspection.check import check_data
     from vjepa2_ac.reporter import INDEXING
 
     wrong = 0
@@ -128,10 +128,10 @@ def check_and_print(config: Config, *, clips: int = 32) -> int:
 def _probe(config: Config, model: str, *, clips: int) -> None:
     from vjepa2_ac.console.data import print_finding, probe_table
     from vjepa2_ac.console.progress import ConsoleReporter, console
-    from vjepa2_ac.data.clips.dataset import open_dataset
-    from vjepa2_ac.data.inspection.check import at_some_stride
-    from vjepa2_ac.data.inspection.finding import Finding
+    from vjepa2_ac.data.dataset import open_dataset
     from vjepa2_ac.evaluation.data_variants.from_config import probe_config
+    from vjepa2_ac.inspection.excerpts import Finding
+    from vjepa2_ac.inspection.statistics import at_some_stride
 
     dataset = at_some_stride(open_dataset(config.data))
     with ConsoleReporter() as reporter:
@@ -145,7 +145,7 @@ def _index(options: argparse.Namespace) -> None:
 
     from vjepa2_ac.console.data import index_lines
     from vjepa2_ac.console.progress import ConsoleReporter, console
-    from vjepa2_ac.data.clips.dataset import open_dataset
+    from vjepa2_ac.data.dataset import open_dataset
     from vjepa2_ac.data.index.index_cache import record_usage
     from vjepa2_ac.reporter import INDEXING
 
@@ -160,13 +160,12 @@ def _inspect(options: argparse.Namespace) -> None:
     config = read_config(options.config, options.overrides)
     _make_folder(options.out)
 
-    from vjepa2_ac.console.data import inspection_lines, motion_table
+    from vjepa2_ac.console.data import motion_table
     from vjepa2_ac.console.progress import ConsoleReporter, console
-    from vjepa2_ac.data.clips.dataset import open_dataset
-    from vjepa2_ac.data.inspection.check import at_some_stride
-    from vjepa2_ac.data.inspection.statistics import RELEASED, inspect_dataset
+    from vjepa2_ac.data.dataset import open_dataset
+    from vjepa2_ac.inspection.sheet import plot_dataset
+    from vjepa2_ac.inspection.statistics import RELEASED, at_some_stride, inspect_dataset
     from vjepa2_ac.reporter import INDEXING
-    from vjepa2_ac.reports.figures.dataset import plot_dataset
     from vjepa2_ac.storage import write_atomically
 
     with ConsoleReporter() as reporter:
@@ -175,15 +174,15 @@ def _inspect(options: argparse.Namespace) -> None:
         console.print(f"data.stride is auto: looked at the smallest candidate, {dataset.config.stride}")
     with ConsoleReporter() as reporter:
         inspection = inspect_dataset(dataset, episodes=options.episodes, progress=reporter.task("reading states"))
-    for line in inspection_lines(inspection):
-        console.print(line)
-    console.print(motion_table(inspection))
+    for name, text in inspection.summary.items():
+        console.print(f"{name:<16}{text}")
+    console.print(motion_table(inspection.steps))
     if inspection.has_poses:
         console.print(f"For comparison: {RELEASED}.")
-    write_atomically(options.out / "inspect.json", json.dumps(inspection.as_dict(), indent=1).encode())
+    write_atomically(options.out / "inspect.json", json.dumps(inspection.values, indent=1).encode())
     path = options.out / "contact_sheet.png"
     with ConsoleReporter() as reporter:
-        image = plot_dataset(dataset, inspection, path, rows=options.rows, progress=reporter.task("reading frames"))
+        image = plot_dataset(inspection, path, rows=options.rows, progress=reporter.task("reading frames"))
     console.print(f"  {image}\n  {options.out / 'inspect.json'}")
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import os
 
-from vjepa2_ac import output
 from vjepa2_ac.cli.options import Commands, add_config, argument, as_path, command, read_config
 
 
@@ -29,7 +28,6 @@ def _encode(options: argparse.Namespace) -> None:
     from vjepa2_ac.encoding.encode_dataset import encode_config
     from vjepa2_ac.reporter import SILENT
 
-    output.never_wait()
     is_first = os.environ.get("RANK", "0") == "0"
     with ConsoleReporter() as reporter:
         encoded = encode_config(config, reporter if is_first else SILENT, out=options.out)

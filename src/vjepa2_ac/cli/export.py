@@ -29,7 +29,7 @@ def _export(options: argparse.Namespace) -> None:
     require_listed(options.run, options.checkpoint)
 
     from vjepa2_ac.console.progress import console
-    from vjepa2_ac.export.export import export_run
+    from vjepa2_ac.export import export_run
 
     written = export_run(options.run, options.folder, options.to, options.checkpoint)
     what = {"merged": "merged model", "official": "official checkpoint", "hub": "adapter with its model card"}

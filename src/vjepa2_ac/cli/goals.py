@@ -19,16 +19,13 @@ from vjepa2_ac.cli.options import (
     read_config,
     record_of_options,
     require_overrides,
-    require_subject,
     say_places_elsewhere,
     whole_number,
 )
 from vjepa2_ac.errors import InputError
 
 if TYPE_CHECKING:
-    from vjepa2_ac.planning.demonstrations.energies import Energies
-    from vjepa2_ac.planning.demonstrations.make_goals import KeyFrameOptions
-    from vjepa2_ac.planning.demonstrations.recording import Recording
+    from vjepa2_ac.demonstrations.make_goals import Recording
     from vjepa2_ac.planning.session import PlanningSession
 
 _FILMS = (".mp4", ".m4v", ".mov")
@@ -66,29 +63,24 @@ def add_to(commands: Commands) -> None:
 def _goals(options: argparse.Namespace) -> int:
     from vjepa2_ac.storage import require_new_folder, try_writing_at, user_can_write
 
-    # Wrong words are told before what takes seconds is imported.
-    is_film = Path(options.source).suffix.lower() in _FILMS
-    way, step = _way(options, is_film=is_film)
+    by, every = _way(options)
     require_overrides(options.overrides)
-    _require_fitting(options, way, is_film=is_film)
-    if options.model is not None:
-        require_subject(options.model, options.checkpoint)
     require_new_folder(options.out)
     with user_can_write(options.out):
         try_writing_at(options.out)
-    recording, stride = _recording(options, is_film=is_film)
+    recording, stride = _recording(options)
 
     from vjepa2_ac.console.goals import goals_notes, goals_table
     from vjepa2_ac.console.progress import ConsoleReporter, console
-    from vjepa2_ac.planning.demonstrations.make_goals import make_goals
-    from vjepa2_ac.planning.demonstrations.recording import recording_of_film
+    from vjepa2_ac.demonstrations.make_goals import Energies, KeyFrameOptions, make_goals, recording_of_film
     from vjepa2_ac.reports.figures.goals import GOALS_IMAGE, plot_goals
 
     still = None if options.still is None else recording_of_film(options.still)
     session = _session(options)
-    chosen = _chosen(options, way, step, stride)
+    chosen = record_of_options(KeyFrameOptions, options, by=by, every=every, stride=stride)
     with ConsoleReporter() as reporter:
-        made = make_goals(recording, chosen, _energies(session), still=still, reporter=reporter)
+        energies = None if session is None else Energies(session)
+        made = make_goals(recording, chosen, energies, still=still, reporter=reporter)
     with user_can_write(options.out):
         written = [made.write(options.out), plot_goals(made, options.out / GOALS_IMAGE)]
     console.print(goals_table(made))
@@ -99,21 +91,33 @@ def _goals(options: argparse.Namespace) -> int:
     return 0
 
 
-def _way(options: argparse.Namespace, *, is_film: bool) -> tuple[str, int | None]:
+def _is_film(options: argparse.Namespace) -> bool:
+    return Path(options.source).suffix.lower() in _FILMS
+
+
+def _way(options: argparse.Namespace) -> tuple[str, int | None]:
     """Return how key frames are found, and of `every` how many frames apart; give back words that are no part of it."""
     words = [word for word in options.by or () if "=" not in word]
     options.overrides = [*options.overrides, *(word for word in options.by or () if "=" in word)]
-    way, *rest = words or ["latent" if is_film else "gripper"]
-    if way == "every" and len(rest) == 1 and rest[0].isdecimal() and 0 < int(rest[0]) < 10**9:
-        return way, int(rest[0])
-    if way in {"gripper", "latent"} and not rest:
-        return way, None
-    raise InputError(where="--by", found=" ".join(words), needed="gripper, latent, or every N, with a number of frames")
+    way, *rest = words or ["latent" if _is_film(options) else "gripper"]
+    is_every = way == "every" and len(rest) == 1 and rest[0].isdecimal() and int(rest[0]) > 0
+    if not is_every and (way not in {"gripper", "latent"} or rest):
+        needed = "gripper, latent, or every N, with a number of frames"
+        raise InputError(where="--by", found=" ".join(words), needed=needed)
+    needs_model = {"--by latent": way == "latent", "--still": options.still, "--checkpoint": options.checkpoint}
+    for name, given in needs_model.items():
+        if given and options.model is None:
+            raise InputError(where=name, found="no model", needed="--model RUN_OR_MODEL")
+    if is_every and options.apart is not None:
+        raise InputError(where="--apart", found="--by every N", needed="one of them: N frames are between its goals")
+    return way, int(rest[0]) if is_every else None
 
 
-def _require_fitting(options: argparse.Namespace, way: str, *, is_film: bool) -> None:
-    """Refuse options that do not belong together."""
-    if is_film:
+def _recording(options: argparse.Namespace) -> tuple[Recording, int]:
+    """Return the demonstration, and the frames of a model step."""
+    from vjepa2_ac.demonstrations.make_goals import recording_of_episode, recording_of_film
+
+    if _is_film(options):
         for name, given in {"--episode": options.episode, "key=value": options.overrides}.items():
             if given:
                 raise InputError(where=name, found=f"{options.source}, a film", needed="a config, of whose data it is")
@@ -121,23 +125,6 @@ def _require_fitting(options: argparse.Namespace, way: str, *, is_film: bool) ->
             found = "a film, which has no model steps of its own"
             fix = "Of 30 frames a second, 8 last 0.27 s, as a model step of the released weights does: --stride 8"
             raise InputError(where="--stride", found=found, needed="how many frames are a model step", fix=fix)
-        if way == "gripper":
-            found, fix = "a film, of which no states are known", "Take --by latent with --model, or --by every N"
-            raise InputError(where="--by gripper", found=found, needed="an episode with states", fix=fix)
-    needs_model = {"--by latent": way == "latent", "--still": options.still, "--checkpoint": options.checkpoint}
-    for name, given in needs_model.items():
-        if given and options.model is None:
-            found, fix = "no model", "Or take --by every N" if way == "latent" and is_film else ""
-            raise InputError(where=name, found=found, needed="--model RUN_OR_MODEL", fix=fix)
-    if way == "every" and options.apart is not None:
-        raise InputError(where="--apart", found="--by every N", needed="one of them: N frames are between its goals")
-
-
-def _recording(options: argparse.Namespace, *, is_film: bool) -> tuple[Recording, int]:
-    """Return the demonstration, and the frames of a model step."""
-    if is_film:
-        from vjepa2_ac.planning.demonstrations.recording import recording_of_film
-
         return recording_of_film(Path(options.source)), options.stride
     config = read_config(options.source, options.overrides, of_run=True)
     stride = options.stride or config.data.stride
@@ -146,12 +133,10 @@ def _recording(options: argparse.Namespace, *, is_film: bool) -> tuple[Recording
         raise InputError(where="data.stride", found=found, needed="a number", fix=fix)
 
     from vjepa2_ac.console.progress import ConsoleReporter
-    from vjepa2_ac.planning.demonstrations.recording import recording_of_episode
     from vjepa2_ac.reporter import INDEXING
 
     with ConsoleReporter() as reporter:
-        recording = recording_of_episode(config.data, options.episode or "0", reporter.task(INDEXING))
-    return recording, stride
+        return recording_of_episode(config.data, options.episode or "0", reporter.task(INDEXING)), stride
 
 
 def _session(options: argparse.Namespace) -> PlanningSession | None:
@@ -161,15 +146,3 @@ def _session(options: argparse.Namespace) -> PlanningSession | None:
 
     say_places_elsewhere(options.model)
     return load_to_plan(options.model, checkpoint=options.checkpoint or "selected")
-
-
-def _energies(session: PlanningSession | None) -> Energies | None:
-    from vjepa2_ac.planning.demonstrations.energies import Energies
-
-    return None if session is None else Energies(session)
-
-
-def _chosen(options: argparse.Namespace, way: str, step: int | None, stride: int) -> KeyFrameOptions:
-    from vjepa2_ac.planning.demonstrations.make_goals import KeyFrameOptions
-
-    return record_of_options(KeyFrameOptions, options, by=way, every=step, stride=stride)

@@ -44,6 +44,8 @@ def command(commands: Commands, name: str, handler: Handler, text: str) -> argpa
     """Add a command with its handler, and return its parser."""
     parser = commands.add_parser(name, help=text, description=text)
     parser.set_defaults(handler=handler)
+    about = "a module of yours that registers a form of data, a loss, a planner, ... (docs/extending.md); repeatable"
+    argument(parser, "--plugin MODULE", about, action="append", default=[])
     return parser
 
 

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from vjepa2_ac.config import Config
     from vjepa2_ac.config.planning import PlanningConfig
-    from vjepa2_ac.planning.goals.folder import GoalFolder
+    from vjepa2_ac.planning.goal_folder import GoalFolder
 
 _QUICK, _QUICK_SEQUENCES = "planning.samples=64 planning.iterations=4", 256  # docs/planning.md says how good it is
 
@@ -93,9 +93,7 @@ def _plan(options: argparse.Namespace) -> int:
     from vjepa2_ac.console.plan import plan_table
     from vjepa2_ac.console.progress import ConsoleReporter, console
     from vjepa2_ac.decoding.imagined_plan import imagine_plan
-    from vjepa2_ac.planning.decision import PlanRequest, decide
-    from vjepa2_ac.planning.plan_json import PLAN_FILE, write_plan
-    from vjepa2_ac.planning.summary import summarize
+    from vjepa2_ac.planning.decision import PLAN_FILE, PlanRequest, decide, summarize, write_plan
     from vjepa2_ac.reports.figures.plan import PLAN_IMAGE, plot_plan
 
     say_places_elsewhere(options.subject)
@@ -155,7 +153,7 @@ def _images(
 ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | GoalFolder, np.ndarray | None]:
     """Return start, goals and mask; refuse what cannot be planned with, before a model is loaded."""
     from vjepa2_ac.media.image_file import read_image
-    from vjepa2_ac.planning.goals.folder import read_goal_folder
+    from vjepa2_ac.planning.goal_folder import read_goal_folder
     from vjepa2_ac.planning.input_checks import require_image, require_mask
 
     folder = None if options.goals is None else read_goal_folder(options.goals)

@@ -33,12 +33,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     0 done, 1 a check failed, 2 an input cannot be used, 75 a training run was asked to stop and can be resumed,
     130 interrupted. A reader that closes early, as `head` does, changes nothing; a full disk for the output is an
-    error, except for progress messages.
+    error, in the end.
     """
-    with output.own_streams() as streams, _our_warnings(), tidy_end():
+    with output.own_streams() as lost, _our_warnings(), tidy_end():
         status = _run(arguments)
-        if lost := streams.what_was_lost():
-            _complain(lost)
+        if problem := lost():
+            _complain(f"standard output: cannot be written ({problem}): some output is missing")
             return status or 2
         return status
 
@@ -48,6 +48,10 @@ def _run(arguments: Sequence[str] | None) -> int:
     handler: Handler = options.handler
     try:
         _require_working_directory()
+        if options.plugin:
+            from vjepa2_ac.config.plugins import name_plugins
+
+            name_plugins(options.plugin)
         return handler(options) or 0
     except (UserError, OSError, MemoryError) as error:  # a full disk, a path that is no path: the message names it
         _complain(in_words(error))

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 
     import numpy as np
 
+    from vjepa2_ac.serving.about import KeptGoals
     from vjepa2_ac.serving.access import Access
-    from vjepa2_ac.serving.kept_goals import KeptGoals
     from vjepa2_ac.serving.server import Served
 
 _GB = 10**9
@@ -83,11 +83,11 @@ def add_to(commands: Commands) -> None:
 
 
 def _serve(options: argparse.Namespace) -> int:
-    from vjepa2_ac.storage.libraries import require_library
+    from vjepa2_ac.errors import require_library
 
     # Wrong words are told before what takes seconds is imported.
     require_overrides(options.overrides)
-    for module in ("websockets", "msgpack"):
+    for module in ("websockets", "msgpack", "prometheus_client"):
         require_library(module, where="serve", called=module, extra="serve")
     if options.metadata == "roboarena" and options.actions != "pose":
         found, needed = f"--actions {options.actions}", "--actions pose: RoboArena knows no changes of a pose"
@@ -96,7 +96,7 @@ def _serve(options: argparse.Namespace) -> int:
     require_to_plan(options)
 
     from vjepa2_ac.console.progress import console
-    from vjepa2_ac.serving.kept_goals import read_kept_goals
+    from vjepa2_ac.serving.about import read_kept_goals
     from vjepa2_ac.serving.recording import require_new_record
     from vjepa2_ac.serving.server import ServerOptions, serve
 

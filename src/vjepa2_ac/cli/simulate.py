@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vjepa2_ac import output, places
+from vjepa2_ac import places
 from vjepa2_ac.cli.options import (
     Commands,
     add_checkpoint,
@@ -57,7 +57,6 @@ def add_to(commands: Commands) -> None:
     text = "of an episode: model steps (8; pick: 12, place: 18); record: control steps, 15/s (41; place: 81)"
     argument(parser, "--steps N", text, count)
     argument(parser, "--seed N", "which problems or demonstrations (0)", whole_number(0, 2**31 - 1))
-    argument(parser, "--renderer", "opengl needs a working MUJOCO_GL (rays)", choices=["rays", "opengl"])
     text = "what is to be done (reach); record: push, pick or place, with a block on the table (none: reaching around)"
     argument(parser, "--task", text, choices=["reach", "push", "pick", "place"])
     group = parser.add_argument_group("of a model that steers")
@@ -108,10 +107,9 @@ def _record(options: argparse.Namespace) -> int:
         try_writing_at(target)
 
     from vjepa2_ac.console.progress import ConsoleReporter, console
+    from vjepa2_ac.simulation.recording.demonstration import default_steps
     from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
-    from vjepa2_ac.simulation.recording.recorded_task import default_steps
 
-    output.never_wait()
     task = None if options.task == "reach" else options.task
     spec = record_of_options(RecordingSpec, options, task=task, steps=options.steps or default_steps(task))
     episodes, workers = options.episodes or 40, options.workers or 1

@@ -7,7 +7,6 @@ import os
 import sys
 from pathlib import Path
 
-from vjepa2_ac import output
 from vjepa2_ac.cli.options import Commands, add_config, argument, command, read_config, say_places_elsewhere
 from vjepa2_ac.errors import InputError, printable
 
@@ -50,7 +49,6 @@ def _train(options: argparse.Namespace) -> int:
     from vjepa2_ac.distributed.signals import EXIT_STATUS, StoppedError
     from vjepa2_ac.training.loop import train
 
-    output.never_wait()
     speaks = os.environ.get("RANK", "0") == "0"  # one of several processes
     try:
         with TrainingConsole() as reporter:

@@ -8,8 +8,18 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import AfterValidator, BeforeValidator, Field, GetCoreSchemaHandler, model_validator
 from pydantic_core import CoreSchema, core_schema
 
-from vjepa2_ac.config.effects import Affects
-from vjepa2_ac.config.section import OFF, Count, Local, NonNegative, Place, Positive, PositiveInt, Section, Share
+from vjepa2_ac.config.section import (
+    OFF,
+    Affects,
+    Count,
+    Local,
+    NonNegative,
+    Place,
+    Positive,
+    PositiveInt,
+    Section,
+    Share,
+)
 from vjepa2_ac.places import is_url
 
 # A serial number is a name, also where YAML takes it for a number.
@@ -45,8 +55,6 @@ class IdleConfig(Section):
     ranges: Place | None = None
     """For published: a JSON file, local or a URL, of {"recording_folderpath--file_path": [[start, end), ...]}. Episodes
     that it does not name count as idle."""
-    keep_share: Annotated[float, Field(ge=0.0, le=1.0), Affects.LATENTS | Affects.RUN] = 0.0
-    """Share of the idle windows that are kept: a world model should see stillness too."""
     velocity_change_rad_s: Positive = 1e-3
     """For commands: a step is idle if no commanded joint velocity changes by this much."""
     translation_m: Positive = 1e-3
@@ -261,6 +269,14 @@ class DataConfig(Section):
             raise ValueError("join_actions belongs to actions recorded")
         return self
 
+    @classmethod
+    def look(cls, path: str) -> dict[str, Any] | None:  # noqa: ARG003 - of a form that is looked for
+        """Return what `vjepa2-ac init` writes for a folder of this form, beside source and path; None: it is none.
+
+        The values of this section; `control_rate_hz`, beside them, is the number of control steps per second.
+        """
+        return None
+
     @property
     def known_cameras(self) -> tuple[str, ...] | None:
         """The cameras known from the config, or None if only the data set knows them."""
@@ -338,17 +354,3 @@ class DataConfig(Section):
     def with_stride(self, stride: int) -> DataConfig:
         """Return the config with a calibrated stride."""
         return self.model_copy(update={"stride": stride})
-
-
-def without_sections_of_others(values: Any) -> Any:
-    """Drop, from the values of a data section, those of other forms of data with their defaults.
-
-    Earlier versions wrote them for each run. A cache is used in place of any form: there all are dropped.
-    """
-    kind = DataConfig.kinds.get(source_of(values))
-    if not isinstance(values, dict) or kind is None:
-        return values
-    others = {name: one for other in DataConfig.kinds.values() for name, one in other.own_sections().items()}
-    foreign = {name: one for name, one in others.items() if name in values and name not in kind.model_fields}
-    unused = {name for name, one in foreign.items() if kind.is_cache or values[name] == one().model_dump(mode="json")}
-    return {name: value for name, value in values.items() if name not in unused}

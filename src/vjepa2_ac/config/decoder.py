@@ -6,8 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from vjepa2_ac.config.effects import Affects
-from vjepa2_ac.config.section import Count, Local, Positive, PositiveInt, Section, Share, ZeroToOne
+from vjepa2_ac.config.section import Affects, Count, Local, Positive, PositiveInt, Section, Share, ZeroToOne
 
 DecoderSize = Literal["tiny", "small", "medium"]
 

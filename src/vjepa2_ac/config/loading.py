@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
+import difflib
+import importlib.resources
 import json
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import yaml  # to write: `storage.structured` reads
 from pydantic import ValidationError
 
-from vjepa2_ac.config import Config
-from vjepa2_ac.config.data import without_sections_of_others
-from vjepa2_ac.config.diagnostics import wrong_values
-from vjepa2_ac.config.gone import GONE, take_gone
-from vjepa2_ac.config.packaged import config_path
+from vjepa2_ac.config import Config, DataConfig
+from vjepa2_ac.config.plugins import admit_forms_of_data, with_plugins
+from vjepa2_ac.config.section import marks_of
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage.structured import parse_yaml, require_shallow
+from vjepa2_ac.places import BUILTIN
+from vjepa2_ac.storage.structured import message_of, parse_yaml
 
-_MOST_BYTES = 4 << 20  # of a config: data.exclude may name thousands of episodes
+_PACKAGED = Path(str(importlib.resources.files("vjepa2_ac"))) / "assets" / "configs"
 
 
 def load_config(config: str | Path | Mapping[str, Any], overrides: Iterable[str] = ()) -> Config:
@@ -43,25 +44,34 @@ def load_config(config: str | Path | Mapping[str, Any], overrides: Iterable[str]
 
 
 def load_config_of_run(path: Path, overrides: Iterable[str] = ()) -> Config:
-    """Read the config of a run that was made: knobs that are gone since then are passed over, in use or not.
+    """Read the config of a run, which may be a stranger's: its plug-ins are not looked for in the working directory.
 
     It may be one of the package, as for `load_config`.
 
     Raises:
         InputError: As `load_config`.
     """
-    values = _read_yaml(config_path(path))
-    take_gone(values)
-    return parse_config(_overridden(values, overrides), where=str(path))
+    return parse_config(_overridden(_read_yaml(config_path(path)), overrides), where=str(path), here=False)
 
 
-def gone_in_use(path: Path) -> dict[str, Any]:
-    """Return the knobs that are gone and that the run of a config was made with, by dotted key.
+def packaged_configs() -> dict[str, str]:
+    """Return the first sentence of each config that comes with the package, by name."""
+    heads = {path.stem: path.read_text(encoding="utf-8").split("\n\n")[0] for path in _PACKAGED.glob("*.yaml")}
+    return {name: re.sub(r"\n?# ?", " ", head).split(". ")[0].strip(" .:\n") for name, head in sorted(heads.items())}
+
+
+def config_path(name: str | Path) -> Path:
+    """Return the file of a config: of `builtin:NAME` that of the package, else the path itself.
 
     Raises:
-        InputError: The file cannot be read.
+        InputError: The package has no config of that name.
     """
-    return take_gone(_read_yaml(path))
+    if not str(name).startswith(BUILTIN):
+        return Path(name)
+    if (known := str(name).removeprefix(BUILTIN)) not in packaged_configs():
+        needed = f"one of {', '.join(f'{BUILTIN}{one}' for one in packaged_configs())}"
+        raise InputError(where=str(name), found="no config of that name comes with the package", needed=needed)
+    return _PACKAGED / f"{known}.yaml"
 
 
 def config_from(values: Mapping[str, Any], overrides: Iterable[str] = (), *, where: str) -> Config:
@@ -73,23 +83,21 @@ def config_from(values: Mapping[str, Any], overrides: Iterable[str] = (), *, whe
     return parse_config(_overridden(json.loads(_as_json(values, where)), overrides), where=where)
 
 
-def parse_config(values: Mapping[str, Any], *, where: str) -> Config:
-    """Validate plain values, as YAML or JSON gives them; a knob that is gone may stand there where it is off.
+def parse_config(values: Mapping[str, Any], *, where: str, here: bool = True) -> Config:
+    """Validate plain values, as YAML or JSON gives them.
+
+    Args:
+        values: The values.
+        where: Their file, for messages.
+        here: Whether plug-ins may lie in the working directory: not those of a run, which may be a stranger's.
 
     Raises:
         InputError: Names every key that is wrong, all at once.
     """
-    plain = json.loads(_as_json(values, where))
-    if "data" in plain:
-        plain["data"] = without_sections_of_others(plain["data"])
-    lines = [f"{key}: {GONE[key]}; leave it out" for key in take_gone(plain)]
     try:
-        config = Config.model_validate_json(json.dumps(plain))
+        return Config.model_validate_json(_as_json(with_plugins(values, where=where, here=here), where))
     except ValidationError as error:
-        lines += wrong_values(plain, error)
-    else:
-        if not lines:
-            return config
+        lines = _wrong_values(error)
     found = f"{len(lines)} value{'s are' if len(lines) > 1 else ' is'} wrong\n  " + "\n  ".join(lines) + "\n"
     raise InputError(where=where, found=found, fix="`vjepa2-ac config schema` lists every key with its range")
 
@@ -126,6 +134,7 @@ def yaml_line(key: str, value: Any) -> str:
 
 def config_schema() -> dict[str, Any]:
     """Return the JSON schema of a config file, for editors."""
+    admit_forms_of_data(all_installed=True)
     return Config.model_json_schema()
 
 
@@ -144,16 +153,12 @@ _Dumper.add_implicit_resolver("!number", re.compile(r"^[-+]?[\d_]*\.?[\d_]*[eE][
 
 def _read_yaml(path: Path) -> dict[str, Any]:
     try:
-        with path.open("rb") as file:  # which may be a pipe
-            data = file.read(_MOST_BYTES + 1)
-        text = data.decode()
+        text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         fix = "`vjepa2-ac init` writes one for your data; `vjepa2-ac config list` shows those of the package"
         raise InputError(where=str(path), found="no such file", needed="a config", fix=fix) from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(where=str(path), found=f"cannot be read ({error})", needed="a YAML file") from None
-    if len(data) > _MOST_BYTES:
-        raise InputError(where=str(path), found=f"more than {_MOST_BYTES:,} bytes", needed="a config")
     values = parse_yaml(text, where=str(path))
     if not isinstance(values, dict):
         found = "nothing" if values is None else f"a {type(values).__name__}"
@@ -163,7 +168,6 @@ def _read_yaml(path: Path) -> dict[str, Any]:
 
 def _as_json(values: Mapping[str, Any], where: str) -> str:
     """Return values as a file would hold them: a Path is text."""
-    require_shallow(dict(values), where=where)
     try:
         return json.dumps(dict(values), default=os.fspath)
     except (TypeError, ValueError) as error:
@@ -188,4 +192,92 @@ def _set(values: dict[str, Any], keys: list[str], value: Any, override: str) -> 
             found = f"{'.'.join(keys[: depth + 1])} is a value"
             raise InputError(where=f"override {override}", found=found, needed="a section")
         values = inner
+    if keys[-2:] == ["data", "source"] and value != values.get("source", "rlds"):
+        others = [kind for name, kind in DataConfig.kinds.items() if name != value]
+        for section in {section for kind in others for section in kind.own_sections()}:
+            values.pop(section, None)  # of the form of data that it replaces
     values[keys[-1]] = value
+
+
+# ---- what is wrong ----
+
+_TYPE_OF_A_UNION = re.compile(r"int|float|str|bool|.*[\[(-].*")  # as pydantic names it in the location of an error
+
+# Names of knobs in other programs.
+_ALSO_CALLED = {
+    "output_dir": "run_dir", "save_dir": "run_dir",
+    "mix": "replay", "data_mix": "replay",
+    "dataset": "data.path", "data_dir": "data.path",
+    "num_frames": "data.frames", "frames_per_clip": "data.frames",
+    "fps": "data.stride", "frameskip": "data.stride",
+    "num_workers": "data.workers",
+    "base_model": "model.base", "pretrained": "model.base",
+    "r": "adapter.rank", "lora_r": "adapter.rank", "lora_alpha": "adapter.alpha", "lora_dropout": "adapter.dropout",
+    "target_modules": "adapter.targets",
+    "max_steps": "training.steps", "num_steps": "training.steps", "epochs": "training.steps",
+    "num_epochs": "training.steps", "iterations": "training.steps",
+    "per_device_train_batch_size": "training.batch_size",
+    "gradient_accumulation_steps": "training.accumulation", "accumulate_grad_batches": "training.accumulation",
+    "auto_steps": "training.rollout_steps",
+    "lr": "training.learning_rate", "max_lr": "training.learning_rate", "min_lr": "training.final_learning_rate",
+    "wd": "training.weight_decay", "warmup": "training.warmup_steps",
+    "grad_clip": "training.max_grad_norm", "clip_grad": "training.max_grad_norm",
+    "amp": "training.precision", "mixed_precision": "training.precision",
+    "activation_checkpointing": "training.gradient_checkpointing",
+    "torch_compile": "training.compile", "logging_steps": "training.log_every",
+    "eval_steps": "validation.every", "save_steps": "checkpoint.every",
+}  # fmt: skip
+
+
+def _wrong_values(error: ValidationError) -> list[str]:
+    """Return a line for every wrong value; a knob that may be of several types gets one line, not one per type."""
+    found: dict[str, list[str]] = {}
+    for detail in error.errors(include_url=False):
+        if detail["type"] != "default_factory_not_called":  # a default that follows from another value, which is wrong
+            key = _key_of(detail["loc"]) + ".source" * (detail["type"] == "union_tag_invalid")
+            found.setdefault(key, []).append(_explain(key, detail))
+    return [f"{key}: {_joined(lines)}".removeprefix(": ") for key, lines in found.items()]
+
+
+def all_keys() -> list[str]:
+    """Return the dotted keys of all sections and knobs."""
+    paths = [key.split(".") for key in marks_of(Config)]
+    return list(dict.fromkeys(".".join(path[:depth]) for path in paths for depth in range(1, len(path) + 1)))
+
+
+def _key_of(location: Sequence[Any]) -> str:
+    """Return the dotted key of pydantic's location, without its names for forms of data and types of a union."""
+    parts: list[str] = []
+    for before, part in zip(["", *location], map(str, location), strict=False):
+        is_form = before == "data" and part in DataConfig.kinds
+        is_type = ".".join(parts) in all_keys() and _TYPE_OF_A_UNION.fullmatch(part)
+        if not is_form and not is_type:
+            parts.append(part)
+    return ".".join(parts)
+
+
+def _joined(lines: list[str]) -> str:
+    """Return the messages of the types of a union, which are about the same value, as one."""
+    *others, last = dict.fromkeys(lines)
+    return ", or ".join([*(line.split(" (found ")[0] for line in others), last])
+
+
+def _explain(key: str, detail: Any) -> str:
+    if detail["type"] == "missing":
+        return "missing; it has no default"
+    if detail["type"] == "union_tag_invalid":
+        return f"Input should be {' or '.join(map(repr, DataConfig.kinds))} (found {detail['ctx']['tag']!r})"
+    if detail["type"] != "extra_forbidden":
+        return message_of(detail)
+    section, _, name = key.rpartition(".")
+    if key in all_keys():
+        owners = [source for source, kind in DataConfig.kinds.items() if name in kind.model_fields]
+        return f"a section of source {' or '.join(owners)}, and this is source {detail['loc'][-2]}"
+    siblings = [one.rpartition(".")[2] for one in all_keys() if one.rpartition(".")[0] == section]
+    prefix = f"{section}." if section else ""
+    close = [prefix + one for one in difflib.get_close_matches(name, siblings, n=1)]
+    elsewhere = [one for one in all_keys() if one.endswith(f".{name}")]
+    also = [_ALSO_CALLED[name]] if name in _ALSO_CALLED else []
+    meant = next(iter([*also, *close, *elsewhere]), None)
+    hint = f"known here: {', '.join(siblings)}" if meant is None else f"did you mean {meant.removeprefix(prefix)}?"
+    return f"unknown key; {hint}"

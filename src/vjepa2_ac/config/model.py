@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
 from vjepa2_ac import places
-from vjepa2_ac.config.effects import Affects
-from vjepa2_ac.config.section import PositiveInt, Section, Share
+from vjepa2_ac.config.section import Affects, PositiveInt, Section, Share
 
 # Far beyond every such model (released: width 1408, depth 40, 1.3 billion weights): a file may claim any size.
 Width = Annotated[int, Field(ge=1, le=16_384)]
@@ -19,7 +18,7 @@ Ratio = Annotated[float, Field(gt=0.0, le=64.0)]
 VectorWidth = Annotated[int, Field(ge=1, le=4_096)]
 _MOST_TOKENS = 65_536  # of a frame
 _MOST_WEIGHTS = 10**10  # 40 GB in float32
-_MOST_PATTERNS = 64  # that select layers by name
+_MOST_TARGETS = 4_096
 _STATE_DIM = 7  # of a pose and a gripper
 _USUAL_ALPHA = 32.0  # of every config here, at any rank
 
@@ -188,6 +187,17 @@ class ModelConfig(Section):
         return self.model_copy(update={"base": name, "random": None, "encoder": None})
 
 
+PEFT_NAMES = {  # of the knobs below
+    "r": "rank",
+    "lora_alpha": "alpha",
+    "lora_dropout": "dropout",
+    "target_modules": "targets",
+    "modules_to_save": "modules_to_save",
+    "use_rslora": "rslora",
+    "use_dora": "dora",
+}
+
+
 class AdapterConfig(Section):
     """What is trained: a LoRA adapter on the predictor, or the whole predictor."""
 
@@ -203,22 +213,29 @@ class AdapterConfig(Section):
     dropout: Share = 0.0
     """Dropout before the adapter's first matrix, in training only. The released recipe and our measurements use none;
     it costs an eighth of a step on a GPU (predicted) and keeps a mask and a copy of each layer's input."""
-    targets: Annotated[tuple[str, ...], Field(max_length=_MOST_PATTERNS)] = ("q", "k", "v", "o", "fc1", "fc2")
+    targets: Annotated[tuple[str, ...], Field(max_length=_MOST_TARGETS)] = ("q", "k", "v", "o", "fc1", "fc2")
     """Linear layers of the predictor that get an adapter, by the last part of their name; besides the defaults:
     predictor_embed, predictor_proj, action_encoder, state_encoder. Or sets: attention (q, k, v, o), mlp (fc1, fc2),
-    all (every linear layer)."""
+    all (every linear layer). Or single layers by their whole name, such as blocks.0.attn.q."""
     modules_to_save: tuple[Literal["predictor_embed", "predictor_proj", "action_encoder", "state_encoder"], ...] = ()
     """Layers before and after the blocks that are trained directly, without an adapter."""
     dora: bool = False
     """Train the norm of each row of a weight separately from its direction (DoRA, arXiv 2402.09353)."""
-    init: Literal["default", "gaussian", "pissa"] = "default"
-    """Initialisation of an adapter. default, gaussian: first matrix random, second zero. pissa: at the largest singular
-    values of the weights (arXiv 2404.02948). PEFT's other methods need data, or change the base's predictions."""
-    rank_pattern: Annotated[dict[str, Annotated[int, Field(ge=1, le=1024)]], Field(max_length=_MOST_PATTERNS)] = {}
-    """Other ranks for some targets: {fc1: 32, blocks.0.attn.q: 4}, by the end of a layer's name or a regular
-    expression for it; the first that matches counts."""
-    alpha_pattern: Annotated[dict[str, Annotated[float, Field(gt=0.0, le=1e6)]], Field(max_length=_MOST_PATTERNS)] = {}
-    """Other alphas for some targets, in the same way."""
+    peft: dict[str, Any] = {}
+    """Further options of PEFT's LoraConfig, by its names: {rank_pattern: {fc1: 32}, init_lora_weights: gaussian}."""
+
+    @model_validator(mode="after")
+    def _is_an_adapter_of_this_base(self) -> AdapterConfig:
+        for name in self.peft:
+            if name in PEFT_NAMES:
+                raise ValueError(f"peft.{name} is adapter.{PEFT_NAMES[name]} here")
+        start = self.peft.get("init_lora_weights", True)
+        if start not in (True, False, "gaussian", "orthogonal"):
+            raise ValueError(
+                f"peft.init_lora_weights {start!r} changes the base, or needs data: the adapter would belong to weights"
+                " that nobody has; take true, false, gaussian or orthogonal"
+            )
+        return self
 
     @property
     def out_of_line(self) -> str | None:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from vjepa2_ac.config.section import OFF, Count, Local, NonNegative, Positive, PositiveInt, Section, Share, ZeroToOne
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.registry import ENERGIES, PLANNERS
 
 Place = Annotated[float, Field(ge=-5.0, le=5.0)]  # along an axis of the base frame, in metres; no arm reaches farther
 Corner = tuple[Place, Place, Place]
@@ -79,12 +80,20 @@ class LimitsConfig(Section):
 class EnergyConfig(Section):
     """Distance of a prediction from the goal."""
 
-    distance: Literal["l1", "l2", "cosine"] = "l1"
-    """Of predicted and goal latents: mean absolute difference (upstream), mean square, or 1 - cosine of a token."""
+    distance: Annotated[str, AfterValidator(ENERGIES.known), ENERGIES.name_in_schema] = "l1"
+    """Of predicted and goal latents. l1: mean absolute difference (upstream). l2: mean square. cosine: 1 - cosine of a
+    token. Or an energy of your own (docs/extending.md)."""
+    options: Annotated[dict[str, Any], ENERGIES.options_in_schema] = {}
+    """Options of an energy of your own, where its class has some."""
     steps: Literal["last", "sum"] = "last"
     """last: of the plan's last step (upstream). sum: over all its steps."""
     samples_at_once: PositiveInt = 64
     """Action sequences that go through the predictor at once: bounds its memory."""
+
+    @model_validator(mode="after")
+    def _options_fit(self) -> EnergyConfig:
+        ENERGIES.options(self.distance, self.options)
+        return self
 
 
 class GoalsConfig(Section):
@@ -159,8 +168,10 @@ class GradientConfig(Section):
 class PlanningConfig(Section):
     """One decision: from the current frame to an action."""
 
-    planner: Literal["cem", "icem", "mppi", "gradient"] = "cem"
-    """How actions are searched."""
+    planner: Annotated[str, AfterValidator(PLANNERS.known), PLANNERS.name_in_schema] = "cem"
+    """How actions are searched: cem, icem, mppi, gradient, or a planner of your own (docs/extending.md)."""
+    planner_options: Annotated[dict[str, Any], PLANNERS.options_in_schema] = {}
+    """Options of a planner of your own, where its class has some."""
     horizon: PositiveInt = 1
     """Model steps that a plan spans."""
     action_repeat: PositiveInt = 1
@@ -185,10 +196,6 @@ class PlanningConfig(Section):
     compile: Annotated[Literal["off", "blocks"], OFF] = "off"
     """blocks: torch.compile for the predictor's blocks; needs a C compiler, and a minute within the first decision. The
     same energies to rounding. Not of `evaluate --planning`, which computes plainly."""
-    quantize: Annotated[Literal["off", "int8", "fp8"], OFF] = "off"
-    """int8, fp8: the predictor's blocks compute in 8 bits, with the adapter merged in (torchao, extra quantize); the
-    rest in bfloat16, which model.dtype must be. fp8 needs compute capability 8.9. Not of planner gradient, nor of
-    `evaluate --planning`."""
     axes: Local | None = None
     """Calibrated axes of the model (`data calibrate --axes`, its axes.json): it is given what the robot does turned by
     their angle, as its training camera would have seen it. Of poses in the base frame. Not of `evaluate --planning`."""
@@ -207,6 +214,11 @@ class PlanningConfig(Section):
     gradient: GradientConfig = GradientConfig()
     """Of planner gradient only."""
 
+    @model_validator(mode="after")
+    def _options_fit(self) -> PlanningConfig:
+        PLANNERS.options(self.planner, self.planner_options)
+        return self
+
     @property
     def sequences(self) -> tuple[int, ...]:
         """The action sequences that each iteration evaluates; without those that icem reuses."""
@@ -223,8 +235,6 @@ class PlanningConfig(Section):
                 f"limits.gripper_from {self.limits.gripper_from} is not a multiple of action_repeat"
                 f" {self.action_repeat}"
             )
-        if self.quantize != "off" and self.planner == "gradient":
-            raise ValueError(f"planner gradient needs gradients, which quantize {self.quantize} does not have")
         elites = {"cem": self.cem.elites, "icem": self.icem.elites}.get(self.planner, 0)
         if elites > self.samples:
             raise ValueError(f"{self.planner}.elites {elites} are more than {self.samples} samples")

@@ -7,8 +7,7 @@ from typing import Annotated
 from pydantic import Field, model_validator
 
 from vjepa2_ac.config.data import DataConfig
-from vjepa2_ac.config.effects import Affects, AtMost
-from vjepa2_ac.config.section import Section
+from vjepa2_ac.config.section import Affects, AtMost, Section
 
 
 class ReplayConfig(Section):

@@ -9,11 +9,10 @@ from pydantic import AfterValidator, Field, model_validator
 from vjepa2_ac import places
 from vjepa2_ac.config.data import DataConfig
 from vjepa2_ac.config.decoder import DecoderConfig
-from vjepa2_ac.config.effects import Affects
 from vjepa2_ac.config.model import AdapterConfig, ModelConfig
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.config.replay import ReplayConfig
-from vjepa2_ac.config.section import Section
+from vjepa2_ac.config.section import Affects, Section
 from vjepa2_ac.config.sources import RldsData  # noqa: F401 - all forms of data
 from vjepa2_ac.config.training import CheckpointConfig, TrackingConfig, TrainingConfig, ValidationConfig
 
@@ -34,6 +33,9 @@ class Config(Section):
     """Folder of the run, on this machine: resolved config, checkpoints, metrics. `checkpoint.remote` keeps a copy."""
     seed: Annotated[int, Field(ge=0, lt=2**31), Affects.RUN | Affects.PLAN] = 0
     """Decides the order of clips, fresh weights and dropout."""
+    plugins: Annotated[tuple[str, ...], Affects.NOTHING] = ()
+    """Modules of your own, imported before this config is checked: they register forms of data, losses, planners,
+    metrics, energies and trackers (docs/extending.md). Installed packages register theirs without being named."""
     data: DataConfig
     """The data set, and the clips made of it."""
     replay: ReplayConfig | None = None

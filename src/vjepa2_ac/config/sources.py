@@ -7,8 +7,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field, model_validator
 
 from vjepa2_ac.config.data import DataConfig
-from vjepa2_ac.config.effects import Affects
-from vjepa2_ac.config.section import Count, Section
+from vjepa2_ac.config.section import Affects, Count, Section
 
 RAW_CAMERAS = ("left", "right", "wrist", "ext1", "ext2")
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
-from vjepa2_ac.config.effects import Affects
 from vjepa2_ac.config.section import (
     OFF,
+    Affects,
     Count,
     LocalOrBuiltin,
     NonNegative,
@@ -18,6 +18,7 @@ from vjepa2_ac.config.section import (
     Section,
     ZeroToOne,
 )
+from vjepa2_ac.registry import LOSSES
 
 
 def _usual_warmup(values: dict[str, Any]) -> int:
@@ -36,8 +37,11 @@ class TrainingConfig(Section):
     clips of a step: accumulation then follows from that."""
     rollout_steps: Annotated[int, Field(ge=1, le=64)] = 2
     """Predictions of the rollout loss; the first is teacher-forced, each further one uses the previous prediction."""
-    loss: Literal["l1", "l2", "smooth_l1"] = "l1"
-    """Distance of predicted and true latents: absolute (released), squared, or squared only below smooth_l1_beta."""
+    loss: Annotated[str, AfterValidator(LOSSES.known), LOSSES.name_in_schema] = "l1"
+    """Distance of predicted and true latents. l1: absolute (released). l2: squared. smooth_l1: squared only below
+    smooth_l1_beta. Or a loss of your own (docs/extending.md)."""
+    loss_options: Annotated[dict[str, Any], LOSSES.options_in_schema] = {}
+    """Options of a loss of your own, where its class has some."""
     smooth_l1_beta: Positive = 1.0
     """Below this difference smooth_l1 is squared, above it is absolute; smooth_l1 only."""
     teacher_forcing_weight: NonNegative = 1.0
@@ -99,6 +103,7 @@ class TrainingConfig(Section):
 
     @model_validator(mode="after")
     def _loss_fits(self) -> TrainingConfig:
+        LOSSES.options(self.loss, self.loss_options)
         if not self.teacher_forcing_weight + self.rollout_weight:
             raise ValueError("teacher_forcing_weight and rollout_weight are both 0: nothing would be learned")
         if self.loss != "smooth_l1" and self.smooth_l1_beta != 1.0:

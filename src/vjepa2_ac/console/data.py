@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 from rich.table import Table
 from rich.text import Text
@@ -11,11 +10,11 @@ from rich.text import Text
 from vjepa2_ac.console.progress import MetricsTable, console, with_interval
 from vjepa2_ac.data.index.episode_table import EpisodeTable
 from vjepa2_ac.data.index.index_cache import Usage
-from vjepa2_ac.data.inspection.finding import Finding
-from vjepa2_ac.data.inspection.statistics import PERCENTILES, Inspection
 from vjepa2_ac.evaluation.axis_fit import AxisFit
 from vjepa2_ac.evaluation.data_variants.measure import VariantProbe, rows_of
 from vjepa2_ac.evaluation.stride_calibration.measure import Calibration
+from vjepa2_ac.inspection.excerpts import Finding
+from vjepa2_ac.inspection.statistics import CHANGED, MOVED, TURNED, StepSizes
 
 _COLOURS = {"ok": "green", "warning": "yellow", "error": "red"}
 
@@ -37,67 +36,20 @@ def index_lines(table: EpisodeTable, watch: Usage, seconds: float) -> list[str]:
     return lines
 
 
-def inspection_lines(inspection: Inspection) -> list[str]:
-    """Return the output of `data inspect` before its table."""
-    success = inspection.success_share
-    known = int((inspection.success >= 0).sum())
-    shortest, low, median, high, longest = inspection.length_percentiles
-    hours = inspection.hours
-    lasting = f"{hours:,.1f} hours" if hours >= 1 else f"{hours * 60:.1f} minutes"
-    config, coverage = inspection.config, inspection.coverage
-    splits = ", ".join(
-        f"{name} {windows:,} clips in {inspection.episodes_of[name]:,} episodes"
-        for name, windows in inspection.windows_of.items()
-    )
-    removed = ", ".join(f"{one.name} {one}" for one in inspection.removed if one.episodes or one.steps)
-    rows = {
-        "data set": f"{config.path} ({config.source})",
-        "episodes": f"{len(inspection.lengths):,} ({inspection.broken:,} broken)",
-        "steps": f"{int(inspection.lengths.sum()):,} at {inspection.control_rate_hz:g} per second: {lasting}",
-        "length": f"{shortest} / {low} / {median} / {high} / {longest} steps (least, 10 %, median, 90 %, most)",
-        "cameras": f"{', '.join(inspection.cameras)}; used: {', '.join(config.cameras)}",
-        "success": "not known" if success is None else f"{success:.1%} of {known:,} episodes of which it is known",
-        "left out": removed or "nothing",
-        "splits": f"{splits}; clips of {config.frames} frames at stride {config.model_stride}",
-        "duplicates": str(inspection.duplicates)
-        + ("; inspect.json lists the copies" if inspection.duplicates.copies else ""),
-        "sample": f"{len(inspection.sample):,} episodes, for what follows",
-        **(_pose_rows(inspection) if inspection.has_poses else _vector_rows(inspection)),
-        **({} if coverage is None else coverage.lines | {"coverage": coverage.verdict}),
-    }
-    return [f"{name:<16}{text}" for name, text in rows.items()]
+_SIZES = {
+    MOVED: "moves by (cm)",
+    TURNED: "turns by (degrees)",
+    CHANGED: "the number that changes most (% of its range)",
+}
 
 
-def _pose_rows(inspection: Inspection) -> dict[str, str]:
-    gripper = inspection.gripper_range
-    limits = [(axis, *inspection.range_of(column)) for column, axis in enumerate("xyz")]
-    places = ", ".join(f"{axis} {low:.2f} to {high:.2f}" for axis, low, high in limits)
-    return {
-        "standing still": f"{inspection.still_share:.1%} of the steps, by the measured motion",
-        "position": f"{places} m",
-        "gripper": f"{gripper[0]:.2f} to {gripper[1]:.2f} (0 open, 1 closed)",
-    }
-
-
-def _vector_rows(inspection: Inspection) -> dict[str, str]:
-    config, widths = inspection.config, inspection.widths
-    ranges = ", ".join(f"{low:.2f} to {high:.2f}" for low, high in inspection.ranges)
-    how = f", joined by {config.join_actions}" if config.join_actions else ""
-    return {"states": f"{widths.state} numbers: {ranges}", "actions": f"{widths.action} numbers, {config.actions}{how}"}
-
-
-def motion_table(inspection: Inspection) -> Table:
+def motion_table(steps: Sequence[StepSizes]) -> Table:
     """Return the percentiles of the motion, or of the change of vectors, per model step at several strides."""
-    rows: list[tuple[Any, ...]]
-    if inspection.has_poses:
-        what, columns = "Motion", ["moves by (cm)", "turns by (degrees)"]
-        rows = [(one, one.percentiles("moved_cm"), one.percentiles("turned_deg")) for one in inspection.motions]
-    else:
-        what, columns = "Change", ["the number that changes most (% of its range)"]
-        rows = [(one, one.percentiles(PERCENTILES)) for one in inspection.changes]
-    table = MetricsTable(f"{what} per model step: 10 / 50 / 90 / 99 %", ["stride", "seconds", *columns], labelled=False)
-    for one, *metrics in rows:
-        cells = (" / ".join(f"{value:.1f}" for value in values) or "no step fits" for values in metrics)
+    names = list(steps[0].sizes)
+    title = f"{'Change' if CHANGED in names else 'Motion'} per model step: 10 / 50 / 90 / 99 %"
+    table = MetricsTable(title, ["stride", "seconds", *(_SIZES[name] for name in names)], labelled=False)
+    for one in steps:
+        cells = [" / ".join(f"{value:.1f}" for value in row) or "no step fits" for row in one.percentiles.values()]
         table.add_row(str(one.stride), f"{one.seconds:.2f}", *cells)
     return table
 

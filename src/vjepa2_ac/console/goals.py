@@ -5,7 +5,7 @@ from __future__ import annotations
 from rich.table import Table
 
 from vjepa2_ac.console.progress import MetricsTable
-from vjepa2_ac.planning.demonstrations.make_goals import MadeGoals
+from vjepa2_ac.demonstrations.make_goals import MadeGoals
 
 
 def goals_table(made: MadeGoals) -> Table:

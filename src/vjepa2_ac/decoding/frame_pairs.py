@@ -24,10 +24,10 @@ from safetensors.torch import save
 from torch import Tensor
 
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.clips.dataset import Dataset
-from vjepa2_ac.data.clips.transforms import input_to_pixels, pixels_to_input
-from vjepa2_ac.data.clips.windows import spread
+from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.sources.latents.dtypes import CacheType, bytes_per_frame, pack_latents, unpack_latents
+from vjepa2_ac.data.transforms import input_to_pixels, pixels_to_input
+from vjepa2_ac.data.windows import spread
 from vjepa2_ac.encoding.cache_lookup import needed_frames
 from vjepa2_ac.encoding.disk_space import GIGABYTE
 from vjepa2_ac.encoding.pipeline import EncoderOnDevice

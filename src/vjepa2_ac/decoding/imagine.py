@@ -18,7 +18,7 @@ from vjepa2_ac.decoding.decoder_folder import DecoderCard
 from vjepa2_ac.decoding.frame_pairs import as_pixels
 from vjepa2_ac.decoding.network import Decoder
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.planning.counterfactual.named_actions import counterfactual_states, feasible_actions
+from vjepa2_ac.planning.counterfactual import counterfactual_states, feasible_actions
 from vjepa2_ac.spaces import StateSpace
 
 AS_RECORDED = "as recorded"

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
-from vjepa2_ac.data.clips.transforms import frames_as_seen, view
-from vjepa2_ac.data.clips.windows import spread_with_ends
+from vjepa2_ac.data.transforms import frames_as_seen, view
+from vjepa2_ac.data.windows import spread_with_ends
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
 from vjepa2_ac.decoding.imagine import shown
 from vjepa2_ac.planning.controller import Decision

@@ -7,7 +7,7 @@ from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor
 
-from vjepa2_ac.data.clips.windows import spread
+from vjepa2_ac.data.windows import spread
 from vjepa2_ac.decoding.frame_pairs import FramePairs, as_images
 from vjepa2_ac.decoding.network import Decoder, DecoderShape
 from vjepa2_ac.episode import Progress

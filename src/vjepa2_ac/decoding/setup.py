@@ -15,8 +15,8 @@ import torch
 
 from vjepa2_ac.config import Config, DecoderConfig
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
-from vjepa2_ac.data.clips.windows import require_stride
+from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.decoding.decoder_folder import CARD, LINEAR, WEIGHTS, read_card
 from vjepa2_ac.decoding.frame_pairs import FramePairs, encode_pairs, require_space_for_pairs, wanted_frames
 from vjepa2_ac.decoding.loss import SMALLEST

@@ -17,7 +17,7 @@ from typing import Any
 import torch
 
 from vjepa2_ac.config import Config, DecoderConfig
-from vjepa2_ac.data.clips.permutation import permuted
+from vjepa2_ac.data.windows import permuted
 from vjepa2_ac.decoding.decoder_folder import CARD, DecoderCard, save_decoder
 from vjepa2_ac.decoding.frame_pairs import FramePairs, Pairs
 from vjepa2_ac.decoding.held_out import mean_image, measure_decoders
@@ -27,7 +27,7 @@ from vjepa2_ac.decoding.optimizer_steps import DecoderSteps
 from vjepa2_ac.decoding.setup import Setup, prepare, setup
 from vjepa2_ac.distributed.signals import StoppedError, StopRequest, stop_on_signals
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.finite import first_not_finite
+from vjepa2_ac.model.network.pretrained_folder import first_not_finite
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import CHECKPOINTS, OPTIMIZER, RunState, newest_checkpoint, read_state, write_checkpoint
 from vjepa2_ac.runs.files import read_torch, write_torch

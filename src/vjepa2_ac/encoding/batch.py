@@ -11,10 +11,10 @@ from jaxtyping import Float, Float32, UInt8
 from torch import Tensor
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.data.clips.dataset import Dataset
-from vjepa2_ac.data.clips.transforms import Crop, pixels_to_input, view
+from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.sources.latents.cache_key import Encoding
 from vjepa2_ac.data.sources.latents.dtypes import unpack_latents
+from vjepa2_ac.data.transforms import Crop, pixels_to_input, view
 from vjepa2_ac.encoding.cache_lookup import require_encoding
 from vjepa2_ac.episode import Batch, LatentBatch, Widths
 from vjepa2_ac.errors import InputError

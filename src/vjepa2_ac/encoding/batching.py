@@ -13,9 +13,9 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from vjepa2_ac.data.clips.clip_reader import joined_latents
-from vjepa2_ac.data.clips.streams import Copies
-from vjepa2_ac.data.clips.transforms import pixels_to_input
+from vjepa2_ac.data.clips import joined_latents
+from vjepa2_ac.data.streams import Copies
+from vjepa2_ac.data.transforms import pixels_to_input
 from vjepa2_ac.encoding.prefetch import FramesToEncode, Part, Unreadable
 from vjepa2_ac.episode import Episode, StoredLatents
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Int32
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.clips.dataset import Dataset, through_latents
+from vjepa2_ac.data.dataset import Dataset, through_latents
 from vjepa2_ac.data.index.index_cache import cache_folder, fingerprints_of
 from vjepa2_ac.data.sources.latents.cache_key import OF_ENCODING, CacheKey, Encoding, key_of_cache
 from vjepa2_ac.data.sources.latents.manifest import is_whole, read_manifest
@@ -38,8 +38,7 @@ def needed_frames(dataset: Dataset) -> Iterator[NeededFrames]:
     for runs in np.split(order, np.flatnonzero(np.diff(starts.episode[order])) + 1):
         if not len(runs):
             return  # a data set without clips
-        ids, share = dataset.table.id_hash, config.idle.keep_share
-        first = np.concatenate([starts.steps_of(int(run), ids, share) for run in runs])
+        first = np.concatenate([starts.steps_of(int(run)) for run in runs])
         steps = np.unique(first[:, None] + within).astype(np.int32)
         yield NeededFrames(int(starts.episode[runs[0]]), steps)
 

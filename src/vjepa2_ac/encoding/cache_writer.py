@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Int64
 
 from vjepa2_ac import storage
-from vjepa2_ac.data.clips.dataset import Dataset
-from vjepa2_ac.data.filters.idle_ranges import find_ranges
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.idle import find_ranges
 from vjepa2_ac.data.sources.latents.cache_key import CacheKey, Encoding
 from vjepa2_ac.data.sources.latents.episode_file import EncodedEpisode, EpisodeLayout, write_episode_file
 from vjepa2_ac.data.sources.latents.manifest import EPISODES, KEPT, MANIFEST, Manifest, path_of, size_column, size_of

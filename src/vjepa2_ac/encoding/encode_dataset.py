@@ -14,10 +14,10 @@ from pathlib import Path
 import torch
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
-from vjepa2_ac.data.clips.loader import ProcessShare
-from vjepa2_ac.data.clips.windows import require_stride
+from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.loader import ProcessShare
 from vjepa2_ac.data.sources.latents.manifest import Manifest, is_whole, read_manifest
+from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.distributed.device import autocast, computing_device
 from vjepa2_ac.encoding.batch import encoding_of
 from vjepa2_ac.encoding.cache_lookup import folder_of, key_for

@@ -18,10 +18,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vjepa2_ac.data.clips.streams import copies_for
 from vjepa2_ac.data.sources.latents.dtypes import pack_latents
 from vjepa2_ac.data.sources.latents.episode_file import EncodedEpisode
 from vjepa2_ac.data.sources.latents.manifest import Manifest
+from vjepa2_ac.data.streams import copies_for
 from vjepa2_ac.encoding.batching import Chunks, Encoded
 from vjepa2_ac.encoding.disk_space import small_frame_side
 from vjepa2_ac.encoding.prefetch import Unreadable, prefetched

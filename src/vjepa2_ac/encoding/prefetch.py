@@ -12,9 +12,8 @@ import numpy as np
 import torch
 from jaxtyping import Int32, UInt8
 
-from vjepa2_ac.data.clips.actions import require_widths
-from vjepa2_ac.data.clips.dataset import Dataset
-from vjepa2_ac.data.clips.transforms import view
+from vjepa2_ac.data.dataset import Dataset, require_widths
+from vjepa2_ac.data.transforms import view
 from vjepa2_ac.encoding.disk_space import FRAMES_AT_ONCE
 from vjepa2_ac.episode import Episode
 from vjepa2_ac.errors import InputError

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vjepa2_ac import storage
-from vjepa2_ac.data.clips.dataset import Dataset
+from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.sources.latents.manifest import (
     MANIFEST,
     path_of,

@@ -8,8 +8,8 @@ from pathlib import Path
 from accelerate import Accelerator
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.data.clips.dataset import Dataset
-from vjepa2_ac.data.clips.loader import WHOLE, ProcessShare
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.loader import WHOLE, ProcessShare
 from vjepa2_ac.data.sources.latents.manifest import is_whole
 from vjepa2_ac.distributed.processes import broadcast_object
 from vjepa2_ac.encoding.batch import require_same_encoder

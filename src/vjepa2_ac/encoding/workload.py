@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from vjepa2_ac import storage
-from vjepa2_ac.data.clips.dataset import Dataset
-from vjepa2_ac.data.clips.loader import WHOLE, ProcessShare
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.loader import WHOLE, ProcessShare
 from vjepa2_ac.data.sources.latents.cache_key import CacheKey
 from vjepa2_ac.data.sources.latents.dtypes import bytes_per_frame
 from vjepa2_ac.data.sources.latents.manifest import is_whole, read_manifest

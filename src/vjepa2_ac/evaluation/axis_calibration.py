@@ -11,9 +11,8 @@ import torch
 from vjepa2_ac import __version__
 from vjepa2_ac.config import Config, DataConfig
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
-from vjepa2_ac.data.clips.loader import validation_batches
-from vjepa2_ac.data.clips.streams import copies_for
+from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.loader import validation_batches
 from vjepa2_ac.distributed.processes import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, require_same_encoder, require_widths
 from vjepa2_ac.evaluation.action_use.inferred_moves import infer_axes
@@ -103,7 +102,7 @@ def calibrate_axes(
 
 def _starts(model: WorldModel, dataset: Dataset, config: Config, split: Split, pairs: int) -> list[RolloutStart]:
     device, size = model.device, config.validation.batch_size
-    batches = validation_batches(dataset, split, clips=pairs, batch_size=size, copies=copies_for(device))
+    batches = validation_batches(dataset, split, clips=pairs, batch_size=size)
     found: list[RolloutStart] = []
     with torch.no_grad():
         for batch in batches:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
-from vjepa2_ac.data.clips.windows import spread
+from vjepa2_ac.data.windows import spread
 from vjepa2_ac.episode import LatentBatch, Progress
 from vjepa2_ac.evaluation.action_score.measure import PlanningStart, measure_plans, planning_start, study_of
 from vjepa2_ac.evaluation.action_use.energy_landscape import LandscapeGrid, measure_landscapes

@@ -8,16 +8,14 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import torch
 from jaxtyping import UInt8
 
 from vjepa2_ac import __version__
 from vjepa2_ac.config import Config, PlanningConfig
-from vjepa2_ac.data.clips.clip_reader import frames_of
-from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
-from vjepa2_ac.data.clips.loader import batches_of, validation_windows
-from vjepa2_ac.data.clips.streams import copies_for
-from vjepa2_ac.data.clips.transforms import frames_as_seen
+from vjepa2_ac.data.clips import frames_of
+from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.loader import batches_of, validation_windows
+from vjepa2_ac.data.transforms import frames_as_seen
 from vjepa2_ac.decoding.decoder_folder import load_decoder
 from vjepa2_ac.distributed.processes import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch
@@ -32,7 +30,6 @@ from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions, settle
 from vjepa2_ac.evaluation.result import About, Evaluation, TrainingCurve
 from vjepa2_ac.evaluation.stride_calibration.measure import calibrate_model
 from vjepa2_ac.evaluation.subject import load_subject
-from vjepa2_ac.model.quantization import require_8_bits
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import select_checkpoint
 from vjepa2_ac.runs.folder import METRICS, is_run
@@ -78,8 +75,6 @@ def measure_subject(
     decoder = None if asked.decoder is None else load_decoder(asked.decoder)
     networks = load_metric_networks(asked)
     accelerator = make_accelerator(config)
-    if asked.probes.planning_clips:
-        _require_quantizable(config, planning, accelerator.device)
     dataset = open_dataset(config.data, progress=reporter.task("looking through the data"))
     chosen = validation_windows(dataset, asked.split, clips=asked.clips)
     loaded = load_subject(subject, config, asked, dataset, decoder)
@@ -93,7 +88,7 @@ def measure_subject(
         sample, progress = ClipSample(asked.split, asked.clips), reporter.task("calibrating strides")
         calibration = calibrate_model(world_model, dataset, config, accelerator, sample, progress).as_dict()
     encode = partial(encode_batch, world_model, device=accelerator.device, chunk=config.model.encode_chunk)
-    read = partial(batches_of, batch_size=config.validation.batch_size, copies=copies_for(accelerator.device))
+    read = partial(batches_of, batch_size=config.validation.batch_size)
     clips = _clips(through_cache, chosen, read, encode, world_model.image_size)
     with accelerator.autocast():
         evaluation = evaluate(
@@ -129,12 +124,6 @@ def _probes(asked: EvaluationOptions, planning: PlanningConfig, dataset: Dataset
     """Return the probes that these data allow: axes are those of poses in the robot base frame."""
     axis_clips = asked.probes.axis_clips if dataset.spaces.state.is_base_pose else 0
     return replace(asked.probes, planning=planning, axis_clips=axis_clips)
-
-
-def _require_quantizable(config: Config, planning: PlanningConfig, device: torch.device) -> None:
-    """Refuse quantized planning where the weights or the device do not allow it."""
-    if planning.quantize != "off":
-        require_8_bits(planning.quantize, getattr(torch, config.model.dtype), device, where="planning.quantize")
 
 
 def _warnings(folder: Path) -> list[str]:

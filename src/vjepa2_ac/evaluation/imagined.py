@@ -13,9 +13,9 @@ from torch import Tensor
 
 from vjepa2_ac.config import Config, LimitsConfig
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
-from vjepa2_ac.data.clips.loader import batches_of, validation_windows
-from vjepa2_ac.data.clips.transforms import frames_as_seen, view
+from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.loader import batches_of, validation_windows
+from vjepa2_ac.data.transforms import frames_as_seen, view
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
 from vjepa2_ac.decoding.imagine import (
     AS_RECORDED,
@@ -35,7 +35,7 @@ from vjepa2_ac.evaluation.evaluate import Contender
 from vjepa2_ac.evaluation.imagined_image import actions_by_name, require_directions
 from vjepa2_ac.evaluation.request import EvaluationOptions, settle
 from vjepa2_ac.evaluation.subject import load_subject
-from vjepa2_ac.planning.counterfactual.named_actions import ACTION_NAMES, STEP_M
+from vjepa2_ac.planning.counterfactual import ACTION_NAMES, STEP_M
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
 from vjepa2_ac.spaces import StateSpace
 

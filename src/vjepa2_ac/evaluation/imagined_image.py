@@ -10,14 +10,13 @@ import torch
 from jaxtyping import Float, UInt8
 
 from vjepa2_ac.config import LimitsConfig
-from vjepa2_ac.data.clips.transforms import frames_as_seen, view
 from vjepa2_ac.data.sources.configured_spaces import measured_space
+from vjepa2_ac.data.transforms import frames_as_seen, view
 from vjepa2_ac.decoding.decoder_folder import load_decoder
 from vjepa2_ac.decoding.imagine import Imagination, Imagined, Start, imagined_latents, shown, worth_knowing
 from vjepa2_ac.encoding.batch import encode_frames
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.planning.counterfactual.actions_file import read_actions
-from vjepa2_ac.planning.counterfactual.named_actions import ACTION_NAMES, STEP_M, named_actions
+from vjepa2_ac.planning.counterfactual import ACTION_NAMES, STEP_M, named_actions, read_actions
 from vjepa2_ac.planning.session import PlanningSession
 from vjepa2_ac.spaces import StateSpace
 

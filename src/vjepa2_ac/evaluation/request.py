@@ -8,7 +8,7 @@ from pathlib import Path
 from vjepa2_ac.config import Config, PlanningConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.loading import config_as_dict, config_from
-from vjepa2_ac.data.clips.windows import require_stride
+from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.action_score.protocol import FRAMES
 from vjepa2_ac.planning.settings import require_limits, with_taught_limits

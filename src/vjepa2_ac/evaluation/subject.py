@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.data.clips.dataset import Dataset
+from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
 from vjepa2_ac.encoding.batch import require_widths
 from vjepa2_ac.episode import Widths

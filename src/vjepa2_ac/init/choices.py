@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vjepa2_ac.init.found import FoundData
-from vjepa2_ac.init.knob import Knob, Knobs
+from vjepa2_ac.config.model import ModelSizes
+from vjepa2_ac.init.found import FoundData, Knob, Knobs
 from vjepa2_ac.init.machine import Machine
-from vjepa2_ac.model.checkpoints.published import PUBLISHED
-from vjepa2_ac.model.checkpoints.published_names import OFFICIAL
+from vjepa2_ac.model.checkpoints.published import OFFICIAL, PUBLISHED
 from vjepa2_ac.places import BUILTIN
 from vjepa2_ac.training.cost.memory import GIGABYTE
 
@@ -34,7 +33,12 @@ class ModelChoice:
 
     kind: str  # released, tiny, scratch
     path: str
-    bytes_a_frame: int  # of its latents, in bfloat16
+    sizes: ModelSizes
+
+    @property
+    def bytes_a_frame(self) -> int:
+        """Of its latents, in bfloat16."""
+        return 2 * self.sizes.tokens_per_frame * self.sizes.encoder.width
 
     @property
     def is_tiny(self) -> bool:
@@ -213,9 +217,10 @@ def _steps(found: FoundData, clips_a_step: int) -> tuple[int, str]:
 def _fresh_predictor(model: ModelChoice) -> dict[str, Any]:
     if model.is_tiny:
         return {"image_size": Knob(96), "predictor": {"width": Knob(128), "depth": Knob(4), "heads": Knob(4)}}
+    width = model.sizes.encoder.width
     sizes = {
-        "width": Knob(768, "as wide as the latents: it can begin at copying"),
+        "width": Knob(width, "as wide as the latents: it can begin at copying"),
         "depth": Knob(12),
-        "heads": Knob(12),
+        "heads": Knob(width // 64),
     }
     return {"image_size": Knob(256, "256 tokens a frame"), "predictor": sizes}

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from vjepa2_ac.config import Config, ModelConfig
+from vjepa2_ac.config import Config, EncoderConfig, ModelConfig
 from vjepa2_ac.config.loading import config_from
 from vjepa2_ac.config.model import ModelSizes
 from vjepa2_ac.init.choices import (
@@ -18,8 +18,7 @@ from vjepa2_ac.init.choices import (
     model_knobs,
     training_knobs,
 )
-from vjepa2_ac.init.found import FoundData
-from vjepa2_ac.init.knob import Knob, Knobs, as_yaml, guesses, plain
+from vjepa2_ac.init.found import FoundData, Knob, Knobs, as_yaml, guesses, plain
 from vjepa2_ac.init.machine import Machine, duration
 from vjepa2_ac.model.checkpoints.loading import base_sizes
 from vjepa2_ac.places import BUILTIN
@@ -29,9 +28,8 @@ from vjepa2_ac.training.cost.memory import GIGABYTE, estimate_memory
 RELEASED = "checkpoints/vjepa2-ac-vitg.pt"
 SCRATCH_ENCODER = "checkpoints/vjepa2.1-vitb-384.pt"
 TINY = f"{BUILTIN}sim-tiny"
-_UTILIZATION = 0.4  # of the card's peak: assumed
+_UTILIZATION = 0.4  # of the speed of one large product: assumed
 _LARGEST_BATCH = 16
-_BF16 = 2
 
 
 @dataclass(frozen=True)
@@ -42,7 +40,7 @@ class Draft:
     config: Config
     memory_bytes: int | None  # at the peak; None: of the tiny model
     fits: bool
-    hours: float | None  # None: the card's peak is not known
+    hours: float | None  # None: there is no GPU
     encoding_hours: float  # of them, before the first step
     cache_bytes: int | None
 
@@ -69,8 +67,8 @@ class Draft:
         if self.cache_bytes is not None:
             lines.append(f"Disk: at most {max(0.1, self.cache_bytes / GIGABYTE):,.1f} GB of cached latents.")
         if self.hours is not None:
-            share = f"{_UTILIZATION:.0%} of its peak: assumed, not measured"
-            lines.append(f"Time: {duration(self.hours)}, if the card reaches {share}.")
+            speed = f"{(machine.flops or 0) / 1e12:.0f} TFLOP/s measured here for one product"
+            lines.append(f"Time: {duration(self.hours)}, if a step reaches {_UTILIZATION:.0%} (assumed) of {speed}.")
         elif machine.gpu is None and self.memory_bytes is not None:
             lines.append(
                 "Time: not known without the GPU; run `vjepa2-ac init` on the machine that has it: batch and precision"
@@ -98,12 +96,12 @@ def choose_model(kind: str, path: str | None) -> ModelChoice:
     """
     path = path or (SCRATCH_ENCODER if kind == "scratch" else RELEASED)
     is_tiny = path.startswith(BUILTIN)
-    if kind == "scratch":
-        sizes = ModelSizes() if not is_tiny else base_sizes(ModelConfig(base=path))
-        width = sizes.encoder.width if is_tiny else 768
-        return ModelChoice(kind, path, _BF16 * sizes.tokens_per_frame * width)
-    sizes = base_sizes(ModelConfig(base=path))
-    return ModelChoice("tiny" if is_tiny else kind, path, _BF16 * sizes.tokens_per_frame * sizes.encoder.width)
+    if kind == "scratch" and not is_tiny:
+        config = ModelConfig(encoder=EncoderConfig(path=path, frame="tubelet"), random=ModelSizes())
+    else:
+        config = ModelConfig(base=path)
+    sizes = base_sizes(config)
+    return ModelChoice("tiny" if is_tiny and kind != "scratch" else kind, path, sizes)
 
 
 def make_draft(found: FoundData, machine: Machine, model: ModelChoice, *, run_dir: str) -> Draft:
@@ -181,11 +179,11 @@ def _batch_knobs(batch: int, machine: Machine, *, checkpointing: bool, fits: boo
 
 def _hours(config: Config, sizes: ModelSizes, found: FoundData, machine: Machine) -> tuple[float | None, float]:
     """Return the hours of a run, and those of them that are for encoding before the first step."""
-    if machine.peak_flops is None:
+    if machine.flops is None:
         return None, 0.0
     clip, training = clip_flops(config, sizes), config.training
     clips = training.steps * training.batch_size * training.accumulation
-    an_hour = machine.peak_flops * _UTILIZATION * 3600
+    an_hour = machine.flops * _UTILIZATION * 3600
     if not config.data.takes_latents:
         return clips * clip.total / an_hour, 0.0
     encoding = (found.steps or 0) * frame_flops(sizes) / an_hour

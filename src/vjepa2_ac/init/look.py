@@ -1,4 +1,4 @@
-"""Which form of data is there, and what is in it."""
+"""Which form of data is there, what is in it, and how long its episodes are."""
 
 from __future__ import annotations
 
@@ -7,15 +7,90 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from vjepa2_ac import storage
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config.loading import config_from
+from vjepa2_ac.config.plugins import admit_forms_of_data
+from vjepa2_ac.data.index.episode_table import EpisodeTable
+from vjepa2_ac.data.sources.droid_raw.episode_folders import find_episodes
 from vjepa2_ac.data.sources.lerobot.info import INFO
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.data.sources.listing import walk, within
+from vjepa2_ac.data.sources.npz.npz_episode import FORMAT_HELP, opened_npz
+from vjepa2_ac.data.sources.registry import open_source
+from vjepa2_ac.episode import STATE_DIM, Progress
+from vjepa2_ac.errors import InputError, UserError
 from vjepa2_ac.init.converters import way_by
-from vjepa2_ac.init.found import FoundData
-from vjepa2_ac.init.of_lerobot import look_at_lerobot
-from vjepa2_ac.init.of_npz import look_at_npz
-from vjepa2_ac.init.of_raw import look_at_raw
-from vjepa2_ac.init.of_rlds import droid, like_droid, look_at_rlds
+from vjepa2_ac.init.found import FoundData, Knob, plain
+from vjepa2_ac.init.lerobot import look_at_lerobot
+from vjepa2_ac.init.names import pick_camera
+from vjepa2_ac.init.rlds import droid, like_droid, look_at_rlds
+from vjepa2_ac.places import BUILTIN
+
+
+def look_at_npz(path: str) -> FoundData:
+    """Look at a folder of .npz files.
+
+    Raises:
+        InputError: There are none, or the first has no states, no rate or no frames.
+    """
+    files = sorted(within(folder, file.name) for folder, file in walk(path, _CONNECTIONS) if file.name.endswith(".npz"))
+    if not files:
+        raise InputError(where=path, found="no .npz files", needed="one for each episode", fix=FORMAT_HELP)
+    where = storage.join(path, files[0])
+    with opened_npz(where, where) as file:
+        headers = {name: file.header(name) for name in file.names}
+        missing = [name for name in ("states", "fps_hz") if name not in headers]
+        cameras = [name for name, one in headers.items() if one.dtype == np.uint8 and len(one.shape) == 4]
+        if missing or not cameras or len(headers["states"].shape) != 2:
+            arrays = ", ".join(f"{name} {list(one.shape)} {one.dtype}" for name, one in headers.items())
+            needed = "states [steps, 7], fps_hz and frames [steps, height, width, 3] of uint8"
+            raise InputError(where=where, found=arrays or "no arrays", needed=needed, fix=FORMAT_HELP)
+        rate = float(np.asarray(file.array("fps_hz")).reshape(-1)[0])
+    steps, width = headers["states"].shape
+    first = "frames" if "frames" in cameras else pick_camera(cameras)
+    velocities = "joint_velocities" in headers
+    is_pose = width == STATE_DIM
+    return FoundData(
+        source="npz",
+        path=path,
+        knobs={"camera": Knob(first, f"of {', '.join(cameras)}" if len(cameras) > 1 else "", len(cameras) > 1)},
+        rate_hz=Knob(rate, f"of {files[0]}"),
+        states="pose" if is_pose else "vector",
+        episodes=len(files),
+        idle={"rule": Knob("commands" if velocities else "motion", "pauses teach nothing")} if is_pose else None,
+        sample=where,
+        about=(f".npz, {len(files):,} episodes at {rate:g} a second, the first of {steps:,} steps",),
+    )
+
+
+RAW_DROID = "gs://gresearch/robotics/droid_raw/1.0.1"
+_CONNECTIONS = 16  # reads at once
+
+
+def look_at_raw(path: str) -> FoundData:
+    """Look at raw DROID; behind a URL its folders are not counted, for that takes long.
+
+    Raises:
+        InputError: There are no episodes.
+    """
+    is_remote = storage.is_url(path)
+    episodes = None if is_remote else len(find_episodes(path, _CONNECTIONS))
+    if episodes == 0:
+        found, needed = "no episode", "folders with trajectory.h5 and metadata_*.json below it"
+        raise InputError(where=path, found=found, needed=needed)
+    return FoundData(
+        source="droid_raw",
+        path=path,
+        knobs={"camera": Knob("left", "what the released weights saw; or right, wrist, a serial number")},
+        rate_hz=Knob(15.0, "DROID's"),
+        episodes=episodes,
+        idle={"rule": Knob("commands", "openpi's rule, on the commanded joint velocities")},
+        about=(f"raw DROID, {'behind a URL' if is_remote else f'{episodes:,} episodes'}, 15 steps a second",),
+        extra="gcs,raw" if is_remote else "raw",
+    )
+
 
 LOOKS: dict[str, Callable[[str], FoundData]] = {
     "rlds": look_at_rlds,
@@ -55,10 +130,26 @@ def look_at(path: str, form: str | None = None) -> FoundData:
         fix = f"For a data set of the Hugging Face Hub: hf://datasets/{path}" if _HUB_NAME.fullmatch(path) else ""
         raise InputError(where=path, found="no such folder", needed="a folder, or a URL", fix=fix)
     try:
+        if form is None and (found := _of_plugins(path)):
+            return found
         form, root = (form, _root_of(path, form)) if form else _recognized(path)
         return LOOKS[form](root)
     except OSError as error:
         raise storage.unreadable(path, error) from None
+
+
+def _of_plugins(path: str) -> FoundData | None:
+    """Return the data of a form of somebody else's, where its class recognizes them (docs/extending.md)."""
+    admit_forms_of_data(all_installed=True)
+    for source, kind in DataConfig.kinds.items():
+        if (values := kind.look(path)) is not None:
+            why = f"found by {kind.__name__}"
+            rate = Knob(10.0, "not said: your robot's control steps a second", is_guess=True)
+            if "control_rate_hz" in values:
+                rate = Knob(values.pop("control_rate_hz"), why)
+            knobs = {name: Knob(value, why) for name, value in values.items()}
+            return FoundData(source, path, knobs, rate, about=(f"{source}, a form of data of your own",))
+    return None
 
 
 def simulated(path: str) -> FoundData:
@@ -118,3 +209,31 @@ def _names_below(path: str) -> list[str]:
             break
         path = storage.join(path, inner)
     return names
+
+
+_MOST_ARE_LONGER = 0.1  # quantile
+
+
+def measured(found: FoundData, progress: Progress | None = None) -> FoundData:
+    """Return what was found with the numbers of the index; unchanged behind a URL, or where it cannot be built.
+
+    Why it cannot, the check of the data says.
+    """
+    if storage.is_url(found.path):
+        return found
+    data = {"source": found.source, "path": found.path, "states": found.states, **plain(found.knobs)}
+    values = {"run_dir": "none", "data": data, "model": {"base": f"{BUILTIN}sim-tiny"}}
+    try:
+        source = open_source(config_from(values, where="vjepa2-ac init").data)
+        lengths = EpisodeTable.of(source.infos(progress)).num_steps
+    except UserError:
+        return found
+    if not len(lengths):
+        return found
+    return replace(
+        found,
+        episodes=len(lengths),
+        steps=int(lengths.sum()),
+        usual_steps=int(np.median(lengths)),
+        short_steps=int(np.quantile(lengths, _MOST_ARE_LONGER)),
+    )

@@ -16,12 +16,6 @@ _SAMPLE_BYTES = 8 << 20
 _LEAST_BYTES = 1 << 20  # a smaller file says how long an answer takes, not how fast data come
 _USUAL_BYTES_PER_S = 100e6 / 8  # 100 Mbit/s: assumed
 
-# Dense bfloat16 or float16 products with sums in float32, TFLOP/s, by the vendor's data sheets. The longest name wins.
-_PEAKS = {
-    "RTX 3090": 71, "RTX 4090": 165, "RTX 5090": 210, "RTX A5000": 111, "RTX A6000": 155, "RTX 6000 Ada": 364,
-    "A10": 125, "A10G": 70, "L4": 121, "L40S": 362, "A100": 312, "H100": 989, "H200": 989, "T4": 65, "V100": 125,
-}  # fmt: skip
-
 
 @dataclass(frozen=True)
 class Machine:
@@ -33,6 +27,7 @@ class Machine:
     cores: int
     free_bytes: int  # of the disk where runs and caches go
     read_bytes_per_s: float | None = None  # of one file of the data, behind a URL
+    flops: float | None = None  # operations a second of the GPU's products, measured
 
     @property
     def precision(self) -> Literal["bf16", "fp16", "fp32"]:
@@ -45,12 +40,6 @@ class Machine:
     def room(self) -> str:
         """The memory that a batch has to fit on."""
         return f"{self.gpu_bytes / GIGABYTE:.1f} GB" + ("" if self.gpu else ", a usual GPU's")
-
-    @property
-    def peak_flops(self) -> float | None:
-        """Operations per second at best, where the card is known."""
-        known = [name for name in _PEAKS if name in (self.gpu or "")]
-        return 1e12 * _PEAKS[max(known, key=len)] if known else None
 
     @property
     def about(self) -> str:
@@ -83,14 +72,15 @@ def this_machine(sample: str = "") -> Machine:
     """
     import torch
 
-    from vjepa2_ac.distributed.device import has_bf16
+    from vjepa2_ac.distributed.device import cuda_index, has_bf16, matmul_speed
 
     cores, free = len(os.sched_getaffinity(0)), storage.free_bytes(Path.cwd())
     speed = _speed_of(sample) if sample else None
     if not torch.cuda.is_available():
         return Machine(None, USUAL_GPU, False, cores, free, speed)
-    device = torch.cuda.get_device_properties(torch.cuda.current_device())
-    return Machine(device.name, device.total_memory, has_bf16(), cores, free, speed)
+    device = torch.device("cuda", cuda_index())
+    card, dtype = torch.cuda.get_device_properties(device), torch.bfloat16 if has_bf16() else torch.float16
+    return Machine(card.name, card.total_memory, has_bf16(), cores, free, speed, matmul_speed(device, dtype))
 
 
 def _speed_of(sample: str) -> float | None:

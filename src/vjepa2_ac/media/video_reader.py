@@ -17,11 +17,10 @@ import numpy as np
 from jaxtyping import UInt8
 
 from vjepa2_ac import storage
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, require_library
 from vjepa2_ac.media.frame_targets import FrameTargets, QuietFile
 from vjepa2_ac.media.image_size import MOST_PIXELS, require_bounded
 from vjepa2_ac.storage import ByteReader
-from vjepa2_ac.storage.libraries import require_library
 
 if TYPE_CHECKING:
     from av.container import InputContainer

@@ -1,18 +1,26 @@
-"""Where a model is: the file or folder that a knob names. PyTorch is not imported."""
+"""Where a model is, and its sizes as its folder says them; no weight is read, and PyTorch is not imported."""
 
 from __future__ import annotations
 
 import importlib.resources
+import json
 from pathlib import Path
+from typing import Any
 
-from vjepa2_ac.config import ModelConfig
+from pydantic import ValidationError
+
+from vjepa2_ac.config import ModelConfig, ModelSizes
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.sizes import CONFIG
 from vjepa2_ac.places import BUILTIN, HUB
+from vjepa2_ac.storage.structured import message_of, read_json_object
 
 ASSETS = Path(str(importlib.resources.files("vjepa2_ac"))) / "assets"
+FORMAT = "vjepa2-ac world model 1"
+CONFIG = "config.json"
 
 _TINY = f"{BUILTIN}sim-tiny"
+_NEEDED = "a folder written by `vjepa2-ac export` or WorldModel.save_pretrained"
+_FIX = "Of a run, `vjepa2-ac export RUN FOLDER` makes one"
 
 
 def find_base(name: str) -> Path:
@@ -69,17 +77,66 @@ def find_model(name: str, *, knob: str, needed: str, fix: str) -> Path:
     Raises:
         InputError: There is none.
     """
-    path = _builtin(name, knob) if name.startswith(BUILTIN) else Path(name)
+    path = ASSETS / name.removeprefix(BUILTIN) if name.startswith(BUILTIN) else Path(name)
+    if name.startswith(BUILTIN) and not (path / CONFIG).is_file():
+        there = ", ".join(sorted(f"{BUILTIN}{config.parent.name}" for config in ASSETS.glob(f"*/{CONFIG}")))
+        found = f"no model of that name in the package; it has {there or 'none: install it again, or run `make base`'}"
+        raise InputError(where=f"{knob}: {name}", found=found, needed=_TINY)
     if not path.exists():
         raise InputError(where=f"{knob}: {name}", found="no such file or folder", needed=needed, fix=fix)
     return path
 
 
-def _builtin(name: str, knob: str = "model.base") -> Path:
-    path = ASSETS / name.removeprefix(BUILTIN)
-    if not (path / CONFIG).is_file():
-        there = sorted(f"{BUILTIN}{config.parent.name}" for config in ASSETS.glob(f"*/{CONFIG}"))
-        found = f"no model of that name in the package; it has {', '.join(there) or 'none'}"
-        fix = "" if _TINY in there else f"Install the package again, or make {_TINY} with `make base`"
-        raise InputError(where=f"{knob}: {name}", found=found, needed=_TINY, fix=fix)
-    return path
+def read_model_config(folder: Path, *, needed: str = _NEEDED, fix: str = _FIX) -> dict[str, Any]:
+    """Return the config.json in the folder of a model.
+
+    Raises:
+        InputError: There is none, or it is no JSON object.
+    """
+    try:
+        return read_json_object(folder / CONFIG, needed=needed, fix=fix)
+    except OSError as error:
+        is_missing = isinstance(error, FileNotFoundError | NotADirectoryError)
+        found = "no such file" if is_missing else f"cannot be read ({error})"
+        raise InputError(where=str(folder / CONFIG), found=found, needed=needed, fix=fix) from None
+
+
+def read_sizes(folder: Path) -> ModelSizes:
+    """Read the sizes of the model in a folder.
+
+    Raises:
+        InputError: The folder is not a world model.
+    """
+    where, card = str(folder / CONFIG), read_model_config(folder)
+    if card.get("format") != FORMAT:
+        raise InputError(where=where, found="not the config of a world model", needed=_NEEDED, fix=_FIX)
+    try:
+        return ModelSizes.model_validate_json(json.dumps(card.get("sizes")))
+    except ValidationError as error:
+        said = [f"{'.'.join(map(str, ('sizes', *one['loc'])))}: {message_of(one)}" for one in error.errors()[:4]]
+        raise InputError(where=where, found="; ".join(said), needed=_NEEDED, fix=_FIX) from None
+
+
+def check_sizes(found: ModelSizes, given: ModelSizes, *, where: str) -> None:
+    """Refuse sizes that were given, and are not those of the model.
+
+    Only those other than the default count as given: a run's own config spells out every default.
+
+    Raises:
+        InputError: Names what differs.
+    """
+    actual, wanted, standard = _flat(found), _flat(given), _flat(ModelSizes())
+    wrong = [key for key in actual if wanted[key] not in (actual[key], standard[key])]
+    if wrong:
+        raise InputError(
+            where=where,
+            found=", ".join(f"{key} {actual[key]}" for key in wrong),
+            needed=", ".join(f"{key} {wanted[key]}" for key in wrong) + ", as model.sizes says",
+            fix="Leave them out of model.sizes: the model tells",
+        )
+
+
+def _flat(sizes: ModelSizes) -> dict[str, Any]:
+    nested = sizes.model_dump()
+    flat = {f"{part}.{key}": value for part in ("encoder", "predictor") for key, value in nested.pop(part).items()}
+    return nested | flat

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.config.planning import PlanningConfig
-from vjepa2_ac.data.clips.transforms import Crop, view
 from vjepa2_ac.data.sources.configured_spaces import spaces_of
+from vjepa2_ac.data.transforms import Crop, view
 from vjepa2_ac.encoding.batch import encode_frames
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.input_heads import heads_to_replace, widths_as_text, widths_of_model
@@ -23,17 +23,22 @@ from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.axes.axes_file import no_vertical_axis
 from vjepa2_ac.planning.axes.mapping import Axes
 from vjepa2_ac.planning.energy import Scene, WorldModelCost, distance
-from vjepa2_ac.planning.goals.goal import GoalSequence, patch_weights
-from vjepa2_ac.planning.goals.progress import REACHED, AdvanceRule, GoalProgress
-from vjepa2_ac.planning.goals.sub_goals import GripperMode, SubGoal
+from vjepa2_ac.planning.goals import (
+    REACHED,
+    AdvanceRule,
+    GoalProgress,
+    GoalSequence,
+    GripperMode,
+    SubGoal,
+    patch_weights,
+)
 from vjepa2_ac.planning.input_checks import require_image, require_mask, require_numbers
 from vjepa2_ac.planning.interfaces import Plan
 from vjepa2_ac.planning.model_setup import Fingerprints, prepare_for_planning
 from vjepa2_ac.planning.planner import Cancelled, Planner
-from vjepa2_ac.planning.search_space import SearchSpace, search_space
+from vjepa2_ac.planning.search_space import SearchSpace, Workspace, search_space
 from vjepa2_ac.planning.settings import warn_beyond_taught, with_taught_limits
 from vjepa2_ac.planning.state_integration import states_along
-from vjepa2_ac.planning.workspace import Workspace
 from vjepa2_ac.runs.loading import TrainedRun
 from vjepa2_ac.spaces import EXTRINSICS, POSES, Spaces
 
@@ -95,7 +100,7 @@ class Controller:
         Raises:
             InputError: The model's states and actions are of other spaces, or nobody knows which state follows from an
                 action; or it needs a camera pose and none is given, or the other way round; or its blocks cannot be
-                compiled or quantized to 8 bits; or vectors have no limits, or a workspace; or `planning.axes` are not
+                compiled; or vectors have no limits, or a workspace; or `planning.axes` are not
                 this model's.
         """
         _require_spaces(world_model.sizes, spaces)
@@ -285,7 +290,7 @@ class Controller:
         """Return which goal applies to the current image."""
 
         def energy(place: int) -> float:
-            return float(distance(latents, goal.latents[place], self.config.energy.distance, goal.weights))
+            return float(distance(latents, goal.latents[place], self.config.energy, goal.weights))
 
         if self._progress is None:
             return GoalProgress.first(energy)
@@ -298,7 +303,7 @@ class Controller:
         goal, done = goals.rest(progress.place), self._done - progress.since
         places = tuple(progress.place + goal.place(done + step) for step in range(self.config.horizon))
         wanted = goal.ahead(done, self.config.horizon)
-        still = distance(latents.expand_as(wanted), wanted, self.config.energy.distance, goal.weights)
+        still = distance(latents.expand_as(wanted), wanted, self.config.energy, goal.weights)
         energy = float(still[-1] if self.config.energy.steps == "last" else still.sum())
         reason: Why | None = "at the goal" if progress.done or float(still.max()) <= REACHED else None
         if reason is None and self._workspace is not None and not self._workspace.is_near(state, self.config.limits):
@@ -311,22 +316,26 @@ class Controller:
         generator = torch.Generator().manual_seed(self.seed + self._done)
         before = None if self.decision is None else self.decision.plan
         start = before.start_after(1) if before is not None and self.config.warm_start else None
-        plan = self._planned(state, lambda planner: planner.plan(cost, generator, start, cancelled))
+        plan = self._planned(state, cost, lambda planner: planner.plan(cost, generator, start, cancelled))
         why: Why = "planned" if plan.stopped == "finished" else plan.stopped
         states = states_along(torch.from_numpy(state), plan.actions.double()[None], self.spaces.state)[0]
         action = self._command(state, plan.actions[0].double().numpy())
         return Decision(action, why, energy, places[0], places, plan, states.numpy(), cost)
 
-    def _planned(self, state: np.ndarray, search: Callable[[Planner], Plan]) -> Plan:
-        """Return what a search finds, inside the workspace if there is one."""
+    def _planned(self, state: np.ndarray, cost: WorldModelCost, search: Callable[[Planner], Plan]) -> Plan:
+        """Return what a search finds, inside the workspace if there is one; the energy is of what is sent."""
         planner, box = self.planner, self._workspace
         if box is None:
             return search(planner)
         plan = search(Planner(planner.config, box.narrowed(planner.space, state), planner.clock, planner.progress))
         if plan.stopped == "no finite energy":
             return plan
-        kept = box.kept(state, plan.actions.double().numpy(), self.config.limits)
-        return replace(plan, actions=torch.from_numpy(kept).to(plan.actions))
+        kept = torch.from_numpy(box.kept(state, plan.actions.double().numpy(), self.config.limits)).to(plan.actions)
+        if torch.equal(kept, plan.actions):
+            return plan
+        with torch.no_grad():
+            energy = float(cost(kept[None])[0])
+        return replace(plan, actions=kept, energy=energy, evaluations=plan.evaluations + 1)
 
     def _use(self, gripper: GripperMode | None) -> None:
         """Let the planner search what a gripper mode allows."""

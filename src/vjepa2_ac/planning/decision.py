@@ -3,26 +3,24 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
 from vjepa2_ac.planning.controller import Controller, Decision
-from vjepa2_ac.planning.energy_slices import (
-    FEWEST_NODES,
-    EnergySlice,
-    energy_slices,
-    fitting_nodes,
-    sequences_of_slices,
-)
-from vjepa2_ac.planning.goals.sub_goals import SubGoal
-from vjepa2_ac.planning.interfaces import Cost, Plan
+from vjepa2_ac.planning.energy import FEWEST_NODES, EnergySlice, energy_slices, fitting_nodes, sequences_of_slices
+from vjepa2_ac.planning.goals import SubGoal
+from vjepa2_ac.planning.interfaces import Cost, Iteration, Plan
 from vjepa2_ac.planning.search_space import SearchSpace
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.spaces import StateSpace
+from vjepa2_ac.storage import write_atomically
+from vjepa2_ac.storage.structured import finite_or_none, json_text
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,3 +151,160 @@ def _slices(
         return ()
     task = reporter.task("energy maps", "action sequences")
     return energy_slices(cost, plan.actions, controller.space, axes, nodes=nodes, progress=task)
+
+
+PLAN_FILE = "plan.json"
+FORMAT = 1  # goes up when a reader of the file would have to change
+
+_AT_LIMIT = 0.98  # share of a limit from which an action is said to be at it
+
+
+def write_plan(answer: PlanResult, about: Mapping[str, Any], path: Path) -> Path:
+    """Write a decision as JSON; the file is written atomically.
+
+    Args:
+        answer: The decision.
+        about: The model and the sources of the images, as plain values.
+        path: The file.
+    """
+    write_atomically(path, json_text(plan_as_dict(answer, about)))
+    return path
+
+
+def plan_as_dict(answer: PlanResult, about: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the content of the file; numbers that are not finite are null."""
+    decision, plan, config = answer.decision, answer.decision.plan, answer.controller.config
+    return {
+        "format": FORMAT,
+        "in_words": summarize(answer),
+        **about,
+        "state": _plain(answer.question.state),
+        "durations": list(answer.question.durations),
+        "settings": config.model_dump(mode="json"),
+        "seed": answer.controller.seed,
+        "crop": answer.controller.crop,
+        "why": decision.why,
+        "actions": _plain(answer.actions),
+        "states": _plain(answer.states),
+        "goal_of_each_step": list(decision.goals),
+        "sub_goals": [_sub_goal(one) for one in answer.question.sub_goals],
+        "since": decision.since,
+        "changed": decision.changed,
+        "done": decision.done,
+        "energy": {
+            "now": finite_or_none(decision.energy_now),
+            "began": finite_or_none(decision.began),
+            "doing_nothing": finite_or_none(answer.doing_nothing),
+            "plan": None if plan is None else finite_or_none(plan.energy),
+        },
+        "evaluations": 0 if plan is None else plan.evaluations,
+        "iterations": [] if plan is None else [_iteration(one) for one in plan.iterations],
+        "slices": [_slice(one, answer.state_space.change_names) for one in answer.slices],
+        "seconds": {
+            "goals": answer.seconds.goals,
+            "decision": answer.seconds.decision,
+            "search": 0.0 if plan is None else plan.seconds,
+            "slices": answer.seconds.slices,
+        },
+    }
+
+
+def _sub_goal(one: SubGoal) -> dict[str, Any]:
+    return {name: getattr(one, name) for name in ("name", "at_least", "at_most", "share", "gripper", "floor")}
+
+
+def _iteration(one: Iteration) -> dict[str, Any]:
+    return {
+        "samples": one.samples,
+        "finite": one.finite,
+        "lowest": finite_or_none(one.lowest),
+        "elites_mean": finite_or_none(one.elite_energy),
+        "mean": _plain(one.mean.double().numpy()),
+        "std": _plain(one.std.double().numpy()),
+        "seconds": one.seconds,
+    }
+
+
+def _slice(one: EnergySlice, names: Sequence[str]) -> dict[str, Any]:
+    across, up = (names[axis] for axis in one.axes)
+    return {"across": across, "up": up, across: _plain(one.across), up: _plain(one.up), "energy": _plain(one.energy)}
+
+
+def _plain(values: np.ndarray) -> Any:
+    return [_plain(row) if row.ndim else finite_or_none(float(row)) for row in np.asarray(values, dtype=np.float64)]
+
+
+def summarize(answer: PlanResult) -> str:
+    """Return the decision as one or more sentences."""
+    plan, why = answer.decision.plan, answer.decision.why
+    if why == "outside the workspace":
+        return (
+            "Does nothing: the robot is farther outside planning.limits.workspace than an action leads. Move it back by"
+            " hand, or correct the box."
+        )
+    if why == "at the goal" or plan is None:
+        return "Does nothing: what the model sees now is what it sees in the goal image."
+    if why == "no finite energy":
+        return (
+            "Does nothing: the model gives no finite energy for any of"
+            f" {plan.evaluations:,} action sequences. It is broken; another checkpoint may not be."
+        )
+    return " ".join([_motion(answer), _energy(answer, plan), _effort(answer, plan), *_warnings(answer, plan)])
+
+
+def _motion(answer: PlanResult) -> str:
+    space, change, steps = answer.state_space, answer.states[-1] - answer.states[0], len(answer.actions)
+    shown = change[list(answer.shown_axes)] * (space.shown_factor if space.is_pose else 1.0)
+    names = [space.change_names[axis] for axis in answer.shown_axes]
+    lasting = f"in {steps} model step{'s' * (steps > 1)}"
+    if not space.is_pose:
+        parts = ", ".join(f"{name} by {value:+.3g}" for name, value in zip(names, shown, strict=True))
+        more = ", ..." if len(answer.space.free) > len(names) else ""
+        return f"Changes {parts}{more} {lasting}."
+    parts = ", ".join(f"{name} {value:+.1f}" for name, value in zip(names, shown, strict=True))
+    gripper = 0.0 if space.gripper is None else change[space.gripper]
+    grips = f", gripper {gripper:+.2f}" if gripper else ""
+    return f"Goes {np.linalg.norm(shown):.1f} {space.shown_unit} {lasting} ({parts} {space.shown_unit}{grips})."
+
+
+def _energy(answer: PlanResult, plan: Plan) -> str:
+    now = answer.decision.energy_now
+    change = f" ({plan.energy / now - 1:+.0%})" if now else ""
+    return (
+        f"Energy {now:.4f} now, {plan.energy:.4f} predicted{change};"
+        f" {answer.doing_nothing:.4f} predicted when doing nothing."
+    )
+
+
+def _effort(answer: PlanResult, plan: Plan) -> str:
+    rounds = len(plan.iterations)
+    return (
+        f"Planner {plan.planner}, seed {plan.seed}: {plan.evaluations:,} action sequences in {rounds}"
+        f" iteration{'s' * (rounds > 1)}, {answer.seconds.decision:.2f} s."
+    )
+
+
+def _warnings(answer: PlanResult, plan: Plan) -> list[str]:
+    found = []
+    if plan.stopped == "out of time":
+        most = answer.controller.config.iterations
+        found.append(f"Time was up after {len(plan.iterations)} of {most} iterations: the best so far.")
+    if not plan.energy < answer.doing_nothing:
+        found.append("None of the evaluated actions is predicted to be better than doing nothing.")
+    if at_limit := axes_at_limit(answer):
+        knob = f"planning.limits.{'xyz' if answer.state_space.is_pose else 'axes'}"
+        found.append(f"The first action is at its limit along {', '.join(at_limit)} ({knob}).")
+    if answer.unused_goals and not answer.question.sub_goals:  # of these everybody knows that the others come later
+        unused = ", ".join(str(place + 1) for place in answer.unused_goals)
+        found.append(f"No part in this plan has goal {unused}: see durations, planning.horizon, planning.energy.steps.")
+    return found
+
+
+def axes_at_limit(answer: PlanResult) -> list[str]:
+    """Return the numbers, of a position or of a vector, whose first change is at its limit."""
+    upper, space = answer.space.upper[0].numpy(), answer.state_space
+    numbers = answer.shown_axes if space.is_pose else range(len(space))
+    return [
+        space.change_names[number] for number in numbers
+        if upper[number] > 0 and abs(answer.actions[0, number]) >= _AT_LIMIT * upper[number]
+    ]  # fmt: skip

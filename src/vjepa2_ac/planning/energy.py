@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from itertools import combinations
+from math import comb
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -14,11 +17,14 @@ from torch.utils.checkpoint import checkpoint
 from vjepa2_ac.config.planning import EnergyConfig
 from vjepa2_ac.distances import absolute_difference, squared_difference
 from vjepa2_ac.episode import Progress, no_progress
-from vjepa2_ac.model.network.kv_cache import KeyValueCache
+from vjepa2_ac.model.network.predictor_network import KeyValueCache
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.axes.mapping import Axes
-from vjepa2_ac.planning.goals.goal import Goal
+from vjepa2_ac.planning.goals import Goal
+from vjepa2_ac.planning.interfaces import Cost, reporting
+from vjepa2_ac.planning.search_space import SearchSpace
 from vjepa2_ac.planning.state_integration import states_along
+from vjepa2_ac.registry import ENERGIES
 from vjepa2_ac.spaces import POSES, Spaces
 
 
@@ -123,7 +129,7 @@ class WorldModelCost:
         wanted = self._goal.ahead(self._done, actions.shape[1])
         if self._config.steps == "last":
             predicted, wanted = predicted[:, -1:], wanted[-1:]
-        far = distance(predicted, wanted, self._config.distance, self._goal.weights)
+        far = distance(predicted, wanted, self._config, self._goal.weights)
         return far.sum(dim=1)
 
     @torch.no_grad()
@@ -143,20 +149,111 @@ class WorldModelCost:
 def distance(
     predicted: Float[Tensor, "*batch tokens dim"],
     wanted: Float[Tensor, "*wanted tokens dim"],
-    kind: Literal["l1", "l2", "cosine"],
+    energy: EnergyConfig,
     weights: Float[Tensor, " tokens"] | None = None,
 ) -> Float[Tensor, "*batch"]:
-    """Return the distance between latents, over patches by weight (None: equal weights).
+    """Return the distance between latents that a config names, over patches by weight (None: equal weights)."""
+    by_token: Tensor = ENERGIES.function(energy.distance, energy.options)(predicted, wanted)
+    return by_token.mean(dim=-1) if weights is None else (by_token * (weights / weights.sum())).sum(dim=-1)
 
-    l1: mean absolute difference. l2: mean square. cosine: 1 - cosine of each token.
+
+def mean_difference(
+    predicted: Float[Tensor, "*batch tokens dim"], wanted: Float[Tensor, "*wanted tokens dim"]
+) -> Float[Tensor, "*batch tokens"]:
+    """Return the mean absolute difference of each token.
 
     Source: facebookresearch/vjepa2 @ c2963a4, notebooks/utils/mpc_utils.py, l1.
     """
-    if kind == "cosine":
-        by_token = 1 - cosine_similarity(predicted, wanted, dim=-1)
-    else:
-        by_number = absolute_difference if kind == "l1" else squared_difference
-        by_token = by_number(predicted, wanted).mean(dim=-1)
-    if weights is None:
-        return by_token.mean(dim=-1)
-    return (by_token * (weights / weights.sum())).sum(dim=-1)
+    return absolute_difference(predicted, wanted).mean(dim=-1)
+
+
+def mean_square(
+    predicted: Float[Tensor, "*batch tokens dim"], wanted: Float[Tensor, "*wanted tokens dim"]
+) -> Float[Tensor, "*batch tokens"]:
+    """Return the mean squared difference of each token."""
+    return squared_difference(predicted, wanted).mean(dim=-1)
+
+
+def one_minus_cosine(
+    predicted: Float[Tensor, "*batch tokens dim"], wanted: Float[Tensor, "*wanted tokens dim"]
+) -> Float[Tensor, "*batch tokens"]:
+    """Return 1 - cosine of each token."""
+    return 1 - cosine_similarity(predicted, wanted, dim=-1)
+
+
+_BEYOND = 1.25  # how far a slice reaches beyond the limits
+_LEAST = 0.05  # metres: half the width of a slice along an axis that is held
+FEWEST_NODES, _MOST_NODES = 5, 13  # of those that are chosen by what they cost
+
+
+@dataclass(frozen=True)
+class EnergySlice:
+    """Energies over two numbers of the first action, all other components of the plan unchanged."""
+
+    axes: tuple[int, int]  # which they are
+    across: Float[np.ndarray, " nodes"]  # values along the first of them
+    up: Float[np.ndarray, " nodes"]
+    energy: Float[np.ndarray, "nodes nodes"]  # [up, across]; NaN where the model gives none
+
+
+def sequences_of_slices(nodes: int, axes: int) -> int:
+    """Return how many action sequences the slices over each pair of some axes evaluate."""
+    return comb(axes, 2) * nodes**2
+
+
+def fitting_nodes(sequences: int, axes: int) -> int:
+    """Return the nodes along each axis of slices that evaluate no more than so many action sequences; 0: none do.
+
+    They are odd, so that no motion is one of them, and 5 to 13.
+    """
+    choices = range(_MOST_NODES, FEWEST_NODES - 1, -2)
+    return next((nodes for nodes in choices if sequences_of_slices(nodes, axes) <= sequences), 0)
+
+
+def energy_slices(
+    cost: Cost,
+    actions: Float[Tensor, "steps dim"],
+    space: SearchSpace,
+    axes: Sequence[int] = (0, 1, 2),
+    *,
+    nodes: int,
+    progress: Progress = no_progress,
+) -> tuple[EnergySlice, ...]:
+    """Return the energy around a plan's first action: over each pair of some numbers of it, such as dx and dy.
+
+    Limits are ignored, to show what is beyond them. A first action that is repeated changes as one.
+
+    Args:
+        cost: The energy of action sequences.
+        actions: The plan.
+        space: Its limits say how far the slices reach.
+        axes: The numbers.
+        nodes: Along each axis.
+        progress: Called with the number of evaluated action sequences.
+
+    Raises:
+        ValueError: Fewer than three nodes.
+    """
+    if nodes < 3:
+        raise ValueError(f"{nodes} nodes")
+    total, slices = sequences_of_slices(nodes, len(axes)), []
+    progress(0, total)
+    for number, pair in enumerate(combinations(axes, 2)):
+        with reporting(cost, progress, done=number * nodes**2, share=nodes**2, total=total):
+            slices.append(_slice(cost, actions, space, pair, nodes))
+    return tuple(slices)
+
+
+@torch.no_grad()
+def _slice(cost: Cost, actions: Tensor, space: SearchSpace, axes: tuple[int, int], nodes: int) -> EnergySlice:
+    across, up = (_BEYOND * _half_width(space, axis, axes) * torch.linspace(-1, 1, nodes) for axis in axes)
+    evaluated = actions.repeat(nodes * nodes, 1, 1)
+    evaluated[:, : space.repeat, axes[0]] = across.repeat(nodes)[:, None]
+    evaluated[:, : space.repeat, axes[1]] = up.repeat_interleave(nodes)[:, None]
+    energy = cost(evaluated).float().cpu().reshape(nodes, nodes)
+    return EnergySlice(axes, across.double().numpy(), up.double().numpy(), energy.double().numpy())
+
+
+def _half_width(space: SearchSpace, axis: int, axes: Sequence[int]) -> float:
+    reach = float(torch.maximum(space.upper[0, axis].abs(), space.lower[0, axis].abs()))
+    return reach or max(*(float(space.upper[0, one]) for one in axes), _LEAST)

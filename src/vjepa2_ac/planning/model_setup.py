@@ -1,4 +1,4 @@
-"""Model setup for planning: merged, in eval mode; on request compiled or quantized to 8 bits."""
+"""Model setup for planning: merged, in eval mode; on request compiled."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.model.adapter.merging import unadapted_copy
 from vjepa2_ac.model.network.compilation import require_compiler
 from vjepa2_ac.model.network.world_model import WorldModel, fingerprint
-from vjepa2_ac.model.quantization import quantized_copy
 
 
 class Fingerprints(NamedTuple):
@@ -30,7 +29,7 @@ class Fingerprints(NamedTuple):
 
 
 def prepare_for_planning(world_model: WorldModel, config: PlanningConfig) -> WorldModel:
-    """Return the model for planning: the same, or a copy that shares its encoder, for an adapted or quantized one.
+    """Return the model for planning: the same, or a copy that shares its encoder, for an adapted one.
 
     Trained weights are float32, and planning does not use autocast as training does: unmerged, PEFT computes an
     adapter in float32, and a predictor that was trained whole takes float32 throughout. So it is merged and computes in
@@ -40,12 +39,9 @@ def prepare_for_planning(world_model: WorldModel, config: PlanningConfig) -> Wor
     lost to rounding (below 0.2 % of a weight) are below bfloat16's noise in the output of a layer.
 
     Raises:
-        InputError: Its blocks are to be compiled or quantized and cannot be: a library or a feature of the device is
-            missing, or its weights are of another type.
+        InputError: Its blocks are to be compiled, and there is no compiler.
     """
-    if config.quantize != "off":
-        world_model = quantized_copy(world_model, config.quantize, where="planning.quantize")
-    elif world_model.adaptation is not None:
+    if world_model.adaptation is not None:
         world_model = unadapted_copy(world_model)
     if config.compile == "blocks":
         require_compiler(world_model.device.type, where="planning.compile")

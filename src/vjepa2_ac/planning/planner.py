@@ -15,22 +15,11 @@ from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.planning.interfaces import Cost, Iteration, Plan, PlanStart, SearchCancelledError, Stopped, reporting
 from vjepa2_ac.planning.search_space import SearchSpace, pose_space
-from vjepa2_ac.planning.solvers.base import EvaluatedPlans, Solver
-from vjepa2_ac.planning.solvers.cem import CemSolver
-from vjepa2_ac.planning.solvers.gradient import GradientSolver
-from vjepa2_ac.planning.solvers.icem import IcemSolver
-from vjepa2_ac.planning.solvers.mppi import MppiSolver
+from vjepa2_ac.planning.solvers import EvaluatedPlans, Solver
+from vjepa2_ac.registry import PLANNERS
 
 Clock = Callable[[], float]  # seconds, from anywhere
 Cancelled = Callable[[], bool]  # whether nobody waits for the plan any more
-MakeSolver = Callable[[SearchSpace, PlanningConfig, Generator, PlanStart | None], Solver]
-
-SOLVERS: dict[str, MakeSolver] = {  # what `planning.planner` names
-    "cem": lambda space, config, *rest: CemSolver(space, config.cem, config.samples, *rest),
-    "icem": lambda space, config, *rest: IcemSolver(space, config.icem, config.samples, config.iterations, *rest),
-    "mppi": lambda space, config, *rest: MppiSolver(space, config.mppi, config.samples, *rest),
-    "gradient": lambda space, config, *rest: GradientSolver(space, config.gradient, config.iterations, *rest),
-}
 
 
 class Planner:
@@ -77,7 +66,8 @@ class Planner:
         began = self.clock()
         if start is not None and start.mean.shape != self.space.lower.shape:
             raise ValueError(f"a start of {tuple(start.mean.shape)} for {tuple(self.space.lower.shape)} decisions")
-        search = SOLVERS[self.config.planner](self.space, self.config, generator, start)
+        options = PLANNERS.options(self.config.planner, self.config.planner_options)
+        search: Solver = PLANNERS.find(self.config.planner)(self.space, self.config, generator, start, **options)
         record: list[Iteration] = []
         best = _Best()
         shares, total = self.config.sequences, sum(self.config.sequences)

@@ -19,10 +19,9 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.merging import merge_adapter
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.model.quantization import require_8_bits
 from vjepa2_ac.planning.controller import Controller, rules_of
-from vjepa2_ac.planning.goals.folder import GoalFolder
-from vjepa2_ac.planning.goals.sub_goals import SubGoal
+from vjepa2_ac.planning.goal_folder import GoalFolder
+from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.planning.model_setup import Fingerprints
 from vjepa2_ac.planning.settings import planning_settings, warn_beyond_taught
 from vjepa2_ac.runs.checkpoint import SELECTED
@@ -141,11 +140,8 @@ def _device_to_plan_on(config: Config) -> torch.device:
     """Return the device, after checking that it supports the type used in planning, without autocast.
 
     Raises:
-        InputError: It does not, or it does not support the requested 8 bits.
+        InputError: It does not.
     """
     device = torch.device("cpu" if is_on_cpu(config.training) else "cuda")
     require_type_of_weights(config.model, device)
-    kind = config.planning.quantize
-    if kind != "off":
-        require_8_bits(kind, getattr(torch, config.model.dtype), device, where="planning.quantize")
     return device

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.config.effects import Affects, mark_of, names_that_affect
 from vjepa2_ac.config.loading import config_from, load_config_of_run
 from vjepa2_ac.config.planning import LimitsConfig
+from vjepa2_ac.config.section import Affects, mark_of, names_that_affect
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.places import literal
 from vjepa2_ac.planning.axes.axes_file import require_axes

@@ -218,7 +218,7 @@ def written_state(checkpoint: Path) -> RunState:
     """
     path = checkpoint / STATE
     try:
-        values = read_json_object(path, needed=_NEEDED, fix=_FIX, allow_nan=True)  # a loss scale may be infinite
+        values = read_json_object(path, needed=_NEEDED, fix=_FIX)  # a loss scale may be infinite
     except OSError as error:
         raise InputError(where=str(path), found=f"cannot be read ({error})", needed=_NEEDED, fix=_FIX) from None
     return record_of(RunState, values, where=str(path), needed=_NEEDED, fix=_FIX)

@@ -34,8 +34,8 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.config.effects import Affects, mark_of
 from vjepa2_ac.config.loading import changed_keys, config_as_flat_dict, config_as_yaml, load_config_of_run
+from vjepa2_ac.config.section import Affects, mark_of
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.places import BUILTIN, is_url, literal
 from vjepa2_ac.runs.checkpoint import CHECKPOINTS, remove_leavings

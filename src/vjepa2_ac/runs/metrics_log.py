@@ -126,7 +126,7 @@ def read_metrics_log(path: Path) -> Iterator[dict[str, Any]]:
         return
     for line in read_bounded(path, _MOST_BYTES).decode(errors="replace").splitlines():
         try:
-            row = json_object(line, where=str(path), allow_nan=True)
+            row = json_object(line, where=str(path))
         except InputError:
             row = {}
         if type(row.get("step")) is int and isinstance(row.get("kind"), str):

@@ -9,10 +9,9 @@ from typing import Any, Self
 
 import numpy as np
 
-from vjepa2_ac.errors import InputError, UnreachableError
-from vjepa2_ac.planning.goals.sub_goals import SubGoal
+from vjepa2_ac.errors import InputError, UnreachableError, require_library
+from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.serving.wire import MOST_BYTES, pack, require_msgpack, unpack
-from vjepa2_ac.storage.libraries import require_library
 
 
 class PlanningClient:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.planning.goals.sub_goals import GripperMode, SubGoal
+from vjepa2_ac.planning.goals import GripperMode, SubGoal
 
 IMAGE_KEYS = ("observation/exterior_image_1_left", "observation/exterior_image_0_left", "observation/image")
 """Where the picture of the camera is looked for: the first that is there. DROID's, RoboArena's, everybody's."""

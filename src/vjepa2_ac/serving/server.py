@@ -8,16 +8,15 @@ import http
 import signal
 import ssl
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, require_library
 from vjepa2_ac.serving.access import Access
-from vjepa2_ac.serving.prometheus import Histogram, counter, plain, text
+from vjepa2_ac.serving.session import Counts, GoneError
 from vjepa2_ac.serving.wire import MOST_BYTES, pack
-from vjepa2_ac.serving.worker import GoneError, Worker
-from vjepa2_ac.storage.libraries import require_library
 
 if TYPE_CHECKING:  # PyTorch is imported with the model, when the server listens
     from vjepa2_ac.serving.session import Session
@@ -62,12 +61,12 @@ class PlanningServer:
             tell: Takes a line for whoever started it.
         """
         self._load, self._options, self._tell = load, options, tell
-        self._worker = Worker()
+        self._planning = ThreadPoolExecutor(1, "planning")
         self._served: Served | None = None
         self._ready: asyncio.Event = asyncio.Event()
         self._robot: str | None = None  # the address of the one that is served
-        self._seconds = Histogram()
         self._turned_away: dict[str, int] = {}
+        self._metrics = _Metrics(self)
 
     async def run(self, stop: asyncio.Event) -> bool:
         """Listen until `stop`; return whether the planning thread has ended, too.
@@ -103,11 +102,18 @@ class PlanningServer:
         finally:
             server.close()
             await server.wait_closed()
-            ended = await asyncio.to_thread(self._worker.end, _END_S)
+            ended = await self._end_planning()
         return ended
 
+    async def _end_planning(self) -> bool:
+        """Let the planning thread end; return whether it did in time."""
+        last = asyncio.wrap_future(self._planning.submit(int))
+        self._planning.shutdown(wait=False)
+        done, _ = await asyncio.wait([last], timeout=_END_S)
+        return bool(done)
+
     async def _serve(self, stop: asyncio.Event) -> None:
-        loading = asyncio.wrap_future(self._worker.submit(self._load))
+        loading = asyncio.wrap_future(self._planning.submit(self._load))
         stopping = asyncio.ensure_future(stop.wait())
         await _first_of(loading, stopping)
         if stop.is_set():
@@ -129,7 +135,7 @@ class PlanningServer:
             return connection.respond(ready, "ready\n" if is_ready else "loading\n")
         refused: tuple[int, str] | None = self._options.access.why_not(host, authorization)
         if refused is None and path == "/metrics":
-            return connection.respond(http.HTTPStatus.OK, self._figures())
+            return connection.respond(http.HTTPStatus.OK, self._metrics.text())
         if refused is None and path != "/":
             return connection.respond(http.HTTPStatus.NOT_FOUND, "no such page\n")
         if refused is None and self._robot is not None and request.headers.get_all("Upgrade"):
@@ -158,7 +164,7 @@ class PlanningServer:
 
     async def _serve_robot(self, connection: Any, left: asyncio.Future[None], served: Served) -> None:
         self._tell(f"{self._robot} is here")
-        await asyncio.wrap_future(self._worker.submit(served.session.begin))
+        await asyncio.wrap_future(self._planning.submit(served.session.begin))
         closed = require_library("websockets.exceptions", where="serve", called="websockets", extra="serve")
         with contextlib.suppress(closed.ConnectionClosed):
             await connection.send(pack(served.metadata))
@@ -175,7 +181,7 @@ class PlanningServer:
     async def _answer(self, message: bytes, left: asyncio.Future[None], session: Session) -> bytes | str | None:
         """Return the answer to a message; None: the robot has left, and its search ends within an iteration."""
         gone = threading.Event()
-        answering = asyncio.wrap_future(self._worker.submit(lambda: session.answer(message, gone.is_set)))
+        answering = asyncio.wrap_future(self._planning.submit(lambda: session.answer(message, gone.is_set)))
         try:
             await _first_of(answering, left)
         finally:
@@ -186,24 +192,65 @@ class PlanningServer:
         except GoneError:
             return None
 
-    def _figures(self) -> str:
-        counts = None if self._served is None else self._served.session.counts
-        if counts is not None:
-            seconds, counts.seconds = counts.seconds, []
-            for one in seconds:
-                self._seconds.add(one)
-        decisions = {} if counts is None else dict(counts.decisions)
-        refused, failed, episodes = (0, 0, 0) if counts is None else (counts.refused, counts.failed, counts.episodes)
-        return text([
-            plain("ready", "1 once requests are answered.", float(self._ready.is_set())),
-            plain("robots", "Robots that are connected.", float(self._robot is not None)),
-            counter("decisions_total", "Decisions, by their reason.", decisions, "why"),
-            plain("requests_refused_total", "Requests that could not be used.", refused, "counter"),
-            plain("requests_failed_total", "Requests at which the server failed.", failed, "counter"),
-            plain("episodes_total", "Episodes that were begun.", episodes, "counter"),
-            counter("connections_refused_total", "Connections, by HTTP status.", self._turned_away, "status"),
-            self._seconds.lines("decision_seconds", "Duration of a decision."),
-        ])  # fmt: skip
+    @property
+    def counts(self) -> Counts:
+        """What was answered since the start."""
+        return Counts() if self._served is None else self._served.session.counts
+
+    @property
+    def state(self) -> dict[str, bool]:
+        """Whether requests are answered, and whether a robot is connected."""
+        return {"ready": self._ready.is_set(), "robots": self._robot is not None}
+
+    @property
+    def turned_away(self) -> dict[str, int]:
+        """Connections that were refused, by HTTP status."""
+        return self._turned_away
+
+
+class _Metrics:
+    """The metrics of a server in Prometheus' text format."""
+
+    def __init__(self, server: PlanningServer) -> None:
+        self._server = server
+        self._library = require_library(
+            "prometheus_client", where="serve", called="prometheus-client, which writes /metrics", extra="serve"
+        )
+        self._registry = self._library.CollectorRegistry()
+        self._registry.register(self)
+        about = {"registry": self._registry, "buckets": (0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30, 60)}
+        self._seconds = self._library.Histogram("vjepa2_ac_decision_seconds", "Duration of a decision.", **about)
+
+    def text(self) -> str:
+        """Return the page."""
+        counts = self._server.counts
+        seconds, counts.seconds = counts.seconds, []
+        for one in seconds:
+            self._seconds.observe(one)
+        return str(self._library.generate_latest(self._registry).decode())
+
+    def collect(self) -> Iterator[Any]:
+        """Yield the metrics that are read when the page is made."""
+        families, counts = self._library.metrics_core, self._server.counts
+        abouts = {"ready": "1 once requests are answered.", "robots": "Robots that are connected."}
+        for name, holds in self._server.state.items():
+            yield families.GaugeMetricFamily(f"vjepa2_ac_{name}", abouts[name], value=float(holds))
+        numbers = {
+            "requests_refused": ("Requests that could not be used.", counts.refused),
+            "requests_failed": ("Requests at which the server failed.", counts.failed),
+            "episodes": ("Episodes that were begun.", counts.episodes),
+        }
+        for name, (about, value) in numbers.items():
+            yield families.CounterMetricFamily(f"vjepa2_ac_{name}", about, value=value)
+        labelled = {
+            "decisions": ("Decisions, by their reason.", "why", counts.decisions),
+            "connections_refused": ("Connections, by HTTP status.", "status", self._server.turned_away),
+        }
+        for name, (about, label, values) in labelled.items():
+            family = families.CounterMetricFamily(f"vjepa2_ac_{name}", about, labels=[label])
+            for key, value in sorted(dict(values).items()):
+                family.add_metric([key], value)
+            yield family
 
 
 def serve(load: Callable[[], Served], options: ServerOptions, tell: Callable[[str], None]) -> bool:

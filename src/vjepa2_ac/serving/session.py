@@ -17,14 +17,12 @@ from jaxtyping import Float
 
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.controller import Controller, Decision
-from vjepa2_ac.planning.goals.sub_goals import SubGoal
+from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.planning.interfaces import SearchCancelledError
-from vjepa2_ac.serving.bounds import why_not_sent
+from vjepa2_ac.serving.motion import waypoints, why_not_sent
 from vjepa2_ac.serving.recording import Recorder
 from vjepa2_ac.serving.request import IMAGE_KEYS, GivenGoal, NamedGoal, Request, read_request
-from vjepa2_ac.serving.waypoints import waypoints
 from vjepa2_ac.serving.wire import WireError, pack, unpack
-from vjepa2_ac.serving.worker import GoneError
 from vjepa2_ac.storage.structured import finite_or_none
 
 logger = logging.getLogger(__name__)
@@ -57,6 +55,10 @@ class Counts:
     failed: int = 0
     episodes: int = 0
     seconds: list[float] = field(default_factory=list)  # of each decision since it was last read
+
+
+class GoneError(Exception):
+    """Nobody waits for the answer any more."""
 
 
 class Session:

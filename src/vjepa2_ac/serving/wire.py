@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from vjepa2_ac.storage.libraries import require_library
+from vjepa2_ac.errors import require_library
 
 MOST_BYTES = 32 << 20  # of a message: eight pictures of 1280 x 720 pixels
 MOST_PARTS = 256  # maps and lists of a message, arrays included

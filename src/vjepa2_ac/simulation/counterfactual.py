@@ -27,8 +27,6 @@ RECORDED_CAMERAS = {"exterior_1_left": "exterior_1", "exterior_2_left": "exterio
 """Camera of a data set, as in `data.fields.cameras` -> camera of the simulated arm."""
 
 _STATE_TOLERANCE = 1e-5  # metres, radians, closedness: recorded states are float32, other libraries round otherwise
-_TILE = 4  # pixels: JPEG libraries differ in pixels, another scene in whole tiles
-_FRAME_TOLERANCE = 12.0  # grey levels, of the mean over a tile
 
 
 @dataclass(frozen=True)
@@ -124,13 +122,13 @@ def resimulate(folder: str | Path, episode: Episode, start: int, camera: str = "
 
     Args:
         folder: Of the data set, with its `simulation.json`.
-        episode: As its source reads it, with the frames of this camera.
+        episode: As its source reads it.
         start: Control step from which other actions are taken.
         camera: Of the data set, as in `data.fields.cameras`.
 
     Raises:
         InputError: The data set was not simulated, or does not say how; it has no such episode, step or camera; or the
-            simulation shows another state or frame than was recorded. Or MuJoCo or OpenGL is missing.
+            simulation comes to another state than was recorded. Or MuJoCo is missing.
     """
     simulation = read_simulation(folder)
     number, steps = simulation.number_of(episode.info.id), simulation.spec.steps
@@ -161,21 +159,6 @@ def _require_same(outcome: Outcome, episode: Episode, start: int, where: str, si
     if off.max() > _STATE_TOLERANCE:
         found = f"simulated again, the state differs by up to {off.max():.2g}"
         raise InputError(where=where, found=found, needed=needed, fix=fix)
-    frame = episode.read_frames([start])[0]
-    if frame.shape != outcome.frames[0].shape:
-        found = f"simulated again, a frame of shape {outcome.frames[0].shape}"
-        fix = "Give the frames of the data set itself, not those of a cache"
-        raise InputError(where=where, found=found, needed=f"{frame.shape}, as was given", fix=fix)
-    if (levels := _tiles_differ_by(frame, outcome.frames[0])) > _FRAME_TOLERANCE:
-        found = f"simulated again, the frame differs by {levels:.0f} grey levels somewhere"
-        raise InputError(where=where, found=found, needed=needed, fix=fix)
-
-
-def _tiles_differ_by(first: UInt8[np.ndarray, "height width 3"], second: UInt8[np.ndarray, "height width 3"]) -> float:
-    """Return the largest mean absolute difference of a tile of two images."""
-    height, width = (side // _TILE for side in first.shape[:2])
-    off = np.abs(first.astype(np.int16) - second)[: height * _TILE, : width * _TILE]
-    return float(off.reshape(height, _TILE, width, _TILE, 3).mean(axis=(1, 3, 4)).max())
 
 
 def _through_jpeg(images: list[UInt8[np.ndarray, "height width 3"]]) -> UInt8[np.ndarray, "time height width 3"]:

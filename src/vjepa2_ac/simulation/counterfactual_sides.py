@@ -19,9 +19,9 @@ from jaxtyping import Float
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.planning import LimitsConfig
-from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
-from vjepa2_ac.data.clips.loader import batches_of, validation_windows
-from vjepa2_ac.data.clips.transforms import frames_as_seen, view
+from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.loader import batches_of, validation_windows
+from vjepa2_ac.data.transforms import frames_as_seen, view
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
 from vjepa2_ac.decoding.frame_pairs import as_images
 from vjepa2_ac.decoding.imagine import Start, imagined_latents
@@ -33,11 +33,11 @@ from vjepa2_ac.evaluation.decoded_rollouts.setup import fitted_probe
 from vjepa2_ac.evaluation.request import EvaluationOptions, settle
 from vjepa2_ac.evaluation.subject import Subject, load_subject
 from vjepa2_ac.intervals import Estimate, share_of
-from vjepa2_ac.planning.counterfactual.named_actions import STEP_M, named_actions
+from vjepa2_ac.planning.counterfactual import STEP_M, named_actions
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
 from vjepa2_ac.simulation.counterfactual import Outcome, resimulate
 from vjepa2_ac.simulation.hand_in_images import hand_positions
-from vjepa2_ac.simulation.world.projection import HAND_MIDDLE_M
+from vjepa2_ac.simulation.world.camera import HAND_MIDDLE_M
 
 AXES: Mapping[str, tuple[str, str]] = {"x": ("forward", "back"), "y": ("left", "right"), "z": ("up", "down")}
 """Axis of the robot base frame -> the named actions along it."""

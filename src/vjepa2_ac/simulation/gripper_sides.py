@@ -30,7 +30,7 @@ from vjepa2_ac.simulation.counterfactual_sides import (
     SidesOptions,
     open_setup,
 )
-from vjepa2_ac.simulation.world.projection import FINGERS_MIDDLE_M
+from vjepa2_ac.simulation.world.camera import FINGERS_MIDDLE_M
 
 ACTIONS = ("open", "close")
 TRUE_FRAMES = "true_frames"

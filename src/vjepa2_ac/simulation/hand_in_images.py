@@ -7,14 +7,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from vjepa2_ac.data.clips.dataset import Dataset
-from vjepa2_ac.data.clips.transforms import Crop, crop_box
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.transforms import Crop, crop_box
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.decoded.hand import HandPositions
 from vjepa2_ac.simulation.counterfactual import RECORDED_CAMERAS, camera_of
 from vjepa2_ac.simulation.recording.simulation_file import SIMULATION_FILE, read_simulation
-from vjepa2_ac.simulation.world.camera import FRAME_SIZE
-from vjepa2_ac.simulation.world.projection import HAND_MIDDLE_M, hand_pixels
+from vjepa2_ac.simulation.world.camera import FRAME_SIZE, HAND_MIDDLE_M, hand_pixels
 
 _FIXED = "exterior"
 

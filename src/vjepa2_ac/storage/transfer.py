@@ -18,11 +18,9 @@ from typing import TypeVar
 
 from vjepa2_ac.errors import RefusedError, UnreachableError
 from vjepa2_ac.places import is_url
-from vjepa2_ac.storage.reading import join
-from vjepa2_ac.storage.remote import ranged_reads, retries
-from vjepa2_ac.storage.remote.filesystems import ask, login_hint, send, sizes_below
-from vjepa2_ac.storage.remote.retries import RetryPolicy
-from vjepa2_ac.storage.writing import atomic_writer, try_writing_at
+from vjepa2_ac.storage import remote, retries
+from vjepa2_ac.storage.files import atomic_writer, join, try_writing_at
+from vjepa2_ac.storage.retries import RetryPolicy
 
 _T = TypeVar("_T")
 
@@ -54,7 +52,7 @@ def upload(source: Path, target: str) -> None:
     allowed_s = source.stat().st_size / _SLOWEST_BYTES_PER_S
     policy = replace(retries.DEFAULT, timeout_s=retries.DEFAULT.timeout_s + allowed_s)
     try:
-        _persist(target, lambda timeout_s: send(source, target, timeout_s), policy)
+        _persist(target, lambda timeout_s: remote.send(source, target, timeout_s), policy)
     except FileNotFoundError:
         if not source.is_file():
             raise
@@ -73,10 +71,10 @@ def download(source: str, target: Path) -> None:
         with Path(source).open("rb") as file, atomic_writer(target) as copy:
             shutil.copyfileobj(file, copy)
         return
-    size = ranged_reads.file_size(source)
+    size = remote.file_size(source)
     with atomic_writer(target) as copy:
         for start in range(0, size, _PIECE_BYTES):
-            copy.write(ranged_reads.read_range(source, start, min(_PIECE_BYTES, size - start)))
+            copy.write(remote.read_range(source, start, min(_PIECE_BYTES, size - start)))
 
 
 def remove(path: str) -> None:
@@ -87,7 +85,7 @@ def remove(path: str) -> None:
     """
     if is_url(path):
         with suppress(FileNotFoundError):
-            _persist(path, lambda timeout_s: ask(path, "rm_file", timeout_s, writing=True), retries.DEFAULT)
+            _persist(path, lambda timeout_s: remote.ask(path, "rm_file", timeout_s, writing=True), retries.DEFAULT)
         return
     with _explained(path):
         Path(path).unlink(missing_ok=True)
@@ -118,7 +116,7 @@ def file_sizes(folder: str) -> dict[str, int]:
             files = [path for path in Path(folder).rglob("*") if path.is_file()]
             return {path.relative_to(folder).as_posix(): path.stat().st_size for path in files}
     try:
-        return _persist(folder, lambda timeout_s: sizes_below(folder, timeout_s), retries.DEFAULT, doing="read")
+        return _persist(folder, lambda timeout_s: remote.sizes_below(folder, timeout_s), retries.DEFAULT, doing="read")
     except FileNotFoundError:
         if folder.startswith(("gs://", "gcs://")):  # which has no folders: only buckets can be missing
             raise _no_bucket(folder) from None
@@ -136,10 +134,10 @@ def try_writing(folder: str) -> None:
             try_writing_at(Path(folder))
         return
     trial = join(folder, f".write-check-{secrets.token_hex(8)}")
-    with tempfile.TemporaryDirectory() as here:
-        source = Path(here) / "trial"
-        source.write_bytes(b"This file of vjepa2-ac may be removed.\n")
-        upload(source, trial)
+    with tempfile.NamedTemporaryFile() as source:
+        source.write(b"This file of vjepa2-ac may be removed.\n")
+        source.flush()
+        upload(Path(source.name), trial)
     remove(trial)
 
 
@@ -155,7 +153,7 @@ def _explained(path: str) -> Iterator[None]:
 
 def _persist(url: str, action: Callable[[float], _T], policy: RetryPolicy, doing: str = "written") -> _T:
     try:
-        return retries.with_retries(url, action, policy=policy, access=login_hint(url), doing=doing)
+        return retries.with_retries(url, action, policy=policy, access=remote.login_hint(url), doing=doing)
     except NotImplementedError:
         found = f"{url.partition('://')[0]}:// cannot be written"
         raise RefusedError(where=url, found=found, needed="a folder of this machine, gs:// or s3://") from None

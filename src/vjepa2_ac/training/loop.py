@@ -128,7 +128,7 @@ def _train(run: Run, opened: OpenRun | None, first: Validation | None, reporter:
 
 def _write_measured(run: Run) -> None:
     """Write what the data and the base have shown: the metrics of a chosen stride, and what the actions teach."""
-    from vjepa2_ac.data.inspection.statistics import coverage_in
+    from vjepa2_ac.data.coverage import coverage_in
 
     folder = run.folder
     if run.calibration is not None:

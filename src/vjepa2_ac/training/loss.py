@@ -12,10 +12,11 @@ from torch import Tensor, nn
 from torch.nn.functional import smooth_l1_loss
 
 from vjepa2_ac.config import TrainingConfig
-from vjepa2_ac.distances import absolute_difference, squared_difference
+from vjepa2_ac.distances import absolute_difference
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.model.network.dynamics import LatentDynamics
-from vjepa2_ac.model.network.kv_cache import KeyValueCache
+from vjepa2_ac.model.network.predictor_network import KeyValueCache
+from vjepa2_ac.registry import LOSSES
 
 Distance = Callable[[Tensor, Tensor], Tensor]  # of predicted and true latents, number by number
 
@@ -48,7 +49,7 @@ class Objective(nn.Module):
         self.world_model = world_model
         self.weights = (training.teacher_forcing_weight, training.rollout_weight)
         self.rollout_steps = training.rollout_steps if training.rollout_weight else 1  # weight 0: no cost
-        self.distance = LOSSES[training.loss](training)
+        self.distance = distance_of(training)
 
     def forward(self, batch: LatentBatch) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
         """Return (teacher forcing, rollout), each times its weight, so that the loss is their sum.
@@ -91,15 +92,14 @@ def prediction_losses(
     )
 
 
-def _smooth_difference(
+def distance_of(training: TrainingConfig) -> Distance:
+    """Return what `training.loss` names."""
+    distance = LOSSES.function(training.loss, training.loss_options)
+    return partial(distance, beta=training.smooth_l1_beta) if training.loss == "smooth_l1" else distance
+
+
+def smooth_difference(
     predicted: Float[Tensor, "batch time tokens dim"], true: Float[Tensor, "batch time tokens dim"], beta: float
 ) -> Float[Tensor, "batch time tokens dim"]:
     """Return d**2 / (2 * beta) where a difference d is below beta, and d - beta / 2 above, computed in float32."""
     return smooth_l1_loss(predicted.float(), true.float(), reduction="none", beta=beta)
-
-
-LOSSES: dict[str, Callable[[TrainingConfig], Distance]] = {  # what `training.loss` names
-    "l1": lambda _: absolute_difference,
-    "l2": lambda _: squared_difference,
-    "smooth_l1": lambda training: partial(_smooth_difference, beta=training.smooth_l1_beta),
-}

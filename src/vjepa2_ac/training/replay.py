@@ -7,8 +7,8 @@ import math
 import numpy as np
 
 from vjepa2_ac.config.replay import ReplayConfig
-from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
-from vjepa2_ac.data.filters.exclusion import named
+from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.selection import named
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.reporter import INDEXING, Reporter

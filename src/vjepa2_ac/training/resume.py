@@ -12,11 +12,11 @@ from typing import Any
 import torch
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.config.effects import Affects, knobs_that_affect
 from vjepa2_ac.config.loading import flat
-from vjepa2_ac.data.clips.dataset import Dataset
-from vjepa2_ac.data.clips.loader import validation_windows
+from vjepa2_ac.config.section import Affects, knobs_that_affect
+from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.index.index_cache import fingerprints_of
+from vjepa2_ac.data.loader import validation_windows
 from vjepa2_ac.distributed.processes import broadcast_object, broadcast_tensors, first_only, require_same
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.lora import load_trained, save_trained

@@ -16,10 +16,9 @@ from torch import nn
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
-from vjepa2_ac.data.clips.loader import Mixed, ProcessShare, training_loader, validation_batches
-from vjepa2_ac.data.clips.prefetch import Batches
-from vjepa2_ac.data.clips.streams import Copies, copies_for
+from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.loader import Batches, Mixed, ProcessShare, training_loader, validation_batches
+from vjepa2_ac.data.streams import Copies, copies_for
 from vjepa2_ac.distributed.device import PRECISIONS
 from vjepa2_ac.distributed.processes import broadcast_object, first_of_machine, make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, extrinsics_for, require_same_encoder
@@ -31,7 +30,7 @@ from vjepa2_ac.model.checkpoints.loading import base_sizes, load_base
 from vjepa2_ac.model.network.input_heads import fit_heads, heads_to_replace, require_trained
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
-from vjepa2_ac.runs.checkpoint import ADAPTER, CHECKPOINTS, RunState, newest_checkpoint
+from vjepa2_ac.runs.checkpoint import RunState
 from vjepa2_ac.runs.folder import with_stride
 from vjepa2_ac.training.loss import Objective
 from vjepa2_ac.training.optim import make_optimizer, trained_parameters
@@ -168,7 +167,7 @@ def open_model(data: RunData, reporter: Reporter = SILENT, *, check_only: bool =
         replayed = _with_latents(alone, replayed, world_model, accelerator, reporter, check_only=check_only)
         _require_fitting_clips(dataset, replayed, _first_of(dataset, "train"))
     _fit_heads(world_model, config, dataset, reporter)
-    add_adapter(world_model, config.adapter, seed=config.seed, started=_started(config))
+    add_adapter(world_model, config.adapter, seed=config.seed)
     reporter.note(str(trainable_report(world_model)))
     if unusual := config.adapter.out_of_line:
         reporter.note(f"Warning: {unusual}.")
@@ -226,7 +225,7 @@ def _open_data_sets(config: Config, reporter: Reporter) -> tuple[Dataset, Datase
 
 
 def _report_duplicates(dataset: Dataset, reporter: Reporter) -> None:
-    from vjepa2_ac.data.inspection.duplicates import find_duplicates
+    from vjepa2_ac.data.duplicates import find_duplicates
 
     if (duplicates := find_duplicates(dataset)).episodes:
         reporter.note(f"Warning: {duplicates}.")
@@ -288,14 +287,6 @@ def _strip_of(decoder: TrainedDecoder | None, dataset: Dataset, model: WorldMode
     from vjepa2_ac.training.imagined_strip import ImaginedStrip
 
     return ImaginedStrip(decoder, dataset, model.image_size)
-
-
-def _started(config: Config) -> Path | None:
-    """Return the adapter of the checkpoint, if knowing it saves minutes: PiSSA starts from its initial weights."""
-    if config.adapter.init != "pissa":
-        return None
-    checkpoint = newest_checkpoint(Path(config.run_dir) / CHECKPOINTS)
-    return checkpoint / ADAPTER if checkpoint else None
 
 
 def _read_one_clip_of_each_split(dataset: Dataset) -> Batch:

@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from vjepa2_ac.data.clips.prefetch import prefetch_next
+from vjepa2_ac.data.loader import prefetch_next
 from vjepa2_ac.data.sources.latents.dtypes import unpack_latents
 from vjepa2_ac.distributed.processes import all_gather_object, all_reduce_gradients, all_reduce_sum, raise_first
 from vjepa2_ac.episode import Batch, StoredLatents

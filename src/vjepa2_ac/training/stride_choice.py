@@ -7,7 +7,7 @@ from dataclasses import replace
 from accelerate import Accelerator
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.data.clips.dataset import Dataset
+from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.measure import ClipSample
 from vjepa2_ac.evaluation.stride_calibration.measure import Calibration, calibrate_model

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-from vjepa2_ac.data.clips.loader import batches_of, validation_windows
-from vjepa2_ac.data.clips.windows import spread
+from vjepa2_ac.data.loader import batches_of, validation_windows
+from vjepa2_ac.data.windows import spread
 from vjepa2_ac.distributed.processes import agreed, broadcast_object
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.errors import InputError
@@ -96,7 +96,7 @@ def validate(run: Run, reporter: TrainingReporter) -> Validation:
 
 def _measured(run: Run) -> Validation:
     windows = validation_windows(run.dataset, "validation", clips=run.config.validation.clips)
-    batches = batches_of(run.dataset, windows, batch_size=run.config.validation.batch_size, copies=run.copies)
+    batches = batches_of(run.dataset, windows, batch_size=run.config.validation.batch_size)
     moves: list[RolloutStart] = []
     encoded = (run.strip.seen(batch, encode(run, batch)) if run.strip else encode(run, batch) for batch in batches)
     errors = prediction_errors(run.world_model, _moves_kept(run, encoded, len(windows), moves))

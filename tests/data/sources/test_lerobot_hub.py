@@ -17,7 +17,7 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.lerobot.source import LeRobotSource
 from vjepa2_ac.errors import InputError, UnreachableError
-from vjepa2_ac.storage.remote import retries
+from vjepa2_ac.storage import retries
 
 LENGTHS = (12, 13, 14, 15, 16)
 

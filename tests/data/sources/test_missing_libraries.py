@@ -9,7 +9,7 @@ import pytest
 from clips import clip_at
 from lerobot_sets import recorded, write_v21
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
+from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.errors import UnreachableError
 

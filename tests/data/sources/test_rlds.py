@@ -370,7 +370,7 @@ def test_a_folder_without_a_data_set_says_where_one_is(droid: Path, tmp_path: Pa
     ("text", "message"),
     [
         ("{", "not JSON"),
-        ("[" * 20_000, "too deep"),
+        ("[" * 20_000, "not JSON"),
         ("[]", "a JSON list"),
         ('{"name": "a"}', "not a description"),
         ('{"name": "a", "splits": []}', "no episodes"),

@@ -256,7 +256,7 @@ def test_a_network_that_stays_away_is_named_and_breaks_no_episode(
 def test_a_bucket_or_a_permission_that_is_missing_is_named(
     droid: Path, far: Callable[..., RldsSource], gcs: Gcs
 ) -> None:
-    with pytest.raises(UnreachableError, match="no bucket nobody"):
+    with pytest.raises(InputError, match="gs://nobody/droid does not exist"):
         RldsSource(DataConfig(path="gs://nobody/droid")).infos()
     source = far(droid)
     with pytest.raises(InputError, match=r"gs://robots/droid.*did you mean gs://robots/droid/1\.0\.0\?"):

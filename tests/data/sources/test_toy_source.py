@@ -6,11 +6,11 @@ from itertools import islice
 import pytest
 
 from vjepa2_ac.config import Config, DataConfig
-from vjepa2_ac.config.effects import Affects, mark_of, marks_of
 from vjepa2_ac.config.loading import config_as_yaml, load_config, parse_config
 from vjepa2_ac.config.replay import ReplayConfig
-from vjepa2_ac.data.clips.dataset import open_dataset
-from vjepa2_ac.data.clips.loader import training_loader
+from vjepa2_ac.config.section import Affects, mark_of, marks_of
+from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.data.loader import training_loader
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.training.loop import train
 
@@ -65,13 +65,3 @@ def test_what_is_wrong_with_its_knobs_is_told_as_of_any_form() -> None:
 def test_it_is_gone_afterwards() -> None:
     with pytest.raises(InputError, match=r"data\.source: Input should be 'rlds' or .* or 'latents' \(found 'toy'\)"):
         parse_config(values(), where="here")
-
-
-def test_runs_of_earlier_versions_have_the_sections_of_all_forms_and_are_read() -> None:
-    old = values(source="npz", fields=DataConfig(path="a").own_section["fields"].model_dump(mode="json"))
-    assert parse_config(old, where="here").data.source == "npz"
-    old["data"]["fields"]["gripper"] = "openness"
-    with pytest.raises(InputError, match=r"data\.fields: a section of source rlds"):
-        parse_config(old, where="here")
-    old["data"]["source"] = "latents"
-    assert parse_config(old, where="here").data.is_cache, "a cache of any form: two knobs change, the rest may stay"

@@ -11,7 +11,7 @@ from vector_sets import write_vectors
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_yaml
-from vjepa2_ac.data.clips.dataset import open_dataset
+from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.evaluation.data_variants.from_config import probe_config
 from vjepa2_ac.evaluation.data_variants.measure import VariantProbe, VariantResult
 from vjepa2_ac.intervals import Estimate

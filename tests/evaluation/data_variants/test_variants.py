@@ -12,9 +12,8 @@ from torch import Tensor
 from memory_source import MemorySource
 from moving_arms import STEPS, spot_states
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.clips.dataset import Dataset
-from vjepa2_ac.data.filters.broken_episodes import BrokenEpisodes
-from vjepa2_ac.data.filters.step_ranges import StepSelection
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.selection import BrokenEpisodes, StepSelection
 from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, LatentBatch, StepRanges
 from vjepa2_ac.evaluation.data_variants.measure import VariantProbe, VariantResult, probe_variants, rows_of
 from vjepa2_ac.evaluation.data_variants.variants import mirrored, variants_of

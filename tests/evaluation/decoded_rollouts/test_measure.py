@@ -9,7 +9,7 @@ import torch
 
 from decoded_worlds import Known, clips, contenders, decoder
 from tiny_models import tiny_model
-from vjepa2_ac.data.clips.transforms import images_to_input
+from vjepa2_ac.data.transforms import images_to_input
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.evaluation.decoded.estimates import (
     cycle_of,

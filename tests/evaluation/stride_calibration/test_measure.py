@@ -8,10 +8,9 @@ import torch
 from torch import Tensor
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.clips.dataset import Dataset
-from vjepa2_ac.data.filters.broken_episodes import BrokenEpisodes
-from vjepa2_ac.data.filters.step_ranges import StepSelection
+from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.index.episode_table import EpisodeTable
+from vjepa2_ac.data.selection import BrokenEpisodes, StepSelection
 from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, LatentBatch, Progress, StepRanges, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.measure import ClipSample
@@ -177,7 +176,7 @@ def test_clips_that_cannot_be_read_are_left_out_and_all_of_them_are_an_error(mon
                 raise InputError(where=f"track {index}", found="damaged")
             return super().read(index, camera, needed)
 
-    monkeypatch.setattr("vjepa2_ac.data.filters.broken_episodes.MOST_BROKEN", 1.0)
+    monkeypatch.setattr("vjepa2_ac.data.selection.MOST_BROKEN", 1.0)
     monkeypatch.setattr(Dataset, "control_rate_hz", 15.0)
     dataset = dataset_of(Damaged([80] * 20), broken_episodes="skip")
     damaged = {int(dataset.windows("validation").episodes[0])}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -20,8 +19,7 @@ from paths import GOLDEN
 from vjepa2_ac.config import EncoderSizes, ModelConfig
 from vjepa2_ac.errors import InputError, RefusedError, UnreachableError
 from vjepa2_ac.model.base_model import find_base
-from vjepa2_ac.model.checkpoints.loading import load_base
-from vjepa2_ac.model.checkpoints.official import load_official, to_official
+from vjepa2_ac.model.checkpoints.loading import load_base, load_official, to_official
 from vjepa2_ac.model.network.encoder_origin import beyond_tensors, identified
 from vjepa2_ac.model.network.world_model import WorldModel, fingerprint
 
@@ -114,28 +112,6 @@ def test_norms_of_lower_levels_are_where_they_belong() -> None:
     norms = [*encoder.vit.level_norms, encoder.vit.layernorm]
     found = torch.cat([norm(level) for norm, level in zip(norms, levels, strict=True)], dim=-1)
     assert_equal_to_rounding(found, io[name])
-
-
-def test_the_file_says_what_it_is(golden: Golden) -> None:
-    sizes, constructor = model_of(golden.path).sizes.encoder, golden.facts["constructor"]
-    assert (sizes.width, sizes.depth, sizes.heads) == tuple(
-        constructor[name] for name in ("embed_dim", "depth", "num_heads")
-    )
-    assert sizes.family == ("v2.1" if golden.is_newer else "v2")
-    assert round(sizes.width * sizes.mlp_ratio) == golden.facts["mlp_hidden"]
-
-
-def test_in_bfloat16_the_weights_are_rounded(golden: Golden) -> None:
-    exact, rounded = model_of(golden.path).encoder, model_of(golden.path, dtype="bfloat16").encoder
-    for name, value in rounded.state_dict().items():
-        assert torch.equal(value, exact.state_dict()[name].bfloat16()), name
-
-
-def test_a_fresh_predictor_is_the_same_for_the_same_seed_and_the_encoder_is_the_files(golden: Golden) -> None:
-    first, again = model_of(golden.path), model_of(golden.path)
-    assert first.predictor_fingerprint() == again.predictor_fingerprint()
-    assert first.encoder_fingerprint() == again.encoder_fingerprint()
-    assert not any(value.requires_grad for value in first.parameters())
 
 
 # Every other form of file gives the same latents.
@@ -300,15 +276,15 @@ def only_predictor(whole: dict[str, Any]) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (without_last_norm, r"without norms_block\.3, its last norm.*get the original"),
-        (of_both, r"tensors of V-JEPA 2\.1 \(img_mod_embed\) and of V-JEPA 2 \(norm\.weight\) together"),
+        (without_last_norm, r"missing: norms_block\.3\.bias.*Get the original"),
+        (of_both, r"1 tensors do not fit \(unknown: norm\.weight\)"),
         (with_another_tensor, r"ema_encoder: 1 tensors do not fit \(unknown: cls_token\)"),
         (without_a_block, r"12 tensors do not fit \(missing: blocks\.7\."),
         (not_finite, r"blocks\.3|layer\.3\.mlp\.fc1\.weight holds NaN or infinity"),
         (only_predictor, r"no encoder \(keys: predictor\).*download --list"),
         (lambda _: [1], "a list. needed: an encoder of V-JEPA 2 or 2.1"),
-        (lambda _: {"encoder": {"a": 1}}, "encoder: no weights"),
-        (lambda _: {"encoder": {"a": torch.zeros(1)}}, "no last norm"),
+        (lambda _: {"encoder": {"a": 1}}, "no weights under 'encoder'"),
+        (lambda _: {"encoder": {"a": torch.zeros(1)}}, "no tensor 'patch_embed.proj.weight'"),
     ],
 )
 def test_a_file_that_is_not_a_whole_encoder_is_refused(rewritten, change: Any, message: str) -> None:
@@ -321,8 +297,8 @@ def test_a_file_that_is_not_a_whole_encoder_is_refused(rewritten, change: Any, m
     [
         (V21, {"heads": None}, "width 64, whose attention heads the tensors do not show.*Set model.encoder.heads"),
         (V21, {"heads": 5}, "64 is not a multiple of encoder.heads 5"),
-        (V2, {"frame": "image"}, "an encoder of V-JEPA 2. needed: one of V-JEPA 2.1: only it has a path for single"),
-        (V2, {"key": "ema_encoder"}, r"no ema_encoder \(encoders: target_encoder, encoder\).*Set model.encoder.key"),
+        (V2, {"frame": "image"}, "V-JEPA 2 has no path for images"),
+        (V2, {"key": "ema_encoder"}, r"no ema_encoder .*Set model.encoder.key"),
     ],
 )
 def test_a_config_that_contradicts_the_file_is_refused(path: Path, encoder: dict[str, Any], message: str) -> None:
@@ -333,7 +309,7 @@ def test_a_config_that_contradicts_the_file_is_refused(path: Path, encoder: dict
 @pytest.mark.parametrize(
     ("card", "message"),
     [
-        ({"model_type": "vit"}, "a model of type 'vit'"),
+        ({"model_type": "vit"}, "model_type: Input should be 'vjepa2'"),
         ({"num_attention_heads": 4}, "48"),
         ({"hidden_size": 96}, "do not fit"),
         ({"tubelet_size": 4}, "tubelet_size"),
@@ -372,32 +348,9 @@ def test_a_folder_that_is_damaged_or_hostile_is_refused(tmp_path: Path) -> None:
         model_of(folder, key="encoder")
 
 
-def test_a_truncated_file_and_one_that_would_run_code_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "cut.pt").write_bytes(V2.read_bytes()[:100_000])
-    with pytest.raises(InputError, match="truncated, or of another kind"):
-        model_of(tmp_path / "cut.pt")
-    with pytest.raises(InputError, match=r"no such file or folder.*download --list"):
-        model_of(tmp_path / "none.pt")
-
-
-def test_a_published_name_on_another_encoder_is_refused(tmp_path: Path) -> None:
-    """Vitg (1 B) and vitG (2 B) differ by the case of a letter, which a disk may be blind to."""
-    for name in ("vjepa2_1_vitG_384.pt", "vjepa2.1-vitg-1b-384.pt", "vitl.pt"):
-        shutil.copyfile(V21, tmp_path / name)
-        with pytest.raises(InputError, match=r"as the name says.*(Rename it|give this file another name)"):
-            model_of(tmp_path / name, heads=4)
-
-
 def test_pretrainings_masked_predictor_is_not_taken_for_one_of_actions() -> None:
     with pytest.raises(InputError, match=r"knows no actions.*set model\.encoder\.path to this file"):
         load_base(ModelConfig(base=str(V21)), seed=0)
-
-
-def test_sizes_that_are_no_multiple_of_a_patch_are_refused() -> None:
-    with pytest.raises(ValueError, match="image_size 90 is not a multiple of patch_size 16"):
-        model_of(V21, 90)
-    with pytest.raises(InputError, match="one patch"):
-        model_of(V21, 16)
 
 
 def test_two_encoders_of_the_same_tensors_and_other_latents_are_two() -> None:
@@ -418,9 +371,9 @@ def test_the_encoder_of_a_model_stays_the_same_encoder_under_another_predictor()
 
 
 def test_only_the_encoder_is_read_from_a_large_file(tmp_path: Path) -> None:
-    """Peak memory is the encoder and a group of tensors, whatever the optimizer's part of the file is."""
+    """Peak memory is the encoder, whatever the optimizer's part of the file is."""
     whole = torch.load(V21, weights_only=True)
-    whole["opt"] = {"state": {0: {"exp_avg": torch.zeros(75_000_000)}}}  # 300 MB
+    whole["opt"] = {"state": {0: {"exp_avg": torch.zeros(40_000_000)}}}  # 160 MB
     torch.save(whole, tmp_path / "large.pt")
     code = f"""
 import resource, torch
@@ -433,4 +386,4 @@ load_base(ModelConfig.model_validate(model), seed=0)
 print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
-    assert int(done.stdout) < 200e6
+    assert int(done.stdout) < 120e6

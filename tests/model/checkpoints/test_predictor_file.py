@@ -12,8 +12,7 @@ from predictor_files import write_predictor_file
 from tiny_models import draw, tiny_model
 from vjepa2_ac.config import EncoderSizes, ModelConfig, ModelSizes, PredictorSizes
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.checkpoints.loading import load_base
-from vjepa2_ac.model.checkpoints.official import load_official
+from vjepa2_ac.model.checkpoints.loading import load_base, load_official
 from vjepa2_ac.model.network.world_model import WorldModel
 
 MODEL = tiny_model(states=False)
@@ -53,19 +52,18 @@ def test_it_predicts_as_the_model_that_was_written_and_its_licence_is_told_once(
     assert f"{file} does not say which encoder its predictor was trained on" in unknown
 
 
-def test_in_bfloat16_its_weights_are_rounded(file: Path, encoder: Path) -> None:
-    model = loaded(file, encoder, dtype="bfloat16")
-    for name, value in model.predictor.state_dict().items():
-        assert torch.equal(value, MODEL.predictor.state_dict()[name].bfloat16()), name
-
-
 def test_what_does_not_fit_is_refused(file: Path, encoder: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"predictor\.use_extrinsics|predictor: 2 tensors do not fit"):
         loaded(file, encoder, sizes={"image_size": 48, "predictor": {"width": 36, "heads": 3, "use_extrinsics": True}})
     with pytest.raises(InputError, match=r"no weights under 'encoder' \(keys: predictor, opt, scaler, epoch\)"):
         load_official(file, MODEL.sizes)
     wider = WorldModel.random(
-        ModelSizes(image_size=48, encoder=EncoderSizes(width=48, depth=1, heads=2, mlp_ratio=2.0)), seed=0
+        ModelSizes(
+            image_size=48,
+            encoder=EncoderSizes(width=48, depth=1, heads=2, mlp_ratio=2.0),
+            predictor=PredictorSizes(width=36, depth=1, heads=3),
+        ),
+        seed=0,
     )
     wider.save_pretrained(tmp_path / "wider")
     with pytest.raises(InputError, match=r"a predictor of latents of width 24. needed: one of width 48"):

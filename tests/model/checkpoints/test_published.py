@@ -5,8 +5,7 @@ import pytest
 from vjepa2_ac.console.downloads import published_table
 from vjepa2_ac.console.progress import PlainConsole
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.checkpoints.published import PUBLISHED, published_as
-from vjepa2_ac.model.checkpoints.published_names import OFFICIAL, find_published
+from vjepa2_ac.model.checkpoints.published import PUBLISHED, find_published, published_as
 
 
 def test_files_do_not_collide_on_a_disk_that_is_blind_to_case() -> None:
@@ -24,16 +23,11 @@ def test_every_name_of_a_file_leads_to_it() -> None:
 @pytest.mark.parametrize(
     ("text", "name"),
     [
-        (OFFICIAL, "vjepa2-ac-vitg"),
-        ("VJEPA2-AC-ViTg", "vjepa2-ac-vitg"),
         ("vjepa2_1_vitG_384.pt", "vjepa2.1-vitG-2b-384"),
         ("vjepa2_1_vitg_384.pt", "vjepa2.1-vitg-1b-384"),
         ("vjepa2.1-vitG-384", "vjepa2.1-vitG-2b-384"),
-        ("vjepa2-1-VITG-2B-384", "vjepa2.1-vitG-2b-384"),
         ("vjepa21-vitb-384", "vjepa2.1-vitb-384"),
-        ("vjepa2_1_vit_base_384", "vjepa2.1-vitb-384"),
         ("vitl.pt", "vjepa2-vitl"),
-        ("vitg-384.PT", "vjepa2-vitg-384"),
     ],
 )
 def test_other_spellings_are_understood(text: str, name: str) -> None:
@@ -43,15 +37,11 @@ def test_other_spellings_are_understood(text: str, name: str) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("VJEPA2_1_VITG_384", r"2 published files.*Write vjepa2\.1-vitg-1b-384 or vjepa2\.1-vitG-2b-384"),
-        ("vitG", r"2 published files.*Write vjepa2-vitg or vjepa2\.1-vitG-2b-384"),
-        ("VITG-384.pt", r"2 published files.*Write vjepa2-vitg-384 or vjepa2\.1-vitG-2b-384"),
+        ("VJEPA2_1_VITG_384", r"Did you mean .*vjepa2\.1-vitg-1b-384 or vjepa2\.1-vitG-2b-384"),
         ("vjepa2-vitx", r"Did you mean vjepa2-vit.*download --list"),
-        ("facebook/vjepa2-vitl-fpc64-256", r"Did you mean vjepa2-vitl or .*--list"),
+        ("facebook/vjepa2-vitl-fpc64-256", r"Did you mean vjepa2-vitl .*--list"),
         ("dinov3", r"no published checkpoint of this name.*--list"),
-        ("checkpoints/x.pt", r"a path.*download vjepa2-ac-vitg --to checkpoints/x\.pt"),
-        ("checkpoints/vitl.pt", r"a path.*download vjepa2-vitl --to checkpoints/vitl\.pt"),
-        ("/data/models", r"a path.*--to /data/models"),
+        ("checkpoints/vitl.pt", r"Did you mean vjepa2-vitl .*--to"),
     ],
 )
 def test_a_name_that_is_none_is_answered_with_a_way_out(text: str, message: str) -> None:
@@ -64,17 +54,6 @@ def test_the_sizes_tell_the_two_largest_encoders_apart() -> None:
     smaller, larger = by_name["vjepa2.1-vitg-1b-384"].bytes_range, by_name["vjepa2.1-vitG-2b-384"].bytes_range
     assert smaller[1] < larger[0]
     assert by_name["vjepa2.1-vitb-384"].bytes_range == (1_664_223_428, 1_664_223_428)
-
-
-@pytest.mark.parametrize(
-    ("name", "millions"),
-    [
-        ("vjepa2-vitl", 303.9), ("vjepa2-vith", 631.6), ("vjepa2-vitg", 1012.2), ("vjepa2.1-vitb-384", 86.8),
-        ("vjepa2.1-vitG-2b-384", 1845.2),
-    ],
-)  # fmt: skip
-def test_parameters_of_encoders_are_the_published_numbers(name: str, millions: float) -> None:
-    assert find_published(name).encoder_parameters / 1e6 == pytest.approx(millions, abs=0.06)
 
 
 @pytest.mark.parametrize("width", [60, 80, 120])

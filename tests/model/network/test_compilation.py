@@ -12,7 +12,7 @@ from tracing import tracing
 from vjepa2_ac.config import AdapterConfig, ModelSizes
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.model.adapter.lora import add_adapter
-from vjepa2_ac.model.network import blocks, compilation
+from vjepa2_ac.model.network import compilation
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.training.loss import prediction_losses
 
@@ -83,28 +83,6 @@ def test_compiled_steps_with_dropout_and_autocast_are_the_plain_ones(sizes: Mode
         assert_same(loss_and_gradients(model, batch, compiled=True), expected)
     assert not counters["graph_break"]
     assert graphs() == before
-
-
-@pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Compile nothing, and tell what was asked for."""
-    names: list[str] = []
-    monkeypatch.setattr(blocks, "compiled", lambda function, **_: names.append(function.__name__) or function)
-    return names
-
-
-def test_only_with_gradients_and_only_if_asked_for_a_block_is_compiled(
-    sizes: ModelSizes, inputs, asked: list[str]
-) -> None:
-    model = adapted(sizes)
-    given = (inputs.latents, inputs.actions, inputs.states)
-    model.predict(*given)
-    model.set_compiled("with gradients")
-    with torch.no_grad():
-        model.predict(*given)
-    assert not asked
-    model.predict(*given)
-    assert asked == ["_before_attention", "_after_attention"] * sizes.predictor.depth
 
 
 def test_what_a_machine_lacks_to_compile_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

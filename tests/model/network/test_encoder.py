@@ -5,8 +5,6 @@ import pytest
 import torch
 from transformers import VJEPA2Model
 
-from vjepa2_ac.model.network import encoder
-from vjepa2_ac.model.network.rotary import RotaryTables, rotate
 from vjepa2_ac.model.network.world_model import WorldModel
 
 
@@ -22,13 +20,6 @@ def test_chunks_change_nothing(model: WorldModel, inputs, chunk: int) -> None:
     torch.testing.assert_close(
         model.encode(inputs.frames, chunk=chunk), model.encode(inputs.frames), rtol=1e-5, atol=1e-5
     )
-
-
-def test_no_more_than_a_chunk_goes_through_the_network_at_once(model: WorldModel, inputs) -> None:
-    seen: list[int] = []
-    model.encoder.vit.register_forward_pre_hook(lambda _, given: seen.append(len(given[0])))
-    model.encode(inputs.frames, chunk=3)
-    assert seen == [3, 3, 2]
 
 
 def test_latents_are_normalised(model: WorldModel, inputs) -> None:
@@ -48,40 +39,6 @@ def test_the_encoder_stays_frozen_and_in_eval_mode_while_the_model_trains(model:
 def test_frames_of_another_size_are_refused(model: WorldModel) -> None:
     with pytest.raises(ValueError, match="64 x 64 px; this encoder needs 48 x 48 px"):
         model.encode(torch.zeros(1, 1, 3, 64, 64))
-
-
-def test_every_layer_turns_queries_and_keys_by_exact_positions_in_bfloat16(
-    fresh: Callable[..., WorldModel], inputs, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    turned: list[torch.Tensor] = []
-
-    def watched(tokens: torch.Tensor, tables: RotaryTables) -> torch.Tensor:
-        turned.append(tables.cosine)
-        return rotate(tokens, tables)
-
-    monkeypatch.setattr(encoder, "rotate", watched)
-    fresh(dtype=torch.bfloat16).encode(inputs.frames[:1, :1])
-    assert len(turned) == 2 * 2  # layers x (query, key)
-    assert all(cosine.dtype == torch.float32 for cosine in turned)
-
-
-def test_bfloat16_weights_give_almost_the_same_latents(fresh: Callable[..., WorldModel], inputs) -> None:
-    latents = fresh(dtype=torch.bfloat16).encode(inputs.frames)
-    assert latents.dtype == torch.float32
-    assert (latents - fresh().encode(inputs.frames)).abs().mean() < 0.01
-
-
-@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float32])
-def test_features_are_float32_and_layers_of_autocasts_own_type_do_without_it(
-    fresh: Callable[..., WorldModel], inputs, dtype: torch.dtype
-) -> None:
-    network, autocast = fresh(dtype=dtype).present_encoder, []
-    network.vit.layer[0].register_forward_hook(lambda *_: autocast.append(torch.is_autocast_enabled("cpu")))
-    with torch.autocast("cpu", torch.bfloat16):
-        features = network(inputs.frames.flatten(0, 1))
-    assert autocast == [dtype != torch.bfloat16]
-    assert features.dtype == torch.float32
-    assert not torch.equal(features, features.bfloat16())
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
@@ -125,16 +82,3 @@ def test_a_video_of_two_equal_frames_is_the_still_frame(model: WorldModel, input
     still = model.present_encoder(frames)
     video = model.present_encoder.encode_videos(frames[:, None].expand(-1, 2, -1, -1, -1))
     torch.testing.assert_close(video, still, rtol=1e-5, atol=1e-5)
-
-
-def test_videos_do_not_see_each_other_and_are_encoded_in_parts(model: WorldModel, inputs) -> None:
-    together = model.present_encoder.encode_videos(inputs.frames, chunk=100)
-    alone = [model.present_encoder.encode_videos(video[None], chunk=1) for video in inputs.frames]
-    torch.testing.assert_close(together, torch.cat(alone), rtol=1e-5, atol=1e-5)
-
-
-def test_a_video_of_an_odd_number_of_frames_or_of_another_size_is_refused(model: WorldModel, inputs) -> None:
-    with pytest.raises(ValueError, match="3 frames; tubelets are of 2"):
-        model.present_encoder.encode_videos(inputs.frames[:, :3])
-    with pytest.raises(ValueError, match="this encoder needs 48 x 48 px"):
-        model.present_encoder.encode_videos(torch.zeros(1, 2, 3, 64, 64))

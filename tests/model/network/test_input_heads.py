@@ -1,6 +1,5 @@
 """Properties of fresh input heads: for robots with other states or actions than the base."""
 
-import json
 from pathlib import Path
 
 import pytest
@@ -13,7 +12,6 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.lora import add_adapter, load_trained, save_trained
 from vjepa2_ac.model.adapter.merging import base_only, merge_adapter
 from vjepa2_ac.model.checkpoints.loading import load_base
-from vjepa2_ac.model.checkpoints.official import to_official
 from vjepa2_ac.model.network.input_heads import fit_heads, heads_to_replace, widths_of_model
 from vjepa2_ac.model.network.predictor import ActionConditionedPredictor
 from vjepa2_ac.model.network.world_model import WorldModel
@@ -84,15 +82,6 @@ def test_only_heads_that_do_not_fit_are_replaced_and_each_is_told(widths: Widths
     assert predict(model, widths).shape == (1, 3, 4, 24)
 
 
-def test_heads_that_fit_stay_bit_for_bit() -> None:
-    model = base()
-    assert fit_heads(model, Widths(7, 7), seed=0) == []
-    assert model.fresh_heads is None
-    assert model.sizes == TINY
-    for name, value in base().predictor.state_dict().items():
-        assert torch.equal(model.predictor.state_dict()[name], value)
-
-
 def test_fresh_heads_are_decided_by_the_seed_and_drawn_as_the_recipe_draws() -> None:
     one, same, other = fitted(Widths(14, 14)), fitted(Widths(14, 14)), fitted(Widths(14, 14), seed=1)
     for name in HEADS:
@@ -103,11 +92,6 @@ def test_fresh_heads_are_decided_by_the_seed_and_drawn_as_the_recipe_draws() -> 
         assert not getattr(one.predictor, name).bias.any()
     assert not torch.equal(one.predictor.action_encoder.weight, one.predictor.state_encoder.weight)
     assert torch.equal(fitted(Widths(7, 14)).predictor.action_encoder.weight, one.predictor.action_encoder.weight)
-
-
-@widths
-def test_fresh_heads_do_not_change_which_base_it_is(widths: Widths) -> None:
-    assert fitted(widths).predictor_fingerprint() == base().predictor_fingerprint()
 
 
 def test_heads_are_replaced_once_and_before_adapting() -> None:
@@ -175,45 +159,3 @@ def test_merged_it_is_a_base_of_its_own_that_folders_keep(
     torch.testing.assert_close(predict(loaded, widths), before, atol=1e-5, rtol=1e-5)
     alone = ActionConditionedPredictor.from_pretrained(tmp_path / "predictor")
     assert (alone.state_encoder.in_features, alone.action_encoder.in_features) == widths
-
-
-def test_an_adapter_of_fresh_heads_does_not_go_onto_another_base(tmp_path: Path) -> None:
-    save_trained(trained(Widths(14, 14), LORA), tmp_path)
-    with pytest.raises(InputError, match="trained on another predictor"):
-        load_trained(WorldModel.random(TINY, seed=2), tmp_path)
-
-
-def test_a_damaged_card_of_fresh_heads_is_named(tmp_path: Path) -> None:
-    save_trained(trained(Widths(14, 14), LORA), tmp_path)
-    path = tmp_path / "vjepa2_ac.json"
-    for wrong in ({"state_dim": 14}, {"state_dim": 0, "action_dim": 14, "seed": 0}, 3):
-        path.write_text(json.dumps(json.loads(path.read_text()) | {"fresh_heads": wrong}))
-        with pytest.raises(InputError, match=r"vjepa2_ac\.json: fresh_heads"):
-            load_trained(base(), tmp_path)
-
-
-def test_a_folder_from_before_widths_were_written_is_a_model_of_seven(tmp_path: Path) -> None:
-    base().save_pretrained(tmp_path)
-    for path in (tmp_path / "config.json", tmp_path / "predictor/config.json"):
-        old = json.loads(path.read_text())
-        for part in (old, old.get("sizes", {}).get("predictor", {})):
-            part.pop("action_dim", None)
-            part.pop("state_dim", None)
-        assert "action_dim" not in json.dumps(old)
-        path.write_text(json.dumps(old))
-    loaded = WorldModel.from_pretrained(tmp_path)
-    assert widths_of_model(loaded.sizes) == Widths(7, 7)
-    assert torch.equal(predict(loaded, Widths(7, 7)), predict(base(), Widths(7, 7)))
-    assert ActionConditionedPredictor.from_pretrained(tmp_path / "predictor").config.state_dim == 7
-
-
-def test_sizes_that_were_given_must_be_those_of_the_model(tmp_path: Path) -> None:
-    fitted(Widths(14, 14)).save_pretrained(tmp_path)
-    wrong = {"base": str(tmp_path), "sizes": {"predictor": {"state_dim": 8}}}
-    with pytest.raises(InputError, match=r"predictor\.state_dim 14.*predictor\.state_dim 8"):
-        load_base(ModelConfig.model_validate(wrong), seed=0)
-
-
-def test_meta_has_no_name_for_other_widths() -> None:
-    with pytest.raises(ValueError, match="Meta's code takes"):
-        to_official(fitted(Widths(14, 14)))

@@ -9,14 +9,13 @@ from torch import Tensor
 
 from vjepa2_ac.config import AdapterConfig, ModelSizes
 from vjepa2_ac.model.adapter.lora import add_adapter
-from vjepa2_ac.model.network.kv_cache import KeyValueCache
+from vjepa2_ac.model.network.predictor_network import KeyValueCache
 from vjepa2_ac.model.network.world_model import WorldModel
 
 LORA = AdapterConfig(rank=4, alpha=8.0, dropout=0.0)
 ADAPTERS = {
     "lora": LORA,
     "dora": LORA.model_copy(update={"dora": True}),
-    "pissa": LORA.model_copy(update={"init": "pissa"}),
     "none": AdapterConfig(kind="none"),
 }
 PARTS = [(1, 1, 1, 1), (2, 2), (3, 1), (1, 3)]
@@ -114,14 +113,6 @@ def test_what_is_kept_holds_nothing_of_the_rest(sizes: ModelSizes, inputs) -> No
         assert piece.untyped_storage().nbytes() == piece.nbytes == 2 * 2 * (9 + 2) * sizes.predictor.width * 4
 
 
-def test_a_pass_that_keeps_nothing_leaves_the_cache_as_it_was(sizes: ModelSizes, inputs) -> None:
-    model, cache, given = adapted(sizes), KeyValueCache(), arguments(inputs)
-    model.predict(*(value[:, :2] for value in given), cache=cache)
-    before = cache.layer(0)
-    model.predict(*(value[:, 2:] for value in given), cache=cache, keep=0)
-    assert cache.layer(0) is before
-
-
 def plain_rollout(model: WorldModel, context: Tensor, actions: Tensor, states: Tensor) -> Tensor:
     """Compute everything again for each prediction."""
     latents = context
@@ -165,10 +156,3 @@ def test_many_samples_go_on_from_one_start_that_was_computed_once(sizes: ModelSi
         found = model.rollout(latents[:, 2:], actions[:, 2:], states[:, 2:], cache=many)
         torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
     assert many.layer(0)[0].untyped_storage().data_ptr() == cache.layer(0)[0].untyped_storage().data_ptr()
-
-
-def test_a_cache_of_several_starts_is_not_expanded(sizes: ModelSizes, inputs) -> None:
-    cache = KeyValueCache()
-    adapted(sizes).predict(*arguments(inputs), cache=cache)
-    with pytest.raises(RuntimeError, match="expand"):
-        cache.expanded(5)

@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from vjepa2_ac.config import EncoderSizes, ModelSizes, PredictorSizes
-from vjepa2_ac.model.network.blocks import normalised
 from vjepa2_ac.model.network.predictor import ActionConditionedPredictor, PredictorConfig
 from vjepa2_ac.model.network.world_model import WorldModel
 
@@ -38,11 +37,6 @@ def test_other_image_sizes_work(image_size: int) -> None:
 def test_tokens_of_another_image_size_are_refused(model: WorldModel, inputs) -> None:
     with pytest.raises(ValueError, match="8 tokens a step do not make a frame of 48 px"):
         model.predict(inputs.latents[:, :, :8], inputs.actions, inputs.states)
-
-
-def test_extrinsics_that_the_model_does_not_use_are_refused(model: WorldModel, inputs) -> None:
-    with pytest.raises(ValueError, match="use_extrinsics is False"):
-        model.predict(inputs.latents, inputs.actions, inputs.states, torch.zeros(2, 4, 6))
 
 
 @pytest.mark.parametrize("by_transformers", [True, False])
@@ -99,15 +93,3 @@ def test_transformers_loads_the_predictor_by_itself(model: WorldModel, tmp_path:
 
 
 HALF = torch.bfloat16
-
-
-@pytest.mark.parametrize(("weights", "given"), [(HALF, HALF), (torch.float32, HALF), (torch.float32, torch.float32)])
-def test_a_norm_is_left_to_autocast_only_where_types_differ(weights: torch.dtype, given: torch.dtype) -> None:
-    norm, tokens, autocast = torch.nn.LayerNorm(6, dtype=weights), torch.randn(2, 6).to(given), []
-    norm.register_forward_hook(lambda *_: autocast.append(torch.is_autocast_enabled("cpu")))
-    with torch.autocast("cpu", HALF):
-        assert normalised(norm, tokens).dtype == HALF
-    assert autocast == [weights != HALF]
-    if weights == given:
-        assert normalised(norm, tokens).dtype == given
-        assert not autocast[1]

@@ -38,10 +38,6 @@ def test_each_token_is_turned_by_its_time_row_and_column(head_dim: int) -> None:
         torch.testing.assert_close(turned[0, token, 0], expected, rtol=1e-5, atol=1e-6)
 
 
-def test_tables_are_computed_once_per_shape() -> None:
-    assert rotary_tables(TokenLayout(2, 3, 2), 12, CPU) is rotary_tables(TokenLayout(2, 3, 2), 12, CPU)
-
-
 def test_a_later_start_is_the_rest_of_a_longer_sequence() -> None:
     whole, rest = rotary_tables(TokenLayout(4, 3, 2), 12, CPU), rotary_tables(TokenLayout(3, 3, 2, start=1), 12, CPU)
     for longer, later in zip(whole, rest, strict=True):
@@ -63,11 +59,6 @@ def test_bfloat16_loses_nothing_but_the_rounding_of_its_result() -> None:
     turned = rotate(x, tables)
     assert turned.dtype == torch.bfloat16
     assert torch.equal(turned, rotate(x.float(), tables).bfloat16())
-
-
-def test_a_head_without_pairs_is_refused() -> None:
-    with pytest.raises(ValueError, match="even"):
-        rotary_tables(TokenLayout(1, 1), 7, CPU)
 
 
 def test_gradients_are_those_of_differences() -> None:

@@ -1,6 +1,5 @@
 """A predictor without states: the one with states whose state tokens are cut out."""
 
-import json
 from pathlib import Path
 
 import pytest
@@ -9,12 +8,11 @@ from torch import Tensor
 from torch.nn.functional import layer_norm
 
 from tiny_models import DIM, draw, tiny_model
-from vjepa2_ac.config import AdapterConfig, ModelConfig, ModelSizes
+from vjepa2_ac.config import AdapterConfig, ModelConfig
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.adapter.lora import add_adapter, load_trained, save_trained, trainable_report
+from vjepa2_ac.model.adapter.lora import add_adapter, load_trained, save_trained
 from vjepa2_ac.model.checkpoints.loading import load_base
-from vjepa2_ac.model.checkpoints.official import to_official
 from vjepa2_ac.model.network.input_heads import fit_heads, heads_to_replace, widths_of_model
 from vjepa2_ac.model.network.predictor import ActionConditionedPredictor
 from vjepa2_ac.model.network.rotary import TokenLayout, rotary_tables
@@ -93,35 +91,6 @@ def test_other_states_of_any_width_change_no_bit(extrinsics: bool) -> None:
     assert not torch.equal(cut.predict(latents, actions + 1, states, *cameras), expected)
 
 
-def test_it_has_no_layer_that_only_states_would_need() -> None:
-    full, cut = pair()
-    missing = full.predictor.state_dict().keys() - cut.predictor.state_dict().keys()
-    assert {name.split(".")[0] for name in missing} == {"state_encoder", "extrinsics_encoder"}
-    assert hasattr(pair(extrinsics=True)[1].predictor, "extrinsics_encoder")
-    assert cut.base_predictor.unused_layers == ()
-
-
-def test_every_weight_of_it_is_trained_and_reported() -> None:
-    model = tiny_model(states=False)
-    add_adapter(model, AdapterConfig(kind="none"), seed=0)
-    report = trainable_report(model)
-    assert report.trained == report.predictor
-    model.predict(*inputs()).sum().backward()
-    assert all(value.grad is not None for value in model.predictor.parameters())
-
-
-def test_an_adapter_on_all_layers_trains_saves_and_comes_back(tmp_path: Path) -> None:
-    heads = ("predictor_embed", "action_encoder")
-    model = tiny_model(states=False)
-    add_adapter(model, LORA.model_copy(update={"targets": ("all",), "modules_to_save": heads}), seed=0)
-    for value in model.parameters():
-        value.data += 0.01 if value.requires_grad else 0
-    save_trained(model, tmp_path)
-    loaded = tiny_model(states=False)
-    load_trained(loaded, tmp_path)
-    assert torch.equal(loaded.predict(*inputs()), model.predict(*inputs()))
-
-
 def test_an_adapter_on_the_missing_layer_is_refused() -> None:
     with pytest.raises(InputError, match=r"modules_to_save: state_encoder, which this predictor does not have.*Leave"):
         add_adapter(tiny_model(states=False), LORA.model_copy(update={"modules_to_save": ("state_encoder",)}), seed=0)
@@ -154,27 +123,3 @@ def test_a_folder_keeps_it_and_contradictions_are_refused(tmp_path: Path) -> Non
     tiny_model().save_pretrained(tmp_path / "full")
     with pytest.raises(InputError, match=r"predictor\.use_states True\. needed: predictor\.use_states False"):
         load_base(ModelConfig.model_validate(told | {"base": str(tmp_path / "full")}), seed=0)
-
-
-def test_a_folder_from_before_there_were_such_models_has_states(tmp_path: Path) -> None:
-    tiny_model().save_pretrained(tmp_path)
-    for path in (tmp_path / "config.json", tmp_path / "predictor/config.json"):
-        old = json.loads(path.read_text())
-        for part in (old, old.get("sizes", {}).get("predictor", {})):
-            part.pop("use_states", None)
-        assert "use_states" not in json.dumps(old)
-        path.write_text(json.dumps(old))
-    loaded = WorldModel.from_pretrained(tmp_path)
-    assert loaded.sizes == tiny_model().sizes
-    assert torch.equal(loaded.predict(*inputs()), tiny_model().predict(*inputs()))
-    assert ActionConditionedPredictor.from_pretrained(tmp_path / "predictor").config.use_states
-
-
-def test_sizes_with_a_width_of_states_that_are_not_used_are_refused() -> None:
-    with pytest.raises(ValueError, match="state_dim 14 with use_states false"):
-        ModelSizes.model_validate({"predictor": {"use_states": False, "state_dim": 14}})
-
-
-def test_meta_has_no_such_predictor() -> None:
-    with pytest.raises(ValueError, match="no predictor without states"):
-        to_official(tiny_model(states=False))

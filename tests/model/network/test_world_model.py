@@ -30,20 +30,6 @@ def test_weights_are_drawn_where_they_are_to_be(model: WorldModel) -> None:
     assert weight.std() == pytest.approx(0.02, rel=0.2)
 
 
-def test_nothing_of_a_base_is_trained(model: WorldModel) -> None:
-    assert not any(value.requires_grad for value in model.parameters())
-
-
-def test_a_rollout_feeds_back_what_it_predicted(model: WorldModel, inputs) -> None:
-    z, a, s = inputs.latents, inputs.actions, inputs.states
-    first = model.predict(z[:, :1], a[:, :1], s[:, :1])[:, -1:]
-    seen = torch.cat([z[:, :1], first], dim=1)
-    second = model.predict(seen, a[:, :2], s[:, :2])[:, -1:]
-    third = model.predict(torch.cat([seen, second], dim=1), a[:, :3], s[:, :3])[:, -1:]
-    expected = torch.cat([first, second, third], dim=1)
-    torch.testing.assert_close(model.rollout(z[:, :1], a[:, :3], s[:, :3]), expected, rtol=1e-5, atol=1e-5)
-
-
 def test_the_first_step_of_a_rollout_is_the_teacher_forced_prediction(model: WorldModel, inputs) -> None:
     z, a, s = inputs.latents, inputs.actions, inputs.states
     forced = model.predict(z, a, s)
@@ -51,13 +37,6 @@ def test_the_first_step_of_a_rollout_is_the_teacher_forced_prediction(model: Wor
         rolled = model.rollout(z[:, :context], a, s)
         assert rolled.shape[1] == 4 - context + 1
         torch.testing.assert_close(rolled[:, 0], forced[:, context - 1], rtol=1e-5, atol=1e-5)
-
-
-def test_a_rollout_goes_on_from_a_prediction_that_is_appended_to_its_context(model: WorldModel, inputs) -> None:
-    z, a, s = inputs.latents, inputs.actions, inputs.states
-    whole = model.rollout(z[:, :1], a, s)
-    rest = model.rollout(torch.cat([z[:, :1], whole[:, :1]], dim=1), a, s)
-    torch.testing.assert_close(rest, whole[:, 1:], rtol=1e-5, atol=1e-5)
 
 
 def test_a_context_longer_than_the_actions_is_refused(model: WorldModel, inputs) -> None:
@@ -95,13 +74,6 @@ def test_fingerprints_do_not_depend_on_the_type_loaded(model: WorldModel, tmp_pa
     assert rounded.predictor_fingerprint() == model.predictor_fingerprint()
 
 
-def test_saving_again_replaces_the_folder_and_leaves_nothing_else(fresh: Fresh, tmp_path: Path) -> None:
-    fresh(seed=0).save_pretrained(tmp_path / "model")
-    fresh(seed=1).save_pretrained(tmp_path / "model")
-    assert WorldModel.from_pretrained(tmp_path / "model").encoder_fingerprint() == fresh(seed=1).encoder_fingerprint()
-    assert [path.name for path in tmp_path.iterdir()] == ["model"]
-
-
 def test_a_model_is_saved_where_one_stands_and_beside_what_is_there(
     fresh: Fresh, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -112,18 +84,6 @@ def test_a_model_is_saved_where_one_stands_and_beside_what_is_there(
     assert WorldModel.from_pretrained(".").encoder_fingerprint() == fresh(1).encoder_fingerprint()
     names = sorted(path.name for path in tmp_path.iterdir())
     assert names == ["README.md", "config.json", "encoder.safetensors", "predictor"]
-
-
-@pytest.mark.parametrize("place", ["file", "file/inner", "/proc/inner"])
-def test_a_place_that_cannot_hold_a_model_is_named(model: WorldModel, tmp_path: Path, place: str) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(InputError, match=rf"{place}: cannot be written"):
-        model.save_pretrained(tmp_path / place)
-
-
-def test_the_config_of_a_saved_model_promises_nothing_that_is_not_checked(model: WorldModel, tmp_path: Path) -> None:
-    model.save_pretrained(tmp_path / "model")
-    assert json.loads((tmp_path / "model" / "config.json").read_text()).keys() == {"format", "sizes"}
 
 
 def break_config(folder: Path) -> None:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from vjepa2_ac.data.clips.transforms import crop_box
+from vjepa2_ac.data.transforms import crop_box
+from vjepa2_ac.inspection.sheet import _short_names
 from vjepa2_ac.reports.figures.contact_sheet import ContactSheet, Strip, pictures_per_row, plot_contact_sheet
-from vjepa2_ac.reports.figures.dataset import _short_names
 
 
 def strip(colour: tuple[int, int, int] = (200, 30, 40), *, steps: int = 30, size: tuple[int, int] = (18, 32)) -> Strip:

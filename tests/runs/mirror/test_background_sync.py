@@ -18,7 +18,7 @@ from vjepa2_ac.runs.mirror import upload
 from vjepa2_ac.runs.mirror.background_sync import Mirror
 from vjepa2_ac.runs.mirror.remote_checkpoints import SENDING, RemoteCheckpoints, complete
 from vjepa2_ac.runs.mirror.upload import HELD, RemoteUpdate
-from vjepa2_ac.storage.remote import retries
+from vjepa2_ac.storage import retries
 
 PLACE = "gs://bucket/run"
 FILES = {"adapter/weights.bin", "optimizer.pt", "state.json"}

@@ -26,10 +26,17 @@ from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.session import load_to_plan
 from vjepa2_ac.serving.about import metadata_of
 from vjepa2_ac.serving.session import Session, SessionOptions
-from vjepa2_ac.simulation.closed_loop.benchmark import FILE, FILM, BenchmarkOptions, run_benchmark
+from vjepa2_ac.simulation.closed_loop.benchmark import (
+    FILE,
+    FILM,
+    BenchmarkOptions,
+    _about_imagined,
+    _imagined,
+    film_frames,
+    run_benchmark,
+)
 from vjepa2_ac.simulation.closed_loop.policies import Planning
 from vjepa2_ac.simulation.closed_loop.steering import JOINT_FIELDS, of_session
-from vjepa2_ac.simulation.closed_loop.video import _about_imagined, _imagined, film_frames
 
 SMALL = ["planning.samples=6", "planning.iterations=2", "planning.cem.elites=3", "planning.limits.xyz=[0.03,0.03,0.03]"]
 TWICE = ["--episodes", "2", "--steps", "2", "--films", "1"]

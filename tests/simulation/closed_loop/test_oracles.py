@@ -8,8 +8,7 @@ from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B
 
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 
-from vjepa2_ac.simulation.closed_loop.oracles import PlaceOracle, oracle_for
-from vjepa2_ac.simulation.closed_loop.policies import DoNothing, RandomActions, farthest
+from vjepa2_ac.simulation.closed_loop.policies import DoNothing, PlaceOracle, RandomActions, farthest, oracle_for
 from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, put, run_episode, run_task
 from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, RELEASED, STEPS, arm_for, make_problem
 

@@ -21,10 +21,16 @@ from vjepa2_ac.simulation.closed_loop.policies import (
     farthest,
     shortened,
 )
-from vjepa2_ac.simulation.closed_loop.result import ClosedLoopResult, EpisodeResult
-from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, run_episode, run_task, ways_along
+from vjepa2_ac.simulation.closed_loop.rollout import (
+    ClosedLoopResult,
+    EpisodeResult,
+    RolloutSpec,
+    run_episode,
+    run_task,
+    ways_along,
+)
 from vjepa2_ac.simulation.world.arm import SimulatedArm
-from vjepa2_ac.simulation.world.kinematics import HIGH, forward_kinematics
+from vjepa2_ac.simulation.world.motion import HIGH, forward_kinematics
 
 LIMITS = LimitsConfig(xyz=(0.075, 0.075, 0.075))
 SMALL = LimitsConfig(xyz=(0.03, 0.03, 0.03))

@@ -11,7 +11,7 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.rlds.source import RldsSource
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B, DomainRanges
-from vjepa2_ac.simulation.world.kinematics import forward_kinematics
+from vjepa2_ac.simulation.world.motion import forward_kinematics
 
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 

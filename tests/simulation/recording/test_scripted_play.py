@@ -7,7 +7,7 @@ import pytest
 
 from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, arm_for
 from vjepa2_ac.simulation.world.domains import DOMAIN_A
-from vjepa2_ac.simulation.world.kinematics import forward_kinematics
+from vjepa2_ac.simulation.world.motion import forward_kinematics
 from vjepa2_ac.simulation.world.scene import BLOCK_M
 
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
@@ -15,8 +15,8 @@ pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.rlds.source import RldsSource
+from vjepa2_ac.simulation.recording.demonstration import default_steps
 from vjepa2_ac.simulation.recording.record import RecordingSpec, record_episode
-from vjepa2_ac.simulation.recording.recorded_task import default_steps
 from vjepa2_ac.simulation.recording.scripted_play import play
 
 

@@ -109,7 +109,6 @@ def record_name(spec: RecordingSpec, index: int) -> str:
         ({"robot": 1}, "robot: unknown"),
         ({"ranges": {}}, "2 of the keys domain and ranges"),
         ({"domain": None}, "0 of the keys"),
-        ({"recipe": {"stride": 4, "speed": 2}}, r"recipe\.speed: unknown"),
         ({"task": "stack"}, "task: "),
     ],
 )

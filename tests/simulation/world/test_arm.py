@@ -9,15 +9,12 @@ import pytest
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.geometry import matrices_from_euler
 from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B, Domain, DomainRanges, named_domain, sample_domain
-from vjepa2_ac.simulation.world.kinematics import HOME, LOW, forward_kinematics
-from vjepa2_ac.simulation.world.motion import rest_joints
+from vjepa2_ac.simulation.world.motion import HOME, LOW, forward_kinematics, rest_joints
 
 mujoco = pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 
-from vjepa2_ac.simulation.world import arm as arm_module  # noqa: E402
 from vjepa2_ac.simulation.world.arm import SimulatedArm  # noqa: E402
-from vjepa2_ac.simulation.world.camera import RayCamera  # noqa: E402
-from vjepa2_ac.simulation.world.ray_renderer import View  # noqa: E402
+from vjepa2_ac.simulation.world.camera import View  # noqa: E402
 from vjepa2_ac.simulation.world.scene import compile_scene, load_mujoco  # noqa: E402
 
 REACHES = HOME + np.array([[0] * 7, [0.4, 0.3, 0.0, 0.4, 0.1, 0.2, 0.5], [-0.6, 0.2, 0.3, -0.2, 0.0, -0.3, 0.0]])
@@ -166,34 +163,3 @@ def test_missing_mujoco_is_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(InputError, match=r"pip install .*\[sim\]"):
         load_mujoco()
-
-
-def test_opengl_that_does_not_work_is_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: object) -> None:
-        raise AttributeError("no display")
-
-    monkeypatch.setattr(mujoco, "Renderer", fail)
-    with pytest.raises(InputError, match=r"OpenGL does not work here .*no display.*renderer: rays"):
-        SimulatedArm(DOMAIN_A, renderer="opengl")
-
-
-def test_the_opengl_camera_has_the_same_pose(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen = []
-
-    class FakeRenderer:
-        def __init__(self, *_: object) -> None: ...
-
-        def update_scene(self, _: object, camera: object) -> None:
-            seen.append(camera)
-
-        def render(self) -> np.ndarray:
-            return np.zeros((180, 320, 3), dtype=np.uint8)
-
-    monkeypatch.setattr(mujoco, "Renderer", FakeRenderer)
-    SimulatedArm(DOMAIN_A, renderer="opengl").image()
-    eye, pose = seen[0], DOMAIN_A.camera.pose()
-    azimuth, elevation = np.deg2rad(eye.azimuth), np.deg2rad(eye.elevation)
-    forward = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
-    np.testing.assert_allclose(forward, pose[:3, 2], atol=1e-9)
-    np.testing.assert_allclose(np.array(eye.lookat) - eye.distance * forward, pose[:3, 3], atol=1e-9)
-    assert arm_module.OpenGlCamera is not RayCamera

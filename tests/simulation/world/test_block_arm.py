@@ -5,17 +5,16 @@ import pytest
 
 from vjepa2_ac.geometry import matrices_from_euler
 from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, HOLDING
+from vjepa2_ac.simulation.world.camera import exterior_pose, pixels_of
 from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B, Domain
 from vjepa2_ac.simulation.world.motion import downward_poses, poses_in_base
-from vjepa2_ac.simulation.world.projection import exterior_pose, pixels_of
 from vjepa2_ac.simulation.world.scene import BLOCK_M, FINGERTIP_M
 
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 
 from vjepa2_ac.simulation.closed_loop.rollout import put
 from vjepa2_ac.simulation.closed_loop.tasks import arm_for
-from vjepa2_ac.simulation.world.arm import SimulatedArm
-from vjepa2_ac.simulation.world.block_arm import ContactArm
+from vjepa2_ac.simulation.world.arm import ContactArm, SimulatedArm
 
 
 @pytest.fixture

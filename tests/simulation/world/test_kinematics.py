@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from vjepa2_ac.geometry import matrices_from_euler
-from vjepa2_ac.simulation.world.kinematics import (
+from vjepa2_ac.simulation.world.motion import (
     HIGH,
     HOME,
     LOW,

@@ -6,8 +6,17 @@ import numpy as np
 
 from vjepa2_ac.geometry import matrices_from_euler
 from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B
-from vjepa2_ac.simulation.world.kinematics import HIGH, HOME, LOW, forward_kinematics
-from vjepa2_ac.simulation.world.motion import MotionRecipe, follow, random_reaching, rest_joints, tracking_share
+from vjepa2_ac.simulation.world.motion import (
+    HIGH,
+    HOME,
+    LOW,
+    MotionRecipe,
+    follow,
+    forward_kinematics,
+    random_reaching,
+    rest_joints,
+    tracking_share,
+)
 
 RECIPE = MotionRecipe()
 

@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 
-from vjepa2_ac.simulation.world.camera import RayCamera
+from vjepa2_ac.simulation.world.camera import RayCamera, exterior_pose, hand_pixels, pixels_of
 from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B, Domain
-from vjepa2_ac.simulation.world.kinematics import forward_kinematics
-from vjepa2_ac.simulation.world.motion import rest_joints
-from vjepa2_ac.simulation.world.projection import exterior_pose, hand_pixels, pixels_of
+from vjepa2_ac.simulation.world.motion import forward_kinematics, rest_joints
 
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 

@@ -15,7 +15,7 @@ from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.model.adapter.lora import add_adapter
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.energy import Scene, WorldModelCost
-from vjepa2_ac.planning.goals.goal import Goal
+from vjepa2_ac.planning.goals import Goal
 from vjepa2_ac.training.cost.flops import clip_flops, frame_flops, plan_flops
 from vjepa2_ac.training.loss import Objective
 
@@ -28,7 +28,7 @@ ADAPTERS: dict[str, dict[str, Any]] = {
     "lora": LORA, "value only": {**LORA, "targets": ["v"]}, "late": {**LORA, "targets": ["fc2"]},
     "everywhere": {**LORA, "targets": ["all"]}, "heads": {**LORA, "modules_to_save": ["action_encoder"]},
     "none": {"kind": "none"}, "ends": {**LORA, "modules_to_save": ["predictor_embed", "predictor_proj"]},
-    "ranks": {**LORA, "rank_pattern": {"fc1": 8, "blocks.0.attn.q": 2}},
+    "ranks": {**LORA, "peft": {"rank_pattern": {"fc1": 8, "blocks.0.attn.q": 2}}},
 }  # fmt: skip
 
 

@@ -10,7 +10,7 @@ from sized_runs import LORA, built, model_sizes, run_config
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import Config, DataConfig, EncoderSizes, ModelSizes, ReplayConfig
 from vjepa2_ac.model.adapter.lora import trainable_report
-from vjepa2_ac.model.network.kv_cache import KeyValueCache
+from vjepa2_ac.model.network.predictor_network import KeyValueCache
 from vjepa2_ac.training.cost.memory import USUAL_GPU, count_parameters, estimate_memory, ways_to_fit
 from vjepa2_ac.training.optim import make_optimizer
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import sys
 
-from vjepa2_ac import output
 from vjepa2_ac.cli.options import Commands, add_config, argument, command, read_config
 from vjepa2_ac.errors import printable
 
@@ -31,7 +30,6 @@ def _decoder(options: argparse.Namespace) -> int:
     from vjepa2_ac.decoding.training import train_decoder
     from vjepa2_ac.distributed.signals import EXIT_STATUS, StoppedError
 
-    output.never_wait()
     try:
         with ConsoleReporter() as reporter:
             folder = train_decoder(config, reporter, check_only=options.check)

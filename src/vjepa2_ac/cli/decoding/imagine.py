@@ -6,7 +6,6 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vjepa2_ac import output
 from vjepa2_ac.cli.options import (
     NEGATIVE_NUMBERS,
     Commands,
@@ -75,7 +74,6 @@ def _imagine(options: argparse.Namespace) -> int:
     from vjepa2_ac.reports.imagined import write_film_of
     from vjepa2_ac.runs.folder import is_run
 
-    output.never_wait()
     home = Path(options.subject) if is_run(options.subject) else Path()
     out = options.out or home / "imagined"
     with ConsoleReporter() as reporter:

@@ -24,8 +24,7 @@ def add_to(commands: Commands) -> None:
 
 
 def _config(options: argparse.Namespace) -> None:
-    from vjepa2_ac.config.loading import config_as_yaml, config_schema, load_config
-    from vjepa2_ac.config.packaged import config_path, packaged_configs
+    from vjepa2_ac.config.loading import config_as_yaml, config_path, config_schema, load_config, packaged_configs
 
     what, where = options.what, "command line"
     if what not in _OF_ONE and options.config is not None:

@@ -27,8 +27,7 @@ def _download(options: argparse.Namespace) -> None:
     from vjepa2_ac.console.downloads import published_notes, published_summary, published_table
     from vjepa2_ac.console.progress import ConsoleReporter, console
     from vjepa2_ac.model.checkpoints.download import download
-    from vjepa2_ac.model.checkpoints.published import PUBLISHED
-    from vjepa2_ac.model.checkpoints.published_names import OFFICIAL, find_published
+    from vjepa2_ac.model.checkpoints.published import OFFICIAL, PUBLISHED, find_published
     from vjepa2_ac.places import literal
 
     if options.list:

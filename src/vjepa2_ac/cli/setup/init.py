@@ -69,8 +69,8 @@ def _init(options: argparse.Namespace) -> int:
     from vjepa2_ac.console.progress import ConsoleReporter, console
     from vjepa2_ac.init.choices import download_of
     from vjepa2_ac.init.draft import TINY, choose_model, make_draft
+    from vjepa2_ac.init.look import measured
     from vjepa2_ac.init.machine import this_machine
-    from vjepa2_ac.init.measure import measured
     from vjepa2_ac.reporter import INDEXING
 
     with ConsoleReporter() as reporter:
@@ -133,7 +133,7 @@ def _found(form: str | None, path: str, *, is_missing: bool) -> FoundData:
 
 def _say(draft: Draft, out: Path, costs: list[str]) -> None:
     from vjepa2_ac.console.progress import console
-    from vjepa2_ac.init.knob import guesses
+    from vjepa2_ac.init.found import guesses
 
     for line in costs:
         console.print(line)

@@ -14,7 +14,7 @@ from jaxtyping import UInt8
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.cache.cached_reads import EpisodeFiles
+from vjepa2_ac.data.cache import EpisodeFiles
 from vjepa2_ac.data.index.episode_table import EpisodeTable
 from vjepa2_ac.episode import EpisodeInfo, Progress, no_progress
 from vjepa2_ac.errors import InputError

@@ -79,7 +79,7 @@ class WindowCost:
         for end in range(FRAMES_SEEN + 1, steps + 1):
             following = self._model.predict(frames, *during(end - FRAMES_SEEN, end))[:, -1:]
             frames = torch.cat([frames[:, 1:], following], dim=1)
-        return distance(frames[:, -1].float(), self._goal, self._config.distance)
+        return distance(frames[:, -1].float(), self._goal, self._config)
 
 
 def planning_start(batch: LatentBatch, row: int, clip: int, seed: int) -> PlanningStart:

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vjepa2_ac.data.clips.dataset import Dataset
-from vjepa2_ac.data.clips.loader import batches_of, validation_windows
-from vjepa2_ac.data.clips.windows import spread
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.loader import batches_of, validation_windows
+from vjepa2_ac.data.windows import spread
 from vjepa2_ac.episode import Batch, LatentBatch, Progress, no_progress
 from vjepa2_ac.evaluation.data_variants.variants import ChangedSource, RememberingSource, Variant, variants_of
 from vjepa2_ac.evaluation.measure import ClipSample, OneStepErrors, Predictor, one_step_errors

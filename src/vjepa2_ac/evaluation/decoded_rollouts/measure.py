@@ -16,7 +16,7 @@ from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor
 
-from vjepa2_ac.data.clips.transforms import images_to_input
+from vjepa2_ac.data.transforms import images_to_input
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
 from vjepa2_ac.decoding.frame_pairs import as_images, as_pixels
 from vjepa2_ac.episode import LatentBatch

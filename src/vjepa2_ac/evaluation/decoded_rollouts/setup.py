@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vjepa2_ac.data.clips.dataset import Dataset
-from vjepa2_ac.data.clips.loader import batches_of, validation_windows
-from vjepa2_ac.data.clips.transforms import input_to_pixels, pixels_to_input
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.loader import batches_of, validation_windows
+from vjepa2_ac.data.transforms import input_to_pixels, pixels_to_input
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
 from vjepa2_ac.decoding.frame_pairs import as_images
 from vjepa2_ac.errors import InputError

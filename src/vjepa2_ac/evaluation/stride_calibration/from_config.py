@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.data.clips.dataset import open_dataset
+from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.distributed.processes import make_accelerator
 from vjepa2_ac.encoding.batch import require_same_encoder, require_widths
 from vjepa2_ac.evaluation.measure import ClipSample

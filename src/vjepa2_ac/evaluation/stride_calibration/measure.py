@@ -18,9 +18,8 @@ from jaxtyping import Float
 
 from vjepa2_ac.config import Config, ModelConfig
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.clips.dataset import Dataset
-from vjepa2_ac.data.clips.loader import batches_of, validation_windows
-from vjepa2_ac.data.clips.streams import NO_COPIES, Copies, copies_for
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.loader import batches_of, validation_windows
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.episode import Batch, LatentBatch, Progress, no_progress
 from vjepa2_ac.errors import InputError
@@ -130,7 +129,6 @@ def calibrate(
     dataset: Dataset,
     sample: ClipSample,
     *,
-    copies: Copies = NO_COPIES,
     progress: Progress = no_progress,
 ) -> Calibration:
     """Measure a model's one-step error over persistence at each stride.
@@ -143,7 +141,6 @@ def calibrate(
         encode: Turns a batch of pixels into latents on the model's device.
         dataset: The source of clips; its config has the candidates, its own stride does not matter.
         sample: The clips at each stride.
-        copies: Copies them to the model's device.
         progress: Called with (clips done, clips in total).
 
     Raises:
@@ -157,7 +154,7 @@ def calibrate(
     chosen = validation_windows(views[possible[-1]], split, clips=sample.clips)
     measured = {}
     for done, stride in enumerate(possible):
-        batches = batches_of(views[stride], chosen, batch_size=sample.batch_size, copies=copies)
+        batches = batches_of(views[stride], chosen, batch_size=sample.batch_size)
         parts = _measure(model, encode, batches, dataset.spaces.action)
         before, total = done * len(chosen), len(possible) * len(chosen)
         measured[stride] = _Measured.joined(list(_reported(parts, progress, before, total)))
@@ -297,4 +294,4 @@ def calibrate_model(
     sample = replace(sample, batch_size=config.validation.batch_size)
     encode = partial(encode_batch, world_model, device=accelerator.device, chunk=config.model.encode_chunk)
     with accelerator.autocast(), torch.no_grad():
-        return calibrate(world_model, encode, dataset, sample, copies=copies_for(accelerator.device), progress=progress)
+        return calibrate(world_model, encode, dataset, sample, progress=progress)

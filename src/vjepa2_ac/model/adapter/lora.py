@@ -1,41 +1,39 @@
 """Trainable weights: a LoRA adapter on the predictor, or the whole predictor: add, save, load.
 
-The only modules that use PEFT are this one and the layer in `lora_linear`. Merging an adapter into the base: `merging`.
+The only module that uses PEFT. Disabling an adapter, and merging it into the base: `merging`.
 """
 
 from __future__ import annotations
 
+import copy
 import math
-from dataclasses import replace
+import re
+import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from vjepa2_ac.config import AdapterConfig
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.adapter.adapter_file import ADAPTER_FILE, read_adapter_file
 from vjepa2_ac.model.adapter.adapter_folder import (
+    ADAPTER_FILE,
     FULL_WEIGHTS,
     LORA_WEIGHTS,
-    PRINCIPAL_PARTS,
     Card,
     Heads,
+    adapter_of,
+    read_adapter_file,
     read_card,
     read_weights,
     write_trained,
 )
-from vjepa2_ac.model.adapter.initialization import (
-    draw_first_matrices,
-    measure_magnitudes,
-    original_weights,
-    principal_parts,
-    start_from,
-)
-from vjepa2_ac.model.adapter.lora_linear import LoraLinear
-from vjepa2_ac.model.adapter.targets import lora_arguments, peft_arguments
+from vjepa2_ac.model.adapter.low_rank import LowRankLayer, low_rank_linear
+from vjepa2_ac.model.adapter.targets import lora_arguments
 from vjepa2_ac.model.network.input_heads import fit_heads, require_trained
 from vjepa2_ac.model.network.predictor_network import PredictorNetwork
 from vjepa2_ac.model.network.world_model import Adaptation, WorldModel, base_weights
@@ -43,7 +41,49 @@ from vjepa2_ac.model.quiet_imports import quiet_imports
 
 with quiet_imports():
     from peft import LoraConfig, PeftModel, get_peft_model, get_peft_model_state_dict, set_peft_model_state_dict
-    from peft.tuners.lora import LoraLayer
+    from peft.tuners.lora import Linear, LoraLayer
+
+
+class LoraLinear(Linear, LowRankLayer):  # type: ignore[misc]  # PEFT has no types
+    """PEFT's linear layer with a low-rank adapter; plain LoRA takes fewer passes over the tokens.
+
+    PEFT casts tokens to the adapter's float32 and autocast casts them back; dropout, scaling and adding are separate
+    passes, and so are their gradients. Here only the two small matrices are cast, and the matrix products scale and
+    add. In float32 the result is the same to rounding; in bfloat16 it is rounded less often. Everything except plain
+    LoRA on a frozen layer (DoRA, a disabled or merged adapter, types that do not match) is left to PEFT. Hooks on the
+    layer and the matrices inside are not called, and there are no second derivatives.
+    """
+
+    def forward(self, tokens: Float[Tensor, "*batch inputs"], *args: Any, **kwargs: Any) -> Tensor:
+        """Return the output of the layer and its adapter for each token."""
+        dtype = self._dtype_of_plain_lora(tokens)
+        if dtype is None or args or kwargs:
+            return super().forward(tokens, *args, **kwargs)  # type: ignore[no-any-return]
+        name = self.active_adapters[0]
+        dropout = self.lora_dropout[name]
+        masking = None if isinstance(dropout, nn.Identity) or not self.training else dropout
+        return low_rank_linear(tokens.to(dtype), self.base_layer, self, masking, self.scaling[name])
+
+    def matrices(self) -> tuple[Tensor, ...]:
+        """Return the two matrices of the adapter that is computed here; none if there are several adapters."""
+        names = self.active_adapters
+        if len(names) != 1 or names[0] not in self.lora_A:
+            return ()
+        return self.lora_A[names[0]].weight, self.lora_B[names[0]].weight
+
+    def _dtype_of_plain_lora(self, tokens: Tensor) -> torch.dtype | None:
+        """Return the type to compute in; None if PEFT computes."""
+        adapters, layer = self.active_adapters, self.base_layer
+        if self.disable_adapters or self.merged or len(adapters) != 1 or adapters[0] not in self.lora_A:
+            return None
+        if self.lora_variant or self.lora_bias.get(adapters[0]) or type(layer).forward is not nn.Linear.forward:
+            return None
+        if tokens.dim() < 2 or any(own.requires_grad for own in layer.parameters()):
+            return None
+        if torch.is_autocast_enabled(tokens.device.type):
+            return torch.get_autocast_dtype(tokens.device.type)
+        same = tokens.dtype == layer.weight.dtype == self.lora_A[adapters[0]].weight.dtype
+        return tokens.dtype if same else None
 
 
 class TrainableReport(NamedTuple):
@@ -65,22 +105,20 @@ class TrainableReport(NamedTuple):
         )
 
 
-def add_adapter(model: WorldModel, config: AdapterConfig, seed: int, started: Path | None = None) -> None:
+def add_adapter(model: WorldModel, config: AdapterConfig, seed: int) -> None:
     """Make a model trainable: its predictor gets an adapter, or is trained completely. Trained weights are float32.
 
-    A fresh adapter does not change the output: its second matrix is zero; the seed determines the first. With `init:
-    pissa` it is a part of the weights, subtracted from them: the same output up to rounding.
+    A fresh adapter does not change the output: its second matrix is zero, unless `peft.init_lora_weights` is `false` or
+    `orthogonal`.
 
     Args:
         model: The base.
         config: What is trained.
         seed: Determines the first matrices.
-        started: A folder of `save_trained` with an adapter of the same start. With `init: pissa` the part is read from
-            there instead of computed, which takes minutes; everything else is left to `load_trained`.
 
     Raises:
-        InputError: A target matches no layer, another knob does not fit the predictor, a fresh head (`input_heads`)
-            would not be trained, or `started` is of another adapter.
+        InputError: A target matches no layer, another knob does not fit the predictor or PEFT, or a fresh head
+            (`input_heads`) would not be trained.
         ValueError: The model is already adapted.
     """
     if model.adaptation is not None:
@@ -90,27 +128,53 @@ def add_adapter(model: WorldModel, config: AdapterConfig, seed: int, started: Pa
         return
     if model.fresh_heads is not None:
         require_trained(tuple(dict.fromkeys(name.split(".")[0] for name in model.fresh_heads.replaced)), config)
-    _wrap(model, LoraConfig(**lora_arguments(model.base_predictor, config)))
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)  # of initialisations that are drawn by PEFT
+        _wrap(model, config, start=config.peft.get("init_lora_weights", True))
+    _written(model, where="adapter.peft")  # or it could not be read again
     layers = lora_layers(model)
-    if config.init == "pissa":
-        parts = principal_parts(layers) if started is None else _read_principal_parts(model, started)
-        _start_from_principal_parts(model, parts)
-    else:
-        draw_first_matrices(layers, config.init, torch.Generator().manual_seed(seed))
-    measure_magnitudes(layers)
+    if config.peft.get("init_lora_weights", True) is True:
+        _draw_first_matrices(layers, torch.Generator().manual_seed(seed))
+    _measure_magnitudes(layers)
 
 
-def with_adapter(predictor: PredictorNetwork, config: AdapterConfig) -> nn.Module:
-    """Return a predictor with a LoRA adapter, as `add_adapter` makes it, but without initial values.
+def with_adapter(predictor: PredictorNetwork, config: AdapterConfig, start: bool | str = True) -> nn.Module:
+    """Return a predictor with a LoRA adapter, as `add_adapter` makes it.
 
     Args:
         predictor: The predictor, not adapted.
         config: What is trained.
+        start: PEFT's `init_lora_weights`.
+
+    Raises:
+        InputError: A knob does not fit the predictor, or PEFT refuses it.
+    """
+    arguments = lora_arguments(predictor, config) | {"init_lora_weights": start}
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", RuntimeWarning)  # a pattern that no layer has
+            peft_config = LoraConfig(**arguments)
+            peft_config._register_custom_module({nn.Linear: LoraLinear})
+            wrapped = get_peft_model(predictor, peft_config)
+    except (ArithmeticError, AttributeError, RuntimeWarning, TypeError, ValueError, re.error) as error:
+        needed = "options of PEFT's LoraConfig, which fit the predictor"
+        raise InputError(where="adapter.peft", found=str(error), needed=needed) from None
+    wrapped.train(predictor.training)  # PEFT's dropout is enabled at first
+    for name, value in wrapped.named_parameters():
+        if _is_trained(name):
+            value.data = value.data.float()
+    return wrapped  # type: ignore[no-any-return]  # PEFT has no types
+
+
+def ranks_by_peft(predictor: PredictorNetwork, config: AdapterConfig) -> dict[str, int]:
+    """Return the rank of each layer that gets an adapter, by name; the predictor is not changed.
 
     Raises:
         InputError: A knob does not fit the predictor.
     """
-    return _with_peft(predictor, LoraConfig(**lora_arguments(predictor, config)))
+    with torch.device("meta"):
+        wrapped: Any = with_adapter(copy.deepcopy(predictor).to("meta"), config)
+    return {name: layer.r["default"] for name, layer in _layers_of(wrapped.get_base_model()).items()}
 
 
 def trainable_report(model: WorldModel) -> TrainableReport:
@@ -118,6 +182,12 @@ def trainable_report(model: WorldModel) -> TrainableReport:
     own = sum(value.numel() for value in base_weights(model.base_predictor).values())
     encoder = sum(value.numel() for value in model.encoder.parameters())
     return TrainableReport(sum(p.numel() for p in model.parameters() if p.requires_grad), own, own + encoder)
+
+
+def adapted_report(model: WorldModel) -> TrainableReport:
+    """Return the report of a model with an adapter as it was when it was trained, also if it is frozen now."""
+    trained = (value.numel() for name, value in model.predictor.named_parameters() if _is_trained(name))
+    return trainable_report(model)._replace(trained=sum(trained))
 
 
 def save_trained(model: WorldModel, folder: str | Path, weights: dict[str, Tensor] | None = None) -> None:
@@ -131,9 +201,9 @@ def save_trained(model: WorldModel, folder: str | Path, weights: dict[str, Tenso
     Raises:
         ValueError: The model is not adapted.
     """
-    adaptation, folder = adaptation_of(model), Path(folder)
-    if adaptation.kind == "lora":
-        write_trained(folder, _card_of(model), _lora_weights(model), adaptation.principal)
+    folder = Path(folder)
+    if adaptation_of(model).kind == "lora":
+        write_trained(folder, _card_of(model), _lora_weights(model))
         _lora_config(model).save_pretrained(str(folder))
     else:
         write_trained(folder, _card_of(model), weights or model.predictor.state_dict())
@@ -159,15 +229,17 @@ def load_trained(model: WorldModel, folder: str | Path, trainable: bool | None =
     if card.kind == "lora":
         _load_lora(model, folder)
     else:
-        _load_everything(model, folder)
+        weights = read_weights(folder / FULL_WEIGHTS, model.predictor.state_dict())
+        if fresh:
+            _train_everything(model)
+        model.predictor.load_state_dict(weights)
     if fresh or trainable is not None:
         _set_trainable(model, bool(trainable))
 
 
 def lora_layers(model: WorldModel) -> dict[str, Any]:
     """Return the layers of the predictor that have an adapter (PEFT's LoraLayer), by name."""
-    found = model.base_predictor.named_modules()
-    return {name: layer for name, layer in found if isinstance(layer, LoraLayer)}
+    return _layers_of(model.base_predictor)
 
 
 def adaptation_of(model: WorldModel) -> Adaptation:
@@ -181,11 +253,15 @@ def adaptation_of(model: WorldModel) -> Adaptation:
     return model.adaptation
 
 
+def _layers_of(predictor: nn.Module) -> dict[str, Any]:
+    return {name: layer for name, layer in predictor.named_modules() if isinstance(layer, LoraLayer)}
+
+
 def _card_of(model: WorldModel) -> Card:
     adaptation, sizes, heads = adaptation_of(model), model.sizes.predictor, None
     if model.fresh_heads is not None:
         heads = Heads(sizes.action_dim, sizes.state_dim, model.fresh_heads.seed)
-    return Card(adaptation.kind, adaptation.base, adaptation.encoder, heads, model.encoder_in_words)
+    return Card(adaptation.kind, adaptation.base, adaptation.encoder, model.encoder_in_words, heads)
 
 
 def _train_everything(model: WorldModel) -> None:
@@ -195,44 +271,35 @@ def _train_everything(model: WorldModel) -> None:
     _set_trainable(model, trainable=True)
 
 
-def _wrap(model: WorldModel, config: LoraConfig) -> None:
+def _wrap(model: WorldModel, config: AdapterConfig, start: bool | str = True) -> None:
     base = model.predictor_fingerprint()
     checkpointing = model.base_predictor.gradient_checkpointing
     model.set_gradient_checkpointing(False)  # or PEFT hooks the input: not needed without re-entrance
-    model.predictor = _with_peft(model.predictor, config)
+    model.predictor = with_adapter(model.base_predictor, config, start)
     model.set_gradient_checkpointing(checkpointing)
     model.adaptation = Adaptation("lora", base, model.encoder_fingerprint())
 
 
-def _with_peft(predictor: nn.Module, config: LoraConfig) -> nn.Module:
-    config._register_custom_module({nn.Linear: LoraLinear})
-    init, config.init_lora_weights = config.init_lora_weights, True  # or PEFT cuts PiSSA out of the base, in its type
-    wrapped = get_peft_model(predictor, config).train(predictor.training)  # PEFT's dropout is enabled at first
-    config.init_lora_weights = init
-    for name, value in wrapped.named_parameters():
-        if _is_trained(name):
-            value.data = value.data.float()
-    return wrapped  # type: ignore[no-any-return]  # PEFT has no types
+def _draw_first_matrices(layers: Mapping[str, Any], generator: torch.Generator) -> None:
+    """Draw the first matrix of each layer as PEFT does, but from a generator; the second one is zero."""
+    for layer in layers.values():
+        first = layer.lora_A["default"].weight
+        fresh = torch.empty(first.shape)
+        nn.init.kaiming_uniform_(fresh, a=math.sqrt(5), generator=generator)
+        first.data.copy_(fresh)
+
+
+def _measure_magnitudes(layers: Mapping[str, Any]) -> None:
+    """Set DoRA's magnitudes to the current norms of the rows, in float32, as PEFT computes them in each step."""
+    for layer in layers.values():
+        if "default" in layer.lora_magnitude_vector:
+            update = layer.lora_B["default"].weight @ layer.lora_A["default"].weight
+            weight = layer.get_base_layer().weight.float() + layer.scaling["default"] * update
+            layer.lora_magnitude_vector["default"].weight.data.copy_(torch.linalg.norm(weight.detach(), dim=1))
 
 
 def _is_trained(name: str) -> bool:
     return ".lora_" in name or ".modules_to_save." in name
-
-
-def _start_from_principal_parts(model: WorldModel, parts: dict[str, Tensor]) -> None:
-    adaptation, layers = adaptation_of(model), lora_layers(model)
-    start = adaptation.start or original_weights(layers)
-    start_from(layers, start, parts)
-    model.adaptation = replace(adaptation, start=start, principal=parts)
-
-
-def _read_principal_parts(model: WorldModel, folder: Path) -> dict[str, Tensor]:
-    like = {
-        f"{name}.{matrix}": getattr(layer, matrix)["default"].weight
-        for name, layer in lora_layers(model).items()
-        for matrix in ("lora_A", "lora_B")
-    }
-    return read_weights(folder / PRINCIPAL_PARTS, like)
 
 
 def _lora_weights(model: WorldModel) -> dict[str, Tensor]:
@@ -240,10 +307,34 @@ def _lora_weights(model: WorldModel) -> dict[str, Tensor]:
 
 
 def _lora_config(model: WorldModel) -> Any:
+    """Return the config that is written: it names its layers, and so holds no regular expression of the user's."""
     predictor: Any = model.predictor
-    config = LoraConfig(**{**predictor.peft_config["default"].to_dict(), "inference_mode": True})
-    config.target_modules = sorted(config.target_modules)
+    own, layers = predictor.peft_config["default"], lora_layers(model)
+    names = [name.removesuffix(".weight") for name in base_weights(model.base_predictor) if name.endswith(".weight")]
+    bare = {name.rpartition(".")[2] for name in names if name not in layers}
+    last = {name: name.rpartition(".")[2] for name in layers}
+    resolved = {
+        "inference_mode": True,
+        "init_lora_weights": True,
+        "target_modules": sorted({name if kind in bare else kind for name, kind in last.items()}),
+        "exclude_modules": None,
+        "layers_to_transform": None,
+        "layers_pattern": None,
+        "rank_pattern": {name: layer.r["default"] for name, layer in layers.items() if layer.r["default"] != own.r},
+        "alpha_pattern": {
+            name: layer.lora_alpha["default"]
+            for name, layer in layers.items()
+            if layer.lora_alpha["default"] != own.lora_alpha
+        },
+    }
+    config = LoraConfig(**(own.to_dict() | resolved))
+    config.target_modules = resolved["target_modules"]  # a list, in this order
     return config
+
+
+def _written(model: WorldModel, *, where: str) -> AdapterConfig:
+    """Return the knobs that a model's adapter is read with after it was written."""
+    return adapter_of(_lora_config(model).to_dict(), LoraConfig().to_dict(), where=where)
 
 
 def _set_trainable(model: WorldModel, trainable: bool) -> None:
@@ -254,51 +345,21 @@ def _set_trainable(model: WorldModel, trainable: bool) -> None:
 
 
 def _load_lora(model: WorldModel, folder: Path) -> None:
-    config = _read_lora_config(folder, model)
-    if model.adaptation is None:
-        _wrap(model, config)
-    else:
-        _check_same_adapter(_lora_config(model), config, where=str(folder))
-    _check_scales(model, where=str(folder / "adapter_config.json"))
-    weights = read_weights(folder / LORA_WEIGHTS, _lora_weights(model))
-    if config.init_lora_weights == "pissa":
-        _start_from_principal_parts(model, _read_principal_parts(model, folder))
-    set_peft_model_state_dict(model.predictor, weights)
-
-
-def _read_lora_config(folder: Path, model: WorldModel) -> Any:
-    """Return an adapter's settings in PEFT's form; on a base they are checked to fit."""
     knobs = read_adapter_file(folder, LoraConfig().to_dict())
-    if model.adaptation is not None:
-        return LoraConfig(**peft_arguments(knobs, knobs.targets))
-    try:
-        return LoraConfig(**lora_arguments(model.base_predictor, knobs))
-    except InputError as error:
-        raise InputError(
-            where=f"{folder / ADAPTER_FILE}: {error.where}", found=error.found, needed=error.needed, fix=error.fix
-        ) from None
-
-
-def _check_scales(model: WorldModel, *, where: str) -> None:
-    for name, layer in lora_layers(model).items():
-        scale, alpha = layer.scaling["default"], layer.lora_alpha["default"]
-        if not math.isfinite(scale):
-            found = f"lora_alpha {alpha} for {name}, a scale of {scale}"
-            raise InputError(where=where, found=found, needed="a finite scale")
-
-
-def _check_same_adapter(own: Any, other: Any, *, where: str) -> None:
-    for key in sorted(peft_arguments(AdapterConfig(), ()).keys() - {"lora_dropout"}):
-        found, needed = (
-            sorted(value) if isinstance(value, set | list) else value
-            for value in (getattr(other, key), getattr(own, key))
-        )
-        if found != needed:
-            raise InputError(where=where, found=f"an adapter with {key} {found}", needed=f"{needed}, as the model has")
-
-
-def _load_everything(model: WorldModel, folder: Path) -> None:
-    weights = read_weights(folder / FULL_WEIGHTS, model.predictor.state_dict())
     if model.adaptation is None:
-        _train_everything(model)
-    model.predictor.load_state_dict(weights)
+        try:
+            _wrap(model, knobs)
+        except InputError as error:
+            where = f"{folder / ADAPTER_FILE}: {error.where}"
+            raise InputError(where=where, found=error.found, needed=error.needed, fix=error.fix) from None
+    else:
+        own = _written(model, where=str(folder))
+        for name in AdapterConfig.model_fields.keys() - {"dropout"}:
+            found, needed = getattr(knobs, name), getattr(own, name)
+            if found != needed:
+                raise InputError(
+                    where=str(folder),
+                    found=f"an adapter with {name} {found}",
+                    needed=f"{needed}, as the model has",
+                )
+    set_peft_model_state_dict(model.predictor, read_weights(folder / LORA_WEIGHTS, _lora_weights(model)))

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import torch
 
-from vjepa2_ac.model.adapter.initialization import set_original_weights
-from vjepa2_ac.model.adapter.lora import adaptation_of, lora_layers
-from vjepa2_ac.model.network.world_model import Adaptation, WorldModel
+from vjepa2_ac.model.adapter.lora import adaptation_of
+from vjepa2_ac.model.network.world_model import WorldModel
 
 
 @contextmanager
@@ -24,21 +23,14 @@ def base_only(model: WorldModel) -> Iterator[None]:
         yield
         return
     trained = [(value, value.requires_grad) for value in model.predictor.parameters()]
-    switch = _lora_off if model.adaptation.kind == "lora" else _start_weights
+    predictor: Any = model.predictor
+    start = model.adaptation.start
     try:
-        with switch(model, model.adaptation):
+        with predictor.disable_adapter() if start is None else _weights(predictor, start):
             yield
     finally:
         for value, requires_grad in trained:  # PEFT enables gradients when it enables an adapter
             value.requires_grad_(requires_grad)
-
-
-def base_dtype(model: WorldModel) -> torch.dtype:
-    """Return the type of the predictor's weights before training, which is in float32: `model.dtype`."""
-    if model.adaptation is not None and model.adaptation.kind == "none" and model.adaptation.start:
-        return next(iter(model.adaptation.start.values())).dtype
-    weight: torch.Tensor = model.base_predictor.predictor_norm.weight  # never trained beside an adapter
-    return weight.dtype
 
 
 def merge_adapter(model: WorldModel) -> None:
@@ -49,8 +41,10 @@ def merge_adapter(model: WorldModel) -> None:
     Raises:
         ValueError: The model is not adapted.
     """
-    dtype = base_dtype(model)
-    if adaptation_of(model).kind == "lora":
+    adaptation = adaptation_of(model)
+    never_trained = model.base_predictor.predictor_norm.weight  # beside an adapter
+    dtype = (adaptation.start or {}).get("predictor_norm.weight", never_trained).dtype
+    if adaptation.kind == "lora":
         kind = model.device.type
         has_autocast = torch.amp.is_autocast_available(kind)  # some, such as meta, have none
         with torch.autocast(kind, enabled=False) if has_autocast else nullcontext():  # or its type would be computed in
@@ -73,23 +67,10 @@ def unadapted_copy(model: WorldModel) -> WorldModel:
 
 
 @contextmanager
-def _lora_off(model: WorldModel, adaptation: Adaptation) -> Iterator[None]:
-    predictor: Any = model.predictor
-    layers = lora_layers(model) if adaptation.start else {}  # PiSSA's: their own weights are not the base's
-    now = {name: layer.get_base_layer().weight.detach().clone() for name, layer in layers.items()}
-    set_original_weights(layers, adaptation.start or {})
-    try:
-        with predictor.disable_adapter():
-            yield
-    finally:
-        set_original_weights(layers, now)
-
-
-@contextmanager
-def _start_weights(model: WorldModel, adaptation: Adaptation) -> Iterator[None]:
-    now = {name: value.detach().clone() for name, value in model.predictor.state_dict().items()}
-    model.predictor.load_state_dict(adaptation.start or {})
+def _weights(predictor: Any, weights: Mapping[str, torch.Tensor]) -> Iterator[None]:
+    now = {name: value.detach().clone() for name, value in predictor.state_dict().items()}
+    predictor.load_state_dict(weights)
     try:
         yield
     finally:
-        model.predictor.load_state_dict(now)
+        predictor.load_state_dict(now)

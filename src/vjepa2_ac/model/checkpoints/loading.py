@@ -1,19 +1,54 @@
-"""Loading the world model that a config starts from: one that is there, or a fresh predictor on an encoder."""
+"""Loading the world model that a config starts from; and Meta's own checkpoint format, read and written.
+
+A model is one that is there (Meta's `.pt`, or a folder of this project), or a fresh predictor on an encoder.
+"""
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
+from pydantic import ValidationError
+from torch import Tensor
 
-from vjepa2_ac.config import ModelConfig, ModelSizes
-from vjepa2_ac.model.base_model import find_base
-from vjepa2_ac.model.checkpoints.encoder_file import FoundEncoder
-from vjepa2_ac.model.checkpoints.find_encoder import expected_sizes, find_encoder, sizes_with
-from vjepa2_ac.model.checkpoints.official import load_official, load_predictor, own_encoder
+from vjepa2_ac.config import ModelConfig, ModelSizes, PredictorSizes
+from vjepa2_ac.config.model import EncoderConfig, EncoderKey
+from vjepa2_ac.episode import ACTION_DIM, POSE_WIDTHS
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.base_model import check_sizes, find_base, read_sizes
+from vjepa2_ac.model.checkpoints.encoders import (
+    FoundEncoder,
+    encoder_in_file,
+    expected_sizes,
+    find_encoder,
+    sizes_with,
+)
+from vjepa2_ac.model.checkpoints.meta_file import (
+    ENCODER_KEYS,
+    depth_of,
+    fill,
+    official_name,
+    open_file,
+    part_of,
+    tensors_of,
+    to_official_names,
+)
+from vjepa2_ac.model.network.blocks import mlp_ratio_of
+from vjepa2_ac.model.network.encoder_origin import HEADS
+from vjepa2_ac.model.network.input_heads import widths_as_text, widths_of_model
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.model.sizes import check_sizes, read_sizes
 from vjepa2_ac.places import BUILTIN
+
+logger = logging.getLogger(__name__)
+
+_NEEDED = "a checkpoint of V-JEPA 2-AC as Meta publishes it (vjepa2-ac-vitg.pt), 11.7 GB"
+_FIX = "`vjepa2-ac download` fetches it, and goes on with a part of it"
+_NON_COMMERCIAL = "The weights that jepa-wms publishes so are CC-BY-NC 4.0: for non-commercial use only"
+_KEYS: tuple[EncoderKey, ...] = ("encoder", "target_encoder")  # one encoder twice: it was frozen
 
 
 def load_base(config: ModelConfig, *, seed: int) -> WorldModel:
@@ -30,19 +65,19 @@ def load_base(config: ModelConfig, *, seed: int) -> WorldModel:
         at_persistence = config.random_start == "persistence"
         if found is None:
             return WorldModel.random(config.random, seed, dtype, at_persistence=at_persistence)
-        model = _on_encoder(found, config.random, dtype)
-        model.draw_predictor(seed, dtype, at_persistence=at_persistence)
+        model = _on_encoder(found, sizes_with(found, config.random), dtype)
+        model.draw_predictor(torch.Generator().manual_seed(seed), dtype, at_persistence=at_persistence)
         return model
     if config.base is None:
         raise ValueError("a ModelConfig has a base or random sizes")
     path = find_base(config.base)
     if path.is_dir():
         if found is not None:
-            raise own_encoder(config.base, found)
+            raise _own_encoder(config.base, found)
         check_sizes(read_sizes(path), config.sizes, where=f"model.base: {config.base}")
         return WorldModel.from_pretrained(path, dtype=dtype)
     if found is not None:
-        return load_predictor(path, found, config.sizes, dtype)
+        return _load_predictor(path, found, config.sizes, dtype)
     return load_official(path, config.sizes, dtype)
 
 
@@ -64,9 +99,151 @@ def base_sizes(config: ModelConfig) -> ModelSizes:
     return read_sizes(path) if path.is_dir() else config.sizes
 
 
-def _on_encoder(found: FoundEncoder, given: ModelSizes, dtype: torch.dtype) -> WorldModel:
+def load_official(path: str | Path, sizes: ModelSizes | None = None, dtype: torch.dtype = torch.float32) -> WorldModel:
+    """Read Meta's checkpoint. Every tensor is matched; only a `pos_embed` of the encoder may remain.
+
+    The file is mapped: beside the weights in `dtype` there are only pages of the file, which the system takes back.
+
+    Args:
+        path: The `.pt` file.
+        sizes: Sizes that tensors do not show: image size, heads, extrinsics. Any other size that differs from both the
+            default and the tensors is a contradiction.
+        dtype: Type of the weights in memory.
+
+    Raises:
+        InputError: The file is missing, truncated, of another kind, contradicts the sizes, or a weight is not finite.
+    """
+    path, given = Path(path), sizes or ModelSizes()
+    whole = open_file(path, needed=_NEEDED, fix=_FIX)
+    key = next((one for one in _KEYS if one in whole), _KEYS[0])
+    patches = tensors_of(whole, key, where=str(path), needed=_NEEDED, fix=_FIX).get("patch_embed.proj.weight")
+    heads = None if patches is not None and patches.shape[0] in HEADS else given.encoder.heads
+    asked = EncoderConfig(path=str(path), key=key, frame=given.encoder.frame, heads=heads)
+    return _beneath(path, whole, encoder_in_file(path, whole, asked), given, dtype)
+
+
+def to_official(model: WorldModel) -> dict[str, Any]:
+    """Return the weights by Meta's names, q, k and v fused: `torch.save` of it is an official checkpoint.
+
+    Raises:
+        InputError: States and actions differ in width from Meta's code, which has no predictor without states either.
+        ValueError: There is an adapter: merge it first.
+    """
+    if model.predictor is not model.base_predictor:
+        raise ValueError("an adapter is on: merge_adapter first")
+    if not model.sizes.predictor.use_states or widths_of_model(model.sizes) != POSE_WIDTHS:
+        raise InputError(
+            where="the official format",
+            found=f"a model that takes {widths_as_text(model.sizes)}"
+            if model.sizes.predictor.use_states
+            else "a predictor without states",
+            needed=f"states and actions of {POSE_WIDTHS.state} numbers: Meta's code has no other predictor",
+            fix="Export it with --to merged (WorldModel.save_pretrained), which `model.base` takes",
+        )
+    encoder = to_official_names(model.present_encoder.state_dict(), part_of(model.sizes.encoder.family))
+    return {
+        "encoder": encoder,
+        "target_encoder": dict(encoder),
+        "predictor": to_official_names(model.predictor.state_dict(), "predictor"),
+        "epoch": 0,
+    }
+
+
+def _load_predictor(path: Path, found: FoundEncoder, sizes: ModelSizes, dtype: torch.dtype) -> WorldModel:
+    """Read a file that holds a predictor alone, and put an encoder from elsewhere under it."""
+    whole = open_file(path, needed=_NEEDED, fix=_FIX)
+    if any(key in whole for key in ENCODER_KEYS):
+        raise _own_encoder(str(path), found)
+    model = _beneath(path, whole, found, sizes, dtype)
+    model.encoder_origin = found.origin
+    if not model.sizes.predictor.use_states:
+        logger.warning("%s: a predictor without states and without an encoder. %s", path, _NON_COMMERCIAL)
+    logger.warning(
+        "%s does not say which encoder its predictor was trained on: on any other than %s it predicts noise. The first"
+        " validation shows it (its error beside that of persistence).",
+        path,
+        found.origin,
+    )
+    return model
+
+
+def _beneath(
+    path: Path, whole: Mapping[str, Any], found: FoundEncoder, given: ModelSizes, dtype: torch.dtype
+) -> WorldModel:
+    """Return the model of the predictor in a file and an encoder."""
+    predictor = tensors_of(whole, "predictor", where=str(path), needed=_NEEDED, fix=_FIX)
+    if "mask_tokens" in {name.partition(".")[0] for name in predictor} and "action_encoder.weight" not in predictor:
+        raise InputError(
+            where=f"model.base: {path}",
+            found="a checkpoint of pretraining: its predictor fills in masked patches, and knows no actions",
+            needed=_NEEDED,
+            fix="Its encoder can be used: set model.encoder.path to this file, and model.random in place of model.base"
+            " for a fresh predictor (configs/scratch_vitb.yaml)",
+        )
+    model = _on_encoder(found, _sizes(predictor, found, given, where=str(path)), dtype)
+    model.encoder_origin = None  # the file is the model's own
+    rename = partial(official_name, part="predictor")
+    fill(model.predictor, predictor, rename, dtype, where=f"{path}: predictor", fix="Check model.base and model.sizes")
+    logger.info("read %s: %s", path, model.sizes.model_dump())
+    return model
+
+
+def _on_encoder(found: FoundEncoder, sizes: ModelSizes, dtype: torch.dtype) -> WorldModel:
     """Return a model with this encoder, and a predictor without weights."""
-    model = WorldModel.empty(sizes_with(found, given))
+    model = WorldModel.empty(sizes)
     found.fill(model.present_encoder, dtype)
     model.encoder_origin = found.origin
     return model
+
+
+def _own_encoder(base: str, found: FoundEncoder) -> InputError:
+    return InputError(
+        where=f"model.base: {base}",
+        found=f"an encoder of its own, and model.encoder names another ({found.where})",
+        needed="the encoder that the predictor was trained on: on other latents it predicts noise",
+        fix="Leave out model.encoder; or train a fresh predictor on it, with model.random in place of model.base",
+    )
+
+
+def _sizes(predictor: Mapping[str, Tensor], encoder: FoundEncoder, given: ModelSizes, *, where: str) -> ModelSizes:
+    """Return the sizes of the tensors; heads, image size and extrinsics are those given."""
+    own = given.predictor
+    try:
+        width, action_width = predictor["action_encoder.weight"].shape
+        hidden, latent = predictor["predictor_blocks.0.mlp.fc1.weight"].shape[0], predictor["predictor_embed.weight"]
+        depth = depth_of(predictor, "predictor_blocks")
+    except (KeyError, ValueError) as missing:
+        raise InputError(where=where, found=f"no tensor {missing} in it", needed=_NEEDED, fix=_FIX) from None
+    if action_width != ACTION_DIM:
+        found = f"action_encoder.weight of {action_width} columns"
+        raise InputError(where=where, found=found, needed=f"{ACTION_DIM} columns", fix=_FIX)
+    if latent.shape[-1] != encoder.sizes.width:
+        raise InputError(
+            where=f"model.base: {where}",
+            found=f"a predictor of latents of width {latent.shape[-1]}",
+            needed=f"one of width {encoder.sizes.width}, as {encoder.where} makes them",
+            fix="Set model.encoder to the encoder that the predictor was trained on",
+        )
+    try:
+        found_sizes = ModelSizes(
+            image_size=given.image_size,
+            patch_size=encoder.patch_size,
+            encoder=encoder.sizes,
+            predictor=PredictorSizes(
+                width=width,
+                depth=depth,
+                heads=own.heads,
+                mlp_ratio=mlp_ratio_of(width, hidden, own.mlp_ratio),
+                use_extrinsics=own.use_extrinsics,
+                use_states=any(name.startswith("state_encoder.") for name in predictor),
+            ),
+        )
+    except ValidationError as error:
+        raise InputError(
+            where=where,
+            found=f"sizes that do not go with model.sizes ({error.errors()[0]['msg']})",
+            needed="image size and heads of the checkpoint",
+            fix="Set them in model.sizes: the tensors cannot tell",
+        ) from None
+    check_sizes(found_sizes, given, where=where)
+    return found_sizes

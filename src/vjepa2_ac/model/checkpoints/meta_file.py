@@ -2,33 +2,29 @@
 
 from __future__ import annotations
 
-import pickle
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from vjepa2_ac.config.model import Family
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.checkpoints.foreign_file import foreign_kind
+from vjepa2_ac.model.network.pretrained_folder import check_tensors, require_finite
 
-GROUP_BYTES = 2**29  # of the file in memory at once, in addition to the weights
 ENCODER_KEYS = ("ema_encoder", "target_encoder", "encoder")
 """Where an encoder can be in a file. The first that is there is taken: an average of weights, which Meta's own use is
 of; `encoder` is the one that was trained by gradient."""
 
 Part = Literal["encoder", "encoder 2.1", "predictor"]
-Shapes = dict[str, tuple[int, ...]]
+Rename = Callable[[str], tuple[str, int | None]]
+"""Our name of a tensor -> the file's, and which third of a fused one it is (None: all of it)."""
 
 _SPLIT = ("q", "k", "v")
 _PREFIXES = re.compile(r"^(?:(?:module|backbone)\.)+")
-_DAMAGE = (  # errors of a damaged pickle, in addition to torch's own
-    pickle.UnpicklingError, OSError, EOFError, RuntimeError, ValueError, LookupError, TypeError, AttributeError,
-    AssertionError, ArithmeticError, MemoryError,
-)  # fmt: skip
+_IGNORED = "pos_embed"  # may be in a file: a network with rotary positions does not use it
 _ENCODER = [
     (r"^vit\.embeddings\.patch_embeddings\.", "patch_embed."),
     (r"^vit\.layer\.", "blocks."),
@@ -47,6 +43,11 @@ _NAMES: dict[Part, list[tuple[str, str]]] = {  # ours -> Meta's, as (pattern, re
     ],
     "predictor": [(r"^blocks\.", "predictor_blocks."), (r"\.attn\.o\.", ".attn.proj.")],
 }
+_FOREIGN = (  # what a file begins with
+    (b"\x80", "a pickle, or a file of an old version of torch.save: neither is loaded, for it could run foreign code"),
+    (b"version https://git-lfs", "a pointer of Git LFS, in place of the file itself"),
+    (b"<", "a web page, or XML"),
+)
 
 
 def open_file(path: Path, *, needed: str, fix: str) -> dict[str, Any]:
@@ -59,28 +60,31 @@ def open_file(path: Path, *, needed: str, fix: str) -> dict[str, Any]:
         raise InputError(where=str(path), found="no such file", needed=needed, fix=fix)
     try:
         whole = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except _DAMAGE as error:
+    except Exception as error:  # a damaged pickle ends in any of them
         raise InputError(where=str(path), found=_foreign(path, error), needed=needed, fix=fix) from None
     if not isinstance(whole, dict):
         raise InputError(where=str(path), found=f"a {type(whole).__name__}", needed=needed, fix=fix)
     return {str(key): value for key, value in whole.items()}
 
 
-def tensors_of(part: Any) -> dict[str, Tensor] | None:
-    """Return the tensors of a part by Meta's names without prefixes; None: it is not only tensors, or has none."""
+def tensors_of(whole: Mapping[str, Any], key: str, *, where: str, needed: str, fix: str) -> dict[str, Tensor]:
+    """Return the tensors of a part by Meta's names without prefixes.
+
+    Raises:
+        InputError: There is no such part, it holds more than tensors, or nothing.
+    """
+    part = whole.get(key)
     if not isinstance(part, dict) or not part or not all(isinstance(value, Tensor) for value in part.values()):
-        return None
-    return {_PREFIXES.sub("", str(name)): value for name, value in part.items()}
+        found = f"no weights under {key!r} (keys: {', '.join(list(whole)[:8])})"
+        raise InputError(where=where, found=found, needed=needed, fix=fix)
+    named = {_PREFIXES.sub("", str(name)): value for name, value in part.items()}
+    named.pop(_IGNORED, None)
+    return named
 
 
 def part_of(family: Family) -> Part:
     """Return the names of an encoder of a family."""
     return "encoder" if family == "v2" else "encoder 2.1"
-
-
-def shapes_of(weights: Mapping[str, Tensor]) -> Shapes:
-    """Return the shapes of tensors by their names."""
-    return {name: tuple(value.shape) for name, value in weights.items()}
 
 
 def official_name(name: str, part: Part) -> tuple[str, int | None]:
@@ -91,19 +95,27 @@ def official_name(name: str, part: Part) -> tuple[str, int | None]:
     return fused, None if fused == name else _SPLIT.index(name.split(".attn.")[1][0])
 
 
-def official_shapes(ours: Mapping[str, tuple[int, ...]], part: Part) -> Shapes:
-    """Return the tensors that a file must have for ours."""
-    needed: Shapes = {}
-    for name, shape in ours.items():
-        official, third = official_name(name, part)
-        needed[official] = shape if third is None else (3 * shape[0], *shape[1:])
-    return needed
+def fill(
+    network: nn.Module, weights: Mapping[str, Tensor], rename: Rename, dtype: torch.dtype, *, where: str, fix: str
+) -> None:
+    """Load mapped weights into a network on the meta device, each cast as it is read; none requires a gradient.
 
-
-def take(official: Mapping[str, Tensor], name: str, part: Part) -> Tensor:
-    """Return one of our tensors from Meta's."""
-    fused, third = official_name(name, part)
-    return official[fused] if third is None else official[fused].chunk(3)[third]
+    Raises:
+        InputError: A tensor is missing, unknown or of another shape, or a weight is not finite.
+    """
+    names = {ours: rename(ours) for ours in network.state_dict()}
+    needed: dict[str, tuple[int, ...]] = {}
+    for ours, value in network.state_dict().items():
+        theirs, third = names[ours]
+        needed[theirs] = tuple(value.shape) if third is None else (3 * value.shape[0], *value.shape[1:])
+    check_tensors({name: tuple(value.shape) for name, value in weights.items()}, needed, where=where, fix=fix)
+    own = {}
+    for ours, (theirs, third) in names.items():
+        value = weights[theirs] if third is None else weights[theirs].chunk(3)[third]
+        own[ours] = value.to(dtype, copy=True)
+    require_finite(own, where=where, fix=fix)
+    network.load_state_dict(own, assign=True)
+    network.requires_grad_(False)
 
 
 def to_official_names(weights: Mapping[str, Tensor], part: Part, *, prefix: str = "module.") -> dict[str, Tensor]:
@@ -124,27 +136,21 @@ def depth_of(names: Mapping[str, object], blocks: str) -> int:
     Raises:
         KeyError: None is.
     """
-    numbers = [int(name.split(".")[1]) for name in names if re.match(rf"{blocks}\.\d+\.", name)]
+    numbers = [int(name.split(".")[1]) for name in names if re.match(rf"{blocks}\.\d{{1,6}}\.", name)]
     if not numbers:
         raise KeyError(f"{blocks}.0")
     return 1 + max(numbers)
 
 
-def in_groups(weights: Mapping[str, Tensor]) -> Iterator[list[str]]:
-    """Yield the names of tensors, as many at once as may be read before a mapped file is released."""
-    group, size = list[str](), 0
-    for name, value in weights.items():
-        group.append(name)
-        size += value.numel() * 4
-        if size >= GROUP_BYTES:
-            yield group
-            group, size = [], 0
-    if group:
-        yield group
-
-
 def _foreign(path: Path, error: Exception) -> str:
-    if (kind := foreign_kind(path, error)) is not None:
-        return kind
-    size, reason = path.stat().st_size / 1e9, str(error).splitlines()[0][:120]
-    return f"{size:.2f} GB that torch cannot read ({reason}): truncated, or of another kind"
+    """Return what a file is that torch did not load."""
+    refused = re.search(r"GLOBAL ([\w.]+)", str(error))
+    if refused:
+        return f"a pickle that would call {refused[1]}: it was refused, since loading it could run foreign code"
+    with path.open("rb") as file:
+        head = file.read(64)
+    if not head.startswith(b"PK"):
+        kind = "a safetensors file" if head[8:10] == b'{"' else "no file of torch.save"
+        return next((known for start, known in _FOREIGN if head.startswith(start)), kind)
+    size, (reason, *_) = path.stat().st_size / 1e9, [*str(error).splitlines(), type(error).__name__]
+    return f"{size:.2f} GB that torch cannot read ({reason[:120]}): truncated, or of another kind"

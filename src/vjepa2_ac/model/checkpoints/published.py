@@ -5,11 +5,16 @@ Sources: facebookresearch/vjepa2 @ 204698b, src/hub/backbones.py and app/vjepa_2
 
 from __future__ import annotations
 
+import difflib
+import re
 from dataclasses import dataclass
 from typing import Literal
 
 from vjepa2_ac.config.model import Family
-from vjepa2_ac.model.network.published_sizes import VIT_B, VIT_G, VIT_H, VIT_L, EncoderShape, VIT_g
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.network.encoder_origin import VIT_B, VIT_G, VIT_H, VIT_L, EncoderShape, VIT_g
+
+OFFICIAL = "vjepa2-ac-vitg"  # Meta's world model, which `download` fetches without a name
 
 _URL = "https://dl.fbaipublicfiles.com/vjepa2/"
 _MIT = "MIT"
@@ -118,3 +123,30 @@ PUBLISHED: tuple[Published, ...] = (
 def published_as(file_name: str) -> Published | None:
     """Return the published file of this name, Meta's or ours, exactly as it is spelt; None: it is none of them."""
     return next((one for one in PUBLISHED if file_name in {one.remote, one.file}), None)
+
+
+def find_published(text: str) -> Published:
+    """Return the published checkpoint that a name means; dots, dashes and underscores do not matter, the case does.
+
+    Args:
+        text: Our name, Meta's name of the file or the name in torch.hub; with or without `.pt`.
+
+    Raises:
+        InputError: None has this name.
+    """
+    names = {_plain(name): one for one in PUBLISHED for name in (one.name, one.remote, *one.aliases)}
+    if (meant := names.get(_plain(text))) is not None:
+        return meant
+    folded = [(name.casefold(), one.name) for name, one in names.items()]
+    near = difflib.get_close_matches(_plain(text.rpartition("/")[2]).casefold(), [name for name, _ in folded], n=3)
+    close = list(dict.fromkeys(ours for name, ours in folded if name in near))
+    meant_perhaps = f"Did you mean {' or '.join(close)}? " if close else ""
+    raise InputError(
+        where=f"download {text}",
+        found="no published checkpoint of this name",
+        fix=f"{meant_perhaps}`vjepa2-ac download --list` shows all; where the file goes is said by --to",
+    )
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[-_. ]", "", name.removesuffix(".pt"))

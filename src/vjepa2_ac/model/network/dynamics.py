@@ -11,7 +11,7 @@ from torch.nn.functional import layer_norm
 
 from vjepa2_ac.model.network.attention import Attend, AttentionKind
 from vjepa2_ac.model.network.compilation import When
-from vjepa2_ac.model.network.kv_cache import KeyValueCache
+from vjepa2_ac.model.network.predictor_network import KeyValueCache
 
 
 class LatentDynamics(nn.Module):

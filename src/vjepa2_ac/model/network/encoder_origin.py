@@ -1,4 +1,8 @@
-"""Where an encoder came from, and what identifies it beyond its tensors."""
+"""Which encoder is it: the published shapes, where one came from, and what identifies it beyond its tensors.
+
+PyTorch is not imported. Source of the shapes: facebookresearch/vjepa2 @ 204698b, src/hub/backbones.py and the classes
+that it names.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +12,35 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from vjepa2_ac.config import EncoderSizes
-from vjepa2_ac.model.network.published_sizes import HEADS
+from vjepa2_ac.config.model import Family, FramePath
+
+
+@dataclass(frozen=True)
+class EncoderShape:
+    """A published encoder."""
+
+    name: str  # ViT-B, ...
+    width: int
+    depth: int
+    heads: int
+    hidden: int  # width of the MLP
+
+    def sizes(self, family: Family, frame: FramePath) -> EncoderSizes:
+        """Return the sizes of an encoder of this shape."""
+        ratio = self.hidden / self.width
+        return EncoderSizes(
+            width=self.width, depth=self.depth, heads=self.heads, mlp_ratio=ratio, family=family, frame=frame
+        )
+
+
+VIT_B = EncoderShape("ViT-B", 768, 12, 12, 3072)
+VIT_L = EncoderShape("ViT-L", 1024, 24, 16, 4096)
+VIT_H = EncoderShape("ViT-H", 1280, 32, 16, 5120)
+VIT_g = EncoderShape("ViT-g", 1408, 40, 22, 6144)
+VIT_G = EncoderShape("ViT-G", 1664, 48, 26, 8192)
+
+HEADS: Mapping[int, int] = {one.width: one.heads for one in (VIT_B, VIT_L, VIT_H, VIT_g, VIT_G)}
+"""Width of an encoder -> its attention heads, which its tensors do not show."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +62,7 @@ def beyond_tensors(sizes: EncoderSizes, *, heads_are_told: bool) -> dict[str, st
 
     Args:
         sizes: Of the encoder.
-        heads_are_told: Whether the heads belong to it. Those of a model of before were not asked for: its caches stay.
+        heads_are_told: Whether the heads belong to it; not of a model that was made with its encoder.
     """
     found: dict[str, str | int] = {}
     if sizes.family != "v2":

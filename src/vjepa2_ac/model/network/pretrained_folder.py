@@ -1,9 +1,13 @@
-"""The folder of a world model: config.json, encoder.safetensors and predictor/ as transformers writes it."""
+"""The folder of a world model: config.json, encoder.safetensors and predictor/ as transformers writes it.
+
+And what every file of weights is checked for: names, shapes, and that each number is finite.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +18,8 @@ from torch import Tensor, nn
 
 from vjepa2_ac import storage
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.finite import require_finite
+from vjepa2_ac.model.base_model import CONFIG, FORMAT
 from vjepa2_ac.model.network.encoder_origin import EncoderOrigin
-from vjepa2_ac.model.sizes import CONFIG, FORMAT
 from vjepa2_ac.storage.structured import read_json_object, record_of
 
 ENCODER, PREDICTOR = "encoder.safetensors", "predictor/model.safetensors"
@@ -78,8 +81,6 @@ def read_tensors(
 ) -> dict[str, Tensor]:
     """Read a safetensors file whose tensors must have the names and shapes of given ones.
 
-    Its header is checked against its size first.
-
     Args:
         path: The file.
         like: Tensors of these names and shapes.
@@ -90,27 +91,37 @@ def read_tensors(
     Raises:
         InputError: The file is missing or truncated, is of another format, holds other tensors, or NaN or infinity.
     """
-    try:
-        with safe_open(path, framework="pt") as file:
-            found = {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118  # no iterator
-            check_tensors(found, {name: tuple(value.shape) for name, value in like.items()}, where=str(path), fix=fix)
-            weights = {}
-            for name in like:
-                value = file.get_tensor(name)
-                weights[name] = value.to(dtype or value.dtype, copy=True)  # the file may be replaced while it is in use
-    except FileNotFoundError:
-        again = "Copy or write the folder again"
-        raise InputError(where=str(path), found="no such file", needed=needed, fix=again) from None
-    except (SafetensorError, OSError, TypeError) as error:  # the last: of a type that torch does not have
-        problem = f"not a whole safetensors file ({error})"
-        raise InputError(where=str(path), found=problem, fix="Copy or write it again") from None
+    with open_safetensors(path, needed=needed) as file:
+        found = {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118  # no iterator
+        check_tensors(found, {name: tuple(value.shape) for name, value in like.items()}, where=str(path), fix=fix)
+        values = {name: file.get_tensor(name) for name in like}
+        # copied: the file may be replaced while it is in use
+        weights = {name: value.to(dtype or value.dtype, copy=True) for name, value in values.items()}
     require_finite(weights, where=str(path), fix=fix)
     return weights
 
 
+@contextmanager
+def open_safetensors(path: Path, *, needed: str) -> Iterator[Any]:
+    """Open a safetensors file, whose header is checked against its size; its tensors are mapped.
+
+    Raises:
+        InputError: It is missing, truncated or of another format; also of a tensor that is read within the block.
+    """
+    again = "Copy or write the folder again"
+    try:
+        with safe_open(path, framework="pt") as file:
+            yield file
+    except FileNotFoundError:
+        raise InputError(where=str(path), found="no such file", needed=needed, fix=again) from None
+    except (SafetensorError, OSError, TypeError) as error:  # the last: of a type that torch does not have
+        found = f"not a whole safetensors file ({error})"
+        raise InputError(where=str(path), found=found, needed=needed, fix=again) from None
+
+
 def check_tensors(
-    found: dict[str, tuple[int, ...]],
-    needed: dict[str, tuple[int, ...]],
+    found: Mapping[str, tuple[int, ...]],
+    needed: Mapping[str, tuple[int, ...]],
     *,
     where: str,
     fix: str = "Check model.base and model.sizes",
@@ -135,6 +146,33 @@ def check_tensors(
             needed="every tensor of the model, and no other",
             fix=fix,
         )
+
+
+def first_not_finite(tensors: Mapping[str, Tensor]) -> str | None:
+    """Return the name of the first tensor that holds NaN or infinity; None if there is none.
+
+    Minimum and maximum show it in one pass, without extra memory: a second for a thousand million numbers.
+    """
+    for name, value in tensors.items():
+        if value.is_floating_point() and value.numel() and not torch.stack(torch.aminmax(value)).isfinite().all():
+            return name
+    return None
+
+
+def require_finite(tensors: Mapping[str, Tensor], *, where: str, fix: str) -> None:
+    """Refuse tensors that hold NaN or infinity.
+
+    Args:
+        tensors: By name.
+        where: Their owner, for messages.
+        fix: How to fix it, as a sentence.
+
+    Raises:
+        InputError: Names the first such tensor.
+    """
+    name = first_not_finite(tensors)
+    if name is not None:
+        raise InputError(where=where, found=f"{name} holds NaN or infinity", needed="finite weights", fix=fix)
 
 
 def _whole(module: nn.Module) -> dict[str, Tensor]:

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from vjepa2_ac.config import ModelSizes
+from vjepa2_ac.model.base_model import read_sizes
 from vjepa2_ac.model.network.dynamics import LatentDynamics, normalise_latents
 from vjepa2_ac.model.network.encoder import Encoder
 from vjepa2_ac.model.network.encoder_origin import EncoderOrigin, beyond_tensors, described, identified
@@ -25,7 +26,6 @@ from vjepa2_ac.model.network.pretrained_folder import (
     read_encoder_origin,
     write_folder,
 )
-from vjepa2_ac.model.sizes import read_sizes
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,7 @@ class Adaptation:
     kind: Literal["lora", "none"]  # as in config.AdapterConfig; none: every weight is trained
     base: str  # fingerprint of the predictor it started from
     encoder: str  # fingerprint of the encoder whose latents it learns from
-    start: dict[str, Tensor] | None = None  # weights it started from: all (kind none), or the adapted ones (PiSSA)
-    principal: dict[str, Tensor] | None = None  # PiSSA: the matrices that were taken off those weights
+    start: dict[str, Tensor] | None = None  # kind none: the weights it started from
 
 
 @dataclass(frozen=True)
@@ -61,7 +60,7 @@ class WorldModel(LatentDynamics):
     Latents and predictions are layer-normalised over `dim` without affine, and float32 whatever the weights' type:
     inputs are cast inside. `model.adapter.lora.add_adapter` selects the trained weights; before that there are none.
 
-    Create one with `random`, `from_pretrained` or `model.checkpoints.official.load_official`.
+    Create one with `random`, `from_pretrained` or `model.checkpoints.loading.load_official`.
     """
 
     def __init__(self, sizes: ModelSizes) -> None:
@@ -93,15 +92,12 @@ class WorldModel(LatentDynamics):
         model = cls.empty(sizes).to_empty(device=device)
         generator = torch.Generator(device).manual_seed(seed)
         model.present_encoder.initialise(generator)
-        model.base_predictor.initialise(generator)
-        if at_persistence:
-            model.base_predictor.start_at_persistence(generator)
+        model.draw_predictor(generator, dtype, at_persistence=at_persistence)
         return model.to(dtype)
 
-    def draw_predictor(self, seed: int, dtype: torch.dtype, *, at_persistence: bool = False) -> None:
-        """Initialise the predictor, which may be without weights: the encoder is one that was read."""
-        predictor = self.base_predictor.to_empty(device="cpu")
-        generator = torch.Generator().manual_seed(seed)
+    def draw_predictor(self, generator: torch.Generator, dtype: torch.dtype, *, at_persistence: bool = False) -> None:
+        """Initialise the predictor on the generator's device; it may be without weights."""
+        predictor = self.base_predictor.to_empty(device=generator.device)
         predictor.initialise(generator)
         if at_persistence:
             predictor.start_at_persistence(generator)

@@ -9,7 +9,7 @@ from typing import Annotated
 from pydantic import Field
 
 from vjepa2_ac.config import Config, DataConfig
-from vjepa2_ac.data.clips.windows import require_stride
+from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage.structured import read_json_object, record_of
 

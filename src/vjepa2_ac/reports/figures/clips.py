@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from vjepa2_ac.data.clips.windows import spread_with_ends
+from vjepa2_ac.data.windows import spread_with_ends
 from vjepa2_ac.reports.figures.page import Page, written_page
 
 _WIDTH, _SIDE, _TITLE = 16.0, 0.3, 0.6  # inches, as all below

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from matplotlib.patches import Rectangle
 
-from vjepa2_ac.data.clips.transforms import CropBox
-from vjepa2_ac.data.inspection.coverage import ENOUGH_NEAR
+from vjepa2_ac.data.coverage import ENOUGH_NEAR
+from vjepa2_ac.data.transforms import CropBox
 from vjepa2_ac.reports.figures.page import BLUE, GREEN, GREY, ORANGE, Page, written_page
 
 _INK, _FAINT, _SPEED, _GRIPPER, _IDLE = "#222222", GREY, BLUE, ORANGE, "#c9c9c9"

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import UInt8
 from matplotlib.colors import to_rgb
 
-from vjepa2_ac.data.clips.windows import spread_with_ends
+from vjepa2_ac.data.windows import spread_with_ends
 from vjepa2_ac.media.image_file import resized
 from vjepa2_ac.reports.figures.caption import text_image
 from vjepa2_ac.reports.figures.page import BLUE, GREEN, GREY, ORANGE

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from vjepa2_ac.planning.demonstrations.make_goals import EnergyCourse, MadeGoals
-from vjepa2_ac.planning.goals.key_frames import GRIPPER
-from vjepa2_ac.planning.goals.sub_goals import SubGoal
+from vjepa2_ac.demonstrations.key_frames import GRIPPER
+from vjepa2_ac.demonstrations.make_goals import EnergyCourse, MadeGoals
+from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.reports.figures.page import BLUE, GREY, ORANGE, RED, Page, written_page
 
 GOALS_IMAGE = "goals.png"

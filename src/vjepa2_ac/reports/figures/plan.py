@@ -11,12 +11,11 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.patches import Rectangle
 
-from vjepa2_ac.data.clips.transforms import crop_box
+from vjepa2_ac.data.transforms import crop_box
 from vjepa2_ac.decoding.imagined_plan import ImaginedPlan
-from vjepa2_ac.planning.decision import PlanResult
-from vjepa2_ac.planning.energy_slices import EnergySlice
+from vjepa2_ac.planning.decision import PlanResult, summarize
+from vjepa2_ac.planning.energy import EnergySlice
 from vjepa2_ac.planning.interfaces import Plan
-from vjepa2_ac.planning.summary import summarize
 from vjepa2_ac.reports.figures.film import MEANING, Kind
 from vjepa2_ac.reports.figures.page import BLUE, GREY, RED, written_page
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 from markupsafe import Markup
 
-from vjepa2_ac.data.clips.windows import spread_with_ends
+from vjepa2_ac.data.windows import spread_with_ends
 from vjepa2_ac.evaluation.result import Evaluation, Example
 from vjepa2_ac.reports.html.formatting import decimal, seconds
 from vjepa2_ac.reports.html.images import colours_of, css_gradient, jpeg_urls, png_url

@@ -16,7 +16,7 @@ from vjepa2_ac.config import CheckpointConfig
 from vjepa2_ac.errors import RefusedError, UnreachableError, UserError
 from vjepa2_ac.runs.checkpoint import CHECKPOINTS
 from vjepa2_ac.runs.mirror.upload import LostPlaceError, RemoteUpdate
-from vjepa2_ac.storage.remote.retries import quietly
+from vjepa2_ac.storage.retries import quietly
 
 logger = logging.getLogger(__name__)
 

@@ -29,7 +29,7 @@ from vjepa2_ac.runs.mirror.background_sync import Mirror, reason_of
 from vjepa2_ac.runs.mirror.remote_checkpoints import Listing, RemoteCheckpoints, complete
 from vjepa2_ac.runs.mirror.upload import SMALL_FILES, RemoteUpdate
 from vjepa2_ac.storage import download, is_url, join, place, sync, try_writing
-from vjepa2_ac.storage.remote.retries import quietly
+from vjepa2_ac.storage.retries import quietly
 
 logger = logging.getLogger(__name__)
 

@@ -53,7 +53,7 @@ class RemoteCheckpoints:
     def run_id(self, name: str) -> str | None:
         """Return the run of a checkpoint; None if unknown."""
         try:
-            state = read_json_object(self._path(name, STATE), allow_nan=True)
+            state = read_json_object(self._path(name, STATE))
         except (FileNotFoundError, InputError):
             return None
         return str(state.get("run_id", ""))

@@ -1,8 +1,9 @@
-"""The closed-loop benchmark: a model beside doing nothing, random actions and an oracle, on the same problems."""
+"""The closed-loop benchmark, and its film: a model beside doing nothing, chance and an oracle, on the same problems."""
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -10,22 +11,20 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from vjepa2_ac import __version__
 from vjepa2_ac.config.planning import LimitsConfig
-from vjepa2_ac.media.video_writer import video_library
-from vjepa2_ac.planning.goals.folder import read_goal_folder
+from vjepa2_ac.media.video_writer import video_library, write_video
+from vjepa2_ac.planning.goal_folder import read_goal_folder
 from vjepa2_ac.reporter import SILENT, Reporter
-from vjepa2_ac.simulation.closed_loop.oracles import oracle_for
-from vjepa2_ac.simulation.closed_loop.policies import DoNothing, GoalsOf, Policy, RandomActions
-from vjepa2_ac.simulation.closed_loop.result import ClosedLoopResult
-from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, run_task
+from vjepa2_ac.reports.figures.caption import side_by_side
+from vjepa2_ac.simulation.closed_loop.policies import DoNothing, GoalsOf, Policy, RandomActions, oracle_for
+from vjepa2_ac.simulation.closed_loop.rollout import ClosedLoopResult, EpisodeResult, RolloutSpec, run_task
 from vjepa2_ac.simulation.closed_loop.steering import Steering
 from vjepa2_ac.simulation.closed_loop.sub_goals import DemonstratedGoals, DemonstrationSpec, every_step
 from vjepa2_ac.simulation.closed_loop.tasks import ALSO, STEPS, SUCCESS_M, TaskName, TaskProblem, arm_for, make_problem
-from vjepa2_ac.simulation.closed_loop.video import write_film
-from vjepa2_ac.simulation.world.arm import Renderer, SimulatedArm
+from vjepa2_ac.simulation.world.arm import SimulatedArm
 from vjepa2_ac.simulation.world.domains import named_domain
 from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ
 from vjepa2_ac.storage import user_can_write, write_atomically
@@ -46,7 +45,6 @@ class BenchmarkOptions:
     steps: int | None = None  # model steps of an episode; None: the task's default
     seed: int = 0  # of the problems
     films: int = 6  # episodes in the video; 0: no video
-    renderer: Renderer = "rays"
     sub_goals: SubGoalsFrom = "none"  # demonstration: key frames of the oracle's solution; every-step: all of it
     goals: str | None = None  # a folder of goals, the same in every problem
 
@@ -95,7 +93,7 @@ def run_benchmark(
         video_library()
     with user_can_write(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    arm = arm_for(options.task, named_domain(options.domain), renderer=options.renderer)
+    arm = arm_for(options.task, named_domain(options.domain))
     model = steering.policy(arm, _goals_of(steering, options))
     results = []
     for policy in (model, *_references(steering.limits, options, arm)):
@@ -154,7 +152,7 @@ def _goals_of(steering: Steering, options: BenchmarkOptions) -> GoalsOf | None:
     spec = DemonstrationSpec(steering.limits, steps, steering.stride)
     if options.sub_goals == "every-step":
         spec = every_step(spec)
-    goals_of = DemonstratedGoals(options.task, named_domain(options.domain), spec, renderer=options.renderer)
+    goals_of = DemonstratedGoals(options.task, named_domain(options.domain), spec)
     goals_of.require(options.problems)
     return goals_of
 
@@ -186,3 +184,50 @@ def _rounded(numbers: Float[np.ndarray, "episodes _"]) -> list[list[float]]:
     if not np.isfinite(numbers).all():
         raise ValueError("a number among the metrics of episodes is not finite")
     return [[round(one, 4) for one in row] for row in numbers.tolist()]
+
+
+_HOLD = 4  # number of repetitions of the first and the last image of an episode
+
+
+def write_film(path: str | Path, result: ClosedLoopResult) -> Path:
+    """Write the stored frames of a policy as a video, in real time.
+
+    Args:
+        path: Of an MP4.
+        result: One camera image beside the goal image.
+
+    Raises:
+        InputError: PyAV is not installed.
+        ValueError: No frames were stored.
+    """
+    return write_video(path, film_frames(result), rate_hz=CONTROL_RATE_HZ / result.stride)
+
+
+def film_frames(result: ClosedLoopResult) -> Iterator[UInt8[np.ndarray, "_ _ 3"]]:
+    """Yield the frames of the video, one per model step, the first and last of an episode repeated."""
+    for number, episode in enumerate(result.episodes, start=1):
+        if episode.frames is None:
+            return
+        about = f"{result.task}, domain {result.domain}    episode {number} of {len(result.episodes)}"
+        for step, (frame, distance_m) in enumerate(zip(episode.frames, episode.distances_m, strict=True)):
+            outcome = ("   missed", "   reached")[episode.success] if step == result.steps else ""
+            caption = f"{result.policy}:   {100 * distance_m:.1f} cm from the goal{outcome}"
+            title = f"{about}    step {step} of {result.steps}"
+            images, captions = [frame, episode.goal_image], [caption, "goal"]
+            if any(one is not None for one in episode.imagined):
+                images.append(_imagined(episode, step))
+                captions.append(_about_imagined(episode, step))
+            image = side_by_side(images, captions, title)
+            yield from itertools.repeat(image, _HOLD if step in {0, result.steps} else 1)
+
+
+def _imagined(episode: EpisodeResult, step: int) -> UInt8[np.ndarray, "height width 3"]:
+    """Return what was imagined of this frame; white where nothing was."""
+    found = episode.imagined[step - 1] if step else None
+    return np.full_like(episode.goal_image, 255) if found is None else found
+
+
+def _about_imagined(episode: EpisodeResult, step: int) -> str:
+    if step and episode.imagined[step - 1] is None:
+        return f"nothing imagined: {episode.whys[step - 1]}"
+    return "imagined one step ago" if step else "imagined one step ago: nothing yet"

@@ -9,14 +9,19 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from vjepa2_ac.config.planning import LimitsConfig
+from vjepa2_ac.demonstrations.key_frames import (
+    OF_MODEL_STEPS,
+    Timing,
+    gripper_key_frames,
+    sub_goals_of,
+    with_frames_between,
+)
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.planning.goals.from_demonstration import Timing, sub_goals_of
-from vjepa2_ac.planning.goals.key_frames import OF_MODEL_STEPS, gripper_key_frames, with_frames_between
-from vjepa2_ac.planning.goals.sub_goals import SubGoal
-from vjepa2_ac.simulation.closed_loop.oracles import oracle_for
+from vjepa2_ac.planning.goals import SubGoal
+from vjepa2_ac.simulation.closed_loop.policies import oracle_for
 from vjepa2_ac.simulation.closed_loop.rollout import run_episode
 from vjepa2_ac.simulation.closed_loop.tasks import STEPS, TaskName, TaskProblem, arm_for
-from vjepa2_ac.simulation.world.arm import Renderer, SimulatedArm
+from vjepa2_ac.simulation.world.arm import SimulatedArm
 from vjepa2_ac.simulation.world.domains import Domain
 
 _SMALL = (18, 32)  # height and width of images that nobody looks at
@@ -54,17 +59,14 @@ class DemonstratedGoals:
         task: The task.
         domain: Its world, the same as of the arm that is steered.
         spec: How it is demonstrated.
-        renderer: Likewise the same.
 
     Raises:
         InputError: MuJoCo is not installed, or OpenGL does not work here.
     """
 
-    def __init__(
-        self, task: TaskName, domain: Domain, spec: DemonstrationSpec | None = None, *, renderer: Renderer = "rays"
-    ) -> None:
+    def __init__(self, task: TaskName, domain: Domain, spec: DemonstrationSpec | None = None) -> None:
         self.spec = spec or DemonstrationSpec()
-        self._arm = arm_for(task, domain, renderer=renderer)
+        self._arm = arm_for(task, domain)
         self._unseen = arm_for(task, domain, size=_SMALL)
 
     def __call__(self, problem: TaskProblem) -> tuple[SubGoal, ...]:

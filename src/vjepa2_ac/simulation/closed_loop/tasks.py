@@ -12,8 +12,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from vjepa2_ac.simulation.world.arm import Renderer, SimulatedArm
-from vjepa2_ac.simulation.world.block_arm import ContactArm, MarkedArm
+from vjepa2_ac.simulation.world.arm import ContactArm, MarkedArm, SimulatedArm
 from vjepa2_ac.simulation.world.camera import FRAME_SIZE
 from vjepa2_ac.simulation.world.domains import Domain
 from vjepa2_ac.simulation.world.motion import MotionRecipe, downward_poses, poses_in_base
@@ -218,13 +217,11 @@ def _states(drawn: _Drawn, domain: Domain) -> Float[np.ndarray, "2 7"]:
     return np.concatenate([poses, np.array(drawn.closedness)[:, None]], axis=1)
 
 
-def arm_for(
-    task: TaskName, domain: Domain, *, renderer: Renderer = "rays", size: tuple[int, int] = FRAME_SIZE
-) -> SimulatedArm:
+def arm_for(task: TaskName, domain: Domain, *, size: tuple[int, int] = FRAME_SIZE) -> SimulatedArm:
     """Return an arm for a task: `reach` needs no contacts, `place` a mark on the table.
 
     Raises:
         InputError: MuJoCo is not installed, or OpenGL does not work here.
     """
     kinds: dict[TaskName, type[SimulatedArm]] = {"reach": SimulatedArm, "place": MarkedArm}
-    return kinds.get(task, ContactArm)(domain, renderer=renderer, size=size)
+    return kinds.get(task, ContactArm)(domain, size=size)

@@ -1,4 +1,4 @@
-"""A demonstration of the simulated arm: which world, which motion; a pure function of a spec and a number."""
+"""Demonstrations: what an episode of a recording is, and what the arm does in it."""
 
 from __future__ import annotations
 
@@ -8,10 +8,25 @@ from typing import Literal
 
 import numpy as np
 
-from vjepa2_ac.simulation.recording.recorded_task import RecordedTask
-from vjepa2_ac.simulation.world.arm import Renderer, SimulatedArm
+from vjepa2_ac.simulation.world.arm import SimulatedArm
 from vjepa2_ac.simulation.world.domains import Domain, DomainRanges, named_domain, sample_domain
 from vjepa2_ac.simulation.world.motion import Motion, MotionRecipe, random_reaching
+
+RecordedTask = Literal["push", "pick", "place"]
+
+INSTRUCTIONS: dict[RecordedTask | None, str] = {
+    None: "reach around over the table",
+    "push": "push the block",
+    "pick": "pick up the block",
+    "place": "put the block on the mark",
+}
+"""Language instruction of an episode; None: random reaching, without a block."""
+
+
+def default_steps(task: RecordedTask | None) -> int:
+    """Return the control steps of an episode, enough for its task: the script of `place` releases the block late."""
+    return 81 if task == "place" else 41
+
 
 SUCCESS_SHARE = 0.9
 
@@ -26,7 +41,6 @@ class RecordingSpec:
     steps: int = 41  # control steps (15 per second); see `default_steps`
     seed: int = 0  # determines motion, outcome and worlds
     cameras: Literal[1, 3] = 1  # 1: the three images of a step are the same one; 3: one image per camera
-    renderer: Renderer = "rays"  # it works everywhere; `opengl` needs a working `MUJOCO_GL`
     recipe: MotionRecipe | None = None  # ranges of the motion, without a task
     task: RecordedTask | None = None  # with a block: half of the episodes by script, half at random
 
@@ -60,10 +74,10 @@ def arm_of(index: int, spec: RecordingSpec) -> SimulatedArm:
     """
     world = world_of(index, spec)
     if spec.task is None:
-        return SimulatedArm(world, renderer=spec.renderer)
+        return SimulatedArm(world)
     from vjepa2_ac.simulation.closed_loop.tasks import arm_for  # it imports torch, which random reaching does not need
 
-    return arm_for(spec.task, world, renderer=spec.renderer)
+    return arm_for(spec.task, world)
 
 
 def carry_out(
@@ -79,7 +93,7 @@ def carry_out(
     """
     rng = _stream(index, spec, _MOTION)
     if spec.task is not None:
-        from vjepa2_ac.simulation.recording.scripted_play import play
+        from vjepa2_ac.simulation.recording.scripted_play import play  # imports torch
 
         return play(arm, spec.task, spec.steps, rng, script=index % 2 == 0, look=look)
     motion = random_reaching(arm.domain, spec.steps, rng, spec.recipe)
@@ -101,7 +115,7 @@ def put_at(arm: SimulatedArm, index: int, spec: RecordingSpec, step: int) -> Sim
     """
     rng = _stream(index, spec, _MOTION)
     if spec.task is not None:  # contacts depend on all that happened before
-        from vjepa2_ac.simulation.recording.scripted_play import play
+        from vjepa2_ac.simulation.recording.scripted_play import play  # imports torch
 
         play(arm, spec.task, step, rng, script=index % 2 == 0)
         return arm

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -14,14 +15,11 @@ from jaxtyping import Float
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.episode import ACTION_DIM
 from vjepa2_ac.geometry import apply_action
-from vjepa2_ac.simulation.closed_loop.oracles import oracle_for
-from vjepa2_ac.simulation.closed_loop.policies import shortened
+from vjepa2_ac.simulation.closed_loop.policies import oracle_for, shortened
 from vjepa2_ac.simulation.closed_loop.rollout import put, ways_along
 from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, TaskProblem, make_problem
-from vjepa2_ac.simulation.recording.recorded_task import RecordedTask
 from vjepa2_ac.simulation.world.arm import SimulatedArm
-from vjepa2_ac.simulation.world.kinematics import OutOfReachError
-from vjepa2_ac.simulation.world.motion import Motion, MotionRecipe
+from vjepa2_ac.simulation.world.motion import Motion, MotionRecipe, OutOfReachError
 
 _NOISE_M = 0.008  # standard deviation of the noise on each axis of an oracle's step
 _LOWEST_M, _HIGHEST_M = 0.155, 0.34  # of the flange while playing
@@ -31,7 +29,7 @@ _AREA = np.array([[0.30, -0.28], [0.64, 0.28]])  # of the flange while playing, 
 
 def play(
     arm: SimulatedArm,
-    task: RecordedTask,
+    task: Literal["push", "pick", "place"],
     steps: int,
     rng: np.random.Generator,
     *,

@@ -6,15 +6,13 @@ import re
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
 from vjepa2_ac import storage
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.simulation.recording.demonstration import RecordingSpec, episode_folder, world_of
-from vjepa2_ac.simulation.recording.recorded_task import RecordedTask
-from vjepa2_ac.simulation.world.arm import Renderer
+from vjepa2_ac.simulation.recording.demonstration import RecordedTask, RecordingSpec, episode_folder, world_of
 from vjepa2_ac.simulation.world.domains import Domain, DomainRanges
 from vjepa2_ac.simulation.world.motion import MotionRecipe
 from vjepa2_ac.storage.structured import json_text, read_json_object, record_of
@@ -37,7 +35,6 @@ class _Content:
     steps: Annotated[int, Field(ge=2, le=1_000_000)]
     seed: Annotated[int, Field(ge=0)]
     cameras: Literal[1, 3]
-    renderer: Renderer
     recipe: MotionRecipe
     task: RecordedTask | None
     domain: Domain | None = None
@@ -93,7 +90,6 @@ def simulation_text(spec: RecordingSpec, episodes: int) -> str:
         steps=spec.steps,
         seed=spec.seed,
         cameras=spec.cameras,
-        renderer=spec.renderer,
         recipe=spec.recipe or MotionRecipe(),
         task=spec.task,
         domain=worlds if isinstance(worlds, Domain) else None,
@@ -123,12 +119,11 @@ def read_simulation(folder: str | Path) -> RecordedSimulation:
             fix=f"What happens under other actions can only be simulated. {_AGAIN}",
         ) from None
     content = record_of(_Content, values, where=where, needed=_NEEDED, fix=_AGAIN)
-    unknown = _unknown_keys(values, asdict(content))
     worlds = [world for world in (content.domain, content.ranges) if world is not None]
-    if unknown or len(worlds) != 1:
-        found = "; ".join(f"{key}: unknown" for key in unknown) or f"{len(worlds)} of the keys domain and ranges"
+    if len(worlds) != 1:
+        found = f"{len(worlds)} of the keys domain and ranges"
         raise InputError(where=where, found=found, needed=_NEEDED, fix=_AGAIN)
-    spec = RecordingSpec(worlds[0], content.steps, content.seed, content.cameras, content.renderer)
+    spec = RecordingSpec(worlds[0], content.steps, content.seed, content.cameras)
     spec = replace(spec, recipe=content.recipe, task=content.task)
     return RecordedSimulation(str(folder), spec, content.episodes, content.version, content.libraries)
 
@@ -142,11 +137,3 @@ def other_versions(simulation: RecordedSimulation) -> str:
 
 def _versions() -> dict[str, str]:
     return {name: version(name) for name in _LIBRARIES}
-
-
-def _unknown_keys(values: Any, known: Any, place: str = "") -> list[str]:
-    """Return the keys within mappings that the records do not have, as `domain.look.colour`."""
-    if not isinstance(values, dict) or not isinstance(known, dict):
-        return []
-    inside = [_unknown_keys(value, known[key], f"{place}{key}.") for key, value in values.items() if key in known]
-    return [f"{place}{key}" for key in values if key not in known] + [key for keys in inside for key in keys]

@@ -63,7 +63,7 @@ def measure_step(config: Config, sizes: ModelSizes, device: Kind = "cuda") -> St
     key = f"{config.model_dump_json(exclude=_WITHOUT_EFFECT)} {sizes} {device}"
     if key not in _measured:
         depth = sizes.predictor.depth
-        if depth <= _BLOCKS[1]:
+        if depth <= _BLOCKS[1] or config.adapter.peft:  # whose options may make blocks differ
             found = _measure(config, sizes, device)
         else:
             fewer, more = (_measure(config, _with_depth(sizes, blocks), device) for blocks in _BLOCKS)

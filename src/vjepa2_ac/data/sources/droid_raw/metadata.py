@@ -25,7 +25,7 @@ class DroidMetadata:
         Raises:
             InputError: It is not a JSON object.
         """
-        return cls(json_object(data, where=where, needed="the metadata of an episode", allow_nan=True), where)
+        return cls(json_object(data, where=where, needed="the metadata of an episode"), where)
 
     def serial(self, camera: str) -> str:
         """Return the serial number of a camera: left, right, wrist, ext1, ext2, or a serial number itself.

@@ -13,13 +13,13 @@ from jaxtyping import UInt8
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import RawDroidData
-from vjepa2_ac.config.effects import Affects, knobs_that_affect
-from vjepa2_ac.data.filters.broken_episodes import as_error, as_problem
+from vjepa2_ac.config.section import Affects, knobs_that_affect
 from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable
 from vjepa2_ac.data.index.index_cache import IndexKeys, get_or_build, key_of
 from vjepa2_ac.data.index.labels import labels_of
 from vjepa2_ac.data.index.packed_text import pack_texts, text_of
 from vjepa2_ac.data.index.state_hash import hash_of_states
+from vjepa2_ac.data.selection import as_error, as_problem
 from vjepa2_ac.data.sources.droid_raw.episode_folders import (
     TRAJECTORY,
     VIDEOS,

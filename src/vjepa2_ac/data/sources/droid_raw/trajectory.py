@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int
 
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, require_library
 from vjepa2_ac.spaces import zero_steps
-from vjepa2_ac.storage.libraries import require_library
 
 _POSE = "observation/robot_state/cartesian_position"
 _GRIPPER = "observation/robot_state/gripper_position"

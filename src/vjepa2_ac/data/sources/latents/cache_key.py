@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.config.effects import Affects, knobs_that_affect
+from vjepa2_ac.config.section import Affects, knobs_that_affect
 from vjepa2_ac.data.sources.latents.dtypes import DTYPES, CacheType
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage.structured import shown

@@ -21,7 +21,7 @@ from urllib.parse import quote
 
 from pydantic import Field
 
-from vjepa2_ac.data.filters.idle_ranges import FoundRanges
+from vjepa2_ac.data.idle import FoundRanges
 from vjepa2_ac.data.index.episode_table import EpisodeTable, NotATableError
 from vjepa2_ac.data.sources.latents.cache_key import CacheKey
 from vjepa2_ac.data.sources.latents.episode_file import EpisodeLayout
@@ -108,7 +108,7 @@ def read_manifest(folder: Path) -> Manifest:
     """
     where = str(folder / MANIFEST)
     try:
-        content = read_json_object(folder / MANIFEST, most_bytes=_MOST_BYTES, allow_nan=True, fix=_AGAIN)
+        content = read_json_object(folder / MANIFEST, most_bytes=_MOST_BYTES, fix=_AGAIN)
     except (FileNotFoundError, NotADirectoryError):
         found = "an unfinished latent cache" if (folder / "episodes").is_dir() else "no latent cache"
         found = found if folder.is_dir() else f"no such folder, seen from {Path.cwd()}"

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Int
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.filters.idle_ranges import FoundRanges
+from vjepa2_ac.data.idle import FoundRanges
 from vjepa2_ac.data.index.episode_table import EpisodeProblem
 from vjepa2_ac.data.sources.indexed_source import IndexedSource, Opened
 from vjepa2_ac.data.sources.latents.cache_key import clip_parts
@@ -139,6 +139,15 @@ class LatentSource(IndexedSource[DataConfig, _Opened]):
                     name, needed = opened.table.identity(number), f"{sizes[number]:,} bytes"
                     problems.append(EpisodeProblem(name, f"{path} ({name})", found, needed, _ENCODE))
         return problems
+
+    def settle(self, episodes: Int[np.ndarray, " episodes"]) -> tuple[DataConfig, list[EpisodeProblem]]:
+        """Return the config with the cameras of the cache, and the episodes whose files are not as written.
+
+        Raises:
+            InputError: One of these episodes, that clips come from, was skipped while encoding.
+        """
+        self.require_encoded(episodes)
+        return self.settled_config, self.wrong_files()
 
     def require_encoded(self, episodes: Int[np.ndarray, " episodes"]) -> None:
         """Refuse to make clips of episodes that were skipped while encoding.

@@ -118,7 +118,7 @@ def _rows_of_lines(info: DatasetInfo, videos: Sequence[str]) -> Iterator[Episode
         if not line.strip():
             continue
         with_line = f"{where}: line {number + 1}"
-        row = json_object(line, where=with_line, needed="an episode", fix=_FIX, allow_nan=True)
+        row = json_object(line, where=with_line, needed="an episode", fix=_FIX)
         yield _checked(with_line, _episode_of_line, info, row, videos)
 
 

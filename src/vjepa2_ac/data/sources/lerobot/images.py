@@ -8,13 +8,13 @@ from functools import cache, partial
 import numpy as np
 from jaxtyping import UInt8
 
-from vjepa2_ac.data.cache.block_cached_file import BlockCachedFile
 from vjepa2_ac.data.sources.indexed_source import FramesByStep
 from vjepa2_ac.data.sources.lerobot.parquet import Opener
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media import video_reader
 from vjepa2_ac.media.image_file import decode_image
 from vjepa2_ac.media.image_size import require_bounded
+from vjepa2_ac.storage.block_file import BlockCachedFile
 
 
 def video_frames(open_file: Opener, path: str, clock: video_reader.Clock, num_steps: int, where: str) -> FramesByStep:

@@ -9,10 +9,10 @@ from dataclasses import replace
 import numpy as np
 
 from vjepa2_ac import storage
-from vjepa2_ac.data.filters.broken_episodes import as_problem
 from vjepa2_ac.data.index.episode_table import EpisodeTable
 from vjepa2_ac.data.index.labels import Labels
 from vjepa2_ac.data.index.state_hash import hash_of_states
+from vjepa2_ac.data.selection import as_problem
 from vjepa2_ac.data.sources.lerobot.episode_list import EpisodeRow, VideoPlace, data_file, video_file
 from vjepa2_ac.data.sources.lerobot.episode_rows import EpisodeContent
 from vjepa2_ac.data.sources.lerobot.info import DatasetInfo

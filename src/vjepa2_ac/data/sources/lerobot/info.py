@@ -105,7 +105,7 @@ def read_info(root: str) -> DatasetInfo:
     """
     where = storage.join(root, INFO)
     try:
-        content = read_json_object(where, needed="a description of a data set", fix=_FIX, allow_nan=True)
+        content = read_json_object(where, needed="a description of a data set", fix=_FIX)
     except (FileNotFoundError, NotADirectoryError):
         fix = _WAY_TO_HUB if root.startswith("hf://") else "Set data.path to the folder with meta, data and videos"
         found = f"no {INFO} in {root}"

@@ -14,8 +14,6 @@ import numpy as np
 from jaxtyping import Shaped
 
 from vjepa2_ac import storage
-from vjepa2_ac.data.cache.block_cached_file import BlockCachedFile
-from vjepa2_ac.data.cache.disk_cache import DiskCache
 from vjepa2_ac.data.sources.lerobot.bounds import (
     FIX,
     MOST_IMAGE_BYTES,
@@ -24,8 +22,8 @@ from vjepa2_ac.data.sources.lerobot.bounds import (
     require_few,
     require_sane,
 )
-from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage.libraries import require_library
+from vjepa2_ac.errors import InputError, require_library
+from vjepa2_ac.storage.block_file import BlockCachedFile, DiskCache
 from vjepa2_ac.storage.npz_reader import read_arrays
 
 if TYPE_CHECKING:

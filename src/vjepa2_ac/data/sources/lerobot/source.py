@@ -9,9 +9,8 @@ from functools import cached_property, partial
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import LeRobotData
-from vjepa2_ac.config.effects import Affects, knobs_that_affect
-from vjepa2_ac.data.cache.block_cached_file import BlockCachedFile
-from vjepa2_ac.data.cache.disk_cache import fetched_data
+from vjepa2_ac.config.section import Affects, knobs_that_affect
+from vjepa2_ac.data.cache import fetched_data
 from vjepa2_ac.data.index.episode_table import EpisodeTable
 from vjepa2_ac.data.index.index_cache import IndexKeys, get_or_build
 from vjepa2_ac.data.sources.indexed_source import FramesByStep, IndexedSource, Opened
@@ -26,6 +25,7 @@ from vjepa2_ac.data.sources.lerobot.path_templates import list_by_template
 from vjepa2_ac.episode import Episode, Progress, StepRanges
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.video_reader import Clock, require_decoder
+from vjepa2_ac.storage.block_file import BlockCachedFile
 from vjepa2_ac.storage.structured import json_list
 
 logger = logging.getLogger(__name__)

@@ -36,11 +36,11 @@ from jaxtyping import Float, Float64
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.cache.block_cached_file import BlockCachedFile
 from vjepa2_ac.data.sources.configured_spaces import measured_space
 from vjepa2_ac.episode import EXTRINSICS_DIM, STATE_DIM
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.image_size import require_bounded
+from vjepa2_ac.storage.block_file import BlockCachedFile
 from vjepa2_ac.storage.npz_reader import NpzFile
 
 _MOST_NUMBERS = 1 << 25  # of an array other than frames: 88 hours of 7 numbers at 15 Hz; 256 MB as float64

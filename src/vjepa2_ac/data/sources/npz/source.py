@@ -13,17 +13,17 @@ from jaxtyping import UInt8
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.cache.block_cached_file import BlockCachedFile
-from vjepa2_ac.data.filters.broken_episodes import as_error, as_problem
 from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable
 from vjepa2_ac.data.index.index_cache import IndexKeys, get_or_build
 from vjepa2_ac.data.index.labels import labels_of
 from vjepa2_ac.data.index.state_hash import hash_of_states
+from vjepa2_ac.data.selection import as_error, as_problem
 from vjepa2_ac.data.sources.indexed_source import FramesByStep, IndexedSource, Opened, require_as_indexed
 from vjepa2_ac.data.sources.listing import in_parallel, walk, within
 from vjepa2_ac.data.sources.npz.npz_episode import FORMAT_HELP, NpzEpisode, opened_npz, read_episode, require_frames
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage.block_file import BlockCachedFile
 
 logger = logging.getLogger(__name__)
 

@@ -47,7 +47,7 @@ def dataset_name(folder: str) -> str:
 
 def _read_info(folder: str, where: str) -> dict[str, Any]:
     try:
-        return read_json_object(where, needed="a description as TFDS writes it", allow_nan=True)
+        return read_json_object(where, needed="a description as TFDS writes it")
     except FileNotFoundError:
         fix = "Set data.path to the data set; docs/QUICKSTART.md says how to get DROID"
         found, needed = _nothing_in(folder), f"a folder with {_INFO}"

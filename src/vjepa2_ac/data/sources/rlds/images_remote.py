@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Int64, UInt8
 
 from vjepa2_ac.config import DiskCacheConfig
-from vjepa2_ac.data.cache.disk_cache import DiskCache, fetched_data
+from vjepa2_ac.data.cache import fetched_data
 from vjepa2_ac.data.index.index_cache import cache_folder
 from vjepa2_ac.data.sources.indexed_source import FramesByStep
 from vjepa2_ac.data.sources.rlds.example import ExampleRecord
@@ -25,6 +25,7 @@ from vjepa2_ac.data.sources.rlds.tfrecord import RecordSpan
 from vjepa2_ac.data.sources.rlds.wire_format import Located, Read
 from vjepa2_ac.episode import StepRanges
 from vjepa2_ac.media.jpeg import decode_jpegs, looks_like_jpeg
+from vjepa2_ac.storage.block_file import DiskCache
 from vjepa2_ac.storage.structured import json_object
 
 _HOP_WINDOW = 1 << 16

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from vjepa2_ac.config import RldsData
-from vjepa2_ac.data.filters.broken_episodes import as_error, as_problem
 from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable
 from vjepa2_ac.data.index.state_hash import UNKNOWN, hash_of_states
+from vjepa2_ac.data.selection import as_error, as_problem
 from vjepa2_ac.data.sources.listing import in_parallel
 from vjepa2_ac.data.sources.rlds.example import ExampleRecord
 from vjepa2_ac.data.sources.rlds.features import check_record, identity_of, info_of

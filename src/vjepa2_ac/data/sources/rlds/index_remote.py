@@ -15,8 +15,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from vjepa2_ac.config import RldsData, RldsFields
-from vjepa2_ac.data.filters.broken_episodes import as_problem
 from vjepa2_ac.data.index.episode_table import EpisodeTable
+from vjepa2_ac.data.selection import as_problem
 from vjepa2_ac.data.sources.listing import in_parallel
 from vjepa2_ac.data.sources.rlds.example import ExampleRecord, not_an_example
 from vjepa2_ac.data.sources.rlds.features import STEP_FLAG, check_record, identity_of, info_of, num_steps_of

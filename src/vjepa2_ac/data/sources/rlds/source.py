@@ -8,7 +8,7 @@ from functools import partial
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import RldsData
-from vjepa2_ac.config.effects import Affects, knobs_that_affect
+from vjepa2_ac.config.section import Affects, knobs_that_affect
 from vjepa2_ac.data.index.index_cache import IndexKeys, cache_folder, get_or_build
 from vjepa2_ac.data.sources.indexed_source import IndexedSource, Opened
 from vjepa2_ac.data.sources.rlds import features

@@ -1,1 +1,0 @@
-"""The public functions: short ways into the other packages. `vjepa2_ac` itself gives their names."""

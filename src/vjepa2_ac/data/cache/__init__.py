@@ -1,1 +1,0 @@
-"""The data cache: remote data that was fetched once and is stored on the local disk."""

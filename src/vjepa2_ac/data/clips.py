@@ -1,0 +1,187 @@
+"""Clips from the steps and frames of an episode, and batches from clips."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.dataset import Dataset, require_widths
+from vjepa2_ac.data.selection import with_way_out
+from vjepa2_ac.data.sources.configured_spaces import measured_space
+from vjepa2_ac.data.transforms import view
+from vjepa2_ac.episode import Augmentation, Batch, Clip, StoredLatents, Widths
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.geometry import states_in_camera_frame
+
+Augment = Callable[[int, int], Augmentation | None]  # from the height and width of a clip's frames
+
+
+@dataclass(frozen=True)
+class ClipRequest:
+    """A request for the clip that starts at a control step of an episode."""
+
+    episode: int  # index into the data set's table
+    start: int  # first control step
+    camera: str | None = None  # whose frames; None: the config's (first) camera
+    augmentation: Augment | None = None  # draws the augmentation
+
+
+def read_clip(dataset: Dataset, request: ClipRequest) -> Clip:
+    """Return a clip; decodes its frames only.
+
+    Raises:
+        InputError: The episode or one of the frames cannot be read; does not say how to leave the episode out.
+    """
+    config = dataset.config
+    steps = range(request.start, request.start + config.clip_steps, config.model_stride)
+    recording = dataset.source.read(request.episode, request.camera, dataset.needed_steps(request.episode))
+    require_widths(recording, dataset.widths)
+    frames = latents = augmentation = None
+    if recording.read_latents is not None:
+        latents = recording.read_latents(steps)
+    else:
+        frames = view(recording.read_frames(steps), config.crop)
+        if request.augmentation is not None:
+            augmentation = request.augmentation(frames.shape[1], frames.shape[2])
+    states = recording.states[list(steps)]
+    extrinsics = None if recording.extrinsics is None else recording.extrinsics[list(steps)]
+    if config.pose_frame == "camera":
+        if extrinsics is None:
+            raise InputError(
+                where=f"episode {recording.info.id}",
+                found="no pose of the camera",
+                needed="one, for data.pose_frame: camera",
+                fix="Set data.pose_frame: base, or choose a camera that has one",
+            )
+        states = states_in_camera_frame(states, extrinsics)
+    return Clip(
+        frames=frames,
+        states=states.astype(np.float32),
+        actions=actions_of(states, recording.commands, steps, config).astype(np.float32),
+        extrinsics=None if extrinsics is None else extrinsics.astype(np.float32),
+        episode_id=recording.info.id,
+        start=request.start,
+        stride=config.model_stride,
+        augmentation=augmentation,
+        latents=latents,
+        camera=request.camera,
+    )
+
+
+def actions_of(
+    states: Float[np.ndarray, "time state_dim"],
+    commands: Float[np.ndarray, "steps action_dim"] | None,
+    steps: Sequence[int],
+    config: DataConfig,
+) -> Float[np.ndarray, "time-1 action_dim"]:
+    """Return the actions between consecutive model steps of a clip.
+
+    Args:
+        states: At these steps, in the config's coordinate frame.
+        commands: The recorded ones of all control steps of the episode; used for `data.actions: recorded` only.
+        steps: Control steps of the clip, equally spaced.
+        config: The definition of an action.
+
+    Raises:
+        ValueError: Commands are required and there are none.
+    """
+    if config.actions == "difference":
+        return measured_space(config, states.shape[1]).differences(states)
+    if commands is None:
+        raise ValueError("no commands: a source gives them where data.actions is recorded")
+    return joined(commands[steps[0] : steps[-1]], config.model_stride, config.join_actions)
+
+
+def joined(
+    commands: Float[np.ndarray, "steps action_dim"], stride: int, how: str | None
+) -> Float[np.ndarray, "model_steps action_dim"]:
+    """Return one action for each `stride` commands: their sum, their mean, or the last of them.
+
+    The command of a control step is sent after that step is measured: the model step from control step t to t + stride
+    has the commands of t .. t + stride - 1.
+    """
+    groups = commands.reshape(-1, stride, commands.shape[1])
+    if how == "sum":
+        return np.asarray(groups.sum(axis=1))
+    if how == "mean":
+        return np.asarray(groups.mean(axis=1))
+    return groups[:, -1]  # the only one at stride 1
+
+
+def collate(clips: Sequence[Clip], bytes_fetched: int = 0) -> Batch:
+    """Stack clips into a batch; it has camera poses if each of the clips has.
+
+    Raises:
+        InputError: The frames of two clips differ in size.
+    """
+    frames = [clip.frames for clip in clips if clip.frames is not None]
+    if len({one.shape for one in frames}) > 1:
+        raise _two_sizes(clips)
+    latents = [clip.latents for clip in clips if clip.latents is not None]
+    extrinsics = [clip.extrinsics for clip in clips if clip.extrinsics is not None]
+    return Batch(
+        frames=torch.from_numpy(np.stack(frames)) if frames else None,
+        states=torch.from_numpy(np.stack([clip.states for clip in clips])),
+        actions=torch.from_numpy(np.stack([clip.actions for clip in clips])),
+        extrinsics=torch.from_numpy(np.stack(extrinsics)) if len(extrinsics) == len(clips) else None,
+        episode_ids=tuple(clip.episode_id for clip in clips),
+        starts=tuple(clip.start for clip in clips),
+        augmentations=tuple(clip.augmentation for clip in clips if clip.augmentation is not None),
+        bytes_fetched=bytes_fetched,
+        latents=joined_latents(latents, torch.stack) if latents else None,
+        cameras=tuple(clip.camera for clip in clips),
+    )
+
+
+def _two_sizes(clips: Sequence[Clip]) -> InputError:
+    sizes = [("x".join(map(str, one.frames.shape[1:3])), one.episode_id) for one in clips if one.frames is not None]
+    size, first = sizes[0]
+    other, name = next(pair for pair in sizes if pair[0] != size)
+    error = InputError(
+        where=f"episode {name}",
+        found=f"frames of {other} after the crop",
+        needed=f"{size}, as in episode {first}",
+        fix="Train on episodes of one size, or set training.batch_size: 1",
+    )
+    return with_way_out(error, [name], skippable=False)
+
+
+def joined_latents(latents: Sequence[StoredLatents], join: Callable[[list[Tensor]], Tensor]) -> StoredLatents:
+    """Return latents joined by `torch.stack` or `torch.cat`, and their scales likewise."""
+    scales = [one.scales for one in latents if one.scales is not None]
+    return StoredLatents(join([one.values for one in latents]), join(scales) if scales else None)
+
+
+def no_clips(frames: int, widths: Widths, bytes_fetched: int) -> Batch:
+    """Return an empty micro-batch, of which no clip could be read."""
+    return Batch(
+        frames=torch.zeros(0, frames, 1, 1, 3, dtype=torch.uint8),
+        states=torch.zeros(0, frames, widths.state),
+        actions=torch.zeros(0, frames - 1, widths.action),
+        extrinsics=None,
+        episode_ids=(),
+        starts=(),
+        bytes_fetched=bytes_fetched,
+    )
+
+
+def frames_of(dataset: Dataset, batch: Batch, row: int) -> UInt8[np.ndarray, "time height width 3"]:
+    """Return the frames of a clip of a batch, cropped, for people to look at; small frames for cached latents.
+
+    Raises:
+        InputError: The frames of a cache cannot be read.
+        ValueError: The clip belongs to another data set.
+    """
+    if batch.frames is not None:
+        return batch.frames[row].numpy()
+    episode, start = dataset.table.find(batch.episode_ids[row]), batch.starts[row]
+    if episode is None:
+        raise ValueError(f"no episode {batch.episode_ids[row]}")
+    steps = range(start, start + dataset.config.clip_steps, dataset.config.model_stride)
+    return view(dataset.source.read(episode, batch.cameras[row]).read_frames(steps), dataset.config.crop)

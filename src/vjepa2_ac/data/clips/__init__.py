@@ -1,1 +1,0 @@
-"""Clips: how episodes become batches, and in which order."""

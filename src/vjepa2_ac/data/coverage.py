@@ -1,0 +1,235 @@
+"""Coverage of actions: does the motion in a data set teach enough of them to plan with?
+
+A planner searches all directions up to its limits, and takes the action with the lowest energy: where the data have no
+such actions, the model guesses, and the search finds the guesses that flatter. So the data are narrow if they move in
+few directions, or hardly at all; it does not matter which way the axes point.
+
+Sources of the advice: GPC (arXiv 2502.00622: a world model needs random exploration beside demonstrations), DreamZero
+(a new robot from 30 minutes of play), lassesofus/thesis @ 4a2f29f (V-JEPA 2-AC fine-tuned on one-direction reaches
+plans worse than its base).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.idle import in_order
+from vjepa2_ac.data.windows import spread
+from vjepa2_ac.episode import Episode, Progress, no_progress
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.geometry import states_in_camera_frame
+from vjepa2_ac.spaces import POSE, StateSpace
+
+PERCENTILE = 99  # of each number's change: what was taught
+PLAY = (
+    "Record half an hour of random motion, in all directions, as far in a step as you will plan: it helps a planner"
+    " more than further demonstrations"
+)
+
+ENOUGH_NEAR = 0.5  # a direction is taught if so many steps go near it, over all directions being equally frequent
+_SHORT_CM = 0.5  # a shorter step has no direction, and along an axis no sign (as evaluation.action_score.metrics)
+_NEAR_DEG = 30.0
+# Measured: random reaching of the simulated arm 0.99 or more, of 100 random steps 0.90; half of all directions 0.61,
+# a plane 0.50 (0.58 if a fifth as thick as wide), an axis 0.14 (0.43), one way 0.07; starts of BridgeData 0.41.
+_ENOUGH = 0.7
+_SMALL_CM = 1.0  # an image hardly shows a shorter step
+_FEWEST = 100  # steps that do not overlap
+_ROWS, _COLUMNS, _MOST = 24, 48, 5000
+_ONE_WAY, _ONE_AXIS, _ONE_PLANE, _LEANING = 0.8, 0.8, 0.1, 0.3
+_GRIPPER = 0.1  # of its way: a change of the gripper
+_HARDLY = 0.01  # numbers of vectors are of the order of 1: a smaller change is hardly one for the model
+_STEP, _OFTEN, _HALF = 0.1, 0.05, 0.5  # shares: of the farthest change, of the steps, of the numbers
+
+
+@dataclass(frozen=True, eq=False)
+class ReadEpisode:
+    """An episode of a sample, without frames."""
+
+    index: int  # index into the data set's table
+    states: Float[np.ndarray, "steps state_dim"]
+    kept: tuple[tuple[int, int], ...]  # ranges that clips come from
+    extrinsics: Float[np.ndarray, "steps 6"] | None = None  # of the camera that `data.pose_frame` says
+
+    def changes(self, stride: int, space: StateSpace) -> Iterator[Float[np.ndarray, "pairs state_dim"]]:
+        """Yield the changes from each step to the one `stride` later, within kept ranges, in the model's frame."""
+        states = self.states if self.extrinsics is None else states_in_camera_frame(self.states, self.extrinsics)
+        for start, end in self.kept:
+            for first in range(start, min(start + stride, end - stride)):
+                yield space.differences(states[first:end:stride])
+
+
+def sample_of(dataset: Dataset, count: int) -> list[int]:
+    """Return at most `count` of the used episodes: a random draw that is always the same."""
+    # A latent cache has only the episodes that clips come from.
+    members = dataset.starts.episodes if dataset.config.is_cache else dataset.episodes
+    members = members[np.argsort(dataset.table.id_hash[members], kind="stable")]
+    return [int(members[place]) for place in spread(len(members), count)]
+
+
+def read_sample(dataset: Dataset, count: int, progress: Progress = no_progress) -> Iterator[ReadEpisode]:
+    """Read at most `count` episodes, without frames; those that cannot be read are treated as `leave_out` says.
+
+    Raises:
+        InputError: An episode cannot be read, and `data.broken_episodes` does not skip it.
+    """
+
+    def look(index: int) -> Episode | InputError:
+        try:
+            return dataset.source.read(index)
+        except InputError as error:
+            return error
+
+    chosen = sample_of(dataset, count)
+    found = in_order(look, chosen, dataset.config)
+    for done, (index, episode) in enumerate(zip(chosen, found, strict=True), start=1):
+        progress(done, len(chosen))
+        if isinstance(episode, InputError):
+            dataset.leave_out(index, episode)
+        else:
+            camera = episode.extrinsics if dataset.config.pose_frame == "camera" else None
+            yield ReadEpisode(index, np.asarray(episode.states, np.float64), tuple(dataset.kept.of(index)), camera)
+
+
+@dataclass(frozen=True, eq=False)
+class Coverage:
+    """Coverage of actions by the changes of the state, from each control step to the one `stride` later."""
+
+    narrow: str  # why the data are not fit to plan with; empty: they are, or there are too few steps to tell
+    is_known: bool  # whether there are enough steps to tell
+    usual: Float[np.ndarray, " dim"]  # the 99th percentile of the size of each number's change
+    lines: Mapping[str, str]  # what was found, by its name
+    metrics: Mapping[str, Any]  # the same as plain values
+    density: Float[np.ndarray, "rows columns"] | None = None  # of the directions of poses; see `density_of`
+
+    @property
+    def verdict(self) -> str:
+        """Whether the data are fit to plan with, and if not, why, and what to record."""
+        if self.narrow:
+            return f"narrow: {self.narrow}. {PLAY}"
+        if not self.is_known:
+            return f"not known of fewer than {_FEWEST} model steps, one after the other, that move"
+        return "fit to plan with"
+
+    def noted(self) -> dict[str, Any]:
+        """Return what a run notes of its data, as plain values."""
+        return {"percentile": PERCENTILE, "changes": self.usual.tolist(), "narrow": self.narrow}
+
+
+def coverage_in(dataset: Dataset, *, episodes: int = 64) -> Coverage | None:
+    """Return the coverage of actions by a sample of the episodes, read without frames; None: no step fits.
+
+    Raises:
+        InputError: As `read_sample`.
+    """
+    return coverage_by(read_sample(dataset, episodes), dataset.spaces.state, dataset.config.model_stride)
+
+
+def coverage_by(sample: Iterable[ReadEpisode], space: StateSpace, stride: int) -> Coverage | None:
+    """Return the coverage of actions by some episodes; None: no step fits into them."""
+    changes = [piece for one in sample for piece in one.changes(stride, space)]
+    return coverage_of(np.concatenate(changes), space, stride) if changes else None
+
+
+def coverage_of(changes: Float[np.ndarray, "pairs dim"], space: StateSpace, stride: int) -> Coverage:
+    """Return the coverage of actions by one or more changes of states, of which neighbouring ones overlap."""
+    usual = np.asarray(np.percentile(np.abs(changes), PERCENTILE, axis=0))
+    is_enough = len(changes) >= _FEWEST * stride
+    found = _of_poses(changes, usual, stride) if space.is_pose else _of_vectors(changes, usual, is_known=is_enough)
+    metrics = {"stride": stride, "steps": len(changes), **found.metrics, "percentile_99": usual.tolist()}
+    narrow = found.narrow if is_enough else ""
+    return Coverage(narrow, found.is_known, usual, found.lines, metrics | {"narrow": narrow}, found.density)
+
+
+def _of_poses(changes: Float[np.ndarray, "pairs 7"], usual: Float[np.ndarray, " 7"], stride: int) -> Coverage:
+    ways_cm, lengths_cm = 100 * changes[:, POSE.position], POSE.shown_size(changes)
+    directions = (ways_cm / np.maximum(lengths_cm, 1e-12)[:, None])[lengths_cm >= _SHORT_CM]
+    is_known = len(directions) >= _FEWEST * stride
+    density = density_of(directions)
+    covered = float((density >= ENOUGH_NEAR).mean())
+    mean = directions.mean(axis=0) if len(directions) else np.zeros(3)
+    one_way = float(np.linalg.norm(mean))  # 0 if the directions balance, 1 if they are one
+    shares, axes = np.linalg.eigh(directions.T @ directions / max(1, len(directions)))  # the least share first
+    usual_cm = [float(one) for one in np.percentile(lengths_cm, [10, 50, 90, 99])]
+    narrow = ""
+    if usual_cm[2] < _SMALL_CM:
+        narrow = f"90% of the steps are shorter than {usual_cm[2]:.1f} cm, which images hardly show: widen data.stride"
+    elif is_known and covered < _ENOUGH:
+        narrow = f"steps go to {covered:.0%} of all directions; {_where(mean, one_way, shares, axes.T)}"
+    back, forth = ((sign * ways_cm >= _SHORT_CM).mean(axis=0) for sign in (-1, 1))
+    gripper = float((np.abs(changes[:, POSE.gripper]) >= _GRIPPER).mean())
+    along = (
+        f"{name} {100 * far:.1f} cm ({one:.0%} back, {other:.0%} forth)"
+        for name, far, one, other in zip(POSE.change_names[:3], usual[:3], back, forth, strict=True)
+    )
+    lines = {
+        "directions": f"{covered:.0%} are taught (at least half of an equal share of the steps goes within"
+        f" {_NEAR_DEG:g} degrees); mean direction {one_way:.2f} (0 balanced, 1 one way)",
+        "axes": f"{PERCENTILE} % of the steps within {', '.join(along)}; the gripper changes in {gripper:.0%}",
+    }
+    metrics = {
+        "directions": covered,
+        "mean_direction": one_way,
+        "principal_shares": shares.tolist(),
+        "length_cm_10_50_90_99": usual_cm,
+        "back_share_xyz": back.tolist(),
+        "forth_share_xyz": forth.tolist(),
+        "gripper_share": gripper,
+    }
+    return Coverage(narrow, is_known, usual, lines, metrics, density)
+
+
+def density_of(directions: Float[np.ndarray, "steps 3"]) -> Float[np.ndarray, "rows columns"]:
+    """Return how many steps go within 30 degrees of a direction, over how many would if all were equally frequent.
+
+    The cells have equal areas: rows are equally spaced in z (-1 to 1), columns in azimuth (-180 to 180 degrees).
+    """
+    some = directions[:: -(-len(directions) // _MOST) or 1].astype(np.float32)
+    if not len(some):
+        return np.zeros((_ROWS, _COLUMNS))
+    height = (np.arange(_ROWS, dtype=np.float32)[:, None] + 0.5) / _ROWS * 2 - 1
+    azimuth = ((np.arange(_COLUMNS, dtype=np.float32) + 0.5) / _COLUMNS * 2 - 1) * np.pi
+    across = np.sqrt(1 - height**2)
+    cells = np.stack([across * np.cos(azimuth), across * np.sin(azimuth), height + 0 * azimuth], axis=-1)
+    near = np.cos(np.deg2rad(_NEAR_DEG))
+    return np.asarray((cells @ some.T > near).mean(axis=-1) / ((1 - near) / 2), np.float64)
+
+
+def _where(
+    mean: Float[np.ndarray, " 3"], one_way: float, shares: Float[np.ndarray, " 3"], axes: Float[np.ndarray, "3 3"]
+) -> str:
+    """Say where directions are, by their mean and principal axes."""
+    if one_way >= _ONE_WAY:
+        return f"nearly all go one way, {_shown(mean / one_way)}"
+    if shares[2] >= _ONE_AXIS:
+        return f"nearly all go back and forth along {_shown(axes[2])}"
+    if shares[0] <= _ONE_PLANE:
+        return f"nearly all lie in one plane, across {_shown(axes[0])}"
+    return f"few go towards {_shown(-mean / one_way)}" if one_way >= _LEANING else f"few go along {_shown(axes[0])}"
+
+
+def _shown(direction: Float[np.ndarray, " 3"]) -> str:
+    numbers = np.round(direction, 1) + 0.0  # without -0.0
+    return f"({', '.join(f'{name} {one:+.1f}' for name, one in zip('xyz', numbers, strict=True))})"
+
+
+def _of_vectors(
+    changes: Float[np.ndarray, "pairs dim"], usual: Float[np.ndarray, " dim"], *, is_known: bool
+) -> Coverage:
+    """Return the coverage of each number by itself: how they move together is not known."""
+    back, forth = ((sign * changes > _STEP * usual).mean(axis=0) for sign in (-1, 1))
+    both = np.flatnonzero((np.minimum(back, forth) >= _OFTEN) & (usual >= _HARDLY)).tolist()
+    still = np.flatnonzero(usual < _HARDLY).tolist()
+    width = len(usual)
+    is_narrow = len(both) <= _HALF * width
+    lines = {
+        "numbers": f"{len(both)} of {width} go up and down, {len(still)} hardly move",
+        "changes": f"{PERCENTILE} % of the steps within {', '.join(f'{one:.2g}' for one in usual)}",
+    }
+    narrow = f"{len(still)} of {width} numbers hardly move, {width - len(both) - len(still)} only one way"
+    return Coverage(narrow if is_narrow else "", is_known, usual, lines, {"both_ways": both, "still": still})

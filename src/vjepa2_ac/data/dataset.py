@@ -1,0 +1,307 @@
+"""The data set of a run: its episodes and steps, opened and filtered once, small enough to send to every worker."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Bool, Int, UInt64
+
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config.data import Split
+from vjepa2_ac.data.idle import FoundRanges, find_ranges
+from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable
+from vjepa2_ac.data.selection import (
+    BrokenEpisodes,
+    StepSelection,
+    groups_of,
+    included,
+    of_outcome,
+    require_distinct,
+    with_way_out,
+)
+from vjepa2_ac.data.sources.configured_spaces import spaces_of
+from vjepa2_ac.data.sources.registry import open_source
+from vjepa2_ac.data.windows import Windows, clip_starts, in_split, windows_of
+from vjepa2_ac.episode import POSE_WIDTHS, Episode, EpisodeSource, Progress, StepRanges, Widths
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.spaces import Spaces
+
+logger = logging.getLogger(__name__)
+
+_MOST_EPISODES_READ = 8  # to find the widths, if some are broken
+
+
+@dataclass(frozen=True)
+class Removed:
+    """What a filter removed, after the previous filters."""
+
+    name: str  # excluded, broken, outcome, idle
+    episodes: int  # without remaining steps
+    steps: int  # of episodes that could be read
+    windows: int | None  # clips; None while data.stride is auto
+
+    def __str__(self) -> str:
+        clips = "" if self.windows is None else f", {self.windows:,} clips"
+        return f"{self.episodes:,} episodes, {self.steps:,} steps{clips}"
+
+
+@runtime_checkable
+class EncodedSource(EpisodeSource, Protocol):
+    """A source of encoded episodes: its steps were selected when they were encoded."""
+
+    def kept_ranges(self) -> FoundRanges:
+        """Return the ranges that `data.idle` keeps."""
+        ...
+
+    def settle(self, episodes: Int[np.ndarray, " episodes"]) -> tuple[DataConfig, list[EpisodeProblem]]:
+        """Return the config with the cameras that there are, and the episodes whose files are not as written.
+
+        Raises:
+            InputError: One of these episodes, that clips come from, was not encoded.
+        """
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """An open data set: its episodes, and the steps that the config selects. Can be pickled to a loader worker."""
+
+    config: DataConfig
+    source: EpisodeSource
+    table: EpisodeTable
+    kept: StepSelection
+    broken: BrokenEpisodes  # grows in the process that opened the set
+    groups: UInt64[np.ndarray, " episodes"] | None = None  # hash of each one's group; None: `data.split_by` names none
+
+    @property
+    def split_hash(self) -> UInt64[np.ndarray, " episodes"]:
+        """The hashes that determine the split of each episode."""
+        return self.table.id_hash if self.groups is None else self.groups
+
+    def members(self, split: Split) -> Bool[np.ndarray, " episodes"]:
+        """Return which episodes are used and belong to a split."""
+        among = of_outcome(self.table, self.config)
+        return np.asarray(self.kept.taking_part & in_split(self.split_hash, self.config, split, among))
+
+    def windows(self, split: Split) -> Windows:
+        """Return the clips of a split.
+
+        Raises:
+            InputError: There are none; see `windows_of`.
+        """
+        members = self.members(split)
+        if not members.any():
+            raise self._empty_split(split)
+        return windows_of(self.table, members, self.starts, self.config, split)
+
+    def _empty_split(self, split: Split) -> InputError:
+        config, taking_part = self.config, self.kept.taking_part
+        groups = None if config.split_by is None else len(np.unique(self.split_hash[taking_part]))
+        together = "" if groups is None else f" in {groups} groups (data.split_by)"
+        shares = f"validation_share {config.validation_share:g}, test_share {config.test_share:g}"
+        share = {"train": 1.0, "validation": config.validation_share, "test": config.test_share}[split]
+        always = f"above 0, three {'episodes' if groups is None else 'groups'} or more always have one"
+        always += ", unless it is broken or in data.exclude" if share else ""
+        return InputError(
+            where=f"data.path: {config.path}",
+            found=f"no {split} episodes among {taking_part.sum()}{together} ({shares})",
+            needed="one or more",
+            fix="Lower data.validation_share or data.test_share"
+            if split == "train"
+            else f"Raise data.{split}_share: {always}",
+        )
+
+    def with_stride(self, stride: int) -> Dataset:
+        """Return the data set with another stride.
+
+        Raises:
+            InputError: The data is a latent cache, which has the frames of one stride only.
+        """
+        if self.config.is_cache and stride != self.config.stride:
+            raise InputError(
+                where=self.config.path,
+                found=f"latents that were encoded for clips at stride {self.config.stride}",
+                needed=f"stride {stride}",
+                fix="Use the data set itself, with data.cache: off",
+            )
+        return replace(self, config=self.config.with_stride(stride))
+
+    @cached_property
+    def removed(self) -> tuple[Removed, ...]:
+        """What each filter removed, in their order."""
+        included_ones = included(self.table, self.config)
+        chosen = included_ones & of_outcome(self.table, self.config)
+        masks = np.ones(len(self.table), bool), included_ones, chosen, self.kept.taking_part
+        left = [self._count(StepSelection.whole(self.table, mask)) for mask in masks]
+        gone = -np.diff([*left, self._count(self.kept)], axis=0)
+        excluded = sum(problem.name in self.config.exclude for problem in self.table.problems)
+        unread = {"excluded": excluded, "outcome": 0, "broken": len(self.table.problems) - excluded, "idle": 0}
+        is_known = self.config.stride != "auto"
+        return tuple(
+            Removed(name, episodes + unread[name], steps, windows if is_known else None)
+            for name, (episodes, steps, windows) in zip(unread, gone.tolist(), strict=True)
+        )
+
+    def _count(self, kept: StepSelection) -> tuple[int, int, int]:
+        """Return the numbers of episodes, steps and, if the stride is known, windows."""
+        is_known = self.config.stride != "auto"
+        windows = len(clip_starts(self.table, kept, self.config)) if is_known else 0
+        return len(np.unique(kept.episode)), kept.steps, windows
+
+    @property
+    def episodes(self) -> Int[np.ndarray, " episodes"]:
+        """The episodes that clips may come from."""
+        return np.unique(self.kept.episode)
+
+    @cached_property
+    def starts(self) -> Windows:
+        """The clips of all splits.
+
+        Raises:
+            ValueError: The stride is not yet calibrated.
+        """
+        return clip_starts(self.table, self.kept, self.config)
+
+    @cached_property
+    def control_rate_hz(self) -> float:
+        """Control steps per second: of the whole data set if the source knows it, else of its first episode."""
+        rate = self.table.texts.get("control_rate_hz")
+        return float(rate) if rate is not None else self.source.read(int(self.episodes[0])).control_rate_hz
+
+    @cached_property
+    def spaces(self) -> Spaces:
+        """The spaces of its states and actions."""
+        return spaces_of(self.config, self.widths)
+
+    @cached_property
+    def widths(self) -> Widths:
+        """The widths of states and actions: 7 for poses, else those of the first readable episode.
+
+        Raises:
+            InputError: None of the first episodes can be read.
+        """
+        if self.config.states == "pose":
+            return POSE_WIDTHS
+        if widths := self.table.texts.get("widths"):
+            return Widths(*map(int, widths.split()))
+        first_error: InputError | None = None
+        for episode in self.episodes[:_MOST_EPISODES_READ].tolist():
+            try:
+                return widths_of(self.source.read(episode))
+            except InputError as error:
+                first_error = first_error or error
+        raise first_error or ValueError("a data set without episodes")
+
+    def leave_out(self, episode: int, error: InputError) -> None:
+        """Apply `data.broken_episodes` to an episode that cannot be read: record it, or stop.
+
+        Raises:
+            InputError: The error with a fix; or, too many are broken by now.
+        """
+        name = self.table.identity(episode)
+        if self.config.broken_episodes == "error":
+            raise with_way_out(error, [name]) from None
+        self.broken.met(name, str(error))
+
+    def needed_steps(self, episode: int) -> StepRanges | None:
+        """Return the steps of an episode that clips may come from; None: all of them."""
+        return None if self.config.idle.rule == "none" else self.kept.of(episode)
+
+
+def open_dataset(config: DataConfig, *, progress: Progress | None = None) -> Dataset:
+    """Open a data set and select its episodes and steps.
+
+    Args:
+        config: Where it is, and what is excluded.
+        progress: Called with (done, total) while the data set is indexed for the first time.
+
+    Raises:
+        InputError: There is no such data set; an episode is broken and `data.broken_episodes` does not skip it, or too
+            many are; two episodes have one identity; a filter or `data.split_by` cannot be applied; or nothing remains.
+    """
+    source = open_source(config)
+    table = EpisodeTable.of(source.infos(progress))
+    broken = BrokenEpisodes(config, len(table) + len(table.problems))
+    taking_part = included(table, config)
+    require_distinct(table, taking_part, config)
+    broken.found(_not_excluded(table.problems, config))
+    taking_part &= of_outcome(table, config)
+    kept = StepSelection.whole(table, taking_part)
+    if config.idle.rule != "none":
+        if isinstance(source, EncodedSource):
+            found = source.kept_ranges()
+        else:
+            found = find_ranges(source, table, config, progress)
+        met = [(place, problem) for place, problem in found.problems if taking_part[place]]
+        broken.found([problem for _, problem in met])
+        taking_part[[place for place, _ in met]] = False
+        kept = StepSelection(found.episode, found.start, found.end, taking_part).only(taking_part)
+    dataset = Dataset(config, source, table, kept, broken, groups_of(table, kept.taking_part, config))
+    if not len(dataset.episodes):
+        raise _nothing_left(dataset)
+    logger.info("%s: %d episodes take part, %d steps of them", config.path, kept.taking_part.sum(), kept.steps)
+    return _settled(dataset)
+
+
+def through_latents(dataset: Dataset, folder: Path) -> Dataset:
+    """Return the same data set, with the same clips in the same order, read from its latent cache.
+
+    Raises:
+        InputError: The cache lacks episodes or is damaged.
+    """
+    config = dataset.config.as_kind("latents", path=str(folder), cache="off", camera=dataset.config.cameras)
+    source = open_source(config)
+    return _settled(replace(dataset, source=source, table=EpisodeTable.of(source.infos()), config=config))
+
+
+def _settled(dataset: Dataset) -> Dataset:
+    """Check that a latent cache has what the clips need, and set its cameras in the config."""
+    if not isinstance(dataset.source, EncodedSource):
+        return dataset
+    config, wrong_files = dataset.source.settle(dataset.starts.episode)
+    dataset.broken.found(_not_excluded(wrong_files, config))
+    return replace(dataset, config=config)
+
+
+def _not_excluded(problems: Sequence[EpisodeProblem], config: DataConfig) -> list[EpisodeProblem]:
+    excluded = frozenset(config.exclude)
+    return [problem for problem in problems if problem.name not in excluded]
+
+
+def _nothing_left(dataset: Dataset) -> InputError:
+    filters = ", ".join(f"{one.name} {one.episodes}" for one in dataset.removed if one.episodes)
+    return InputError(
+        where=f"data.path: {dataset.config.path}",
+        found=f"none of {len(dataset.table) + len(dataset.table.problems)} episodes is left"
+        + (f" (left out: {filters})" if filters else ""),
+        needed="at least one",
+        fix="Look at data.exclude, data.outcome and data.idle" if filters else "",
+    )
+
+
+def widths_of(episode: Episode) -> Widths:
+    """Return the widths of an episode's states and actions."""
+    state = int(episode.states.shape[1])
+    return Widths(state, state if episode.commands is None else int(episode.commands.shape[1]))
+
+
+def require_widths(episode: Episode, widths: Widths) -> None:
+    """Refuse an episode whose widths differ from those of the others.
+
+    Raises:
+        InputError: Names both.
+    """
+    found = widths_of(episode)
+    if found != widths:
+        raise InputError(
+            where=f"episode {episode.info.id}",
+            found=f"states of {found.state} and actions of {found.action} numbers",
+            needed=f"{widths.state} and {widths.action}, as in the others",
+            fix="Keep the recordings of different robots in different data sets",
+        )

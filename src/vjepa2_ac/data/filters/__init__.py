@@ -1,1 +1,0 @@
-"""Filters: which episodes and steps are used."""

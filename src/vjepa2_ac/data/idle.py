@@ -1,0 +1,257 @@
+"""Idle time: the ranges of steps in which the robot moves, by a rule or from a list, found once and cached on disk."""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from typing import TypeVar
+
+import numpy as np
+from jaxtyping import Bool, Float, Int32
+from scipy.spatial.transform import Rotation
+
+from vjepa2_ac import storage
+from vjepa2_ac.config import DataConfig, IdleConfig
+from vjepa2_ac.config.section import Affects, knobs_that_affect
+from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable, NotATableError
+from vjepa2_ac.data.index.index_cache import fingerprints_of, get_or_make, key_of
+from vjepa2_ac.data.selection import as_error, as_problem
+from vjepa2_ac.episode import Episode, EpisodeSource, Progress, no_progress
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.spaces import POSE
+from vjepa2_ac.storage.npz_reader import read_arrays
+from vjepa2_ac.storage.structured import json_object, shown
+
+logger = logging.getLogger(__name__)
+
+_MOST_BYTES = 1 << 28  # of a published list
+_ALL_BROKEN = 10  # so many broken episodes at the start, and no others, have one cause
+
+Found = list[tuple[int, int]] | EpisodeProblem
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, eq=False)
+class FoundRanges:
+    """The remaining ranges [start, end) of all episodes of a table, and the episodes that could not be read."""
+
+    episode: Int32[np.ndarray, " ranges"]  # ascending
+    start: Int32[np.ndarray, " ranges"]
+    end: Int32[np.ndarray, " ranges"]
+    problems: tuple[tuple[int, EpisodeProblem], ...] = ()  # with the episode's place in the table
+
+    @classmethod
+    def of(cls, found: Sequence[Found]) -> FoundRanges:
+        """Join the results of all episodes."""
+        problems = tuple((place, one) for place, one in enumerate(found) if isinstance(one, EpisodeProblem))
+        ranges = [(place, *pair) for place, one in enumerate(found) if isinstance(one, list) for pair in one]
+        episode, start, end = np.ascontiguousarray(np.array(ranges, np.int32).reshape(-1, 3).T)
+        return cls(episode, start, end, problems)
+
+    def to_bytes(self) -> bytes:
+        """Return this as a file's content."""
+        text = json.dumps({"problems": [[place, vars(problem)] for place, problem in self.problems]}).encode()
+        file = io.BytesIO()
+        np.savez(file, text=np.frombuffer(text, np.uint8), episode=self.episode, start=self.start, end=self.end)
+        return file.getvalue()
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> FoundRanges:
+        """Read the result of `to_bytes`.
+
+        Raises:
+            NotATableError: It is another kind of file, or damaged.
+        """
+        try:
+            arrays = read_arrays(data)
+            episode, start, end = (np.asarray(arrays[name], np.int32) for name in ("episode", "start", "end"))
+            problems = json.loads(arrays["text"].tobytes())["problems"]
+            return cls(episode, start, end, tuple((int(place), EpisodeProblem(**values)) for place, values in problems))
+        except (InputError, LookupError, TypeError, ValueError) as error:
+            raise NotATableError(f"no ranges of steps ({error})") from None
+
+    def require_of(self, table: EpisodeTable) -> None:
+        """Refuse ranges that do not belong to the episodes of a table.
+
+        Raises:
+            NotATableError: They do not.
+        """
+        places = np.array([*self.episode, *(place for place, _ in self.problems)], np.int64)
+        if places.min(initial=0) < 0 or places.max(initial=-1) >= len(table):
+            raise NotATableError(f"ranges of other episodes than these {len(table)}")
+        within = (self.start >= 0) & (self.start <= self.end) & (self.end <= table.num_steps[self.episode])
+        if not within.all() or (np.diff(self.episode) < 0).any():
+            raise NotATableError("ranges that are not in their episodes, or not in their order")
+
+
+def find_ranges(
+    source: EpisodeSource, table: EpisodeTable, config: DataConfig, progress: Progress | None
+) -> FoundRanges:
+    """Return the ranges that `data.idle.rule` keeps, of all episodes, used or not.
+
+    Raises:
+        InputError: The list of ranges cannot be read or belongs to another data set; or the rule fits no episode.
+    """
+    knobs = knobs_that_affect(Affects.IDLE, config)
+    parts: dict[str, object] = {"found": "idle ranges", "table": fingerprints_of(table)[0], "data": knobs}
+    make = partial(_computed, source, table, config, progress or no_progress)
+    if config.idle.rule == "published":
+        path = str(config.idle.ranges)
+        make, parts["list"] = partial(published_ranges, path, table), _version(path)
+    return get_or_make(
+        config.disk_cache, key_of(parts), make, to_bytes=FoundRanges.to_bytes, from_bytes=FoundRanges.from_bytes
+    )
+
+
+def _version(path: str) -> list[object]:
+    """Return the version of a list, without reading it if possible."""
+    try:
+        return [storage.absolute(path), storage.file_size(path), storage.file_version(path)]
+    except OSError:
+        return [path]
+
+
+def _computed(source: EpisodeSource, table: EpisodeTable, config: DataConfig, progress: Progress) -> FoundRanges:
+    def look(place: int) -> Found:
+        try:
+            return kept_ranges(source.read(place), config.idle)
+        except InputError as error:
+            return as_problem(error, table.identity(place))
+
+    found: list[Found] = []
+    for one in in_order(look, range(len(table)), config):
+        found.append(one)
+        progress(len(found), len(table))
+        if len(found) == min(_ALL_BROKEN, len(table)):
+            problems = [problem for problem in found if isinstance(problem, EpisodeProblem)]
+            if len(problems) == len(found):
+                raise as_error(problems[0])
+    return FoundRanges.of(found)
+
+
+def in_order(look: Callable[[int], T], places: Sequence[int], config: DataConfig) -> Iterator[T]:
+    """Yield what a function says of each episode, in order; several are read at once where the data is far away."""
+    threads = config.connections if storage.is_url(config.path) else 1
+    with ThreadPoolExecutor(threads) as pool:
+        for first in range(0, len(places), 4 * threads):
+            yield from pool.map(look, places[first : first + 4 * threads])
+
+
+def published_ranges(path: str, table: EpisodeTable) -> FoundRanges:
+    """Return the ranges of a list that somebody published; see `data.idle.ranges`.
+
+    Raises:
+        InputError: It cannot be read, or has no episode of the table, or wrong ranges of one.
+    """
+    where = f"data.idle.ranges: {path}"
+    needed = 'a JSON object {"identity of an episode": [[start, end], ...], ...}'
+    another = "Name the list of this version of the data set, or set data.idle.rule: commands or motion"
+    try:
+        lists = json_object(storage.read_bounded(path, _MOST_BYTES), where=where, needed=needed)
+    except OSError as error:
+        raise InputError(where=where, found=f"cannot be read ({error})", needed=needed) from None
+    names = [table.identity(place) for place in range(len(table))]
+    listed = sum(name in lists for name in names)
+    if not listed:
+        first = next(iter(lists), "none at all")
+        raise InputError(
+            where=where,
+            found=f"none of the {len(table)} episodes; its first is {first}",
+            needed="the identities of the episodes" + (f", such as {names[0]}" if names else ""),
+            fix=another,
+        )
+    found: list[Found] = []
+    for name, steps in zip(names, table.num_steps.tolist(), strict=True):
+        pairs = _pairs(lists.get(name, []), steps)
+        if pairs is None:
+            needed = f"pairs [start, end) of steps from 0 to {steps}, its length, that do not overlap"
+            raise InputError(where=f"{where}: {name}", found=shown(lists[name]), needed=needed, fix=another)
+        found.append(pairs)
+    logger.log(
+        logging.INFO if listed == len(table) else logging.WARNING,
+        "%s: knows %d of the %d episodes; the other %d count as idle", path, listed, len(table), len(table) - listed,
+    )  # fmt: skip
+    return FoundRanges.of(found)
+
+
+def _pairs(ranges: object, steps: int) -> list[tuple[int, int]] | None:
+    """Return the ranges of one episode in their order; None if they are no pairs of its steps, or overlap."""
+    try:
+        pairs = sorted((start, end) for start, end in ranges)  # type: ignore[attr-defined] # that is what is tried
+        edges = [edge for pair in pairs for edge in pair]
+        are_steps = all(type(edge) is int and 0 <= edge <= steps for edge in edges)
+    except (TypeError, ValueError):
+        return None
+    return pairs if are_steps and edges == sorted(edges) and all(start < end for start, end in pairs) else None
+
+
+def kept_ranges(episode: Episode, config: IdleConfig) -> list[tuple[int, int]]:
+    """Return the ranges [start, end) of steps that an episode keeps under the rule `commands` or `motion`.
+
+    Raises:
+        InputError: The rule is `commands` and the episode has no joint velocities, or some that are not finite.
+    """
+    if config.rule == "motion":
+        return moving_ranges(idle_by_motion(episode.states, config), config)
+    where, velocities = f"episode {episode.info.id}", episode.joint_velocities
+    if velocities is None:
+        raise InputError(
+            where=where,
+            found="no commanded joint velocities",
+            needed="them, for data.idle.rule commands",
+            fix="Set data.idle.rule: motion, which needs only poses, or name the feature with the velocities",
+        )
+    if not np.isfinite(velocities).all():
+        raise InputError(where=where, found="a joint velocity that is not finite", needed="finite numbers")
+    return moving_ranges(idle_by_commands(velocities, config), config)
+
+
+def idle_by_commands(velocities: Float[np.ndarray, "steps joints"], config: IdleConfig) -> Bool[np.ndarray, " steps"]:
+    """Return the steps at which no commanded joint velocity differs from the step before; never the first.
+
+    Source: Physical-Intelligence/openpi @ 15a9616, examples/droid/compute_droid_nonidle_ranges.py.
+    """
+    still = (abs(np.diff(velocities, axis=0)) < config.velocity_change_rad_s).all(axis=1)
+    return np.concatenate([np.zeros(min(1, len(velocities)), bool), still])
+
+
+def idle_by_motion(states: Float[np.ndarray, "steps 7"], config: IdleConfig) -> Bool[np.ndarray, " steps"]:
+    """Return the steps at which the measured pose hardly differs from the step before; never the first."""
+    if len(states) < 2:
+        return np.zeros(len(states), bool)
+    motion = POSE.differences(states.astype(np.float64))
+    still = (
+        (np.linalg.norm(motion[:, POSE.position], axis=1) < config.translation_m)
+        & (Rotation.from_euler("xyz", motion[:, POSE.rotation]).magnitude() < config.rotation_rad)
+        & (abs(motion[:, POSE.gripper]) < config.gripper)
+    )
+    return np.concatenate([[False], still])
+
+
+def long_idle_runs(idle: Bool[np.ndarray, " steps"], config: IdleConfig) -> Bool[np.ndarray, " steps"]:
+    """Return the steps in idle runs that are long enough to go."""
+    found = np.zeros(len(idle), bool)
+    for start, end in runs_of(idle):
+        found[start:end] = end - start >= config.shortest_idle_steps
+    return found
+
+
+def moving_ranges(idle: Bool[np.ndarray, " steps"], config: IdleConfig) -> list[tuple[int, int]]:
+    """Return the ranges that remain without long idle runs, short ranges between them, and the last steps of each.
+
+    Source: Physical-Intelligence/openpi @ 15a9616, examples/droid/compute_droid_nonidle_ranges.py.
+    """
+    moving, cut = runs_of(~long_idle_runs(idle, config)), config.cut_last_steps
+    ranges = [(start, end) for start, end in moving if end - start >= config.shortest_kept_steps]
+    return [(start, end - cut) for start, end in ranges if end - cut > start]
+
+
+def runs_of(mask: Bool[np.ndarray, " steps"]) -> list[tuple[int, int]]:
+    """Return the ranges [start, end) of neighbouring steps at which a mask is true."""
+    edges = np.flatnonzero(np.diff(mask.astype(np.int8), prepend=0, append=0)).tolist()
+    return list(zip(edges[::2], edges[1::2], strict=True))

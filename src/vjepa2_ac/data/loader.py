@@ -1,0 +1,361 @@
+"""The clip loader: batches in a deterministic order.
+
+The batch at a position of the run is a pure function of the seed and the position. Workers only affect the speed.
+"""
+
+from __future__ import annotations
+
+import atexit
+import itertools
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from functools import partial
+from multiprocessing import forkserver, resource_tracker
+from typing import Any
+
+import torch
+from torch.utils.data import DataLoader
+from torch.utils.data import Dataset as TorchDataset
+
+from vjepa2_ac import storage
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config.data import Split
+from vjepa2_ac.data.clips import ClipRequest, collate, no_clips, read_clip
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.selection import BrokenEpisodes, named, with_way_out
+from vjepa2_ac.data.streams import NO_COPIES, Copies
+from vjepa2_ac.data.transforms import draw
+from vjepa2_ac.data.windows import ClipOrder, drawn, far_neighbours, spread
+from vjepa2_ac.episode import Batch, Clip, Skipped
+from vjepa2_ac.errors import InputError, UserError
+
+CLIPS_WORTH_WORKERS = 256  # starting workers takes longer than reading fewer validation clips
+
+
+@dataclass(frozen=True)
+class ProcessShare:
+    """The index of a process among those that share some work."""
+
+    rank: int = 0
+    processes: int = 1
+
+
+WHOLE = ProcessShare()
+
+
+@dataclass(frozen=True)
+class Mixed:
+    """A data set, and a second one that a share of the training clips comes from."""
+
+    dataset: Dataset
+    replayed: Dataset
+    share: float
+
+
+def training_loader(
+    dataset: Dataset | Mixed,
+    *,
+    seed: int,
+    batch_size: int,
+    start_position: int = 0,
+    share: ProcessShare = WHOLE,
+    copies: Copies = NO_COPIES,
+) -> Batches:
+    """Yield the micro-batches of one process, endlessly, from any position of the run.
+
+    The run is one sequence of clips. Micro-batch m of rank r holds the `batch_size` clips from position
+    start_position + (m * processes + r) * batch_size, so after m micro-batches of every rank the position to resume
+    from is start_position + m * processes * batch_size. If `data.broken_episodes` is skip, clips that cannot be
+    read are missing from their micro-batch, which may even be empty; no other clip replaces them.
+
+    Of two data sets each has its own sequence. Clip p of the run is the second one's if floor(p * share) grows after
+    it, and that number is its position there: the share is exact in every stretch of the run, up to a clip.
+
+    If batches are prefetched to a device (`copies`), they are in pinned memory.
+
+    Raises:
+        InputError: There is nothing to train on, or a clip cannot be read, also in a worker.
+    """
+    replayed = None
+    if isinstance(dataset, Mixed):
+        replayed, of_clips = dataset.replayed, Fraction(str(dataset.share))
+        dataset = dataset.dataset
+        clips = replace(_training_clips(dataset, seed), replayed=_training_clips(replayed, seed), share=of_clips)
+    else:
+        clips = _training_clips(dataset, seed)
+    firsts = itertools.count(start_position + share.rank * batch_size, batch_size * share.processes)
+    rows = (list(range(first, first + batch_size)) for first in firsts)
+    micro_batches = _micro_batches(clips, rows, dataset.config.workers, pinned=copies.overlap)
+    return Batches(micro_batches, dataset.broken, copies, replayed.broken if replayed else None)
+
+
+def _training_clips(dataset: Dataset, seed: int) -> _Clips:
+    return _Clips(dataset, partial(_training_clip, dataset.config, ClipOrder(dataset.windows("train"), seed)))
+
+
+def _training_clip(config: DataConfig, order: ClipOrder, position: int) -> ClipRequest:
+    """Return a clip of the endless sequence of a run: camera and augmentation are drawn per clip."""
+    camera = config.cameras[order.choice(position, len(config.cameras))]
+    augmentation = partial(draw, config.augment, seed=order.seed, position=position)
+    return ClipRequest(*order.window(position), camera, augmentation)
+
+
+def validation_batches(dataset: Dataset, split: Split, *, clips: int, batch_size: int) -> Iterator[Batch]:
+    """Yield a fixed set of at most `clips` clips of a split, evenly spread over its windows, in batches.
+
+    The set depends on the data only: neither the seed nor the number of shards changes it. Neighbours in it are from
+    distant parts of the data, so that their actions are unrelated. A large set is read by workers.
+
+    Raises:
+        InputError: The split is empty, or a clip cannot be read.
+    """
+    return batches_of(dataset, validation_windows(dataset, split, clips=clips), batch_size=batch_size)
+
+
+def validation_windows(dataset: Dataset, split: Split, *, clips: int) -> list[tuple[int, int]]:
+    """Return the starts of those clips: (episode, first control step), in their order.
+
+    Raises:
+        InputError: The split is empty.
+    """
+    windows = dataset.windows(split)
+    return [windows[index] for index in far_neighbours(spread(len(windows), clips))]
+
+
+def batches_of(dataset: Dataset, windows: Sequence[tuple[int, int]], *, batch_size: int) -> Iterator[Batch]:
+    """Yield the clips that start at these (episode, first control step), in this order, in batches.
+
+    If `data.broken_episodes` is skip, a batch may be smaller; none is empty. Many clips are read by workers.
+
+    Raises:
+        InputError: A clip cannot be read; or, by policy, none of them.
+    """
+    count, empty = len(windows), True
+    rows = [list(range(first, min(first + batch_size, count))) for first in range(0, count, batch_size)]
+    workers = dataset.config.workers if count >= CLIPS_WORTH_WORKERS else 0
+    clips = _Clips(dataset, partial(_chosen_clip, dataset, windows))
+    for batch in Batches(_micro_batches(clips, iter(rows), workers), dataset.broken):
+        if batch.starts:
+            empty = False
+            yield batch
+    if empty:
+        raise InputError(
+            where=f"data.path: {dataset.config.path}",
+            found=f"none of the clips can be read; broken episodes: {named(tuple(dataset.broken.reasons))}",
+            needed="at least one",
+            fix="Repair or fetch these episodes again, or add them to data.exclude",
+        )
+
+
+def _chosen_clip(dataset: Dataset, windows: Sequence[tuple[int, int]], position: int) -> ClipRequest:
+    """Return a clip of a list of windows; the camera is drawn per window."""
+    episode, start = windows[position]
+    cameras = dataset.config.cameras
+    number = drawn(int(~dataset.table.id_hash[episode]), start)
+    return ClipRequest(episode, start, cameras[int(number * len(cameras))])
+
+
+@dataclass(frozen=True)
+class MicroBatch:
+    """A worker's result for one micro-batch."""
+
+    batch: Batch
+    skipped: tuple[Skipped, ...] = ()
+
+    def pin_memory(self) -> MicroBatch:
+        """Return it in pinned memory; DataLoader calls a method of this name to pin."""
+        return replace(self, batch=self.batch.pin_memory())
+
+
+@dataclass(frozen=True)
+class _Clips(TorchDataset[MicroBatch]):
+    """Clips by position, read a micro-batch at a time."""
+
+    dataset: Dataset
+    request_at: Callable[[int], ClipRequest]  # a pure function of the position, the same in every worker
+    replayed: _Clips | None = None  # of the second data set
+    share: Fraction = Fraction(0)  # of these
+
+    def __getitems__(self, positions: list[int]) -> MicroBatch | UserError:
+        """Return a micro-batch, or its error: DataLoader would change an error that is raised."""
+        before = storage.bytes_fetched()
+        try:
+            read = self._read(positions)
+            clips = [one for one in read if isinstance(one, Clip)]
+            skipped = tuple(one for one in read if isinstance(one, Skipped))
+            fetched = storage.bytes_fetched() - before
+            if not clips:
+                return MicroBatch(no_clips(self.dataset.config.frames, self.dataset.widths, fetched), skipped)
+            return MicroBatch(collate(clips, fetched), skipped)
+        except UserError as error:
+            return error
+
+    def _read(self, positions: list[int]) -> list[Clip | Skipped]:
+        configs = [one.dataset.config for one in (self, self.replayed) if one is not None]
+        if not any(storage.is_url(config.path) for config in configs):
+            return [self._clip(position) for position in positions]
+        with ThreadPoolExecutor(min(len(positions), *(config.connections for config in configs))) as pool:
+            return list(pool.map(self._clip, positions))
+
+    def _clip(self, position: int) -> Clip | Skipped:
+        if self.replayed is not None:
+            before, after = (int(number * self.share) for number in (position, position + 1))
+            if after > before:
+                clip = self.replayed._clip(before)
+                return replace(clip, replayed=True) if isinstance(clip, Skipped) else clip
+            position -= before
+        request = self.request_at(position)
+        try:
+            return read_clip(self.dataset, request)
+        except InputError as error:
+            name = self.dataset.table.identity(request.episode)
+            if self.dataset.config.broken_episodes == "error":
+                raise with_way_out(error, [name]) from None
+            return Skipped(name, str(error))
+
+
+class Batches(Iterator[Batch]):
+    """The batches of a loader, in order, each being copied to the device since it was fetched.
+
+    They stay on the host; a copy on the device is in `on_device`. A batch's error and its skipped clips are reported
+    when it is requested, not when it is prefetched: a checkpoint in between must not contain them.
+
+    Args:
+        rows: The workers' results: micro-batches, or errors instead.
+        broken: Records clips that could not be read.
+        copies: How batches are copied to the device; without overlap there are no copies and no prefetching.
+        replayed: Records those of the second data set.
+    """
+
+    def __init__(
+        self,
+        rows: Generator[MicroBatch | UserError, None, None],
+        broken: BrokenEpisodes,
+        copies: Copies = NO_COPIES,
+        replayed: BrokenEpisodes | None = None,
+    ) -> None:
+        self._rows, self._broken, self._copies = rows, broken, copies
+        self._replayed = broken if replayed is None else replayed
+        self._prefetched: Exception | MicroBatch | None = None
+
+    def __next__(self) -> Batch:
+        """Return the next batch.
+
+        Raises:
+            InputError: A clip cannot be read, also in a worker; or too many cannot.
+        """
+        fetched, self._prefetched = self._prefetched or self._fetched(), None
+        if isinstance(fetched, Exception):
+            self.close()
+            raise fetched
+        for one in fetched.skipped:
+            (self._replayed if one.replayed else self._broken).met(one.episode_id, one.reason)
+        return fetched.batch
+
+    def prefetch_next(self) -> None:
+        """Fetch the next batch and start its copy to the device."""
+        if self._copies.overlap and self._prefetched is None:
+            self._prefetched = self._fetched()
+
+    def close(self) -> None:
+        """End the workers and drop the prefetched batch."""
+        self._prefetched = None
+        self._rows.close()
+
+    def _fetched(self) -> Exception | MicroBatch:
+        try:
+            row = next(self._rows)
+            if isinstance(row, UserError) or not self._copies.overlap:
+                return row
+            held = [self._copies.to_device.start(row.batch.mapped)]
+        except Exception as error:  # also the end of the rows
+            return error
+        take_once = lambda: held.pop()() if held else None  # noqa: E731 - so that the copy is freed after use
+        return replace(row, batch=replace(row.batch, on_device=take_once))
+
+
+def prefetch_next(batches: Iterator[Batch]) -> None:
+    """Prefetch the next batch if these batches support it: to be called before the host waits for the device."""
+    if hasattr(batches, "prefetch_next"):
+        batches.prefetch_next()
+
+
+def _micro_batches(
+    clips: _Clips, positions: Iterator[list[int]], workers: int, *, pinned: bool = False
+) -> Generator[MicroBatch | UserError, None, None]:
+    # A fork server has no threads: a plain fork may hang in OpenMP or CUDA, and Python warns of it.
+    context = multiprocessing.get_context("forkserver") if workers else None
+    if context is not None:
+        context.set_forkserver_preload([__name__])
+        _start_servers_deaf()
+    loader = DataLoader(
+        clips,
+        batch_sampler=positions,
+        collate_fn=_identity,
+        generator=torch.Generator(),  # otherwise the loader uses dropout's generator
+        num_workers=workers,
+        multiprocessing_context=context,
+        worker_init_fn=_end_with_the_run if workers else None,
+        prefetch_factor=clips.dataset.config.prefetch if workers else None,
+        pin_memory=pinned,
+    )
+    others = set(multiprocessing.active_children())
+    rows = iter(loader)
+    ours = set(multiprocessing.active_children()) - others
+    at_exit = partial(_end_workers, ours)
+    atexit.register(at_exit)  # multiprocessing sends SIGTERM, and waits for workers that ignore it
+    try:
+        yield from rows
+    finally:
+        del rows  # requests the workers to end, and waits for a while
+        _end_workers(ours)
+        atexit.unregister(at_exit)
+
+
+def _identity(batch: Any) -> Any:
+    return batch
+
+
+def _end_workers(workers: Iterable[multiprocessing.process.BaseProcess]) -> None:
+    """Kill workers that did not end on request: blocked by a clip, and ignoring SIGTERM."""
+    for worker in workers:
+        if worker.is_alive():
+            worker.kill()
+
+
+def _start_servers_deaf() -> None:
+    """Start the fork server with a run's stop signals blocked, which its workers inherit.
+
+    A signal to the whole process group, as from a terminal, `timeout` or Slurm, is for the run: it needs its workers to
+    finish the step, and ends them.
+    """
+    stop = {signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP}
+    for start in (resource_tracker.ensure_running, forkserver.ensure_running):  # the first one clears the mask
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, stop)
+        try:
+            start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _end_with_the_run(_worker: int) -> None:
+    """End this worker when its reading process has ended for any reason.
+
+    PyTorch's own watchdog checks the fork server, which lives as long as its workers: both would stay for ever.
+    """
+    run = multiprocessing.parent_process()
+    if run is None:
+        raise ValueError("not in a worker")
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the run, which ends its workers
+
+    def watch() -> None:
+        run.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

@@ -1,0 +1,278 @@
+"""Which episodes and control steps a run uses: exclusion, broken episodes, groups of episodes, and ranges of steps."""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Int32, UInt64
+
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable, identity_hash
+from vjepa2_ac.episode import StepRanges
+from vjepa2_ac.errors import InputError
+
+logger = logging.getLogger(__name__)
+
+NAMED = 10  # episodes in one message, at most
+MOST_BROKEN = 0.01  # share of the episodes
+
+# For DROID, whose identities contain .../LAB/success|failure/DATE/..., and for any data in folders.
+IN_IDENTITY = {
+    "lab": r"([^/]+)/(?:success|failure)/",
+    "day": r"/(?:success|failure)/([0-9]{4}-[0-9]{2}-[0-9]{2})(?:/|$)",
+    "folder": r"^(.+)/[^/]*$",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class StepSelection:
+    """Ranges [start, end) of control steps that a clip must fit into; by episode, then ascending and disjoint."""
+
+    episode: Int32[np.ndarray, " ranges"]  # index into the table
+    start: Int32[np.ndarray, " ranges"]
+    end: Int32[np.ndarray, " ranges"]
+    taking_part: Bool[np.ndarray, " episodes"]  # an episode may be used although none of its steps is kept
+
+    @classmethod
+    def whole(cls, table: EpisodeTable, taking_part: Bool[np.ndarray, " episodes"]) -> StepSelection:
+        """Keep every step of the used episodes."""
+        episode = np.flatnonzero(taking_part).astype(np.int32)
+        return cls(episode, np.zeros(len(episode), np.int32), table.num_steps[episode], taking_part)
+
+    def only(self, episodes: Bool[np.ndarray, " episodes"]) -> StepSelection:
+        """Return the selection with these episodes only."""
+        stays = episodes[self.episode]
+        ranges = replace(self, episode=self.episode[stays], start=self.start[stays], end=self.end[stays])
+        return replace(ranges, taking_part=self.taking_part & episodes)
+
+    def of(self, episode: int) -> StepRanges:
+        """Return the ranges of one episode."""
+        first, last = np.searchsorted(self.episode, np.array([episode, episode + 1], np.int32))
+        return tuple(zip(self.start[first:last].tolist(), self.end[first:last].tolist(), strict=True))
+
+    @property
+    def steps(self) -> int:
+        """The total number of kept steps."""
+        return int((self.end.astype(np.int64) - self.start).sum())
+
+
+def included(table: EpisodeTable, config: DataConfig) -> Bool[np.ndarray, " episodes"]:
+    """Return which episodes are used: all except those in `data.exclude`.
+
+    Raises:
+        InputError: `data.exclude` contains an unknown identity.
+    """
+    excluded = frozenset(config.exclude)
+    hashes = np.array([identity_hash(name) for name in excluded], np.uint64)
+    candidates = np.flatnonzero(np.isin(table.id_hash, hashes)).tolist()
+    found = {place: name for place in candidates if (name := table.identity(place)) in excluded}
+    unknown = excluded.difference(found.values(), (problem.name for problem in table.problems))
+    if unknown:
+        raise InputError(
+            where="data.exclude",
+            found=f"not the identity of any episode: {named(sorted(unknown))}",
+            needed="identities as errors name them" + (f", such as {table.identity(0)}" if len(table) else ""),
+        )
+    taking_part = np.ones(len(table), bool)
+    taking_part[list(found)] = False
+    return taking_part
+
+
+def of_outcome(table: EpisodeTable, config: DataConfig) -> Bool[np.ndarray, " episodes"]:
+    """Return which episodes have the outcome of `data.outcome`.
+
+    Raises:
+        InputError: No episode says whether it succeeded.
+    """
+    if config.outcome == "all":
+        return np.ones(len(table), bool)
+    if len(table) and (table.success < 0).all():
+        raise InputError(
+            where=f"data.outcome: {config.outcome}",
+            found=f"no episode of {config.path} says whether it succeeded",
+            needed="at least some that do",
+            fix="Set data.outcome: all",
+        )
+    return np.asarray(table.success == (config.outcome == "success"))
+
+
+def require_distinct(table: EpisodeTable, taking_part: Bool[np.ndarray, " episodes"], config: DataConfig) -> None:
+    """Refuse two episodes with one identity: they would share a split, and an error could not name one of them.
+
+    Raises:
+        InputError: There are two.
+    """
+    members = np.flatnonzero(taking_part)
+    hashes, counts = np.unique(table.id_hash[members], return_counts=True)
+    places: dict[str, int] = {}
+    for place in members[np.isin(table.id_hash[members], hashes[counts > 1])].tolist():
+        name = table.identity(place)
+        if name in places:
+            error = InputError(
+                where=f"data.path: {config.path}",
+                found=f"episodes {places[name]} and {place} have the same identity: {name}",
+                needed="episodes that can be told apart: the split is a hash of the identity",
+                fix=config.same_identity_fix,
+            )
+            raise with_way_out(error, [name], skippable=False)
+        places[name] = place
+
+
+class BrokenEpisodes:
+    """The broken episodes of an opened data set: those found while opening it, and those found by clips since.
+
+    It is in the process that opened the data set; loader workers report to it. `data.broken_episodes` is the policy:
+    stop at the first, or skip and count them, and stop where too many are broken.
+    """
+
+    def __init__(self, config: DataConfig, episodes: int) -> None:
+        self._config, self._episodes = config, episodes
+        self._reasons: dict[str, str] = {}
+
+    def __len__(self) -> int:
+        return len(self._reasons)
+
+    @property
+    def reasons(self) -> dict[str, str]:
+        """The broken episodes and their errors, in the order in which they were found."""
+        return dict(self._reasons)
+
+    def found(self, problems: Sequence[EpisodeProblem]) -> None:
+        """Record the problems found while the data set was opened or indexed.
+
+        Raises:
+            InputError: `data.broken_episodes` is error: the first of them; or too many are broken.
+        """
+        if not problems:
+            return
+        names = [problem.name for problem in problems]
+        if self._config.broken_episodes == "error":
+            raise with_way_out(as_error(problems[0]), names)
+        logger.warning(
+            "%s: %d of %d episodes are broken and left out: %s; the first: %s",
+            self._config.path, len(problems), self._episodes, named(names), as_error(problems[0]),
+        )  # fmt: skip
+        self._add({problem.name: str(as_error(problem)) for problem in problems})
+
+    def met(self, name: str, reason: str) -> None:
+        """Record an episode of which a clip could not be read.
+
+        Raises:
+            InputError: Now too many are broken.
+        """
+        if name not in self._reasons:
+            count = len(self) + 1
+            logger.warning("A clip is left out, %d of %d episodes are broken: %s", count, self._episodes, reason)
+            self._add({name: reason})
+
+    def recall(self, reasons: Mapping[str, str]) -> None:
+        """Count also what the run has found before it was resumed, or in its other processes.
+
+        Raises:
+            InputError: In total too many are broken.
+        """
+        self._add({name: why for name, why in reasons.items() if name not in self._config.exclude})
+
+    def _add(self, reasons: Mapping[str, str]) -> None:
+        self._reasons |= {name: why for name, why in reasons.items() if name not in self._reasons}
+        if len(self) <= MOST_BROKEN * self._episodes:
+            return
+        name, reason = next(iter(self._reasons.items()))
+        raise InputError(
+            where=f"data.path: {self._config.path}",
+            found=f"{len(self)} of {self._episodes} episodes are broken: {named(tuple(self._reasons))}."
+            f" The first, {name}: {reason.rstrip('.')}",
+            needed=f"{MOST_BROKEN:.0%} at most: data.broken_episodes is skip",
+            fix="Repair or fetch them again, or add them to data.exclude",
+        )
+
+
+def as_error(problem: EpisodeProblem) -> InputError:
+    """Return the error of an unusable episode."""
+    return InputError(where=problem.where, found=problem.found, needed=problem.needed, fix=problem.fix)
+
+
+def as_problem(error: InputError, name: str) -> EpisodeProblem:
+    """Return the record of an unusable episode."""
+    return EpisodeProblem(name=name, where=error.where, found=error.found, needed=error.needed, fix=error.fix)
+
+
+def with_way_out(error: InputError, names: Sequence[str], *, skippable: bool = True) -> InputError:
+    """Return an error of one or more episodes with the way to exclude them: ten of them, and the number of the rest.
+
+    Args:
+        error: What is wrong with the first of them.
+        names: Their identities.
+        skippable: Whether `data.broken_episodes: skip` would skip them.
+    """
+    others = f"{len(names) - 1} more cannot be used either. " if len(names) > 1 else ""
+    fix = f"{error.fix.rstrip('.')}. " if error.fix else ""
+    listed = json.dumps(list(names[:NAMED]), ensure_ascii=False)
+    of_all = f" (the first {NAMED} of {len(names)})" if len(names) > NAMED else ""
+    skip = "set data.broken_episodes: skip, or " if skippable else ""
+    return InputError(
+        where=error.where,
+        found=error.found,
+        needed=error.needed,
+        fix=f"{others}{fix}To go on without, {skip}add{of_all} to data.exclude: {listed}",
+    )
+
+
+def named(ids: Sequence[str], count: int | None = None) -> str:
+    """Return identities for a message: the first ten, and the number of the rest (of `count` in total)."""
+    more = (len(ids) if count is None else count) - NAMED
+    return ", ".join(ids[:NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+def groups_of(
+    table: EpisodeTable, taking_part: Bool[np.ndarray, " episodes"], config: DataConfig
+) -> UInt64[np.ndarray, " episodes"] | None:
+    """Return the hash of each episode's group (`data.split_by`), which determines its split; None: its identity does.
+
+    Args:
+        table: The episodes.
+        taking_part: Which of them are used; the others need not belong to a group, and then get that of another one.
+        config: `data.split_by`.
+
+    Raises:
+        InputError: There is no such field, one of those has none, or a pattern does not match its identity.
+    """
+    split_by = config.split_by
+    if split_by is None:
+        return None
+    groups = _groups(table, split_by)
+    lacking = [table.identity(place) for place in np.flatnonzero(taking_part).tolist() if not groups[place]]
+    if lacking:
+        from_source = split_by in table.labels
+        reason = "the data set does not say it of" if from_source else "found nothing in the identities of"
+        another = "choose another field" if from_source else "choose a pattern that fits every identity"
+        raise InputError(
+            where=f"data.split_by: {split_by}",
+            found=f"{reason} {len(lacking)} of {taking_part.sum()} episodes: {named(lacking)}",
+            needed="a group for every episode that takes part",
+            fix=f"Leave these out with data.exclude, or {another}",
+        )
+    hashes = {group: identity_hash(group) for group in groups if group}
+    any_hash = next(iter(hashes.values()), 0)
+    return np.array([hashes[group] if group else any_hash for group in groups], np.uint64)
+
+
+def _groups(table: EpisodeTable, split_by: str) -> list[str | None]:
+    if labels := table.labels.get(split_by):
+        return [labels.of_episode(place) for place in range(len(table))]
+    identities = [table.identity(place) for place in range(len(table))]
+    if split_by not in IN_IDENTITY and re.fullmatch(r"[A-Za-z_]+", split_by):
+        raise InputError(
+            where=f"data.split_by: {split_by}",
+            found=f"no such field; this data set has {', '.join(table.labels) or 'none of its own'}, and its identities"
+            f" may have {', '.join(IN_IDENTITY)}",
+            needed="a field, or a regular expression with one group for the identity"
+            + (f", such as {identities[0]}" if identities else ""),
+        )
+    search = re.compile(IN_IDENTITY.get(split_by, split_by)).search
+    return [found.group(1) if (found := search(identity)) else None for identity in identities]

@@ -1,0 +1,232 @@
+"""Camera frames to encoder input: crop, augmentation, scaling, normalisation.
+
+The crop is taken in the loader, on uint8; everything else runs on the device, on a whole batch. Augmentation of
+training clips, a random crop and colour jitter, is drawn once per clip in the loader and applied on the device.
+
+Source: facebookresearch/vjepa2 @ c2963a4, app/vjepa_droid/transforms.py and src/datasets/utils/video/transforms.py. The
+recipe's random crop never fits a 16:9 frame, so its fallback, a central crop, is always taken: nothing is random.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from vjepa2_ac.config import AugmentConfig
+from vjepa2_ac.episode import Augmentation
+
+Crop = Literal["released", "square", "letterbox"]
+
+NARROWEST, WIDEST = 0.75, 1.35  # width over height that the recipe leaves uncropped
+
+_MEAN = (0.485 * 255, 0.456 * 255, 0.406 * 255)  # of ImageNet, as the encoder was trained
+_STD = (0.229 * 255, 0.224 * 255, 0.225 * 255)
+_BRIGHTNESS = (0.299, 0.587, 0.114)  # weights of red, green and blue, ITU-R BT.601
+_STREAM = 0xA6  # separates the random numbers of augmentation from others of the same seed and position
+
+
+@dataclass(frozen=True)
+class CropBox:
+    """A part of a frame, in pixels."""
+
+    top: int
+    left: int
+    height: int
+    width: int
+
+
+def crop_box(height: int, width: int, kind: Crop = "released") -> CropBox:
+    """Return the part of a frame that the model sees: all of it, or the centre cut to an aspect (width over height).
+
+    released: an aspect between 0.75 and 1.35. square: 1, as upstream evaluates. letterbox: all.
+    """
+    aspects = {"released": (NARROWEST, WIDEST), "square": (1.0, 1.0), "letterbox": (0.0, float("inf"))}
+    narrowest, widest = aspects[kind]
+    box_height, box_width = height, width
+    if width / height < narrowest:
+        box_height = round(width / narrowest)
+    elif width / height > widest:
+        box_width = round(height * widest)
+    return CropBox((height - box_height) // 2, (width - box_width) // 2, box_height, box_width)
+
+
+def view(
+    frames: UInt8[np.ndarray, "time height width 3"], kind: Crop = "released"
+) -> UInt8[np.ndarray, "time seen_height seen_width 3"]:
+    """Return the part of the frames that the model sees, at their own resolution; see `DataConfig.crop`.
+
+    A view of the same memory, except for letterbox, if bars must be added.
+    """
+    if kind == "letterbox":
+        return _with_bars(frames)
+    box = crop_box(frames.shape[1], frames.shape[2], kind)
+    return frames[:, box.top : box.top + box.height, box.left : box.left + box.width]
+
+
+def _with_bars(frames: UInt8[np.ndarray, "time height width 3"]) -> UInt8[np.ndarray, "time side side 3"]:
+    height, width = frames.shape[1:3]
+    if height == width:
+        return frames
+    rows, columns = max(0, width - height), max(0, height - width)  # missing ones, in all
+    return np.pad(frames, ((0, 0), (rows // 2, rows - rows // 2), (columns // 2, columns - columns // 2), (0, 0)))
+
+
+def pixels_to_input(
+    frames: UInt8[Tensor, "batch time height width 3"], image_size: int, augmentations: Sequence[Augmentation] = ()
+) -> Float[Tensor, "batch time 3 size size"]:
+    """Return cropped frames as encoder input: squashed to a square (bilinear), ImageNet mean 0 and std 1.
+
+    Args:
+        frames: Results of `view`, stacked, on any device.
+        image_size: Height and width of a result, in pixels.
+        augmentations: One for each clip, applied before; or none.
+
+    Raises:
+        ValueError: There are some augmentations, but not one for each clip.
+    """
+    batch, time = frames.shape[:2]
+    if not augmentations:
+        resized = _resized(frames.flatten(0, 1), image_size)
+    elif len(augmentations) == batch:
+        pairs = zip(frames, augmentations, strict=True)
+        resized = torch.cat([_augmented(clip, image_size, augmentation) for clip, augmentation in pairs])
+    else:
+        raise ValueError(f"{len(augmentations)} augmentations for {batch} clips")
+    normalised: Tensor = (resized - per_channel(_MEAN, frames.device)) / per_channel(_STD, frames.device)
+    return normalised.reshape(batch, time, 3, image_size, image_size)
+
+
+def input_to_pixels(inputs: Float[Tensor, "*batch 3 size size"]) -> UInt8[Tensor, "*batch 3 size size"]:
+    """Return encoder input as the image that it is, rounded to 8 bits: the inverse of the normalisation."""
+    pixels = inputs.float() * per_channel(_STD, inputs.device) + per_channel(_MEAN, inputs.device)
+    return pixels.round().clamp(0, 255).to(torch.uint8)
+
+
+def images_to_input(images: Float[Tensor, "*batch 3 size size"]) -> Float[Tensor, "*batch 3 size size"]:
+    """Return images of the encoder's size, black 0 to white 1, as encoder input: with the same normalisation."""
+    return (images.float() * 255.0 - per_channel(_MEAN, images.device)) / per_channel(_STD, images.device)
+
+
+def frames_as_seen(
+    frames: UInt8[np.ndarray, "time height width 3"], size: int
+) -> UInt8[np.ndarray, "time size size 3"]:
+    """Return cropped frames as the encoder sees them, for people to look at."""
+    inputs = pixels_to_input(torch.from_numpy(np.ascontiguousarray(frames))[None], size)[0]
+    return np.ascontiguousarray(input_to_pixels(inputs).permute(0, 2, 3, 1).numpy())
+
+
+def frame_of_seen(
+    seen: UInt8[np.ndarray, "size size 3"], height: int, width: int, kind: Crop = "released"
+) -> UInt8[np.ndarray, "height width 3"]:
+    """Return what the encoder sees at its place in a camera frame, for people: white where nothing is seen."""
+    box, side = crop_box(height, width, kind), max(height, width)
+    if kind == "letterbox":
+        box = CropBox((height - side) // 2, (width - side) // 2, side, side)  # larger than the frame: with the bars
+    part = torch.nn.functional.interpolate(
+        torch.tensor(seen).permute(2, 0, 1)[None].float(), size=(box.height, box.width), mode="bilinear"
+    )
+    pixels = part[0].round().to(torch.uint8).permute(1, 2, 0).numpy()
+    pixels = pixels[max(0, -box.top) :, max(0, -box.left) :][:height, :width]
+    frame = np.full((height, width, 3), 255, np.uint8)
+    top, left = max(0, box.top), max(0, box.left)
+    frame[top : top + len(pixels), left : left + pixels.shape[1]] = pixels
+    return frame
+
+
+def _augmented(clip: Tensor, image_size: int, augmentation: Augmentation) -> Float[Tensor, "time 3 size size"]:
+    top, left, height, width = augmentation.box
+    return jittered(_resized(clip[:, top : top + height, left : left + width], image_size), augmentation)
+
+
+def _resized(frames: UInt8[Tensor, "count height width 3"], size: int) -> Float[Tensor, "count 3 size size"]:
+    pixels = frames.permute(0, 3, 1, 2).to(torch.float32)
+    return torch.nn.functional.interpolate(
+        pixels, size=(size, size), mode="bilinear", align_corners=False, antialias=False
+    )
+
+
+def draw(config: AugmentConfig, height: int, width: int, *, seed: int, position: int) -> Augmentation | None:
+    """Return the augmentation of the clip at a position of the run, or None if there is none.
+
+    A pure function of its arguments: neither workers nor resuming change it. The crop's share of the area is uniform,
+    the logarithm of its aspect likewise, among the aspects with which that area fits into the frame; where none of
+    `crop_aspect` fits, the nearest one that fits is used. So no draw falls back to the whole frame.
+
+    Args:
+        config: The ranges of the changes.
+        height: Of the clip's frames, in pixels, after `transforms.view`.
+        width: Likewise.
+        seed: Of the run.
+        position: Of the clip in the run.
+
+    Source: the random resized crop of Szegedy et al. (arXiv 1409.4842, section 6), without its rejections.
+    """
+    if not config.is_on:
+        return None
+    numbers = np.random.default_rng([_STREAM, seed, position]).random(7)
+    brightness, contrast, saturation = (
+        1 + reach * (2 * float(number) - 1)
+        for reach, number in zip((config.brightness, config.contrast, config.saturation), numbers[4:], strict=True)
+    )
+    return Augmentation(_box(config, height, width, numbers), brightness, contrast, saturation)
+
+
+def _box(
+    config: AugmentConfig, height: int, width: int, numbers: Float[np.ndarray, " numbers"]
+) -> tuple[int, int, int, int]:
+    if config.crop_scale is None:
+        return 0, 0, height, width
+    least, greatest = config.crop_scale
+    share = least + (greatest - least) * float(numbers[0])
+    shape = width / height
+    fits = share * shape, shape / share  # the narrowest and the widest box of this area
+    low, high = (math.log(min(max(aspect, fits[0]), fits[1])) for aspect in config.crop_aspect)
+    aspect = math.exp(low + (high - low) * float(numbers[1]))
+    area = share * height * width
+    box_height = min(height, max(1, round(math.sqrt(area / aspect))))
+    box_width = min(width, max(1, round(math.sqrt(area * aspect))))
+    top = int(numbers[2] * (height - box_height + 1))
+    left = int(numbers[3] * (width - box_width + 1))
+    return top, left, box_height, box_width
+
+
+def jittered(
+    pixels: Float[Tensor, "time 3 height width"], augmentation: Augmentation
+) -> Float[Tensor, "time 3 height width"]:
+    """Return a clip, 0..255, with changed brightness, contrast and saturation; a factor of 1 changes nothing.
+
+    Each blends the frame with another one and clamps: brightness with black, contrast with the mean grey,
+    saturation with the frame in grey. The mean grey is the whole clip's, so that every frame changes alike.
+
+    Source: the formulas of torchvision's adjust_brightness, adjust_contrast and adjust_saturation, in this order.
+    """
+    if augmentation.brightness != 1:
+        pixels = _blend(pixels, torch.zeros_like(pixels), augmentation.brightness)
+    if augmentation.contrast != 1:
+        pixels = _blend(pixels, _grey(pixels).mean(), augmentation.contrast)
+    if augmentation.saturation != 1:
+        pixels = _blend(pixels, _grey(pixels), augmentation.saturation)
+    return pixels
+
+
+def _blend(pixels: Tensor, plainer: Tensor, factor: float) -> Tensor:
+    return (factor * pixels + (1 - factor) * plainer).clamp(0, 255)
+
+
+def _grey(pixels: Tensor) -> Float[Tensor, "time 1 height width"]:
+    return (pixels * per_channel(_BRIGHTNESS, pixels.device)).sum(dim=1, keepdim=True)
+
+
+@lru_cache(maxsize=32)
+def per_channel(values: tuple[float, float, float], device: torch.device) -> Float[Tensor, "3 1 1"]:
+    """Return numbers for red, green and blue on a device: copied there once, since the copy blocks the host."""
+    with torch.inference_mode(False):  # tensors of inference mode could not be trained with
+        return torch.tensor(values, device=device).view(3, 1, 1)

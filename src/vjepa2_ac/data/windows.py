@@ -1,0 +1,269 @@
+"""Clip windows: which clips exist, the split they belong to, and their order.
+
+Everything here is a pure function of the episodes' identities and remaining steps, the seed and a position: nothing
+depends on the number of shards, workers or ranks, and resuming a run needs no saved state.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import logging
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, Int32, Int64, UInt64
+
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config.data import Split
+from vjepa2_ac.data.index.episode_table import EpisodeTable
+from vjepa2_ac.data.selection import NAMED, StepSelection, named
+from vjepa2_ac.errors import InputError
+
+logger = logging.getLogger(__name__)
+
+_FEWEST_GROUPS = 3  # one for each split
+_ROUNDS = 8  # of the permutation
+_HALF_BITS = 3  # minimum: narrower halves favour some orders of few windows
+_MASK64 = (1 << 64) - 1
+
+
+def in_split(
+    split_hash: UInt64[np.ndarray, " episodes"],
+    config: DataConfig,
+    split: Split,
+    among: Bool[np.ndarray, " episodes"] | None = None,
+) -> Bool[np.ndarray, " episodes"]:
+    """Return which episodes belong to a split.
+
+    The hash, as a number in [0, 1), is compared with the shares. Where that leaves validation or test without any,
+    as may happen to few episodes, though its share is above 0, the one whose number comes next moves there.
+
+    Args:
+        split_hash: Of each episode's identity; with `data.split_by`, of the name of its group.
+        config: The shares.
+        split: Which split.
+        among: Which of them are split, None: all. The split of one depends on the others where these are few: so they
+            are the same throughout a run, with those that are broken or left out by `data.exclude`.
+    """
+    number = split_hash.astype(np.float64) / 2**64
+    among = np.ones(len(number), bool) if among is None else among
+    test, held_out = _bounds(np.unique(number[among]), config)
+    low, high = {"test": (0.0, test), "validation": (test, held_out), "train": (held_out, 2.0)}[split]
+    return np.asarray(among & (number >= low) & (number < high))
+
+
+def _bounds(groups: Float[np.ndarray, " groups"], config: DataConfig) -> tuple[float, float]:
+    """Return the numbers below which a group is of test, and of test or validation; `groups` has all, sorted."""
+    test, held_out = config.test_share, config.test_share + config.validation_share
+    if len(groups) < _FEWEST_GROUPS:
+        return test, held_out
+    if config.test_share > 0 and not (groups < test).any():
+        test = float(np.nextafter(groups[0], 2.0))
+    held_out = max(test, held_out)
+    left = groups[groups >= test]
+    if config.validation_share > 0 and len(left) > 1 and not (left < held_out).any():
+        held_out = float(np.nextafter(left[0], 2.0))
+    return test, held_out
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """Clips in the order of their episodes' identities, then of their starts; as runs of neighbours.
+
+    A run has the clips that start at `first`, `first` + `every`, ..., `count` of them.
+    """
+
+    episode: Int32[np.ndarray, " runs"]  # index into the source
+    first: Int32[np.ndarray, " runs"]  # control step
+    count: Int32[np.ndarray, " runs"]
+    every: int = 1  # control steps
+    short: tuple[int, ...] = ()  # episodes skipped because they are shorter than a clip
+
+    def of(self, runs: np.ndarray) -> Windows:
+        """Return some of the runs, by a mask or by index."""
+        return replace(self, episode=self.episode[runs], first=self.first[runs], count=self.count[runs])
+
+    @cached_property
+    def _ends(self) -> Int64[np.ndarray, " runs"]:
+        return np.cumsum(self.count, dtype=np.int64)
+
+    def __len__(self) -> int:
+        return int(self._ends[-1]) if len(self._ends) else 0
+
+    def __getitem__(self, index: int) -> tuple[int, int]:
+        """Return (episode, first control step) of a window."""
+        if not 0 <= index < len(self):
+            raise IndexError(f"window {index} of {len(self)}")
+        run = int(np.searchsorted(self._ends, index, side="right"))
+        place = index - (int(self._ends[run]) - int(self.count[run]))
+        return int(self.episode[run]), int(self.first[run]) + self.every * place
+
+    def steps_of(self, run: int) -> Int[np.ndarray, " n"]:
+        """Return the starts of a run, by its index."""
+        return int(self.first[run]) + self.every * np.arange(self.count[run])
+
+    @property
+    def episodes(self) -> Int32[np.ndarray, " episodes"]:
+        """The episodes that clips come from, each once, ascending."""
+        return np.unique(self.episode)
+
+
+def clip_starts(table: EpisodeTable, kept: StepSelection, config: DataConfig) -> Windows:
+    """Return all clips within kept ranges.
+
+    With `data.start_every` their starts are multiples of it, counted from the first kept step of their episode.
+    """
+    span = kept.end - kept.start - (config.clip_steps - 1)
+    phase = np.zeros(len(table), np.int32)
+    phase[kept.episode[::-1]] = kept.start[::-1]  # the last write counts: an episode's first range
+    skipped = (phase[kept.episode] - kept.start) % config.start_every
+    count = -((skipped - span) // config.start_every)  # rounded up; 0 or less if none remains
+    runs = Windows(kept.episode, kept.start + skipped, count, config.start_every).of(count > 0)
+    return runs.of(np.lexsort((runs.first, table.id_rank[runs.episode])))
+
+
+def windows_of(
+    table: EpisodeTable, members: Bool[np.ndarray, " episodes"], starts: Windows, config: DataConfig, split: Split
+) -> Windows:
+    """Return the windows of a split.
+
+    Args:
+        table: The episodes.
+        members: Which of them are used, and belong to the split: at least one.
+        starts: The result of `clip_starts`, at least of these.
+        config: What to do with short episodes.
+        split: The name of the split.
+
+    Raises:
+        InputError: The split has only short episodes, or none with a clip's length of kept steps, or
+            `data.short_episodes` forbids short ones.
+    """
+    where, count = f"data.path: {config.path}", int(members.sum())
+    length = f"{config.clip_steps} steps for a clip of {config.frames} frames at stride {config.stride}"
+    short = np.flatnonzero(members & (table.num_steps < config.clip_steps)).astype(np.int32)
+    short = short[np.argsort(table.id_rank[short])]
+    names = tuple(table.identity(place) for place in short[: NAMED + 1].tolist())
+    if len(short) and (config.short_episodes == "error" or len(short) == count):
+        longest = int(short[np.argmax(table.num_steps[short])])
+        raise InputError(
+            where=where,
+            found=f"{len(short)} of {count} {split} episodes are shorter than a clip; the longest of these,"
+            f" {table.identity(longest)}, has {table.num_steps[longest]} steps. Too short: {named(names, len(short))}",
+            needed=length,
+            fix="Lower data.frames or data.stride"
+            + (", or set data.short_episodes: skip" if len(short) < count else ""),
+        )
+    if len(short):
+        _warn_of_short(config.path, split, config.clip_steps, count, len(short), names)
+    own = starts.of(members[starts.episode])
+    if not len(own):
+        raise InputError(
+            where=where,
+            found=f"no {split} episode has a range of kept steps as long as a clip (data.idle.rule {config.idle.rule})",
+            needed=length,
+            fix="Lower data.frames or data.stride, or set data.idle.rule: none",
+        )
+    return replace(own, short=tuple(short.tolist()))
+
+
+@lru_cache(maxsize=64)  # logged once: every validation uses the same windows
+def _warn_of_short(path: str, split: Split, clip_steps: int, members: int, short: int, names: tuple[str, ...]) -> None:
+    logger.warning(
+        "%s: %d of %d %s episodes are shorter than a clip of %d control steps and left out: %s",
+        path, short, members, split, clip_steps, named(names, short),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ClipOrder:
+    """The endless order of training: every window once per epoch, each epoch in its own order."""
+
+    windows: Windows
+    seed: int
+
+    def window(self, position: int) -> tuple[int, int]:
+        """Return (episode, first control step) of the clip at a position of the run."""
+        epoch, index = divmod(position, len(self.windows))
+        return self.windows[permuted(index, size=len(self.windows), seed=self.seed, epoch=epoch)]
+
+    def choice(self, position: int, count: int) -> int:
+        """Return one of `range(count)`, uniformly drawn, for the clip at a position of the run."""
+        digest = hashlib.blake2b(f"{self.seed} {position}".encode(), digest_size=8).digest()
+        return int.from_bytes(digest, "big") % count
+
+
+def permuted(index: int, *, size: int, seed: int, epoch: int) -> int:
+    """Return the image of an index under a keyed permutation of `range(size)`, which is never in memory.
+
+    A Feistel network permutes the next power of four; results outside the range are permuted again until inside.
+    """
+    if not 0 <= index < size:
+        raise ValueError(f"index {index} of {size}")
+    half = max(_HALF_BITS, ((size - 1).bit_length() + 1) // 2)
+    keys = _round_keys(size, seed, epoch)
+    index = _feistel(index, half, keys)
+    while index >= size:
+        index = _feistel(index, half, keys)
+    return index
+
+
+def _feistel(value: int, half: int, keys: tuple[int, ...]) -> int:
+    mask = (1 << half) - 1
+    left, right = value >> half, value & mask
+    for key in keys:
+        left, right = right, left ^ (_mix(right ^ key) & mask)
+    return left << half | right
+
+
+def _mix(value: int) -> int:
+    """Scatter 64 bits. Source: Steele, Lea, Flood (2014), SplitMix64 (constants of Stafford's variant 13)."""
+    value = (value ^ value >> 30) * 0xBF58476D1CE4E5B9 & _MASK64
+    value = (value ^ value >> 27) * 0x94D049BB133111EB & _MASK64
+    return value ^ value >> 31
+
+
+@lru_cache(maxsize=8)
+def _round_keys(size: int, seed: int, epoch: int) -> tuple[int, ...]:
+    digest = hashlib.blake2b(f"{size} {seed} {epoch}".encode(), digest_size=8 * _ROUNDS).digest()
+    return tuple(int.from_bytes(digest[8 * number : 8 * number + 8], "big") for number in range(_ROUNDS))
+
+
+def drawn(id_hash: int, start: int) -> float:
+    """Return a number in [0, 1) for a window: a hash of its episode's identity hash and its first step."""
+    return (_mix((id_hash + (start + 1) * 0x9E3779B97F4A7C15) & _MASK64) >> 11) / (1 << 53)
+
+
+def require_stride(config: DataConfig, *, to: str, fix: str = "`vjepa2-ac data calibrate CONFIG` finds one") -> int:
+    """Return the stride of a config.
+
+    Args:
+        config: The data.
+        to: What it is needed for.
+        fix: How to say it.
+
+    Raises:
+        InputError: It is auto.
+    """
+    if config.stride == "auto":
+        raise InputError(where="data.stride", found="auto", needed=f"a number of control steps, to {to}", fix=fix)
+    return config.stride
+
+
+def spread(size: int, count: int) -> list[int]:
+    """Return at most `count` of `range(size)`, evenly spread, each once."""
+    count = min(size, count)
+    return [(2 * number + 1) * size // (2 * count) for number in range(count)]
+
+
+def spread_with_ends(size: int, count: int) -> list[int]:
+    """Return at most `count` of `range(size)`, evenly spread, each once, the first and the last among them."""
+    return sorted({round(place) for place in np.linspace(0, size - 1, min(size, count))})
+
+
+def far_neighbours(items: list[int]) -> list[int]:
+    """Return sorted items in an order in which neighbours are about half the list apart."""
+    half = (len(items) + 1) // 2
+    pairs = itertools.zip_longest(items[:half], items[half:])
+    return [item for pair in pairs for item in pair if item is not None]

@@ -1,0 +1,213 @@
+"""Export of a trained run: as one merged model, as Meta's checkpoint, or as an adapter with its card for the Hub."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePath
+from typing import Any, Literal
+
+from huggingface_hub import EvalResult, ModelCardData
+from jinja2 import Environment, PackageLoader, StrictUndefined, TemplateError, select_autoescape
+
+from vjepa2_ac import __version__
+from vjepa2_ac.config import Config
+from vjepa2_ac.config.loading import config_as_yaml
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.adapter.adapter_folder import ADAPTER_FILE
+from vjepa2_ac.model.adapter.lora import adapted_report
+from vjepa2_ac.model.adapter.merging import merge_adapter
+from vjepa2_ac.model.checkpoints.loading import to_official
+from vjepa2_ac.model.network.input_heads import widths_as_text, widths_of_model
+from vjepa2_ac.model.network.pretrained_folder import require_finite
+from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics
+from vjepa2_ac.reports.write import PLOT
+from vjepa2_ac.runs.checkpoint import ADAPTER, SELECTED, read_state
+from vjepa2_ac.runs.files import write_torch
+from vjepa2_ac.runs.folder import read_run_config
+from vjepa2_ac.runs.loading import TrainedRun, load_run
+from vjepa2_ac.storage import atomic_writer, folder_writer, is_empty, try_writing_at, user_can_write, write_atomically
+
+Form = Literal["merged", "official", "hub"]
+Metrics = Mapping[str, Any]
+
+OFFICIAL_NAME = "vjepa2-ac.pt"  # in a folder; a destination that ends in .pt is the file itself
+CARD = "README.md"
+
+
+@dataclass(frozen=True)
+class Exported:
+    """The result of an export."""
+
+    path: Path  # the file or folder
+    checkpoint: str  # the one it was made from, as text
+
+
+def export_run(folder: Path, destination: Path, form: Form = "merged", checkpoint: str = SELECTED) -> Exported:
+    """Export a trained run, atomically.
+
+    An adapter is merged in float32, then cast to the type of the base's weights (`model.dtype`).
+
+    Args:
+        folder: The run.
+        destination: A new or empty folder; for official also a file ending in `.pt`, which must not exist.
+        form: merged: the model as a folder, which `model.base` takes. official: one `.pt` with Meta's names, q, k
+            and v fused, for the official code. hub: the adapter in PEFT's format with a model card, ready to upload.
+        checkpoint: selected (the best, else the newest), newest, best, or a number of optimizer steps.
+
+    Raises:
+        InputError: As `load_run`; the destination is occupied or cannot be written; official: Meta's code has no such
+            model; hub: the run has no adapter, or its `metrics.json` is damaged; or a weight of the merged model is not
+            finite, whatever the form.
+    """
+    _check_free(destination, form)
+    kind = read_run_config(folder).adapter.kind
+    if form == "hub" and kind != "lora":
+        raise InputError(
+            where=str(folder),
+            found=f"a run without an adapter (adapter.kind: {kind})",
+            needed="one with adapter.kind: lora, for --to hub",
+            fix="Export the whole model with --to merged or --to official",
+        )
+    metrics = read_metrics(folder) if form == "hub" and (folder / METRICS_FILE).exists() else None
+    run = load_run(folder, checkpoint)
+    if form == "hub":
+        card = _card(run, folder, metrics)
+        _merge(run)  # the merged model is not written, but an adapter that makes it not finite is of no use
+        _write_hub(run, folder, destination, card, metrics)
+        return Exported(destination, run.chosen)
+    _merge(run)
+    if form == "merged":
+        run.world_model.save_pretrained(destination)
+        return Exported(destination, run.chosen)
+    path = destination if destination.suffix == ".pt" else destination / OFFICIAL_NAME
+    with user_can_write(path), atomic_writer(path) as file:
+        write_torch(to_official(run.world_model), file)
+    return Exported(path, run.chosen)
+
+
+def _merge(run: TrainedRun) -> None:
+    """Merge the trained weights into the model, and check that every weight is then finite."""
+    merge_adapter(run.world_model)
+    require_finite(
+        run.world_model.predictor.state_dict(),
+        where=f"{run.checkpoint}, merged into its base",
+        fix="Check lora_alpha in its adapter_config.json, or export another checkpoint: --checkpoint best",
+    )
+
+
+def _check_free(destination: Path, form: Form) -> None:
+    """Check that a destination is free and can be written. Changes nothing."""
+    if destination.suffix == ".pt" and form != "official" and not destination.is_dir():
+        found = "the name of a .pt file"
+        raise InputError(where=str(destination), found=found, needed=f"a folder, for --to {form}")
+    with user_can_write(destination):
+        if destination.exists() and not (destination.is_dir() and is_empty(destination)):
+            raise InputError(where=str(destination), found="something is there already", needed="a new or empty folder")
+        try_writing_at(destination)
+
+
+def _write_hub(run: TrainedRun, folder: Path, destination: Path, card: str, metrics: Metrics | None) -> None:
+    """Copy the adapter of a checkpoint, which load_run has verified, and put the card beside it."""
+    with folder_writer(destination, ADAPTER_FILE) as fresh:
+        for path in (run.checkpoint / ADAPTER).iterdir():
+            shutil.copyfile(path, fresh / path.name)
+        if metrics is not None:
+            if (folder / PLOT).is_file():
+                shutil.copyfile(folder / PLOT, fresh / PLOT)
+            here = {
+                "subject": folder.resolve().name,
+                "checkpoint_path": PurePath(metrics["about"]["checkpoint_path"]).name,
+            }
+            told = {**metrics, "about": {**metrics["about"], **here}}  # without paths of this machine
+            write_atomically(fresh / METRICS_FILE, json.dumps(told, indent=1))
+        write_atomically(fresh / CARD, card)
+
+
+def _card(run: TrainedRun, folder: Path, metrics: Metrics | None) -> str:
+    """Return the README.md of an adapter, in Markdown, with the Hub's front matter."""
+    config, model, name = run.config, run.world_model, folder.resolve().name
+    environment = Environment(  # Markdown is not escaped
+        loader=PackageLoader("vjepa2_ac", "assets"),
+        undefined=StrictUndefined,
+        autoescape=select_autoescape(),
+        trim_blocks=True,
+        keep_trailing_newline=True,
+    )
+    environment.filters |= {"code": lambda name: f"`{name}`", "count": _count, "ratio": _ratio}
+    try:
+        measured = None if metrics is None else PurePath(metrics["about"]["checkpoint_path"]).name
+        front = ModelCardData(
+            library_name="peft",
+            pipeline_tag="robotics",
+            tags=["v-jepa-2-ac", "world-model", "lora"],
+            model_name=name,
+            eval_results=_eval_results(config, metrics) if metrics and measured == run.checkpoint.name else None,
+        )
+        return environment.get_template("model_card.md.jinja").render(
+            **dict(config),
+            run=run,
+            name=name,
+            evaluation=metrics,
+            measured=measured,
+            plot=PLOT if metrics is not None and (folder / PLOT).is_file() else None,
+            base=model.adaptation,
+            heads=None if model.fresh_heads is None else widths_of_model(model.sizes),
+            takes=widths_as_text(model.sizes),
+            steps=read_state(run.checkpoint).step,
+            trained=adapted_report(model),
+            version=__version__,
+            front=str(front.to_yaml()),
+            base_arguments=_base_arguments(config),
+            every_setting=config_as_yaml(config.model_copy(update={"run_dir": name})),
+        )
+    except (KeyError, TypeError, AttributeError, TemplateError) as error:
+        raise InputError(
+            where=str(folder / METRICS_FILE),
+            found=f"metrics that cannot be used ({error!r})",
+            needed="what `vjepa2-ac evaluate` writes",
+            fix=f"Write it again with `vjepa2-ac evaluate {folder}`, or delete it",
+        ) from None
+
+
+def _eval_results(config: Config, metrics: Metrics) -> list[EvalResult]:
+    """Return the rollout errors over persistence by horizon, as the Hub shows them."""
+    about, models = metrics["about"], metrics["models"]
+    ratios = models[list(models)[-1]]["rollout"]["l1"]["over_persistence"]  # what was measured comes last
+    return [
+        EvalResult(
+            task_type="robotics",
+            task_name="prediction of latents",
+            dataset_type=config.data.source,
+            dataset_name=PurePath(config.data.path).name,
+            dataset_split=about["split"],
+            metric_type="l1_over_persistence",
+            metric_name=f"L1 error over persistence, {step * about['seconds_per_step']:.2f} s ahead",
+            metric_value=round(ratio["value"], 4),
+        )
+        for step, ratio in enumerate(ratios, start=1)
+        if ratio["value"] is not None
+    ]
+
+
+def _base_arguments(config: Config) -> str:
+    """Return the arguments with which `load_model` gives the base, as Python source."""
+    words = [repr(config.model.base), f"dtype={config.model.dtype!r}"]
+    for name, part in (("sizes", config.model.sizes), ("encoder", config.model.encoder)):
+        told = {} if part is None else part.model_dump(mode="json", exclude_defaults=True)
+        if told.keys() == {"path"}:
+            words.append(f"{name}={told['path']!r}")
+        elif told:
+            words.append(f"{name}={type(part).__name__}.model_validate({told!r})")
+    return ", ".join(words)
+
+
+def _ratio(ratio: Metrics) -> str:
+    interval = "" if ratio["low"] is None else f" [{ratio['low']:.3f}, {ratio['high']:.3f}]"
+    return f"{ratio['value']:.3f}{interval}"
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number:,} {what}{'s' * (number != 1)}"

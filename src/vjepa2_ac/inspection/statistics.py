@@ -1,0 +1,219 @@
+"""Statistics of a data set: lengths, outcomes, idle time, and the motion of the robot per model step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
+
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config.data import Split
+from vjepa2_ac.data.coverage import Coverage, ReadEpisode, coverage_by, read_sample
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.duplicates import Duplicates, find_duplicates
+from vjepa2_ac.data.idle import idle_by_motion, long_idle_runs
+from vjepa2_ac.episode import Progress, no_progress
+from vjepa2_ac.errors import InputError
+
+PERCENTILES = (10, 50, 90, 99)
+SPLITS: tuple[Split, ...] = ("train", "validation", "test")
+MOVED, TURNED, CHANGED = "moved_cm", "turned_deg", "changed_percent_of_range"
+
+RELEASED_STEP_CM = 12.9  # motion of the flange between the two frames of upstream's example (franka_example_traj.npz)
+RELEASED = (
+    "the released weights saw DROID at a step of 4, 8 or 15 control steps (0.27, 0.53 or 1 s): which one is unsettled."
+    f" The one known pair of frames, upstream's own example, is {RELEASED_STEP_CM} cm apart."
+    " `data calibrate` lets the weights choose"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class StepSizes:
+    """How far the state moves in a model step, at one stride."""
+
+    stride: int
+    seconds: float
+    sizes: dict[str, Float[np.ndarray, " pairs"]]  # of poses MOVED and TURNED, of vectors CHANGED
+
+    @property
+    def percentiles(self) -> dict[str, list[float]]:
+        """The percentiles 10, 50, 90 and 99 of each; empty if no pair of steps fits."""
+        return {
+            name: np.percentile(one, list(PERCENTILES)).tolist() if len(one) else [] for name, one in self.sizes.items()
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Inspection:
+    """The statistics of a data set; motion is measured on a sample of the used episodes."""
+
+    dataset: Dataset
+    duplicates: Duplicates
+    sample: tuple[ReadEpisode, ...]
+
+    @property
+    def has_poses(self) -> bool:
+        """Whether there is a position, of which motion is measured."""
+        return self.dataset.spaces.state.position is not None
+
+    @cached_property
+    def ranges(self) -> Float[np.ndarray, "state_dim 2"]:
+        """The least and the greatest value of each number of the sample's states."""
+        states = np.concatenate([one.states for one in self.sample])
+        return np.stack([states.min(axis=0), states.max(axis=0)], axis=1)
+
+    def range_of(self, column: int) -> tuple[float, float]:
+        """Return the least and the greatest value of one number of the sample's states."""
+        low, high = self.ranges[column].tolist()
+        return low, high
+
+    @cached_property
+    def coverage(self) -> Coverage | None:
+        """The coverage of actions by the sample at the config's stride; None: no step fits."""
+        return coverage_by(self.sample, self.dataset.spaces.state, self.dataset.config.model_stride)
+
+    @cached_property
+    def steps(self) -> tuple[StepSizes, ...]:
+        """The motion per model step at each candidate stride."""
+        rate = self.dataset.control_rate_hz
+        return tuple(self._at_stride(stride, rate) for stride in self.dataset.config.strides_to_try(rate))
+
+    def _at_stride(self, stride: int, control_rate_hz: float) -> StepSizes:
+        space = self.dataset.spaces.state
+        pieces = [piece for one in self.sample for piece in one.changes(stride, space)]
+        changes = np.concatenate([np.zeros((0, len(space))), *pieces])
+        if self.has_poses:
+            turned = Rotation.from_euler("xyz", changes[:, space.rotation]).magnitude()
+            sizes = {MOVED: space.shown_size(changes), TURNED: np.rad2deg(turned)}
+        else:
+            sizes = {CHANGED: largest_change(changes, self.ranges)}
+        return StepSizes(stride, stride / control_rate_hz, sizes)
+
+    @cached_property
+    def values(self) -> dict[str, Any]:
+        """All statistics as plain values, as in `inspect.json`."""
+        config, table, rate = self.dataset.config, self.dataset.table, self.dataset.control_rate_hz
+        known = table.success[table.success >= 0]
+        about_states = {"ranges": self.ranges.tolist()}
+        if self.has_poses:
+            about_states = {
+                "still_share": self._still_share(),
+                "xyz_m": self.ranges[:3].tolist(),
+                "gripper": self.ranges[-1].tolist(),
+                "released_weights": RELEASED,
+            }
+        return {
+            "path": config.path,
+            "source": config.source,
+            "cameras": list(config.offered_cameras),
+            "camera": list(config.cameras),
+            "control_rate_hz": rate,
+            "episodes": len(table),
+            "broken_episodes": len(table.problems),
+            "steps": int(table.num_steps.sum()),
+            "hours": float(table.num_steps.sum() / rate / 3600),
+            "length_percentiles_0_10_50_90_100": np.percentile(table.num_steps, [0, 10, 50, 90, 100])
+            .astype(int)
+            .tolist(),
+            "success_share": float(known.mean()) if len(known) else None,
+            "success_known_of": len(known),
+            "removed": [vars(one) for one in self.dataset.removed],
+            "splits": {split: self._size_of(split) for split in SPLITS},
+            "duplicates": self.duplicates.as_dict(),
+            "sampled_episodes": len(self.sample),
+            "state_dim": self.dataset.widths.state,
+            "action_dim": self.dataset.widths.action,
+            "percentiles": list(PERCENTILES),
+            "per_model_step": [{"stride": one.stride, "seconds": one.seconds, **one.percentiles} for one in self.steps],
+            "coverage": None if self.coverage is None else dict(self.coverage.metrics),
+            **about_states,
+        }
+
+    def _size_of(self, split: Split) -> dict[str, int]:
+        try:
+            windows = len(self.dataset.windows(split))
+        except InputError:  # an empty split is a statistic here, not an error
+            windows = 0
+        return {"episodes": int(self.dataset.members(split).sum()), "windows": windows}
+
+    def _still_share(self) -> float:
+        """Return the share of the sample's steps in a run of idle ones, by the measured motion."""
+        return float(np.concatenate([idle_runs(one.states, self.dataset.config) for one in self.sample]).mean())
+
+    @cached_property
+    def summary(self) -> dict[str, str]:
+        """What there is to say, by what it is about."""
+        config, values = self.dataset.config, self.values
+        hours, success, copies = values["hours"], values["success_share"], self.duplicates.copies
+        lasting = f"{hours:,.1f} hours" if hours >= 1 else f"{hours * 60:.1f} minutes"
+        lengths = " / ".join(map(str, values["length_percentiles_0_10_50_90_100"]))
+        splits = ", ".join(
+            f"{name} {one['windows']:,} clips in {one['episodes']:,} episodes" for name, one in values["splits"].items()
+        )
+        removed = ", ".join(f"{one.name} {one}" for one in self.dataset.removed if one.episodes or one.steps)
+        known = f"of {values['success_known_of']:,} episodes of which it is known"
+        return {
+            "data set": f"{config.path} ({config.source})",
+            "episodes": f"{values['episodes']:,} ({values['broken_episodes']:,} broken)",
+            "steps": f"{values['steps']:,} at {values['control_rate_hz']:g} per second: {lasting}",
+            "length": f"{lengths} steps (least, 10 %, median, 90 %, most)",
+            "cameras": f"{', '.join(values['cameras'])}; used: {', '.join(values['camera'])}",
+            "success": "not known" if success is None else f"{success:.1%} {known}",
+            "left out": removed or "nothing",
+            "splits": f"{splits}; clips of {config.frames} frames at stride {config.model_stride}",
+            "duplicates": f"{self.duplicates}{'; inspect.json lists the copies' if copies else ''}",
+            "sample": f"{len(self.sample):,} episodes, for what follows",
+            **self._summary_of_states(),
+            **({} if self.coverage is None else {**self.coverage.lines, "coverage": self.coverage.verdict}),
+        }
+
+    def _summary_of_states(self) -> dict[str, str]:
+        config, widths = self.dataset.config, self.dataset.widths
+        ranges = [f"{low:.2f} to {high:.2f}" for low, high in self.ranges]
+        if not self.has_poses:
+            how = f", joined by {config.join_actions}" if config.join_actions else ""
+            actions = f"{widths.action} numbers, {config.actions}{how}"
+            return {"states": f"{widths.state} numbers: {', '.join(ranges)}", "actions": actions}
+        return {
+            "standing still": f"{self.values['still_share']:.1%} of the steps, by the measured motion",
+            "position": f"{', '.join(f'{axis} {one}' for axis, one in zip('xyz', ranges, strict=False))} m",
+            "gripper": f"{ranges[-1]} (0 open, 1 closed)",
+        }
+
+
+def inspect_dataset(dataset: Dataset, *, episodes: int = 100, progress: Progress = no_progress) -> Inspection:
+    """Compute the statistics of a data set: from the table for all episodes, from the states of a sample for motion.
+
+    Args:
+        dataset: Its stride is a number.
+        episodes: At most as many are read, without frames, spread over the used ones.
+        progress: Called with (episodes read, total number).
+
+    Raises:
+        InputError: Episodes of the sample cannot be read, and `data.broken_episodes` does not skip them.
+    """
+    return Inspection(dataset, find_duplicates(dataset), tuple(read_sample(dataset, episodes, progress)))
+
+
+def idle_runs(states: Float[np.ndarray, "steps 7"], config: DataConfig) -> Bool[np.ndarray, " steps"]:
+    """Return the steps in runs of idle ones, by measured motion, that are long enough for the idle filter."""
+    return long_idle_runs(idle_by_motion(states, config.idle), config.idle)
+
+
+def largest_change(
+    changes: Float[np.ndarray, "steps state_dim"], ranges: Float[np.ndarray, "state_dim 2"]
+) -> Float[np.ndarray, " steps"]:
+    """Return, at each step, the change of the number that changes most, in percent of its range."""
+    spans = ranges[:, 1] - ranges[:, 0]
+    return np.asarray((abs(changes) / np.where(spans > 0, spans, np.inf)).max(axis=1) * 100)
+
+
+def at_some_stride(dataset: Dataset) -> Dataset:
+    """Return a data set at its stride; if that is auto, at the smallest candidate."""
+    if dataset.config.stride != "auto":
+        return dataset
+    return dataset.with_stride(min(dataset.config.strides_to_try(dataset.control_rate_hz)))

@@ -1,0 +1,143 @@
+"""Actions that were not taken, named or of a file, and the states to which they lead.
+
+They need no simulator: a model can predict under them from any start of recorded robot data.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from vjepa2_ac.config.planning import LimitsConfig
+from vjepa2_ac.episode import ACTION_DIM
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.planning.search_space import GRIPPER
+from vjepa2_ac.planning.state_integration import states_along
+from vjepa2_ac.spaces import POSE, POSE_CHANGE, StateSpace
+
+STEP_M, GRIPPER_STEP = 0.05, 0.75
+"""Metres, and change of closedness, of a named step: the largest that upstream plans (`planning.limits`). A run may
+have been taught less; what a model predicts for longer steps than it was taught means nothing."""
+
+_DIRECTIONS: dict[str, tuple[int, float]] = {  # in the robot base frame: x to the front, y to the left, z up
+    "up": (2, 1.0),
+    "down": (2, -1.0),
+    "left": (1, 1.0),
+    "right": (1, -1.0),
+    "forward": (0, 1.0),
+    "back": (0, -1.0),
+    "open": (6, -1.0),
+    "close": (6, 1.0),
+}
+ACTION_NAMES = ("none", *_DIRECTIONS)
+_LARGEST = np.array([1.0] * 3 + [np.pi] * 3 + [1.0])  # metres, radians, closedness in one step: more are other units
+
+
+def named_actions(
+    name: str, steps: int, *, size_m: float = STEP_M, limits: LimitsConfig | None = None
+) -> Float[np.ndarray, "steps 7"]:
+    """Return the same action for every model step (legend: episode.py).
+
+    `open` and `close` go on changing a gripper at its end, as `planning.limits.gripper_mode: close` does: a real one
+    lags behind. Give a model `feasible_actions` of them.
+
+    Args:
+        name: What happens.
+        steps: Model steps.
+        size_m: Length of each step in metres, if the limits allow it.
+        limits: The largest actions, at best those that the data taught (`planning.limits.xyz: data`, resolved). None:
+            `size_m` counts alone, and the gripper changes as upstream's.
+
+    Raises:
+        InputError: No such name, or one that the limits hold still.
+        ValueError: No steps, or no length.
+    """
+    if steps < 1 or not 0 < size_m < np.inf:
+        raise ValueError(f"{steps} steps of {size_m} m")
+    actions = np.zeros((steps, ACTION_DIM))
+    if name == "none":
+        return actions
+    if name not in _DIRECTIONS:
+        raise InputError(where="actions", found=repr(name), needed=f"one of {', '.join(ACTION_NAMES)}, or a file")
+    axis, sign = _DIRECTIONS[name]
+    size = _size_along(axis, size_m, limits)
+    if size == 0:
+        key = "planning.limits.gripper" if axis == GRIPPER else "planning.limits.xyz"
+        raise InputError(where=key, found=f"0, so that nothing can move {name}", needed="a limit above 0")
+    actions[:, axis] = sign * size
+    return actions
+
+
+def read_actions(path: str | Path, *, steps: int | None = None) -> Float[np.ndarray, "steps 7"]:
+    """Read actions of poses (legend: episode.py), one for each model step, from a `.npy` or `.csv` file.
+
+    A CSV may begin with a line of names; empty lines do not count.
+
+    Args:
+        path: The file.
+        steps: How many are needed; None: any number. Further ones of the file are left out.
+
+    Raises:
+        InputError: It cannot be read, a row has not 7 finite numbers in metres, radians and closedness, or there are
+            too few rows.
+    """
+    where, needed = str(path), f"one line of {ACTION_DIM} numbers for each model step: {', '.join(POSE_CHANGE.names)}"
+    fix = "In metres, radians, and closedness from -1 to 1; a .npy of NumPy, or a .csv with commas"
+    try:
+        if where.lower().endswith(".npy"):
+            with Path(path).open("rb") as file:
+                actions = np.asarray(np.lib.format.read_array(file, allow_pickle=False), dtype=np.float64)
+        else:
+            text = Path(path).read_text(encoding="utf-8-sig")
+            lines = [line for line in text.splitlines() if line.strip()]
+            names = bool(lines) and lines[0].replace(" ", "") == ",".join(POSE_CHANGE.names)
+            actions = np.loadtxt(lines[names:], delimiter=",", ndmin=2)
+    except (OSError, ValueError, TypeError) as error:
+        raise InputError(where=where, found=f"cannot be read ({error})", needed=needed, fix=fix) from None
+    if actions.ndim != 2 or actions.shape[1] != ACTION_DIM or not len(actions):
+        raise InputError(where=where, found=f"an array of shape {actions.shape}", needed=needed, fix=fix)
+    wrong = ~(np.abs(actions) <= _LARGEST).all(axis=1)  # NaN is wrong, too
+    if wrong.any():
+        step = int(wrong.argmax())
+        found = f"action {step} is {np.array2string(actions[step], precision=4, max_line_width=200)}"
+        raise InputError(where=where, found=found, needed=needed, fix=fix)
+    if steps is not None and len(actions) < steps:
+        raise InputError(where=where, found=f"{len(actions)} actions", needed=f"{steps}, one for each model step")
+    return actions[:steps]
+
+
+def counterfactual_states(
+    state: Float[np.ndarray, " state_dim"], actions: Float[np.ndarray, "steps state_dim"], space: StateSpace = POSE
+) -> Float[np.ndarray, "steps+1 state_dim"]:
+    """Return the states before and after actions that were not taken: integrated from the first, in double precision.
+
+    Never take them from a recording: later states of what did happen would give the model the truth. The gripper stays
+    within 0 .. 1. Of poses without the lag of a real arm, which covers some 95 % of a commanded step.
+    """
+    first, changes = (torch.from_numpy(np.array(one, dtype=np.float64)) for one in (state, actions))
+    return states_along(first, changes[None], space)[0].numpy()
+
+
+def feasible_actions(
+    state: Float[np.ndarray, " state_dim"], actions: Float[np.ndarray, "steps state_dim"], space: StateSpace = POSE
+) -> Float[np.ndarray, "steps state_dim"]:
+    """Return actions whose gripper changes only as far as it can: those of `counterfactual_states`, as data would have.
+
+    A measured closedness does not change any more at its end, so a model has never seen further changes there.
+    """
+    feasible = np.array(actions, dtype=np.float64)
+    if space.gripper is not None:
+        feasible[:, space.gripper] = np.diff(counterfactual_states(state, actions, space)[:, space.gripper])
+    return feasible
+
+
+def _size_along(axis: int, size_m: float, limits: LimitsConfig | None) -> float:
+    """Return the size of a step along an axis: metres, or change of closedness."""
+    if limits is None:
+        return GRIPPER_STEP if axis == GRIPPER else size_m
+    if axis == GRIPPER:
+        return limits.gripper
+    return min(size_m, limits.xyz_m[axis], limits.radius if limits.ball != "none" else np.inf)

@@ -1,1 +1,0 @@
-"""Actions that were not taken: named ones, or those of a file."""

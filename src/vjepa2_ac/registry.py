@@ -1,0 +1,185 @@
+"""Doors for other people's code: what a config may name, here, in installed packages, and in modules of the user's.
+
+A thing is found by its name in one of the registries below. This package's own are listed here as `module:object` and
+imported when they are used; an installed package lists its own as entry points of the registry's group; a module that
+`plugins` in a config or `--plugin` names registers its own when it is imported. docs/extending.md has a recipe of each.
+"""
+
+from __future__ import annotations
+
+import difflib
+import sys
+from collections.abc import Callable, Iterable, Mapping
+from importlib import import_module
+from importlib.metadata import entry_points
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, Field
+
+from vjepa2_ac.errors import InputError
+
+_Thing = TypeVar("_Thing")
+
+
+class Registry:
+    """Things of one kind, by name.
+
+    Args:
+        kind: What they are, in messages.
+        group: The entry points of installed packages.
+        own: Those of this package, each as `module:object` below it.
+    """
+
+    def __init__(self, kind: str, group: str, own: Mapping[str, str]) -> None:
+        self.kind, self.group = kind, group
+        self._things: dict[str, Any] = {name: f"vjepa2_ac.{place}" for name, place in own.items()}
+
+    def register(self, name: str) -> Callable[[_Thing], _Thing]:
+        """Return a decorator that adds a function or a class; a module that is imported twice may do so again."""
+
+        def add(thing: _Thing) -> _Thing:
+            self._things[name] = thing
+            return thing
+
+        return add
+
+    def names(self) -> list[str]:
+        """Return all names, those of this package first; nothing is imported."""
+        return list(dict.fromkeys([*self._things, *(one.name for one in entry_points(group=self.group))]))
+
+    def known(self, name: str) -> str:
+        """Return a name that is registered.
+
+        Raises:
+            ValueError: It is not; names those that are.
+        """
+        if name not in (names := self.names()):
+            close = difflib.get_close_matches(name, names, n=1)
+            meant = f"did you mean {close[0]!r}? " if close else ""
+            raise ValueError(f"no {self.kind} of this name; {meant}known are {', '.join(map(repr, names))}")
+        return name
+
+    def find(self, name: str) -> Any:
+        """Return the thing of a name, imported now.
+
+        Raises:
+            ValueError: There is none.
+        """
+        thing = self._things.get(self.known(name))
+        if thing is None:
+            thing = next(one for one in entry_points(group=self.group) if one.name == name).load()
+        elif isinstance(thing, str):
+            module, _, attribute = thing.partition(":")
+            thing = getattr(import_module(module), attribute)
+        self._things[name] = thing
+        return thing
+
+    def section(self, name: str) -> type[BaseModel] | None:
+        """Return the class of a thing's own options, its `Config`; None: it has none.
+
+        What this package lists has its knobs in the config itself, and is not imported for this.
+        """
+        return None if isinstance(self._things.get(name), str) else getattr(self.find(name), "Config", None)
+
+    def options(self, name: str, given: Mapping[str, Any]) -> dict[str, BaseModel]:
+        """Return the checked options of a thing, as the keyword argument that it takes them by; empty: it has none.
+
+        Raises:
+            ValueError: They are not what its `Config` says, or it has none.
+        """
+        section = self.section(name)
+        if section is not None:
+            return {"options": section.model_validate(dict(given))}
+        if given:
+            raise ValueError(f"{self.kind} {name!r} has no options of its own, and {', '.join(given)} is given")
+        return {}
+
+    def function(self, name: str, given: Mapping[str, Any]) -> Callable[..., Any]:
+        """Return a function of a name; of a class an object that was made with its options.
+
+        Raises:
+            ValueError: As `options`.
+        """
+        found, options = self.find(name), self.options(name, given)
+        made: Callable[..., Any] = found(**options) if isinstance(found, type) else found
+        return made
+
+    @property
+    def name_in_schema(self) -> Any:
+        """The names, as a JSON schema has them: for a knob that names one of these things."""
+
+        def add(schema: dict[str, Any]) -> None:
+            schema["enum"] = self.names()
+
+        return Field(json_schema_extra=add)
+
+    @property
+    def options_in_schema(self) -> Any:
+        """The options of things that have some, by the names of their classes: for the knob that holds them."""
+
+        def add(schema: dict[str, Any]) -> None:
+            sections = [section.model_json_schema() for name in self.names() if (section := self.section(name))]
+            if sections:
+                schema["anyOf"] = [*sections, {"type": "object", "maxProperties": 0}]
+
+        return Field(json_schema_extra=add)
+
+
+SOURCES = Registry("form of data", "vjepa2_ac.sources", {})
+LOSSES = Registry(
+    "loss",
+    "vjepa2_ac.losses",
+    {
+        "l1": "distances:absolute_difference",
+        "l2": "distances:squared_difference",
+        "smooth_l1": "training.loss:smooth_difference",
+    },
+)
+PLANNERS = Registry(
+    "planner",
+    "vjepa2_ac.planners",
+    {
+        "cem": "planning.solvers:CemSolver",
+        "icem": "planning.solvers:IcemSolver",
+        "mppi": "planning.solvers:MppiSolver",
+        "gradient": "planning.solvers:GradientSolver",
+    },
+)
+ENERGIES = Registry(
+    "energy",
+    "vjepa2_ac.energies",
+    {
+        "l1": "planning.energy:mean_difference",
+        "l2": "planning.energy:mean_square",
+        "cosine": "planning.energy:one_minus_cosine",
+    },
+)
+METRICS = Registry("metric", "vjepa2_ac.metrics", {"l1": "evaluation.metrics:L1", "l2": "evaluation.metrics:L2"})
+TRACKERS = Registry("tracker", "vjepa2_ac.trackers", {})
+REGISTRIES = (SOURCES, LOSSES, PLANNERS, ENERGIES, METRICS, TRACKERS)
+
+
+def import_plugins(modules: Iterable[str], *, where: str, here: bool = True) -> None:
+    """Import the modules that register things.
+
+    Args:
+        modules: Their names, as `import` takes them.
+        where: What names them, for messages.
+        here: Whether one may lie in the working directory. Not where a run or a model names it, which may be a
+            stranger's: its config imports what is installed, and nothing that came with it.
+
+    Raises:
+        InputError: One is not there, or fails.
+    """
+    for module in modules:
+        try:
+            if here and find_spec(module) is None:
+                sys.path.append(str(Path.cwd()))
+            import_module(module)
+        except ModuleNotFoundError as error:
+            if error.name is None or not f"{module}.".startswith(f"{error.name}."):
+                raise
+            fix = "Install it, or run where it is" if here else f"Install it, or name it by --plugin {module}"
+            raise InputError(where=where, found=f"plugin {module!r}: no such module", fix=fix) from None

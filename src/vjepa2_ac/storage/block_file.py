@@ -1,0 +1,260 @@
+"""A seekable file of blocks that are fetched when they are read, and cached on the local disk: none is fetched twice.
+
+`DiskCache` is the one cache of remote bytes: whole files and parts of them use it too.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import io
+import logging
+import os
+import secrets
+import time
+import zlib
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from itertools import groupby
+from pathlib import Path
+
+from vjepa2_ac.storage import remote
+
+logger = logging.getLogger(__name__)
+
+BLOCK_BYTES = 128 << 10
+_READ_AHEAD_BLOCKS = 32  # at most, for sequential reads
+_CACHED_BLOCKS = 128
+
+_CHECK_SHARE = 0.02  # of the limit: after so many bytes of its own a process looks whether the limit is reached
+_KEPT_SHARE = 0.8  # of the limit, when it was: ten processes together do not come above it until the next look
+_CRC_BYTES = 4  # behind the data of an entry
+_PARTIAL = ".partial"
+_ABANDONED_S = 3600.0
+
+
+class RangedFile(io.RawIOBase):
+    """A seekable file that is fetched in blocks; the last 16 MB read are cached in memory.
+
+    A seek costs one block of 128 KB. Sequential reads fetch twice as much each time, up to 4 MB. So a video's header,
+    or one group of its frames, costs little more than its bytes, and a whole file few reads.
+
+    Args:
+        fetch: Returns exactly `length` bytes from `start`: called with (start, length), which are of whole blocks.
+        size: Size of the file.
+    """
+
+    def __init__(self, fetch: Callable[[int, int], bytes], size: int) -> None:
+        super().__init__()
+        self._fetch, self._size = fetch, size
+        self._position = 0
+        self._blocks: OrderedDict[int, bytes] = OrderedDict()
+        self._fetched_to, self._read_ahead = -1, 1
+
+    def readable(self) -> bool:
+        """Return that it can be read."""
+        return True
+
+    def seekable(self) -> bool:
+        """Return that it can seek."""
+        return True
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
+        """Go to an offset from the start, the current position or the end; return it from the start, as `tell` does."""
+        base = {io.SEEK_SET: 0, io.SEEK_CUR: self._position, io.SEEK_END: self._size}[whence]
+        if base + offset < 0:
+            raise ValueError(f"negative position {base + offset}")
+        self._position = base + offset
+        return self._position
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Return the next `size` bytes, fewer if the file ends; all remaining ones with -1."""
+        if self.closed:
+            raise ValueError("the file is closed")
+        start = min(self._position, self._size)
+        end = self._size if size is None or size < 0 else min(start + size, self._size)
+        data = self._range(start, end)
+        self._position += len(data)
+        return data
+
+    def readinto(self, buffer: bytearray | memoryview, /) -> int:  # type: ignore[override] # any writable buffer
+        """Fill a buffer with the next bytes; return how many there were."""
+        view = memoryview(buffer).cast("B")
+        data = self.read(len(view))
+        view[: len(data)] = data
+        return len(data)
+
+    def _range(self, start: int, end: int) -> bytes:
+        if start >= end:
+            return b""
+        first, last = start // BLOCK_BYTES, (end - 1) // BLOCK_BYTES
+        pieces: dict[int, bytes] = {}
+        for number in range(first, last + 1):
+            if number not in pieces:
+                pieces |= self._load(number, last)
+        data = b"".join(pieces[number] for number in range(first, last + 1))
+        return data[start - first * BLOCK_BYTES : end - first * BLOCK_BYTES]
+
+    def _load(self, number: int, last: int) -> dict[int, bytes]:
+        """Return a block by number; if it must be fetched, also the wanted ones up to the next cached block."""
+        if number in self._blocks:
+            self._blocks.move_to_end(number)
+            return {number: self._blocks[number]}
+        self._read_ahead = min(2 * self._read_ahead, _READ_AHEAD_BLOCKS) if number == self._fetched_to else 1
+        stop = max(last + 1, number + self._read_ahead)
+        stop = next((other for other in range(number + 1, stop) if other in self._blocks), stop)
+        start = number * BLOCK_BYTES
+        data = self._fetch(start, min(stop * BLOCK_BYTES, self._size) - start)
+        blocks = {number + i: data[i * BLOCK_BYTES : (i + 1) * BLOCK_BYTES] for i in range(stop - number)}
+        self._fetched_to = stop
+        self._blocks |= blocks
+        while len(self._blocks) > _CACHED_BLOCKS:
+            self._blocks.popitem(last=False)
+        return blocks
+
+
+class DiskCache:
+    """Entries of bytes under keys in a local folder; the least recently used are evicted at the limit.
+
+    Any number of threads and processes may use one folder, with one limit. A process looks at the sizes of all entries
+    when it has written 2 % of the limit itself, and makes room down to 80 %: up to ten processes stay below the limit.
+    If the folder cannot be used, all entries count as absent: that causes a warning, never an error.
+
+    Args:
+        folder: Created with the first entry.
+        limit_bytes: Total size of all entries; a larger entry is not stored, so with 0 none is.
+    """
+
+    def __init__(self, folder: str | Path, limit_bytes: int) -> None:
+        self._folder, self._limit = Path(folder), limit_bytes
+        self._written, self._warned = 0, False
+
+    def read(self, key: str) -> bytes | None:
+        """Return the entry of a key, or None; it counts as used now. A damaged one, as a power cut leaves, is none."""
+        path = self._path(key)
+        try:
+            content = path.read_bytes()
+        except OSError:  # usually: absent
+            return None
+        with suppress(OSError):  # evicted meanwhile, or in a read-only folder
+            os.utime(path)
+        data, crc = content[:-_CRC_BYTES], content[-_CRC_BYTES:]
+        return data if crc == _crc(data) else None
+
+    def write(self, key: str, data: bytes) -> None:
+        """Store bytes under a key, replacing an old entry; a warning is logged if that is not possible."""
+        path, content = self._path(key), data + _crc(data)
+        if len(content) > self._limit * _KEPT_SHARE:
+            return
+        partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}{_PARTIAL}")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                partial.write_bytes(content)
+                partial.replace(path)
+            except OSError:
+                partial.unlink(missing_ok=True)
+                raise
+            self._written += len(content)
+            if self._written > self._limit * _CHECK_SHARE:
+                self._evict()
+        except OSError as error:
+            if not self._warned:
+                logger.warning("%s: %s; the run goes on and fetches again", self._folder, error.strerror)
+            self._warned = True
+
+    def _path(self, key: str) -> Path:
+        name = hashlib.sha256(key.encode()).hexdigest()[:40]
+        return self._folder / name[:2] / name[2:]
+
+    def _evict(self) -> None:
+        """Delete the least recently used entries if the limit is reached; one process at a time."""
+        with (self._folder / "lock").open("wb") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:  # another one does it
+                return
+            self._written = 0
+            entries = sorted(self._entries())
+            total = sum(size for _, size, _ in entries)
+            if total <= self._limit:
+                return
+            for _, size, path in entries:
+                if total <= self._limit * _KEPT_SHARE:
+                    break
+                Path(path).unlink(missing_ok=True)
+                total -= size
+
+    def _entries(self) -> Iterator[tuple[int, int, str]]:
+        """Yield last use, size and path of every entry; partial files of killed writers are removed."""
+        for inner in [entry.path for entry in os.scandir(self._folder) if entry.is_dir()]:
+            for entry in os.scandir(inner):
+                with suppress(FileNotFoundError):  # renamed meanwhile
+                    stat = entry.stat()
+                    if not entry.name.endswith(_PARTIAL):
+                        yield stat.st_mtime_ns, stat.st_size, entry.path
+                    elif time.time() - stat.st_mtime > _ABANDONED_S:
+                        Path(entry.path).unlink()
+
+
+def _crc(data: bytes) -> bytes:
+    return zlib.crc32(data).to_bytes(_CRC_BYTES, "big")
+
+
+class BlockCachedFile(RangedFile):
+    """A seekable file behind a URL; each block is fetched once per machine.
+
+    The error of a fetch stays in `failure`: libraries that read through this object may wrap it in their own.
+
+    Args:
+        path: The URL.
+        version: Changes with the content; blocks of another version are not used.
+        size: The file's size.
+        cache: The local cache of blocks.
+    """
+
+    def __init__(self, path: str, *, version: str, size: int, cache: DiskCache) -> None:
+        super().__init__(self._fetched, size)
+        self._path, self._cache = path, cache
+        self._bytes, self._key = size, f"{path} {version} {size}"
+        self.failure: Exception | None = None
+
+    def _fetched(self, start: int, length: int) -> bytes:
+        """Return whole blocks: no others are requested."""
+        try:
+            return b"".join(self._blocks_of(start // BLOCK_BYTES, (start + length - 1) // BLOCK_BYTES))
+        except Exception as error:
+            self.failure = error
+            raise
+
+    def _blocks_of(self, first: int, last: int) -> list[bytes]:
+        """Return blocks from the disk; missing ones are fetched, adjacent ones together."""
+        found = {number: self._cached(number) for number in range(first, last + 1)}
+        lacking = [number for number, block in found.items() if not block]
+        runs = [
+            [number for _, number in run] for _, run in groupby(enumerate(lacking), key=lambda pair: pair[1] - pair[0])
+        ]
+        ranges = [(run[0] * BLOCK_BYTES, sum(map(self._length_of, run))) for run in runs]
+        for run, data in zip(runs, remote.read_ranges(self._path, ranges), strict=True):
+            for place, number in enumerate(run):
+                found[number] = data[place * BLOCK_BYTES :][: self._length_of(number)]
+                self._cache.write(f"{self._key} {number}", found[number])
+        return list(found.values())
+
+    def _cached(self, number: int) -> bytes:
+        block = self._cache.read(f"{self._key} {number}") or b""
+        return block if len(block) == self._length_of(number) else b""
+
+    def _length_of(self, number: int) -> int:
+        return min(BLOCK_BYTES, self._bytes - number * BLOCK_BYTES)
+
+
+def open_remote(url: str) -> RangedFile:
+    """Open a file behind a URL for reading and seeking; its reads are retried, and not cached on the disk.
+
+    Raises:
+        OSError: There is no such file.
+        UnreachableError: It cannot be reached.
+    """
+    return RangedFile(lambda start, length: remote.read_ranges(url, [(start, length)])[0], remote.file_size(url))

@@ -1,0 +1,385 @@
+"""Files on this machine and behind URLs: find, read and hash them; write local ones whole, or not at all.
+
+A path is local, or a URL such as `gs://bucket/folder` (see `remote`). A missing or truncated file is an error of the
+file. A network failure is not: it is retried, and finally raises an `UnreachableError`; nor is an error of the
+operating system (see `unreadable`). Handlers of broken episodes catch an `InputError`, which this is not.
+
+A file is written under a temporary name, `.NAME.RANDOM.partial` in the target folder, and renamed when it is complete
+and on the disk. What a killed writer left is removed by a later one, when it is unchanged for a day.
+"""
+
+from __future__ import annotations
+
+import errno
+import functools
+import hashlib
+import os
+import re
+import secrets
+import shutil
+import stat
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
+from pathlib import Path
+from typing import BinaryIO, Protocol, runtime_checkable
+
+from vjepa2_ac.errors import InputError, UnreachableError, UserError
+from vjepa2_ac.places import is_url
+from vjepa2_ac.storage import remote
+from vjepa2_ac.storage.block_file import open_remote
+from vjepa2_ac.storage.remote import FileInfo, ShortReadError, complete
+
+_HASH_CHUNK_BYTES = 1 << 20
+_ABSENT = frozenset({errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG})
+_FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
+_UNWRITABLE = _FULL | _ABSENT | {errno.EACCES, errno.EPERM, errno.EROFS, errno.EEXIST, errno.EINVAL}
+_PARTIAL = re.compile(r"\..+\.[0-9a-f]{8}\.partial")
+_NAME_BYTES = 200  # of the 255 that a name may have
+_OLD_S = 86_400.0
+
+
+@runtime_checkable
+class ByteReader(Protocol):
+    """A file open for reading, on this machine or behind a URL."""
+
+    def read(self, size: int = -1, /) -> bytes:
+        """Return the next bytes; all remaining ones with -1."""
+        ...
+
+    def seek(self, offset: int, /) -> int:
+        """Go to an offset from the start."""
+        ...
+
+    def close(self) -> None:
+        """Close the file."""
+        ...
+
+
+# ---- find and read ----
+
+
+def join(folder: str | Path, name: str) -> str:
+    """Return the path of a file in a folder."""
+    return f"{str(folder).rstrip('/')}/{name}" if is_url(folder) else str(Path(folder) / name)
+
+
+def absolute(path: str | Path) -> str:
+    """Return the absolute path with links resolved, independent of the working directory; a URL unchanged."""
+    return str(path) if is_url(path) else str(Path(path).resolve())
+
+
+def exists(path: str | Path) -> bool:
+    """Return whether there is a file or folder."""
+    if not is_url(path):
+        return Path(path).exists()
+    try:
+        remote.file_version(str(path))
+    except FileNotFoundError:
+        return False
+    return True
+
+
+def file_size(path: str | Path) -> int:
+    """Return the size of a file in bytes.
+
+    Raises:
+        OSError: There is no such file, or it cannot be read.
+    """
+    return remote.file_size(str(path)) if is_url(path) else Path(path).stat().st_size
+
+
+def file_version(path: str | Path) -> str:
+    """Return a version of a file's content that changes with the content, as far as is known without reading it.
+
+    Raises:
+        OSError: There is no such file, or it cannot be read.
+    """
+    return remote.file_version(str(path)) if is_url(path) else str(Path(path).stat().st_mtime_ns)
+
+
+def list_files(folder: str | Path) -> list[FileInfo]:
+    """Return the files of a folder, sorted by name; none where there is no such folder.
+
+    Raises:
+        OSError: The folder cannot be listed.
+    """
+    if is_url(folder):
+        return [file for file in remote.list_folder(str(folder)) if file.is_file]
+    files = [path for path in Path(folder).iterdir() if path.is_file()] if Path(folder).is_dir() else []
+    found = {path.name: path.stat() for path in files}
+    return [FileInfo(name, one.st_size, str(one.st_mtime_ns)) for name, one in sorted(found.items())]
+
+
+def list_names(folder: str | Path) -> list[str]:
+    """Return the names of the files and folders in a folder, sorted; none where there is no such folder."""
+    if is_url(folder):
+        return [entry.name for entry in remote.list_folder(str(folder))]
+    return sorted(entry.name for entry in Path(folder).iterdir()) if Path(folder).is_dir() else []
+
+
+def open_to_read(path: str | Path) -> ByteReader:
+    """Open a file for reading and seeking; the caller closes it.
+
+    Of a URL only the blocks that are read are fetched, so it can be given to a reader of videos or tables.
+
+    Raises:
+        OSError: There is no such file, or it cannot be read.
+    """
+    return open_remote(str(path)) if is_url(path) else Path(path).open("rb")
+
+
+def unreadable(where: str, error: OSError, *, needed: str = "", fix: str = "") -> UserError:
+    """Return the error of a file that is missing, truncated, or refused by the operating system.
+
+    The last (no permission, too many open files, a disk that went away) is temporary and says nothing about the file's
+    content: it is an UnreachableError, which is never stored.
+
+    Args:
+        where: The file, and its episode.
+        error: The system's error.
+        needed: What should be there.
+        fix: How to fix it where the file is wrong.
+    """
+    found = f"cannot be read: {error.strerror or error}"
+    if isinstance(error, ShortReadError) or error.errno in _ABSENT:
+        return InputError(where=where, found=found, needed=needed, fix=fix)
+    return UnreachableError(where=where, found=found, needed=needed, fix="Check its permissions, and the disk")
+
+
+def read_bytes(path: str | Path) -> bytes:
+    """Return the content of a file.
+
+    Raises:
+        OSError: There is no such file, or it cannot be read.
+    """
+    if is_url(path):
+        return remote.read_range(str(path), 0, remote.file_size(str(path)))
+    return Path(path).read_bytes()
+
+
+def read_bounded(path: str | Path, most_bytes: int) -> bytes:
+    """Return the content of a stranger's small file: at most `most_bytes` are ever read.
+
+    Raises:
+        InputError: It is larger, or may never end, such as a pipe.
+        OSError: There is no such file, or it cannot be read.
+    """
+    if not is_url(path) and not (stat.S_ISREG(mode := Path(path).stat().st_mode) or stat.S_ISDIR(mode)):
+        raise InputError(where=str(path), found="a pipe or a device", needed="a file")
+    length = min(file_size(path), most_bytes + 1) if is_url(path) else most_bytes + 1
+    data = read_range(path, 0, length)
+    if len(data) > most_bytes:
+        raise InputError(where=str(path), found=f"more than {most_bytes:,} bytes", needed="a file that small")
+    return data
+
+
+def read_range(path: str | Path, start: int, length: int) -> bytes:
+    """Return `length` bytes from `start`; fewer if the file ends before.
+
+    Raises:
+        OSError: There is no such file, or it cannot be read.
+    """
+    if is_url(path):
+        return remote.read_range(str(path), start, length)
+    with Path(path).open("rb") as file:
+        file.seek(start)
+        return file.read(length)
+
+
+def read_ranges(path: str | Path, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
+    """Return several (start, length) pieces of a file, each complete; those of a URL are fetched concurrently.
+
+    Raises:
+        OSError: There is no such file, it cannot be read, or it ends within a piece.
+    """
+    if is_url(path):
+        return remote.read_ranges(str(path), ranges)
+    pieces = []
+    with Path(path).open("rb") as file:
+        for start, length in ranges:
+            file.seek(start)
+            pieces.append(file.read(length))
+    return complete(path, ranges, pieces)
+
+
+def sha256_of_file(path: str | Path, *, progress: Callable[[int], None] = lambda _: None) -> str:
+    """Return the SHA-256 of a file as hexadecimal digits, read in chunks.
+
+    Args:
+        path: The file.
+        progress: Called after every chunk with the bytes read so far.
+
+    Raises:
+        OSError: There is no such file, or it cannot be read.
+    """
+    digest, done = hashlib.sha256(), 0
+    with closing(open_to_read(path)) as file:
+        while chunk := file.read(_HASH_CHUNK_BYTES):
+            digest.update(chunk)
+            done += len(chunk)
+            progress(done)
+    return digest.hexdigest()
+
+
+# ---- write, on this machine ----
+
+
+@contextmanager
+def atomic_writer(path: str | Path) -> Iterator[BinaryIO]:
+    """Open a local file that gets its name, complete, when the block ends, and never if the block fails.
+
+    Missing folders are created. The bytes are on the disk (fsync) before the file gets its name.
+    """
+    target = Path(path)
+    temporary = _new_partial(target.parent, target.name)
+    try:
+        with temporary.open("xb") as file:  # opened by name: some libraries determine the format by it
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(target)
+    except BaseException as error:
+        temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename is None:  # the error of a full disk has no file name
+            error.filename = str(target)
+        raise
+    sync(target.parent)
+
+
+def write_atomically(path: str | Path, data: bytes | str) -> None:
+    """Write a local file atomically; text is written as UTF-8."""
+    with atomic_writer(path) as file:
+        file.write(data.encode() if isinstance(data, str) else data)
+
+
+@contextmanager
+def folder_writer(folder: str | Path, manifest: str) -> Iterator[Path]:
+    """Yield an empty local folder to fill; its files move to `folder` when the block ends, and nowhere if it fails.
+
+    A new folder appears complete. An existing one is not replaced (it may be the working directory, or mounted) and
+    keeps its other files: the old manifest is removed first and the new one comes last, so a folder with a manifest is
+    complete.
+
+    Args:
+        folder: Where the files go; missing folders are created.
+        manifest: Name of the file without which the folder does not count.
+
+    Raises:
+        InputError: The folder cannot be created or written, or the disk is full.
+    """
+    target = Path(folder).resolve()
+    with user_can_write(folder):
+        there = target.is_dir()
+        if target.exists() and not there:
+            raise NotADirectoryError(errno.ENOTDIR, "it is a file")
+        filling = _new_partial(target if there else target.parent, target.name)
+        filling.mkdir()
+    try:
+        with user_can_write(folder, errors=_FULL):  # any other error of the block is the caller's
+            yield filling
+        with user_can_write(folder):
+            if there:
+                _move_into(target, filling, manifest)
+            else:
+                filling.replace(target)
+            sync(target if there else target.parent)
+    except BaseException:
+        shutil.rmtree(filling, ignore_errors=True)
+        raise
+
+
+def _move_into(target: Path, filled: Path, manifest: str) -> None:
+    (target / manifest).unlink(missing_ok=True)
+    files = [path.relative_to(filled) for path in filled.rglob("*") if path.is_file()]
+    for file in sorted(files, key=lambda file: file == Path(manifest)):
+        (target / file).parent.mkdir(parents=True, exist_ok=True)
+        (filled / file).replace(target / file)
+    shutil.rmtree(filled)
+
+
+def sync(path: str | Path) -> None:
+    """Make the bytes of a local file, or the names in a local folder, survive a power cut."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+@contextmanager
+def user_can_write(path: str | Path, errors: frozenset[int] = _UNWRITABLE) -> Iterator[None]:
+    """Raise an error for the user if a local path cannot be written, or the disk is full.
+
+    Raises:
+        InputError: Instead of an OSError with one of these numbers; other errors pass.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in errors:
+            raise
+        full = error.errno in _FULL
+        fix = "Free some space, or name a place on another disk" if full else "Name a place that can be written"
+        raise InputError(where=str(path), found=f"cannot be written: {error.strerror}", fix=fix) from None
+
+
+def is_empty(folder: Path) -> bool:
+    """Return whether a folder is empty, apart from partial files of killed writers."""
+    return all(_PARTIAL.fullmatch(path.name) for path in folder.iterdir())
+
+
+def require_new_folder(folder: Path) -> None:
+    """Refuse a folder that holds something already.
+
+    Raises:
+        InputError: It does, or it cannot be looked into.
+    """
+    with user_can_write(folder):
+        in_use = folder.is_dir() and not is_empty(folder)
+    if in_use:
+        found, fix = "already there and not empty", "Delete it, or name another folder"
+        raise InputError(where=str(folder), found=found, fix=fix)
+
+
+def try_writing_at(path: Path) -> None:
+    """Write a temporary file into a folder, or where it would be made. Nothing stays there.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    with tempfile.TemporaryFile(dir=_nearest(path)):
+        pass
+
+
+def free_bytes(folder: Path) -> int:
+    """Return the free bytes on the disk of a folder, which need not exist yet."""
+    return shutil.disk_usage(_nearest(folder)).free
+
+
+def _nearest(path: Path) -> Path:
+    return next(place for place in (path, *path.absolute().parents) if place.exists())
+
+
+def _new_partial(parent: Path, name: str) -> Path:
+    """Return the temporary path of a file or folder that will be renamed to `name`; its folder is there."""
+    parent.mkdir(parents=True, exist_ok=True)
+    _remove_abandoned_once(parent.absolute())
+    short = name.encode(errors="surrogateescape")[:_NAME_BYTES].decode(errors="ignore")
+    return parent / f".{short}.{secrets.token_hex(4)}.partial"
+
+
+def remove_abandoned(folder: Path) -> None:
+    """Remove the partial files in a folder that are unchanged for a day; those that cannot be removed stay."""
+    with suppress(OSError):
+        for path in [path for path in folder.iterdir() if _PARTIAL.fullmatch(path.name) and not path.is_symlink()]:
+            with suppress(OSError):
+                if time.time() - max(one.lstat().st_mtime for one in (path, *path.rglob("*"))) > _OLD_S:
+                    shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
+@functools.cache
+def _remove_abandoned_once(folder: Path) -> None:
+    """Scan a folder only the first time that this process writes there: it may hold thousands of files."""
+    remove_abandoned(folder)

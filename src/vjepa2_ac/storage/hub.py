@@ -1,0 +1,45 @@
+"""Files of a model from the Hugging Face Hub, through its own library and cache."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from vjepa2_ac.errors import InputError, RefusedError, UnreachableError
+from vjepa2_ac.places import HUB
+
+
+def from_hub(name: str, files: Sequence[str], *, where: str) -> Path:
+    """Return the folder of a model in the Hub's cache, after downloading what is missing; a part is gone on with.
+
+    Args:
+        name: hf://owner/name, with @revision if it is not the newest.
+        files: Patterns of the files that are wanted.
+        where: For messages.
+
+    Raises:
+        RefusedError: There is no such model, or not for this user.
+        UnreachableError: The Hub cannot be reached, and the model is not in the cache.
+        InputError: The Hub answers something else, or the disk is full.
+    """
+    from huggingface_hub import errors, snapshot_download
+
+    model, _, revision = name.removeprefix(HUB).partition("@")
+    log_in = "for one that is not public, `hf auth login` or set HF_TOKEN"
+    try:
+        return Path(snapshot_download(model, revision=revision or None, allow_patterns=list(files)))
+    except errors.GatedRepoError:
+        fix = f"Ask for it on its page; then {log_in}"
+        raise RefusedError(where=where, found="a model that must be asked for", needed="access", fix=fix) from None
+    except (errors.RepositoryNotFoundError, errors.RevisionNotFoundError) as error:
+        found = (
+            "no such revision" if isinstance(error, errors.RevisionNotFoundError) else "no such model, or none for you"
+        )
+        fix = f"Check the name (hf://owner/name@revision); {log_in}"
+        raise RefusedError(where=where, found=found, fix=fix) from None
+    except errors.LocalEntryNotFoundError:
+        fix = "Check the network, or name a folder of this machine"
+        raise UnreachableError(where=where, found="the Hub cannot be reached", fix=fix) from None
+    except (errors.HfHubHTTPError, OSError, ValueError) as error:
+        said = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise InputError(where=where, found=said, needed="the files of a model", fix="Check name and disk") from None

@@ -1,0 +1,168 @@
+"""Retries of network operations: which failures are temporary, how long to wait, and when to give up."""
+
+from __future__ import annotations
+
+import json
+import logging
+import secrets
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+from typing import TypeVar
+
+from vjepa2_ac.errors import RefusedError, UnreachableError, UserError
+
+logger = logging.getLogger(__name__)
+
+_T = TypeVar("_T")
+
+# 499 is Google's answer to cancelling an upload after a failed piece; gcsfs raises it instead of that failure.
+_PASSING_STATUS = frozenset({408, 425, 429, 499, *range(500, 600)})
+_NO_ACCESS = frozenset({401, 403, 407})
+_ABSENT = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
+_LONGEST_SUMMARY = 300
+_FAILURES_BEFORE_WARNING = 3
+_WARNING_INTERVAL_S = 30.0
+
+
+@dataclass(frozen=True)
+class RetryPolicy:
+    """How long an operation is retried: at most `attempts` times `timeout_s`, plus the waits between.
+
+    The waits double from the first to the longest. Half of each is random, so that many processes do not retry at the
+    same moment. A library without time-outs, or with its own retries (huggingface_hub: six), takes longer per attempt:
+    none begins after `total_s`.
+    """
+
+    attempts: int = 8
+    first_wait_s: float = 0.5
+    longest_wait_s: float = 16.0
+    timeout_s: float = 30.0
+    total_s: float = 300.0
+
+    def wait_s(self, failures: int) -> float:
+        """Return how long to wait after so many failures."""
+        longest: float = min(self.first_wait_s * 2 ** (failures - 1), self.longest_wait_s)
+        return longest * (1 + secrets.randbelow(1001) / 1000) / 2  # own randomness: no generator of a run is used
+
+
+DEFAULT = RetryPolicy()  # fails within a minute on immediate errors, within five on no answer
+
+
+def with_retries(
+    where: str,
+    action: Callable[[float], _T],
+    *,
+    policy: RetryPolicy,
+    access: str,
+    doing: str = "read",
+    progress: Callable[[], int] = lambda: 0,
+) -> _T:
+    """Return what an action returns, trying again while its failures are of a kind that passes.
+
+    Args:
+        where: What is read or written, for messages.
+        action: Called with the seconds that it may take.
+        policy: How often to try, and how long.
+        access: The way out where permission is missing, as a sentence.
+        doing: "read" or "written", for messages.
+        progress: How far the action is, where a later attempt goes on from there; attempts and time are counted anew
+            from the last one that came farther.
+
+    Raises:
+        InputError: The action raised it, as it may any `UserError`.
+        OSError: There is no such file, or it is a folder, or the other way round.
+        UnreachableError: What failed did not pass in time; a RefusedError where permission is missing, or it does not
+            pass.
+    """
+    begin, failures, before = time.monotonic(), 0, progress()
+    while True:
+        try:
+            return action(policy.timeout_s)
+        except (*_ABSENT, UserError):
+            raise
+        except Exception as error:
+            if _is_a_bug(error):
+                raise
+            if not _passes(error):
+                raise _refused(where, error, access, doing) from error
+            if progress() > before:
+                begin, failures = time.monotonic(), 0
+            before, failures = progress(), failures + 1
+            wait_s, seconds = policy.wait_s(failures), time.monotonic() - begin
+            if failures >= policy.attempts or seconds + wait_s > policy.total_s:
+                found = f"not reached in {failures} attempts over {seconds:.0f} s; the last: {_summary(error)}"
+                fix = "Check the network, and start again: a run goes on from its last checkpoint"
+                raise UnreachableError(where=where, found=found, fix=fix) from error
+            _say(failures, "%s: %s; trying again in %.1f s", where, _summary(error), wait_s)
+        time.sleep(wait_s)
+
+
+@contextmanager
+def quietly() -> Iterator[None]:
+    """Log retried failures below warnings, in this thread: for callers that can do without the result."""
+    token = _quiet.set(True)
+    try:
+        yield
+    finally:
+        _quiet.reset(token)
+
+
+_quiet = ContextVar("_quiet", default=False)
+_last_warning_s = [-_WARNING_INTERVAL_S]
+
+
+def _say(failures: int, text: str, *arguments: object) -> None:
+    """Log a failure; as a warning from the third of a call on, at most once in half a minute."""
+    now = time.monotonic()
+    is_late = failures >= _FAILURES_BEFORE_WARNING and now - _last_warning_s[0] > _WARNING_INTERVAL_S
+    is_warning = is_late and not _quiet.get()
+    if is_warning:
+        _last_warning_s[0] = now
+    logger.log(logging.WARNING if is_warning else logging.INFO, text, *arguments)
+
+
+def status_of(error: BaseException) -> int | None:
+    """Return the HTTP status of an error of any library, or None."""
+    for holder in (error, getattr(error, "response", None)):
+        for name in ("code", "status", "status_code"):
+            found = getattr(holder, name, None)
+            if isinstance(found, int | str) and str(found).isdigit():
+                return int(found)
+    return 403 if isinstance(error, PermissionError) or str(error).startswith("Forbidden") else None  # as gcsfs says
+
+
+def _is_a_bug(error: Exception) -> bool:
+    """Return whether it is an error of Python's own that no network causes, such as a TypeError."""
+    return type(error).__module__ == "builtins" and not isinstance(error, OSError | ValueError | EOFError)
+
+
+def _passes(error: Exception) -> bool:
+    status = status_of(error)
+    if status is not None:
+        return status in _PASSING_STATUS
+    if _is_of_login(error):
+        return type(error).__name__ == "TransportError" or bool(getattr(error, "retryable", False))
+    # JSON: a truncated listing. A file is said to exist where a condition of the server's is not met.
+    return isinstance(error, json.JSONDecodeError) or not isinstance(error, ValueError | FileExistsError)
+
+
+def _is_of_login(error: Exception) -> bool:
+    return type(error).__module__.startswith("google.auth") or "Credentials" in type(error).__name__
+
+
+def _refused(where: str, error: Exception, access: str, doing: str) -> RefusedError:
+    if status_of(error) in _NO_ACCESS or _is_of_login(error):
+        return RefusedError(where=where, found=f"no permission ({_summary(error)})", fix=access)
+    return RefusedError(where=where, found=f"cannot be {doing} ({_summary(error)})", fix="Check the address")
+
+
+def _summary(error: Exception) -> str:
+    """Return a library's error in one line."""
+    status = status_of(error)
+    text = " ".join(str(getattr(error, "message", "") or error).split())
+    text = text if len(text) <= _LONGEST_SUMMARY else f"{text[:_LONGEST_SUMMARY]}…"
+    name = "time-out" if isinstance(error, TimeoutError) else type(error).__name__
+    return ": ".join(part for part in (f"HTTP {status}" if status else name, text) if part)

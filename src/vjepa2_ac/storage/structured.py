@@ -1,0 +1,214 @@
+"""JSON and YAML: values of a file, as a mapping or as a record of declared types; and JSON that this program writes.
+
+Both parsers execute nothing. A stranger's file is read up to a size; YAML has no aliases, so that none becomes larger.
+Invalid content is an InputError; a file that is missing or cannot be read stays the system's OSError.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import fields
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import TypeAdapter, ValidationError
+from yaml.nodes import MappingNode, Node, ScalarNode
+
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage import read_bounded
+
+T = TypeVar("T")
+
+MOST_BYTES = 16 << 20
+_MOST_SHOWN = 120  # characters of a value
+_MOST_PROBLEMS = 5  # shown of one file
+_PLAIN_LIST = re.compile(r"\[\s+((?:(?:-?\d[\d.e+-]*|null|true|false),?\s+)+)\]")
+_INNER_WORDS = {  # pydantic uses JSON's terms; the user may have written YAML
+    "Value error, ": "",
+    "a valid array": "a list",
+    "a valid tuple": "a list",
+    "an object": "a mapping of keys to values",
+    "a valid dictionary": "a mapping of keys to values",
+    "Tuple should": "List should",
+    " after validation": "",
+}
+
+
+# ---- JSON ----
+
+
+def json_object(data: bytes | str, *, where: str, needed: str = "a JSON object", fix: str = "") -> dict[str, Any]:
+    """Return the keys and values of a JSON object; numbers may be NaN and infinite, as Python writes them.
+
+    Args:
+        data: The text.
+        where: The file, for messages.
+        needed: What it should be.
+        fix: How to fix it.
+
+    Raises:
+        InputError: It is not JSON, or no object.
+    """
+    return _parsed(data, dict, where=where, needed=needed, fix=fix)
+
+
+def json_list(data: bytes | str, *, where: str) -> list[Any]:
+    """Return the values of a JSON list; errors as of `json_object`."""
+    return _parsed(data, list, where=where, needed="a JSON list", fix="")
+
+
+def read_json_object(
+    path: str | Path, *, most_bytes: int = MOST_BYTES, needed: str = "a JSON object", fix: str = ""
+) -> dict[str, Any]:
+    """Return the keys and values of a JSON object in a file, on this machine or behind a URL.
+
+    Raises:
+        InputError: As `json_object`; or the file is larger than `most_bytes`.
+        OSError: There is no such file, or it cannot be read.
+    """
+    return json_object(read_bounded(path, most_bytes), where=str(path), needed=needed, fix=fix)
+
+
+def _parsed(data: bytes | str, kind: type[T], *, where: str, needed: str, fix: str) -> T:
+    try:
+        value = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise InputError(where=where, found=f"not JSON: {error}", needed=needed, fix=fix) from None
+    if not isinstance(value, kind):
+        raise InputError(where=where, found=f"a JSON {type(value).__name__}", needed=needed, fix=fix)
+    return value
+
+
+def json_text(value: Any) -> str:
+    """Return plain values as indented JSON, each list of plain values on one line.
+
+    Raises:
+        ValueError: A number is not finite.
+    """
+    text = json.dumps(value, indent=1, allow_nan=False)
+    return _PLAIN_LIST.sub(lambda found: "[" + " ".join(found[1].split()) + "]", text) + "\n"
+
+
+def finite_or_none(value: float) -> float | None:
+    """Return a number; None for NaN and infinity, which JSON does not have."""
+    return value if math.isfinite(value) else None
+
+
+def utc_now() -> str:
+    """Return the time in UTC, to the second, as ISO 8601."""
+    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+
+
+# ---- records ----
+
+_adapter: Callable[[Any], Any] = cache(TypeAdapter)
+
+
+def record_of(kind: type[T], values: Mapping[str, Any], *, where: str, needed: str = "", fix: str = "") -> T:
+    """Return a dataclass of values from JSON: no value is converted to another type.
+
+    Args:
+        kind: The dataclass; its annotations may have pydantic's bounds.
+        values: Of its fields; those with a default may be missing.
+        where: The file, for messages.
+        needed: What it should be.
+        fix: How to fix it.
+
+    Raises:
+        InputError: A value is missing, unknown, of another type or beyond its bounds.
+    """
+    known = {field.name for field in fields(kind)}  # type: ignore[arg-type] # that is what `kind` is
+    problems = [f"{key}: unknown" for key in values if key not in known]
+    try:
+        record: T = _adapter(kind).validate_json(json.dumps(dict(values)), strict=True)
+    except ValidationError as error:
+        problems += [f"{'.'.join(map(str, one['loc']))}: {message_of(one)}" for one in error.errors()]
+    if problems:
+        more = f"; and {len(problems) - _MOST_PROBLEMS} more" if len(problems) > _MOST_PROBLEMS else ""
+        raise InputError(where=where, found="; ".join(problems[:_MOST_PROBLEMS]) + more, needed=needed, fix=fix)
+    return record
+
+
+def message_of(detail: Any) -> str:
+    """Return pydantic's message for one value in this program's terms, with the value found.
+
+    Args:
+        detail: One of `ValidationError.errors()`.
+    """
+    message, found = str(detail["msg"]), detail.get("input")
+    if detail["type"] == "missing":
+        return "missing"
+    for inner, ours in _INNER_WORDS.items():
+        message = message.replace(inner, ours)
+    return message if isinstance(found, dict) else f"{message} (found {shown(found)})"
+
+
+def shown(value: object) -> str:
+    """Return a value as Python source, cut if it is long."""
+    text = repr(value)
+    return text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]}…"
+
+
+# ---- YAML ----
+
+
+def parse_yaml(text: str, *, where: str) -> Any:
+    """Return the values of a YAML document: mappings with keys of text, lists, text, numbers, truth values, None.
+
+    A date is text, as are 017 and 12:30, which YAML would take for other numbers; 1e-4 is a number.
+
+    Raises:
+        InputError: It is not YAML, has a key twice or an alias; names line and column.
+    """
+    try:
+        return yaml.load(text, _Loader)  # noqa: S506 - a SafeLoader
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        mark = getattr(error, "problem_mark", None)
+        place = f"{where}: line {mark.line + 1}, column {mark.column + 1}" if mark else where
+        problem = getattr(error, "problem", None) or str(error)
+        raise InputError(where=place, found=f"not YAML: {problem}") from None
+
+
+class _Loader(yaml.SafeLoader):
+    """PyYAML's safe loader, stricter and without surprising numbers."""
+
+    def compose_node(self, parent: Node | None, index: Any) -> Node | None:
+        """Compose a node, which is no alias: a few lines of those can stand for more than fits into memory."""
+        if self.check_event(yaml.AliasEvent):
+            mark = self.peek_event().start_mark  # type: ignore[no-untyped-call] # PyYAML's
+            raise yaml.MarkedYAMLError(problem="an alias; write it out", problem_mark=mark)
+        return super().compose_node(parent, index)
+
+    def construct_mapping(self, node: MappingNode, deep: bool = False) -> dict[Any, Any]:  # noqa: ARG002 - PyYAML's
+        """Return keys, as they are written, and values; each key once."""
+        found: dict[str, Any] = {}
+        for key, value in node.value:
+            if not isinstance(key, ScalarNode):
+                problem = "a key that is a mapping or a list itself; fill in the template, if it is {{ NAME }} of one"
+                raise yaml.MarkedYAMLError(problem=problem, problem_mark=key.start_mark)
+            if key.value in found:
+                raise yaml.MarkedYAMLError(problem=f"key {key.value!r} is given twice", problem_mark=key.start_mark)
+            found[key.value] = self.construct_object(value, deep=True)
+        return found
+
+
+_NUMBERS = {  # PyYAML's own make numbers of 017 and 12:30, and text of 1e-4
+    "int": re.compile(r"[-+]?(?:0|[1-9][0-9_]*|0b[01_]+|0x[0-9a-fA-F_]+)$"),
+    "float": re.compile(
+        r"[-+]?(?:[0-9][0-9_]*\.[0-9_]*(?:[eE][-+]?[0-9]+)?|\.[0-9][0-9_]*(?:[eE][-+]?[0-9]+)?|[0-9]+[eE][-+]?[0-9]+"
+        r"|\.(?:inf|Inf|INF))$|\.(?:nan|NaN|NAN)$"
+    ),
+}
+_OTHERS = {f"tag:yaml.org,2002:{name}" for name in (*_NUMBERS, "timestamp", "value")}
+_Loader.yaml_implicit_resolvers = {
+    first: [(tag, pattern) for tag, pattern in resolvers if tag not in _OTHERS]
+    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+for _name, _pattern in _NUMBERS.items():
+    _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_name}", _pattern, list("-+.0123456789"))

@@ -1,0 +1,195 @@
+"""Selection of episodes and steps: once, counted, and the same for every source."""
+
+import hashlib
+import sys
+import tracemalloc
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from clips import open_in_memory
+from memory_source import MemorySource
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data import dataset as opening
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.idle import FoundRanges
+from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable
+from vjepa2_ac.data.selection import BrokenEpisodes
+from vjepa2_ac.errors import InputError
+
+
+def removed(dataset: Dataset) -> dict[str, tuple[int, int, int | None]]:
+    return {one.name: (one.episodes, one.steps, one.windows) for one in dataset.removed}
+
+
+def problems(count: int) -> list[EpisodeProblem]:
+    return [
+        EpisodeProblem(f"bad {number}", f"shard 3: record {number}", "all zeros", "poses", "Look")
+        for number in range(count)
+    ]
+
+
+def test_every_filter_counts_what_it_took() -> None:
+    source = MemorySource([10, 20, 30, 40, 50], [True, False, None, True, False], problems=problems(2))
+    dataset = open_in_memory(source, exclude=("episode 4", "bad 1", "bad 0"), outcome="success")
+    assert removed(dataset) == {
+        "excluded": (3, 50, 46),
+        "outcome": (2, 50, 16 + 26),
+        "broken": (0, 0, 0),
+        "idle": (0, 0, 0),
+    }
+    assert dataset.windows("train").episodes.tolist() == [0, 3]
+    assert len(open_in_memory(source, exclude=("bad 1", "bad 0"), outcome="failure").windows("train")) == 16 + 46
+
+
+def test_windows_are_not_counted_before_the_stride_is_known() -> None:
+    dataset = open_in_memory(MemorySource([10, 20]), stride="auto", exclude=("episode 1",))
+    assert removed(dataset)["excluded"] == (1, 20, None)
+    known = dataset.with_stride(4)
+    assert removed(known)["excluded"] == (1, 20, 12)
+    assert len(known.windows("train")) == 2
+    assert known.broken is dataset.broken
+
+
+def test_an_outcome_that_nobody_tells_is_refused() -> None:
+    with pytest.raises(InputError, match=r"data\.outcome: success: no episode.*Set data\.outcome: all"):
+        open_in_memory(MemorySource([10, 10]), outcome="success")
+    with pytest.raises(InputError, match=r"none of 2 episodes is left \(left out: outcome 2\)"):
+        open_in_memory(MemorySource([10, 10], [False, None]), outcome="success")
+
+
+def test_a_broken_episode_stops_by_default_and_says_how_to_go_on() -> None:
+    with pytest.raises(InputError) as caught:
+        open_in_memory(MemorySource([10] * 2000, problems=problems(12)))
+    error = caught.value
+    assert (error.where, error.found, error.needed) == ("shard 3: record 0", "all zeros", "poses")
+    assert "Look. To go on without, set data.broken_episodes: skip, or add (the first 10 of 12) to data.exclude" in (
+        error.fix.replace("11 more cannot be used either. ", "")
+    )
+    assert '"bad 9"]' in error.fix
+    assert "bad 10" not in error.fix
+
+
+def test_broken_episodes_are_skipped_by_policy_counted_and_named(caplog: Any) -> None:
+    dataset = open_in_memory(MemorySource([10] * 1188, problems=problems(12)), broken_episodes="skip")
+    assert "12 of 1200 episodes are broken and left out: bad 0, bad 1" in caplog.text
+    assert "and 2 more; the first: shard 3: record 0: all zeros" in caplog.text
+    assert len(dataset.broken) == 12
+    assert removed(dataset)["broken"] == (12, 0, 0)
+
+
+def test_more_than_one_in_a_hundred_stops_the_run_whatever_the_policy() -> None:
+    with pytest.raises(InputError, match=r"12 of 1199 episodes are broken: bad 0, .*needed: 1% at most"):
+        open_in_memory(MemorySource([10] * 1187, problems=problems(12)), broken_episodes="skip")
+
+
+def test_broken_episodes_that_are_excluded_are_nobodys_concern() -> None:
+    names = tuple(problem.name for problem in problems(12))
+    assert len(open_in_memory(MemorySource([10], problems=problems(12)), exclude=names).broken) == 0
+
+
+def test_what_a_run_met_before_it_was_resumed_counts_unless_it_is_excluded() -> None:
+    def resumed(**knobs: Any) -> BrokenEpisodes:
+        ledger = BrokenEpisodes(DataConfig(path="the set", broken_episodes="skip", **knobs), 300)
+        ledger.recall({name: f"{name} is damaged" for name in "abc"})
+        return ledger
+
+    resumed().met("a", "a is damaged")
+    with pytest.raises(InputError, match=r"4 of 300 episodes are broken: a, b, c, d\. The first, a: a is damaged\."):
+        resumed().met("d", "d is damaged")
+    resumed(exclude=("b",)).met("d", "d is damaged")
+
+
+def test_the_broken_episodes_of_all_processes_count_together() -> None:
+    """One in a hundred of the whole, and not in each process."""
+    ledgers = [BrokenEpisodes(DataConfig(path="the set", broken_episodes="skip"), 300) for _ in range(2)]
+    for ledger, names in zip(ledgers, ("ab", "bc"), strict=True):
+        for name in names:
+            ledger.met(name, "damaged")
+    everyone = ledgers[0].reasons | ledgers[1].reasons
+    for ledger in ledgers:
+        ledger.recall(everyone)
+        assert set(ledger.reasons) == set("abc")
+        with pytest.raises(InputError, match="4 of 300 episodes are broken"):
+            ledger.recall(everyone | {"d": "damaged"})
+
+
+def test_excluding_what_there_is_not_is_refused() -> None:
+    with pytest.raises(InputError, match=r"data\.exclude: not the identity of any episode: elsewhere\."):
+        open_in_memory(MemorySource([10], problems=problems(1)), exclude=("elsewhere", "bad 0"))
+
+
+def test_two_episodes_of_one_identity_are_refused() -> None:
+    source = MemorySource([10, 20, 30], names=["same", "other", "same"])
+    with pytest.raises(
+        InputError, match=r"episodes 0 and 2 have the same identity: same.*data\.fields\.identity"
+    ) as caught:
+        open_in_memory(source)
+    assert "broken_episodes" not in caught.value.fix, "that would not help"
+    assert open_in_memory(source, exclude=("same",)).windows("train").episodes.tolist() == [1]
+
+
+def test_nothing_is_read_to_open_a_set() -> None:
+    source = MemorySource([10, 20])
+    dataset = open_in_memory(source)
+    _ = dataset.removed, dataset.windows("train")
+    assert source.reads == []
+
+
+def droid_sized() -> EpisodeTable:
+    """Return a table of as many episodes as DROID 1.0.1 has, with identities as long as its own."""
+    count, generator = 95_658, np.random.default_rng(0)
+    names = np.array([f"{number:06d}".encode() * 38 for number in generator.permutation(count)])
+    return EpisodeTable(
+        num_steps=generator.integers(60, 520, count).astype(np.int32),
+        success=np.ones(count, np.int8),
+        id_ends=np.arange(1, count + 1) * 228,
+        id_bytes=np.frombuffer(names.tobytes(), np.uint8),
+        id_hash=np.array([int.from_bytes(hashlib.sha256(name).digest()[:8], "big") for name in names], np.uint64),
+        id_rank=np.argsort(np.argsort(names)).astype(np.int32),
+    )
+
+
+def two_ranges_each(table: EpisodeTable) -> FoundRanges:
+    """Return ranges with rests between them: a quarter of the steps, as in DROID."""
+    count, steps = len(table), table.num_steps
+    start, end = (np.zeros(2 * count, np.int32) for _ in range(2))
+    start[1::2], end[0::2], end[1::2] = steps * 0.4, steps * 0.3, steps * 0.85
+    return FoundRanges(np.repeat(np.arange(count, dtype=np.int32), 2), start, end)
+
+
+@pytest.mark.parametrize("idle", [{}, {"rule": "motion"}])
+def test_a_set_of_droids_size_is_opened_without_a_call_for_each_episode_and_in_fifty_megabytes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, idle: dict[str, Any]
+) -> None:
+    kept, ranges = tmp_path / "table", tmp_path / "ranges"
+    table = droid_sized()
+    kept.write_bytes(table.to_bytes())
+    ranges.write_bytes(two_ranges_each(table).to_bytes())
+    monkeypatch.setattr(opening, "find_ranges", lambda *_: FoundRanges.from_bytes(ranges.read_bytes()))
+    del table
+
+    class Kept:
+        def infos(self, progress: object = None) -> EpisodeTable:
+            del progress
+            return EpisodeTable.from_bytes(kept.read_bytes())
+
+        def read(self, *_: object) -> Any: ...
+
+    calls = 0
+
+    def count(*_: object) -> None:
+        nonlocal calls
+        calls += 1
+
+    tracemalloc.start()
+    sys.setprofile(count)
+    windows = open_in_memory(Kept(), outcome="success", stride=4, frames=16, idle=idle).windows("train")
+    sys.setprofile(None)
+    size, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(windows) > (8e6 if idle else 15e6)
+    assert size < 50e6
+    assert calls < 50_000, "of 95,658 episodes"

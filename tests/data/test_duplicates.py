@@ -1,0 +1,147 @@
+"""Duplicates: an episode under several names is found in every form of data, and reported by every command."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from clips import dataset_in_memory
+from copied_sets import STEPS, WRITERS, write_lerobot, write_npz
+from gcs import Gcs
+from latent_sets import write_cache
+from memory_source import MemorySource
+from synthetic import synthetic_states
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.duplicates import Duplicates, find_duplicates
+from vjepa2_ac.data.index.episode_table import EpisodeTable
+from vjepa2_ac.data.index.state_hash import UNKNOWN, hash_of_states
+from vjepa2_ac.data.sources.latents.manifest import EPISODES
+from vjepa2_ac.inspection.check import check_data
+from vjepa2_ac.inspection.statistics import inspect_dataset
+
+RECORDINGS = (0, 1, 2, 3, 0, 4, 5, 0, 6, 4)  # the first one three times, the fifth one twice
+
+
+def config_of(source: str, path: object, tmp_path: Path, **changes: object) -> DataConfig:
+    values = {
+        "source": source, "path": str(path), "frames": 3, "stride": 2, "workers": 0, "validation_share": 0.4,
+        "test_share": 0.2, "disk_cache": {"dir": str(tmp_path / "cache")},
+    }  # fmt: skip
+    return DataConfig.model_validate(values | changes)
+
+
+def in_memory(hashes: list[int]) -> Dataset:
+    dataset = dataset_in_memory(MemorySource([20] * len(hashes)), validation_share=0.3, test_share=0.2)
+    return replace(dataset, table=replace(dataset.table, state_hash=np.array(hashes, np.uint64)))
+
+
+def test_a_hash_is_that_of_the_numbers_whatever_their_type() -> None:
+    states = synthetic_states(9)
+    assert hash_of_states(states) == hash_of_states(states.astype(np.float32)) != UNKNOWN
+    states[4, 2] = 0.0
+    negative = states.copy()
+    negative[4, 2] = -0.0
+    assert hash_of_states(negative) == hash_of_states(states)
+    for other in (states[:-1], states + 1e-6, states.reshape(-1, 1), states[::-1]):
+        assert hash_of_states(np.ascontiguousarray(other)) != hash_of_states(states)
+
+
+@pytest.mark.parametrize("source", WRITERS)
+def test_copies_are_found_in_every_form_of_data_and_again_from_its_kept_index(source: str, tmp_path: Path) -> None:
+    config = config_of(source, WRITERS[source](tmp_path / "set", RECORDINGS), tmp_path)
+    for _ in range(2):
+        dataset = open_dataset(config)
+        found = find_duplicates(dataset)
+        assert (found.is_known, found.episodes, found.different) == (True, 5, 2)
+        assert len(found.copies) == 3
+        one, other = (dataset.table.find(name) for name, _ in found.example)
+        assert one != other
+        np.testing.assert_array_equal(*(dataset.source.read(place).states for place in (one, other)))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("source", ["rlds", "lerobot"])
+def test_copies_far_away_are_found_without_reading_all_states(source: str, gcs: Gcs, tmp_path: Path) -> None:
+    folder = WRITERS[source](tmp_path / "set", RECORDINGS)
+    if source == "lerobot":
+        with_statistics(folder)
+    gcs.upload(folder, "bucket/set/1.0.0")
+    dataset = open_dataset(config_of(source, "gs://bucket/set/1.0.0", tmp_path))
+    found = find_duplicates(dataset)
+    assert (found.is_known, found.episodes, found.different) == (True, 5, 2)
+
+
+def with_statistics(folder: Path) -> None:
+    """Add what LeRobot writes of every episode, in its order."""
+    rows = [synthetic_states(STEPS, seed=number).astype(np.float32) for number in RECORDINGS]
+
+    path = folder / "meta/episodes/chunk-000/file-000.parquet"
+    table = pq.read_table(path)
+    for name, part in (("cartesian_position", slice(6)), ("gripper_position", slice(6, 7))):
+        for kind in ("min", "max", "mean", "std"):
+            values = [getattr(states[:, part], kind)(axis=0).tolist() for states in rows]
+            table = table.append_column(f"stats/observation.state.{name}/{kind}", pa.array(values))
+    pq.write_table(table, path)
+
+
+def test_a_far_set_of_which_nothing_tells_the_states_is_said_to_be_not_known(gcs: Gcs, tmp_path: Path) -> None:
+    gcs.upload(write_lerobot(tmp_path / "set", RECORDINGS), "bucket/set")
+    found = find_duplicates(open_dataset(config_of("lerobot", "gs://bucket/set", tmp_path)))
+    assert found == Duplicates(is_known=False)
+    assert "not known" in str(found)
+
+
+def test_a_latent_cache_passes_the_hashes_on_and_an_older_one_is_read_without(tmp_path: Path) -> None:
+    dataset = open_dataset(config_of("npz", write_npz(tmp_path / "set", RECORDINGS), tmp_path))
+    folder = write_cache(dataset)
+    cached = open_dataset(config_of("latents", folder, tmp_path, stride=2))
+    assert find_duplicates(cached) == find_duplicates(dataset)
+    data = (folder / EPISODES).read_bytes()
+    assert (
+        EpisodeTable.from_bytes(replace(EpisodeTable.from_bytes(data), state_hash=None).to_bytes()).state_hash is None
+    )
+
+
+def test_those_across_splits_are_counted_and_two_of_them_are_named() -> None:
+    pairs = in_memory([1 + number // 2 for number in range(40)])
+    found = find_duplicates(pairs)
+    splits = {name: split for split in ("train", "validation", "test") for name in names_in(pairs, split)}
+    across = sum(2 for number in range(0, 40, 2) if splits[f"episode {number}"] != splits[f"episode {number + 1}"])
+    assert (found.episodes, found.different, found.across, len(found.copies)) == (40, 20, across, 20)
+    (one, its_split), (other, others_split) = found.example
+    assert (splits[one], splits[other]) == (its_split, others_split)
+    assert its_split != others_split
+    assert int(one.split()[1]) // 2 == int(other.split()[1]) // 2
+    assert f"{across} of them have a copy in another split, such as {one} ({its_split})" in str(found)
+    assert "data.exclude" in str(found)
+    assert "data.split_by" in str(found)
+
+
+def names_in(dataset: Dataset, split: str) -> list[str]:
+    return [dataset.table.identity(int(place)) for place in dataset.windows(split).episodes]  # type: ignore[arg-type]
+
+
+def test_no_copies_and_episodes_that_were_not_looked_at_are_none() -> None:
+    assert find_duplicates(in_memory([1, 2, 3, UNKNOWN, UNKNOWN])) == Duplicates(is_known=True)
+
+
+def test_what_is_left_out_is_no_copy() -> None:
+    dataset = in_memory([7, 7, 8])
+    without = dataset.kept.taking_part.copy()
+    without[1] = False
+    assert find_duplicates(replace(dataset, kept=dataset.kept.only(without))).episodes == 0
+
+
+def test_check_and_inspect_warn_of_copies_and_are_calm_without(tmp_path: Path) -> None:
+    copied = config_of("npz", write_npz(tmp_path / "copied", RECORDINGS), tmp_path)
+    finding = next(one for one in check_data(copied, clips=2) if one.about == "duplicates")
+    assert (finding.level, "5 episodes have the states" in finding.text) == ("warning", True)
+    inspection = inspect_dataset(open_dataset(copied))
+    assert "inspect.json" in inspection.summary["duplicates"]
+    assert sorted(inspection.values["duplicates"]["copies"]) == ["004", "007", "009"]
+    single = config_of("npz", write_npz(tmp_path / "single", range(10)), tmp_path)
+    finding = next(one for one in check_data(single, clips=2) if one.about == "duplicates")
+    assert (finding.level, finding.text) == ("ok", "no two episodes have the same states")

@@ -1,0 +1,164 @@
+"""Groups stay in one split; unknown groups are refused, and so is an episode without one."""
+
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from clips import open_in_memory, split_of
+from copied_sets import write_lerobot, write_npz, write_raw, write_rlds
+from latent_sets import write_cache
+from memory_source import MemorySource
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.index.episode_table import EpisodeTable
+from vjepa2_ac.data.selection import groups_of
+from vjepa2_ac.episode import EpisodeInfo
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.inspection.check import check_data
+from vjepa2_ac.inspection.statistics import inspect_dataset
+
+DROID = "gs://xembodiment_data/r2d2/r2d2-data-full/{lab}/{outcome}/{day}/Fri_Jul__7_09:42:23_2023/{number}--{number}.h5"
+NAMES = [
+    DROID.format(
+        lab=f"LAB{n % 3}", outcome="failure" if n % 5 == 4 else "success", day=f"2023-07-{n % 7:02d}", number=n
+    )
+    for n in range(60)
+]
+SHARES = {"validation_share": 0.3, "test_share": 0.2}
+
+
+def config_of(**changes: Any) -> DataConfig:
+    return DataConfig.model_validate({"path": "somewhere", "frames": 3, "stride": 2, "workers": 0, **SHARES, **changes})
+
+
+def opened(names: list[str] | None = None, **changes: Any) -> Dataset:
+    names = NAMES if names is None else names
+    return open_in_memory(MemorySource([20] * len(names), names=names), **(SHARES | changes))
+
+
+def splits_of(dataset: Dataset) -> dict[str, str]:
+    """Return the split of every episode, by the clips that come from it."""
+    return {
+        dataset.table.identity(int(place)): split
+        for split in ("train", "validation", "test")
+        for place in dataset.windows(split).episodes  # type: ignore[arg-type]
+    }
+
+
+def groups_split(dataset: Dataset, group: Any) -> dict[str, set[str]]:
+    found = defaultdict(set)
+    for name, split in splits_of(dataset).items():
+        found[group(name)].add(split)
+    return dict(found)
+
+
+def test_without_it_the_identity_decides_as_ever() -> None:
+    dataset = opened()
+    assert dataset.groups is None
+    assert splits_of(dataset) == {name: split_of(name, dataset.config) for name in NAMES}
+
+
+@pytest.mark.parametrize("by", ["day", r"/(\d{4}-\d\d-\d\d)/"])
+def test_episodes_of_a_group_share_the_split_of_its_name(by: str) -> None:
+    dataset = opened(split_by=by)
+    days = groups_split(dataset, lambda name: name.split("/")[7])
+    assert days == {day: {split_of(day, dataset.config)} for day in days}
+    assert len(days) == 7
+    assert sum(len(dataset.windows(split)) for split in ("train", "validation", "test")) == 60 * (20 - 4)
+
+
+def count_of_groups(dataset: Dataset) -> int:
+    return len(np.unique(dataset.split_hash))
+
+
+def test_an_identity_without_a_group_is_named_and_refused() -> None:
+    names = [*NAMES[:20], "elsewhere/one", "elsewhere/two"]
+    with pytest.raises(InputError, match=r"split_by: day: .*in the identities of 2 of 22 episodes: elsewhere/one, "):
+        opened(names, split_by="day")
+    with pytest.raises(InputError, match=r"2 of 22 episodes: elsewhere/one, elsewhere/two.*data\.exclude"):
+        opened(names, split_by=r"LAB(\d?)")
+    opened(names, split_by="day", exclude=("elsewhere/one", "elsewhere/two"))
+
+
+def test_a_group_of_nothing_is_none() -> None:
+    with pytest.raises(InputError, match="60 of 60 episodes"):
+        opened(split_by=r"LAB(x*)")
+
+
+def test_a_field_that_is_not_there_is_refused_with_those_that_are() -> None:
+    with pytest.raises(InputError, match=r"no such field; this data set has none of its own.*lab, day, folder"):
+        opened(split_by="kitchen")
+
+
+@pytest.mark.parametrize("pattern", ["(", "(a)(b)", r"\d+-\d+", "(?:a)", "", "(?P<a>", "a" * 501])
+def test_a_pattern_without_one_group_is_refused_with_the_config(pattern: str) -> None:
+    with pytest.raises(ValidationError, match="split_by"):
+        config_of(split_by=pattern)
+
+
+def test_a_split_without_groups_says_that_groups_are_drawn() -> None:
+    two_days = [name for number, name in enumerate(NAMES) if number % 7 < 2]
+    dataset = opened(two_days, split_by="day", validation_share=0.001, test_share=0.0)
+    with pytest.raises(InputError, match=r"among 18 in 2 groups \(data.split_by\).*three groups or more always have"):
+        dataset.windows("validation")
+
+
+@pytest.mark.parametrize(
+    ("source", "by", "groups"),
+    [("npz", "scene", 3), ("npz", "task", 2), ("lerobot", "task", 2), ("droid_raw", "day", 8), ("rlds", "lab", 2)],
+)
+def test_every_source_offers_what_it_knows(source: str, by: str, groups: int, tmp_path: Path) -> None:
+    folder = tmp_path / "set"
+    if source == "npz":
+        write_npz(folder, range(8), scene=lambda place: f"room {place % 3}", language=lambda place: f"task {place % 2}")
+    else:
+        {"lerobot": write_lerobot, "droid_raw": write_raw, "rlds": write_rlds}[source](folder, range(8))
+    dataset = open_dataset(config_of(source=source, path=str(folder), split_by=by, disk_cache={"dir": str(tmp_path)}))
+    assert count_of_groups(dataset) == groups
+
+
+def test_a_camera_may_be_called_scene(tmp_path: Path) -> None:
+    folder = write_npz(tmp_path / "set", range(4))
+    for path in folder.iterdir():
+        with np.load(path) as file:
+            arrays = dict(file)
+        np.savez(path, **arrays, scene=arrays["frames"])
+    assert len(open_dataset(config_of(source="npz", path=str(folder), camera="scene")).table) == 4
+
+
+def test_an_episode_of_which_the_field_is_not_said_is_named(tmp_path: Path) -> None:
+    folder = write_npz(tmp_path / "set", range(4), scene=lambda place: "" if place == 2 else "kitchen")
+    with pytest.raises(InputError, match=r"does not say it of 1 of 4 episodes: 002"):
+        open_dataset(config_of(source="npz", path=str(folder), split_by="scene"))
+
+
+def test_a_latent_cache_knows_the_groups_and_serves_any_grouping(tmp_path: Path) -> None:
+    write_npz(tmp_path / "set", range(8), scene=lambda place: f"room {place % 3}")
+    plain = config_of(source="npz", path=str(tmp_path / "set"), disk_cache={"dir": str(tmp_path / "cache")})
+    folder = write_cache(open_dataset(plain))
+    assert count_of_groups(open_dataset(plain.as_kind("latents", path=str(folder), split_by="scene"))) == 3
+
+
+def test_check_says_how_many_groups_there_are_and_inspect_counts_the_splits_of_the_clips(tmp_path: Path) -> None:
+    write_npz(tmp_path / "set", range(8), scene=lambda place: f"room {place % 4}")
+    config = config_of(source="npz", path=str(tmp_path / "set"), split_by="scene", test_share=0.0)
+    findings = {one.about: one for one in check_data(config, clips=2)}
+    assert findings["groups"].text == "4 by scene, each in one split"
+    dataset = open_dataset(config)
+    found = inspect_dataset(dataset).values["splits"]
+    for split in ("train", "validation"):
+        assert found[split]["episodes"] == len(dataset.windows(split).episodes)
+
+
+def test_labels_come_back_from_a_file() -> None:
+    from vjepa2_ac.data.index.labels import Labels
+
+    infos = [EpisodeInfo(name, 20) for name in "abc"]
+    table = EpisodeTable.of(infos, labels={"scene": Labels.of(["x", None, "y"])}, state_hashes=[1, 0, 2])
+    back = EpisodeTable.from_bytes(table.to_bytes())
+    assert [back.labels["scene"].of_episode(place) for place in range(3)] == ["x", None, "y"]
+    assert groups_of(back, np.array([True, False, True]), config_of(split_by="scene")) is not None

@@ -1,0 +1,264 @@
+"""Idle steps: the same as in openpi, and never where the robot moves."""
+
+import json
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from clips import clip_at, open_in_memory
+from gcs import Gcs
+from memory_source import MemorySource
+from paths import GOLDEN
+from synthetic import synthetic_states
+from vjepa2_ac.config import DataConfig, IdleConfig
+from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.idle import FoundRanges, idle_by_commands, idle_by_motion, kept_ranges, moving_ranges
+from vjepa2_ac.data.index.episode_table import EpisodeProblem, NotATableError
+from vjepa2_ac.errors import InputError, UnreachableError
+
+COMMANDS = IdleConfig(rule="commands")
+MOTION = IdleConfig(rule="motion")
+
+
+def resting(steps: int, rests: list[tuple[int, int]], *, seed: int = 0) -> np.ndarray:
+    """Return a trajectory in which nothing changes during the rests: step t equals step t - 1."""
+    states = synthetic_states(steps, seed=seed)
+    for start, end in rests:
+        states[start:end] = states[start - 1]
+    return states
+
+
+def test_commands_keep_what_openpi_keeps() -> None:
+    golden = np.load(GOLDEN / "idle_ranges.npz")
+    for number in range(3):
+        idle = idle_by_commands(golden[f"velocities_{number}"].astype(np.float64), COMMANDS)
+        assert moving_ranges(idle, COMMANDS) == [tuple(pair) for pair in golden[f"ranges_{number}"].tolist()]
+
+
+def test_the_reference_set_keeps_what_openpi_keeps(shared: Path) -> None:
+    folder = shared / "data/droid_rlds"
+    expected = json.loads((folder / "expected.json").read_text())["episodes"]
+    dataset = open_dataset(DataConfig(path=str(folder / "r2d2_faceblur/1.0.0"), idle=COMMANDS))
+    for number, info in enumerate(dataset.table):
+        assert [list(pair) for pair in dataset.kept.of(number)] == expected[info.id]["idle_keep_ranges"]
+
+
+@pytest.mark.parametrize("number", range(7))
+def test_motion_of_any_kind_is_motion(number: int) -> None:
+    states = np.tile(np.array([0.5, 0.0, 0.3, np.pi, 0.0, 1.0, 0.5]), (30, 1))
+    states[:, number] += np.linspace(0, 0.5, 30)
+    assert not idle_by_motion(states, MOTION)[1:].any()
+    assert idle_by_motion(states[:1].repeat(30, axis=0), MOTION)[1:].all()
+
+
+def test_rest_is_found_in_the_poses_where_roll_wraps() -> None:
+    states = resting(60, [(20, 40)])
+    states[20:40, 3] += np.where(np.arange(20) % 2, 2 * np.pi, 0)  # the same angle, written differently
+    idle = idle_by_motion(states, MOTION)
+    assert np.flatnonzero(idle).tolist() == list(range(20, 40))
+    assert moving_ranges(idle, MOTION) == [(0, 10), (40, 50)]
+
+
+def test_short_rests_stay_and_short_moves_go() -> None:
+    def ranges(rests: list[tuple[int, int]], **knobs: Any) -> list[tuple[int, int]]:
+        idle = np.zeros(80, bool)
+        for start, end in rests:
+            idle[start:end] = True
+        return moving_ranges(idle, IdleConfig(rule="motion", **knobs))
+
+    assert ranges([(30, 36)]) == [(0, 70)]
+    assert ranges([(30, 37)]) == [(0, 20), (37, 70)]
+    assert ranges([(15, 30)]) == [(30, 70)], "15 steps are too short to keep"
+    assert ranges([(16, 30)]) == [(0, 6), (30, 70)]
+    assert ranges([(30, 37)], cut_last_steps=0) == [(0, 30), (37, 80)]
+    assert ranges([(5, 80)], shortest_kept_steps=1) == [], "nothing is left of 5 steps without the last 10"
+    assert ranges([(0, 80)]) == []
+
+
+@settings(max_examples=60)
+@given(idle=st.lists(st.booleans(), max_size=120))
+def test_kept_ranges_lie_apart_and_hold_no_long_rest(idle: list[bool]) -> None:
+    ranges = moving_ranges(np.array(idle, bool), MOTION)
+    edges = [edge for pair in ranges for edge in pair]
+    assert edges == sorted(set(edges))
+    assert all(0 <= edge <= len(idle) for edge in edges)
+    for start, end in ranges:
+        assert "1" * 7 not in "".join(str(int(one)) for one in idle[start:end])
+
+
+def test_no_steps_and_one_step_are_not_idle() -> None:
+    assert idle_by_commands(np.zeros((0, 7)), COMMANDS).tolist() == []
+    assert idle_by_commands(np.zeros((1, 7)), COMMANDS).tolist() == [False]
+    assert idle_by_motion(np.zeros((1, 7)), MOTION).tolist() == [False]
+
+
+def test_commands_without_velocities_name_the_way_out() -> None:
+    episode = MemorySource([20]).read(0)
+    with pytest.raises(InputError, match=r"episode 0: no commanded joint velocities.*idle\.rule: motion"):
+        kept_ranges(episode, COMMANDS)
+
+
+# The whole way: a data set is looked through once, and what was found is kept.
+
+
+@pytest.fixture
+def open_with(tmp_path: Path) -> Any:
+    return partial(open_in_memory, path=str(tmp_path / "set"), disk_cache={"dir": str(tmp_path / "cache")})
+
+
+def restful(lengths: list[int] | None = None, **knobs: Any) -> MemorySource:
+    return MemorySource(
+        lengths or [60, 40, 80], states=lambda index: resting((lengths or [60, 40, 80])[index], [(20, 35)]), **knobs
+    )
+
+
+def starts(dataset: Dataset) -> set[tuple[int, int]]:
+    windows = dataset.windows("train")
+    return {windows[index] for index in range(len(windows))}
+
+
+def test_clips_come_from_kept_ranges_only(open_with: Any) -> None:
+    dataset = open_with(restful(), idle=MOTION)
+    assert [dataset.kept.of(episode) for episode in range(3)] == [((0, 10), (35, 50)), ((0, 10),), ((0, 10), (35, 70))]
+    assert starts(dataset) == {
+        (episode, start)
+        for episode in range(3)
+        for first, end in dataset.kept.of(episode)
+        for start in range(first, end - 4)
+    }
+    removed = {one.name: one for one in dataset.removed}["idle"]
+    assert (removed.episodes, removed.steps) == (0, 180 - 25 - 10 - 45)
+    assert removed.windows == 56 + 36 + 76 - len(starts(dataset))
+
+
+def test_an_episode_is_read_with_the_steps_that_clips_may_come_from(open_with: Any) -> None:
+    source = restful()
+    assert open_with(source, idle=MOTION).needed_steps(0) == ((0, 10), (35, 50))
+    assert open_with(source).needed_steps(0) is None
+    clip_at(open_with(source, idle=MOTION), 2, 40)
+    assert source.reads[-1] == (2, None, ((0, 10), (35, 70)))
+
+
+def test_the_episodes_are_indexed_once(open_with: Any) -> None:
+    first, second, third = restful(), restful(), restful()
+    kept = open_with(first, idle=MOTION).kept
+    again = open_with(second, idle=MOTION, exclude=("episode 1",), stride=3).kept
+    assert [index for index, *_ in first.reads] == [0, 1, 2]
+    assert second.reads == []
+    assert again.of(2) == kept.of(2)
+    assert again.of(1) == ()
+    open_with(third, idle=MOTION.model_copy(update={"cut_last_steps": 4}))
+    assert len(third.reads) == 3, "another rule is another pass"
+
+
+def test_a_data_set_that_changed_is_indexed_anew(tmp_path: Path) -> None:
+    def kept(rests: list[tuple[int, int]]) -> object:
+        states = resting(60, rests).astype(np.float32)
+        (tmp_path / "kitchen").mkdir(exist_ok=True)
+        np.savez(tmp_path / "kitchen/one.npz", states=states, frames=np.zeros((60, 8, 8, 3), np.uint8), fps_hz=15.0)
+        return open_dataset(DataConfig(source="npz", path=str(tmp_path), idle=MOTION, frames=3)).kept.of(0)
+
+    assert kept([(20, 35)]) == ((0, 10), (35, 50))
+    assert kept([(22, 37)]) == ((0, 12), (37, 50)), "another file of the same size and length"
+
+
+def test_an_episode_that_stands_still_all_the_time_has_no_clips(open_with: Any) -> None:
+    source = MemorySource([60, 60], states=lambda index: resting(60, [(1, 60)] if index else []))
+    dataset = open_with(source, idle=MOTION)
+    assert {episode for episode, _ in starts(dataset)} == {0}
+    assert str(dataset.removed[-1]).startswith("1 episodes, 70 steps, ")
+    with pytest.raises(InputError, match=r"none of 1 episodes is left \(left out: idle 1\)"):
+        open_with(MemorySource([60], states=lambda _: resting(60, [(1, 60)])), idle=MOTION)
+
+
+def test_kept_ranges_shorter_than_a_clip_give_none(open_with: Any) -> None:
+    with pytest.raises(InputError, match=r"no train episode has a range of kept steps.*needed: 59 steps"):
+        open_with(restful(), idle=MOTION, frames=30).windows("train")
+
+
+def test_an_episode_that_breaks_on_the_way_is_a_broken_episode(open_with: Any, caplog: Any) -> None:
+    lengths = [60] * 200
+    source = restful(lengths, unreadable=frozenset({7, 9}))
+    with pytest.raises(InputError, match=r"memory: episode 7: damaged\. 1 more.*\[\"episode 7\", \"episode 9\"\]"):
+        open_with(source, idle=MOTION)
+    dataset = open_with(source, idle=MOTION, broken_episodes="skip")
+    assert "2 of 200 episodes are broken and left out: episode 7, episode 9" in caplog.text
+    assert not dataset.kept.taking_part[[7, 9]].any()
+    assert {one.name: one.episodes for one in dataset.removed}["broken"] == 2
+    assert len(open_with(source, idle=MOTION, exclude=("episode 7", "episode 9")).broken) == 0
+
+
+def test_settings_at_fault_end_the_pass_early(open_with: Any) -> None:
+    source = MemorySource([40] * 50)
+    with pytest.raises(InputError, match="no commanded joint velocities"):
+        open_with(source, idle=COMMANDS, broken_episodes="skip")
+    assert len(source.reads) <= 14
+
+
+def test_an_unreachable_network_is_nobodys_broken_episode(open_with: Any) -> None:
+    source = MemorySource(
+        [40] * 300, unreadable=frozenset({5}), fault=lambda where: UnreachableError(where=where, found="503")
+    )
+    with pytest.raises(UnreachableError):
+        open_with(source, idle=MOTION, broken_episodes="skip")
+
+
+def test_what_was_found_survives_the_disk_and_damage_is_seen() -> None:
+    found = FoundRanges.of([[(0, 3), (5, 9)], EpisodeProblem("x", "here", "bad"), [], [(1, 2)]])
+    data = found.to_bytes()
+    back = FoundRanges.from_bytes(data)
+    assert back.problems == found.problems
+    assert np.array_equal([back.episode, back.start, back.end], [[0, 0, 3], [0, 5, 1], [3, 9, 2]])
+    for damaged in (b"", data[:-40], data.replace(b"here", b"gone")):
+        with pytest.raises(NotATableError):
+            FoundRanges.from_bytes(damaged)
+
+
+# Ranges from a list that somebody published.
+
+
+def published(tmp_path: Path, content: object) -> dict[str, Any]:
+    path = tmp_path / "ranges.json"
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    return {"idle": IdleConfig(rule="published", ranges=str(path))}
+
+
+def test_published_ranges_are_taken_by_identity(open_with: Any, tmp_path: Path, caplog: Any, gcs: Gcs) -> None:
+    ranges = {"episode 1": [[0, 12], [20, 40]], "elsewhere": [[0, 9999]], "episode 2": []}
+    source = restful()
+    dataset = open_with(source, **published(tmp_path, ranges))
+    assert [dataset.kept.of(episode) for episode in range(3)] == [(), ((0, 12), (20, 40)), ()]
+    assert "knows 2 of the 3 episodes; the other 1 count as idle" in caplog.text
+    assert source.reads == []
+    assert starts(dataset) == {(1, start) for start in (*range(8), *range(20, 36))}
+    other = open_with(source, **published(tmp_path, {"episode 1": [[0, 13]]}))
+    assert other.kept.of(1) == ((0, 13),), "a changed list is read anew"
+    url = gcs.put("robots/ranges.json", json.dumps({"episode 1": [[0, 13]]}).encode())
+    assert open_with(source, idle=IdleConfig(rule="published", ranges=url)).kept.of(1) == ((0, 13),)
+    with pytest.raises(InputError, match=r"nowhere\.json: cannot be read"):
+        open_with(source, idle=IdleConfig(rule="published", ranges=str(tmp_path / "nowhere.json")))
+
+
+BAD_LISTS = {
+    "of another set": ({"elsewhere": [[0, 3]]}, r"none of the 3 episodes; its first is elsewhere.*such as episode 0"),
+    **{
+        str(wrong): ({"episode 1": wrong}, r"ranges\.json: episode 1: .*pairs \[start, end\) of steps from 0 to 40")
+        for wrong in ([[0, 41]], [[-1, 4]], [[0, 9], [5, 12]], [[9, 3]], [[3, 3]], [1, 2], [[0, "9"]], [[0, 9.5]], None)
+    },
+    "not an object": ([1, 2], r"a JSON list"),
+    "not JSON": ("{", r"not JSON"),
+}
+
+
+@pytest.mark.parametrize(("content", "complaint"), BAD_LISTS.values(), ids=BAD_LISTS.keys())
+def test_a_list_that_does_not_fit_is_one_clear_error(
+    open_with: Any, tmp_path: Path, content: object, complaint: str
+) -> None:
+    with pytest.raises(InputError, match=complaint) as caught:
+        open_with(restful(), **published(tmp_path, content))
+    assert "ranges.json" in caught.value.where

@@ -1,0 +1,442 @@
+"""The loader: batches depend on seed and position only; a worker's error reaches the user."""
+
+import itertools
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from clips import clip_at, open_in_memory
+from memory_source import MemorySource
+from recording_cuda import Pinning, RecordingCuda, recorded_copies
+from synthetic import write_synthetic_droid
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data import loader
+from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.loader import ProcessShare, collate, training_loader, validation_batches
+from vjepa2_ac.data.streams import NO_COPIES, copies_for
+from vjepa2_ac.episode import Batch, Episode
+from vjepa2_ac.errors import InputError, UnreachableError
+from vjepa2_ac.geometry import actions_from_states, states_in_camera_frame
+
+Names = list[tuple[str, int]]
+
+
+def config_of(folder: Path, **knobs: Any) -> DataConfig:
+    chosen = {"frames": 3, "stride": 2, "workers": 0, "validation_share": 0.3, "test_share": 0.0} | knobs
+    return DataConfig(path=str(folder), **chosen)
+
+
+def take(count: int, config: DataConfig, **knobs: Any) -> list[Batch]:
+    chosen = {"seed": 1, "batch_size": 2} | knobs
+    return list(itertools.islice(training_loader(open_dataset(config), **chosen), count))
+
+
+def names(batches: list[Batch]) -> Names:
+    return [name for batch in batches for name in zip(batch.episode_ids, batch.starts, strict=True)]
+
+
+def assert_same(found: list[Batch], expected: list[Batch]) -> None:
+    assert names(found) == names(expected)
+    for one, other in zip(found, expected, strict=True):
+        assert torch.equal(one.frames, other.frames)
+        assert torch.equal(one.states, other.states)
+        assert torch.equal(one.actions, other.actions)
+
+
+def test_a_clip_holds_the_strided_steps_of_its_episode(droid: Path) -> None:
+    config = config_of(droid, frames=4, stride=3)
+    dataset = open_dataset(config)
+    episode = dataset.source.read(2)
+    clip = clip_at(dataset, 2, 4)
+    assert (clip.episode_id, clip.start, clip.stride) == (episode.info.id, 4, 3)
+    assert np.array_equal(clip.states, episode.states[[4, 7, 10, 13]].astype(np.float32))
+    assert np.array_equal(clip.frames, episode.read_frames([4, 7, 10, 13])[:, :, 15:80])
+
+
+def test_resumed_run_sees_the_clips_the_uninterrupted_run_would_have(droid: Path) -> None:
+    config = config_of(droid)
+    uninterrupted = take(40, config)  # more than an epoch
+    for done in (1, 17, 33):
+        assert_same(take(5, config, start_position=done * 2), uninterrupted[done : done + 5])
+
+
+def test_another_layout_goes_on_where_the_run_stopped(droid: Path) -> None:
+    config = config_of(droid)
+    alone = names(take(12, config))
+    ranks = [take(2, config, start_position=5, batch_size=3, share=ProcessShare(rank, 2)) for rank in range(2)]
+    assert names([ranks[rank][step] for step in range(2) for rank in range(2)]) == alone[5:17]
+
+
+def test_an_epoch_holds_every_training_window_once_and_no_other(droid: Path) -> None:
+    config = config_of(droid)
+    held_out = set(names(list(validation_batches(open_dataset(config), "validation", clips=1000, batch_size=1))))
+    everything = {
+        (info.id, start)
+        for info in open_dataset(config).table
+        for start in range(info.num_steps - config.clip_steps + 1)
+    }
+    epoch = names(take(len(everything - held_out), config, batch_size=1))
+    assert held_out
+    assert len(epoch) == len(set(epoch))
+    assert set(epoch) == everything - held_out
+
+
+def test_seeds_change_the_order(droid: Path) -> None:
+    assert names(take(5, config_of(droid), seed=1)) != names(take(5, config_of(droid), seed=2))
+
+
+def test_the_shards_change_neither_training_nor_validation(droid: Path, tmp_path: Path) -> None:
+    other = config_of(write_synthetic_droid(tmp_path / "set", steps=range(12, 18), size=(48, 96), shards=5))
+    config = config_of(droid)
+    assert_same(take(9, other), take(9, config))
+    chosen = [list(validation_batches(open_dataset(c), "validation", clips=5, batch_size=2)) for c in (config, other)]
+    assert_same(*chosen)
+
+
+def test_loading_does_not_draw_from_the_generator_of_dropout(droid: Path) -> None:
+    before = torch.get_rng_state()
+    take(2, config_of(droid))
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_validation_clips_are_few_distinct_and_from_all_held_out_episodes(droid: Path) -> None:
+    config = config_of(droid, validation_share=0.6)
+    batches = list(validation_batches(open_dataset(config), "validation", clips=7, batch_size=3))
+    assert [len(batch.starts) for batch in batches] == [3, 3, 1]
+    assert len(set(names(batches))) == 7
+    everyone = {
+        name for name, _ in names(list(validation_batches(open_dataset(config), "validation", clips=999, batch_size=9)))
+    }
+    assert len(everyone) > 1
+    assert {name for name, _ in names(batches)} == everyone
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+@pytest.mark.parametrize("pinned", [False, True])
+def test_an_error_in_a_worker_is_the_error_the_user_reads(
+    spoiled: Callable[..., Path], monkeypatch: pytest.MonkeyPatch, workers: int, *, pinned: bool
+) -> None:
+    def spoil(features: dict[str, tuple[Any, Any]]) -> None:
+        features["steps/observation/exterior_image_1_left"][1][:] = [b"GIF89a"] * 12
+
+    config = config_of(spoiled(spoil), workers=workers, validation_share=0.0)
+    copies = recorded_copies(RecordingCuda()) if pinned else NO_COPIES
+    with monkeypatch.context() as patch:
+        _ = Pinning(patch) if pinned else None
+        with pytest.raises(InputError, match="not a JPEG") as caught:
+            take(60, config, copies=copies)
+    assert type(caught.value) is InputError
+    assert "tfrecord-00000-of-00002: record 0 at byte 0" in caught.value.where
+    assert caught.value.needed == "a JPEG image"
+    exclude = tuple(json.loads(caught.value.fix.split("data.exclude: ")[1]))
+    assert len(exclude) == 1
+    assert exclude[0] not in {name for name, _ in names(take(60, config.model_copy(update={"exclude": exclude})))}
+
+
+RUN_THAT_DIES = """
+import os, signal, sys
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.data.loader import training_loader
+if __name__ == "__main__":
+    config = DataConfig(path=sys.argv[1], frames=3, stride=2, workers=1, validation_share=0.0, test_share=0.0)
+    batches = training_loader(open_dataset(config), seed=0, batch_size=1)
+    next(batches)
+    if sys.argv[2] == "error":
+        raise RuntimeError("boom")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.parametrize("death", ["error", "kill"])
+def test_workers_end_with_the_run_however_it_ends(droid: Path, tmp_path: Path, death: str) -> None:
+    script = tmp_path / "run.py"
+    script.write_text(RUN_THAT_DIES)
+    with subprocess.Popen(
+        [sys.executable, "-W", "always", str(script), str(droid), death],
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    ) as run:
+        try:
+            _, said = run.communicate(timeout=120)  # waits until no process holds the pipe any more
+        except subprocess.TimeoutExpired:
+            os.killpg(run.pid, signal.SIGKILL)
+            pytest.fail("a worker outlives the run")
+    assert said.count("Traceback") == (death == "error")
+    if death == "error":
+        assert said.endswith("RuntimeError: boom\n")
+        assert "Warning" not in said
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_batches_for_a_device_are_pinned_by_the_loader(
+    droid: Path, monkeypatch: pytest.MonkeyPatch, workers: int
+) -> None:
+    expected = take(2, config_of(droid))
+    pinning, cuda = Pinning(monkeypatch), RecordingCuda()
+    with closing(
+        training_loader(
+            open_dataset(config_of(droid, workers=workers)), seed=1, batch_size=2, copies=recorded_copies(cuda)
+        )
+    ) as batches:
+        found = [next(batches), next(batches)]
+    assert_same(found, expected)
+    assert all(any(batch.frames is one for one in pinning.pinned) for batch in found)
+    assert all(any(batch.states is one for one in pinning.pinned) for batch in found)
+    assert cuda.calls.count("side 1: to device") == 2 * 3
+    assert "side 1: to pinned memory" not in cuda.calls, "that is the loader's work"
+    main = threading.current_thread().name
+    assert (main in pinning.threads) == (not workers), "beside the workers, a thread of its own does it"
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@pytest.mark.parametrize("workers", [0, 1])
+def test_batches_reach_a_cuda_device_as_they_are(droid: Path, workers: int) -> None:
+    dataset = open_dataset(config_of(droid, workers=workers))
+    copies = copies_for(torch.device("cuda"))
+    with closing(training_loader(dataset, seed=1, batch_size=2, copies=copies)) as batches:
+        found = [next(batches)]
+        batches.prefetch_next()
+        found.append(next(batches))
+    assert all(batch.frames.is_pinned() for batch in found)
+    there = [batch.on_device() for batch in found]
+    assert all(batch.frames.is_cuda for batch in there)
+    assert_same([batch.mapped(torch.Tensor.cpu) for batch in there], take(2, config_of(droid)))
+
+
+def test_frames_of_two_sizes_do_not_stack(droid: Path) -> None:
+    config = config_of(droid)
+    clip = clip_at(open_dataset(config), 0, 0)
+    other = replace(clip, frames=clip.frames[:, :20], episode_id="the other")
+    with pytest.raises(InputError, match=r"the other: frames of 20x65.*48x65") as caught:
+        collate([clip, other])
+    assert "broken_episodes" not in caught.value.fix, "that would not help"
+
+
+# Laws of the order, on episodes in memory: what is read can be counted.
+
+
+def first(dataset: Dataset, count: int, **knobs: Any) -> list[Batch]:
+    chosen = {"seed": 1, "batch_size": 2} | knobs
+    return list(itertools.islice(training_loader(dataset, **chosen), count))
+
+
+@pytest.mark.parametrize("world_size", [1, 3])
+@pytest.mark.parametrize("batch_size", [1, 4])
+def test_ranks_lose_no_window_and_see_none_twice_in_an_epoch(world_size: int, batch_size: int) -> None:
+    dataset = open_in_memory(MemorySource([9, 12, 7, 10]))
+    everything = {(f"episode {e}", s) for e, length in enumerate((9, 12, 7, 10)) for s in range(length - 4)}
+    steps = -(-2 * len(everything) // (world_size * batch_size))
+    ranks = [
+        first(dataset, steps, batch_size=batch_size, share=ProcessShare(rank, world_size)) for rank in range(world_size)
+    ]
+    assert {len(batch.starts) for rank in ranks for batch in rank} == {batch_size}
+    row = names([ranks[rank][step] for step in range(steps) for rank in range(world_size)])
+    for epoch in (row[: len(everything)], row[len(everything) : 2 * len(everything)]):
+        assert len(set(epoch)) == len(epoch)
+        assert set(epoch) == everything
+
+
+def test_resuming_reads_nothing_that_came_before() -> None:
+    lengths = [30] * 40
+    whole = names(first(open_in_memory(MemorySource(lengths)), 60))
+    source = MemorySource(lengths)
+    resumed = first(open_in_memory(source), 2, start_position=100)
+    assert names(resumed) == whole[100:104]
+    assert len(source.reads) == 4
+    assert len(source.decoded) == 4 * 3
+
+
+CAMERAS = ("exterior_1_left", "exterior_2_left", "wrist_left")
+
+
+def test_the_camera_is_drawn_per_clip_by_the_position_alone() -> None:
+    def cameras(start: int, count: int) -> list[str | None]:
+        source = MemorySource([30] * 10)
+        first(open_in_memory(source, camera=CAMERAS[:2]), count, batch_size=1, start_position=start)
+        return [camera for _, camera, _ in source.reads]
+
+    drawn = cameras(0, 200)
+    assert cameras(150, 50) == drawn[150:]
+    assert set(drawn) == set(CAMERAS[:2])
+    assert 70 < drawn.count(CAMERAS[0]) < 130
+
+
+def test_the_camera_of_a_validation_clip_stays() -> None:
+    def cameras() -> dict[tuple[str, int], int]:
+        dataset = open_in_memory(MemorySource([30] * 10), camera=CAMERAS, validation_share=0.5)
+        batches = list(validation_batches(dataset, "validation", clips=40, batch_size=1))
+        return dict(zip(names(batches), (int(batch.frames[0, 0, 0, 0, 2]) for batch in batches), strict=True))
+
+    assert cameras() == cameras()
+    assert len(set(cameras().values())) == 2  # the names of the exterior cameras are as long
+
+
+def test_training_clips_are_changed_by_their_position_and_validation_clips_never() -> None:
+    knobs = {"augment": {"crop_scale": (0.3, 1.0), "brightness": 0.4}, "validation_share": 0.5}
+    dataset = open_in_memory(MemorySource([30] * 10), **knobs)
+    whole = [one for batch in first(dataset, 20) for one in batch.augmentations]
+    resumed = [one for batch in first(dataset, 5, start_position=30) for one in batch.augmentations]
+    assert len(set(whole)) == 40
+    assert resumed == whole[30:]
+    validation = list(validation_batches(dataset, "validation", clips=4, batch_size=2))
+    assert all(batch.augmentations == () for batch in validation)
+    assert first(open_in_memory(MemorySource([30])), 1)[0].augmentations == ()
+
+
+@pytest.mark.parametrize("crop", ["released", "square", "letterbox"])
+def test_the_crop_is_the_configs(crop: str) -> None:
+    sizes = {"released": (4, 5), "square": (4, 4), "letterbox": (5, 5)}
+    assert first(open_in_memory(MemorySource([30]), crop=crop), 1)[0].frames.shape[2:4] == sizes[crop]
+
+
+# Poses of the camera.
+
+
+def test_poses_in_the_cameras_frame_lead_to_actions_in_it() -> None:
+    cameras = np.tile([0.3, -0.2, 0.5, 0.4, -0.3, 1.2], (30, 1))
+    source = MemorySource([30], extrinsics=lambda _: cameras)
+    in_base = clip_at(open_in_memory(source), 0, 3)
+    dataset = open_in_memory(source)
+    dataset = replace(dataset, config=dataset.config.model_copy(update={"pose_frame": "camera"}))
+    clip = clip_at(dataset, 0, 3)
+    expected = states_in_camera_frame(source.read(0).states[3:8:2], cameras[3:8:2])
+    np.testing.assert_allclose(clip.states, expected, atol=1e-6)
+    np.testing.assert_allclose(clip.actions, actions_from_states(expected), atol=1e-6)
+    assert not np.allclose(clip.actions, in_base.actions, atol=1e-3)
+    assert np.allclose(clip.extrinsics, cameras[:3])
+
+
+def test_a_camera_without_a_pose_cannot_be_the_frame() -> None:
+    dataset = open_in_memory(MemorySource([30]))
+    dataset = replace(dataset, config=dataset.config.model_copy(update={"pose_frame": "camera"}))
+    with pytest.raises(InputError, match=r"episode 0: no pose of the camera.*pose_frame: base.*data\.exclude"):
+        next(loader.batches_of(dataset, [(0, 0)], batch_size=1))
+
+
+def test_a_batch_has_camera_poses_if_all_its_clips_have() -> None:
+    def poses(index: int) -> np.ndarray | None:
+        return np.full((30, 6), 0.5) if index else None
+
+    dataset = open_in_memory(MemorySource([30, 30], extrinsics=poses))
+    without, with_poses = clip_at(dataset, 0, 0), clip_at(dataset, 1, 0)
+    assert collate([with_poses, with_poses]).extrinsics.shape == (2, 3, 6)
+    assert collate([with_poses, without]).extrinsics is None
+
+
+# Clips that cannot be read.
+
+
+def broken_set(broken: set[int], **knobs: Any) -> Dataset:
+    source = MemorySource([5] * 300, pictureless=frozenset(broken))
+    return open_in_memory(source, **({"broken_episodes": "skip"} | knobs))
+
+
+def test_a_clip_that_cannot_be_read_is_missing_and_no_other_takes_its_place(caplog: pytest.LogCaptureFixture) -> None:
+    whole = [names([batch]) for batch in first(broken_set(set()), 80, batch_size=4)]
+    broken = {f"episode {number}" for number in (3, 17)}
+    dataset = broken_set({3, 17})
+    found = first(dataset, 80, batch_size=4)
+    assert [names([batch]) for batch in found] == [[one for one in row if one[0] not in broken] for row in whole]
+    assert any(len(batch.starts) < 4 for batch in found)
+    assert set(dataset.broken.reasons) == broken
+    assert sum("A clip is left out" in record.getMessage() for record in caplog.records) == 2
+    assert "memory: pictures of episode 17: damaged." in caplog.text
+
+
+def test_a_batch_may_lose_all_its_clips() -> None:
+    found = first(broken_set({3, 17}), 300, batch_size=1)
+    empty = [batch for batch in found if not batch.starts]
+    assert empty
+    assert empty[0].frames.shape[:2] == (0, 3)
+    assert empty[0].actions.shape == (0, 2, 7)
+
+
+def test_the_default_is_to_stop_at_a_clip_that_cannot_be_read() -> None:
+    with pytest.raises(InputError, match=r"pictures of episode \d+: damaged\..*broken_episodes: skip, or add to"):
+        first(broken_set(set(range(300)), broken_episodes="error"), 1)
+
+
+def test_a_network_that_is_away_is_no_broken_episode() -> None:
+    source = MemorySource(
+        [30] * 300, unreadable=frozenset(range(300)), fault=lambda where: UnreachableError(where=where, found="503")
+    )
+    with pytest.raises(UnreachableError) as caught:
+        first(open_in_memory(source, broken_episodes="skip"), 1)
+    assert "data.exclude" not in str(caught.value)
+
+
+def test_a_validation_of_nothing_but_broken_clips_is_refused() -> None:
+    dataset = broken_set({0}, validation_share=0.5)
+    windows = dataset.windows("validation")
+    nothing = broken_set(set(windows.episodes.tolist()), validation_share=0.5)
+    with pytest.raises(InputError, match=r"none of the clips can be read; broken episodes: episode \d+"):
+        list(validation_batches(nothing, "validation", clips=1, batch_size=1))
+
+
+def test_with_every_knob_on_neither_workers_nor_resuming_change_a_bit(
+    spoiled: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def spoil(features: dict[str, tuple[Any, Any]]) -> None:
+        features["steps/observation/exterior_image_1_left"][1][3] = b"GIF89a"
+
+    monkeypatch.setattr("vjepa2_ac.data.selection.MOST_BROKEN", 0.2)
+    config = config_of(
+        spoiled(spoil), validation_share=0.0, broken_episodes="skip", camera=CAMERAS, crop="letterbox",
+        idle={"rule": "motion", "shortest_kept_steps": 2, "cut_last_steps": 6},
+        augment={"crop_scale": (0.3, 1.0), "brightness": 0.4},
+    )  # fmt: skip
+    alone = take(40, config)
+    assert sum(len(batch.starts) for batch in alone) < 80
+    for found, start in (
+        (take(40, config.model_copy(update={"workers": 2})), 0),
+        (take(10, config, start_position=60), 30),
+        (take(10, config.model_copy(update={"workers": 1}), start_position=60), 30),
+    ):
+        assert_same(found, alone[start : start + len(found)])
+        assert [one.augmentations for one in found] == [one.augmentations for one in alone[start : start + len(found)]]
+
+
+def test_clips_of_a_set_that_lies_elsewhere_are_read_several_at_once() -> None:
+    meeting = threading.Barrier(4, timeout=120)
+
+    class Slow(MemorySource):
+        def read(self, *arguments: Any) -> Episode:
+            meeting.wait()  # nobody gets on before four are here
+            return super().read(*arguments)
+
+    dataset = open_in_memory(Slow([30] * 10))
+    expected = names(first(open_in_memory(MemorySource([30] * 10)), 3, batch_size=4))
+    remote = replace(dataset, config=dataset.config.model_copy(update={"path": "gs://bucket/set"}))
+    assert names(first(remote, 3, batch_size=4)) == expected
+
+
+def test_bytes_that_were_fetched_are_told_with_the_batch(monkeypatch: pytest.MonkeyPatch) -> None:
+    dataset = open_in_memory(source := MemorySource([30] * 10))
+    monkeypatch.setattr(loader.storage, "bytes_fetched", lambda: 1000 * len(source.reads))
+    assert [batch.bytes_fetched for batch in first(dataset, 3, batch_size=2)] == [2000, 2000, 2000]
+
+
+def test_many_validation_clips_are_read_by_workers_and_are_the_same(
+    droid: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def chosen(workers: int) -> list[Batch]:
+        dataset = open_dataset(config_of(droid, validation_share=0.6, workers=workers))
+        return list(validation_batches(dataset, "validation", clips=30, batch_size=4))
+
+    alone = chosen(0)
+    monkeypatch.setattr(loader, "CLIPS_WORTH_WORKERS", 1)
+    assert_same(chosen(1), alone)

@@ -1,0 +1,246 @@
+"""Splits, windows and order: pure functions of identities, lengths, seed and position."""
+
+import itertools
+import json
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from clips import open_in_memory, split_of
+from memory_source import MemorySource
+from paths import GOLDEN, ROOT
+from vjepa2_ac.config.data import DataConfig, Split
+from vjepa2_ac.config.loading import load_config
+from vjepa2_ac.data.index.episode_table import EpisodeTable
+from vjepa2_ac.data.selection import StepSelection, included
+from vjepa2_ac.data.windows import ClipOrder, Windows, clip_starts, far_neighbours, in_split, permuted, spread
+from vjepa2_ac.data.windows import windows_of as windows_of_starts
+from vjepa2_ac.episode import EpisodeInfo
+from vjepa2_ac.errors import InputError
+
+
+def settings_of(**knobs: Any) -> DataConfig:
+    return DataConfig(path="nowhere", **({"frames": 4, "stride": 3} | knobs))
+
+
+def episodes(*lengths: int) -> list[EpisodeInfo]:
+    return [EpisodeInfo(id=f"episode {number}", num_steps=length) for number, length in enumerate(lengths)]
+
+
+def windows_of(infos: list[EpisodeInfo], config: DataConfig, split: Split) -> Windows:
+    """Return the windows of episodes of which every step is kept."""
+    table = EpisodeTable.of(infos)
+    taking_part = included(table, config)
+    starts = clip_starts(table, StepSelection.whole(table, taking_part), config)
+    members = taking_part & in_split(table.id_hash, config, split)
+    return windows_of_starts(table, members, starts, config, split)
+
+
+ALL_TRAIN = {"validation_share": 0.0, "test_share": 0.0}
+
+
+@settings(max_examples=60)
+@given(size=st.integers(1, 300), seed=st.integers(0, 2**31), epoch=st.integers(0, 1000))
+def test_a_permutation_hits_every_index_once(size: int, seed: int, epoch: int) -> None:
+    assert sorted(permuted(index, size=size, seed=seed, epoch=epoch) for index in range(size)) == list(range(size))
+
+
+def test_seeds_and_epochs_have_orders_of_their_own() -> None:
+    orders = {
+        tuple(permuted(index, size=20, seed=seed, epoch=epoch) for index in range(20))
+        for seed in range(5)
+        for epoch in range(5)
+    }
+    assert len(orders) == 25
+
+
+def test_neighbours_do_not_stay_together() -> None:
+    places = np.array([permuted(index, size=4_000, seed=0, epoch=0) for index in range(4_000)])
+    assert abs(np.corrcoef(places[:-1], places[1:])[0, 1]) < 0.05
+    assert abs(np.corrcoef(np.arange(4_000), places)[0, 1]) < 0.05
+
+
+def test_an_epoch_sees_every_window_once() -> None:
+    windows = windows_of(episodes(10, 25, 12, 13), settings_of(**ALL_TRAIN), "train")
+    order = ClipOrder(windows, seed=3)
+    everything = sorted(
+        (episode, start) for episode, length in enumerate((10, 25, 12, 13)) for start in range(length - 9)
+    )
+    first, second = ([order.window(epoch * len(windows) + index) for index in range(len(windows))] for epoch in (0, 1))
+    assert sorted(first) == sorted(second) == everything
+    assert first != second
+
+
+def test_a_window_beyond_the_last_is_refused() -> None:
+    windows = windows_of(episodes(10), settings_of(**ALL_TRAIN), "train")
+    for index in (-1, 1):
+        with pytest.raises(IndexError):
+            windows[index]
+    with pytest.raises(ValueError, match="index 5 of 5"):
+        permuted(5, size=5, seed=0, epoch=0)
+
+
+def test_order_and_split_do_not_depend_on_the_order_of_the_episodes() -> None:
+    infos = [EpisodeInfo(id=f"episode {number}", num_steps=10 + number % 7) for number in range(60)]
+    shuffled = [infos[number] for number in np.random.default_rng(0).permutation(60)]
+    config = settings_of(validation_share=0.2, test_share=0.2)
+    for split in ("train", "validation", "test"):
+        named = []
+        for order in (infos, shuffled):
+            clips = ClipOrder(windows_of(order, config, split), seed=1)
+            named.append([(order[episode].id, start) for episode, start in map(clips.window, range(30))])
+        assert named[0] == named[1]
+
+
+def test_shares_are_kept_and_growing_one_moves_few_episodes() -> None:
+    names = [f"lab/{number}" for number in range(4_000)]
+    counts = Counter(split_of(name, settings_of(validation_share=0.1, test_share=0.05)) for name in names)
+    assert abs(counts["validation"] / 4_000 - 0.10) < 0.02
+    assert abs(counts["test"] / 4_000 - 0.05) < 0.015
+    for name in names[:500]:
+        before = split_of(name, settings_of(validation_share=0.1, test_share=0.05))
+        after = split_of(name, settings_of(validation_share=0.2, test_share=0.05))
+        assert before == after or (before, after) == ("train", "validation")
+
+
+def test_the_split_never_changes_between_versions() -> None:
+    config = settings_of(validation_share=0.3, test_share=0.3)
+    assert [split_of(f"episode {number}", config) for number in range(8)] == [
+        "validation",
+        "train",
+        "test",
+        "train",
+        "train",
+        "train",
+        "validation",
+        "train",
+    ]
+
+
+def test_the_order_never_changes_between_versions() -> None:
+    assert [permuted(index, size=11, seed=7, epoch=2) for index in range(11)] == [7, 9, 1, 10, 3, 6, 8, 2, 0, 5, 4]
+
+
+def test_the_demo_sees_the_clips_it_always_saw() -> None:
+    golden = json.loads((GOLDEN / "demo_clip_order.json").read_text())
+    infos = [EpisodeInfo(f"{folder}/recordings/MP4--{folder}/trajectory.h5", 41) for folder in golden["folders"]]
+    config = load_config(ROOT / "configs/demo.yaml", []).data
+    for split, count in golden["windows"].items():
+        windows = windows_of(infos, config, split)
+        assert len(windows) == count
+        if split == "train":
+            order = ClipOrder(windows, seed=0)
+            assert {place: list(order.window(int(place))) for place in golden["train"]} == golden["train"]
+        else:
+            assert [list(windows[index]) for index in far_neighbours(spread(count, 40))] == golden[split]
+
+
+def test_short_episodes_are_left_out_counted_and_named(caplog: pytest.LogCaptureFixture) -> None:
+    windows = windows_of(episodes(9, 10, 3), settings_of(**ALL_TRAIN), "train")
+    assert windows.short == (0, 2)
+    assert windows.episodes.tolist() == [1]
+    assert "2 of 3 train episodes are shorter than a clip of 10 control steps" in caplog.text
+    assert "episode 2" in caplog.text
+
+
+def test_short_episodes_stop_the_run_when_told_to() -> None:
+    config = settings_of(short_episodes="error", **ALL_TRAIN)
+    with pytest.raises(InputError, match=r"2 of 3 train episodes.*episode 0, has 9 steps.*needed: 10 steps.*skip"):
+        windows_of(episodes(9, 10, 3), config, "train")
+
+
+def test_nothing_but_short_episodes_stops_the_run() -> None:
+    with pytest.raises(InputError, match=r"2 of 2 train episodes.*Lower data\.frames or data\.stride\.$"):
+        windows_of(episodes(9, 3), settings_of(**ALL_TRAIN), "train")
+
+
+@settings(max_examples=50)
+@given(size=st.integers(1, 500), count=st.integers(1, 100))
+def test_what_is_spread_is_distinct_and_even(size: int, count: int) -> None:
+    chosen = spread(size, count)
+    assert len(chosen) == len(set(chosen)) == min(size, count)
+    gaps = np.diff([-size / len(chosen) / 2, *chosen])
+    assert 0 <= min(chosen) <= max(chosen) < size
+    assert abs(gaps - size / len(chosen)).max() <= 1
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 8, 31])
+def test_far_neighbours_are_all_there_and_lie_half_the_list_apart(count: int) -> None:
+    order = far_neighbours(list(range(count)))
+    assert sorted(order) == list(range(count))
+    for one, other in itertools.pairwise(order):
+        assert abs(one - other) >= count // 2 - 1
+
+
+SPLITS: tuple[Split, ...] = ("train", "validation", "test")
+HASHES = st.lists(st.integers(0, 1023), min_size=1, max_size=40, unique=True)  # in 1/1024
+
+
+def counts(hashes: list[int], **shares: float) -> dict[str, int]:
+    config = DataConfig(path="nowhere", **shares)
+    return {split: int(in_split(np.array(hashes, np.uint64), config, split).sum()) for split in SPLITS}
+
+
+@given(numbers=HASHES, validation=st.floats(0, 0.4), test=st.floats(0, 0.4))
+def test_each_episode_is_in_one_split_and_none_that_has_a_share_is_empty(
+    numbers: list[int], validation: float, test: float
+) -> None:
+    found = counts([number * 2**54 for number in numbers], validation_share=validation, test_share=test)
+    assert sum(found.values()) == len(numbers)
+    if len(numbers) >= 20:
+        assert (found["validation"] > 0) == (validation > 0) or found["train"] < 2
+        assert found["test"] > 0 or test == 0
+
+
+def test_those_whose_number_comes_next_move_and_nobody_else() -> None:
+    hashes = [int(share * 2**64) for share in (0.9, 0.5, 0.3, 0.7)]
+    config = DataConfig(path="nowhere", validation_share=0.05, test_share=0.05)
+    assert in_split(np.array(hashes, np.uint64), config, "test").tolist() == [False, False, True, False]
+    assert in_split(np.array(hashes, np.uint64), config, "validation").tolist() == [False, True, False, False]
+
+
+def test_a_group_moves_as_a_whole() -> None:
+    hashes = [int(share * 2**64) for share in (0.3, 0.3, 0.5, 0.5, 0.9)]
+    assert counts(hashes) == {"train": 1, "validation": 2, "test": 2}
+
+
+def splits_of(source: MemorySource, **knobs: object) -> dict[str, Split]:
+    """Return the split of every episode that takes part."""
+    dataset = open_in_memory(source, **({"validation_share": 0.02, "test_share": 0.02} | knobs))
+    return {
+        dataset.table.identity(int(place)): split
+        for split in SPLITS
+        for place in np.flatnonzero(dataset.members(split))
+    }
+
+
+@pytest.mark.parametrize("split_by", [None, r"episode (\d)"])
+@pytest.mark.parametrize("left_out", [0, 2, 6, 7])
+def test_leaving_an_episode_out_moves_no_other(
+    monkeypatch: pytest.MonkeyPatch, left_out: int, split_by: str | None
+) -> None:
+    """Neither `data.exclude` nor an episode that breaks: what a run has trained on stays out of its validation."""
+    knobs = {"split_by": split_by, "idle": {"rule": "motion"}, "broken_episodes": "skip"}
+    before = splits_of(MemorySource([60] * 8), **knobs)
+    assert set(before.values()) == set(SPLITS)
+    without = {name: split for name, split in before.items() if name != f"episode {left_out}"}
+    excluded = {"exclude": (f"episode {left_out}",)}
+    assert splits_of(MemorySource([60] * 8), **knobs, **excluded) == without
+    monkeypatch.setattr("vjepa2_ac.data.selection.MOST_BROKEN", 0.2)
+    assert splits_of(MemorySource([61 + left_out] * 8, unreadable=frozenset({left_out})), **knobs) == without
+
+
+def test_of_the_outcomes_only_the_chosen_one_is_split() -> None:
+    source = MemorySource([60] * 12, [number % 2 == 0 for number in range(12)])
+    found = splits_of(source, outcome="success")
+    assert sorted(found.values()).count("train") == 4
+    assert set(found.values()) == set(SPLITS)
+
+
+def test_one_or_two_episodes_and_shares_of_zero_stay_as_the_hash_says() -> None:
+    assert counts([2**63, 2**63 + 2**60]) == {"train": 2, "validation": 0, "test": 0}
+    assert counts([2**63] * 9, validation_share=0.0, test_share=0.0) == {"train": 9, "validation": 0, "test": 0}

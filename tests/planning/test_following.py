@@ -1,0 +1,217 @@
+"""A controller that follows goals: which one applies, what the gripper may do, and when it is done."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from decisions import QUICK, STATE, asked, image
+from paths import ROOT
+from tiny_models import tiny_model
+from vjepa2_ac.config.planning import GoalsConfig, LimitsConfig
+from vjepa2_ac.episode import Widths
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.planning.decision import PlanRequest, decide, plan_as_dict
+from vjepa2_ac.planning.goal_folder import write_goals
+from vjepa2_ac.planning.goals import GripperMode, SubGoal
+from vjepa2_ac.spaces import Spaces
+
+
+def controller(**changes: object) -> Controller:
+    return Controller(tiny_model(), QUICK.model_copy(update={"horizon": 1, "iterations": 2, **changes}), seed=3)
+
+
+def noisy(seed: int, most: int = 6) -> np.ndarray:
+    """Return an image as a camera with noise sees it."""
+    noise = np.random.default_rng(99).integers(-most, most + 1, (60, 48, 3))
+    return (image(seed) + noise).clip(0, 255).astype(np.uint8)
+
+
+def decided(run: Controller, seen: np.ndarray) -> tuple[int, int, bool, bool]:
+    """Return which goal applies, since when, whether it changed, and whether all is done."""
+    run.act(seen, STATE)
+    assert run.decision is not None
+    return run.decision.goal, run.decision.since, bool(run.decision.changed), run.decision.done
+
+
+def test_the_next_goal_follows_once_an_image_is_near_the_present_one() -> None:
+    run = controller()
+    run.follow([SubGoal(image(100), at_least=2, at_most=6, share=0.5), SubGoal(image(101))])
+    assert decided(run, image(0)) == (0, 0, False, False)
+    assert decided(run, noisy(100)) == (0, 0, False, False), "not before its time"
+    assert decided(run, image(1)) == (0, 0, False, False)
+    assert decided(run, noisy(100)) == (1, 3, True, False)
+    assert decided(run, image(2)) == (1, 3, False, False)
+    assert run.decision is not None
+    assert run.decision.began == pytest.approx(begun(run, noisy(100), 101), rel=1e-5)
+
+
+def begun(run: Controller, seen: np.ndarray, goal: int) -> float:
+    return float((run.encoded(seen) - run.encoded(image(goal))).abs().mean())
+
+
+def test_a_noisy_image_of_the_goal_ends_it_and_what_is_done_stays_done() -> None:
+    run = controller(goals=GoalsConfig(stop_share=0.5))
+    run.reset(image(100))
+    assert decided(run, image(0)) == (0, 0, False, False)
+    assert not run.act(noisy(100), STATE).any()
+    assert run.decision is not None
+    assert (run.decision.why, run.decision.done, run.decision.plan) == ("at the goal", True, None)
+    assert "below 50%" in run.decision.changed
+    assert not run.act(image(1), STATE).any(), "only a reset begins again"
+    run.reset(image(100))
+    assert run.act(image(1), STATE).any()
+    plain = controller()
+    plain.reset(image(100))
+    plain.act(image(0), STATE)
+    assert plain.act(noisy(100), STATE).any(), "without the rule, only an equal image is the goal"
+
+
+def test_an_equal_image_is_the_goal_without_any_rule() -> None:
+    run = controller()
+    run.reset(image(100), image(101), durations=(1,))
+    assert decided(run, image(100)) == (0, 0, False, False), "not the last goal"
+    assert decided(run, image(101)) == (1, 1, True, True)
+
+
+def test_a_mask_decides_which_energies_count() -> None:
+    mask = np.zeros((60, 48), bool)
+    mask[:, :16] = True
+    seen = image(0)
+    seen[:, :24] = image(100)[:, :24]  # near the goal where it counts
+    found = []
+    for counted in (None, mask):
+        run = controller()
+        run.follow([SubGoal(image(100), at_most=9, share=0.3), SubGoal(image(101))], mask=counted)
+        run.act(image(0), STATE)
+        found.append(decided(run, seen)[0])
+    assert found == [0, 1]
+
+
+def test_each_goal_has_its_own_gripper_mode() -> None:
+    run = controller(gripper_start_std=2.0)
+    modes: list[GripperMode] = ["close", "held", "open"]
+    run.follow([*(SubGoal(image(100 + n), at_most=1, gripper=mode) for n, mode in enumerate(modes)), SubGoal(image(9))])
+    found = [run.act(image(seed), STATE)[6] for seed in range(4)]
+    assert found[:3] == [1.0, 0.0, -1.0]
+    assert run.space.gripper_rounding == QUICK.limits.gripper_rounding
+    assert float(run.space.upper[0, 6]) == pytest.approx(0.75)
+
+
+def test_the_progress_of_a_search_is_reported_for_every_gripper_mode() -> None:
+    run, called = controller(), []
+    run.planner.progress = lambda done, _: called.append(done)
+    run.follow([SubGoal(image(100), at_most=1, gripper="held"), SubGoal(image(101))])
+    for seed in range(2):
+        run.act(image(seed), STATE)
+    assert called == [0, 12, 24, 0, 12, 24]
+
+
+def test_fixed_durations_are_a_special_case_of_goals_with_rules() -> None:
+    found = []
+    for horizon in (1, 3):
+        for way in ("durations", "rules"):
+            run = controller(horizon=horizon)
+            if way == "durations":
+                run.reset(image(100), image(101), image(102), durations=(2, 1))
+            else:
+                timed = [SubGoal(image(100), at_least=2, at_most=2), SubGoal(image(101), at_least=1, at_most=1)]
+                run.follow([*timed, SubGoal(image(102))])
+            actions = [run.act(image(seed), STATE) for seed in range(5)]
+            found.append(np.stack(actions))
+        np.testing.assert_array_equal(found[-1], found[-2])
+
+
+def test_a_plan_looks_ahead_to_what_follows_at_the_latest() -> None:
+    run = controller(horizon=6)
+    bounded, unbounded = SubGoal(image(100), at_most=2, share=0.01), SubGoal(image(101), share=0.01)
+    run.follow([bounded, unbounded, SubGoal(image(102), at_most=1), SubGoal(image(103))])
+    found = []
+    for seed in range(3):
+        run.act(image(seed), STATE)
+        assert run.decision is not None
+        found.append(run.decision.goals)
+    assert found == [(0, 0, 1, 1, 1, 1), (0, 1, 1, 1, 1, 1), (1,) * 6], "nobody knows when the second one ends"
+
+
+def test_a_share_in_the_config_stands_for_that_of_every_goal_but_the_last() -> None:
+    run = controller(goals=GoalsConfig(share=0.5))
+    run.follow([SubGoal(image(100), at_most=9), SubGoal(image(101))])
+    run.act(image(0), STATE)
+    assert decided(run, noisy(100)) == (1, 1, True, False)
+
+
+@pytest.mark.parametrize(
+    ("goals", "wrong"),
+    [
+        ([SubGoal(image(100)), SubGoal(image(101))], r"goal 0: a goal that would never end"),
+        ([SubGoal(image(100), at_most=3)], r"goal 0: at_most 3 of the last goal"),
+        ([SubGoal(image(100), share=0.5), SubGoal(image(101)[:30])], r"goal 1: 48 x 30 pixels"),
+        ([SubGoal(image(100).astype(float))], r"goal 0: .*float64"),
+    ],
+)  # fmt: skip
+def test_goals_that_cannot_be_followed_are_refused_and_change_nothing(goals: list[SubGoal], wrong: str) -> None:
+    run = controller()
+    run.follow([SubGoal(image(100))])
+    run.act(image(0), STATE)
+    before = run.decision
+    with pytest.raises(InputError, match=wrong):
+        run.follow(goals)
+    assert run.decision is before
+    assert decided(run, image(1)) == (0, 0, False, False)
+    with pytest.raises(ValueError, match="no goal"):
+        run.follow([])
+
+
+@pytest.mark.parametrize(
+    ("numbers", "wrong"),
+    [
+        ({"at_least": 0}, "at least 0"), ({"at_least": 3, "at_most": 2}, "at most 2"), ({"share": 0.0}, "share 0.0"),
+        ({"share": 1.0}, "share 1.0"), ({"share": float("nan")}, "share nan"), ({"floor": -1.0}, "noise floor"),
+    ],
+)  # fmt: skip
+def test_numbers_that_contradict_each_other_are_refused(numbers: dict, wrong: str) -> None:
+    with pytest.raises(InputError, match=rf"goal 'grasp': .*{wrong}"):
+        SubGoal(image(0), "grasp", **numbers)
+
+
+def test_the_pages_example_runs(tmp_path: Path) -> None:
+    examples = re.findall(r"```py\n(.*?)```", (ROOT / "docs/planning.md").read_text(), flags=re.DOTALL)
+    (example,) = (one for one in examples if "read_goals" in one)
+    write_goals(tmp_path, [SubGoal(image(100), "grasped", at_most=3), SubGoal(image(101))])
+    run = controller()
+    exec(  # noqa: S102 - our own page
+        example.replace("goals/pick", str(tmp_path)), {"controller": run, "grasped": image(100), "placed": image(101)}
+    )
+    assert decided(run, image(0)) == (0, 0, False, False)
+    assert decided(run, image(100)) == (1, 1, True, False), "by the share that the example gives"
+
+
+def test_a_gripper_mode_needs_a_gripper_and_something_to_plan() -> None:
+    sizes = tiny_model(states=False).sizes
+    predictor = sizes.predictor.model_copy(update={"action_dim": 8})
+    model = WorldModel.random(sizes.model_copy(update={"predictor": predictor}), seed=0)
+    config = QUICK.model_copy(update={"limits": LimitsConfig(axes=(0.1,))})
+    run = Controller(model, config, spaces=Spaces.of_vectors(Widths(8, 8), "difference"))
+    with pytest.raises(InputError, match=r"'held' of a goal: .*vectors"):
+        run.follow([SubGoal(image(100), gripper="held")])
+    held = controller(limits=LimitsConfig(xyz=(0.0, 0.0, 0.0)))
+    with pytest.raises(InputError, match="'held' of a goal: nothing that is left to plan"):
+        held.follow([SubGoal(image(100), gripper="held")])
+
+
+def test_a_request_of_goals_with_rules_says_in_its_file_which_applies() -> None:
+    goals = [SubGoal(image(100), "grasp", at_most=4, share=0.4, gripper="held"), SubGoal(image(101))]
+    found = decide(controller(), PlanRequest.of_sub_goals(image(0), STATE, goals))
+    assert not found.actions[:, 6].any()
+    written = plan_as_dict(found, {})
+    assert written["sub_goals"][0] == {
+        "name": "grasp", "at_least": 1, "at_most": 4, "share": 0.4, "gripper": "held", "floor": 0.0,
+    }  # fmt: skip
+    assert (written["since"], written["changed"], written["done"]) == (0, "", False)
+    assert written["energy"]["began"] == pytest.approx(written["energy"]["now"], rel=1e-6)
+    plain = plan_as_dict(asked(), {})
+    assert (plain["sub_goals"], plain["done"]) == ([], False)

@@ -1,0 +1,121 @@
+"""A folder of goals: what is written is read again, and what is broken is refused by name."""
+
+import json
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from decisions import image
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.media.image_file import encode_png
+from vjepa2_ac.planning.goal_folder import GOALS_FILE, NoiseFloor, read_goal_folder, read_goals, write_goals
+from vjepa2_ac.planning.goals import SubGoal
+
+NOISE = NoiseFloor(0.08, 12, "a" * 64, "l1")
+GOALS = (
+    SubGoal(image(1), "before closing", 2, 8, 0.5, "held"),
+    SubGoal(image(2), "closed", 1, 4, None, "close"),
+    SubGoal(image(3), "end", 1, None, 0.4),
+)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    write_goals(tmp_path / "goals", GOALS, frames=(8, 12, 30), began=(0.3, 0.1, 0.4), noise=NOISE, origin={"by": "me"})
+    return tmp_path / "goals"
+
+
+def settings(goal: SubGoal) -> tuple:
+    return goal.name, goal.at_least, goal.at_most, goal.share, goal.gripper, goal.floor
+
+
+def test_what_is_written_is_read_again(folder: Path) -> None:
+    found = read_goal_folder(folder)
+    assert [settings(goal) for goal in found.goals] == [settings(goal) for goal in GOALS]
+    for goal, written in zip(found.goals, GOALS, strict=True):
+        np.testing.assert_array_equal(goal.image, written.image)
+    assert (found.frames, found.began, found.noise) == ((8, 12, 30), (0.3, 0.1, 0.4), NOISE)
+    assert found.origin == {"by": "me"}
+    assert len(read_goals(folder)) == 3
+    assert sorted(path.name for path in folder.iterdir()) == ["goal_1.png", "goal_2.png", "goal_3.png", GOALS_FILE]
+
+
+def test_a_folder_written_by_hand_needs_no_more_than_files(tmp_path: Path) -> None:
+    for name in ("grasped.png", "placed.png"):
+        (tmp_path / name).write_bytes(encode_png(image(1)))
+    written = {"format": 1, "goals": [{"file": "grasped.png", "at_most": 4, "at_least": 4}, {"file": "placed.png"}]}
+    (tmp_path / GOALS_FILE).write_text(json.dumps(written))
+    first, last = read_goals(tmp_path)
+    assert settings(first) == ("", 4, 4, None, None, 0.0)
+    assert settings(last) == ("", 1, None, None, None, 0.0)
+    assert len(read_goal_folder(tmp_path).for_model("b", "l1")) == 2
+
+
+def test_thresholds_are_kept_above_the_noise_of_the_same_encoder_only(
+    folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    found = read_goal_folder(folder)
+    with caplog.at_level(logging.WARNING):
+        assert [goal.floor for goal in found.for_model("a" * 64, "l1")] == [0.08] * 3
+        assert not caplog.records, "half of 0.3 is above 0.08"
+        for encoder, distance in (("b" * 64, "l1"), ("a" * 64, "l2")):
+            assert [goal.floor for goal in found.for_model(encoder, distance)] == [0.0] * 3
+            assert "does not guard their thresholds" in caplog.messages.pop()
+            caplog.clear()
+        edit(folder, lambda goals: goals[0].update(share=0.2))
+        assert read_goal_folder(folder).for_model("a" * 64, "l1")[0].floor == 0.08
+        expected = "goal 1: 20% of energy 0.3 is below the noise of a resting arm, 0.08: that is its threshold"
+        assert caplog.messages == [expected]
+
+
+def edit(folder: Path, change: Any, key: str | None = "goals") -> None:
+    path = folder / GOALS_FILE
+    content = json.loads(path.read_text())
+    change(content if key is None else content[key])
+    path.write_text(json.dumps(content))
+
+
+def first(**changes: object) -> Any:
+    return lambda goals: goals[0].update(changes)
+
+
+@pytest.mark.parametrize(
+    ("change", "wrong"),
+    [
+        (first(file="none.png"), "none.png: "), (first(file=3), r"goals\.0\.file"), (first(at_least=9), "at least 9"),
+        (first(share=1.5), "share"), (first(gripper="shut"), "gripper"), (first(more=1), r"goals\.0\.more"),
+        (lambda goals: goals.clear(), "goals: List should have at least 1"),
+        (lambda goals: goals.append(3), r"goals\.3"),
+    ],
+)  # fmt: skip
+def test_a_broken_goal_is_refused_by_name(change: Any, wrong: str, folder: Path) -> None:
+    edit(folder, change)
+    with pytest.raises(InputError, match=wrong):
+        read_goals(folder)
+
+
+@pytest.mark.parametrize("text", ["[]", "{", '{"goals": []}', '{"format": 2, "goals": []}', '{"format": 1}'])
+def test_a_file_that_says_something_else_is_refused(text: str, folder: Path) -> None:
+    (folder / GOALS_FILE).write_text(text)
+    with pytest.raises(InputError, match=r"goals\.json: "):
+        read_goals(folder)
+
+
+def test_images_that_are_none_or_of_another_size_are_refused(folder: Path) -> None:
+    (folder / "goal_2.png").write_bytes(encode_png(image(2)[:40]))
+    with pytest.raises(InputError, match=r"goal_2\.png: 48 x 40 pixels"):
+        read_goals(folder)
+    (folder / "goal_2.png").write_bytes(b"GIF89a")
+    with pytest.raises(InputError, match=r"goal_2\.png: 6 bytes that are no image"):
+        read_goals(folder)
+
+
+def test_a_folder_without_goals_says_what_makes_one(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"goals\.json: cannot be read.*`vjepa2-ac goals` writes"):
+        read_goals(tmp_path)
+    with pytest.raises(ValueError, match="no goals"):
+        write_goals(tmp_path / "new", [])
+    assert not (tmp_path / "new").exists()

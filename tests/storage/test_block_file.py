@@ -1,0 +1,255 @@
+"""The block file: reads like a file, fetches little more than is read, and that once per machine, up to a limit."""
+
+import errno
+import io
+import logging
+import os
+import pickle
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gcs import Gcs
+from run_fixtures import Popen
+from vjepa2_ac import storage
+from vjepa2_ac.storage import block_file
+from vjepa2_ac.storage.block_file import BLOCK_BYTES, BlockCachedFile, DiskCache, RangedFile
+
+MB = 1 << 20
+DATA = bytes(i * 7 % 251 for i in range(3000))
+
+
+class Served:
+    """Bytes that count what is fetched of them."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data, self.fetches = data, []
+        self.file = RangedFile(self.fetch, len(data))
+
+    def fetch(self, start: int, length: int) -> bytes:
+        assert 0 <= start < start + length <= len(self.data)
+        self.fetches.append((start, length))
+        return self.data[start : start + length]
+
+    @property
+    def bytes(self) -> int:
+        return sum(length for _, length in self.fetches)
+
+
+STEPS = st.lists(
+    st.tuples(st.sampled_from(["set", "end", "read", "readinto"]), st.integers(-1, 3500)), min_size=1, max_size=40
+)
+
+
+@settings(max_examples=150)
+@given(size=st.integers(0, 3000), steps=STEPS)
+def test_reading_and_seeking_equal_those_of_a_file_in_memory(size: int, steps: list[tuple[str, int]]) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(block_file, "BLOCK_BYTES", 64)
+        patch.setattr(block_file, "_CACHED_BLOCKS", 8)
+        data = DATA[:size]
+        ours, theirs = Served(data).file, io.BytesIO(data)
+        for kind, number in steps:
+            if kind == "set":
+                assert ours.seek(max(number, 0)) == theirs.seek(max(number, 0))
+            elif kind == "end":
+                assert ours.seek(-min(number, size), os.SEEK_END) == theirs.seek(-min(number, size), os.SEEK_END)
+            elif kind == "read":
+                assert ours.read(number) == theirs.read(number)
+            else:
+                mine, its = bytearray(max(number, 0)), bytearray(max(number, 0))
+                assert ours.readinto(mine) == theirs.readinto(its)
+                assert mine == its
+            assert ours.tell() == theirs.tell()
+
+
+def test_a_jump_costs_a_block_and_what_is_at_hand_nothing() -> None:
+    served = Served(bytes(100 * MB))
+    served.file.read(32)
+    served.file.seek(-50_000, os.SEEK_END)
+    served.file.read(50_000)
+    served.file.seek(50 * MB)
+    served.file.read(40_000)
+    assert served.bytes <= 5 * 128 * 1024
+    before = len(served.fetches)
+    served.file.seek(5)
+    served.file.read(32)
+    assert len(served.fetches) == before
+
+
+def test_reading_on_takes_fewer_and_fewer_fetches_and_a_long_read_one() -> None:
+    served = Served(bytes(64 * MB))
+    while served.file.read(32 * 1024):
+        pass
+    assert len(served.fetches) <= 24
+    assert served.bytes == 64 * MB
+    served = Served(bytes(64 * MB))
+    served.file.seek(10 * MB + 5)
+    assert len(served.file.read(7 * MB)) == 7 * MB
+    assert len(served.fetches) == 1
+    assert served.bytes <= 7 * MB + 2 * 128 * 1024
+
+
+def test_a_file_that_was_closed_is_not_read() -> None:
+    served = Served(b"123")
+    with served.file as file:
+        assert (file.readable(), file.seekable(), file.read(1)) == (True, True, b"1")
+    with pytest.raises(ValueError, match="closed"):
+        served.file.read(1)
+    with pytest.raises(ValueError, match="negative"):
+        Served(b"123").file.seek(-1)
+
+
+def test_a_block_is_fetched_once_per_machine_and_not_used_for_another_version(gcs: Gcs, tmp_path: Path) -> None:
+    data = os.urandom(5 * BLOCK_BYTES + 77)
+    url, cache = gcs.put("bucket/file", data), DiskCache(tmp_path, 10 * MB)
+
+    def opened(version: str = "1") -> BlockCachedFile:
+        return BlockCachedFile(url, version=version, size=len(data), cache=cache)
+
+    first = opened()
+    first.seek(2 * BLOCK_BYTES + 5)
+    assert first.read(10) == data[2 * BLOCK_BYTES + 5 :][:10]
+    before = storage.bytes_fetched()
+    assert opened().read() == data
+    assert storage.bytes_fetched() - before == len(data) - BLOCK_BYTES
+    assert opened().read() == data
+    assert storage.bytes_fetched() - before == len(data) - BLOCK_BYTES
+    opened("2").read(1)
+    assert storage.bytes_fetched() - before == len(data)
+    gcs.fail_next(404, times=9)
+    broken = BlockCachedFile(url, version="3", size=len(data), cache=cache)
+    with pytest.raises(FileNotFoundError):
+        broken.read(1)
+    assert isinstance(broken.failure, FileNotFoundError)
+
+
+# ---- the disk cache ----
+
+
+def entries(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.rglob("*") if path.is_file() and path.name != "lock")
+
+
+def size_of(folder: Path) -> int:
+    return sum(path.stat().st_size for path in entries(folder))
+
+
+def test_what_is_written_is_read_by_every_cache_on_the_folder(tmp_path: Path) -> None:
+    cache = DiskCache(tmp_path / "new", 1000)
+    assert cache.read("gs://a/b 0-10") is None
+    cache.write("gs://a/b 0-10", b"first")
+    cache.write("gs://a/b 0-10", b"second")
+    for other in (cache, DiskCache(tmp_path / "new", 1000), pickle.loads(pickle.dumps(cache))):  # noqa: S301 - our own
+        assert other.read("gs://a/b 0-10") == b"second"
+        assert other.read("gs://a/b 0-11") is None
+    [path] = entries(tmp_path)
+    whole = path.read_bytes()
+    for damaged in (b"", whole[:-1], b"S" + whole[1:], bytes(len(whole))):
+        path.write_bytes(damaged)
+        assert cache.read("gs://a/b 0-10") is None, "as after a power cut"
+
+
+def test_the_entry_used_longest_ago_goes_first(tmp_path: Path) -> None:
+    cache = DiskCache(tmp_path, 4 * 100)
+    for second, key in enumerate("abcd"):
+        before = set(entries(tmp_path))
+        cache.write(key, bytes(96))
+        [new] = set(entries(tmp_path)) - before
+        os.utime(new, (second, second))  # the clock of a file system is coarse
+    assert cache.read("a") is not None
+    cache.write("e", bytes(96))
+    assert [key for key in "abcde" if cache.read(key) is not None] == ["a", "d", "e"], "one more, for room"
+
+
+@settings(max_examples=30)
+@given(writes=st.lists(st.tuples(st.integers(0, 9), st.integers(1, 1000)), max_size=30))
+def test_the_limit_holds_and_what_was_just_written_is_there(
+    tmp_path_factory: pytest.TempPathFactory, writes: list[tuple[int, int]]
+) -> None:
+    folder = tmp_path_factory.mktemp("cache")
+    cache = DiskCache(folder, 1000)
+    for key, size in writes:
+        cache.write(f"{key} {size}", bytes(size))
+        assert (cache.read(f"{key} {size}") == bytes(size)) == (size + 4 <= 800)
+        assert size_of(folder) <= 1000
+    DiskCache(folder / "none", 0).write("a", b"1")
+    assert not (folder / "none").exists()
+
+
+def test_a_folder_that_may_only_be_read_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    DiskCache(tmp_path, 1000).write("a", b"content")
+
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(os, "utime", refuse)
+    monkeypatch.setattr(Path, "write_bytes", refuse)
+    cache = DiskCache(tmp_path, 1000)
+    cache.write("b", b"content")
+    assert cache.read("a") == b"content"
+    assert cache.read("b") is None
+
+
+@pytest.mark.parametrize("fault", ["full", "no folder"])
+def test_a_disk_that_cannot_be_written_costs_one_warning_and_not_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, fault: str
+) -> None:
+    (tmp_path / "file").touch()
+    folder = tmp_path / "file" / "inner" if fault == "no folder" else tmp_path / "cache"
+    cache = DiskCache(folder, 1000)
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    if fault == "full":
+        monkeypatch.setattr(Path, "replace", full)
+    cache.write("a", b"first")
+    cache.write("b", b"second")
+    assert cache.read("a") is None
+    assert [record.levelno for record in caplog.records] == [logging.WARNING]
+    assert entries(tmp_path) == [tmp_path / "file"]
+
+
+def test_what_an_interrupted_writer_left_behind_goes_when_room_is_made(tmp_path: Path) -> None:
+    cache = DiskCache(tmp_path, 1000)
+    cache.write("a", b"first")
+    inner = entries(tmp_path)[0].parent
+    old, fresh = inner / ".x.1234abcd.partial", inner / ".y.1234abcd.partial"
+    for path in (old, fresh):
+        path.write_bytes(bytes(500))
+    os.utime(old, (0, 0))
+    cache.write("b", bytes(500))
+    assert not old.exists()
+    assert fresh.exists()
+    assert cache.read("a") == b"first"
+
+
+WRITE_MANY = """
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from vjepa2_ac.storage.block_file import DiskCache
+
+cache = DiskCache(sys.argv[1], 5000)
+
+def once(number):
+    key = number % 37
+    cache.write(str(key), bytes([key]) * (1 + key * 20))
+    other = number * 7 % 37
+    assert cache.read(str(other)) in (None, bytes([other]) * (1 + other * 20))
+
+with ThreadPoolExecutor(4) as pool:
+    list(pool.map(once, range(150)))
+"""
+
+
+def test_several_processes_and_threads_share_a_folder(popen: Popen, tmp_path: Path) -> None:
+    writers = [popen([sys.executable, "-c", WRITE_MANY, str(tmp_path)]) for _ in range(2)]
+    assert [writer.wait(timeout=120) for writer in writers] == [0, 0]
+    assert 0 < size_of(tmp_path) <= 5000 + 8 * 725, "each thread may have written one while another made room"
+    DiskCache(tmp_path, 5000).write("last", b"1" * 101)
+    assert size_of(tmp_path) <= 5000
+    assert not list(tmp_path.rglob("*.partial"))

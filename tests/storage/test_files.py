@@ -1,0 +1,243 @@
+"""Files: complete or absent, and URLs read like local paths. With real processes that are killed."""
+
+import errno
+import hashlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import closing
+from pathlib import Path
+
+import fsspec
+import pytest
+
+from run_fixtures import Popen
+from vjepa2_ac import storage
+from vjepa2_ac.distributed.signals import tidy_end
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage.files import remove_abandoned
+
+WRITING = """
+import sys, time
+from pathlib import Path
+from vjepa2_ac import storage
+from vjepa2_ac.distributed.signals import tidy_end
+target = Path(sys.argv[1])
+with tidy_end():
+    if sys.argv[2] == "file":
+        with storage.atomic_writer(target) as file:
+            file.write(b"x" * 1000)
+            file.flush()
+            print("writing", flush=True)
+            time.sleep(300)
+    with storage.folder_writer(target, "manifest") as folder:
+        storage.write_atomically(folder / "inner" / "a", "a")
+        print("writing", flush=True)
+        time.sleep(300)
+"""
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def age(path: Path, days: float) -> None:
+    for one in (path, *path.rglob("*")):
+        os.utime(one, (time.time() - days * 86_400,) * 2)
+
+
+# ---- one file ----
+
+
+def test_a_file_has_its_name_when_it_is_whole_and_one_that_fails_leaves_the_old_one(tmp_path: Path) -> None:
+    target = tmp_path / "inner" / "file"
+    with storage.atomic_writer(target) as file:
+        file.write("Grüße".encode())
+        file.flush()
+        assert not target.exists()
+
+    def write_half() -> None:
+        with storage.atomic_writer(target) as file:
+            file.write(b"new, but not ")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        write_half()
+    assert target.read_text(encoding="utf-8") == "Grüße"
+    assert names(target.parent) == ["file"]
+    storage.write_atomically(tmp_path / ("ü" * 127), "a long name")
+
+
+def test_a_full_disk_is_called_one_and_says_of_which_file(tmp_path: Path) -> None:
+    full = OSError(errno.ENOSPC, "No space left on device")
+    with (
+        pytest.raises(OSError, match=r"No space left on device: '.*a\.json'"),
+        storage.atomic_writer(tmp_path / "a.json"),
+    ):
+        raise full
+    with pytest.raises(InputError, match=r"^a: cannot be written: .*Free some space"), storage.user_can_write("a"):
+        raise full
+    with pytest.raises(ConnectionResetError), storage.user_can_write("a"):
+        raise ConnectionResetError(errno.ECONNRESET, "not about writing")
+
+
+# ---- a folder ----
+
+
+def fill(folder: Path, *names: str) -> None:
+    with storage.folder_writer(folder, "manifest") as partial:
+        for name in names:
+            storage.write_atomically(partial / name, name)
+
+
+def test_a_folder_is_filled_whole_and_nothing_is_left_where_that_fails(tmp_path: Path) -> None:
+    def fail() -> None:
+        with storage.folder_writer(tmp_path / "new", "manifest") as partial:
+            (partial / "a").touch()
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail()
+    assert names(tmp_path) == []
+    fill(tmp_path / "deep" / "new", "a", "inner/b", "manifest")
+    assert names(tmp_path / "deep" / "new") == ["a", "inner", "manifest"]
+
+
+def test_a_folder_that_is_there_stays_itself_and_keeps_its_other_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "mine").write_text("precious")
+    (tmp_path / "manifest").write_text("old")
+    before = tmp_path.stat().st_ino
+    monkeypatch.chdir(tmp_path)
+    fill(Path(), "inner/b", "manifest")
+    assert tmp_path.stat().st_ino == before
+    assert names(tmp_path) == ["inner", "manifest", "mine"]
+    assert (tmp_path / "manifest").read_text() == "manifest"
+
+
+def test_a_folder_in_which_moving_fails_has_no_manifest(tmp_path: Path) -> None:
+    (tmp_path / "manifest").write_text("old")
+    (tmp_path / "a").mkdir()  # where a file is to go
+    (tmp_path / "a" / "mine").write_text("precious")
+    with pytest.raises(InputError, match=r"cannot be written: .*directory"):
+        fill(tmp_path, "a", "manifest")
+    assert names(tmp_path) == ["a"]
+
+
+@pytest.mark.parametrize("place", ["file", "file/inner", "/proc/inner"])
+def test_a_place_that_cannot_be_a_folder_is_named(tmp_path: Path, place: str) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match=rf"{place}: cannot be written: .*Name a place") as caught:
+        fill(tmp_path / place, "manifest")
+    assert caught.value.where == str(tmp_path / place)
+
+
+# ---- writers that end early ----
+
+
+@pytest.mark.usefixtures("default_signals")
+@pytest.mark.parametrize("kind", ["file", "folder"])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
+def test_what_was_not_whole_never_has_its_name(tmp_path: Path, popen: Popen, kind: str, number: int) -> None:
+    process = popen([sys.executable, "-c", WRITING, str(tmp_path / "target"), kind], stdout=subprocess.PIPE)
+    assert process.stdout.readline() == b"writing\n"
+    process.send_signal(number)
+    assert process.wait(timeout=120) == -number
+    left = names(tmp_path)
+    assert len(left) == (number == signal.SIGKILL), "a writer that is told to end leaves nothing"
+    assert storage.is_empty(tmp_path)
+    remove_abandoned(tmp_path)
+    assert names(tmp_path) == left, "another writer may be at work on it"
+    for path in tmp_path.iterdir():
+        age(path, days=1.1)
+    remove_abandoned(tmp_path)
+    assert names(tmp_path) == []
+
+
+@pytest.mark.usefixtures("default_signals")
+def test_a_writer_under_nohup_outlives_its_terminal(tmp_path: Path) -> None:
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    with tidy_end():
+        os.kill(os.getpid(), signal.SIGHUP)
+        storage.write_atomically(tmp_path / "target", "a")
+    assert names(tmp_path) == ["target"]
+
+
+def test_a_folder_that_changed_today_names_of_others_and_links_are_left_alone(tmp_path: Path) -> None:
+    precious = tmp_path / ".f.0123abcd.partial"
+    (precious / "inner").mkdir(parents=True)
+    for name in (".a.partial", "a.0123abcd.partial", ".a.0123abcd.part", ".a.xyz.partial", "partial"):
+        (tmp_path / name).touch()
+    for path in tmp_path.iterdir():
+        age(path, days=9)
+    (precious / "inner" / "file").touch()
+    (tmp_path / ".l.0123abcd.partial").symlink_to(precious / "inner")
+    before = names(tmp_path)
+    remove_abandoned(tmp_path)
+    assert names(tmp_path) == before
+    assert (precious / "inner" / "file").exists()
+    assert not storage.is_empty(tmp_path)
+
+
+# ---- reading ----
+
+
+def test_a_hash_is_that_of_the_whole_file(tmp_path: Path) -> None:
+    data = bytes(range(256)) * 10_000
+    (tmp_path / "file").write_bytes(data)
+    assert storage.sha256_of_file(tmp_path / "file") == hashlib.sha256(data).hexdigest()
+
+
+@pytest.fixture(params=["local", "memory"])
+def folder(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """A folder with two files, on this machine and behind a URL."""
+    place = str(tmp_path) if request.param == "local" else f"memory://{tmp_path.name}"
+    filesystem = fsspec.filesystem("file" if request.param == "local" else "memory")
+    for name, data in (("b", b"0123456789"), ("a", b"")):
+        filesystem.pipe_file(storage.join(place, name), data)
+    return place
+
+
+def test_a_url_is_read_like_a_local_folder(folder: str) -> None:
+    assert storage.list_names(folder) == ["a", "b"]
+    file = storage.join(folder, "b")
+    assert storage.exists(file)
+    assert not storage.exists(storage.join(folder, "c"))
+    assert storage.file_size(file) == 10
+    assert storage.read_bytes(file) == storage.read_bounded(file, 10) == b"0123456789"
+    with pytest.raises(InputError, match="more than 9 bytes"):
+        storage.read_bounded(file, 9)
+    assert storage.read_range(file, 3, 4) == b"3456"
+    assert storage.read_range(file, 8, 4) == b"89"
+    assert storage.read_ranges(file, [(3, 4), (0, 1)]) == [b"3456", b"0"]
+    with pytest.raises(storage.ShortReadError, match="2 of 4 bytes at 8"):
+        storage.read_ranges(file, [(0, 1), (8, 4)])
+    assert [(info.name, info.size) for info in storage.list_files(folder)] == [("a", 0), ("b", 10)]
+    with closing(storage.open_to_read(file)) as opened:
+        opened.seek(4)
+        assert (opened.read(2), opened.read()) == (b"45", b"6789")
+    for read in (storage.read_bytes, storage.open_to_read, storage.file_size):
+        with pytest.raises(FileNotFoundError):
+            read(storage.join(folder, "c"))
+    assert storage.list_names(storage.join(folder, "none")) == []
+
+
+def test_a_file_that_changes_has_another_version(folder: str) -> None:
+    before = storage.list_files(folder)
+    assert storage.list_files(folder) == before
+    filesystem, file = fsspec.core.url_to_fs(storage.join(folder, "a"))
+    filesystem.pipe_file(file, b"")
+    assert [old.name for old, new in zip(before, storage.list_files(folder), strict=True) if old != new] == ["a"]
+
+
+def test_a_file_that_may_never_end_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(InputError, match="a pipe"):
+        storage.read_bounded(tmp_path / "pipe", 10)
+    with (tmp_path / "sparse").open("wb") as file:
+        file.truncate(1 << 40)
+    with pytest.raises(InputError, match="more than 10 bytes"):
+        storage.read_bounded(tmp_path / "sparse", 10)

@@ -1,0 +1,225 @@
+"""Remote reads: network failures are retried, or reported in time; with a real server that fails. And who logs in."""
+
+import importlib
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from gcs import Failure, Gcs
+from vjepa2_ac import storage
+from vjepa2_ac.errors import InputError, UnreachableError, pip_install
+from vjepa2_ac.storage import remote, retries
+
+DATA = bytes(range(256)) * 400
+FILE = "gs://bucket/folder/file"
+
+PASSING: list[Failure] = [408, 429, 500, 502, 503, 504, "reset", "cut", "short"]
+
+
+@pytest.fixture
+def file(gcs: Gcs) -> str:
+    gcs.put("bucket/folder/other", b"12345")
+    return gcs.put("bucket/folder/file", DATA)
+
+
+@pytest.mark.parametrize("failure", PASSING)
+def test_a_read_survives_what_passes(gcs: Gcs, file: str, failure: Failure) -> None:
+    gcs.fail_next(failure, times=2, match="/download/")
+    assert storage.read_range(file, 300, 4000) == DATA[300:4300]
+    assert gcs.faults_left == 0
+    assert len(gcs.reads()) == 3
+
+
+@pytest.mark.parametrize("failure", [429, 503, "reset", "cut"])
+@pytest.mark.parametrize(
+    ("action", "expected"),
+    [
+        (lambda: storage.file_size(FILE), len(DATA)),
+        (lambda: storage.exists(FILE), True),
+        (lambda: storage.list_names("gs://bucket/folder"), ["file", "other"]),
+        (lambda: [file.size for file in storage.list_files("gs://bucket/folder")], [len(DATA), 5]),
+        (lambda: storage.read_bytes(FILE), DATA),
+        (lambda: storage.read_ranges(FILE, [(0, 5), (256, 3)]), [DATA[:5], DATA[256:259]]),
+        (lambda: storage.open_to_read(FILE).read(), DATA),
+    ],
+    ids=["file_size", "exists", "list_names", "list_files", "read_bytes", "read_ranges", "open_to_read"],
+)
+@pytest.mark.usefixtures("file")
+def test_everything_survives_what_passes(
+    gcs: Gcs, action: Callable[[], object], expected: object, failure: Failure
+) -> None:
+    gcs.fail_next(failure, times=2)
+    assert action() == expected
+    assert gcs.faults_left == 0
+
+
+def test_a_server_that_does_not_answer_is_asked_again(gcs: Gcs, file: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    # A busy machine is slow as well: it has further attempts.
+    monkeypatch.setattr(retries, "DEFAULT", retries.RetryPolicy(attempts=100, first_wait_s=0.0, timeout_s=0.3))
+    gcs.fail_next("hang", match="/download/")
+    assert storage.read_range(file, 0, 5) == DATA[:5]
+    monkeypatch.setattr(retries, "DEFAULT", retries.RetryPolicy(attempts=2, first_wait_s=0.0, timeout_s=0.3))
+    gcs.fail_next("hang", times=100, match="/download/")
+    with pytest.raises(UnreachableError, match=r"2 attempts over \d s; the last: time-out"):
+        storage.read_range(file, 0, 5)
+
+
+@pytest.mark.parametrize(
+    ("failure", "words"), [(503, "HTTP 503: made to fail"), (429, "HTTP 429"), ("reset", "Disconnected")]
+)
+def test_attempts_are_counted_and_the_error_says_where_and_why(
+    gcs: Gcs, file: str, failure: Failure, words: str
+) -> None:
+    gcs.fail_next(failure, times=100, match="/download/")
+    with pytest.raises(UnreachableError, match=rf"^{file}: not reached in 5 attempts.*{words}.*Check the net"):
+        storage.read_range(file, 0, 5)
+    attempts = 5 if failure != "reset" else 10  # aiohttp asks again at once where a connection in use before was cut
+    assert len(gcs.reads()) <= attempts, "gcsfs would make six of each"
+
+
+@pytest.mark.parametrize("status", [401, 403])
+def test_missing_permission_is_said_at_once_with_the_way_to_log_in(gcs: Gcs, file: str, status: int) -> None:
+    gcs.fail_next(status, times=100)
+    with pytest.raises(UnreachableError, match=rf"no permission \(HTTP {status}.*gcloud auth application-def"):
+        storage.read_range(file, 0, 5)
+    assert len(gcs.requests) == 1
+
+
+def test_an_absent_file_is_absent_and_not_asked_for_again(gcs: Gcs, file: str) -> None:
+    with pytest.raises(FileNotFoundError):
+        storage.read_range(f"{file}.none", 0, 5)
+    assert len(gcs.reads()) == 1
+    assert not storage.exists(f"{file}.none")
+    assert storage.exists("gs://bucket/folder")
+    assert storage.list_names("gs://bucket/none") == []
+    assert storage.list_files("gs://bucket/none") == []
+    with pytest.raises(FileNotFoundError):
+        storage.open_to_read(f"{file}.none")
+
+
+def test_a_read_past_the_end_gives_what_there_is(gcs: Gcs, file: str) -> None:
+    size = len(DATA)
+    assert storage.read_range(file, size - 3, 10) == DATA[-3:]
+    assert storage.read_range(file, size + 3, 10) == b""
+    gcs.fail_next(416, match="/download/")  # what Google says there
+    assert storage.read_range(file, size, 10) == b""
+    assert storage.read_range(file, 0, 0) == b""
+    with pytest.raises(storage.ShortReadError, match=f"3 of 10 bytes at {size - 3}"):
+        storage.read_ranges(file, [(0, 4), (size - 3, 10)])
+
+
+def test_ranges_are_read_at_the_same_time_and_come_in_order(gcs: Gcs, file: str) -> None:
+    ranges = [(start, 3) for start in range(0, 9600, 100)]
+    gcs.hold(33, match="/download/")
+    assert storage.read_ranges(file, ranges) == [DATA[start : start + 3] for start, _ in ranges]
+    assert gcs.most_in_flight >= 33
+    assert len(gcs.reads()) == len(ranges)
+
+
+def test_a_long_read_comes_in_pieces(gcs: Gcs, file: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vjepa2_ac.storage.remote._PIECE_BYTES", 1000)
+    assert storage.read_bytes(file) == DATA
+    assert len(gcs.reads()) == -(-len(DATA) // 1000)
+    assert storage.read_ranges(file, [(5, 2500), (7, 3)]) == [DATA[5:2505], DATA[7:10]]
+
+
+def test_the_bytes_fetched_are_counted(file: str) -> None:
+    before = storage.bytes_fetched()
+    storage.read_ranges(file, [(0, 10), (50, 20)])
+    storage.file_size(file)
+    assert storage.bytes_fetched() - before == 30
+
+
+def test_a_folder_is_listed_at_once_with_sizes_and_versions(gcs: Gcs) -> None:
+    for number in range(100):
+        gcs.put(f"bucket/set/{number:03d}", bytes(number))
+    gcs.put("bucket/set/inner/file", b"1")
+    files = storage.list_files("gs://bucket/set/")
+    assert [(file.name, file.size) for file in files] == [(f"{number:03d}", number) for number in range(100)]
+    assert storage.list_names("gs://bucket/set")[-1] == "inner"
+    assert len(gcs.requests) == 2
+    gcs.put("bucket/set/007", bytes(7))
+    changed = [new.name for old, new in zip(files, storage.list_files("gs://bucket/set"), strict=True) if old != new]
+    assert changed == ["007"]
+
+
+def test_a_worker_process_reads_on_its_own(file: str) -> None:
+    code = (
+        "import multiprocessing, sys; from vjepa2_ac import storage\n"
+        "def read(start): return storage.read_range(sys.argv[1], start, 3)\n"
+        "if __name__ == '__main__':\n"
+        "    assert read(0) == bytes([0, 1, 2])\n"
+        "    import concurrent.futures as futures\n"
+        "    for method in ('forkserver', 'fork'):\n"
+        "        with futures.ProcessPoolExecutor(1, multiprocessing.get_context(method)) as pool:\n"
+        "            assert pool.submit(storage.read_range, sys.argv[1], 5, 3).result(30) == bytes([5, 6, 7]), method\n"
+    )
+    subprocess.run([sys.executable, "-W", "ignore", "-c", code, file], check=True, timeout=120)
+
+
+def test_a_url_that_nothing_reads_is_named() -> None:
+    with pytest.raises(InputError, match=r"nothing reads ftpx://.*gs://, hf://, s3://"):
+        storage.exists("ftpx://host/file")
+
+
+@pytest.mark.parametrize(("url", "extra"), [("gs://bucket/set", "gcs"), ("hf://datasets/one/set", "")])
+def test_a_missing_library_is_named_with_the_extra_that_brings_it(
+    url: str, extra: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(importlib.import_module("fsspec.registry"), "registry", {})
+    monkeypatch.setattr(remote, "_filesystems", {})
+    monkeypatch.setitem(sys.modules, "gcsfs", None)
+    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
+    with pytest.raises(InputError, match=rf"is not installed\. Install it: {re.escape(pip_install(extra))}"):
+        storage.exists(url)
+
+
+def test_zonal_buckets_are_off_unless_the_user_wants_them(file: str) -> None:
+    code = (
+        "import os, sys; from vjepa2_ac import storage\n"
+        "storage.read_range(sys.argv[1], 0, 1)\n"
+        "assert os.environ['GCSFS_EXPERIMENTAL_ZB_HNS_SUPPORT'] == 'false'\n"
+        "assert 'gcsfs.extended_gcsfs' not in sys.modules\n"
+    )
+    environment = {name: value for name, value in os.environ.items() if name != "GCSFS_EXPERIMENTAL_ZB_HNS_SUPPORT"}
+    subprocess.run([sys.executable, "-c", code, file], check=True, timeout=120, env=environment)
+
+
+# ---- who logs in ----
+
+
+@pytest.fixture
+def nobody(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A machine without any login."""
+    for name in ("STORAGE_EMULATOR_HOST", "GOOGLE_APPLICATION_CREDENTIALS"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("CLOUDSDK_CONFIG", str(tmp_path))
+    monkeypatch.setattr(remote, "_MACHINE", tmp_path / "product_name")
+    return tmp_path
+
+
+def test_google_is_asked_as_the_user_as_the_machine_or_as_nobody(nobody: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert remote.google_token() == "anon"
+    assert remote.login_hint("gs://a/b").startswith("You are not logged in. Log in with `gcloud auth application-de")
+    (nobody / "product_name").write_text("Some other machine\n")
+    assert remote.google_token() == "anon"
+    (nobody / "product_name").write_text("Google Compute Engine\n")
+    assert remote.google_token() == "cloud"
+    (nobody / "application_default_credentials.json").write_text("{}")
+    assert remote.google_token() == "google_default"
+    assert remote.login_hint("gcs://a/b").startswith("Log in with `gcloud")
+    (nobody / "application_default_credentials.json").unlink()
+    monkeypatch.setenv("GOOGLE_APPLICATION_CREDENTIALS", "key.json")
+    assert remote.google_token() == "google_default"
+    monkeypatch.setenv("STORAGE_EMULATOR_HOST", "http://127.0.0.1:1")
+    assert remote.google_token() == "anon", "an emulator is shown no login"
+
+
+def test_the_way_in_is_that_of_the_place() -> None:
+    assert "hf auth login" in remote.login_hint("hf://datasets/owner/name")
+    assert remote.login_hint("https://host/file") == "Check the login"

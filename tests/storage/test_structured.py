@@ -1,0 +1,148 @@
+"""JSON and YAML: read as people mean it, or refused with the place; nothing is executed, nothing grows."""
+
+import json
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import pytest
+import yaml
+from pydantic import Field
+
+from paths import ROOT
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage.structured import json_list, json_object, json_text, parse_yaml, read_json_object, record_of
+
+# ---- JSON ----
+
+
+@pytest.mark.parametrize(
+    "text", ["[" * 200_000, '{"a": 1} {}', "", "[1]", "null", b"\xff\xfe\x00", '{"a": ' + "9" * 5000 + "}"]
+)
+def test_what_is_no_json_object_is_refused_with_its_file(text: str | bytes) -> None:
+    with pytest.raises(InputError, match=r"^x\.json: .*JSON.*needed: a card\. Copy it again\.") as caught:
+        json_object(text, where="x.json", needed="a card", fix="Copy it again")
+    assert len(str(caught.value)) < 400
+
+
+@pytest.mark.parametrize(
+    "value", [{}, {"a": [1, -2, 3.5, 1e-300, None, True, math.inf, "ü\U0001f600"]}, {"n": 2**63, "m": {"": {"": []}}}]
+)
+def test_what_python_writes_is_read_as_it_was(value: dict[str, Any]) -> None:
+    for text in (json.dumps(value), json.dumps(value, ensure_ascii=False), json.dumps(value).encode("utf-8-sig")):
+        assert json_object(text, where="") == value
+    assert json_list(json.dumps([value]).encode("utf-16"), where="") == [value]
+
+
+def test_no_more_of_a_file_is_read_than_its_reader_wants_and_the_systems_errors_stay_its_own(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text('{"a": "' + "x" * 100 + '"}')
+    assert read_json_object(tmp_path / "a.json", most_bytes=200)
+    with pytest.raises(InputError, match="more than 50 bytes"):
+        read_json_object(tmp_path / "a.json", most_bytes=50)
+    for path, error in ((tmp_path / "none.json", FileNotFoundError), (tmp_path, IsADirectoryError)):
+        with pytest.raises(error):
+            read_json_object(path)
+
+
+def test_lists_of_numbers_are_written_on_one_line_and_read_back() -> None:
+    value = {"a": [1, 2.5, None], "b": [[1e-5, -2], ["text, 1"]]}
+    assert json_text({"a": [1, 2.5, None]}) == '{\n "a": [1, 2.5, null]\n}\n'
+    assert json.loads(json_text(value)) == value
+    with pytest.raises(ValueError, match="JSON"):
+        json_text(math.nan)
+
+
+# ---- records ----
+
+
+@dataclass(frozen=True)
+class Sample:
+    step: Annotated[int, Field(ge=0)]
+    name: str = ""
+    error: float | None = None
+    reasons: Mapping[str, str] = field(default_factory=dict)
+    names: tuple[str, ...] = ()
+
+
+def test_a_record_is_made_of_plain_values() -> None:
+    values = {"step": 3, "error": 1, "reasons": {"a": "b"}, "names": ["x"]}
+    assert record_of(Sample, values, where="") == Sample(3, "", 1.0, {"a": "b"}, ("x",))
+
+
+@pytest.mark.parametrize(
+    ("values", "complaint"),
+    [
+        ({}, "step: missing"),
+        ({"step": "3"}, "step: Input should be a valid integer (found '3')"),
+        ({"step": True}, "step: Input should be a valid integer (found True)"),
+        ({"step": 1.5}, "step: "),
+        ({"step": -1}, "step: Input should be greater than or equal to 0 (found -1)"),
+        ({"step": 1, "reasons": []}, "reasons: Input should be a mapping"),
+        ({"step": 1, "reasons": {"a": 1}}, "reasons.a: Input should be a valid string (found 1)"),
+        ({"step": 1, "names": "ab"}, "names: Input should be a list (found 'ab')"),
+        ({"step": 1, "steps": 2}, "steps: unknown"),
+        ({f"k{n}": 1 for n in range(1000)}, "; and 996 more"),
+    ],
+)
+def test_values_of_other_types_are_refused_by_name(values: dict[str, object], complaint: str) -> None:
+    with pytest.raises(InputError) as caught:
+        record_of(Sample, values, where="state.json")
+    assert complaint in str(caught.value)
+    assert len(str(caught.value)) < 500
+
+
+# ---- YAML ----
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("a: [1e-4, 1.5e3, .5, 1_000, 0x1F, 0b11, -7, 0, 0.0]", {"a": [1e-4, 1500.0, 0.5, 1000, 31, 3, -7, 0, 0.0]}),
+        ("a: [on, Off, yes, no, TRUE, false, 'on']", {"a": [True, False, True, False, True, False, "on"]}),
+        ("a: [null, ~, '', 'null']\nb:", {"a": [None, None, "", "null"], "b": None}),
+        ("a: [2024-01-31, 017, 12:30, 089, 0o10, =]", {"a": ["2024-01-31", "017", "12:30", "089", "0o10", "="]}),
+        ('a: [!!str 010, !!int "12", !!float 3]', {"a": ["010", 12, 3.0]}),
+        ("off: 1\n22008760: 2\n010: 3\n2024-01-01: 4", {"off": 1, "22008760": 2, "010": 3, "2024-01-01": 4}),
+        ("a: |\n  two\n  lines\n", {"a": "two\nlines\n"}),
+        ("a: [.inf, -.INF, 1e400]", {"a": [math.inf, -math.inf, math.inf]}),
+        ("", None),
+    ],
+)
+def test_what_people_mean_is_read(text: str, value: Any) -> None:
+    assert parse_yaml(text, where="") == value
+    assert repr(parse_yaml(text, where="")) == repr(value)  # True is not 1
+
+
+def test_what_is_written_and_every_config_is_read_as_pyyaml_reads_it() -> None:
+    values = {"a": [1, -2.5, 1e-05, True, None, "text", "off", "010", "1:30", "~", "", "a: b", "=", "<<"], "b": {}}
+    assert parse_yaml(yaml.safe_dump(values), where="") == values
+    for path in (ROOT / "configs").glob("*.yaml"):
+        text = path.read_text()
+        assert parse_yaml(text, where="") == yaml.safe_load(re.sub(r"(?<![\d.])(\d+)e-", r"\1.0e-", text))
+
+
+@pytest.mark.parametrize(
+    ("text", "place", "complaint"),
+    [
+        ("a: 1\nb: 2\na: 3", ": line 3, column 1", "key 'a' is given twice"),
+        ("a: &x [1, 2]\nb: [*x, *x]", ": line 2, column 5", "an alias"),
+        ("a: &a [1, *a]", ": line 1, column 11", "an alias"),
+        ("seed: 1\nrun: {{ RUN }}\n", ": line 2, column 7", "fill in the template"),
+        ("a: !!python/object:os.system x", ": line 1, column 4", "os.system"),
+        ("a: !env HOME", ": line 1, column 4", "!env"),
+        ('a: !!int "abc"', "", "abc"),
+        ("a: [1,\nb", ": line 2, column 2", "not YAML"),
+        ("--- 1\n--- 2", ": line 2, column 1", "another document"),
+        ("a: \x1b[2J", "", "special characters"),
+        ("[" * 20_000, "", "recursion"),
+        ("a: " + "9" * 5000, "", "digits"),
+    ],
+)
+def test_what_is_no_config_is_refused_where_it_stands(text: str, place: str, complaint: str) -> None:
+    with pytest.raises(InputError) as caught:
+        parse_yaml(text, where="my.yaml")
+    assert str(caught.value).startswith(f"my.yaml{place}: not YAML")
+    assert complaint in str(caught.value)
