@@ -21,7 +21,7 @@ from vjepa2_ac.data.transforms import Crop, crop_box, frames_as_seen, input_to_p
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
 from vjepa2_ac.decoding.imagine import Start, imagined_latents
 from vjepa2_ac.decoding.network import as_images
-from vjepa2_ac.distributed.launch import make_accelerator
+from vjepa2_ac.distributed.processes import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, encode_frames
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.evaluate_run import Subject, load_subject

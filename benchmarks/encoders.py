@@ -22,8 +22,7 @@ from vjepa2_ac.encoding.latent_cache import picture_bytes
 from vjepa2_ac.model.checkpoints.published import PUBLISHED
 from vjepa2_ac.storage import write_atomically
 from vjepa2_ac.training.cost.flops import frame_flops
-from vjepa2_ac.training.cost.memory import GIGABYTE, estimate_memory
-from vjepa2_ac.training.cost.parameters import count_parameters
+from vjepa2_ac.training.cost.memory import GIGABYTE, count_parameters, estimate_memory
 
 IMAGE_SIZES = (256, 384)  # pixels
 FRAMES_PER_HOUR = 15 * 3600  # of DROID's rate

@@ -61,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     plain = rows.attempt(partial(plain_curve, options, clips, rows), way=PLAIN)
     beyond = []
     if plain is not None:
-        for way in our_ways(options.ways, compiled=options.compile, graphs=False):
+        for way in our_ways(options.ways, compiled=options.compile):
             beyond.append(rows.attempt(partial(learns_otherwise, options, clips, way, plain, rows), way=way))
             let_go(options.device)
     beyond.append(rows.attempt(partial(rounds_too_much, options, rows), way="bfloat16"))

@@ -70,7 +70,7 @@ def found(options: argparse.Namespace, dtype: str, setting: Setting, rows: Rows)
     """Return a setting with its batch; the largest is looked for with the last way, and what was found is a row."""
     if setting.batch:
         return [setting]
-    way = our_ways(options.attention, compiled=options.compile, graphs=options.graph)[-1]
+    way = our_ways(options.attention, compiled=options.compile)[-1]
     named = {"measured": "largest batch", "dtype": dtype, **asdict(setting), "way": way, "cap_gb": options.cap_gb}
     batch = rows.attempt(partial(find_largest, options, dtype, setting, way, rows), **named)
     let_go(options.device)

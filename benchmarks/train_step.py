@@ -165,7 +165,7 @@ def compiled_graphs() -> int:
 
 def choose_ways(bench: Bench, options: argparse.Namespace, rows: Rows) -> list[str]:
     """Return the ways to compare, the baseline first; the official one only if it computes the same."""
-    ours = our_ways(options.attention, compiled=options.compile, graphs=options.graph)
+    ours = our_ways(options.attention, compiled=options.compile)
     plain = ["dense", *(way for way in ours if way != "dense")]
     print(f"ours: {trainable_report(bench.model)}")
     if not has_checkout(options):
@@ -216,7 +216,6 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--checkpointing", nargs="+", choices=("off", "on"), default=["off"])
     parser.add_argument("--attention", nargs="+", default=["auto"], help="auto, per_step, flex, dense: a line each")
     parser.add_argument("--compile", action="store_true", help="each way of ours once more with compiled blocks")
-    parser.add_argument("--graph", action="store_true", help="each way of ours once more as a CUDA graph")
     parser.add_argument("--full", action="store_true", help="the official step that trains every weight, too")
     parser.add_argument("--profile", action="store_true", help="count waits for the device, and compilations")
     add_options(parser)

@@ -32,7 +32,7 @@ from vjepa2_ac.config import (
 )
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.transforms import pixels_to_input
-from vjepa2_ac.distributed.launch import make_accelerator
+from vjepa2_ac.distributed.processes import make_accelerator
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.model.adapter.lora import add_adapter
 from vjepa2_ac.model.checkpoints.loading import to_official
@@ -47,7 +47,7 @@ from vjepa2_ac.training.step import training_step
 
 OFFICIAL = "official"
 OFFICIAL_FULL = "official_full"  # every weight of its predictor is trained
-COMPILED, GRAPH = "+compile", "+graph"  # at the end of a way of ours, in this order
+COMPILED = "+compile"  # at the end of a way of ours
 PRECISIONS = {"float32": "fp32", "bfloat16": "bf16"}
 _PAST_WARM_UP = 1001  # a step at which the learning rate is what it mostly is
 
@@ -71,11 +71,9 @@ class Started:
     problem: str | None
 
 
-def our_ways(attention: Sequence[str], *, compiled: bool, graphs: bool) -> list[str]:
-    """Return ways of ours: kinds of attention, each once more as a CUDA graph, compiled, and as both, as is asked."""
-    plain = [*attention, *(way + GRAPH for way in attention if graphs)]
-    both = [*(way + COMPILED for way in attention), *(way + COMPILED + GRAPH for way in attention if graphs)]
-    return plain + both if compiled else plain
+def our_ways(attention: Sequence[str], *, compiled: bool) -> list[str]:
+    """Return ways of ours: kinds of attention, each once more compiled, if that is asked for."""
+    return [*attention, *(way + COMPILED for way in attention if compiled)]
 
 
 def take_way(model: WorldModel, way: str) -> None:
@@ -175,7 +173,7 @@ class Bench:
         for parameter in self.model.parameters():
             if not parameter.requires_grad:
                 parameter.data = parameter.data.to(self.dtype)
-        run, batches = self.run(setting, cuda_graph=way.endswith(GRAPH)), itertools.repeat(self.batch(setting))
+        run, batches = self.run(setting), itertools.repeat(self.batch(setting))
         return partial(self._our_step, run, batches, None if setting.encoder else latents, way)
 
     def _our_step(self, run: Run, batches: Any, latents: LatentBatch | None, way: str) -> None:
@@ -241,11 +239,9 @@ class Bench:
             frames=max(self.options.frames), encoder="pixels" in self.options.source, device=self.device,
         )  # fmt: skip
 
-    def run(self, setting: Setting, *, cuda_graph: bool = False) -> Run:
+    def run(self, setting: Setting) -> Run:
         """Return the run that `training_step` works on."""
         config = self.config(setting)
-        training = config.training.model_copy(update={"cuda_graph": cuda_graph})
-        config = config.model_copy(update={"training": training})
         return Run(
             config=config,
             accelerator=self._accelerator(config),

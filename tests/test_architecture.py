@@ -97,6 +97,7 @@ HOMES = {
     "PIL": ["media/"],
     "accelerate": [
         "distributed/",
+        "runs/trackers.py",
         "training/",
         "runs/trackers.py",
         "encoding/encode_dataset.py",

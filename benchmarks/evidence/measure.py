@@ -32,11 +32,11 @@ from vjepa2_ac.planning.axes.mapping import Axes
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.session import Fingerprints
 from vjepa2_ac.reporter import SILENT
-from vjepa2_ac.runs.checkpoint_selection import NEWEST
+from vjepa2_ac.runs.checkpoint import NEWEST
 from vjepa2_ac.runs.loading import load_run
 from vjepa2_ac.simulation.closed_loop.policies import DoNothing, Oracle, Planning, Policy, RandomActions
 from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, run_task
-from vjepa2_ac.training.cost.parameters import count_parameters
+from vjepa2_ac.training.cost.memory import count_parameters
 from vjepa2_ac.training.loop import train
 
 TEST_GOALS, VALIDATION_GOALS = 9_000, 4_000  # seeds of problems, to which a cell adds its own

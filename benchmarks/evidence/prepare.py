@@ -17,7 +17,7 @@ from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.reporter import TrainingReporter
+from vjepa2_ac.training.monitoring import TrainingReporter
 
 BUILTIN = "builtin:sim-tiny"
 EPISODES_A, EPISODES_SHIFTED = 400, 100

@@ -22,7 +22,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 from torch.utils.flop_counter import flop_registry
 
-from vjepa2_ac.training.cost.live_storages import LiveStorages
+from vjepa2_ac.training.cost.step import LiveStorages
 
 _BLOCK = 512  # bytes: what the allocator rounds to
 _OURS = ("vjepa2_ac", "peft", "transformers")

@@ -248,7 +248,7 @@ def train(
 
     Raises:
         InputError: Something cannot be used; raised before the first step wherever possible.
-        StoppedError: A signal ended it, see `distributed.preemption`; the same call resumes.
+        StoppedError: A signal ended it, see `distributed.signals`; the same call resumes.
 
     Example:
         >>> run = train(load_config("configs/demo.yaml", ["training.steps=200"]), note=print)

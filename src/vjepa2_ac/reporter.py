@@ -28,7 +28,7 @@ class Reporter(Protocol):
 
 
 class NullReporter:
-    """Shows nothing; for a training run, too (`training.reporter`)."""
+    """Shows nothing; for a training run, too (`training.monitoring`)."""
 
     def note(self, text: str) -> None:
         """Show nothing."""

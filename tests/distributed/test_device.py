@@ -111,16 +111,6 @@ def test_since_ampere_there_is_bfloat16() -> None:
 
 
 @pytest.mark.usefixtures("gpu")
-def test_the_gpu_of_this_process_is_the_one_that_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
-    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda index: (7, 5) if index else (8, 6))
-    assert computing_device(parsed().training) == torch.device("cuda", 0)
-    monkeypatch.setenv("LOCAL_RANK", "3")
-    with pytest.raises(InputError, match=r"compute capability 7\.5"):
-        computing_device(parsed().training)
-
-
-@pytest.mark.usefixtures("gpu")
 def test_a_model_without_a_config_is_planned_with_in_what_the_gpu_computes() -> None:
     with pytest.raises(InputError, match="no such model: no such file or folder"):  # and not its type
         load_to_plan("no such model")
@@ -143,13 +133,6 @@ def test_a_slow_bfloat16_of_a_cpu_is_told_once_with_the_way_out(
     products[torch.bfloat16] = 4.0
     through(door, monkeypatch, tmp_path)
     assert "warning" not in capsys.readouterr().err
-
-
-@pytest.mark.usefixtures("products")
-def test_who_computes_in_float32_is_told_nothing(caplog: pytest.LogCaptureFixture) -> None:
-    config = parsed(precision="fp32", dtype="float32")
-    require_type_of_weights(config.model, computing_device(config.training))
-    assert not caplog.records
 
 
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="the variable is of x86")

@@ -21,7 +21,7 @@ from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.reports.write import Evaluated, evaluate_subject
-from vjepa2_ac.runs.checkpoint_selection import select_checkpoint
+from vjepa2_ac.runs.checkpoint import select_checkpoint
 from vjepa2_ac.training.loop import train
 
 PROBES = ProbeOptions(sensitivity_clips=3, samples=6, landscape_clips=1, nodes=3, examples=1)

@@ -1,13 +1,49 @@
-"""The run's folder: it belongs to a run from its first file on."""
+"""The run's folder: it is one run's from its first file on, one process trains in it, and its paths lead home."""
 
+import errno
+import fcntl
+import json
+import logging
 import os
+import shutil
+import signal
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+from PIL import Image
 
+from vjepa2_ac.cli import main
+from vjepa2_ac.config.loading import config_as_dict, config_as_yaml, parse_config
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.runs.folder import check_run_folder, open_run_folder
-from vjepa2_ac.runs.lock import RunLock
+from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
+from vjepa2_ac.reports.write import evaluate_subject
+from vjepa2_ac.runs.checkpoint import newest_checkpoint
+from vjepa2_ac.runs.folder import (
+    RunLock,
+    check_run_folder,
+    open_run_folder,
+    places_elsewhere,
+    read_run_config,
+    run_id,
+)
+from vjepa2_ac.runs.loading import load_run
+from vjepa2_ac.training import loop
+from vjepa2_ac.training.loop import train
+
+HOLD = """
+import sys
+from pathlib import Path
+from vjepa2_ac.runs.folder import RunLock
+lock = RunLock(Path(sys.argv[1]))
+lock.take()
+print("held", flush=True)
+sys.stdin.read()
+"""
+ASKED = EvaluationOptions(clips=4, probes=ProbeOptions(sensitivity_clips=0, landscape_clips=0, examples=0))
 
 
 class KilledError(BaseException):
@@ -44,12 +80,6 @@ def test_a_start_that_was_killed_at_any_file_stands_in_nobodys_way(make_config, 
     check_run_folder(config)
 
 
-def test_a_machine_that_had_but_a_later_process_may_have_the_first_one_next_time(make_config, tmp_path) -> None:
-    """Clips of a step that could not be done are all that a process other than the first leaves in its folder."""
-    (tmp_path / "run" / "not_finite" / "step-00000003").mkdir(parents=True)
-    check_run_folder(make_config())
-
-
 def test_a_folder_of_other_things_stays_refused_though_a_lock_lies_in_it(make_config, tmp_path) -> None:
     config = make_config()
     with RunLock(Path(config.run_dir)) as lock:
@@ -57,3 +87,212 @@ def test_a_folder_of_other_things_stays_refused_though_a_lock_lies_in_it(make_co
     (tmp_path / "run" / "thesis.tex").write_text("years of work")
     with pytest.raises(InputError, match="other things"):
         check_run_folder(config)
+
+
+def test_small_files_of_a_run_that_are_none_are_no_traceback(tmp_path: Path, make_config) -> None:
+    (tmp_path / "config.yaml").write_text(config_as_yaml(make_config(data__path="nowhere")))
+    for text in ("[" * 20_000, '[3, {"folder": 4}, {}]'):
+        (tmp_path / "environment.json").write_text(text)
+        assert read_run_config(tmp_path).data.path == "nowhere"
+    for text in ("../../x", "a b", "x" * 10_000, "\x1b[2J"):
+        (tmp_path / "run_id").write_text(text)
+        with pytest.raises(InputError, match="run_id"):
+            run_id(tmp_path)
+
+
+# The lock
+
+
+def test_a_folder_in_use_is_refused_until_its_process_is_killed(tmp_path: Path) -> None:
+    words = [sys.executable, "-c", HOLD, str(tmp_path / "run")]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout.readline() == "held\n"
+        with RunLock(tmp_path / "run") as lock, pytest.raises(InputError, match="trained right now, by another"):
+            lock.take()
+        process.send_signal(signal.SIGKILL)
+        assert process.wait(timeout=120) == -signal.SIGKILL
+    with RunLock(tmp_path / "run") as lock:
+        lock.take()
+        lock.take()
+        with RunLock(tmp_path / "run") as other, pytest.raises(InputError, match="being trained right now"):
+            other.take()
+
+
+def test_a_lock_that_nobody_took_leaves_no_trace(tmp_path: Path) -> None:
+    with RunLock(tmp_path / "run"):
+        pass
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_file_system_without_locks_costs_a_warning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def refuse(file: object, operation: int) -> None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK), file, operation)
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    with caplog.at_level(logging.WARNING), RunLock(tmp_path) as lock:
+        lock.take()
+    assert "no locks here" in caplog.text
+
+
+def test_a_folder_that_cannot_be_made_is_the_users_to_mend(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("no folder")
+    with RunLock(tmp_path / "file" / "run") as lock, pytest.raises(InputError, match="cannot be written"):
+        lock.take()
+
+
+def test_a_run_holds_its_folder_while_it_trains_and_gives_it_back(make_config, reporter) -> None:
+    refused = []
+
+    def try_to_train_too(step: int, metrics: object) -> None:
+        del metrics
+        with pytest.raises(InputError, match=rf"by process {os.getpid()} on .+, since 20"):
+            train(make_config(training__steps=2), other)
+        refused.append(step)
+
+    other, reporter.stepped = type(reporter)(), try_to_train_too
+    train(make_config(training__steps=2), reporter)
+    assert refused == [1, 2]
+    assert other.notes == [], "refused before anything was loaded"
+    train(make_config(training__steps=2), other)
+
+
+def test_a_start_that_another_one_overtook_leaves_its_run_alone(make_config, reporter, monkeypatch) -> None:
+    config, restore = make_config(), loop.restore
+
+    def overtaken(*arguments):
+        run = restore(*arguments)
+        monkeypatch.setattr(loop, "restore", restore)
+        train(config, type(reporter)())
+        return run
+
+    monkeypatch.setattr(loop, "restore", overtaken)
+    with pytest.raises(InputError, match="step 6, which another start wrote while this one stood at 0"):
+        train(config, reporter)
+    assert newest_checkpoint(Path(config.run_dir) / "checkpoints").name == "step-00000006"
+
+
+# Relative paths
+
+
+@pytest.fixture
+def home(tmp_path: Path, data_folder: Path, base_folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a data set and a base in it, which is gone to; and one beside it."""
+    home = tmp_path / "home"
+    home.mkdir()
+    (tmp_path / "elsewhere").mkdir()
+    shutil.copytree(data_folder, home / "data")
+    shutil.copytree(base_folder, home / "base")
+    monkeypatch.chdir(home)
+    return home
+
+
+@pytest.fixture
+def at_home(make_config, home: Path):  # type: ignore[no-untyped-def]
+    values = config_as_dict(make_config(training__steps=2, data__test_share=0.3))
+    values["data"]["path"], values["model"]["base"] = "data", "base"
+    return parse_config({**values, "run_dir": "run"}, where=str(home))
+
+
+def test_a_run_is_measured_and_goes_on_from_anywhere_as_from_its_own_folder(
+    at_home, home, reporter, monkeypatch
+) -> None:
+    train(at_home, reporter)
+    as_written = (home / "run/config.yaml").read_text()
+    here = evaluate_subject("run", ASKED).evaluation
+    monkeypatch.chdir(home.parent / "elsewhere")
+    there = evaluate_subject(str(home / "run"), ASKED).evaluation
+    elsewhere, nearby = (found.models["adapter"].errors.of("rollout") for found in (there, here))
+    assert (elsewhere == nearby).all()
+    assert there.about.data == str(home / "data")
+    assert load_run(Path("../home/run")).config.model.base == str(home / "base")
+    train(read_run_config(home / "run"), reporter)
+    assert any("Going on from" in note for note in reporter.notes)
+    assert (home / "run/config.yaml").read_text() == as_written
+    assert list(Path.cwd().iterdir()) == []
+
+
+def test_only_paths_that_lead_nowhere_are_looked_for_elsewhere(at_home, home, monkeypatch) -> None:
+    (home / "caches").mkdir()
+    (home / "ranges.json").write_text("{}")
+    elsewhere = home.parent / "elsewhere"
+    (elsewhere / "data").mkdir()
+    values = config_as_dict(at_home)
+    values["data"] |= {"cache_dir": "caches", "disk_cache": {"dir": "none"}}
+    values["data"]["idle"] |= {"rule": "published", "ranges": "ranges.json"}
+    (home / "run").mkdir()
+    (home / "run/environment.json").write_text(json.dumps([{"folder": str(home)}]))
+    monkeypatch.chdir(elsewhere)
+
+    def seen(**changes: object):  # type: ignore[no-untyped-def]
+        changed = parse_config({**values, "data": {**values["data"], **changes}}, where="")
+        (home / "run/config.yaml").write_text(config_as_yaml(changed))
+        return read_run_config(home / "run").data
+
+    found = seen()
+    assert (found.path, found.cache_dir, found.disk_cache.dir) == ("data", str(home / "caches"), "none")
+    assert found.idle.ranges == str(home / "ranges.json")
+    assert seen(source="latents").idle.ranges == "ranges.json", "a part of the cache's key"
+    for path in ("gs://bucket/set", "/nowhere/set"):
+        assert seen(path=path).path == path
+
+
+# Addresses in a run of unknown origin are listed before one of them is contacted
+
+ELSEWHERE = {
+    "run_dir": "r",
+    "data": {"path": "gs://bucket/set", "idle": {"rule": "published", "ranges": "https://example.org/ranges.json"}},
+    "model": {"base": "b.pt"},
+    "checkpoint": {"remote": "s3://bucket/run"},
+    "tracking": {"wandb": "online"},
+}
+LINES = [
+    "data.path: gs://bucket/set",
+    "data.idle.ranges: https://example.org/ranges.json",
+    "checkpoint.remote: s3://bucket/run",
+    "tracking.wandb: online",
+]
+
+
+def test_every_address_of_a_config_is_named_with_its_knob() -> None:
+    assert places_elsewhere(parse_config(ELSEWHERE, where="")) == LINES
+    here = {"run_dir": "r", "data": {"path": "d", "exclude": ["gs://is-but-a-name"]}, "model": {"base": "b.pt"}}
+    assert places_elsewhere(parse_config(here, where="")) == []
+
+
+@pytest.mark.parametrize(
+    ("command", "contacts"),
+    [
+        (["train", "RUN", "--resume"], "vjepa2_ac.training.loop.train"),
+        (["evaluate", "RUN"], "vjepa2_ac.reports.write.evaluate_subject"),
+        (
+            ["plan", "RUN", "--start", "a.png", "--goal", "a.png", "--state", "0.4,0,0.3,3.1,0,0.1,0.2", "--out", "p"],
+            "vjepa2_ac.planning.session.load_to_plan",
+        ),
+    ],
+    ids=["train", "evaluate", "plan"],
+)
+def test_a_run_that_leads_elsewhere_says_so_before_it_goes_there(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    command: list[str],
+    contacts: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Image.fromarray(np.zeros((64, 64, 3), np.uint8)).save("a.png")
+    run = tmp_path / "[b]run"  # no markup
+    run.mkdir()
+    (run / "config.yaml").write_text(config_as_yaml(parse_config(ELSEWHERE, where="")))
+    said: list[str] = []
+
+    def contact(*_: Any, **__: Any) -> None:
+        said.append(capsys.readouterr().out)
+        raise InputError(where="here", found="the end")
+
+    monkeypatch.setattr(contacts, contact)
+    monkeypatch.setattr("vjepa2_ac.runs.checkpoint.select_checkpoint", lambda *_: None)  # the run has none
+    assert main([str(run) if word == "RUN" else word for word in command]) == 2
+    for line in LINES:
+        assert f"{run} names a place elsewhere: {line}" in said[0]

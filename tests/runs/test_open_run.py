@@ -7,12 +7,11 @@ import pytest
 
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.runs import open_run as opening
 from vjepa2_ac.runs.checkpoint import RunState
-from vjepa2_ac.runs.folder import with_stride
-from vjepa2_ac.runs.lock import RunLock
-from vjepa2_ac.runs.mirror.background_sync import NoMirror
+from vjepa2_ac.runs.folder import RunLock, with_stride
 from vjepa2_ac.runs.open_run import open_run
+
+OPEN_REMOTE = "vjepa2_ac.runs.mirror.open_remote.open_remote"
 
 
 def test_a_new_folder_is_made_and_locked_when_the_run_begins_and_not_before(make_config, reporter) -> None:
@@ -24,39 +23,36 @@ def test_a_new_folder_is_made_and_locked_when_the_run_begins_and_not_before(make
         assert (folder / "config.yaml").read_text() == config_as_yaml(config)
         with pytest.raises(InputError, match=f"by process {os.getpid()}"):
             RunLock(folder).take()
-        assert isinstance(opened.mirror("mine"), NoMirror)
+        assert opened.mirror("mine") is None
     with RunLock(folder) as lock:
         lock.take()
 
 
-def test_a_folder_that_is_there_is_locked_before_the_remote_is_asked(make_config, reporter, monkeypatch) -> None:
-    config = make_config()
-    with open_run(config, reporter) as opened:
-        opened.begin(config, RunState(step=0))
-    seen = []
+@pytest.mark.parametrize("check_only", [False, True])
+def test_a_folder_is_locked_before_the_remote_is_asked_and_a_check_locks_nothing(
+    make_config, reporter, monkeypatch, tmp_path: Path, check_only: bool
+) -> None:
+    config = make_config(checkpoint__remote=str(tmp_path / "remote"))
+    folder, asked = Path(config.run_dir), []
+    with open_run(make_config(), reporter) as opened:
+        opened.begin(opened.config, RunState(step=0))
 
-    def remote(*_: object, **__: object) -> None:
-        with pytest.raises(InputError, match="trained right now"):
-            RunLock(Path(config.run_dir)).take()
-        seen.append("locked")
+    def remote(*_: object, **options: object) -> None:
+        with RunLock(folder) as lock:
+            if check_only:
+                options["claim"]()
+                lock.take()
+            else:
+                with pytest.raises(InputError, match="trained right now"):
+                    lock.take()
+        asked.append(options["into"])
 
-    monkeypatch.setattr(opening, "open_remote", remote)
-    with open_run(config, reporter):
-        assert seen == ["locked"]
-
-
-def test_a_check_locks_nothing_and_fetches_elsewhere(make_config, reporter, monkeypatch) -> None:
-    config = make_config()
-    with open_run(config, reporter) as opened:
-        opened.begin(config, RunState(step=0))
-    asked: dict[str, object] = {}
-    monkeypatch.setattr(opening, "open_remote", lambda *_, **options: asked.update(options))
-    with open_run(config, reporter, check_only=True):
-        asked["claim"]()
-        assert Path(config.run_dir) not in Path(asked["into"]).parents
-        with RunLock(Path(config.run_dir)) as lock:
-            lock.take()
-    assert not Path(asked["into"]).parent.exists()
+    monkeypatch.setattr(OPEN_REMOTE, remote)
+    with open_run(config, reporter, check_only=check_only):
+        (into,) = asked
+        assert (into is not None) == check_only
+        assert into is None or folder not in into.parents
+    assert into is None or not into.parent.exists()
 
 
 def test_the_stride_that_a_run_has_chosen_is_the_one_of_its_next_start(make_config, reporter) -> None:
@@ -66,11 +62,3 @@ def test_the_stride_that_a_run_has_chosen_is_the_one_of_its_next_start(make_conf
         opened.begin(with_stride(config, 3), RunState(step=0))
     with open_run(config, reporter) as opened:
         assert opened.config.data.stride == 3
-
-
-def test_a_process_that_writes_nothing_needs_no_folder(make_config, reporter, tmp_path: Path) -> None:
-    (tmp_path / "run").write_text("of another machine")
-    with open_run(make_config(), reporter, writes=False, allow_config_change=True) as opened:
-        opened.begin(opened.config, RunState(step=0))
-        assert opened.changes(opened.config) == []
-    assert (tmp_path / "run").read_text() == "of another machine"

@@ -11,18 +11,21 @@ import torch
 from run_fixtures import set_up
 from vjepa2_ac.config.loading import load_config
 from vjepa2_ac.data.loader import training_loader
-from vjepa2_ac.distributed.collectives import (
+from vjepa2_ac.distributed.processes import (
     all_gather_object,
     all_reduce_max,
     all_reduce_sum,
     broadcast_object,
+    first_of_machine,
+    first_only,
+    make_accelerator,
     require_same,
 )
-from vjepa2_ac.distributed.launch import make_accelerator
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.reporter import SILENT
-from vjepa2_ac.training.setup import Run, save_checkpoint
+from vjepa2_ac.training.resume import save_checkpoint
+from vjepa2_ac.training.setup import Run
 from vjepa2_ac.training.step import gradients, training_step
 
 
@@ -62,6 +65,10 @@ def main() -> None:
     require_same(accelerator, "one", what="it", fix="none")
     with pytest.raises(InputError, match="in process 1 than in process 0"):
         require_same(accelerator, rank, what="it", fix="none")
+
+    index = Path(config.run_dir).parent / "index"
+    assert first_of_machine(accelerator, lambda: index.exists() or bool(index.write_text("made"))) or rank == 0
+    assert first_only(accelerator, lambda: "done") == (None if rank else "done")
 
     run = set_up(config, SILENT, accelerator=accelerator)
     first = run.world_model.predictor.state_dict()

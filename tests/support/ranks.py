@@ -65,10 +65,10 @@ def start_rank(words: list[str], rank: int, processes: int, port: int, **more: s
     return Rank(words, environment)
 
 
-def finish(processes: list, status: int = 0) -> list[tuple[str, str]]:
+def finish(processes: list, status: int = 0, timeout: float = 120.0) -> list[tuple[str, str]]:
     """Wait for all; return what each wrote. None is left behind."""
     try:
-        said = [process.communicate(timeout=120) for process in processes]
+        said = [process.communicate(timeout=timeout) for process in processes]
     finally:
         for process in processes:
             process.kill()

@@ -17,7 +17,7 @@ from killable import Nursery
 from synthetic import write_synthetic_droid
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict, parse_config
-from vjepa2_ac.distributed.preemption import HANG_UP, SIGNALS
+from vjepa2_ac.distributed.signals import HANG_UP, SIGNALS
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import SILENT, NullReporter
@@ -25,7 +25,7 @@ from vjepa2_ac.reporter import SILENT, NullReporter
 if TYPE_CHECKING:
     from accelerate import Accelerator
 
-    from vjepa2_ac.training.reporter import TrainingReporter
+    from vjepa2_ac.training.monitoring import TrainingReporter
     from vjepa2_ac.training.setup import Run
 
 TINY = {
@@ -66,6 +66,23 @@ class SilentReporter(NullReporter):
     def stepped(self, step: int, figures: object) -> None:
         del figures
         self.steps.append(step)
+
+
+class KilledError(Exception):
+    """Simulates the end of the process."""
+
+
+def dying_reporter(reporter: SilentReporter, last_step: int) -> SilentReporter:
+    """Return a reporter at whose step the process ends."""
+    stepped = reporter.stepped
+
+    def die(step: int, figures: object) -> None:
+        stepped(step, figures)
+        if step == last_step:
+            raise KilledError
+
+    reporter.stepped = die  # type: ignore[method-assign]
+    return reporter
 
 
 def set_up(config: Config, reporter: TrainingReporter = SILENT, accelerator: Accelerator | None = None) -> Run:

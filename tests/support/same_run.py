@@ -7,7 +7,7 @@ from safetensors.torch import load_file
 
 from vjepa2_ac.runs.checkpoint import newest_checkpoint
 from vjepa2_ac.runs.metrics_log import read_metrics_log
-from vjepa2_ac.training.monitoring.throughput import MEASURED
+from vjepa2_ac.training.monitoring import MEASURED
 
 TIMINGS = MEASURED  # metrics of the machine
 

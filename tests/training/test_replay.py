@@ -5,12 +5,11 @@ import shutil
 from pathlib import Path
 
 import pytest
-import yaml
 
-from run_fixtures import set_up
+from run_fixtures import KilledError, dying_reporter, set_up
 from same_run import assert_same_run
 from synthetic import write_synthetic_droid
-from vjepa2_ac.config import Config, DataConfig, ReplayConfig
+from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict, config_as_yaml, parse_config
 from vjepa2_ac.config.section import Affects, knobs_that_affect, marks_of, names_that_affect
 from vjepa2_ac.data import loader
@@ -85,13 +84,9 @@ def test_every_position_has_its_clip_whoever_asks_and_from_wherever(replaying) -
     assert clips_of(in_workers, 4) == whole[:16]
 
 
-class KilledError(Exception):
-    """Simulates the end of the process."""
-
-
 @pytest.mark.parametrize("cache", ["off", "auto"])
 def test_a_run_that_replays_died_and_went_on_equals_the_one_that_did_not(
-    replaying, reporter, tmp_path, monkeypatch, cache: str
+    replaying, reporter, tmp_path, cache: str
 ) -> None:
     changes = {
         "training__steps": 4, "data__cache": cache,
@@ -99,17 +94,9 @@ def test_a_run_that_replays_died_and_went_on_equals_the_one_that_did_not(
         "replay__data__cache_dir": str(tmp_path / "b"),
     }  # fmt: skip
     train(replaying(run_dir=str(tmp_path / "whole"), **changes), reporter)
-    config, stepped = replaying(run_dir=str(tmp_path / "broken"), **changes), reporter.stepped
-
-    def die(step: int, seen: dict) -> None:
-        if step == 3:
-            raise KilledError
-        stepped(step, seen)
-
-    monkeypatch.setattr(reporter, "stepped", die)
+    config = replaying(run_dir=str(tmp_path / "broken"), **changes)
     with pytest.raises(KilledError):
-        train(config, reporter)
-    monkeypatch.setattr(reporter, "stepped", stepped)
+        train(config, dying_reporter(type(reporter)(), 3))
     train(config, reporter)
     assert_same_run(tmp_path / "whole", tmp_path / "broken")
     assert any("Replay: 25% of the clips are from" in note for note in reporter.notes)
@@ -174,16 +161,6 @@ def test_a_clip_that_cannot_be_read_counts_for_its_own_data_set(replaying, monke
 def test_a_second_data_set_that_cannot_fit_is_refused_when_the_config_is_read(replaying, changes, complaint) -> None:
     with pytest.raises(InputError, match=complaint):
         replaying(**changes)
-
-
-def test_poses_in_another_frame_and_commands_joined_otherwise_are_misfits() -> None:
-    in_camera = ReplayConfig(data=DataConfig(source="droid_raw", path="x", pose_frame="camera"))
-    assert in_camera.misfits(DataConfig(path="y")) == ["replay.data.pose_frame camera is not data.pose_frame base"]
-    summed, last = (
-        DataConfig(path="x", states="vector", actions="recorded", join_actions=how) for how in ("sum", "last")
-    )
-    assert ReplayConfig(data=summed).misfits(last) == ["replay.data.join_actions sum is not data.join_actions last"]
-    assert not ReplayConfig(data=last).misfits(last)
 
 
 def test_steps_of_another_length_are_refused_with_the_stride_that_fits(replaying, reporter) -> None:
@@ -251,8 +228,3 @@ def test_replay_is_part_of_what_decides_a_run_and_of_nothing_else(replaying, mak
         assert "replay" not in knobs_that_affect(what, config)
         assert not [name for name in names_that_affect(what, Config) if name.startswith("replay")]
     assert knobs_that_affect(Affects.LATENTS, config.for_replay().data)["frames"] == 4
-
-
-def test_a_config_with_replay_is_written_and_read_back(replaying) -> None:
-    config = replaying()
-    assert parse_config(yaml.safe_load(config_as_yaml(config)), where="test") == config

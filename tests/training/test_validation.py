@@ -1,17 +1,14 @@
 """Validation ranks the actions of moves, selects by that rank, and may end a run early."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from same_run import assert_same_run
-from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_from
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.runs.checkpoint import checkpoint_name, newest_checkpoint, read_state
-from vjepa2_ac.runs.checkpoint_selection import select_checkpoint
+from vjepa2_ac.runs.checkpoint import checkpoint_name, newest_checkpoint, read_state, select_checkpoint
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.training import loop, validation
 from vjepa2_ac.training.loop import train
@@ -110,10 +107,3 @@ def test_a_run_without_a_better_one_ends_when_patience_does(make_config, reporte
 def test_what_does_not_fit_together_is_refused(overrides: list[str], words: str) -> None:
     with pytest.raises(InputError, match=words):
         config_from({"run_dir": "r", "data": {"path": "d"}, "model": {"base": "b"}}, overrides, where="here")
-
-
-@pytest.mark.parametrize(("written", "meant"), [(True, "error"), (False, "off"), ("ranking", "ranking")])
-def test_what_earlier_versions_wrote_means_what_it_meant(make_config, written: object, meant: str) -> None:
-    config: Config = make_config(checkpoint__keep_best=written)
-    assert config.checkpoint.keep_best == meant
-    assert json.loads(config.model_dump_json())["checkpoint"]["keep_best"] == meant

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from run_fixtures import TINY
-from same_run import assert_same_run, metrics
+from same_run import metrics
 from vector_sets import write_vectors
 from vjepa2_ac.config import Config, LimitsConfig, ModelConfig, ModelSizes, PlanningConfig
 from vjepa2_ac.config.planning import CemConfig
@@ -98,26 +98,6 @@ def test_from_training_to_a_plan(make_config: MakeConfig, reporter: Any, tmp_pat
     drive(load_to_plan(str(merged), overrides=["planning.samples=6", "planning.cem.elites=3"]).controller(), STATE)
     with pytest.raises(InputError, match=r"predictor without states.*Meta's code has no other.* --to merged"):
         export_run(folder, tmp_path / "official.pt", "official")
-
-
-@pytest.mark.parametrize("kind", ["lora", "none"])
-def test_a_resumed_run_equals_the_one_that_was_not_stopped(
-    make_config: MakeConfig, reporter: Any, tmp_path: Path, base: Path, kind: str
-) -> None:
-    whole, stopped = ({**start_of(kind, base), "run_dir": str(tmp_path / name)} for name in ("whole", "stopped"))
-    train(make_config(**whole), type(reporter)())
-
-    class Interrupts(type(reporter)):  # type: ignore[misc]
-        def stepped(self, step: int, metrics: object) -> None:
-            super().stepped(step, metrics)
-            if step == 3:
-                raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train(make_config(**stopped), Interrupts())
-    train(make_config(**stopped), reporter)
-    assert any(note.startswith("Going on from") for note in reporter.notes)
-    assert_same_run(tmp_path / "whole", tmp_path / "stopped")
 
 
 def test_states_of_any_width_need_no_new_head(

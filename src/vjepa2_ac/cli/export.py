@@ -22,7 +22,7 @@ def add_to(commands: Commands) -> None:
 
 
 def _export(options: argparse.Namespace) -> None:
-    from vjepa2_ac.runs.checkpoint_selection import require_listed
+    from vjepa2_ac.runs.checkpoint import require_listed
     from vjepa2_ac.runs.folder import read_run_config
 
     read_run_config(options.run)  # wrong words are told before what takes seconds is imported

@@ -135,7 +135,7 @@ def require_subject(subject: str, checkpoint: str | None = None) -> None:
         InputError: There is no such run, checkpoint or model.
     """
     from vjepa2_ac.model.base_model import find_base
-    from vjepa2_ac.runs.checkpoint_selection import require_listed
+    from vjepa2_ac.runs.checkpoint import require_listed
     from vjepa2_ac.runs.folder import is_run, read_run_config
 
     if not is_run(subject):

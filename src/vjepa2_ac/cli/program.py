@@ -24,7 +24,7 @@ from vjepa2_ac.cli import (
 from vjepa2_ac.cli.decoding import decoder, imagine
 from vjepa2_ac.cli.options import Handler, Parser, parsed
 from vjepa2_ac.cli.setup import config, demo, doctor, download, init
-from vjepa2_ac.distributed.ending import tidy_end
+from vjepa2_ac.distributed.signals import tidy_end
 from vjepa2_ac.errors import InputError, UserError, extra_of, in_words, is_out_of_memory, pip_install, printable
 
 

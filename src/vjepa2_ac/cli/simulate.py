@@ -144,7 +144,6 @@ def _run_benchmark(options: argparse.Namespace) -> int:
 
     from vjepa2_ac.console.closed_loop import benchmark_notes, benchmark_table
     from vjepa2_ac.console.progress import ConsoleReporter, console
-    from vjepa2_ac.runs.own_files import refuse_links_out
     from vjepa2_ac.simulation.closed_loop.benchmark import BenchmarkOptions, run_benchmark
     from vjepa2_ac.simulation.world.scene import load_mujoco
 
@@ -153,8 +152,6 @@ def _run_benchmark(options: argparse.Namespace) -> int:
     chosen = replace(chosen, films=min(chosen.films, chosen.episodes))
     name = f"closed_loop/{chosen.task}-{chosen.domain}"
     home = Path(options.subject) if is_run(options.subject) else Path()
-    if options.out is None and is_run(options.subject):
-        refuse_links_out(Path(options.subject), [name])
     with _steering(options) as steering, ConsoleReporter() as reporter:
         benchmark, files = run_benchmark(steering, chosen, options.out or home / name, reporter)
     if benchmark.checkpoint:

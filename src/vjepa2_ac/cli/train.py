@@ -46,7 +46,7 @@ def _train(options: argparse.Namespace) -> int:
 
     from vjepa2_ac.console.progress import console
     from vjepa2_ac.console.training import TrainingConsole
-    from vjepa2_ac.distributed.preemption import EXIT_STATUS, StoppedError
+    from vjepa2_ac.distributed.signals import EXIT_STATUS, StoppedError
     from vjepa2_ac.training.loop import train
 
     speaks = os.environ.get("RANK", "0") == "0"  # one of several processes

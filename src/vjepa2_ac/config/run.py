@@ -70,8 +70,6 @@ class Config(Section):
             raise ValueError("training.precision fp32 needs model.dtype float32: bfloat16 weights compute in bfloat16")
         if self.training.compile != "off" and self.adapter.kind == "lora" and self.adapter.dora:
             raise ValueError("training.compile blocks cannot trace adapter.dora; set one of them off")
-        if self.training.cuda_graph and (self.training.precision == "fp16" or self.adapter.dropout):
-            raise ValueError("training.cuda_graph needs adapter.dropout 0, and bf16 or fp32")
         if self.checkpoint.keep_best == "ranking" and not self.validation.ranking_clips:
             raise ValueError("checkpoint.keep_best ranking needs validation.ranking_clips of 1 or more")
         if self.training.patience is not None and self.checkpoint.keep_best == "off":

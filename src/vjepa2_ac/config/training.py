@@ -77,9 +77,6 @@ class TrainingConfig(Section):
     compile: Annotated[Literal["off", "blocks"], OFF] = "off"
     """blocks: torch.compile for the predictor's blocks, in training steps only; needs a C compiler, and a minute before
     the first step. The same losses and gradients to rounding; dropout draws other masks."""
-    cuda_graph: bool = False
-    """Ask the GPU for a whole micro-batch at once instead of kernel by kernel, which at one or two clips takes longer
-    than computing. Not measured yet. Keeps the memory of a step all the time; not with fp16, dropout or FSDP."""
     attention: Literal["auto", "per_step"] = "auto"
     """auto: FlexAttention in training steps on CUDA, which is compiled for each size of a batch. per_step: one plain
     attention for each model step, which compiles nothing. The same losses and gradients to rounding."""

@@ -15,8 +15,6 @@ def memory_lines(config: Config, estimate: MemoryEstimate) -> list[str]:
     """Return one line for every part, then both totals."""
     training, counts = config.training, estimate.parameters
     clips = f"{training.batch_size} clips of {config.data.frames} frames"
-    stored, again = estimate.step.stored, estimate.step.checkpointed
-    fed_back = training.rollout_steps - 1 if stored.rollout else 0
     eight_bits = "8 bits where a tensor has 4,096 elements" if training.optimizer == "adamw_8bit" else "float32"
     parts = [
         (
@@ -34,11 +32,8 @@ def memory_lines(config: Config, estimate: MemoryEstimate) -> list[str]:
         ("next batch", estimate.arriving, "on its way while this one is computed"),
         ("latents", estimate.latents, f"{clips}, float32"),
         ("encoder, at work", estimate.encoding, f"{config.model.encode_chunk} frames at once; before the predictor"),
-        ("predictor, teacher forcing", stored.teacher_forcing, "kept for the backward pass, without checkpointing"),
-        ("predictor, rollout", stored.rollout, f"{fed_back} x one step more, without checkpointing"),
-        ("losses", stored.losses, "without checkpointing"),
-        ("temporaries", stored.peak - stored.saved, "beside all three where most lives at once"),
-        ("all four, checkpointed", again.peak, "instead: inputs of blocks, and one block computed again"),
+        ("predictor, at work", estimate.step.stored, "forward, losses and backward, without checkpointing"),
+        ("the same, checkpointed", estimate.step.checkpointed, "inputs of blocks, and one block computed again"),
         ("copies", estimate.step.casts, f"of adapters in {training.precision}"),
         (
             "validation", estimate.validating,

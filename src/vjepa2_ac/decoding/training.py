@@ -30,7 +30,7 @@ from vjepa2_ac.decoding.frame_pairs import FramePairs, Pairs, wanted_frames
 from vjepa2_ac.decoding.network import UPSAMPLED, Decoder, DecoderShape
 from vjepa2_ac.decoding.steps import SMALLEST, DecoderSteps
 from vjepa2_ac.distributed.device import autocast, computing_device
-from vjepa2_ac.distributed.preemption import StoppedError, StopRequest, stop_on_signals
+from vjepa2_ac.distributed.signals import StoppedError, StopRequest, stop_on_signals
 from vjepa2_ac.encoding.batch import encoding_of
 from vjepa2_ac.encoding.latent_cache import frames_in, key_for, require_space
 from vjepa2_ac.encoding.pipeline import EncoderOnDevice, FramesToEncode, encode_files
@@ -39,9 +39,9 @@ from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.pretrained_folder import first_not_finite
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
-from vjepa2_ac.runs.lock import RunLock
+from vjepa2_ac.runs.files import read_torch, write_torch
+from vjepa2_ac.runs.folder import RunLock
 from vjepa2_ac.runs.metrics_log import MetricsLog
-from vjepa2_ac.runs.torch_file import read_torch, write_torch
 from vjepa2_ac.storage import atomic_writer, try_writing_at, user_can_write, write_atomically
 from vjepa2_ac.storage.structured import utc_now
 

@@ -23,8 +23,8 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import ProcessShare
 from vjepa2_ac.data.windows import require_stride
-from vjepa2_ac.distributed.collectives import value_of_first
 from vjepa2_ac.distributed.device import computing_device
+from vjepa2_ac.distributed.processes import broadcast_object, first_only
 from vjepa2_ac.encoding.batch import encoding_of, require_same_encoder
 from vjepa2_ac.encoding.latent_cache import LatentCache, frames_in, through_cache
 from vjepa2_ac.encoding.pipeline import EncoderOnDevice, FramesToEncode, encode_files
@@ -184,7 +184,11 @@ def _encode_together(
     its files. What stops one of them is written into a file of this attempt, and stops the others.
     """
     share = ProcessShare(accelerator.process_index, accelerator.num_processes)
-    attempt = None if share.processes == 1 else value_of_first(accelerator, partial(_begin_attempt, cache))
+    attempt = (
+        None
+        if share.processes == 1
+        else broadcast_object(accelerator, first_only(accelerator, partial(_begin_attempt, cache)))
+    )
     try:
         if attempt is not None:
             _require_seen(attempt, share)

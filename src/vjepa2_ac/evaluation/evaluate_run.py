@@ -20,7 +20,7 @@ from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import batches_of, validation_windows
 from vjepa2_ac.data.transforms import frames_as_seen
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
-from vjepa2_ac.distributed.launch import make_accelerator
+from vjepa2_ac.distributed.processes import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, require_widths
 from vjepa2_ac.encoding.encode_dataset import with_latents_if_there
 from vjepa2_ac.episode import Batch, LatentBatch, Progress, Widths
@@ -36,7 +36,7 @@ from vjepa2_ac.model.network.input_heads import heads_to_replace, widths_as_text
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.places import BUILTIN
 from vjepa2_ac.reporter import SILENT, Reporter
-from vjepa2_ac.runs.checkpoint_selection import select_checkpoint
+from vjepa2_ac.runs.checkpoint import select_checkpoint
 from vjepa2_ac.runs.folder import METRICS, is_run
 from vjepa2_ac.runs.loading import TrainedRun, load_run
 from vjepa2_ac.runs.metrics_log import read_metrics_log, warnings_of

@@ -23,9 +23,8 @@ from vjepa2_ac.config.planning import CemConfig, EnergyConfig, LimitsConfig, Pla
 from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.settings import require_limits, with_taught_limits
-from vjepa2_ac.runs.checkpoint_selection import SELECTED
+from vjepa2_ac.runs.checkpoint import SELECTED
 from vjepa2_ac.runs.folder import is_run, read_run_config
-from vjepa2_ac.runs.relative_paths import DATA, with_paths_from_start
 
 STEPS = 3  # of a scored plan
 FRAMES = STEPS + 1  # required of a clip
@@ -135,8 +134,7 @@ def _check_metric_files(asked: EvaluationOptions) -> None:
 def _config_of(subject: str, asked: EvaluationOptions) -> tuple[Config, Path]:
     """Return the config to measure with, and the output folder."""
     if is_run(subject):
-        config, needed = read_run_config(Path(subject)), [DATA] if asked.data is None else []
-        config = with_paths_from_start(config, Path(subject), needed=needed)
+        config = read_run_config(Path(subject))
         if asked.data is None:
             return config, asked.out or Path(subject)
         config = config.model_copy(update={"data": asked.data.data})

@@ -24,7 +24,7 @@ from vjepa2_ac.planning.goal_folder import GoalFolder
 from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.planning.model_setup import Fingerprints
 from vjepa2_ac.planning.settings import planning_settings, warn_beyond_taught
-from vjepa2_ac.runs.checkpoint_selection import SELECTED
+from vjepa2_ac.runs.checkpoint import SELECTED
 from vjepa2_ac.runs.folder import is_run
 from vjepa2_ac.runs.loading import load_run
 from vjepa2_ac.storage.structured import utc_now

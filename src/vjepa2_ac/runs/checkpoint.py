@@ -23,18 +23,21 @@ from pydantic import Field
 from vjepa2_ac.config import CheckpointConfig
 from vjepa2_ac.config.section import PositiveInt
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.runs.manifest import verify_manifest, write_manifest
+from vjepa2_ac.runs.files import verify_manifest, write_manifest
 from vjepa2_ac.storage import sync
-from vjepa2_ac.storage.structured import read_json_object, record_of, shown
+from vjepa2_ac.storage.structured import read_json_object, record_of
 
 logger = logging.getLogger(__name__)
 
+CHECKPOINTS = "checkpoints"  # of a run's folder
 STATE = "state.json"
 ADAPTER = "adapter"  # a folder: what `model.adapter.lora.save_trained` writes
 OPTIMIZER = "optimizer.pt"
-FETCHING = ".fetching-"  # a checkpoint being fetched, see `runs.mirror.fetch`
+FETCHING = ".fetching-"  # a checkpoint being fetched, see `runs.mirror.open_remote`
 
 _WRITING = ".writing-"
+SELECTED, NEWEST, BEST = "selected", "newest", "best"
+
 _NAME = re.compile(r"step-([0-9]{8,})")
 _NEEDED = "where a run stood, as this program wrote it"
 _FIX = "Delete this checkpoint, to use an older one"
@@ -60,7 +63,7 @@ class RunState:
     best_error: Finite | None = None  # its rollout error
     best_rank: Finite | None = None  # its mean rank of the true action, if that selects
     lowest_rank: Finite | None = None  # of all validations
-    measured_on: Mapping[str, str] | None = None  # what validation errors depend on, see `training.best_checkpoint`
+    measured_on: Mapping[str, str] | None = None  # what validation errors depend on, see `training.resume`
     loss_scale: Mapping[str, int | float] | None = None  # of fp16: state of the gradient scaler
     data: str | None = None  # the fingerprint of the episodes
     replayed_broken: Mapping[str, str] = field(default_factory=dict)  # the same of the second data set
@@ -194,50 +197,31 @@ def newest_checkpoint(folder: Path) -> Path | None:
     return None
 
 
-def find_damage(checkpoint: Path, name: str | None = None) -> str | None:
-    """Return what is wrong with a checkpoint, or None if every file matches the manifest.
-
-    Args:
-        checkpoint: Its folder.
-        name: Its name, if its folder has another.
-    """
-    return verify_manifest(checkpoint, needed={STATE}) or _another_step(checkpoint, name or checkpoint.name)
+def find_damage(checkpoint: Path) -> str | None:
+    """Return what is wrong with a checkpoint, or None if every file matches the manifest."""
+    return verify_manifest(checkpoint, needed={STATE})
 
 
 def read_state(checkpoint: Path) -> RunState:
-    """Return the progress of the run at a checkpoint, without a best checkpoint that is missing or damaged."""
+    """Return the progress of the run at a checkpoint, without a best checkpoint that is missing."""
     state = written_state(checkpoint)
-    if state.best_step in {None, state.step} or find_damage(checkpoint.parent / str(state.best_name)) is None:
+    if state.best_name is None or (checkpoint.parent / state.best_name).is_dir():
         return state
     return replace(state, best_step=None, best_error=None, best_rank=None, lowest_rank=None)
 
 
 def written_state(checkpoint: Path) -> RunState:
-    """Return the progress of the run as it was written, without checking the best checkpoint.
+    """Return the progress of the run as it was written.
 
     Raises:
-        InputError: The file is missing or damaged, or of an older version of this program.
+        InputError: The file is missing or damaged.
     """
     path = checkpoint / STATE
     try:
         values = read_json_object(path, needed=_NEEDED, fix=_FIX)  # a loss scale may be infinite
     except OSError as error:
         raise InputError(where=str(path), found=f"cannot be read ({error})", needed=_NEEDED, fix=_FIX) from None
-    if "clips_done" not in values:  # or the run would begin the row of clips again
-        found = "of an older version of this program, without clips_done"
-        raise InputError(where=str(path), found=found, needed=_NEEDED, fix=_FIX)
     return record_of(RunState, values, where=str(path), needed=_NEEDED, fix=_FIX)
-
-
-def _another_step(checkpoint: Path, name: str) -> str | None:
-    """Return the error of a checkpoint that is a copy of another one: its name and its state differ in the step."""
-    try:
-        step = read_json_object(checkpoint / STATE).get("step")
-    except (OSError, InputError) as error:
-        return f"no readable {STATE} ({error})"
-    if type(step) is not int:
-        return f"no readable {STATE} (step: {shown(step)})"
-    return None if step_of(name) in {None, step} else f"a copy of another one, of step {step}"
 
 
 def _remove(checkpoint: Path) -> None:
@@ -245,3 +229,85 @@ def _remove(checkpoint: Path) -> None:
         checkpoint.unlink()  # its target is not this run's
     else:
         shutil.rmtree(checkpoint)
+
+
+@dataclass(frozen=True)
+class SelectedCheckpoint:
+    """A complete checkpoint, and how it was selected."""
+
+    path: Path
+    why: str  # how it was selected, in words
+
+    def __str__(self) -> str:
+        """Return its name, and how it was selected."""
+        return f"{self.path.name} ({self.why})"
+
+
+def select_checkpoint(run: Path, by: str = SELECTED) -> SelectedCheckpoint:
+    """Return a complete checkpoint of a run.
+
+    Args:
+        run: The run's folder.
+        by: selected: the best where there is one, else the newest; newest; best (by validation, see
+            `checkpoint.keep_best`); or a number of optimizer steps.
+
+    Raises:
+        InputError: There is no such checkpoint, or it is damaged; names the existing ones.
+    """
+    folder = run / CHECKPOINTS
+    newest = newest_checkpoint(folder)
+    if newest is None:
+        raise InputError(
+            where=str(run),
+            found="a run without a whole checkpoint",
+            needed="at least one",
+            fix=f"Train on with `vjepa2-ac train {run} --resume`",
+        )
+    state = written_state(newest)
+    if by == NEWEST or (by == SELECTED and state.best_step is None):
+        return SelectedCheckpoint(newest, "the newest" if by == NEWEST else "the newest: none was selected")
+    step = _best_step(newest, state) if by in {SELECTED, BEST} else _number(by, folder)
+    path = folder / checkpoint_name(step)
+    if not path.is_dir():
+        raise _not_there(folder, f"no checkpoint of step {step:,}")
+    if (problem := find_damage(path)) is not None:
+        raise _not_there(folder, f"{path.name} is damaged: {problem}")
+    return SelectedCheckpoint(path, _why(state, step) if by in {SELECTED, BEST} else "as asked for")
+
+
+def require_listed(run: Path, by: str = SELECTED) -> None:
+    """Refuse a checkpoint that is not there, without reading any: whether it is whole is checked when it is loaded.
+
+    Raises:
+        InputError: There is no such checkpoint.
+    """
+    there = {str(step_of(path.name)) for path in listed(run / CHECKPOINTS)}
+    if not there or (by not in {SELECTED, NEWEST, BEST} and by not in there):
+        select_checkpoint(run, by)  # says what there is
+
+
+def _why(state: RunState, step: int) -> str:
+    by = "error" if state.best_rank is None else "action ranking"
+    return f"the best by {by}" if step else f"the base: none of its checkpoints is better by {by}"
+
+
+def _best_step(newest: Path, state: RunState) -> int:
+    if state.best_step is None:
+        found = (
+            "no best checkpoint: checkpoint.keep_best was off, there was no validation yet, what it measures was"
+            " changed since, or it was deleted"
+        )
+        raise _not_there(newest.parent, found)
+    return state.best_step
+
+
+def _number(by: str, folder: Path) -> int:
+    step = step_of(f"step-{by.zfill(8)}")
+    if step is None:
+        raise _not_there(folder, f"--checkpoint {by}")
+    return step
+
+
+def _not_there(folder: Path, found: str) -> InputError:
+    steps = ", ".join(str(step_of(path.name)) for path in listed(folder) if find_damage(path) is None)
+    return InputError(where=str(folder), found=found, needed=f"selected, newest, best or one of the steps {steps}")

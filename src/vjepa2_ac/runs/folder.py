@@ -12,51 +12,59 @@ RUN/tensorboard/        event files; RUN/wandb/ likewise
 RUN/imagined/           what is imagined at each validation, where `validation.decoder` is set; and films of `imagine`
 RUN/not_finite/         clips of a step that could not be done
 RUN/.mirror/            links to what is being sent to checkpoint.remote, while it is
-RUN/.lock               held by the process that is training, see `runs.lock`
+RUN/.lock               a kernel lock, held by the process that is training: released however it ends
 """
 
 from __future__ import annotations
 
+import errno
 import importlib.metadata
 import json
+import logging
 import os
 import platform
 import re
 import secrets
 import shutil
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import changed_keys, config_as_flat_dict, config_as_yaml, load_config_of_run
 from vjepa2_ac.config.section import Affects, mark_of
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.places import is_url, literal
-from vjepa2_ac.runs.checkpoint import remove_leavings
-from vjepa2_ac.runs.lock import LOCK
-from vjepa2_ac.runs.own_files import refuse_links_out
-from vjepa2_ac.storage import read_bounded, try_writing_at, write_atomically
+from vjepa2_ac.places import BUILTIN, is_url, literal
+from vjepa2_ac.runs.checkpoint import CHECKPOINTS, remove_leavings
+from vjepa2_ac.storage import read_bounded, try_writing_at, user_can_write, write_atomically
 from vjepa2_ac.storage.structured import MOST_BYTES, json_list, shown, utc_now
 
+logger = logging.getLogger(__name__)
+
+LOCK = ".lock"
 CONFIG = "config.yaml"
 ENVIRONMENT = "environment.json"
 RUN_ID = "run_id"
 CALIBRATION = "calibration.json"  # of an auto stride
 CHANGES = "changes.json"  # of states in a model step
-CHECKPOINTS = "checkpoints"
 HELD = ".mirror"
 METRICS = "metrics.jsonl"
-TENSORBOARD, WANDB = "tensorboard", "wandb"
+TENSORBOARD = "tensorboard"
 _ID = re.compile(r"[\w.-]{0,128}")
 _MOST_BYTES_OF_ID = 1_000
 IMAGINED = "imagined"  # images of what the model imagines
 NOT_FINITE = "not_finite"  # each process writes its own, on the disk that it sees
 
-_OWN = (
-    *(LOCK, CONFIG, ENVIRONMENT, CALIBRATION, CHANGES, RUN_ID, METRICS),
-    *(CHECKPOINTS, HELD, TENSORBOARD, WANDB, NOT_FINITE, IMAGINED),
+_NO_LOCKS = frozenset({errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS})
+_OF_DATA = ("path", "idle.ranges", "cache_dir", "disk_cache.dir")
+_PATHS = (
+    *(f"{data}.{key}" for data in ("data", "replay.data") for key in _OF_DATA),
+    "model.base",
+    "model.encoder.path",
 )
-_FILLED = (NOT_FINITE, IMAGINED)  # folders of files that are written one by one
 
 
 def check_run_folder(config: Config, *, allow_config_change: bool = False) -> None:
@@ -67,14 +75,11 @@ def check_run_folder(config: Config, *, allow_config_change: bool = False) -> No
         allow_config_change: A run of another config is to go on with this one.
 
     Raises:
-        InputError: The folder is a file, somebody else's, of another config, or not writable; or what is to be written
-            into it is a link to elsewhere.
+        InputError: The folder is a file, somebody else's, of another config, or not writable.
     """
     folder = Path(config.run_dir)
     if folder.exists() and not folder.is_dir():
         raise InputError(where=str(folder), found="a file", needed="a folder for the run", fix="Set another run_dir")
-    written = (f"{name}/{path.name}" for name in _FILLED for path in (folder / name).glob("*"))
-    refuse_links_out(folder, [*_OWN, *written])
     if (folder / CONFIG).exists():
         if not allow_config_change:
             _refuse_another_config(folder, config)
@@ -102,7 +107,7 @@ def open_run_folder(config: Config, run_name: str, *, allow_config_change: bool 
     if (changes := config_changes(config)) and allow_config_change:
         start["config_changes"] = changes
     is_new = not (folder / CONFIG).exists()
-    if is_new or allow_config_change or _paths(read_run_config(folder)) != _paths(config):  # the data were moved
+    if is_new or allow_config_change or _moved(config):
         # First of all files: it makes the folder a run's.
         write_atomically(folder / CONFIG, config_as_yaml(config).encode())
     path = folder / ENVIRONMENT
@@ -146,7 +151,7 @@ def is_run(subject: str) -> bool:
 
 
 def read_run_config(folder: Path) -> Config:
-    """Return the config of a run.
+    """Return the config of a run; relative paths that do not exist here as seen from where the run was started.
 
     Raises:
         InputError: Not the folder of a run.
@@ -155,7 +160,25 @@ def read_run_config(folder: Path) -> Config:
         found = "no config.yaml" if folder.is_dir() else "no such folder"
         needed = "the folder of a run, which `vjepa2-ac train CONFIG` makes"
         raise InputError(where=str(folder), found=found, needed=needed)
-    return load_config_of_run(folder / CONFIG, [f"run_dir={json.dumps(literal(folder))}"])
+    overrides = [f"run_dir={json.dumps(literal(folder))}"]
+    config = load_config_of_run(folder / CONFIG, overrides)
+    moved = [f"{key}={json.dumps(path)}" for key, path in _seen_from_start(config, folder)]
+    return load_config_of_run(folder / CONFIG, [*overrides, *moved]) if moved else config
+
+
+def _seen_from_start(config: Config, folder: Path) -> Iterator[tuple[str, str]]:
+    """Yield the keys of relative paths that exist from a folder in which the run was started, and not from here."""
+    flat = config_as_flat_dict(config)
+    data_sets = zip(("data", "replay.data"), config.data_sets, strict=False)
+    only_names = {f"{name}.idle.ranges" for name, data in data_sets if data.is_cache}  # a part of the cache's key
+    starts = [str(start.get("folder")) for start in reversed(_earlier_starts(folder / ENVIRONMENT))]
+    for key in _PATHS:
+        path = flat.get(key)
+        if path is None or key in only_names or is_url(path) or path.startswith(BUILTIN) or Path(path).exists():
+            continue
+        there = next((found for start in starts if (found := Path(start, path)).exists()), None)
+        if there is not None:
+            yield key, str(there)
 
 
 def places_elsewhere(config: Config) -> list[str]:
@@ -166,12 +189,6 @@ def places_elsewhere(config: Config) -> list[str]:
     knobs = config_as_flat_dict(config).items()
     named = [f"{key}: {value}" for key, value in knobs if isinstance(value, str) and is_url(value)]
     return [*named, "tracking.wandb: online"] if config.tracking.wandb == "online" else named
-
-
-def start_folders(folder: Path) -> list[Path]:
-    """Return the folders in which a run was started, the last one first."""
-    starts = [start for start in _earlier_starts(folder / ENVIRONMENT) if isinstance(start, dict)]
-    return [Path(start["folder"]) for start in reversed(starts) if isinstance(start.get("folder"), str)]
 
 
 def environment() -> dict[str, object]:
@@ -193,15 +210,18 @@ def _is_without_config(path: Path) -> bool:
     return path.name in {LOCK, NOT_FINITE} or (path.name.startswith(f".{CONFIG}.") and path.name.endswith(".partial"))
 
 
-def _earlier_starts(path: Path) -> list[object]:
+def _earlier_starts(path: Path) -> list[dict[str, Any]]:
     try:
-        return json_list(read_bounded(path, MOST_BYTES), where=str(path))
+        starts = json_list(read_bounded(path, MOST_BYTES), where=str(path))
     except (OSError, InputError):
         return []
+    return [start for start in starts if isinstance(start, dict)]
 
 
-def _paths(config: Config) -> list[str]:
-    return [data.path for data in config.data_sets]
+def _moved(config: Config) -> bool:
+    """Return whether the data are elsewhere than the config in the run's folder says."""
+    before = read_run_config(Path(config.run_dir)).data_sets
+    return [data.path for data in before] != [data.path for data in config.data_sets]
 
 
 def _refuse_another_config(folder: Path, config: Config) -> None:
@@ -236,3 +256,57 @@ def with_settled_stride(config: Config) -> Config:
 def with_stride(config: Config, stride: int) -> Config:
     """Return the config with a stride that was found out."""
     return config.model_copy(update={"data": config.data.with_stride(stride)})
+
+
+class RunLock:
+    """A lock for writing into a run's folder: two training processes would overwrite each other's checkpoints.
+
+    It is held from `take` to the end of the `with` block.
+
+    Args:
+        folder: The run's folder; `take` creates it if needed.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._lock = folder, FileLock(folder / LOCK)
+
+    def take(self) -> None:
+        """Take the lock; does nothing if it is held already.
+
+        On a file system without such locks the run continues without one, with a warning.
+
+        Raises:
+            InputError: Another process holds it, which is named if it has begun to train; or the folder cannot be
+                written.
+        """
+        if self._lock.is_locked:
+            return
+        with user_can_write(self._folder / LOCK):
+            self._folder.mkdir(parents=True, exist_ok=True)
+            try:
+                self._lock.acquire(blocking=False)
+            except Timeout:
+                found = f"a run that is being trained right now, by {_last_start(self._folder)}"
+                needed = "a folder that no other process writes to"
+                fix = "Wait until it ends, stop it, or set another run_dir"
+                raise InputError(where=str(self._folder), found=found, needed=needed, fix=fix) from None
+            except OSError as error:
+                if error.errno not in _NO_LOCKS:
+                    raise
+                what_to_do = "see that no other process trains in this folder"
+                logger.warning("%s: no locks here (%s): %s", self._folder, error.strerror, what_to_do)
+
+    def __enter__(self) -> RunLock:
+        """Return the lock, not yet taken."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Release the lock."""
+        self._lock.release()
+
+
+def _last_start(folder: Path) -> str:
+    last: dict[str, Any] = (_earlier_starts(folder / ENVIRONMENT) or [{}])[-1]
+    if "host" not in last:
+        return "another process"
+    return f"process {last.get('process')} on {last['host']}, since {last.get('time')}"

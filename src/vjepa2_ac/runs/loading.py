@@ -9,10 +9,8 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.model.adapter.lora import load_trained
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.runs.checkpoint import ADAPTER
-from vjepa2_ac.runs.checkpoint_selection import SELECTED, select_checkpoint
+from vjepa2_ac.runs.checkpoint import ADAPTER, SELECTED, select_checkpoint
 from vjepa2_ac.runs.folder import read_run_config
-from vjepa2_ac.runs.relative_paths import BASE, ENCODER, with_paths_from_start
 
 
 @dataclass(frozen=True)
@@ -30,15 +28,13 @@ def load_run(folder: Path, checkpoint: str = SELECTED, config: Config | None = N
 
     Args:
         folder: The run.
-        checkpoint: selected, newest, best, or a number of optimizer steps; see `runs.checkpoint_selection`.
+        checkpoint: selected, newest, best, or a number of optimizer steps; see `runs.checkpoint.select_checkpoint`.
         config: The run's config, with changed settings for loading; None: unchanged.
 
     Raises:
         InputError: Not the folder of a run, no such checkpoint, or its base cannot be loaded.
     """
     config = config or read_run_config(folder)
-    needed = [BASE] if config.model.encoder is None else [BASE, ENCODER]
-    config = with_paths_from_start(config, folder, needed=needed)
     chosen = select_checkpoint(folder, checkpoint)
     world_model = load_base(config.model, seed=config.seed)
     load_trained(world_model, chosen.path / ADAPTER, trainable=False)

@@ -10,6 +10,8 @@ from __future__ import annotations
 import json
 import logging
 import os
+import threading
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,14 +19,14 @@ from typing import Any
 
 from vjepa2_ac.errors import InputError, UserError
 from vjepa2_ac.runs.folder import METRICS
-from vjepa2_ac.runs.slow_disk import warn_if_stalled
-from vjepa2_ac.runs.tracker_thread import Image
-from vjepa2_ac.runs.trackers import Trackers
+from vjepa2_ac.runs.trackers import Image, Trackers
 from vjepa2_ac.storage import read_bounded, user_can_write, write_atomically
 from vjepa2_ac.storage.structured import finite_or_none, json_object
 
-WARNING = "warning"  # kind of a row in metrics.jsonl, which has a `text`
 logger = logging.getLogger(__name__)
+
+WARNING = "warning"  # kind of a row in metrics.jsonl, which has a `text`
+STALLED_S = 60.0
 
 _MOST_BYTES = 1 << 28
 
@@ -143,3 +145,27 @@ def warnings_of(path: Path) -> list[str]:
     """Return the warnings of a run, from its metrics.jsonl."""
     rows = (row for row in read_metrics_log(path) if row.get("kind") == WARNING)
     return [row["text"] for row in rows if isinstance(row.get("text"), str)]
+
+
+@contextmanager
+def warn_if_stalled(path: Path) -> Iterator[None]:
+    """Warn if the block, which writes a file, lasts longer than a minute; and when it ends, how long it took.
+
+    A network disk may block for minutes, and training has to wait: without a message it would look like one that hangs.
+    """
+    patience_s, begun_s, is_over = STALLED_S, time.monotonic(), threading.Lock()
+
+    def warn() -> None:
+        if is_over.acquire(blocking=False):
+            logger.warning("%s: the disk has not taken it for %g s; training waits for it", path, patience_s)
+
+    timer = threading.Timer(patience_s, warn)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+        if not is_over.acquire(blocking=False):
+            timer.join()
+            logger.warning("%s: the disk took it after %.0f s; training goes on", path, time.monotonic() - begun_s)

@@ -7,31 +7,31 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.reporter import Reporter
-from vjepa2_ac.runs.checkpoint import RunState, find_damage, listed, read_state, step_of
-from vjepa2_ac.runs.folder import CHECKPOINTS, check_run_folder, config_changes, open_run_folder, with_settled_stride
-from vjepa2_ac.runs.lock import RunLock
-from vjepa2_ac.runs.mirror.background_sync import Mirror, NoMirror
-from vjepa2_ac.runs.mirror.open_remote import Remote, open_remote
-from vjepa2_ac.runs.relative_paths import require_start_folder
+from vjepa2_ac.runs.checkpoint import CHECKPOINTS, RunState, find_damage, listed, step_of
+from vjepa2_ac.runs.folder import RunLock, check_run_folder, config_changes, open_run_folder, with_settled_stride
+
+if TYPE_CHECKING:
+    from vjepa2_ac.runs.mirror.background_sync import Mirror
+    from vjepa2_ac.runs.mirror.open_remote import Remote
 
 
 @dataclass(frozen=True)
 class OpenRun:
-    """A run that can begin or go on."""
+    """A run that can begin or go on, in the process that writes its files."""
 
     config: Config  # with the stride that the run has chosen; its run_dir has the checkpoints to resume from
     lock: RunLock
     remote: Remote | None
-    writes: bool  # whether this process writes the run's files; else another one does
     allow_config_change: bool
 
     def changes(self, config: Config) -> list[str]:
         """Return a line per setting in which a config differs from the run's, where that is allowed."""
-        return config_changes(config) if self.writes and self.allow_config_change else []
+        return config_changes(config) if self.allow_config_change else []
 
     def begin(self, config: Config, state: RunState) -> None:
         """Lock the folder, and record this start in it; a new folder is only created now.
@@ -44,54 +44,47 @@ class OpenRun:
             InputError: Another process trains in the folder, or has done so since it was inspected; or as
                 `open_run_folder`.
         """
-        if self.writes:
-            self.lock.take()
-            _refuse_if_overtaken(Path(config.run_dir), state)
-            open_run_folder(config, state.run_id, allow_config_change=self.allow_config_change)
+        self.lock.take()
+        _refuse_if_overtaken(Path(config.run_dir), state)
+        open_run_folder(config, state.run_id, allow_config_change=self.allow_config_change)
 
-    def mirror(self, run_id: str) -> Mirror | NoMirror:
+    def mirror(self, run_id: str) -> Mirror | None:
         """Return what keeps `checkpoint.remote` up to date."""
-        return NoMirror() if self.remote is None else self.remote.mirror(run_id)
+        return None if self.remote is None else self.remote.mirror(run_id)
 
 
 @contextlib.contextmanager
 def open_run(
-    config: Config,
-    reporter: Reporter,
-    *,
-    writes: bool = True,
-    check_only: bool = False,
-    allow_config_change: bool = False,
+    config: Config, reporter: Reporter, *, check_only: bool = False, allow_config_change: bool = False
 ) -> Iterator[OpenRun]:
     """Check the folder of a run, fetch what is newer in `checkpoint.remote`, and hold the lock to the end of the block.
 
     Args:
         config: The run.
         reporter: Receives messages.
-        writes: Whether this process, of several, writes the run's files; only it needs to see the folder.
         check_only: Lock nothing, and download into a temporary folder.
         allow_config_change: The run in the folder may have another config.
 
     Raises:
         InputError: The folder is not this run's, is in use or cannot be written; or as `open_remote`.
     """
-    folder, remote = Path(config.run_dir), None
+    folder, remote, trial = Path(config.run_dir), None, None
+    config = with_settled_stride(config)
+    check_run_folder(config, allow_config_change=allow_config_change)
     with contextlib.ExitStack() as until_the_end:
         lock = until_the_end.enter_context(RunLock(folder))
-        if writes:
-            config = with_settled_stride(config)
-            check_run_folder(config, allow_config_change=allow_config_change)
-            require_start_folder(config, folder)
-            trial = None
-            if check_only:
-                trial = Path(until_the_end.enter_context(tempfile.TemporaryDirectory()), "run")
-            elif folder.is_dir():  # a new one is created, and locked, after all checks
-                lock.take()
+        if check_only:
+            trial = Path(until_the_end.enter_context(tempfile.TemporaryDirectory()), "run")
+        elif folder.is_dir():  # a new one is created, and locked, after all checks
+            lock.take()
+        if config.checkpoint.remote is not None:
+            from vjepa2_ac.runs.mirror.open_remote import open_remote
+
             # Locked before anything is downloaded into the run's folder: another process could still be writing there.
             claim = lock.take if trial is None else lambda: None
             remote = open_remote(config, reporter, claim=claim, allow_config_change=allow_config_change, into=trial)
             config = with_settled_stride(remote.config if remote else config)
-        yield OpenRun(config, lock, remote, writes, allow_config_change)
+        yield OpenRun(config, lock, remote, allow_config_change)
 
 
 def _refuse_if_overtaken(folder: Path, state: RunState) -> None:
@@ -100,6 +93,6 @@ def _refuse_if_overtaken(folder: Path, state: RunState) -> None:
     further = [path for path in listed(folder / CHECKPOINTS) if (step_of(path.name) or 0) > state.step]
     newest = next((path for path in reversed(further) if find_damage(path) is None), None)
     if newest is not None:
-        there = f"a checkpoint of step {read_state(newest).step}"
+        there = f"a checkpoint of step {step_of(newest.name)}"
         found = f"{there}, which another start wrote while this one stood at {state.step}"
         raise InputError(where=str(newest), found=found, fix="Start again: the run continues from there")

@@ -1,36 +1,50 @@
-"""Trackers for a run's curves: TensorBoard, Weights & Biases and trackio, as the config asks.
+"""Trackers for a run's curves: TensorBoard, Weights & Biases and trackio, as the config asks, by Accelerate's classes.
 
-A tracker has a thread of its own (`tracker_thread`): one that cannot be opened, fails or hangs is disabled with one
-warning, and training continues without it. Only a library that is not installed is an error, before the first step.
-`metrics.jsonl` (`runs.metrics_log`) has all metrics regardless of trackers. A resumed run, on whatever machine,
-continues the same W&B or trackio run.
+A tracker has a thread of its own: one that cannot be opened, fails or hangs is disabled with one warning, and training
+continues without it. Only a library that is not installed is an error, before the first step. `metrics.jsonl`
+(`runs.metrics_log`) has all metrics regardless of trackers. A resumed run, on whatever machine, continues the same W&B
+or trackio run.
 """
 
 from __future__ import annotations
 
 import importlib.util
+import logging
 import math
 import os
+import queue
+import threading
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8
 
 from vjepa2_ac.config import Config, TrackingConfig
 from vjepa2_ac.config.loading import config_as_flat_dict
 from vjepa2_ac.errors import InputError, pip_install
 from vjepa2_ac.runs.folder import TENSORBOARD
-from vjepa2_ac.runs.tracker_thread import Image, Opening, TrackerThread
+
+logger = logging.getLogger(__name__)
 
 PATIENCE_S = 60.0  # after which a warning says that a tracker does not answer
 CLOSING_S = 30.0  # that the end of a run waits for all of them
+MOST_ROWS = 10_000  # that wait for a tracker: some 15 MB
+MOST_IMAGES = 8  # likewise
+
+Image = UInt8[np.ndarray, "height width 3"]
+Opening = Callable[[], Any]
+"""Makes a tracker (accelerate.tracking.GeneralTracker), whose methods may raise anything, and take any time."""
 
 
 class Trackers:
     """The working trackers of a run.
 
     Args:
-        openings: Functions that open a tracker, by its display name.
+        openings: Functions that make a tracker, by its display name.
         opening_s: After which a warning says that one does not answer; training does not wait for it.
         closing_s: Longest wait at the end, for all of them.
     """
@@ -39,18 +53,18 @@ class Trackers:
         self, openings: Mapping[str, Opening], *, opening_s: float = PATIENCE_S, closing_s: float = CLOSING_S
     ) -> None:
         self._closing_s = closing_s
-        self._threads = [TrackerThread(name, opening, patience_s=opening_s) for name, opening in openings.items()]
+        self._threads = [_Thread(name, opening, patience_s=opening_s) for name, opening in openings.items()]
 
     def log(self, kind: str, step: int, metrics: Mapping[str, Any]) -> None:
         """Log the numbers of a row; lists, such as errors by horizon, number by number from 1."""
         numbers = {f"{kind}/{key}": value for key, value in _numbers(metrics).items()}
         for thread in self._threads:
-            thread.log(numbers, step)
+            thread.put(lambda tracker: tracker.log(numbers, step=step), MOST_ROWS)
 
     def log_image(self, kind: str, name: str, step: int, image: Image) -> None:
         """Log an image, which nobody changes any more."""
         for thread in self._threads:
-            thread.log_image(f"{kind}/{name}", image, step)
+            thread.put(lambda tracker: tracker.log_images({f"{kind}/{name}": image[None]}, step=step), MOST_IMAGES)
 
     def close(self) -> None:
         """Close all; a second call does nothing."""
@@ -60,6 +74,63 @@ class Trackers:
             thread.end()
         for thread in threads:
             thread.wait(max(0.0, until_s - time.monotonic()), self._closing_s)
+
+
+class _Thread:
+    """A tracker in a thread, which makes it, sends it rows and closes it; problems are warned of once."""
+
+    def __init__(self, name: str, opening: Opening, *, patience_s: float) -> None:
+        self._name, self._opening, self._patience_s = name, opening, patience_s
+        self._rows: queue.SimpleQueue[Callable[[Any], None] | None] = queue.SimpleQueue()
+        self._doing, self._since_s = "cannot be opened", time.monotonic()  # the current call, if it does not end
+        self._warned, self._dropped = False, 0
+        self._thread = threading.Thread(target=self._work, name=name, daemon=True)
+        self._thread.start()
+
+    def put(self, send: Callable[[Any], None], most: int) -> None:
+        """Queue what is to be sent, unless so many rows wait already."""
+        if not self._thread.is_alive():
+            return
+        if self._rows.qsize() < most:
+            self._rows.put(send)
+        else:
+            self._dropped += 1
+        if time.monotonic() - self._since_s > self._patience_s:
+            self._warn(f"no answer within {self._patience_s:g} s", "its metrics wait")
+
+    def end(self) -> None:
+        """Close it after the last row; does not wait."""
+        self._rows.put(None)
+
+    def wait(self, within_s: float, limit_s: float) -> None:
+        """Wait until it is closed, at most `within_s`: the rest of `limit_s`."""
+        self._thread.join(within_s)
+        if self._thread.is_alive():
+            self._warn(f"no answer within {limit_s:g} s", "its last metrics may be missing there")
+        if self._dropped:
+            logger.warning("%s was too slow for %d rows, which are missing there", self._name, self._dropped)
+
+    def _work(self) -> None:
+        after = "going on without it"
+        try:
+            tracker = self._opening()
+            tracker.start()
+            self._since_s = math.inf
+            while (send := self._rows.get()) is not None:
+                self._doing, self._since_s = "failed", time.monotonic()
+                send(tracker)
+                self._since_s = math.inf
+            after = "its last metrics may be missing there"
+            self._doing, self._since_s = "did not close", time.monotonic()
+            tracker.finish()
+        except BaseException as error:  # also SystemExit and the like: a tracker never stops training
+            first_line = str(error).strip().partition("\n")[0]
+            self._warn(f"{type(error).__name__}: {first_line}".removesuffix(": "), after)
+
+    def _warn(self, reason: str, after: str) -> None:
+        if not self._warned:
+            self._warned = True
+            logger.warning("%s %s (%s); %s", self._name, self._doing, reason, after)
 
 
 def require_installed(tracking: TrackingConfig) -> None:
@@ -91,58 +162,30 @@ def open_trackers(config: Config, folder: Path, *, run_id: str, first_step: int)
     tracking = config.tracking
     openings: dict[str, Opening] = {}
     if tracking.tensorboard:
-        openings["TensorBoard"] = lambda: _TensorBoard(folder / TENSORBOARD, first_step)
+        openings["TensorBoard"] = lambda: _tensorboard(folder, first_step)
     if tracking.wandb != "disabled":
-        openings["Weights & Biases"] = lambda: _wandb_run(config, folder, run_id)
+        openings["Weights & Biases"] = lambda: _wandb(config, folder, run_id)
     if tracking.trackio:
-        openings["trackio"] = lambda: _trackio_run(config, run_id)
+        openings["trackio"] = lambda: _trackio(config, run_id)
     return Trackers(openings)
 
 
-class _TensorBoard:
-    def __init__(self, folder: Path, first_step: int) -> None:
-        from torch.utils.tensorboard import SummaryWriter
+def _tensorboard(folder: Path, first_step: int) -> Any:
+    from accelerate.tracking import TensorBoardTracker
 
-        self._writer: Any = SummaryWriter(str(folder), purge_step=first_step + 1)
-
-    def log(self, metrics: Mapping[str, float], step: int) -> None:
-        for name, value in metrics.items():
-            self._writer.add_scalar(name, value, step)
-
-    def log_image(self, name: str, image: Image, step: int) -> None:
-        self._writer.add_image(name, image, step, dataformats="HWC")
-
-    def close(self) -> None:
-        self._writer.close()
+    tracker = TensorBoardTracker(TENSORBOARD, folder, purge_step=first_step + 1)
+    tracker.log_images = partial(tracker.log_images, dataformats="NHWC")
+    return tracker
 
 
-class _OnlineRun:
-    """A run of W&B or trackio, whose methods are alike.
-
-    W&B ignores rows of steps that it has already: a resumed run repeats the same metrics.
-    """
-
-    def __init__(self, run: Any, as_image: Callable[[Image], Any]) -> None:
-        self._run, self._as_image = run, as_image
-
-    def log(self, metrics: Mapping[str, float], step: int) -> None:
-        self._run.log(dict(metrics), step=step)
-
-    def log_image(self, name: str, image: Image, step: int) -> None:
-        self._run.log({name: self._as_image(image)}, step=step)
-
-    def close(self) -> None:
-        self._run.finish()
-
-
-def _wandb_run(config: Config, folder: Path, run_id: str) -> _OnlineRun:
+def _wandb(config: Config, folder: Path, run_id: str) -> Any:
+    """Return a tracker of W&B, which ignores rows of steps that it has already: a resumed run repeats the same."""
     import wandb
+    from accelerate.tracking import WandBTracker
 
-    # Output is not captured: it would contain the console's progress bar. Times are bounded where W&B can.
-    bounds: dict[str, Any] = {"init_timeout": 20.0, "login_timeout": 30.0, "finish_timeout": 20.0, "console": "off"}
-    known = getattr(wandb.Settings, "model_fields", {})
-    run = wandb.init(
-        project=config.tracking.project,
+    # Output is not captured: it would contain the console's progress bar. Times are bounded.
+    return WandBTracker(
+        config.tracking.project,
         id=run_id,
         name=folder.resolve().name,
         resume="allow",
@@ -150,18 +193,21 @@ def _wandb_run(config: Config, folder: Path, run_id: str) -> _OnlineRun:
         dir=os.environ.get("WANDB_DIR") or str(folder),
         config=config_as_flat_dict(config),
         allow_val_change=True,
-        settings=wandb.Settings(**{name: value for name, value in bounds.items() if name in known}),
+        settings=wandb.Settings(init_timeout=20.0, login_timeout=30.0, finish_timeout=20.0, console="off"),
     )
-    return _OnlineRun(run, lambda image: wandb.Image(image))  # looked up late: an old version may have none
 
 
-def _trackio_run(config: Config, run_id: str) -> _OnlineRun:
-    """Open trackio, which identifies a run by its name: that is therefore the run's id."""
+def _trackio(config: Config, run_id: str) -> Any:
+    """Return a tracker of trackio, which identifies a run by its name: that is therefore the run's id."""
     import trackio
+    from accelerate.tracking import TrackioTracker
 
-    plain, project = config_as_flat_dict(config), config.tracking.project
-    run = trackio.init(project=project, name=run_id, resume="allow", config=plain, embed=False)
-    return _OnlineRun(run, lambda image: trackio.Image(image))
+    class WithImages(TrackioTracker):  # type: ignore[misc]  # untyped
+        def log_images(self, values: Mapping[str, Any], step: int) -> None:
+            self.log({name: trackio.Image(images[0]) for name, images in values.items()}, step=step)
+
+    plain = config_as_flat_dict(config)
+    return WithImages(config.tracking.project, name=run_id, resume="allow", config=plain, embed=False)
 
 
 def _numbers(metrics: Mapping[str, Any]) -> dict[str, float]:

@@ -13,32 +13,33 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict
-from vjepa2_ac.data.coverage import coverage_in
-from vjepa2_ac.distributed.collectives import all_reduce_max, broadcast_object, require_same
-from vjepa2_ac.distributed.launch import make_accelerator
-from vjepa2_ac.distributed.preemption import StoppedError, stop_on_signals
+from vjepa2_ac.distributed.processes import (
+    agreed,
+    all_reduce_max,
+    broadcast_object,
+    first_only,
+    make_accelerator,
+    require_same,
+)
+from vjepa2_ac.distributed.signals import StoppedError, stop_on_signals
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.result import Validation
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.checkpoint import CheckpointClock
 from vjepa2_ac.runs.folder import CALIBRATION, CHANGES
 from vjepa2_ac.runs.metrics_log import MetricsLog
-from vjepa2_ac.runs.mirror.background_sync import Mirror, NoMirror
 from vjepa2_ac.runs.open_run import OpenRun, open_run
 from vjepa2_ac.runs.trackers import open_trackers, require_installed
 from vjepa2_ac.storage import write_atomically
-from vjepa2_ac.training.monitoring.divergence import WatchedMetricsLog
-from vjepa2_ac.training.monitoring.stopwatch import stopwatch_for
-from vjepa2_ac.training.monitoring.throughput import Throughput, TimedBatches
+from vjepa2_ac.training.monitoring import NullMetricsLog, Throughput, TimedBatches, TrainingReporter, WatchedMetricsLog
 from vjepa2_ac.training.optim import require_optimizer
-from vjepa2_ac.training.reporter import NullMetricsLog, TrainingReporter
-from vjepa2_ac.training.resume import require_same_data, restore
-from vjepa2_ac.training.setup import Run, batches_from, open_data, open_model, save_checkpoint
+from vjepa2_ac.training.resume import require_same_data, restore, save_checkpoint
+from vjepa2_ac.training.setup import Run, batches_from, open_data, open_model
 from vjepa2_ac.training.step import gradients, training_step
 from vjepa2_ac.training.validation import (
     is_out_of_patience,
@@ -47,6 +48,10 @@ from vjepa2_ac.training.validation import (
     validate_if_due,
     validation_metrics,
 )
+
+if TYPE_CHECKING:
+    from vjepa2_ac.evaluation.result import Validation
+    from vjepa2_ac.runs.mirror.background_sync import Mirror
 
 _IN_PLACE = "Everything is in place: data, model, validation and gradients were checked; nothing was written."
 
@@ -67,51 +72,64 @@ def train(
 
     Raises:
         InputError: An input cannot be used; raised before the first step wherever possible.
-        StoppedError: A signal asked the run to stop between its first and last step; see `distributed.preemption`.
+        StoppedError: A signal asked the run to stop between its first and last step; see `distributed.signals`.
     """
     accelerator = make_accelerator(config)
     require_same(accelerator, config_as_dict(config), what="the config", fix="Start all processes with one config")
     require_optimizer(config.training)
-    writes = accelerator.is_main_process  # the only one that reports, has trackers and needs to see the run's folder
-    if writes:
-        require_installed(config.tracking)
-    else:
-        reporter = SILENT
-    opening = open_run(config, reporter, writes=writes, check_only=check_only, allow_config_change=allow_config_change)
-    with opening as opened, _out_of_memory_explained():
-        data = open_data(broadcast_object(accelerator, opened.config), reporter, accelerator)
-        if writes and not allow_config_change:
-            require_same_data(data.config, data.dataset, data.replayed)
+    reporter = reporter if accelerator.is_main_process else SILENT
+
+    with contextlib.ExitStack() as until_the_end, _out_of_memory_explained():
+
+        def opening() -> OpenRun:
+            require_installed(config.tracking)
+            here = open_run(config, reporter, check_only=check_only, allow_config_change=allow_config_change)
+            return until_the_end.enter_context(here)
+
+        # The first process is the only one that reports, has trackers and needs to see the run's folder.
+        opened = first_only(accelerator, opening)
+        data = open_data(broadcast_object(accelerator, opened.config if opened else config), reporter, accelerator)
+        if not allow_config_change:
+            first_only(accelerator, lambda: require_same_data(data.config, data.dataset, data.replayed))
         run = restore(open_model(data, reporter, check_only=check_only), reporter)
         first = validate_base(run, reporter)
-        for line in opened.changes(run.config):
+        for line in opened.changes(run.config) if opened else ():
             reporter.note(f"The config changes: {line}")
         if check_only:
             gradients(run, batches_from(run))
             reporter.note(_IN_PLACE)
         else:
-            opened.begin(run.config, run.state)
             _train(run, opened, first, reporter)
     return run.folder
 
 
-def _train(run: Run, opened: OpenRun, first: Validation | None, reporter: TrainingReporter) -> None:
-    if opened.writes:
-        _write_measured(run)
-    try:
-        with _open_metrics_log(run, reporter) as metrics_log, opened.mirror(run.state.run_id) as mirror:
-            if first is not None and record(run, validation_metrics(first), metrics_log):
-                with metrics_log.before_a_checkpoint():
-                    save_checkpoint(run, run.folder)  # the base: nothing that is worse is ever selected
+def _train(run: Run, opened: OpenRun | None, first: Validation | None, reporter: TrainingReporter) -> None:
+    with contextlib.ExitStack() as until_the_end:
+
+        def beginning() -> tuple[MetricsLog, Mirror | None] | None:
+            if opened is None:
+                return None
+            opened.begin(run.config, run.state)
+            _write_measured(run)
+            metrics_log = until_the_end.enter_context(_open_metrics_log(run, reporter))
+            mirror = opened.mirror(run.state.run_id)
+            return metrics_log, mirror and until_the_end.enter_context(mirror)
+
+        metrics_log, mirror = agreed(run.accelerator, beginning) or (NullMetricsLog(), None)
+        if first is not None and record(run, validation_metrics(first), metrics_log):
+            _save(run, metrics_log)  # the base: nothing that is worse is ever selected
+        try:
             _loop(run, metrics_log, mirror, reporter)
-    except StoppedError:
-        run.accelerator.end_training()
-        raise
+        except StoppedError:
+            run.accelerator.end_training()
+            raise
     run.accelerator.end_training()
 
 
 def _write_measured(run: Run) -> None:
     """Write what the data and the base have shown: the metrics of a chosen stride, and what the actions teach."""
+    from vjepa2_ac.data.coverage import coverage_in
+
     folder = run.folder
     if run.calibration is not None:
         write_atomically(folder / CALIBRATION, json.dumps(run.calibration.as_dict(), indent=1).encode())
@@ -119,52 +137,61 @@ def _write_measured(run: Run) -> None:
         write_atomically(folder / CHANGES, json.dumps(coverage.noted()).encode())
 
 
-def _open_metrics_log(run: Run, reporter: TrainingReporter) -> MetricsLog | NullMetricsLog:
-    if not run.accelerator.is_main_process:
-        return NullMetricsLog()
-    folder, done = run.folder, run.state.step
-    trackers = open_trackers(run.config, folder, run_id=run.state.run_id, first_step=done)
-    return WatchedMetricsLog(folder, config=run.config, reporter=reporter, first_step=done, trackers=trackers)
+def _open_metrics_log(run: Run, reporter: TrainingReporter) -> MetricsLog:
+    done = run.state.step
+    trackers = open_trackers(run.config, run.folder, run_id=run.state.run_id, first_step=done)
+    return WatchedMetricsLog(run.folder, config=run.config, reporter=reporter, first_step=done, trackers=trackers)
+
+
+def _save(run: Run, metrics_log: MetricsLog | NullMetricsLog) -> None:
+    """Write a checkpoint, after the metrics that lead to it."""
+
+    def save() -> None:
+        with metrics_log.before_a_checkpoint():
+            save_checkpoint(run, run.folder)
+
+    agreed(run.accelerator, save)
 
 
 def _loop(
-    run: Run, metrics_log: MetricsLog | NullMetricsLog, mirror: Mirror | NoMirror, reporter: TrainingReporter
+    run: Run, metrics_log: MetricsLog | NullMetricsLog, mirror: Mirror | None, reporter: TrainingReporter
 ) -> None:
-    training, folder = run.config.training, run.folder
+    training = run.config.training
     device, processes = run.accelerator.device, run.accelerator.num_processes
     throughput = Throughput.of(run.config, run.world_model.sizes, device, processes, encodes=run.encodes)
     reporter.note(str(throughput))
     reporter.started(run.state.step, training.steps)
     clock = CheckpointClock(run.config.checkpoint)
     with stop_on_signals() as stop, contextlib.closing(batches_from(run)) as batches:
-        timed = TimedBatches(batches, stopwatch_for(device))
-        for step in range(run.state.step + 1, training.steps + 1):
-            if is_out_of_patience(run):
-                reporter.note(_out_of_patience(run))
-                break
-            last = step == training.steps
-            is_logged = step % training.log_every == 0 or last
+        timed, stopped_by = TimedBatches(batches, device), 0
+        while not (stopped_by or _is_done(run)):
+            step = run.state.step + 1
+            is_logged = step % training.log_every == 0 or step == training.steps
             metrics = _timed_step(run, timed, step, throughput, measure_update=is_logged)
             reporter.stepped(step, metrics)
             if is_logged:
                 metrics_log.write("train", step, metrics)
             run.state = replace(run.state, step=step, clips_done=run.state.clips_done + run.clips_per_step)
             is_best = validate_if_due(run, metrics_log, reporter)
-            last = last or is_out_of_patience(run)
             # Agreed among all processes, and read once: a signal after this takes effect at the next step.
-            is_due = clock.is_due(step) or is_best or last or metrics_log.is_behind
+            is_due = clock.is_due(step) or is_best or _is_done(run) or metrics_log.is_behind
             stopped_by, due = all_reduce_max(run.accelerator, [stop.number, is_due])
             if due or stopped_by:
-                with metrics_log.before_a_checkpoint():
-                    save_checkpoint(run, folder)
+                _save(run, metrics_log)
                 clock.restart()
-            mirror.tick()
-            if stopped_by and not last:
-                mirror.finish(lambda: True)
-                run.accelerator.wait_for_everyone()  # the launcher ends all processes once one has ended
-                raise StoppedError(folder, step, signal.Signals(stopped_by).name)
-        mirror.finish(lambda: stop.reason is not None)
-    run.accelerator.wait_for_everyone()
+            if mirror:
+                mirror.tick()
+        is_done = _is_done(run)
+        if is_done and run.state.step < training.steps:
+            reporter.note(_out_of_patience(run))
+        # All wait: the launcher ends all processes once one has ended.
+        agreed(run.accelerator, lambda: mirror.finish(lambda: not is_done or bool(stop.number)) if mirror else None)
+    if not is_done:
+        raise StoppedError(run.folder, run.state.step, signal.Signals(stopped_by).name)
+
+
+def _is_done(run: Run) -> bool:
+    return run.state.step >= run.config.training.steps or is_out_of_patience(run)
 
 
 def _out_of_patience(run: Run) -> str:

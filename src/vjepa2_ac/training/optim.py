@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from vjepa2_ac.config import TrainingConfig
 from vjepa2_ac.errors import InputError, pip_install
-from vjepa2_ac.model.network.pretrained_folder import first_not_finite
-
-_MOST_STEPS = 2**53  # larger counts are not exact in float64
 
 
 def parameter_groups(module: nn.Module, weight_decay: float) -> list[dict[str, object]]:
@@ -76,55 +73,14 @@ def load_moments(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> Non
     The same holds for `fused`, by which PyTorch decides on the device of the step counts.
 
     Raises:
-        ValueError: The state is of another kind of optimizer, or of other parameters, or not finite.
+        ValueError: The state is of another kind of optimizer, or of other parameters.
     """
-    # Names of PyTorch and of bitsandbytes.
-    first, second = ("exp_avg", "exp_avg_sq") if isinstance(optimizer, torch.optim.AdamW) else ("state1", "state2")
-    known = (
-        isinstance(state, dict) and isinstance(state.get("state"), dict) and isinstance(state.get("param_groups"), list)
-    )
-    if not known or not all(isinstance(moments, dict) for moments in state["state"].values()):
-        raise ValueError("it is not the state of an optimizer")
-    flat = {number: _flat(moments) for number, moments in state["state"].items()}
-    if any(first not in moments for moments in flat.values()):
+    is_adamw = isinstance(optimizer, torch.optim.AdamW)  # bitsandbytes gives its moments other names
+    if any(("exp_avg" in moments) != is_adamw for moments in state["state"].values()):
         raise ValueError("its moments are of another training.optimizer")
-    _require_shapes(optimizer, flat, first)
-    for number, moments in flat.items():
-        if lacking := {second, "step"} - moments.keys():
-            raise ValueError(f"{min(lacking)} of parameter {number} is missing")
-        tensors = {name: value for name, value in moments.items() if isinstance(value, Tensor)}
-        if (name := first_not_finite(tensors)) is not None:
-            raise ValueError(f"{name} of parameter {number} holds NaN or infinity")
-        if not _is_count(moments["step"]):
-            raise ValueError(f"step of parameter {number} is no count of steps")
     own = [{name: value for name, value in group.items() if name != "params"} for group in optimizer.param_groups]
-    groups = [group | settings for group, settings in zip(state["param_groups"], own, strict=False)]
-    left = state["param_groups"][len(own) :]  # which PyTorch refuses
-    optimizer.load_state_dict({**state, "param_groups": groups + left})
-
-
-def _is_count(step: object) -> bool:
-    """Return whether this is a possible step count of an optimizer: powers of its betas have to exist."""
-    if isinstance(step, Tensor):
-        return step.numel() == 1 and 1 <= float(step) <= _MOST_STEPS
-    return isinstance(step, int | float) and 1 <= step <= _MOST_STEPS
-
-
-def _flat(moments: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the moments of a parameter by name: bitsandbytes stores its own in a nested dict."""
-    groups = [value for value in moments.values() if isinstance(value, Mapping)]
-    return {name: value for group in (moments, *groups) for name, value in group.items()}
-
-
-def _require_shapes(optimizer: torch.optim.Optimizer, moments: Mapping[Any, Any], first: str) -> None:
-    """Refuse moments of other shapes than their parameters, which nothing else checks before the first step."""
-    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
-    for place, of_one in moments.items():
-        if type(place) is not int or not 0 <= place < len(parameters):
-            raise ValueError(f"moments of a parameter {place!r}, of {len(parameters)}")
-        shape = getattr(of_one[first], "shape", None)
-        if isinstance(optimizer, torch.optim.AdamW) and shape != parameters[place].shape:
-            raise ValueError(f"moments of shape {shape} for a parameter of shape {tuple(parameters[place].shape)}")
+    groups = [group | settings for group, settings in zip(state["param_groups"], own, strict=True)]
+    optimizer.load_state_dict({**state, "param_groups": groups})
 
 
 def learning_rate_at(step: int, training: TrainingConfig) -> float:

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from vjepa2_ac.config import Config
+from vjepa2_ac.config.replay import ReplayConfig
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.selection import named
 from vjepa2_ac.episode import Batch
@@ -16,25 +16,38 @@ from vjepa2_ac.reporter import INDEXING, Reporter
 _STEP_TOLERANCE = 0.01  # by which the time of a model step may differ
 
 
-def open_replay(config: Config, dataset: Dataset, reporter: Reporter) -> Dataset | None:
-    """Open the second data set of a run; None if it has none.
+def open_replay(replay: ReplayConfig, dataset: Dataset, reporter: Reporter) -> Dataset:
+    """Open the second data set of a run.
 
     Args:
-        config: The run.
-        dataset: Its first data set, at its stride.
+        replay: Which one.
+        dataset: The first data set, at its stride.
         reporter: Receives messages, and the progress of indexing.
 
     Raises:
         InputError: It cannot be opened; or its spaces or the time of its steps are others than the first one's.
     """
-    if config.replay is None:
-        return None
-    replayed = open_dataset(config.replay.data, progress=reporter.task(INDEXING))
-    _require_same_spaces(dataset, replayed)
-    _require_same_step(dataset, replayed)
+    replayed = open_dataset(replay.data, progress=reporter.task(INDEXING))
+    if replayed.widths != dataset.widths or replayed.spaces != dataset.spaces:
+        found, needed = (
+            f"states of {one.widths.state} and actions of {one.widths.action} numbers ({one.config.states})"
+            for one in (replayed, dataset)
+        )
+        where, fix = f"replay.data.path: {replayed.config.path}", "Replay a data set of the same kind of robot"
+        raise InputError(where=where, found=found, needed=f"{needed}, as data have them", fix=fix)
+    found_s, needed_s = (one.config.model_stride / one.control_rate_hz for one in (replayed, dataset))
+    if not math.isclose(found_s, needed_s, rel_tol=_STEP_TOLERANCE):  # data sets have different control rates
+        raise InputError(
+            where="replay.data.stride",
+            found=f"{replayed.config.stride} at {replayed.control_rate_hz:g} control steps a second: model steps of"
+            f" {found_s:.3g} s",
+            needed=f"{needed_s:.3g} s, as those of data (stride {dataset.config.stride} at"
+            f" {dataset.control_rate_hz:g} a second)",
+            fix="Choose strides whose steps last equally long:"
+            f" replay.data.stride={needed_s * replayed.control_rate_hz:.3g} would",
+        )
     windows = replayed.windows("train")
-    name, share = replayed.config.path, config.replay.share
-    reporter.note(f"Replay: {share:.0%} of the clips are from {name}, which has {len(windows):,}.")
+    reporter.note(f"Replay: {replay.share:.0%} of the clips are from {replay.data.path}, which has {len(windows):,}.")
     if held_out := _held_out(dataset, replayed):
         reporter.note(
             f"Warning: {len(held_out):,} episodes that the first data set holds out are replayed in training:"
@@ -58,53 +71,17 @@ def require_same_form(first: Batch, replayed: Batch) -> None:
         raise InputError(
             where="replay.data",
             found=f"clips of {found}",
-            needed=f"{needed}, as data has them: clips of both are in one micro-batch",
+            needed=f"{needed}, as data have them: clips of both are in one micro-batch",
             fix="Take latents instead of frames: set data.cache and replay.data.cache to auto, with the same"
             " cache_dtype",
         )
 
 
-def _require_same_spaces(dataset: Dataset, replayed: Dataset) -> None:
-    if replayed.widths != dataset.widths or replayed.spaces != dataset.spaces:
-        found, needed = (
-            f"states of {one.widths.state} and actions of {one.widths.action} numbers ({one.config.states})"
-            for one in (replayed, dataset)
-        )
-        raise InputError(
-            where=f"replay.data.path: {replayed.config.path}",
-            found=found,
-            needed=f"{needed}, as data has them",
-            fix="Replay a data set of the same kind of robot",
-        )
-
-
-def _require_same_step(dataset: Dataset, replayed: Dataset) -> None:
-    """Compare strides by the time they take: data sets have different control rates."""
-    found, needed = (one.config.model_stride / one.control_rate_hz for one in (replayed, dataset))
-    if not math.isclose(found, needed, rel_tol=_STEP_TOLERANCE):
-        fitting = needed * replayed.control_rate_hz
-        near = math.isclose(max(1, round(fitting)), fitting, rel_tol=_STEP_TOLERANCE)
-        raise InputError(
-            where="replay.data.stride",
-            found=f"{replayed.config.stride} at {replayed.control_rate_hz:g} control steps a second: model steps of"
-            f" {found:.3g} s",
-            needed=f"{needed:.3g} s, as those of data (stride {dataset.config.stride} at"
-            f" {dataset.control_rate_hz:g} a second)",
-            fix=f"Set replay.data.stride={round(fitting)}"
-            if near
-            else "Choose data.stride and replay.data.stride so that both steps last equally long",
-        )
-
-
 def _held_out(dataset: Dataset, replayed: Dataset) -> list[str]:
     """Return the replayed training episodes that the first data set, by their identity, validates or tests on."""
-    held_out = dataset.kept.taking_part & ~dataset.members("train")
-    first, second = dataset.table.id_hash[held_out], replayed.table.id_hash[replayed.members("train")]
-    return sorted(replayed.table.identity(int(place)) for place in _places(replayed, np.intersect1d(first, second)))
-
-
-def _places(dataset: Dataset, hashes: np.ndarray) -> np.ndarray:
-    return np.flatnonzero(np.isin(dataset.table.id_hash, hashes) & dataset.kept.taking_part)
+    held_out = dataset.table.id_hash[dataset.kept.taking_part & ~dataset.members("train")]
+    places = np.flatnonzero(replayed.members("train") & np.isin(replayed.table.id_hash, held_out))
+    return sorted(replayed.table.identity(int(place)) for place in places)
 
 
 def _form(batch: Batch) -> str:

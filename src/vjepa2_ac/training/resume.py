@@ -1,7 +1,10 @@
-"""Resuming a run: from its newest checkpoint, on any number of processes."""
+"""Checkpoints of a run: written, and resumed from exactly, on any number of processes."""
 
 from __future__ import annotations
 
+import hashlib
+import json
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,39 +12,74 @@ from typing import Any
 import torch
 
 from vjepa2_ac.config import Config
+from vjepa2_ac.config.loading import flat
+from vjepa2_ac.config.section import Affects, knobs_that_affect
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.index import fingerprint_of
-from vjepa2_ac.distributed.collectives import broadcast_object, broadcast_tensors, require_same
+from vjepa2_ac.data.loader import validation_windows
+from vjepa2_ac.distributed.processes import broadcast_object, broadcast_tensors, first_only, require_same
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.adapter.lora import load_trained
+from vjepa2_ac.model.adapter.lora import load_trained, save_trained
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.checkpoint import (
     ADAPTER,
+    CHECKPOINTS,
     OPTIMIZER,
-    STATE,
     RunState,
+    checkpoint_name,
     newest_checkpoint,
     read_state,
+    write_checkpoint,
     written_state,
 )
-from vjepa2_ac.runs.folder import CHECKPOINTS, CONFIG, read_run_config, run_id
-from vjepa2_ac.runs.torch_file import read_torch
-from vjepa2_ac.training.best_checkpoint import best_so_far, measured_on
-from vjepa2_ac.training.fsdp import shard_predictor
+from vjepa2_ac.runs.files import read_torch, write_torch
+from vjepa2_ac.runs.folder import CONFIG, read_run_config, run_id
+from vjepa2_ac.runs.metrics_log import warn_if_stalled
 from vjepa2_ac.training.optim import load_moments
 from vjepa2_ac.training.setup import Run
 
 
+def save_checkpoint(run: Run, folder: Path) -> None:
+    """Write the state of the run into its folder (see `runs.checkpoint`): all processes call, the first writes.
+
+    Raises:
+        InputError: It cannot be written; in the first process only.
+    """
+
+    def write(inner: Path) -> None:
+        save_trained(run.world_model, inner / ADAPTER)
+        with (inner / OPTIMIZER).open("wb") as file:
+            write_torch(run.optimizer.state_dict(), file)
+
+    replayed = run.replayed
+    run.state = replace(
+        run.state,
+        broken=run.dataset.broken.reasons,
+        windows=len(run.dataset.windows("train")),
+        data=fingerprint_of(run.dataset.table),
+        replayed_broken=replayed.broken.reasons if replayed else {},
+        replayed_windows=len(replayed.windows("train")) if replayed else None,
+        replayed_data=fingerprint_of(replayed.table) if replayed else None,
+        clips_per_step=run.clips_per_step,
+        clips_asked=run.config.training.batch_size * run.config.training.accumulation,
+        processes=run.accelerator.num_processes,
+        loss_scale=run.scaler.state_dict() if run.scaler.is_enabled() else None,
+    )
+    if run.accelerator.is_main_process:
+        with warn_if_stalled(folder / CHECKPOINTS / checkpoint_name(run.state.step)):
+            write_checkpoint(folder / CHECKPOINTS, run.state, write, keep=run.config.checkpoint.keep)
+
+
 def restore(run: Run, reporter: Reporter) -> Run:
-    """Bring a run to its newest checkpoint, in every process, and share its weights where the launch requests it.
+    """Bring a run to its newest checkpoint, in every process.
 
     Raises:
         InputError: The processes have different bases, or the checkpoint is not of this run.
     """
     state = _state_of_all(run, reporter)
-    run.optimizer = shard_predictor(run.world_model, run.optimizer, run.config, run.accelerator, reporter)
-    restore_loss_scale(run.scaler, state)
+    if state.loss_scale is not None and run.scaler.is_enabled():
+        run.scaler.load_state_dict(dict(state.loss_scale))
     run.dataset.broken.recall(state.broken)
     _report_data_changes(run.dataset, state.windows, reporter)
     if run.replayed is not None:
@@ -54,19 +92,71 @@ def restore(run: Run, reporter: Reporter) -> Run:
 
 def _state_of_all(run: Run, reporter: Reporter) -> RunState:
     """Restore weights and moments in every process: the first one reads them, and sends them to the others."""
-    config, accelerator, world_model = run.config, run.accelerator, run.world_model
+    accelerator, world_model = run.accelerator, run.world_model
     encoder = world_model.adaptation.encoder if world_model.adaptation else ""
     require_same(accelerator, encoder, what="model.base", fix="Give every machine the same checkpoint")
-    state, moments = RunState(step=0), None
-    if accelerator.is_main_process and (checkpoint := newest_checkpoint(run.folder / CHECKPOINTS)) is not None:
-        state, moments = _read(checkpoint, world_model, run.optimizer)
-        reporter.note(f"Going on from {checkpoint} ({state.step} of {config.training.steps} steps are done).")
-    state = broadcast_object(accelerator, replace(state, run_id=state.run_id or run_id(run.folder)))
+    read = first_only(accelerator, lambda: _read_newest(run, reporter))
+    state, moments = broadcast_object(accelerator, read or (RunState(step=0), None))
     broadcast_tensors(accelerator, world_model.predictor.state_dict().values())
-    moments = broadcast_object(accelerator, moments)
     if moments is not None and not accelerator.is_main_process:
         load_moments(run.optimizer, moments)
     return state
+
+
+def _read_newest(run: Run, reporter: Reporter) -> tuple[RunState, dict[str, Any] | None]:
+    checkpoint = newest_checkpoint(run.folder / CHECKPOINTS)
+    if checkpoint is None:
+        return RunState(step=0, run_id=run_id(run.folder)), None
+    state, moments = read_checkpoint(checkpoint, run.world_model, run.optimizer)
+    reporter.note(f"Going on from {checkpoint} ({state.step} of {run.config.training.steps} steps are done).")
+    return replace(state, run_id=state.run_id or run_id(run.folder)), moments
+
+
+def read_checkpoint(
+    checkpoint: Path, world_model: WorldModel, optimizer: torch.optim.Optimizer
+) -> tuple[RunState, dict[str, Any]]:
+    """Load the weights and moments of a checkpoint; return the progress of the run there, and the moments.
+
+    Raises:
+        InputError: It is not the state of such a run.
+    """
+    load_trained(world_model, checkpoint / ADAPTER, trainable=True)
+    try:
+        moments = read_torch(checkpoint / OPTIMIZER)
+        load_moments(optimizer, moments)
+        return read_state(checkpoint), moments
+    except (OSError, ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:
+        raise InputError(
+            where=str(checkpoint),
+            found=f"not the state of this run ({error})",
+            fix="Set back what was changed in the config; or delete this checkpoint, to use an older one",
+        ) from None
+
+
+def measured_on(config: Config, dataset: Dataset) -> Mapping[str, str]:
+    """Return what determines the measurements of a validation, by readable names."""
+    settings = {key: json.dumps(value) for key, value in flat(knobs_that_affect(Affects.MEASURED, config)).items()}
+    windows = validation_windows(dataset, "validation", clips=config.validation.clips)
+    clips = [(dataset.table.identity(episode), int(start)) for episode, start in windows]
+    return {**settings, "its clips": hashlib.sha256(json.dumps(clips).encode()).hexdigest()[:16]}
+
+
+def best_so_far(state: RunState, now: Mapping[str, str], reporter: Reporter) -> RunState:
+    """Return the state to resume from: a best validation by other measurements is dropped, with a message.
+
+    Only errors of the same clips, time span and latents are compared. What a state does not record, or records beyond
+    what matters now, is accepted.
+    """
+    before = state.measured_on or {}
+    differing = sorted(key for key in before.keys() & now if before[key] != now[key])
+    state = replace(state, measured_on=dict(now))
+    if not differing or state.best_error is None:
+        return state
+    reporter.note(
+        f"Validation measures something else than before (other: {', '.join(differing)}): the error"
+        f" {state.best_error:.4g} of step {state.best_step}, the best so far, does not compare and no longer counts."
+    )
+    return replace(state, best_step=None, best_error=None, best_rank=None, lowest_rank=None)
 
 
 def micro_batches_of(config: Config, state: RunState, processes: int, reporter: Reporter) -> int:
@@ -100,30 +190,13 @@ def micro_batches_of(config: Config, state: RunState, processes: int, reporter: 
     return micro_batches
 
 
-def restore_loss_scale(scaler: torch.amp.GradScaler, state: RunState) -> None:
-    """Restore the loss scale of the checkpoint.
-
-    Raises:
-        InputError: The stored value is no loss scale.
-    """
-    if state.loss_scale is None or not scaler.is_enabled():
-        return
-    known = scaler.state_dict().keys()
-    if state.loss_scale.keys() != known:
-        found, needed = f"{STATE} with loss_scale of {sorted(state.loss_scale)}", f"{sorted(known)}"
-        raise InputError(
-            where="--resume", found=found, needed=needed, fix="Delete this checkpoint, to use an older one"
-        )
-    scaler.load_state_dict(dict(state.loss_scale))
-
-
 def require_same_data(config: Config, dataset: Dataset, replayed: Dataset | None = None) -> None:
     """Refuse to go on with other data sets than those that the run in its folder began with.
 
     At the place where it began the data may have changed, which is reported; elsewhere they must be the same.
 
     Raises:
-        InputError: They are others, or an earlier version did not note which they were.
+        InputError: They are others.
     """
     folder = Path(config.run_dir)
     before = read_run_config(folder).data_sets if (folder / CONFIG).is_file() else config.data_sets
@@ -137,7 +210,7 @@ def require_same_data(config: Config, dataset: Dataset, replayed: Dataset | None
             continue
         raise InputError(
             where=f"{key}: {now.path}",
-            found="other episodes or files than the run has seen" if seen else "a run that did not note its data",
+            found="other episodes or files than the run has seen",
             needed=f"the data set that was at {began.path}",
             fix=f"Set {key} to where that is now (its files keep names, sizes and times when they are moved); where the"
             " change is meant, add --allow-config-change",
@@ -152,19 +225,3 @@ def _report_data_changes(dataset: Dataset, before: int | None, reporter: Reporte
             f"The data has changed: {windows:,} training clips instead of {before:,}."
             " From here on their order is another, and some may be seen twice in this epoch or not at all."
         )
-
-
-def _read(
-    checkpoint: Path, world_model: WorldModel, optimizer: torch.optim.Optimizer
-) -> tuple[RunState, dict[str, Any]]:
-    load_trained(world_model, checkpoint / ADAPTER, trainable=True)
-    try:
-        moments = read_torch(checkpoint / OPTIMIZER)
-        load_moments(optimizer, moments)
-        return read_state(checkpoint), moments
-    except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
-        raise InputError(
-            where=str(checkpoint),
-            found=f"not the state of this run ({error})",
-            fix="Set back what was changed in the config; or delete this checkpoint, to use an older one",
-        ) from None

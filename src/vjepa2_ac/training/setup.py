@@ -1,8 +1,11 @@
-"""Setup of a run before the first step: device, data, model, adapter, optimizer and newest checkpoint, with checks."""
+"""Setup of a run before the first step: device, data, model, adapter and optimizer, with checks.
+
+What only some runs use is imported where they use it: a stride chosen by the model, replay, a latent cache, strips.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,44 +17,28 @@ from torch import nn
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.data.duplicates import find_duplicates
-from vjepa2_ac.data.index import fingerprint_of
 from vjepa2_ac.data.loader import Batches, Mixed, ProcessShare, training_loader, validation_batches
 from vjepa2_ac.data.streams import Copies, copies_for
-from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
-from vjepa2_ac.distributed.collectives import all_gather_object, broadcast_object
 from vjepa2_ac.distributed.device import PRECISIONS
-from vjepa2_ac.distributed.launch import make_accelerator
-from vjepa2_ac.distributed.shared_memory import warn_if_shared_memory_is_small
-from vjepa2_ac.encoding.batch import encode_batch, extrinsics_for
-from vjepa2_ac.encoding.encode_dataset import with_latents
+from vjepa2_ac.distributed.processes import broadcast_object, first_of_machine, make_accelerator
+from vjepa2_ac.encoding.batch import encode_batch, extrinsics_for, require_same_encoder
 from vjepa2_ac.episode import Batch, LatentBatch
-from vjepa2_ac.model.adapter.lora import add_adapter, save_trained, trainable_report
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.adapter.lora import add_adapter, trainable_report
 from vjepa2_ac.model.adapter.low_rank import CastMatrices
-from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.checkpoints.loading import base_sizes, load_base
+from vjepa2_ac.model.network.input_heads import fit_heads, heads_to_replace, require_trained
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
-from vjepa2_ac.runs.checkpoint import (
-    ADAPTER,
-    OPTIMIZER,
-    RunState,
-    checkpoint_name,
-    write_checkpoint,
-)
-from vjepa2_ac.runs.folder import CHECKPOINTS, with_stride
-from vjepa2_ac.runs.slow_disk import warn_if_stalled
-from vjepa2_ac.runs.torch_file import write_torch
-from vjepa2_ac.training.fsdp import full_optimizer_state_dict, full_state_dict
+from vjepa2_ac.runs.checkpoint import RunState
+from vjepa2_ac.runs.folder import with_stride
 from vjepa2_ac.training.loss import Objective
-from vjepa2_ac.training.micro_step import CapturedMicroStep, MicroStep, captured_on_cuda
-from vjepa2_ac.training.monitoring.imagined_strip import ImaginedStrip
-from vjepa2_ac.training.new_embodiment import check_heads, fit_to_data
 from vjepa2_ac.training.optim import make_optimizer, trained_parameters
-from vjepa2_ac.training.replay import open_replay, require_same_form
 
 if TYPE_CHECKING:
     from vjepa2_ac.calibration.strides import Calibration
-
+    from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
+    from vjepa2_ac.training.imagined_strip import ImaginedStrip
 
 _CLIPS_TRIED = 8  # one is read; the others are for clips skipped by data.broken_episodes
 
@@ -108,22 +95,6 @@ class Run:
         return CastMatrices(self.world_model.predictor, PRECISIONS[self.config.training.precision])
 
     @property
-    def micro_step(self) -> MicroStep | CapturedMicroStep:
-        """The micro-step."""
-        return self.captured or self._plain_micro_step
-
-    @cached_property
-    def captured(self) -> CapturedMicroStep | None:
-        """The micro-step as a graph, if requested."""
-        if not self.config.training.cuda_graph:
-            return None
-        return CapturedMicroStep(self._plain_micro_step, self.trained, captured_on_cuda)
-
-    @property
-    def _plain_micro_step(self) -> MicroStep:
-        return MicroStep(self.objective, self.accelerator, self.scaler)
-
-    @property
     def copies(self) -> Copies:
         """The copies of batches to the run's device."""
         return copies_for(self.accelerator.device)
@@ -150,13 +121,15 @@ def open_data(config: Config, reporter: Reporter = SILENT, accelerator: Accelera
         from vjepa2_ac.calibration.variants import require_learned
 
         require_learned(config.model)
-    decoder = _decoder_of(config)
-    with accelerator.local_main_process_first():  # the others find the index of the first one on this machine
-        dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
-        replayed = open_replay(config, dataset, reporter)
-    if (duplicates := find_duplicates(dataset)).episodes:
-        reporter.note(f"Warning: {duplicates}.")
-    check_heads(config, dataset)
+    decoder = None
+    if config.validation.decoder is not None:
+        from vjepa2_ac.training.imagined_strip import decoder_of
+
+        decoder = decoder_of(config)
+    # The others find the index of the first one on this machine, however long it takes.
+    dataset, replayed = first_of_machine(accelerator, lambda: _open_data_sets(config, reporter))
+    _report_duplicates(dataset, reporter)
+    _check_heads(config, dataset)
     world_model, calibration = None, None
     if is_auto:
         from vjepa2_ac.training.stride_choice import choose_stride
@@ -186,15 +159,14 @@ def open_model(data: RunData, reporter: Reporter = SILENT, *, check_only: bool =
     extrinsics_for(world_model, data.first_clip)
     if data.decoder is not None:
         data.decoder.require_fit(world_model, config.data.crop, subject=str(config.model.base or "the random model"))
-    dataset = with_latents(config, data.dataset, world_model, accelerator, reporter, check_only=check_only)
+    dataset = _with_latents(config, data.dataset, world_model, accelerator, reporter, check_only=check_only)
     replayed = data.replayed
     if replayed is not None:
         extrinsics_for(world_model, _first_of(replayed, "train"))
         alone = config.for_replay()
-        replayed = with_latents(alone, replayed, world_model, accelerator, reporter, check_only=check_only)
+        replayed = _with_latents(alone, replayed, world_model, accelerator, reporter, check_only=check_only)
         _require_fitting_clips(dataset, replayed, _first_of(dataset, "train"))
-    warn_if_shared_memory_is_small(config, dataset, data.first_clip, accelerator, reporter)
-    fit_to_data(world_model, config, dataset, reporter)
+    _fit_heads(world_model, config, dataset, reporter)
     add_adapter(world_model, config.adapter, seed=config.seed)
     reporter.note(str(trainable_report(world_model)))
     if unusual := config.adapter.out_of_line:
@@ -220,7 +192,7 @@ def open_model(data: RunData, reporter: Reporter = SILENT, *, check_only: bool =
         micro_batches=training.accumulation,
         calibration=data.calibration,
         replayed=replayed,
-        strip=None if data.decoder is None else ImaginedStrip(data.decoder, dataset, world_model.image_size),
+        strip=_strip_of(data.decoder, dataset, world_model),
     )
 
 
@@ -243,48 +215,78 @@ def encode(run: Run, batch: Batch) -> LatentBatch:
         return encode_batch(run.world_model, batch, device=run.accelerator.device, chunk=run.config.model.encode_chunk)
 
 
-def save_checkpoint(run: Run, folder: Path) -> None:
-    """Write the state of the run into its folder (see `runs.checkpoint`): all processes call, the first writes."""
-    writes = run.accelerator.is_main_process
-    weights, moments = (
-        full_state_dict(run.world_model, keep=writes),
-        full_optimizer_state_dict(run.optimizer, keep=writes),
-    )
+def _open_data_sets(config: Config, reporter: Reporter) -> tuple[Dataset, Dataset | None]:
+    dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
+    if config.replay is None:
+        return dataset, None
+    from vjepa2_ac.training.replay import open_replay
 
-    def write(inner: Path) -> None:
-        save_trained(run.world_model, inner / ADAPTER, weights)
-        with (inner / OPTIMIZER).open("wb") as file:
-            write_torch(moments, file)
-
-    broken, broken_replayed = (
-        {
-            name: why
-            for reasons in all_gather_object(run.accelerator, one.broken.reasons if one else {})
-            for name, why in reasons.items()
-        }
-        for one in (run.dataset, run.replayed)
-    )
-    run.state = replace(
-        run.state,
-        broken=broken,
-        windows=len(run.dataset.windows("train")),
-        data=fingerprint_of(run.dataset.table),
-        replayed_broken=broken_replayed,
-        replayed_windows=len(run.replayed.windows("train")) if run.replayed else None,
-        replayed_data=fingerprint_of(run.replayed.table) if run.replayed else None,
-        clips_per_step=run.clips_per_step,
-        clips_asked=run.config.training.batch_size * run.config.training.accumulation,
-        processes=run.accelerator.num_processes,
-        loss_scale=run.scaler.state_dict() if run.scaler.is_enabled() else None,
-    )
-    if writes:
-        with warn_if_stalled(folder / CHECKPOINTS / checkpoint_name(run.state.step)):
-            write_checkpoint(folder / CHECKPOINTS, run.state, write, keep=run.config.checkpoint.keep)
+    return dataset, open_replay(config.replay, dataset, reporter)
 
 
-def _decoder_of(config: Config) -> TrainedDecoder | None:
-    name = config.validation.decoder
-    return None if name is None else load_decoder(name, where="validation.decoder:")
+def _report_duplicates(dataset: Dataset, reporter: Reporter) -> None:
+    from vjepa2_ac.data.duplicates import find_duplicates
+
+    if (duplicates := find_duplicates(dataset)).episodes:
+        reporter.note(f"Warning: {duplicates}.")
+
+
+def _check_heads(config: Config, dataset: Dataset) -> None:
+    """Refuse, before the model is loaded, data of other widths than the base's if no layer would learn them.
+
+    Raises:
+        InputError: A new head would not be trained; or the stride is to be chosen by the base, which cannot predict
+            from this data.
+    """
+    heads, widths = heads_to_replace(base_sizes(config.model), dataset.widths), dataset.widths
+    if heads and config.data.stride == "auto":
+        raise InputError(
+            where="data.stride",
+            found=f"auto, for states of {widths.state} and actions of {widths.action} numbers",
+            needed="widths that the base knows: it is asked at which stride it predicts best",
+            fix="Set data.stride to a number of control steps",
+        )
+    require_trained(heads, config.adapter)
+
+
+def _fit_heads(world_model: WorldModel, config: Config, dataset: Dataset, reporter: Reporter) -> None:
+    """Give a base new input heads if the data's states or actions have other widths, and report them."""
+    heads = heads_to_replace(world_model.sizes, dataset.widths)
+    for line in fit_heads(world_model, dataset.widths, config.seed):
+        reporter.note(line)
+    if config.data.states != "vector" or config.adapter.kind == "none" or config.model.random is not None:
+        return
+    for name in ("state_encoder", "action_encoder") if world_model.sizes.predictor.use_states else ("action_encoder",):
+        if name not in {*heads, *config.adapter.modules_to_save}:
+            reporter.note(
+                f"{name.replace('_', ' ')}: the base's own, as wide as the data. If its numbers mean something else"
+                f" than those the base was trained on, add {name} to adapter.modules_to_save"
+            )
+
+
+def _with_latents(
+    config: Config,
+    dataset: Dataset,
+    model: WorldModel,
+    accelerator: Accelerator,
+    reporter: Reporter,
+    *,
+    check_only: bool,
+) -> Dataset:
+    if config.data.is_cache or config.data.cache == "off":
+        require_same_encoder(model, dataset, config)
+        return dataset
+    from vjepa2_ac.encoding.encode_dataset import with_latents
+
+    return with_latents(config, dataset, model, accelerator, reporter, check_only=check_only)
+
+
+def _strip_of(decoder: TrainedDecoder | None, dataset: Dataset, model: WorldModel) -> ImaginedStrip | None:
+    if decoder is None:
+        return None
+    from vjepa2_ac.training.imagined_strip import ImaginedStrip
+
+    return ImaginedStrip(decoder, dataset, model.image_size)
 
 
 def _read_one_clip_of_each_split(dataset: Dataset) -> Batch:
@@ -302,4 +304,6 @@ def _first_of(dataset: Dataset, split: Split) -> Batch:
 def _require_fitting_clips(dataset: Dataset, replayed: Dataset, first_clip: Batch) -> None:
     """Refuse a second data set whose clips differ in form; frames that are still to be encoded may."""
     if all(one.config.is_cache or not one.config.takes_latents for one in (dataset, replayed)):
+        from vjepa2_ac.training.replay import require_same_form
+
         require_same_form(first_clip, _first_of(replayed, "train"))

@@ -1,30 +1,39 @@
-"""The optimizer step: gradients of micro-batches accumulated and clipped, weights updated, or the step refused."""
+"""The optimizer step: gradients of micro-batches accumulated and clipped, weights updated, or the step refused.
+
+Clips whose loss or gradient is not finite are saved for inspection in RUN/not_finite/step-XXXXXXXX. Each process saves
+its own: an npz per clip (frames, or the latents of a cache as float32; states, actions, episode_id, start), and its
+frames side by side as a PNG.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
-from torch.distributed.tensor import DTensor
 
 from vjepa2_ac.data.loader import prefetch_next
-from vjepa2_ac.distributed.collectives import all_reduce_gradients, all_reduce_sum
-from vjepa2_ac.episode import Batch
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.data.sources.latents.cache_files import unpack_latents
+from vjepa2_ac.distributed.processes import all_gather_object, all_reduce_gradients, all_reduce_sum, raise_first
+from vjepa2_ac.episode import Batch, StoredLatents
+from vjepa2_ac.errors import InputError, UserError
 from vjepa2_ac.runs.checkpoint import checkpoint_name
 from vjepa2_ac.runs.folder import NOT_FINITE
-from vjepa2_ac.storage import is_url
-from vjepa2_ac.training.monitoring.nonfinite_clips import ClipRecorder
-from vjepa2_ac.training.monitoring.throughput import Update
+from vjepa2_ac.storage import atomic_writer, is_url, write_atomically
+from vjepa2_ac.training.monitoring import Update
 from vjepa2_ac.training.optim import learning_rate_at, set_learning_rate
 from vjepa2_ac.training.setup import Run, encode
 
 SMALLEST_LOSS_SCALE = 1.0  # fp16: if gradients still overflow, they are not finite for another reason
+MOST_CLIPS = 16  # that are saved
+MOST_BYTES = 512 * 10**6  # of frames, held until the gradients are known to be finite
 
 
 @dataclass(frozen=True)
@@ -36,6 +45,15 @@ class Gradients:
     norm: float  # before clipping; not finite after an overflow in fp16, which the loss scale handles
     clips: int  # that were read
     bytes_fetched: int
+
+
+@dataclass
+class _Taken:
+    """What this process has accumulated."""
+
+    totals: Float[Tensor, 2]  # its part of the step's losses
+    clips: list[str] = field(default_factory=list)
+    bytes_fetched: int = 0
 
 
 def training_step(run: Run, batches: Iterator[Batch], step: int, *, measure_update: bool = False) -> dict[str, float]:
@@ -58,7 +76,7 @@ def training_step(run: Run, batches: Iterator[Batch], step: int, *, measure_upda
     if taken.clips:  # without a clip there are no gradients, and nothing moves
         run.scaler.step(run.optimizer)  # with fp16 and an overflow nothing moves either
         run.scaler.update()
-    run.optimizer.zero_grad(set_to_none=not run.config.training.cuda_graph)  # a graph adds to the same tensors
+    run.optimizer.zero_grad(set_to_none=True)
     return {
         "loss": taken.forced_loss + taken.rollout_loss,
         "loss_teacher_forcing": taken.forced_loss,
@@ -86,41 +104,65 @@ def gradients(
         more: Whether another step follows, whose first micro-batch is fetched while the device is computing.
 
     Raises:
-        InputError: A loss or gradient is not finite; names the clips of this process.
+        InputError: A loss or gradient is not finite; names the clips of this process. Or a clip of any process cannot
+            be read, or too many episodes of all processes are broken: in all processes.
     """
     if not run.world_model.training:  # after a validation
         run.world_model.train()
+    taken, error = _Taken(torch.zeros(2, device=run.accelerator.device)), None
+    try:
+        with run.cast_matrices.current():
+            _accumulate(run, batches, look_back, taken)
+        if more:
+            prefetch_next(batches)
+    except UserError as own:
+        error = own
+    totals = taken.totals.tolist()
+    own_part = [*totals, len(taken.clips), taken.bytes_fetched, error is not None]
+    *losses, clips, bytes_fetched, failed = all_reduce_sum(run.accelerator, own_part)
+    if failed:
+        raise_first(run.accelerator, error)
     expected = run.clips_per_step
-    with run.cast_matrices.current():
-        totals, seen, fetched = _accumulate(run, batches, look_back)
-    if more:
-        prefetch_next(batches)
-    *losses, clips, fetched_by_all = all_reduce_sum(run.accelerator, [*totals.tolist(), len(seen), fetched])
+    if clips < expected:
+        _tell_of_broken_episodes(run)
     if not clips:
-        return Gradients(math.nan, math.nan, 0.0, clips=0, bytes_fetched=int(fetched_by_all))
+        return Gradients(math.nan, math.nan, 0.0, clips=0, bytes_fetched=int(bytes_fetched))
     forced_loss, rollout_loss = (loss * (expected / clips) for loss in losses)
     norm = _finish_gradients(run, factor=expected / clips)
-    _refuse_not_finite(run, forced_loss + rollout_loss, norm, seen, look_back)
-    return Gradients(forced_loss, rollout_loss, norm, int(clips), int(fetched_by_all))
+    _refuse_not_finite(run, forced_loss + rollout_loss, norm, taken.clips, look_back)
+    return Gradients(forced_loss, rollout_loss, norm, int(clips), int(bytes_fetched))
 
 
-def _accumulate(run: Run, batches: Iterator[Batch], look_back: ClipRecorder | None) -> tuple[Tensor, list[str], int]:
-    """Return the losses of this process's clips, as parts of the step's; names of the clips; and bytes fetched."""
-    totals = torch.zeros(2, device=run.accelerator.device)
-    seen: list[str] = []
-    fetched = 0
+def _accumulate(run: Run, batches: Iterator[Batch], look_back: ClipRecorder | None, taken: _Taken) -> None:
     for _ in range(run.micro_batches):
         batch = next(batches)
-        fetched += batch.bytes_fetched
+        taken.bytes_fetched += batch.bytes_fetched
         if not batch.starts:
             continue
-        seen += [f"{name} from step {start}" for name, start in zip(batch.episode_ids, batch.starts, strict=True)]
+        taken.clips += [
+            f"{name} from step {start}" for name, start in zip(batch.episode_ids, batch.starts, strict=True)
+        ]
         parts = run.clips_per_step / len(batch.starts)
-        losses = run.micro_step(encode(run, batch), parts)
-        totals += losses / parts
+        latents = encode(run, batch)
+        with run.accelerator.autocast():
+            forced, rollout = run.objective(latents)
+        run.scaler.scale((forced + rollout) / parts).backward()
+        losses = torch.stack([forced.detach(), rollout.detach()])
+        taken.totals += losses / parts
         if look_back is not None:
             look_back.add(batch, losses.sum())
-    return totals, seen, fetched
+
+
+def _tell_of_broken_episodes(run: Run) -> None:
+    """Let each process count the broken episodes of all of them: the allowed share is that of the run.
+
+    Raises:
+        InputError: There are too many; in all processes.
+    """
+    for dataset in filter(None, (run.dataset, run.replayed)):
+        for reasons in all_gather_object(run.accelerator, dataset.broken.reasons):
+            for name, reason in reasons.items():
+                dataset.broken.met(name, reason)
 
 
 def _finish_gradients(run: Run, factor: float) -> float:
@@ -133,7 +175,7 @@ def _finish_gradients(run: Run, factor: float) -> float:
                 parameter.grad *= factor
     limit = run.config.training.max_grad_norm
     norm = nn.utils.clip_grad_norm_(run.trained, math.inf if limit is None else limit)
-    return float(norm.full_tensor() if isinstance(norm, DTensor) else norm)
+    return float(norm)
 
 
 def _about_the_data(run: Run, taken: Gradients) -> dict[str, float]:
@@ -165,3 +207,61 @@ def _refuse_not_finite(run: Run, loss: float, norm: float, clips: list[str], loo
         found=f"a loss or gradient that is not finite; the clips were {'; '.join(clips)}",
         fix=f"The weights have not moved. Look at these clips{saved}, or lower training.learning_rate{fp16}",
     )
+
+
+class ClipRecorder:
+    """The micro-batches of a step, until it is known whether its gradients are finite."""
+
+    def __init__(self) -> None:
+        self._kept: list[tuple[Batch, Tensor]] = []
+        self._bytes = 0
+
+    def add(self, batch: Batch, loss: Float[Tensor, ""]) -> None:
+        """Store a micro-batch and its loss, unless too much is stored already. Does not wait for the loss."""
+        self._bytes += batch.nbytes
+        if self._bytes <= MOST_BYTES:
+            self._kept.append((batch, loss.detach()))
+
+    def save(self, folder: Path, process: int) -> str:
+        """Write some clips, those with numbers that are not finite first; return where they are, or what failed.
+
+        Nothing is raised: the error that is being reported is more important.
+
+        Args:
+            folder: RUN/not_finite/step-XXXXXXXX.
+            process: The process of the clips.
+        """
+        clips = [(batch, row, loss) for batch, loss in self._kept for row in range(len(batch.starts))]
+        clips.sort(key=lambda clip: (_is_finite(*clip[:2]), bool(torch.isfinite(clip[2]))))
+        from vjepa2_ac.media.image_file import encode_png
+
+        try:
+            for number, (batch, row, _) in enumerate(clips[:MOST_CLIPS]):
+                path = folder / f"process{process}-clip{number:02d}.npz"
+                with atomic_writer(path) as file:
+                    np.savez_compressed(file, **_arrays(batch, row))
+                if batch.frames is not None:
+                    strip = np.concatenate(batch.frames[row].numpy(), axis=1)
+                    write_atomically(path.with_suffix(".png"), encode_png(strip))
+        except Exception as error:  # a full disk, no permission
+            return f"they could not all be saved in {folder}: {type(error).__name__}: {error}"
+        return f"{min(len(clips), MOST_CLIPS)} of them are saved in {folder}"
+
+
+def _is_finite(batch: Batch, row: int) -> bool:
+    return bool(batch.states[row].isfinite().all() and batch.actions[row].isfinite().all())
+
+
+def _arrays(batch: Batch, row: int) -> dict[str, Any]:
+    arrays: dict[str, Any] = {
+        "states": batch.states[row].numpy(),
+        "actions": batch.actions[row].numpy(),
+        "episode_id": np.array(batch.episode_ids[row]),
+        "start": np.array(batch.starts[row]),
+    }
+    if batch.frames is not None:
+        return {"frames": batch.frames[row].numpy(), **arrays}
+    if batch.latents is None:
+        raise ValueError("a batch with neither frames nor latents")
+    scales = None if batch.latents.scales is None else batch.latents.scales[row]
+    return {"latents": unpack_latents(StoredLatents(batch.latents.values[row], scales)).numpy(), **arrays}

@@ -18,40 +18,28 @@ from vjepa2_ac.reporter import Reporter
 def choose_stride(
     world_model: WorldModel, dataset: Dataset, config: Config, accelerator: Accelerator, reporter: Reporter
 ) -> Calibration:
-    """Let the model of a run, before training, choose among the candidates on the validation episodes.
+    """Let the model of a run, before training, choose among the candidates at which the run's clips fit into episodes.
 
     Raises:
-        InputError: As `calibrate`.
+        InputError: There is none, or as `calibrate_model`.
     """
     reporter.note("data.stride is auto: measuring the model at each candidate stride")
-    strides = strides_that_fit(dataset)
-    for stride in set(dataset.config.strides_to_try(dataset.control_rate_hz)).difference(strides):
-        reporter.note(f"  stride {stride}: not possible: no clip of {dataset.config.frames} frames fits")
-    candidates = replace(dataset, config=dataset.config.model_copy(update={"stride_candidates": tuple(strides)}))
+    fitting, errors = [], []
+    for stride in dataset.config.strides_to_try(dataset.control_rate_hz):
+        view = dataset.with_stride(stride)
+        try:
+            view.windows("train"), view.windows("validation")
+        except InputError as error:
+            errors.append(error)
+            reporter.note(f"  stride {stride}: not possible: no clip of {dataset.config.frames} frames fits")
+        else:
+            fitting.append(stride)
+    if not fitting:
+        raise errors[0]
+    candidates = replace(dataset, config=dataset.config.model_copy(update={"stride_candidates": tuple(fitting)}))
     calibration = calibrate_model(
         world_model, candidates, config, accelerator, ClipSample(clips=config.validation.clips)
     )
     for line in calibration.lines():
         reporter.note(line)
     return calibration
-
-
-def strides_that_fit(dataset: Dataset) -> list[int]:
-    """Return the candidates at which the run's clips, which may be longer than a calibration's, fit into episodes.
-
-    Raises:
-        InputError: There is none.
-    """
-    fitting, first_error = [], None
-    for stride in dataset.config.strides_to_try(dataset.control_rate_hz):
-        view = dataset.with_stride(stride)
-        try:
-            view.windows("train")
-            view.windows("validation")
-        except InputError as error:
-            first_error = first_error or error
-        else:
-            fitting.append(stride)
-    if not fitting and first_error is not None:
-        raise first_error
-    return fitting

@@ -7,6 +7,7 @@ from typing import Any
 
 from vjepa2_ac.data.loader import batches_of, validation_windows
 from vjepa2_ac.data.windows import spread
+from vjepa2_ac.distributed.processes import agreed, broadcast_object
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.action_use import RolloutStart, moves_of, pool_of, rank_actions
@@ -14,13 +15,16 @@ from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persi
 from vjepa2_ac.evaluation.measure import prediction_errors
 from vjepa2_ac.evaluation.result import ActionRanking, Validation
 from vjepa2_ac.runs.metrics_log import MetricsLog
-from vjepa2_ac.training.new_embodiment import NOT_ASKED
-from vjepa2_ac.training.reporter import NullMetricsLog, TrainingReporter
+from vjepa2_ac.training.monitoring import NullMetricsLog, TrainingReporter
 from vjepa2_ac.training.setup import Run, encode
 
 BEST_BY = "rollout_over_persistence_last"  # checkpoint.keep_best error: planning depends on the longest horizon
 RANK = "action_rank"  # checkpoint.keep_best ranking
 _AT_ONCE = 64  # samples per batch: as many tokens as the clips of a small micro-batch
+_NOT_ASKED = (
+    "The base is not asked whether it is better than persistence: with fresh input heads it predicts little until they"
+    " are trained."
+)
 
 
 def validate_if_due(run: Run, metrics_log: MetricsLog | NullMetricsLog, reporter: TrainingReporter) -> bool:
@@ -42,15 +46,13 @@ def record(run: Run, metrics: dict[str, Any], metrics_log: MetricsLog | NullMetr
 
 
 def _draw_strip(run: Run, metrics_log: MetricsLog | NullMetricsLog) -> None:
-    """Show what the model imagines now, if `validation.decoder` is set. All processes call, the first one draws."""
-    if run.strip is None:
+    """Show what the model imagines now, if `validation.decoder` is set."""
+    if run.strip is None or not run.accelerator.is_main_process:
         return
     with run.accelerator.autocast():
-        latents = run.strip.roll_out(run.world_model, run.accelerator.device)
-    if latents is not None and run.accelerator.is_main_process:
-        image = run.strip.write(latents, run.folder, run.state.step)
-        if image is not None:
-            metrics_log.show("validation", "imagined", run.state.step, image)
+        image = run.strip.draw(run.world_model, run.accelerator.device, run.folder, run.state.step)
+    if image is not None:
+        metrics_log.show("validation", "imagined", run.state.step, image)
 
 
 def is_out_of_patience(run: Run) -> bool:
@@ -79,18 +81,25 @@ def validation_metrics(found: Validation) -> dict[str, Any]:
 
 
 def validate(run: Run, reporter: TrainingReporter) -> Validation:
-    """Measure the held-out clips, and rank the true actions of moves in some of them."""
-    config = run.config
+    """Measure the held-out clips, and rank the true actions of moves in some of them.
+
+    Each process measures, and what the first one found counts in all: with other kernels the last digits differ, and
+    processes that disagree about the best would not end together.
+    """
     run.world_model.eval()
-    windows = validation_windows(run.dataset, "validation", clips=config.validation.clips)
-    batches = batches_of(run.dataset, windows, batch_size=config.validation.batch_size)
-    moves: list[RolloutStart] = []
     with run.accelerator.autocast():
-        encoded = (run.strip.seen(batch, encode(run, batch)) if run.strip else encode(run, batch) for batch in batches)
-        errors = prediction_errors(run.world_model, _moves_kept(run, encoded, len(windows), moves))
-        found = Validation(errors, _ranking(run, moves) if moves else None)
+        found = broadcast_object(run.accelerator, agreed(run.accelerator, lambda: _measured(run)))
     reporter.validated(run.state.step, found)
     return found
+
+
+def _measured(run: Run) -> Validation:
+    windows = validation_windows(run.dataset, "validation", clips=run.config.validation.clips)
+    batches = batches_of(run.dataset, windows, batch_size=run.config.validation.batch_size)
+    moves: list[RolloutStart] = []
+    encoded = (run.strip.seen(batch, encode(run, batch)) if run.strip else encode(run, batch) for batch in batches)
+    errors = prediction_errors(run.world_model, _moves_kept(run, encoded, len(windows), moves))
+    return Validation(errors, _ranking(run, moves) if moves else None)
 
 
 def _moves_kept(
@@ -129,7 +138,7 @@ def validate_base(run: Run, reporter: TrainingReporter) -> Validation | None:
     if error < 1.0 or config.training.allow_weak_base or config.model.random is not None:
         return found
     if run.world_model.fresh_heads is not None:
-        reporter.note(NOT_ASKED)
+        reporter.note(_NOT_ASKED)
         return found
     raise InputError(
         where="model.base",

@@ -15,10 +15,8 @@ from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.errors import InputError, UnreachableError
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.checkpoint import RunState, checkpoint_name, newest_checkpoint, read_state, write_checkpoint
-from vjepa2_ac.runs.folder import check_run_folder
-from vjepa2_ac.runs.lock import RunLock
+from vjepa2_ac.runs.folder import RunLock, check_run_folder
 from vjepa2_ac.runs.mirror.open_remote import Remote, open_remote
-from vjepa2_ac.storage import remote as filesystems
 
 PLACE = "gs://bucket/run"
 
@@ -65,10 +63,6 @@ def files_of(folder: Path) -> dict[str, bytes]:
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_without_a_place_there_is_nothing_to_open(make_config: Callable[..., Config]) -> None:
-    assert open_remote(make_config(), SILENT) is None
-
-
 def test_an_empty_place_is_tried_and_left_empty(bucket: Gcs, config: Config) -> None:
     assert open_remote(config, SILENT) == Remote(PLACE, config)
     assert bucket.names("bucket") == ["other"]
@@ -78,14 +72,14 @@ def test_an_empty_place_is_tried_and_left_empty(bucket: Gcs, config: Config) -> 
 
 
 def test_a_fresh_machine_gets_the_newest_checkpoint_and_the_small_files(bucket: Gcs, config: Config) -> None:
-    source, reporter = run_there(bucket, config, 10, 20), SilentReporter()
+    source, reporter = run_there(bucket, config, 5, 10, 20, best_step=10, best_error=0.5), SilentReporter()
     remote = open_remote(config, reporter)
     assert remote == Remote(PLACE, config)
     newest = newest_checkpoint(local(config) / "checkpoints")
     assert newest is not None
     assert newest.name == checkpoint_name(20)
     assert read_state(newest).run_id == "mine"
-    expected = {name: data for name, data in files_of(source).items() if checkpoint_name(10) not in name}
+    expected = {name: data for name, data in files_of(source).items() if checkpoint_name(5) not in name}
     assert files_of(local(config)) == expected
     assert reporter.notes == [
         f"{PLACE} can be written: it is brought up to date every 30 minutes, and in the end.",
@@ -103,15 +97,7 @@ def test_fetching_survives_what_passes(bucket: Gcs, config: Config, failure: Fai
     assert files_of(local(config)) == files_of(source)
 
 
-def test_the_best_one_comes_too(bucket: Gcs, config: Config) -> None:
-    run_there(bucket, config, 10, 20, 30, best_step=10, best_error=0.5)
-    open_remote(config, SILENT)
-    newest = newest_checkpoint(local(config) / "checkpoints")
-    assert read_state(newest).best_step == 10
-    assert sorted(path.name for path in newest.parent.iterdir()) == [checkpoint_name(10), checkpoint_name(30)]
-
-
-@pytest.mark.parametrize("damage", ["flip", "truncate", "remove", "manifest"])
+@pytest.mark.parametrize("damage", ["flip", "remove", "manifest"])
 def test_a_damaged_checkpoint_there_is_passed_over_by_name(
     bucket: Gcs, config: Config, damage: str, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -123,29 +109,12 @@ def test_a_damaged_checkpoint_there_is_passed_over_by_name(
         storage.remove(f"gs://bucket/{victim}")
     else:
         data[5] ^= 1
-        bucket.put(f"bucket/{victim}", bytes(data) if damage == "flip" else bytes(data[:20]))
+        bucket.put(f"bucket/{victim}", bytes(data) if damage == "flip" else b"{")
     remote = open_remote(config, SILENT)
     assert [path.name for path in (local(config) / "checkpoints").iterdir()] == [checkpoint_name(10)]
     assert remote.damaged == (checkpoint_name(20),)
     assert [record.levelno for record in caplog.records] == [logging.WARNING]
     assert f"{PLACE}: {checkpoint_name(20)}" in caplog.text
-
-
-def test_where_all_are_damaged_the_run_does_not_begin_anew_unasked(bucket: Gcs, config: Config) -> None:
-    run_there(bucket, config, 10, 20)
-    for step in (10, 20):
-        bucket.put(f"bucket/run/checkpoints/{checkpoint_name(step)}/optimizer.pt", b"?")
-    with pytest.raises(InputError, match="none of 2 checkpoints is whole"):
-        open_remote(config, SILENT)
-    write(local(config), 5)
-    assert set(open_remote(config, SILENT).damaged) == {checkpoint_name(10), checkpoint_name(20)}
-
-
-def test_half_a_checkpoint_there_does_not_count(bucket: Gcs, config: Config) -> None:
-    run_there(bucket, config, 10)
-    bucket.put(f"bucket/run/checkpoints/{checkpoint_name(20)}/state.json", b'{"step": 20, "run_id": "mine"}')
-    open_remote(config, SILENT)
-    assert newest_checkpoint(local(config) / "checkpoints").name == checkpoint_name(10)
 
 
 @pytest.mark.parametrize(("here", "elsewhere", "taken"), [(10, 20, 20), (20, 10, 20), (20, 20, 20)])
@@ -156,13 +125,6 @@ def test_the_further_one_is_taken(bucket: Gcs, config: Config, here: int, elsewh
     open_remote(config, SILENT)
     assert newest_checkpoint(local(config) / "checkpoints").name == checkpoint_name(taken)
     assert bool(bucket.bytes_read("optimizer.pt")) == (elsewhere > here)
-
-
-def test_what_is_damaged_on_this_machine_is_replaced_from_there(bucket: Gcs, config: Config) -> None:
-    run_there(bucket, config, 10, 20)
-    (write(local(config), 20) / "optimizer.pt").write_bytes(b"?")
-    open_remote(config, SILENT)
-    assert newest_checkpoint(local(config) / "checkpoints").name == checkpoint_name(20)
 
 
 def test_another_config_is_refused_as_if_it_were_on_this_machine(bucket: Gcs, config: Config) -> None:
@@ -176,15 +138,6 @@ def test_another_config_is_refused_as_if_it_were_on_this_machine(bucket: Gcs, co
     assert newest_checkpoint(local(config) / "checkpoints") is not None
 
 
-def test_a_stride_that_the_run_there_has_chosen_is_no_other_config(
-    bucket: Gcs, make_config: Callable[..., Config]
-) -> None:
-    config = make_config(checkpoint__remote=PLACE, data__stride="auto")
-    run_there(bucket, config.model_copy(update={"data": config.data.with_stride(2)}), 10)
-    open_remote(config, SILENT)
-    assert newest_checkpoint(local(config) / "checkpoints") is not None
-
-
 def test_another_runs_place_is_refused(bucket: Gcs, config: Config) -> None:
     run_there(bucket, config, 10, run_id="other")
     before = bucket.names("bucket")
@@ -192,13 +145,6 @@ def test_another_runs_place_is_refused(bucket: Gcs, config: Config) -> None:
     with pytest.raises(InputError, match=rf"{PLACE} holds a checkpoint of another run, {checkpoint_name(10)}.*Set an"):
         open_remote(config, SILENT)
     assert bucket.names("bucket") == before
-
-
-def test_a_place_of_two_runs_is_refused_everywhere(bucket: Gcs, config: Config) -> None:
-    run_there(bucket, config, 10, run_id="one")
-    run_there(bucket, config, 20, run_id="two")
-    with pytest.raises(InputError, match="another run"):
-        open_remote(config, SILENT)
 
 
 def test_a_place_that_cannot_be_reached_is_a_warning(
@@ -241,25 +187,6 @@ def test_a_bucket_that_does_not_exist_is_an_error(bucket: Gcs, make_config: Call
     assert bucket.names("bucket")
     with pytest.raises(InputError, match=r"there is no bucket buckett\..*check its name\. Or name another place"):
         open_remote(make_config(checkpoint__remote="gs://buckett/run"), SILENT)
-
-
-def test_a_place_that_nothing_writes_is_an_error(make_config: Callable[..., Config]) -> None:
-    with pytest.raises(InputError, match="nothing reads ftpx://"):
-        open_remote(make_config(checkpoint__remote="ftpx://host/run"), SILENT)
-    with pytest.raises(InputError, match="cannot be written"):
-        open_remote(make_config(checkpoint__remote="/proc/run"), SILENT)
-
-
-def test_a_missing_library_is_named_with_its_install_line(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
-    import fsspec
-
-    def absent(protocol: str) -> None:
-        raise ImportError(f"Please install gcsfs to access {protocol}")
-
-    monkeypatch.setattr(fsspec, "get_filesystem_class", absent)
-    monkeypatch.setattr(filesystems, "_filesystems", {})
-    with pytest.raises(InputError, match=r"pip install .*\[gcs\]"):
-        open_remote(config, SILENT)
 
 
 @pytest.mark.parametrize("inner", ["", "mirror"])

@@ -14,7 +14,7 @@ from gcs import Gcs
 from same_run import assert_same_run
 from vjepa2_ac import storage
 from vjepa2_ac.config import Config
-from vjepa2_ac.distributed.preemption import StoppedError
+from vjepa2_ac.distributed.signals import StoppedError
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.runs.checkpoint import checkpoint_name
 from vjepa2_ac.runs.mirror.remote_checkpoints import RemoteCheckpoints, complete

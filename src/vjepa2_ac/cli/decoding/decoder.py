@@ -28,7 +28,7 @@ def _decoder(options: argparse.Namespace) -> int:
     from vjepa2_ac.console.progress import ConsoleReporter, console
     from vjepa2_ac.decoding.decoder_folder import read_card
     from vjepa2_ac.decoding.training import train_decoder
-    from vjepa2_ac.distributed.preemption import EXIT_STATUS, StoppedError
+    from vjepa2_ac.distributed.signals import EXIT_STATUS, StoppedError
 
     try:
         with ConsoleReporter() as reporter:

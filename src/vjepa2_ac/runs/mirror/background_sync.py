@@ -14,7 +14,7 @@ from collections.abc import Callable
 
 from vjepa2_ac.config import CheckpointConfig
 from vjepa2_ac.errors import RefusedError, UnreachableError, UserError
-from vjepa2_ac.runs.folder import CHECKPOINTS
+from vjepa2_ac.runs.checkpoint import CHECKPOINTS
 from vjepa2_ac.runs.mirror.upload import LostPlaceError, RemoteUpdate
 from vjepa2_ac.storage.retries import quietly
 
@@ -42,12 +42,11 @@ class Mirror:
         outage_reported: bool = False,
         now_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._update = update
-        self._every_minutes, self._wait_s = config.remote_every_minutes, config.remote_wait_seconds
+        self._update, self._config = update, config
         self._outage_reported, self._now_s = outage_reported, now_s
         self._thread: threading.Thread | None = None
-        self._hurry, self._stop = threading.Event(), threading.Event()
-        self._begun_s, self._is_off = -float("inf"), False
+        self._is_ending, self._has_ended = threading.Event(), threading.Event()
+        self._begun_s, self._is_lost = -float("inf"), False
         self._aim: str | None = None  # the newest local checkpoint when the thread started
         self._sent: str | None = None  # the newest remote one
 
@@ -56,7 +55,7 @@ class Mirror:
 
         The first checkpoint of a start is sent at once.
         """
-        due = self._now_s() - self._begun_s >= 60.0 * self._every_minutes
+        due = self._now_s() - self._begun_s >= 60.0 * self._config.remote_every_minutes
         if due and not self.is_sending and self._update.newest_here() != self._sent:
             self._begin()
 
@@ -72,15 +71,18 @@ class Mirror:
             is_asked_to_stop: Whether the machine is about to stop: then the wait is `checkpoint.remote_wait_seconds`,
                 else an hour.
         """
-        patience = _Patience(is_asked_to_stop, self._wait_s)
-        self._hurry.set()
-        self._wait(patience)
-        if not self.is_sending:
-            self._begin()
-            self._wait(patience)
+        self._is_ending.set()
+        is_short, until_s = False, time.monotonic() + LONGEST_WAIT_S
+        for is_last in (False, True):  # the current upload ends, or breaks off if there is a newer one
+            if is_last and not self.is_sending:
+                self._begin()
+            while self._thread and self.is_sending and time.monotonic() < until_s:
+                if not is_short and is_asked_to_stop():
+                    is_short, until_s = True, time.monotonic() + self._config.remote_wait_seconds
+                self._thread.join(_LOOK_EVERY_S)
         in_time = not self.is_sending
-        self._stop.set()
-        if not self._is_off and not (in_time and self._sent == self._update.newest_here()):
+        self._has_ended.set()
+        if not self._is_lost and not (in_time and self._sent == self._update.newest_here()):
             logger.warning(
                 "%s has checkpoints up to %s; what %s has after that is on this machine only%s. A next start sends it",
                 self._update.place, self._sent or "those of earlier starts", self._update.folder / CHECKPOINTS,
@@ -93,17 +95,13 @@ class Mirror:
 
     def __exit__(self, _kind: object, error: object, _traceback: object) -> None:
         """Stop uploading; if the run ends with an error, upload what exists first."""
-        if isinstance(error, Exception) and not self._stop.is_set():
+        if isinstance(error, Exception) and not self._has_ended.is_set():
             self.finish(lambda: True)
-        self._stop.set()
-
-    def _wait(self, patience: _Patience) -> None:
-        while self._thread is not None and self._thread.is_alive() and patience.lasts():
-            self._thread.join(_LOOK_EVERY_S)
+        self._has_ended.set()
 
     def _begin(self) -> None:
         self._begun_s, self._aim = self._now_s(), self._update.newest_here()
-        if not self._is_off:
+        if not self._is_lost:
             self._thread = threading.Thread(target=self._send, name="mirror", daemon=True)
             self._thread.start()
 
@@ -115,13 +113,13 @@ class Mirror:
         except _BrokenOffError:
             pass
         except LostPlaceError as error:
-            self._is_off = True
+            self._is_lost = True
             logger.warning("checkpoint.remote: %s", error)
         except (UserError, OSError) as error:
             log = logger.info if self._outage_reported else logger.warning
             log(
                 "checkpoint.remote is not up to date: %s. Training continues; next attempt in %g minutes",
-                reason_of(error), self._every_minutes,
+                reason_of(error), self._config.remote_every_minutes,
             )  # fmt: skip
             self._outage_reported = True
         except Exception:  # no error here may stop the run
@@ -131,7 +129,7 @@ class Mirror:
 
     def _go_on(self) -> None:
         """Cancel the upload if the run has ended, or is ending and has a newer checkpoint."""
-        if self._stop.is_set() or (self._hurry.is_set() and self._update.newest_here() != self._aim):
+        if self._has_ended.is_set() or (self._is_ending.is_set() and self._update.newest_here() != self._aim):
             raise _BrokenOffError
 
 
@@ -140,37 +138,6 @@ def reason_of(error: Exception) -> str:
     if isinstance(error, UnreachableError) and not isinstance(error, RefusedError):
         return f"{error.where}: {error.found}"
     return str(error).rstrip(".")
-
-
-class NoMirror:
-    """Does nothing: there is no `checkpoint.remote`, or another process handles it."""
-
-    def tick(self) -> None:
-        """Do nothing."""
-
-    def finish(self, is_asked_to_stop: Callable[[], bool]) -> None:
-        """Do nothing."""
-
-    def __enter__(self) -> NoMirror:
-        """Return itself."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Do nothing."""
-
-
-class _Patience:
-    """A waiting time: long, but at most `then_s` after a machine has been asked to stop."""
-
-    def __init__(self, is_asked_to_stop: Callable[[], bool], then_s: float) -> None:
-        self._is_asked_to_stop, self._then_s = is_asked_to_stop, then_s
-        self._until_s, self._is_short = time.monotonic() + LONGEST_WAIT_S, False
-
-    def lasts(self) -> bool:
-        """Return whether to continue waiting."""
-        if not self._is_short and self._is_asked_to_stop():
-            self._is_short, self._until_s = True, time.monotonic() + self._then_s
-        return time.monotonic() < self._until_s
 
 
 class _BrokenOffError(Exception):

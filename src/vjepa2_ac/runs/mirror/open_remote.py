@@ -6,7 +6,9 @@ A place that cannot be reached is a warning. A place that can never be written, 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+import shutil
+import tempfile
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,13 +16,19 @@ from pathlib import Path
 from vjepa2_ac.config import Config
 from vjepa2_ac.errors import InputError, RefusedError, UnreachableError
 from vjepa2_ac.reporter import Reporter
-from vjepa2_ac.runs.checkpoint import newest_checkpoint, step_of, written_state
-from vjepa2_ac.runs.folder import CHECKPOINTS
+from vjepa2_ac.runs.checkpoint import (
+    CHECKPOINTS,
+    FETCHING,
+    newest_checkpoint,
+    remove_leavings,
+    step_of,
+    written_state,
+)
+from vjepa2_ac.runs.folder import CONFIG, check_run_folder, with_settled_stride
 from vjepa2_ac.runs.mirror.background_sync import Mirror, reason_of
-from vjepa2_ac.runs.mirror.fetch import fetch_newest
 from vjepa2_ac.runs.mirror.remote_checkpoints import Listing, RemoteCheckpoints, complete
-from vjepa2_ac.runs.mirror.upload import RemoteUpdate
-from vjepa2_ac.storage import is_url, place, try_writing
+from vjepa2_ac.runs.mirror.upload import SMALL_FILES, RemoteUpdate
+from vjepa2_ac.storage import download, is_url, join, place, sync, try_writing
 from vjepa2_ac.storage.retries import quietly
 
 logger = logging.getLogger(__name__)
@@ -54,7 +62,8 @@ def open_remote(
 ) -> Remote | None:
     """Test `checkpoint.remote`, and fetch a newer checkpoint from there; None if it is not set.
 
-    A small file is written there and removed again.
+    A small file is written there and removed again. Fetched is the newest checkpoint there whose every file matches
+    its manifest, the best one, and the run's small files; damaged ones are named and skipped.
 
     Args:
         config: The run.
@@ -88,7 +97,7 @@ def open_remote(
         return remote
     target = config if into is None else config.model_copy(update={"run_dir": str(into)})
     try:
-        damaged = fetch_newest(
+        damaged = _fetch_newest(
             checkpoints, further, target, reporter, claim=claim, allow_config_change=allow_config_change
         )
     except UnreachableError as error:
@@ -154,3 +163,68 @@ def _where_this_machine_stands(run_dir: Path) -> tuple[int | None, str | None]:
 
 def _warn(text: str) -> None:
     logger.warning("%s: %s", _KNOB, text)
+
+
+def _fetch_newest(
+    remote: RemoteCheckpoints,
+    names: Sequence[str],
+    config: Config,
+    reporter: Reporter,
+    *,
+    claim: Callable[[], None],
+    allow_config_change: bool = False,
+) -> list[str]:
+    """Download a run into `run_dir`, with the first of these checkpoints (the newest first) that is complete.
+
+    Of all it fetches, the checkpoint comes last, so that an interrupted download starts again.
+
+    Returns:
+        The damaged checkpoints; all of `names` if none is complete.
+
+    Raises:
+        InputError: The run there has another config; nothing is downloaded then.
+        UnreachableError: The place cannot be reached.
+    """
+    folder, checkpoints = Path(config.run_dir), Path(config.run_dir, CHECKPOINTS)
+    _require_this_config(config, remote.place, allow_config_change=allow_config_change)
+    claim()
+    for name in SMALL_FILES:  # config.yaml first: without it the folder would be no run's
+        with suppress(FileNotFoundError):
+            download(join(remote.place, name), folder / name)
+    remove_leavings(checkpoints)
+    for number, name in enumerate(names):
+        if _fetch(remote, name, checkpoints):
+            reporter.note(f"Fetched {name} from {remote.place}.")
+            return list(names[:number])
+    return list(names)
+
+
+def _require_this_config(config: Config, place: str, *, allow_config_change: bool) -> None:
+    """Check that the run there is the requested one, as for a local folder."""
+    with tempfile.TemporaryDirectory() as folder:
+        with suppress(FileNotFoundError):
+            download(join(place, CONFIG), Path(folder, CONFIG))
+        try:
+            there = with_settled_stride(config.model_copy(update={"run_dir": folder}))
+            check_run_folder(there, allow_config_change=allow_config_change)
+        except InputError as error:
+            fix = "Set another checkpoint.remote for a new run; where the change is meant, add --allow-config-change"
+            where = f"checkpoint.remote {place}"
+            raise InputError(where=where, found=error.found, needed=error.needed, fix=fix) from None
+
+
+def _fetch(remote: RemoteCheckpoints, name: str, checkpoints: Path) -> bool:
+    """Download a checkpoint, after the best one that it names; return False, with a warning, if it is damaged."""
+    fetched, final = checkpoints / f"{FETCHING}{name}", checkpoints / name
+    if problem := remote.fetch(name, fetched):
+        shutil.rmtree(fetched)
+        logger.warning("%s: %s: %s; passed over", remote.place, name, problem)
+        return False
+    best = written_state(fetched).best_name
+    if best is not None and best != name and not (checkpoints / best).is_dir():
+        _fetch(remote, best, checkpoints)
+    if final.is_dir():  # a damaged local one
+        shutil.rmtree(final)
+    fetched.rename(final)
+    sync(checkpoints)
+    return True

@@ -14,9 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.runs.checkpoint import STATE, find_damage, step_of
-from vjepa2_ac.runs.folder import CHECKPOINTS
-from vjepa2_ac.runs.manifest import MANIFEST, named_files
+from vjepa2_ac.runs.checkpoint import CHECKPOINTS, STATE, find_damage, step_of
+from vjepa2_ac.runs.files import MANIFEST, named_files
 from vjepa2_ac.storage import download, file_sizes, join, read_bounded, remove, remove_folder, upload
 from vjepa2_ac.storage.structured import MOST_BYTES, read_json_object
 
@@ -101,7 +100,7 @@ class RemoteCheckpoints:
         except InputError as error:
             return f"no readable {MANIFEST} ({error.found})"
         (folder / MANIFEST).write_bytes(manifest)
-        return find_damage(folder, name)
+        return find_damage(folder)
 
     def _of_this(self, name: str, files: Mapping[str, int], manifest: bytes) -> Mapping[str, int]:
         """Return the files of this checkpoint that are there; remove those of another one with the same name."""

@@ -15,8 +15,9 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.runs.checkpoint import find_damage, listed, step_of, written_state
-from vjepa2_ac.runs.folder import CALIBRATION, CHANGES, CHECKPOINTS, CONFIG, ENVIRONMENT, HELD, METRICS, RUN_ID
+from vjepa2_ac.runs.checkpoint import CHECKPOINTS, listed, step_of, written_state
+from vjepa2_ac.runs.files import MANIFEST, named_files
+from vjepa2_ac.runs.folder import CALIBRATION, CHANGES, CONFIG, ENVIRONMENT, HELD, METRICS, RUN_ID
 from vjepa2_ac.runs.mirror.remote_checkpoints import Listing, RemoteCheckpoints, complete
 from vjepa2_ac.storage import join, read_bounded, upload
 from vjepa2_ac.storage.structured import MOST_BYTES, json_list, shown
@@ -141,9 +142,10 @@ class RemoteUpdate:
         shutil.rmtree(held, ignore_errors=True)
         try:
             shutil.copytree(self.folder / CHECKPOINTS / str(name), held, copy_function=_link)
-        except (FileNotFoundError, shutil.Error):
+            files = named_files((held / MANIFEST).read_bytes())
+        except (FileNotFoundError, shutil.Error, InputError):
             return None
-        return held if find_damage(held) is None else None
+        return held if all((held / file).is_file() for file in files) else None
 
     def _remove(self, names: Collection[str], go_on: GoOn) -> None:
         for name in sorted(names):

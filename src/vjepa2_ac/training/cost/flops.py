@@ -15,10 +15,8 @@ from dataclasses import dataclass
 
 from torch import nn
 
-from vjepa2_ac.config import AdapterConfig, Config, ModelSizes
-from vjepa2_ac.model.adapter.targets import adapter_ranks
-from vjepa2_ac.model.network.predictor_network import PredictorNetwork
-from vjepa2_ac.training.cost.fake_model import meta_network
+from vjepa2_ac.config import Config, ModelSizes
+from vjepa2_ac.training.cost.step import meta_network, meta_predictor
 
 
 @dataclass(frozen=True)
@@ -103,7 +101,7 @@ class _Passes:
         if config is not None and config.adapter.kind == "none":
             self._whole = set(self._layers)
         elif config is not None:
-            self._ranks, self._whole = _ranks(network, config.adapter), set(config.adapter.modules_to_save)
+            self._ranks, self._whole = _ranks(config, sizes), set(config.adapter.modules_to_save)
         conditions = ("action_encoder", "state_encoder", "extrinsics_encoder")
         self._conditions = [name for name in conditions if name in self._layers and name not in network.unused_layers]
 
@@ -164,9 +162,8 @@ class _Passes:
         return name in self._whole or name in self._ranks
 
 
-def _ranks(network: PredictorNetwork, adapter: AdapterConfig) -> dict[str, int]:
-    if not adapter.peft:
-        return adapter_ranks(network, adapter)
-    from vjepa2_ac.model.adapter.lora import ranks_by_peft  # PEFT itself says what its options do
-
-    return ranks_by_peft(network, adapter)
+def _ranks(config: Config, sizes: ModelSizes) -> dict[str, int]:
+    """Return the rank of each layer that has an adapter."""
+    named = meta_predictor(config, sizes).named_parameters()
+    first = ((name.removeprefix("base_model.model.").partition(".lora_A"), value) for name, value in named)
+    return {layer: value.shape[0] for (layer, is_first, _), value in first if is_first}

@@ -1,6 +1,6 @@
 """GPU memory of a run, part by part: what a step on fake tensors keeps, and arithmetic for the rest.
 
-The predictor's part is measured (`training.cost.fake_step`). Calculated is what needs no pass through it: weights and
+The predictor's part is measured (`training.cost.step`). Calculated is what needs no pass through it: weights and
 moments from the counts of parameters (bitsandbytes' kernels take no fake tensors), the next batch from its sizes, and
 the encoder at work, whose code would take seconds to import. The total has not yet been compared with the peak that a
 GPU measures.
@@ -13,9 +13,7 @@ from dataclasses import dataclass
 
 from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.encoding.pipeline import FRAMES_AT_ONCE
-from vjepa2_ac.training.cost.fake_model import Kind
-from vjepa2_ac.training.cost.fake_step import StepBytes, measure_step
-from vjepa2_ac.training.cost.parameters import Parameters, count_parameters
+from vjepa2_ac.training.cost.step import Kind, StepBytes, measure_step, meta_predictor
 
 GIGABYTE = 10**9
 ALLOWANCE = 3 * GIGABYTE // 2  # CUDA context 0.5, cuBLAS workspaces, fragmentation: not computed but assumed
@@ -26,6 +24,22 @@ HALF = 2  # bfloat16 and float16
 
 _BYTES_OF_CACHED = {"int8": 1, "bf16": HALF, "fp32": FLOAT32}
 _SMALLEST_IN_8_BITS, _ELEMENTS_OF_A_SCALE = 4096, 256  # of bitsandbytes
+_TUBELET = 2  # frames that the encoder's first layer takes at once
+_LEVELS = 4  # of V-JEPA 2.1, each with a norm
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """How many parameters there are, exactly."""
+
+    encoder: int
+    predictor: int
+    trained_tensors: tuple[int, ...]  # elements of each: of an adapter and whole heads, or of the whole predictor
+
+    @property
+    def trained(self) -> int:
+        """How many are trained."""
+        return sum(self.trained_tensors)
 
 
 @dataclass(frozen=True)
@@ -56,9 +70,33 @@ class MemoryEstimate:
     def total(self, *, checkpointing: bool) -> int:
         """Return the peak with or without gradient checkpointing."""
         passes = self.step.checkpointed if checkpointing else self.step.stored
-        predicting = self.latents + self.step.casts + passes.peak
+        predicting = self.latents + self.step.casts + passes
         training = self.gradients + max(self.latents + self.encoding, predicting, self.optimizer_temporaries)
         return max(self.standing + max(training, self.validating), self.caching)
+
+
+def count_parameters(config: Config, sizes: ModelSizes) -> Parameters:
+    """Return how many parameters a model of these sizes has, and how many of them the config trains. No weight is made.
+
+    Raises:
+        InputError: A knob of the adapter does not fit the predictor.
+    """
+    every = list(meta_predictor(config, sizes).parameters())
+    trained = tuple(one.numel() for one in every if one.requires_grad)
+    total = sum(one.numel() for one in every)
+    own = total if config.adapter.kind == "none" else total - sum(trained)
+    return Parameters(_encoder_parameters(sizes), own, trained)
+
+
+def _encoder_parameters(sizes: ModelSizes) -> int:
+    """Return the encoder's parameters; of V-JEPA 2.1 both frame paths."""
+    width, hidden = sizes.encoder.width, int(sizes.encoder.width * sizes.encoder.mlp_ratio)
+    block = 4 * (width + 1) * width + 4 * width + (width + 1) * hidden + (hidden + 1) * width
+    of_a_frame = 3 * sizes.patch_size**2
+    total = sizes.encoder.depth * block + (_TUBELET * of_a_frame + 1) * width + 2 * width
+    if sizes.encoder.family == "v2":
+        return total
+    return total + (of_a_frame + 1) * width + _LEVELS * 2 * width
 
 
 def estimate_memory(config: Config, sizes: ModelSizes, device: Kind = "cuda") -> MemoryEstimate:
@@ -188,6 +226,8 @@ def _validating(config: Config, sizes: ModelSizes, step: StepBytes) -> int:
     Either it is encoded, or predicted: true latents, two predictions of them, and the larger of what a prediction of
     all steps at once takes and the keys and values that the rollout keeps of all steps but the last two.
     """
-    clips = config.validation.batch_size
-    latents = _latents(config, sizes, clips)
-    return latents + max(_encoding(config, sizes, clips), 2 * latents + max(step.cached, step.predicting))
+    clips, predictor = config.validation.batch_size, sizes.predictor
+    latents, number = _latents(config, sizes, clips), FLOAT32 if config.training.precision == "fp32" else HALF
+    tokens = sizes.tokens_per_frame + 1 + predictor.use_states + predictor.use_extrinsics
+    cached = 2 * predictor.depth * clips * (config.data.frames - 2) * tokens * predictor.width * number
+    return latents + max(_encoding(config, sizes, clips), 2 * latents + max(cached, step.predicting))

@@ -15,10 +15,11 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from vjepa2_ac.config import Config
 from vjepa2_ac.data.clips import frames_of
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.transforms import frames_as_seen
-from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
+from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
 from vjepa2_ac.decoding.imagine import AS_RECORDED, Imagination, Imagined, Start, rolled_out, shown
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.media.image_file import encode_png
@@ -28,14 +29,11 @@ from vjepa2_ac.reports.figures.film import draw_strip
 from vjepa2_ac.reports.imagined import strip_of
 from vjepa2_ac.runs.checkpoint import checkpoint_name
 from vjepa2_ac.runs.folder import IMAGINED
-from vjepa2_ac.runs.own_files import refuse_links_out
 from vjepa2_ac.storage import write_atomically
 
 logger = logging.getLogger(__name__)
 
-_NOW = "model now"
-
-Rollouts = dict[str, Float[Tensor, "steps tokens dim"]]
+Image = UInt8[np.ndarray, "height width 3"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,8 +62,8 @@ class ImaginedStrip:
         self._decoder, self._dataset, self._size = decoder, dataset, size
         self._clip: _Clip | None = None
         self._is_found = False  # from the first drawing on
-        self._base: Rollouts = {}
-        self._frames: UInt8[np.ndarray, "time size size 3"] | None = None
+        self._base: dict[str, Tensor] = {}  # what the base imagines: [steps, tokens, dim]
+        self._frames: UInt8[np.ndarray, "time size size 3"] | None = None  # what happened
 
     def seen(self, batch: Batch, encoded: LatentBatch) -> LatentBatch:
         """Return the latents of a batch of validation clips, after looking for the clip with the most motion."""
@@ -76,63 +74,65 @@ class ImaginedStrip:
                     self._clip = _clip_of(batch, encoded, row, motion)
         return encoded
 
-    @torch.no_grad()
-    def roll_out(self, world_model: WorldModel, device: torch.device) -> Rollouts | None:
-        """Return what base and model imagine of the clip; None before there was a validation.
-
-        The base is asked once, and only where an adapter can be switched off; before training, the model is the base.
-        """
+    def draw(self, world_model: WorldModel, device: torch.device, run: Path, step: int) -> Image | None:
+        """Write RUN/imagined/step-XXXXXXXX.png; return the image, None if none was drawn."""
         if self._clip is None:
             return None
-        world_model.eval()
-        clip, self._is_found = self._clip, True
-        extrinsics = None if clip.extrinsics is None else clip.extrinsics.to(device)
-        start = Start(clip.latents[0].to(device), clip.states[0], self._dataset.spaces.state, extrinsics)
-        adaptation = world_model.adaptation
-        if not self._base and adaptation is not None and adaptation.kind == "lora" and world_model.fresh_heads is None:
-            with base_only(world_model):
-                self._base = {"base": rolled_out(world_model, start, clip.actions, clip.states[:-1]).cpu()}
-        return {**self._base, _NOW: rolled_out(world_model, start, clip.actions, clip.states[:-1])}
-
-    def write(self, rollouts: Rollouts, run: Path, step: int) -> UInt8[np.ndarray, "height width 3"] | None:
-        """Decode and draw them, and write RUN/imagined/step-XXXXXXXX.png; return the image, None if none was drawn."""
-        if self._clip is None:
-            return None
+        self._is_found = True
         try:
-            image = draw_strip(strip_of(self._imagination(self._clip, rollouts, run, step)))
+            imagination = self._imagine(self._clip, world_model, device, f"{run.name}, step {step:,}")
+            image: Image = draw_strip(strip_of(imagination))
+            (run / IMAGINED).mkdir(exist_ok=True)
+            write_atomically(run / IMAGINED / f"{checkpoint_name(step)}.png", encode_png(image))
         except Exception as error:  # an image is not worth a run
             logger.warning("What the model imagines at step %d could not be drawn: %s", step, error)
             return None
-        name = f"{IMAGINED}/{checkpoint_name(step)}.png"
-        try:
-            refuse_links_out(run, [IMAGINED, name])
-            (run / IMAGINED).mkdir(exist_ok=True)
-            write_atomically(run / name, encode_png(image))
-        except Exception as error:  # likewise
-            logger.warning("%s could not be written: %s", run / name, error)
         return image
 
-    def _imagination(self, clip: _Clip, rollouts: Rollouts, run: Path, step: int) -> Imagination:
+    @torch.no_grad()
+    def _imagine(self, clip: _Clip, world_model: WorldModel, device: torch.device, subject: str) -> Imagination:
         if self._frames is None:
             self._frames = frames_as_seen(frames_of(self._dataset, clip.batch, clip.row), self._size)
-        decoded = self._decoded(clip.latents, rollouts[_NOW].device)
+        decoder = self._decoder.to(device).decoder
+        decoded = shown(decoder, clip.latents.to(device))
         return Imagination(
-            subject=f"{run.name}, step {step:,}",
+            subject=subject,
             episode_id=clip.batch.episode_ids[clip.row],
             start=clip.batch.starts[clip.row],
             seconds_per_step=self._dataset.config.model_stride / self._dataset.control_rate_hz,
             first=self._frames[0],
             decoded_first=decoded[0],
             rollouts=tuple(
-                Imagined(name, AS_RECORDED, clip.actions, self._decoded(latents, rollouts[_NOW].device))
-                for name, latents in rollouts.items()
+                Imagined(name, AS_RECORDED, clip.actions, shown(decoder, latents.to(device)))
+                for name, latents in self._rollouts(clip, world_model, device).items()
             ),
             truth=self._frames[1:],
             decoded_truth=decoded[1:],
         )
 
-    def _decoded(self, latents: Tensor, device: torch.device) -> UInt8[np.ndarray, "time size size 3"]:
-        return shown(self._decoder.to(device).decoder, latents.to(device))
+    def _rollouts(self, clip: _Clip, world_model: WorldModel, device: torch.device) -> dict[str, Tensor]:
+        """Return the latents that base and model imagine.
+
+        The base is asked once, and only where an adapter can be switched off; before training, the model is the base.
+        """
+        world_model.eval()
+        extrinsics = None if clip.extrinsics is None else clip.extrinsics.to(device)
+        start = Start(clip.latents[0].to(device), clip.states[0], self._dataset.spaces.state, extrinsics)
+        adaptation = world_model.adaptation
+        if not self._base and adaptation is not None and adaptation.kind == "lora" and world_model.fresh_heads is None:
+            with base_only(world_model):
+                self._base = {"base": rolled_out(world_model, start, clip.actions, clip.states[:-1]).cpu()}
+        return {**self._base, "model now": rolled_out(world_model, start, clip.actions, clip.states[:-1])}
+
+
+def decoder_of(config: Config) -> TrainedDecoder | None:
+    """Load `validation.decoder`; None if it is not set.
+
+    Raises:
+        InputError: It is no decoder.
+    """
+    name = config.validation.decoder
+    return None if name is None else load_decoder(name, where="validation.decoder:")
 
 
 def _clip_of(batch: Batch, encoded: LatentBatch, row: int, motion: float) -> _Clip:

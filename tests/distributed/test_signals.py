@@ -13,17 +13,17 @@ import pytest
 from ranks import Rank
 from same_run import assert_same_run
 from vjepa2_ac.config.loading import config_as_yaml
-from vjepa2_ac.distributed import preemption
-from vjepa2_ac.distributed.preemption import EXIT_STATUS, SIGNALS, StoppedError, stop_on_signals
+from vjepa2_ac.distributed import signals
+from vjepa2_ac.distributed.signals import EXIT_STATUS, SIGNALS, StoppedError, stop_on_signals
 from vjepa2_ac.runs.checkpoint import newest_checkpoint, read_state
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.training.loop import train
 
 WAITING = """
 import time
-from vjepa2_ac.distributed import preemption
-preemption.SAME_WITHIN_S = 0.0
-with preemption.stop_on_signals() as stop:
+from vjepa2_ac.distributed import signals
+signals.SAME_WITHIN_S = 0.0
+with signals.stop_on_signals() as stop:
     print(stop.reason, flush=True)
     while stop.reason is None:
         time.sleep(0.01)
@@ -67,10 +67,6 @@ def test_a_run_under_nohup_outlives_its_terminal(make_config, reporter, tmp_path
     assert_same_run(whole_run, tmp_path / "run")
 
 
-def test_a_run_asked_to_stop_after_its_last_step_is_done(make_config, reporter) -> None:
-    train(make_config(), signalled_reporter(reporter, 6, signal.SIGTERM))
-
-
 def test_a_signal_to_the_whole_group_stops_the_run_and_its_workers_in_good_order(
     make_config, reporter, tmp_path
 ) -> None:
@@ -108,7 +104,7 @@ def test_a_second_signal_ends_the_process_at_once(popen, number: int) -> None:
 
 
 def test_a_signal_that_comes_twice_at_once_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(preemption, "SAME_WITHIN_S", 60.0)
+    monkeypatch.setattr(signals, "SAME_WITHIN_S", 60.0)
     with stop_on_signals() as stop:
         os.kill(os.getpid(), signal.SIGTERM)
         os.kill(os.getpid(), signal.SIGTERM)
@@ -116,7 +112,7 @@ def test_a_signal_that_comes_twice_at_once_is_one(monkeypatch: pytest.MonkeyPatc
 
 
 def test_a_terminal_that_goes_asks_to_stop_however_often_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(preemption, "SAME_WITHIN_S", 0.0)
+    monkeypatch.setattr(signals, "SAME_WITHIN_S", 0.0)
     with stop_on_signals() as stop:
         for _ in range(3):
             os.kill(os.getpid(), signal.SIGHUP)

@@ -1,8 +1,9 @@
-"""Stop requests by SIGTERM, SIGINT (Ctrl-C), SIGUSR1 and SIGHUP: the loop stops where it can be resumed.
+"""Signals: training stops where it can be resumed; other commands remove partial files and end with the signal.
 
-The first signal is recorded: the loop finishes its optimizer step, and the validation that is due after it, writes a
-checkpoint and raises `StoppedError`. The command line then exits with `EXIT_STATUS`. A second signal stops at once: it
-has its default effect, which ends the process; checkpoints are complete or absent, whenever that happens.
+`stop_on_signals`: the first SIGTERM, SIGINT (Ctrl-C), SIGUSR1 or SIGHUP is recorded: the loop finishes its optimizer
+step, and the validation that is due after it, writes a checkpoint and raises `StoppedError`. The command line then
+exits with `EXIT_STATUS`. A second signal has its default effect, which ends the process; checkpoints are complete or
+absent, whenever that happens.
 
 SIGHUP means that the terminal is gone: shell and kernel send one each, so only the first counts. To let a run outlive
 its terminal, start it with `nohup` or in tmux.
@@ -19,8 +20,8 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import FrameType
 
-SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)
 HANG_UP = signal.SIGHUP
+SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)
 SAME_WITHIN_S = 0.5  # another signal is the same request: `timeout` and launchers signal a process and its group
 EXIT_STATUS = 75  # sysexits.h, EX_TEMPFAIL: the same command resumes
 
@@ -39,30 +40,36 @@ class StoppedError(Exception):
         super().__init__(f"{reason}: stopped after step {step:,}; the same command goes on from there")
 
 
+class EndedError(BaseException):
+    """Ends the current work, as KeyboardInterrupt does, so that temporary files are removed.
+
+    Args:
+        number: The signal.
+    """
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+        super().__init__(signal.Signals(number).name)
+
+
 class StopRequest:
     """Records whether a signal has requested a stop, and which."""
 
     def __init__(self) -> None:
-        self.reason: str | None = None
+        self.number = 0  # of the signal; 0: none
         self._came_at = 0.0
 
     @property
-    def number(self) -> int:
-        """The signal's number; 0: none."""
-        return 0 if self.reason is None else signal.Signals[self.reason].value
+    def reason(self) -> str | None:
+        """The signal's name; None: none."""
+        return signal.Signals(self.number).name if self.number else None
 
     def take(self, number: int, _frame: FrameType | None) -> None:
         """Record a first signal; give a second one its default effect."""
-        if self.reason is None:
-            self.reason, self._came_at = signal.Signals(number).name, time.monotonic()
+        if not self.number:
+            self.number, self._came_at = number, time.monotonic()
         elif number != HANG_UP and time.monotonic() - self._came_at >= SAME_WITHIN_S:
             end_by(number)
-
-
-def end_by(number: int) -> None:
-    """Give a signal its default effect, and this process the signal."""
-    signal.signal(number, signal.SIG_DFL)
-    os.kill(os.getpid(), number)
 
 
 @contextlib.contextmanager
@@ -74,13 +81,39 @@ def stop_on_signals() -> Iterator[StopRequest]:
     """
     request = StopRequest()
     taken = [number for number in (*SIGNALS, HANG_UP) if signal.getsignal(number) is not signal.SIG_IGN]
-    with handle_signals(taken, request.take):
+    with _handled(taken, request.take):
         yield request
 
 
 @contextlib.contextmanager
-def handle_signals(numbers: Iterable[int], handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
-    """Handle signals within the context, in the main thread; afterwards the old handlers are restored."""
+def tidy_end() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP end the block cleanly, and then the process; a second one ends it at once.
+
+    Outside the main thread, and for signals that already have a handler, nothing is changed.
+    """
+    first = StopRequest()
+
+    def end(number: int, frame: FrameType | None) -> None:
+        is_first = not first.number
+        first.take(number, frame)
+        if is_first:
+            raise EndedError(number)
+
+    try:
+        with _handled([one for one in (signal.SIGTERM, HANG_UP) if signal.getsignal(one) is signal.SIG_DFL], end):
+            yield
+    except EndedError as ended:
+        end_by(ended.number)
+
+
+def end_by(number: int) -> None:
+    """Give a signal its default effect, and this process the signal."""
+    signal.signal(number, signal.SIG_DFL)
+    os.kill(os.getpid(), number)
+
+
+@contextlib.contextmanager
+def _handled(numbers: Iterable[int], handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
     before = {}
     if threading.current_thread() is threading.main_thread():
         before = {number: signal.signal(number, handler) for number in numbers}

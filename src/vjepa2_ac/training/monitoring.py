@@ -1,0 +1,324 @@
+"""What is watched while a run trains: its reporter, its speed, and whether it diverges.
+
+Metrics of one optimizer step, for the metrics log and the console:
+
+update_to_weight    norm of the update over the norm of the weights before it, of all that is trained together
+data_wait_share     share of the step's wall time spent waiting for the loader; on CUDA only the device's idle time,
+                    since it computes queued work while the host waits
+samples_per_second  clips, of all processes
+tokens_per_second   patch tokens of the frames of these clips
+mfu                 model FLOPs per second (`training.cost.flops`) over the ceiling: the rate of this device in a large
+                    matrix product in the run's precision, measured for a fraction of a second at the start
+memory_gb           peak so far in 10^9 bytes: of PyTorch's allocator on CUDA, resident elsewhere
+"""
+
+from __future__ import annotations
+
+import math
+import resource
+import statistics
+import time
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+
+import torch
+from torch import Tensor
+
+from vjepa2_ac.config import Config, ModelSizes
+from vjepa2_ac.data.loader import prefetch_next
+from vjepa2_ac.data.streams import Cuda
+from vjepa2_ac.distributed.device import PRECISIONS, matmul_speed
+from vjepa2_ac.episode import Batch
+from vjepa2_ac.reporter import Reporter
+from vjepa2_ac.runs.metrics_log import WARNING, MetricsLog, read_metrics_log
+from vjepa2_ac.training.cost.flops import clip_flops
+
+if TYPE_CHECKING:
+    from vjepa2_ac.evaluation.result import Validation
+    from vjepa2_ac.runs.trackers import Image, Trackers
+
+MEASURED = frozenset({"data_wait_share", "samples_per_second", "tokens_per_second", "mfu", "memory_gb"})
+"""Metrics of the machine: they differ between identical runs."""
+
+_ERRORS = {
+    "error_over_persistence": "one-step error",
+    "rollout_over_persistence_last": "rollout error at the last horizon",
+}
+_NOISE = 1.01  # validation clips are always the same; smaller changes mean nothing
+_LOSSES = 10  # number of `train` rows whose median is compared
+_FEWEST_LOSSES = 5
+_FAR_ABOVE = 2.0  # times the lowest such median
+
+
+@runtime_checkable
+class TrainingReporter(Reporter, Protocol):
+    """Shows the progress of a run, too; it is silent in all processes but the first."""
+
+    def started(self, done: int, total: int) -> None:
+        """The loop begins after `done` of `total` optimizer steps."""
+        ...
+
+    def stepped(self, step: int, metrics: dict[str, float]) -> None:
+        """An optimizer step is done."""
+        ...
+
+    def validated(self, step: int, found: Validation) -> None:
+        """Held-out clips were measured after `step` optimizer steps."""
+        ...
+
+
+class NullMetricsLog:
+    """The metrics log of the processes that write nothing."""
+
+    is_behind = False
+
+    def write(self, kind: str, step: int, metrics: Mapping[str, Any]) -> None:
+        """Write nothing."""
+
+    def show(self, kind: str, name: str, step: int, image: Image) -> None:
+        """Show nothing."""
+
+    def before_a_checkpoint(self) -> nullcontext[None]:
+        """Do nothing."""
+        return nullcontext()
+
+
+class WatchedMetricsLog(MetricsLog):
+    """A metrics log that warns, in it and on the console, when its rows show that training diverges.
+
+    Only the rows are used, so that a resumed run neither loses nor repeats a warning.
+
+    Args:
+        run_dir: The run's folder.
+        config: Its config, for the knobs to change.
+        reporter: Receives messages for the user.
+        first_step: As of `MetricsLog`.
+        trackers: As of `MetricsLog`.
+    """
+
+    def __init__(
+        self, run_dir: Path, *, config: Config, reporter: Reporter, first_step: int, trackers: Trackers | None = None
+    ) -> None:
+        super().__init__(run_dir, first_step=first_step, trackers=trackers)
+        self._watch, self._reporter = Watch(config), reporter
+        for row in read_metrics_log(self.path):
+            self._watch(str(row.get("kind")), row["step"], row)
+
+    def write(self, kind: str, step: int, metrics: Mapping[str, Any]) -> None:
+        """Append a row, followed by its warnings."""
+        super().write(kind, step, metrics)
+        for text in self._watch(kind, step, metrics):
+            super().write(WARNING, step, {"text": text})
+            self._reporter.note(f"Warning: {text}")
+
+
+class Watch:
+    """Checks the rows of a metrics log one after the other; each cause is warned of once.
+
+    Args:
+        config: Of the run.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self._reported: set[str] = set()
+        self._at_start: Mapping[str, Any] = {}  # the validation of the base
+        self._losses: deque[float] = deque(maxlen=_LOSSES)
+        self._lowest = math.inf
+
+    def __call__(self, kind: str, step: int, metrics: Mapping[str, Any]) -> list[str]:
+        """Return the warnings of a row: none if it is fine or the cause is known already."""
+        found: Iterable[tuple[str, str]] = ()
+        if kind == "train":
+            found = self._of_loss(_number(metrics, "loss"))
+        elif kind == "validation" and step == 0:
+            self._at_start = metrics
+        elif kind == "validation":
+            found = (*self._of_errors(metrics), *self._of_ranking(metrics))
+        new = {cause: text for cause, text in found if cause not in self._reported}
+        self._reported |= set(new)
+        return [f"at step {step:,} {text}. {advice(self._config)}" for text in new.values()]
+
+    def _of_errors(self, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+        now = {name: _number(metrics, key) for key, name in _ERRORS.items()}
+        before = {name: _number(self._at_start, key) for key, name in _ERRORS.items()}
+        if not all(map(math.isfinite, now.values())):
+            yield "not finite", "an error of the validation is not a finite number"
+        worse = [name for name in now if now[name] > _NOISE * before[name]]
+        if worse:
+            errors = " and ".join(
+                f"the {name} is {now[name]:.3f} (before training {before[name]:.3f})" for name in worse
+            )
+            beyond = any(now[name] > 1.0 > before[name] for name in worse)
+            copying = "; copying the last frame would be better" if beyond else ""
+            yield f"{worse} {beyond}", f"{errors} of persistence's in the validation{copying}"
+
+    def _of_ranking(self, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+        """Warn of a model that planning would not want, though it may predict better: the intervals are apart."""
+        if _number(metrics, "action_rank_low") > _number(self._at_start, "action_rank_high"):
+            better = all(_number(metrics, key) < _number(self._at_start, key) for key in _ERRORS)
+            words = "predicts better and plans worse than the base" if better else "plans worse than the base"
+            rank, before = _number(metrics, "action_rank"), _number(self._at_start, "action_rank")
+            text = f"the model {words}: the mean rank of the true action among others is {rank:.3f}"
+            hint = "`vjepa2-ac data check` says how varied the motion of the data is"
+            yield "rank", f"{text} (before training {before:.3f}; 0 is best, 0.5 chance). {hint}"
+
+    def _of_loss(self, loss: float) -> Iterator[tuple[str, str]]:
+        if not math.isfinite(loss):  # a step without clips, or one that was refused
+            return
+        self._losses.append(loss)
+        if len(self._losses) < _FEWEST_LOSSES:
+            return
+        typical = statistics.median(self._losses)
+        self._lowest = min(self._lowest, typical)
+        if typical > _FAR_ABOVE * self._lowest:
+            yield "loss", f"the loss is {typical:.4g}, and was {self._lowest:.4g} (medians of {_LOSSES} rows)"
+
+
+def advice(config: Config) -> str:
+    """Return the knobs to change in a config whose training has made the model worse."""
+    training, adapter = config.training, config.adapter
+    knobs = [f"lower training.learning_rate ({training.learning_rate:g})"]
+    if adapter.kind == "lora":
+        knobs.append(f"lower adapter.alpha ({adapter.alpha:g}) or adapter.rank ({adapter.rank})")
+    if training.max_grad_norm is None:
+        knobs.append("set training.max_grad_norm=1")
+    knobs.append(f"raise training.warmup_steps ({training.warmup_steps:,})")
+    kept = config.checkpoint.keep_best != "off"
+    best = "; the best checkpoint is kept, and used unless another is asked for" if kept else ""
+    return f"If it stays so: {', '.join(knobs)}{best}"
+
+
+class TimedBatches:
+    """Passes on batches, and measures how long the loader was waited for, also for prefetched ones.
+
+    On CUDA only the idle time of the device counts: from the end of its queued work to the next work.
+
+    Args:
+        batches: The loader's.
+        device: Of the run.
+    """
+
+    def __init__(self, batches: Iterator[Batch], device: torch.device) -> None:
+        self._batches, self._waited_s = batches, 0.0
+        self._cuda = Cuda(device) if device.type == "cuda" else None
+        self._spans: deque[tuple[Any, Any]] = deque()  # events that the device may not have reached yet
+
+    @property
+    def waited_s(self) -> float:
+        """Waiting time in seconds; what the device has not reached yet counts later. Does not synchronize."""
+        while self._spans and self._spans[0][1].query():
+            began, ended = self._spans.popleft()
+            self._waited_s += began.elapsed_time(ended) / 1000
+        return self._waited_s
+
+    def __iter__(self) -> TimedBatches:
+        """Return itself."""
+        return self
+
+    def __next__(self) -> Batch:
+        """Return the next batch."""
+        with self._waiting():
+            return next(self._batches)
+
+    def prefetch_next(self) -> None:
+        """Fetch the next batch in advance, if the loader can."""
+        with self._waiting():
+            prefetch_next(self._batches)
+
+    @contextmanager
+    def _waiting(self) -> Iterator[None]:
+        began = time.perf_counter() if self._cuda is None else self._cuda.timestamp()
+        try:
+            yield
+        finally:
+            if self._cuda is None:
+                self._waited_s += time.perf_counter() - began
+            else:
+                self._spans.append((began, self._cuda.timestamp()))
+
+
+@dataclass(frozen=True)
+class Throughput:
+    """Turns a step's clips and seconds into metrics."""
+
+    flops_per_clip: int
+    tokens_per_clip: int
+    ceiling: float  # FLOPs per second of all processes
+    device: torch.device
+
+    @classmethod
+    def of(
+        cls, config: Config, sizes: ModelSizes, device: torch.device, processes: int, *, encodes: bool = True
+    ) -> Throughput:
+        """Measure the ceiling, once per device, precision and program.
+
+        Args:
+            config: The run.
+            sizes: Of its model.
+            device: Of this process.
+            processes: Of the run.
+            encodes: Whether the encoder's work counts; cached latents need none.
+        """
+        tokens = config.data.frames * sizes.tokens_per_frame
+        ceiling = processes * matmul_speed(device, PRECISIONS[config.training.precision])
+        flops = clip_flops(config, sizes)
+        return cls(flops.total if encodes else flops.predictor, tokens, ceiling, device)
+
+    def metrics(self, clips: float, seconds: float, waited_s: float) -> dict[str, float]:
+        """Return the metrics of one step.
+
+        Args:
+            clips: Of all processes.
+            seconds: The step's wall time.
+            waited_s: The part of it spent waiting for the loader.
+        """
+        return {
+            "samples_per_second": clips / seconds,
+            "tokens_per_second": clips * self.tokens_per_clip / seconds,
+            "data_wait_share": min(1.0, waited_s / seconds),
+            "mfu": clips * self.flops_per_clip / seconds / self.ceiling,
+            "memory_gb": peak_memory_gb(self.device),
+        }
+
+    def __str__(self) -> str:
+        return (
+            f"A clip takes {self.flops_per_clip / 1e12:.3g} TFLOP; the ceiling for mfu is {self.ceiling / 1e12:.3g}"
+            f" TFLOP/s, measured on {self.device.type} now"
+        )
+
+
+class Update:
+    """Measures how far an optimizer step moves the weights. Keeps a copy of them until it is read.
+
+    Args:
+        parameters: Those of the optimizer, before the step.
+    """
+
+    def __init__(self, parameters: Iterable[Tensor]) -> None:
+        self._parameters = list(parameters)
+        self._before = [parameter.detach().clone() for parameter in self._parameters]
+
+    def to_weight(self) -> float:
+        """Return the norm of the update over that of the weights before it, of all tensors together; read it once."""
+        weight = float(torch.nn.utils.get_total_norm(self._before))
+        for before, parameter in zip(self._before, self._parameters, strict=True):
+            before -= parameter.detach()  # in the copy's own memory
+        return float(torch.nn.utils.get_total_norm(self._before)) / weight if weight else math.nan
+
+
+def peak_memory_gb(device: torch.device) -> float:
+    """Return the peak so far: of PyTorch's allocator on CUDA, of this process's resident memory elsewhere."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device) / 1e9
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9  # Linux counts in KiB
+
+
+def _number(metrics: Mapping[str, Any], key: str) -> float:
+    """Return a number; NaN for one that is absent, or that JSON could not hold."""
+    value = metrics.get(key)
+    return float(value) if isinstance(value, int | float) else math.nan

@@ -1,1 +1,0 @@
-"""Monitoring: how fast is training, and does it diverge?"""

@@ -1,0 +1,56 @@
+"""The ranks of a run end together, and say the same: what one of them meets, all of them know."""
+
+from pathlib import Path
+
+import pytest
+
+from paths import ROOT
+from ranks import finish, free_port, start_rank
+from vjepa2_ac.config.loading import config_as_yaml
+from vjepa2_ac.runs.checkpoint import newest_checkpoint, read_state
+
+pytestmark = pytest.mark.usefixtures("default_signals")
+SCRIPT = str(ROOT / "tests/support/disagreeing_ranks.py")
+
+
+def start_both(config: object, tmp_path: Path, happens: str, status: int) -> list[str]:
+    """Start two ranks, to one of which something happens; return what each wrote."""
+    path, port = tmp_path / "config.yaml", free_port()
+    path.write_text(config_as_yaml(config))
+    ranks = [start_rank([SCRIPT, str(path), happens], rank, 2, port) for rank in range(2)]
+    return [out for out, _ in finish(ranks, status, timeout=60)]
+
+
+def test_ranks_whose_errors_differ_in_the_last_digits_lose_patience_together(make_config, tmp_path: Path) -> None:
+    """Rank 0 finds nothing better than the base, and ends after two validations; rank 1 would go on."""
+    changes = {"training__patience": 2, "checkpoint__keep_best": "error", "validation__every": 1}
+    start_both(make_config(**changes), tmp_path, "measures_otherwise", status=0)
+    state = read_state(newest_checkpoint(tmp_path / "run/checkpoints"))
+    assert (state.step, state.best_step) == (2, 0)
+
+
+@pytest.mark.parametrize(
+    ("happens", "found"),
+    [
+        ("disk_is_full", "No space left on device"),
+        ("run_is_of_another_config", "a run of another config"),
+        ("checkpoint_cannot_be_read", "nowhere"),
+        ("index_cannot_be_made", "no data set"),
+    ],
+)
+def test_what_the_first_rank_alone_meets_ends_both_with_its_error(
+    make_config, tmp_path: Path, happens: str, found: str
+) -> None:
+    for said in start_both(make_config(), tmp_path, happens, status=3):
+        assert "InputError: " in said
+        assert found in said
+
+
+def test_the_share_of_broken_episodes_is_that_of_all_ranks_together(make_config, tmp_path: Path) -> None:
+    config = make_config(data__broken_episodes="skip")
+    for said in start_both(config, tmp_path, "each_meets_another_broken_episode", status=3):
+        assert "2 of 8 episodes are broken" in said
+
+
+def test_a_rank_that_indexes_for_long_is_waited_for(make_config, tmp_path: Path) -> None:
+    start_both(make_config(training__steps=1), tmp_path, "indexing_takes_longer_than_the_time_out", status=0)

@@ -1,0 +1,93 @@
+"""What test_agreement.py starts twice: a rank of a training run that meets something the other rank does not.
+
+Arguments: a config, and what happens (a function below).
+"""
+
+import os
+import sys
+import time
+from dataclasses import replace
+from datetime import timedelta
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import torch
+
+from vjepa2_ac.config.loading import load_config
+from vjepa2_ac.data.loader import training_loader
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.reporter import SILENT
+from vjepa2_ac.training import loop, resume, setup, validation
+from vjepa2_ac.training.loop import train
+
+RANK = int(os.environ["RANK"])
+
+
+def measures_otherwise() -> None:
+    """The other rank's errors differ in the last digits: what is no better for one is better for the other."""
+    measure, times = validation.prediction_errors, [0]
+
+    def measured(*given: object) -> object:
+        found = measure(*given)
+        times[0] += 1
+        predicted = 0.5 * (1 - 1e-7 * RANK * times[0])
+        arrays = {
+            key: np.full_like(one, 1.0 if key[0] == "persistence" else predicted) for key, one in found.arrays.items()
+        }
+        return replace(found, arrays=arrays)
+
+    validation.prediction_errors = measured
+
+
+def disk_is_full() -> None:
+    if RANK == 0:
+        full = InputError(where="checkpoints", found="the checkpoint cannot be written (No space left on device)")
+        resume.write_checkpoint = mock.Mock(side_effect=full)
+
+
+def run_is_of_another_config() -> None:
+    if RANK == 0:
+        loop.open_run = mock.Mock(side_effect=InputError(where="run", found="a run of another config"))
+
+
+def checkpoint_cannot_be_read() -> None:
+    if RANK == 0:
+        resume.newest_checkpoint = mock.Mock(return_value=Path("nowhere"))
+
+
+def index_cannot_be_made() -> None:
+    if RANK == 0:
+        setup.open_dataset = mock.Mock(side_effect=InputError(where="data.path", found="no data set"))
+
+
+def indexing_takes_longer_than_the_time_out() -> None:
+    torch.distributed.init_process_group("gloo", timeout=timedelta(seconds=6))
+    if RANK == 0:
+        make = setup.open_dataset
+        setup.open_dataset = lambda *given, **named: (time.sleep(9), make(*given, **named))[1]
+
+
+def each_meets_another_broken_episode() -> None:
+    """One broken episode would be below the limit, two are not."""
+    from vjepa2_ac.data import selection as broken_episodes
+
+    broken_episodes.MOST_BROKEN = 1.5 / 8
+    make = training_loader
+
+    def loader(dataset: object, **given: object) -> object:
+        for batch in make(dataset, **given):  # type: ignore[arg-type]
+            dataset.broken.met(f"episode {RANK}", "its image is damaged")  # type: ignore[attr-defined]
+            yield replace(batch, **{key: getattr(batch, key)[:1] for key in ("states", "actions", "frames")},
+                          episode_ids=batch.episode_ids[:1], starts=batch.starts[:1])  # fmt: skip
+
+    setup.training_loader = loader
+
+
+if __name__ == "__main__":
+    globals()[sys.argv[2]]()
+    try:
+        train(load_config(sys.argv[1]), SILENT)
+    except Exception as error:
+        sys.stdout.write(f"{type(error).__name__}: {error}\n")
+        sys.exit(3)

@@ -1,0 +1,176 @@
+"""A step on fake tensors takes the memory that a real one takes, whatever is trained, and all of its blocks at once."""
+
+import contextlib
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch._subclasses.fake_tensor import FakeTensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+from sized_runs import LORA, built, model_sizes, run_config
+from vjepa2_ac.config import Config, ModelSizes
+from vjepa2_ac.distributed.device import PRECISIONS
+from vjepa2_ac.episode import LatentBatch
+from vjepa2_ac.model.adapter.low_rank import CastMatrices
+from vjepa2_ac.model.network.rotary import TokenLayout, rotary_tables
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.training.cost import step as cost_step
+from vjepa2_ac.training.cost.step import LiveStorages, measure_step
+from vjepa2_ac.training.loss import Objective
+
+TOLERANCE = 0.015
+ENDS = ["predictor_embed", "predictor_proj", "action_encoder", "state_encoder"]
+FLOAT32_BASE = {"model__dtype": "float32"}
+KNOBS: dict[str, dict[str, Any]] = {
+    "adapter": {
+        "LoRA": {**LORA, "dropout": 0.0},
+        "LoRA of one layer, dropout": {**LORA, "targets": ["fc1"], "dropout": 0.1},
+        "DoRA, dropout": {**LORA, "dora": True, "dropout": 0.1},
+        "LoRA everywhere, heads whole": {**LORA, "targets": ["mlp", "attention"], "modules_to_save": ENDS},
+        "everything": {"kind": "none"},
+    },
+    "arithmetic": {
+        "bf16": {},
+        "bf16, float32 base": FLOAT32_BASE,
+        "fp16, float32 base": {**FLOAT32_BASE, "training__precision": "fp16"},  # over bfloat16: CUDA only
+        "fp32": {**FLOAT32_BASE, "training__precision": "fp32"},
+    },
+    "sizes": {
+        "small": model_sizes(),
+        "wide, few tokens": model_sizes(latent=12, width=96, image=16, depth=4),
+        "many heads, little MLP": model_sizes(latent=12, heads=8, mlp=0.25),
+        "wide latents, extrinsics": model_sizes(latent=960, width=12, depth=1, extrinsics=True),
+        "no states": model_sizes(states=False),
+    },
+    "loss": {
+        "L1": {},
+        "L2, no rollout": {"training__loss": "l2", "training__rollout_steps": 1},
+        "smooth, long rollout": {"training__loss": "smooth_l1", "training__rollout_steps": 4},
+    },
+}
+
+
+CASES = [  # each value of each knob at least once, and with others each time
+    ("LoRA", "bf16", "small", "L1"),
+    ("LoRA", "fp16, float32 base", "many heads, little MLP", "smooth, long rollout"),
+    ("LoRA of one layer, dropout", "bf16, float32 base", "wide, few tokens", "L2, no rollout"),
+    ("DoRA, dropout", "bf16", "wide latents, extrinsics", "smooth, long rollout"),
+    ("DoRA, dropout", "fp32", "no states", "L1"),
+    ("LoRA everywhere, heads whole", "fp32", "many heads, little MLP", "L1"),
+    ("LoRA everywhere, heads whole", "bf16", "wide latents, extrinsics", "L2, no rollout"),
+    ("everything", "bf16", "no states", "L1"),
+    ("everything", "fp16, float32 base", "wide, few tokens", "smooth, long rollout"),
+]
+
+
+def case(names: tuple[str, ...], **changes: Any) -> tuple[Config, ModelSizes]:
+    adapter, arithmetic, sizes, loss = (values[name] for values, name in zip(KNOBS.values(), names, strict=True))
+    return run_config(adapter, **arithmetic, **loss, **changes), sizes
+
+
+class Counting(TorchDispatchMode):
+    """Counts the bytes of real tensors that live at once."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.storages = LiveStorages()
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        made = func(*args, **(kwargs or {}))
+        for leaf in tree_leaves(made):
+            if isinstance(leaf, Tensor):
+                self.storages.hold(leaf)
+        return made
+
+
+def clips(config: Config, model: WorldModel) -> LatentBatch:
+    batch, frames = config.training.batch_size, config.data.frames
+    cameras = torch.randn(batch, frames, 6) if model.sizes.predictor.use_extrinsics else None
+    latents = torch.randn(batch, frames, model.num_tokens, model.latent_dim)
+    poses = torch.randn(batch, frames, 7)
+    return LatentBatch(latents, poses, poses[:, 1:].clone(), cameras, ("a",) * batch, (0,) * batch)
+
+
+def taken_by_pytorch(config: Config, sizes: ModelSizes) -> tuple[int, ...]:
+    """Return the bytes that live at once in a forward and backward pass, without checkpointing and with it."""
+    rotary_tables.cache_clear()
+    dtype, peaks = PRECISIONS[config.training.precision], []
+    arithmetic = contextlib.nullcontext() if dtype == torch.float32 else torch.autocast("cpu", dtype)
+    with Counting() as counting:
+        model = built(config, sizes)
+        for parameter in model.parameters():
+            parameter.grad = torch.zeros_like(parameter) if parameter.requires_grad else None
+        batch, matrices = clips(config, model), CastMatrices(model, dtype)
+        for checkpointing in (False, True):
+            model.set_gradient_checkpointing(checkpointing)
+            with matrices.current():
+                counting.storages.forget()
+                with arithmetic:
+                    loss = torch.stack(Objective(model, config.training)(batch)).sum()
+                loss.backward()
+            del loss
+            peaks.append(counting.storages.peak)
+    return tuple(peaks)
+
+
+@pytest.mark.parametrize("names", CASES, ids=", ".join)
+def test_a_step_takes_what_it_takes_on_a_cpu(names: tuple[str, ...]) -> None:
+    config, sizes = case(names)
+    step = measure_step(config, sizes, "cpu")
+    assert (step.stored, step.checkpointed) == pytest.approx(taken_by_pytorch(config, sizes), rel=TOLERANCE)
+
+
+@pytest.mark.parametrize(
+    ("adapter", "rollout_steps"),
+    [("LoRA", 4), ("DoRA, dropout", 1), ("everything", 2)],
+)
+def test_all_blocks_are_inferred_from_two_and_three(
+    adapter: str, rollout_steps: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config, sizes = run_config(KNOBS["adapter"][adapter], training__rollout_steps=rollout_steps), model_sizes(depth=5)
+    inferred = measure_step(config, sizes)
+    monkeypatch.setattr(cost_step, "_BLOCKS", (5, 5))
+    cost_step._measured.clear()
+    whole = measure_step(config, sizes)
+    cost_step._measured.clear()
+    assert inferred == pytest.approx(whole, rel=0.005)  # the place of the peak may change with depth
+
+
+def test_nothing_is_taken_by_a_rollout_that_does_not_count() -> None:
+    without = measure_step(run_config(training__rollout_steps=3, training__rollout_weight=0.0), model_sizes())
+    assert without == measure_step(run_config(training__rollout_steps=1), model_sizes())
+
+
+@pytest.mark.parametrize(
+    ("adapter", "changes", "copies"),
+    [
+        (LORA, {}, False),
+        (LORA, FLOAT32_BASE, True),
+        ({"kind": "none"}, {}, True),
+        (LORA, {**FLOAT32_BASE, "training__precision": "fp32"}, False),
+    ],
+)
+def test_norms_have_a_float32_copy_on_cuda_where_autocast_makes_one(
+    adapter: dict[str, Any], changes: dict[str, Any], copies: bool
+) -> None:
+    config, sizes = run_config(adapter, **changes, training__attention="per_step"), model_sizes()
+    cpu, cuda = (measure_step(config, sizes, device) for device in ("cpu", "cuda"))
+    assert (cuda.stored > cpu.stored) == copies
+
+
+def test_a_mask_is_a_byte_on_cuda_and_the_size_of_a_number_on_a_cpu() -> None:
+    adapter = {**LORA, "targets": ["fc1"], "dropout": 0.1}
+    config, sizes = run_config(adapter, training__attention="per_step"), model_sizes()
+    cpu, cuda = (measure_step(config, sizes, device) for device in ("cpu", "cuda"))
+    assert cuda.stored < cpu.stored
+
+
+def test_no_fake_table_is_left_for_a_run() -> None:
+    layout, cpu = TokenLayout(5, 4, 2), torch.device("cpu")
+    measure_step(run_config(), model_sizes(width=24, heads=1))
+    assert not isinstance(rotary_tables(layout, 24, cpu).cosine, FakeTensor)
+    measure_step(run_config(), model_sizes(width=24, heads=1), "cpu")
+    assert not isinstance(rotary_tables(layout, 24, cpu).cosine, FakeTensor)
