@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from PIL import Image
@@ -12,6 +13,8 @@ from PIL import Image
 from paths import ROOT
 from run_fixtures import as_yaml
 
+RECIPES = ("A loss", "A planner", "An energy", "A metric", "A tracker", "A form of data")
+STATE = "0.4,0,0.4,3.1,0,0,0"
 PAGE = (ROOT / "docs/extending.md").read_text()
 
 
@@ -26,7 +29,7 @@ def at_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder = tmp_path / "home"
     folder.mkdir()
     monkeypatch.chdir(folder)
-    (folder / "my_module.py").write_text(recipes("A loss", "A planner", "An energy"))
+    (folder / "my_module.py").write_text(recipes(*RECIPES))
     return folder
 
 
@@ -46,28 +49,18 @@ def test_a_loss_trains_and_a_planner_and_an_energy_plan_by_yaml(at_home: Path, m
     values["training"] |= {"loss": "log_cosh", "loss_options": {"scale": 2.0}}
     values["planning"] |= {"planner": "random", "samples": 16, "iterations": 2}
     values["planning"]["energy"] |= {"distance": "largest"}
+    values["tracking"] = {"tensorboard": False, "others": {"lines": {"file": "curves.txt"}}}
     (at_home / "own.yaml").write_text(yaml.safe_dump(values))
     trained = command("train", "own.yaml")
     assert trained.returncode == 0, trained.stderr
     assert yaml.safe_load((at_home / "run/config.yaml").read_text())["plugins"] == ["my_module"]
 
+    assert '"train/loss": ' in (at_home / "run/curves.txt").read_text()
+
     for name, brightness in (("now", 90), ("goal", 160)):
         Image.new("RGB", (48, 48), (brightness,) * 3).save(f"{name}.png")
-    words = [
-        "plan",
-        "run",
-        "--start",
-        "now.png",
-        "--goal",
-        "goal.png",
-        "--state",
-        "0.4,0,0.4,3.1,0,0,0",
-        "--nodes",
-        "0",
-        "--out",
-        "out",
-    ]
-    words.append("planning.limits.xyz=[0.05,0.05,0.05]")
+    words = ["plan", "run", "--start", "now.png", "--goal", "goal.png", "--state", STATE, "--nodes", "0"]
+    words += ["--out", "out", "planning.limits.xyz=[0.05,0.05,0.05]"]
     planned = command(*words, "--plugin", "my_module")
     assert planned.returncode == 0, planned.stderr
     assert json.loads((at_home / "out/plan.json").read_text())["settings"]["planner"] == "random"
@@ -117,3 +110,28 @@ def test_an_installed_package_is_known_without_being_named(at_home: Path, make_c
     done = subprocess.run([sys.executable, "-P", "-c", code, *words], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert yaml.safe_load(done.stdout)["training"]["loss_options"] == {"scale": 3}
+
+
+def test_a_form_of_data_is_found_trained_on_and_measured_by_a_metric(at_home: Path, base_folder: Path) -> None:
+    data = at_home / "walls"
+    data.mkdir()
+    for number in range(6):
+        states = np.zeros((24, 7))
+        states[:, number % 3] = np.linspace(0.3, 0.5, 24)
+        np.savetxt(data / f"{number}.wall", states)
+    plugin = ["--plugin", "my_module"]
+    begun = command("init", "walls", "--model", str(base_folder), "--out", "own.yaml", *plugin)
+    assert begun.returncode == 0, begun.stdout + begun.stderr
+    values = yaml.safe_load((at_home / "own.yaml").read_text())
+    assert (values["data"]["source"], values["data"]["camera"]) == ("wall", "front")
+
+    few = ["data.wall.size=24", "data.frames=4", "data.stride=2", "data.workers=0", "data.cache=off", "run_dir=run"]
+    few += ["training.steps=1", "training.batch_size=2", "training.accumulation=1", "training.warmup_steps=0"]
+    few += ["training.allow_weak_base=true", "validation.clips=2", "validation.ranking_clips=1"]
+    trained = command("train", "own.yaml", *few, *plugin)
+    assert trained.returncode == 0, trained.stderr
+    less = ["--clips", "2", "--sensitivity-clips", "0"]
+    measured = command("evaluate", "run", *plugin, *less)
+    assert measured.returncode == 0, measured.stderr
+    keys = {row["key"] for row in json.loads((at_home / "run/metrics.json").read_text())["rows"]}
+    assert any(key.startswith("rollout.largest.") for key in keys), sorted(keys)

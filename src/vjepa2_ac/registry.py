@@ -116,6 +116,19 @@ class Registry:
         return Field(json_schema_extra=add)
 
     @property
+    def things_in_schema(self) -> Any:
+        """The options of things by their names: for a knob that holds several of them."""
+
+        def add(schema: dict[str, Any]) -> None:
+            sections = {name: self.section(name) for name in self.names()}
+            schema["properties"] = {
+                name: {} if section is None else section.model_json_schema() for name, section in sections.items()
+            }
+            schema["additionalProperties"] = False
+
+        return Field(json_schema_extra=add)
+
+    @property
     def options_in_schema(self) -> Any:
         """The options of things that have some, by the names of their classes: for the knob that holds them."""
 
@@ -156,7 +169,7 @@ ENERGIES = Registry(
         "cosine": "planning.energy:one_minus_cosine",
     },
 )
-METRICS = Registry("metric", "vjepa2_ac.metrics", {"l1": "evaluation.metrics:L1", "l2": "evaluation.metrics:L2"})
+METRICS = Registry("metric", "vjepa2_ac.metrics", {"l1": "evaluation.result:L1", "l2": "evaluation.result:L2"})
 TRACKERS = Registry("tracker", "vjepa2_ac.trackers", {})
 REGISTRIES = (SOURCES, LOSSES, PLANNERS, ENERGIES, METRICS, TRACKERS)
 

@@ -18,7 +18,7 @@ from vjepa2_ac.config.section import (
     Section,
     ZeroToOne,
 )
-from vjepa2_ac.registry import LOSSES
+from vjepa2_ac.registry import LOSSES, TRACKERS
 
 
 def _usual_warmup(values: dict[str, Any]) -> int:
@@ -167,3 +167,11 @@ class TrackingConfig(Section):
     """trackio, extra trackio: stored where trackio stores its runs (TRACKIO_DIR), shown by `trackio show`."""
     project: Annotated[str, Field(min_length=1)] = "vjepa2-ac"
     """Name of the project there; the run in it has the same id wherever it is resumed."""
+    others: Annotated[dict[str, dict[str, Any]], TRACKERS.things_in_schema] = {}
+    """Trackers of your own (docs/extending.md), by name, each with its options: {} where it has none."""
+
+    @model_validator(mode="after")
+    def _others_are_known(self) -> TrackingConfig:
+        for name, options in self.others.items():
+            TRACKERS.options(TRACKERS.known(name), options)
+        return self

@@ -31,7 +31,6 @@ from vjepa2_ac.evaluation.estimates import episode_scores
 from vjepa2_ac.evaluation.measure import ALL, Predictor, joined, measured, with_other_actions
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import (
-    METRICS,
     About,
     ActionRanking,
     Clips,
@@ -48,6 +47,7 @@ from vjepa2_ac.evaluation.result import (
     Role,
     Sensitivity,
     Way,
+    registered_metrics,
 )
 from vjepa2_ac.reporter import SILENT, Reporter
 
@@ -82,7 +82,7 @@ def evaluate(
     clips: RepeatableClips,
     about: About,
     *,
-    metrics: tuple[Metric, ...] = METRICS,
+    metrics: tuple[Metric, ...] | None = None,
     probes: ProbeOptions | None = None,
     reporter: Reporter = SILENT,
 ) -> Evaluation:
@@ -92,14 +92,14 @@ def evaluate(
         contenders: In the order of the table; one of them has the role trained.
         clips: What to measure on.
         about: Description of the evaluation.
-        metrics: Of the errors; the first one is L1.
+        metrics: Of the errors, L1 first; None: all that are registered.
         probes: Options of the measurements beyond the errors.
         reporter: Shows the progress of each part of the work.
 
     Raises:
         ValueError: No clips; or too few frames for planning.
     """
-    probes = probes or ProbeOptions()
+    probes, metrics = probes or ProbeOptions(), metrics or registered_metrics()
     seen = _collect(contenders, clips, probes, about, metrics, reporter.task("measuring"))
     ids, seconds = tuple(seen.ids), about.seconds_per_step
     known = clips_of(seen.actions, ids, tuple(seen.firsts), space=about.space, seconds_per_step=seconds)

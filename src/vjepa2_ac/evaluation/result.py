@@ -1,8 +1,8 @@
 """Evaluation results: records of plain arrays, and the rows that people and programs read. PyTorch is not imported.
 
 Axes: clips in one fixed order; horizon 1 .. H model steps ahead (index h - 1; H is frames - 1). All errors compare
-layer-normalised latents, by METRICS. What has intervals is computed from these by `evaluation.estimates`; the rows by
-`evaluation.rows`, the verdict as text by `evaluation.verdict`.
+layer-normalised latents, by all metrics that are registered. What has intervals is computed from these by
+`evaluation.estimates`; the rows by `evaluation.rows`, the verdict as text by `evaluation.verdict`.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from pydantic import BeforeValidator
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.distances import absolute_difference, squared_difference
 from vjepa2_ac.intervals import Estimate
+from vjepa2_ac.registry import METRICS
 from vjepa2_ac.spaces import ActionSpace
 
 if TYPE_CHECKING:
@@ -130,7 +131,10 @@ def _l2(predicted: Tensor, true: Tensor) -> Tensor:
 L1 = Metric("l1", "L1", "mean absolute difference", _l1)
 L2 = Metric("l2", "L2", "mean squared difference", _l2)
 
-METRICS: tuple[Metric, ...] = (L1, L2)  # L1, which models are trained on, comes first: the others stand beside it
+
+def registered_metrics() -> tuple[Metric, ...]:
+    """Return all metrics, other people's among them; L1, which models are trained on, comes first."""
+    return tuple(METRICS.find(name) for name in METRICS.names())
 
 
 Mode = Literal["teacher_forced", "rollout"]
@@ -433,7 +437,7 @@ class Evaluation:
     beside: Mapping[str, Measurement] = field(default_factory=dict)  # as of a model: of the one that is evaluated
     notes: tuple[str, ...] = ()  # for the reader: why there is no base, no landscape ...
     planning: PlanningStudy | None = None
-    metrics: tuple[Metric, ...] = METRICS  # of the errors
+    metrics: tuple[Metric, ...] = (L1, L2)  # of the errors
     persistence_distribution: PersistenceDistribution | None = None
     decoded: DecodedRollouts | None = None  # None: no decoder was given
 

@@ -26,6 +26,7 @@ from jaxtyping import UInt8
 from vjepa2_ac.config import Config, TrackingConfig
 from vjepa2_ac.config.loading import config_as_flat_dict
 from vjepa2_ac.errors import InputError, pip_install
+from vjepa2_ac.registry import TRACKERS
 from vjepa2_ac.runs.folder import TENSORBOARD
 
 logger = logging.getLogger(__name__)
@@ -167,7 +168,13 @@ def open_trackers(config: Config, folder: Path, *, run_id: str, first_step: int)
         openings["Weights & Biases"] = lambda: _wandb(config, folder, run_id)
     if tracking.trackio:
         openings["trackio"] = lambda: _trackio(config, run_id)
+    for name, given in tracking.others.items():
+        openings[name] = partial(_of_others, name, given, folder, run_id)
     return Trackers(openings)
+
+
+def _of_others(name: str, given: Mapping[str, Any], folder: Path, run_id: str) -> Any:
+    return TRACKERS.find(name)(folder, run_id, **TRACKERS.options(name, given))
 
 
 def _tensorboard(folder: Path, first_step: int) -> Any:
