@@ -1,6 +1,7 @@
 """Every recipe of docs/extending.md as a stranger uses it: a module outside the package, YAML, and the commands."""
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -41,6 +42,32 @@ def command(*words: str) -> subprocess.CompletedProcess[str]:
 def test_every_recipe_is_short() -> None:
     for block in PAGE.split("```python\n")[1:]:
         assert len([line for line in block.split("```")[0].splitlines() if line.strip()]) <= 40
+
+
+def test_the_map_is_read_in_an_afternoon() -> None:
+    files = re.findall(r"^\| `([a-z_/]+\.py)` \|", PAGE.split("## The map")[1].split("\n## ")[0], flags=re.MULTILINE)
+    lines = [len((ROOT / "src/vjepa2_ac" / file).read_text().splitlines()) for file in files]
+    assert len(files) == 15
+    assert sum(lines) < 4000
+
+
+def test_training_loads_the_core_only() -> None:
+    code = "import sys, vjepa2_ac.training.loop; print(*(name for name in sys.modules if name.startswith('vjepa2_ac')))"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    rooms = {name.split(".")[1] for name in loaded if "." in name}
+    assert len(loaded) <= 120
+    beside = {
+        "simulation",
+        "init",
+        "serving",
+        "inspection",
+        "calibration",
+        "demonstrations",
+        "console",
+        "cli",
+        "export",
+    }
+    assert not rooms & beside
 
 
 def test_a_loss_trains_and_a_planner_and_an_energy_plan_by_yaml(at_home: Path, make_config) -> None:
