@@ -20,7 +20,7 @@ import numpy as np
 from synthetic_droid import draw_episodes
 
 from vjepa2_ac import storage
-from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config import DiskCacheConfig, RldsData
 from vjepa2_ac.data.sources.rlds.droid_writer import write_droid_rlds
 from vjepa2_ac.data.sources.rlds.source import RldsSource
 
@@ -51,8 +51,8 @@ def main(options: Sequence[str] | None = None) -> None:
             url = server.upload(folder, f"droid/{order.replace(' ', '_')}/1.0.0")
             third = arguments.episodes * arguments.steps * 17_000 / 3 / 1e9
             for limit_gb in (0.0, third, 10.0):
-                cache = {"dir": f"{scratch}/{order} {limit_gb}", "limit_gb": limit_gb}
-                costs = measure(RldsSource(DataConfig(path=url, disk_cache=cache)), server, arguments.clips)
+                cache = DiskCacheConfig(dir=f"{scratch}/{order} {limit_gb}", limit_gb=limit_gb)
+                costs = measure(RldsSource(RldsData(path=url, disk_cache=cache)), server, arguments.clips)
                 print(f"{order:10}{limit_gb:10.4f}" + "".join(f"{kb:10.0f} ({reads:5.1f})" for kb, reads in costs))
 
 

@@ -22,7 +22,7 @@ from jaxtyping import Float
 from rich.console import Console
 from rich.table import Table
 
-from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config import RldsData
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.evaluation.distribution import discrepancy
 from vjepa2_ac.media.image_similarity import mean_where, moving_region, ms_ssim, psnr, ssim, ssim_map
@@ -73,7 +73,7 @@ def _futures(number: int, futures: int) -> np.ndarray:
     rng = np.random.default_rng(number)
     with tempfile.TemporaryDirectory() as folder:
         path = record_dataset(Path(folder) / "data", RecordingSpec("B", 2, seed=number), episodes=1)
-        dataset = open_dataset(DataConfig(path=str(path), frames=2, stride=1))
+        dataset = open_dataset(RldsData(path=str(path), frames=2, stride=1))
         arm = resimulate(path, dataset.source.read(0, dataset.config.cameras[0]), 0)
         shown = []
         for _ in range(futures):

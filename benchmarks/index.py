@@ -30,7 +30,7 @@ import google_crc32c
 import numpy as np
 
 from vjepa2_ac import storage
-from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config import DiskCacheConfig, RldsData
 from vjepa2_ac.data.sources.rlds import index as rlds_index
 from vjepa2_ac.data.sources.rlds.droid_writer import dataset_info
 from vjepa2_ac.data.sources.rlds.source import RldsSource
@@ -76,7 +76,9 @@ def measure(order: str, shards: int, in_flight: int, latency_s: float) -> None:
     rlds_index.FEWEST_IN_FLIGHT = in_flight
     rlds_index._possible_copies = lambda *_, **__: np.array([], np.int64)  # all records are of one length
     with tempfile.TemporaryDirectory() as cache:
-        source = RldsSource(DataConfig(path="gs://droid/1.0.1", connections=in_flight, disk_cache={"dir": cache}))
+        source = RldsSource(
+            RldsData(path="gs://droid/1.0.1", connections=in_flight, disk_cache=DiskCacheConfig(dir=cache))
+        )
         before, start = storage.bytes_fetched(), time.perf_counter()
         found = len(source.infos())
         taken = time.perf_counter() - start

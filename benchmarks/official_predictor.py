@@ -16,7 +16,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from peft import LoraConfig, get_peft_model
@@ -29,6 +29,7 @@ from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.model.adapter.lora import lora_layers
 from vjepa2_ac.model.checkpoints.meta_file import official_name
 from vjepa2_ac.model.network.blocks import NORM_EPSILON
+from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.training.loss import Objective
 
 TARGETS = ["qkv", "proj", "fc1", "fc2"]
@@ -74,11 +75,12 @@ class Official:
             dtype: Of autocast; float32: none.
             checkpointing: Whether blocks are computed again in the backward pass.
         """
-        self._inner.use_activation_checkpointing = checkpointing
+        setattr(self._inner, "use_activation_checkpointing", checkpointing)  # noqa: B010 - a module of theirs
         mixed = dtype != torch.float32
         with torch.autocast(self._device.type, dtype if mixed else None, enabled=mixed):
             latents = batch.latents if pixels is None else self.encode(pixels)
-            loss = sum(self.losses(latents, batch.actions, batch.states))
+            forced, rolled = self.losses(latents, batch.actions, batch.states)
+            loss = forced + rolled
         scaler = self._scaler if mixed else torch.amp.GradScaler(self._device.type, enabled=False)
         scaler.scale(loss).backward()
         scaler.unscale_(self._optimizer)
@@ -139,8 +141,8 @@ def difference(ours: Objective, official: Official, batch: LatentBatch) -> str |
     modules = (ours, official.predictor)
     for module in modules:
         module.eval()  # no dropout
-    loss = sum(ours(batch))
-    other = sum(official.losses(batch.latents, batch.actions, batch.states))
+    loss = torch.stack(list(ours(batch))).sum()
+    other = torch.stack(list(official.losses(batch.latents, batch.actions, batch.states))).sum()
     loss.backward()
     other.backward()
     found = None
@@ -164,7 +166,7 @@ def _share_adapters(ours: Objective, official: Official) -> list[tuple[str, Tens
         second = layer.lora_B["default"].weight
         second.data.copy_(torch.randn(second.shape, generator=generator) * 0.01)
     pairs = []
-    for name, layer in lora_layers(ours.world_model).items():
+    for name, layer in lora_layers(cast("WorldModel", ours.world_model)).items():
         fused, third = official_name(f"{name}.weight", "predictor")
         other = theirs[fused.removesuffix(".weight")]
         part = slice(None) if third is None else third  # q, k and v share the first matrix of a fused layer
@@ -186,7 +188,7 @@ def _with_lora(predictor: nn.Module, adapter: AdapterConfig) -> nn.Module:
         r=adapter.rank, lora_alpha=adapter.alpha, use_rslora=adapter.rslora, lora_dropout=adapter.dropout,
         target_modules=TARGETS,
     )  # fmt: skip
-    return get_peft_model(predictor, lora)  # type: ignore[no-any-return]
+    return get_peft_model(predictor, lora)
 
 
 def plain_names(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -211,7 +213,7 @@ def built_on(device: torch.device, build: Callable[[], nn.Module]) -> nn.Module:
 def build_predictor(module: Any, sizes: ModelSizes, frames: int) -> nn.Module:
     """Return the official predictor with random weights, for clips of so many frames."""
     predictor = sizes.predictor
-    return module.VisionTransformerPredictorAC(  # type: ignore[no-any-return]
+    return module.VisionTransformerPredictorAC(
         img_size=sizes.image_size, patch_size=sizes.patch_size, tubelet_size=2, num_frames=2 * frames,
         embed_dim=sizes.encoder.width, predictor_embed_dim=predictor.width, depth=predictor.depth,
         num_heads=predictor.heads, mlp_ratio=predictor.mlp_ratio, norm_layer=partial(nn.LayerNorm, eps=NORM_EPSILON),
@@ -220,7 +222,7 @@ def build_predictor(module: Any, sizes: ModelSizes, frames: int) -> nn.Module:
 
 def _encoder(module: Any, sizes: ModelSizes) -> nn.Module:
     encoder = sizes.encoder
-    return module.VisionTransformer(  # type: ignore[no-any-return]
+    return module.VisionTransformer(
         img_size=sizes.image_size, patch_size=sizes.patch_size, tubelet_size=2, num_frames=512,
         embed_dim=encoder.width, depth=encoder.depth, num_heads=encoder.heads, mlp_ratio=encoder.mlp_ratio,
         norm_layer=partial(nn.LayerNorm, eps=NORM_EPSILON), use_rope=True, use_sdpa=True, uniform_power=True,

@@ -48,7 +48,7 @@ class PlainCost:
 
     def __call__(self, actions: Tensor) -> Tensor:
         """Return the energy of each action sequence."""
-        parts = actions.split(self._config.samples_at_once)  # type: ignore[no-untyped-call]  # torch
+        parts = actions.split(self._config.samples_at_once)
         return torch.cat([self._energies(part) for part in parts]).to(actions.device)
 
     def _energies(self, actions: Tensor) -> Tensor:
@@ -138,7 +138,7 @@ class Bench:
     @property
     def sequences(self) -> int:
         """Action sequences that are tried in a decision of ours; the last is the answer."""
-        return self.options.samples * self.options.iterations + 1  # type: ignore[no-any-return]  # a command line's
+        return self.options.samples * self.options.iterations + 1
 
     def flops(self, horizon: int) -> int:
         """Return the model FLOPs of a decision."""

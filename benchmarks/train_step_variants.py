@@ -127,11 +127,18 @@ class Bench:
         objective = Objective(self.model, self.config(setting).training)
         latents = self.latents(setting)
         if setting.encoder:
-            pixels = pixels_to_input(self.batch(setting).frames.to(self.device), self.options.image_size)
+            pixels = pixels_to_input(self.frames(setting), self.options.image_size)
             gap = (self.model.encode(pixels) - self.official.encode(pixels.transpose(1, 2))).abs().max()
             if not gap < 1e-3:  # of values of variance 1
                 return f"latents differ by {float(gap):.2g}"
         return difference(objective, self.official, latents)
+
+    def frames(self, setting: Setting) -> Tensor:
+        """Return the frames of a batch, on the device."""
+        frames = self.batch(setting).frames
+        if frames is None:
+            raise ValueError("a batch of latents")
+        return frames.to(self.device)
 
     def config(self, setting: Setting, *, whole: bool = False) -> Config:
         """Return what a run of a setting is (`whole`: without an adapter); its data and base are never opened."""
@@ -142,8 +149,9 @@ class Bench:
             adapter=AdapterConfig(kind="none" if whole else "lora"),
             model=ModelConfig(base="none", dtype="bfloat16" if self.precision == "bf16" else "float32"),
             training=TrainingConfig(
-                batch_size=setting.batch, accumulation=1, rollout_steps=options.rollout_steps, device=self.device.type,
-                precision=self.precision, gradient_checkpointing=setting.checkpointing,
+                batch_size=setting.batch, accumulation=1, rollout_steps=options.rollout_steps,
+                device="cpu" if self.device.type == "cpu" else "cuda",
+                precision="bf16" if self.precision == "bf16" else "fp32", gradient_checkpointing=setting.checkpointing,
             ),
         )  # fmt: skip
 
@@ -164,7 +172,7 @@ class Bench:
         latents, pixels = self.latents(setting), None
         if way in {OFFICIAL, OFFICIAL_FULL}:
             if setting.encoder:
-                frames = self.batch(setting).frames.to(self.device)
+                frames = self.frames(setting)
                 pixels = pixels_to_input(frames, self.options.image_size).transpose(1, 2).contiguous()
             official = self.official if way == OFFICIAL else self.official_full
             return partial(

@@ -73,7 +73,8 @@ class Method:
         if self.kind != "LoRA":
             return AdapterConfig(kind="none")
         whole = IN_OUT if self.in_out else ()
-        return AdapterConfig(rank=self.rank, alpha=2.0 * self.rank, dropout=0.0, modules_to_save=whole)
+        given = {"rank": self.rank, "alpha": 2.0 * self.rank, "dropout": 0.0, "modules_to_save": whole}
+        return AdapterConfig.model_validate(given)
 
     @property
     def training(self) -> TrainingConfig:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from cells import SHIFTS, TRAINING, Base, Shift
 
-from vjepa2_ac.config import Config, DataConfig, ModelConfig
+from vjepa2_ac.config import Config, DataConfig, ModelConfig, RldsData
 from vjepa2_ac.config.loading import load_config
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.encoding.encode_dataset import encode_config
@@ -27,7 +27,7 @@ BASE_CONFIG = Path(__file__).with_name("base_one_camera.yaml")
 
 def data_a(folder: Path) -> DataConfig:
     """Return the data of domain A, on which the base of one camera is trained; its test split measures forgetting."""
-    return DataConfig(
+    return RldsData(
         path=str(folder / "data-A"),
         frames=4,
         stride=4,

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
+import decision_ways
 import planning_variants
 import torch
 import train_step_variants
@@ -88,8 +89,9 @@ class _Steps(train_step_variants.Bench):
         batch = super().batch(setting)
         if not (self.options.augment and setting.encoder):
             return batch
-        sizes, clips = batch.frames.shape[2:4], range(setting.batch)
-        return replace(batch, augmentations=tuple(draw(_AUGMENT, *sizes, seed=0, position=clip) for clip in clips))
+        sizes, clips = self.frames(setting).shape[2:4], range(setting.batch)
+        drawn = (draw(_AUGMENT, *sizes, seed=0, position=clip) for clip in clips)
+        return replace(batch, augmentations=tuple(one for one in drawn if one is not None))
 
     def _accelerator(self, config: Config) -> Any:  # noqa: ARG002  # Accelerate's own asks the driver
         return SimpleNamespace(
@@ -159,7 +161,11 @@ def decoding(options: argparse.Namespace) -> Iterator[Work]:
         images = torch.empty(frames, 3, shape.image_size, shape.image_size, dtype=torch.uint8, device="cuda")
         pairs = Pairs(latents, images, ())
         name = f"{size} decoder, {frames} frames"
-        yield Work(name, {"size": size, "batch": frames}, 0, lambda _, steps=steps, pairs=pairs: steps.do(1, pairs))
+        yield Work(name, {"size": size, "batch": frames}, 0, partial(_decoder_step, steps, pairs))
+
+
+def _decoder_step(steps: DecoderSteps, pairs: Pairs, _bench: object) -> None:
+    steps.do(1, pairs)
 
 
 def planning(options: argparse.Namespace) -> Iterator[Work]:
@@ -167,7 +173,7 @@ def planning(options: argparse.Namespace) -> Iterator[Work]:
     bench = _Decisions(options, options.dtype)
     for horizon, at_once in itertools.product(options.horizon, options.at_once):
         for adapter in (False, True) if options.adapter else (False,):
-            yield _decision(bench, horizon, planning_variants.Way.ours(at_once, adapter=adapter))
+            yield _decision(bench, horizon, decision_ways.Way.ours(at_once, adapter=adapter))
 
 
 def _step(bench: _Steps, setting: train_step_variants.Setting, way: str, batch: int) -> Work:
@@ -203,7 +209,7 @@ def _encoding(bench: _Steps, frames: int) -> Work:
     return Work(f"{frames} frames", {"batch": frames}, flops, encode, estimated)
 
 
-def _decision(bench: _Decisions, horizon: int, way: planning_variants.Way) -> Work:
+def _decision(bench: _Decisions, horizon: int, way: decision_ways.Way) -> Work:
     samples, iterations, at_once = bench.options.samples, bench.options.iterations, way.at_once
     if way.has_adapter:
         _ = bench.adapted  # what loading it takes is not counted

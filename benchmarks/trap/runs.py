@@ -12,9 +12,9 @@ import torch
 from vjepa2_ac.config import (
     AdapterConfig,
     Config,
-    DataConfig,
     ModelConfig,
     ReplayConfig,
+    RldsData,
     TrainingConfig,
     ValidationConfig,
 )
@@ -120,15 +120,18 @@ def cells_of(run: Run) -> list[Cell]:
 
 def prepare(folder: Path) -> None:
     """Record what is not there yet: demonstrations, and random worlds as the base was trained on, to replay."""
-    specs = {name: RecordingSpec(WORLD, seed=RECORDED, recipe=recipe) for name, recipe in RECIPES.items()}
-    for name, spec in {**specs, "replay": RecordingSpec("random", seed=RECORDED + 1)}.items():
+    specs: dict[str, RecordingSpec] = {
+        name: RecordingSpec(WORLD, seed=RECORDED, recipe=recipe) for name, recipe in RECIPES.items()
+    }
+    specs["replay"] = RecordingSpec("random", seed=RECORDED + 1)
+    for name, spec in specs.items():
         if not (folder / f"data-{name}").exists():
             record_dataset(folder / f"data-{name}", spec, episodes=EPISODES)
 
 
 def config_of(run: Run, folder: Path) -> Config:
     """Return the config that anybody would write; every checkpoint is kept."""
-    data = DataConfig(
+    data = RldsData(
         path=str(folder / f"data-{run.motions}"),
         frames=8,
         stride=4,
