@@ -2,7 +2,6 @@
 PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
-LOOSELY := --follow-imports=silent --no-warn-return-any --allow-untyped-calls --no-warn-unused-ignores
 SIMULATION := .venv/sim-installed
 INSTALLED := .venv/installed
 OLDEST := .venv-oldest
@@ -75,8 +74,7 @@ lint: $(INSTALLED)  ## style, types, spelling, and links within the project; nee
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	for each in 'benchmarks/*.py' benchmarks/evidence benchmarks/trap benchmarks/fake_gpu; do \
-	MYPYPATH=benchmarks:$$each:tests/support $(BIN)/mypy $(LOOSELY) $$each || exit 1; done
+	$(BIN)/python scripts/check_benchmarks.py
 	git ls-files -z -co --exclude-standard | xargs -0 $(BIN)/codespell
 	$(BIN)/python scripts/check_links.py
 

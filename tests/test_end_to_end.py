@@ -54,6 +54,14 @@ def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+ERRORS = "rollout.l1.over_persistence."
+
+
+def of_model(metrics: dict, model: str, key: str) -> list[float]:
+    """Return the values of the rows of a model whose key begins so."""
+    return [row["value"] for row in metrics["rows"] if row["model"] == model and row["key"].startswith(key)]
+
+
 def test_evaluate_ends_with_the_result_in_words_a_picture_and_paths(
     workshop: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -63,8 +71,8 @@ def test_evaluate_ends_with_the_result_in_words_a_picture_and_paths(
     assert result["verdict"] in printed
     assert str(workshop / "lora" / "evaluation.png") in printed
     assert (workshop / "lora" / "evaluation.png").read_bytes().startswith(b"\x89PNG")
-    assert list(result["models"]) == ["base", "adapter"]
-    assert len(result["models"]["adapter"]["rollout"]["l1"]["over_persistence"]) == 2
+    assert list(result["by_clip"]["models"]) == ["base", "adapter"]
+    assert len(of_model(result, "adapter", "rollout.l1.over_persistence.")) == 2
     for word in ("persistence", "base", "adapter", "0.27 s ahead", "zero actions", "shuffled actions"):
         assert word in printed
 
@@ -84,12 +92,13 @@ def test_a_finished_run_has_nothing_left_to_do(workshop: Path, capsys: pytest.Ca
 def test_an_exported_adapter_predicts_as_the_run_does(workshop: Path, tmp_path: Path) -> None:
     assert main(["export", str(workshop / "lora"), str(tmp_path / "merged")]) == 0
     assert main(["evaluate", str(workshop / "lora"), "--clips", "4"]) == 0
-    with_adapter = json.loads((workshop / "lora" / "metrics.json").read_text())["models"]["adapter"]
+    with_adapter = json.loads((workshop / "lora" / "metrics.json").read_text())
     config = write_config(workshop, "again", model={"base": str(tmp_path / "merged"), "dtype": "float32"})
     assert main(["train", config, f"run_dir={tmp_path / 'again'}", "training.steps=1"]) == 0
     assert main(["evaluate", str(tmp_path / "again"), "--clips", "4"]) == 0
-    merged = json.loads((tmp_path / "again" / "metrics.json").read_text())["models"]["base"]
-    errors, true = ([one["value"] for one in model["rollout"]["l1"]["error"]] for model in (merged, with_adapter))
+    merged = json.loads((tmp_path / "again" / "metrics.json").read_text())
+    errors, true = of_model(merged, "base", ERRORS), of_model(with_adapter, "adapter", ERRORS)
+    assert errors
     assert errors == pytest.approx(true, rel=1e-4)
 
 

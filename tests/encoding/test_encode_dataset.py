@@ -426,7 +426,8 @@ class Process(SimpleNamespace):
 @pytest.fixture
 def together(make_config: MakeConfig, cache: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[LatentCache, Callable]:
     """A cache, and a function by which the first of two processes encodes its share and waits for the other one's."""
-    monkeypatch.setattr(collectives, "broadcast_object", lambda _, value: value)
+    monkeypatch.setattr(encode_dataset, "broadcast_object", lambda _, value: value)
+    monkeypatch.setattr(encode_dataset, "first_only", lambda _, work: work())
     monkeypatch.setattr(encode_dataset, "_LOOKS_EVERY_S", 0.01)
     config = make_config(data__cache="auto", data__cache_dir=str(cache))
     dataset, model = open_dataset(config.data), load_base(config.model, seed=config.seed)
@@ -506,19 +507,20 @@ def test_an_error_that_only_the_first_process_can_meet_is_told_to_all(
 ) -> None:
     cache, run = together
     told: list[object] = []
-    monkeypatch.setattr(collectives, "broadcast_object", lambda _, value: told.append(value) or value)
+    monkeypatch.setattr(collectives, "all_gather_object", lambda _, value: told.append(value) or [value, None])
+    monkeypatch.setattr(encode_dataset, "first_only", collectives.first_only)
     cache.folder.mkdir(parents=True)
     (cache.folder / "thesis.tex").touch()
     with pytest.raises(InputError, match="other things in it"):
         run()
-    assert [type(one) for one in told] == [InputError], "broadcast, so that each process raises it"
+    assert [type(one) for one in told] == [InputError], "sent to all, so that each process raises it"
 
 
 def test_a_folder_that_processes_do_not_share_is_refused_before_the_work(
     together: tuple[LatentCache, Callable], monkeypatch: pytest.MonkeyPatch, encoded_frames: list[int], tmp_path: Path
 ) -> None:
     monkeypatch.setattr(encode_dataset, "_LONGEST_UNSEEN_S", 0.0)
-    monkeypatch.setattr(collectives, "broadcast_object", lambda _, value: tmp_path / "elsewhere" / value.name)
+    monkeypatch.setattr(encode_dataset, "broadcast_object", lambda _, value: tmp_path / "elsewhere" / value.name)
     with pytest.raises(InputError, match="all machines of the run share"):
         together[1]()
     assert not encoded_frames

@@ -226,7 +226,8 @@ def test_only_paths_that_lead_nowhere_are_looked_for_elsewhere(at_home, home, mo
     monkeypatch.chdir(elsewhere)
 
     def seen(**changes: object):  # type: ignore[no-untyped-def]
-        changed = parse_config({**values, "data": {**values["data"], **changes}}, where="")
+        data = {key: one for key, one in values["data"].items() if key != "fields" or "source" not in changes}
+        changed = parse_config({**values, "data": {**data, **changes}}, where="")
         (home / "run/config.yaml").write_text(config_as_yaml(changed))
         return read_run_config(home / "run").data
 

@@ -18,7 +18,7 @@ from vjepa2_ac.geometry import actions_from_states
 
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 
-from vjepa2_ac.planning import counterfactual as named_actions
+from vjepa2_ac.planning.counterfactual import named_actions
 from vjepa2_ac.simulation.counterfactual import RECORDED_CAMERAS, Resimulation, resimulate
 from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset, record_episode
 from vjepa2_ac.simulation.recording.simulation_file import SIMULATION_FILE
