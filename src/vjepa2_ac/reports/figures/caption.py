@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
 
-from vjepa2_ac.reports.figures.page import new_figure
+from vjepa2_ac.reports.figures.page import new_figure, pixels_of
 
 _DOTS = 100  # per inch, of text
 _LINE = 30  # pixels
@@ -33,22 +32,17 @@ def side_by_side(
     if len(captions) != len(pictures):
         raise ValueError(f"{len(captions)} captions for {len(pictures)} pictures")
     large = [picture.repeat(enlarged, axis=0).repeat(enlarged, axis=1) for picture in pictures]
-    columns = [np.concatenate([text_image(text, one.shape[1]), one]) for text, one in zip(captions, large, strict=True)]
+    columns = [
+        np.concatenate([_text_image(text, one.shape[1]), one]) for text, one in zip(captions, large, strict=True)
+    ]
     gap = np.full((columns[0].shape[0], _GAP, 3), 255, dtype=np.uint8)
     row = np.concatenate([part for column in columns for part in (column, gap)][:-1], axis=1)
-    return np.concatenate([text_image(title, row.shape[1], points=11.0), row])
+    return np.concatenate([_text_image(title, row.shape[1], points=11.0), row])
 
 
 @lru_cache(maxsize=512)
-def text_image(
-    text: str, width: int, *, height: int = _LINE, points: float = 9.0, colour: str = "black", bold: bool = False
-) -> UInt8[np.ndarray, "height width 3"]:
-    """Return text on white, up to a few lines; read only, since it is drawn once."""
-    figure = new_figure(width / _DOTS, height / _DOTS, dpi=_DOTS, facecolor="white")
-    canvas: Any = figure.canvas
-    figure.text(
-        8 / width, 0.5, text, fontsize=points, va="center", ha="left", parse_math=False, color=colour,
-        weight="bold" if bold else "normal", linespacing=1.35,
-    )  # fmt: skip
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+def _text_image(text: str, width: int, *, points: float = 9.0) -> UInt8[np.ndarray, "_ width 3"]:
+    """Return a line of text on white; read only, since it is drawn once."""
+    figure = new_figure(width / _DOTS, _LINE / _DOTS, dpi=_DOTS, facecolor="white")
+    figure.text(8 / width, 0.5, text, fontsize=points, va="center", ha="left", parse_math=False)
+    return pixels_of(figure)

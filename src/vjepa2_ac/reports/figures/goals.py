@@ -8,7 +8,7 @@ from typing import Any
 from vjepa2_ac.demonstrations.key_frames import GRIPPER
 from vjepa2_ac.demonstrations.make_goals import EnergyCourse, MadeGoals
 from vjepa2_ac.planning.goals import SubGoal
-from vjepa2_ac.reports.figures.page import BLUE, GREY, ORANGE, RED, written_page
+from vjepa2_ac.reports.figures.page import BLUE, GREY, ORANGE, RED, headline, written_figure
 
 GOALS_IMAGE = "goals.png"
 
@@ -19,13 +19,11 @@ _NAME = 70  # characters of a recording's name, its end
 def plot_goals(made: MadeGoals, path: Path) -> Path:
     """Write the contact sheet of goals as PNG; it is written atomically."""
     images = [made.first, *(goal.image for goal in made.goals)]
-    rows, plots, style = -(-len(images) // _ACROSS), _plots(made), {"font.size": 8}
+    rows, plots = -(-len(images) // _ACROSS), _plots(made)
     heights = [2.8 * rows, *(1.8 for _ in plots)]
-    with written_page(
-        path, 13.0, 0.5 + sum(heights), dpi=100, style=style, layout="constrained", facecolor="white"
-    ) as page:
-        page.headline(_title(made))
-        sheet, *parts = page.figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
+    with written_figure(path, 13.0, 0.5 + sum(heights)) as figure:
+        headline(figure, _title(made))
+        sheet, *parts = figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
         for place, axes in enumerate(sheet.subplots(rows, _ACROSS, squeeze=False).flat):
             axes.set_axis_off()
             if place < len(images):

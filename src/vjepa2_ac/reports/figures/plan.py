@@ -16,12 +16,11 @@ from vjepa2_ac.decoding.imagined_plan import ImaginedPlan
 from vjepa2_ac.planning.decision import PlanResult, summarize
 from vjepa2_ac.planning.energy import EnergySlice
 from vjepa2_ac.planning.interfaces import Plan
-from vjepa2_ac.reports.figures.film import MEANING, Kind
-from vjepa2_ac.reports.figures.page import BLUE, GREY, RED, written_page
+from vjepa2_ac.reports.figures.film import MEANING, Kind, show_framed
+from vjepa2_ac.reports.figures.page import BLUE, GREY, RED, headline, written_figure
 
 PLAN_IMAGE = "plan.png"
 
-_STYLE = {"font.size": 9, "legend.fontsize": 7.5}
 _FRAME = "#e8b10c"
 _ROW, _ROW_OF_IMAGINED = 3.4, 2.3  # inches
 _MOST_NUMBERS = 8  # of a vector
@@ -46,9 +45,9 @@ def plot_plan(answer: PlanResult, path: Path, imagined: ImaginedPlan | None = No
         if answer.slices:
             rows.append((_ROW, partial(_slices, answer=answer)))
     heights = [height for height, _ in rows]
-    with written_page(path, 13.0, 0.9 + sum(heights), dpi=100, style=_STYLE, layout="constrained") as page:
-        page.headline(summarize(answer))
-        parts = page.figure.subfigures(len(rows), 1, squeeze=False, height_ratios=heights)[:, 0]
+    with written_figure(path, 13.0, 0.9 + sum(heights), size=9) as figure:
+        headline(figure, summarize(answer))
+        parts = figure.subfigures(len(rows), 1, squeeze=False, height_ratios=heights)[:, 0]
         for part, (_, draw) in zip(parts, rows, strict=True):
             draw(part)
     return path
@@ -81,12 +80,8 @@ def _imagined(part: Any, answer: PlanResult, imagined: ImaginedPlan) -> None:
         panels.append((name, "imagined", image))
     panels += [("goal, decoded", "decoded", imagined.decoded_goal), ("goal", "recorded", imagined.goal)]
     for axes, (title, kind, image) in zip(part.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
-        colour = MEANING[kind][0]
-        axes.imshow(image)
-        axes.set(xticks=[], yticks=[])
-        for spine in axes.spines.values():
-            spine.set(visible=True, color=colour, linewidth=3)
-        axes.set_title(title, color=colour, fontsize=8)
+        show_framed(axes, image, kind)
+        axes.set_title(title, color=MEANING[kind][0], fontsize=8)
     note = "Imagined from the start and the plan's actions alone: what the model predicts, no evidence that it happens."
     part.supxlabel(note, fontsize=8, color=GREY, x=0.01, ha="left")
 
@@ -145,7 +140,7 @@ def _energies(axes: Any, answer: PlanResult, plan: Plan) -> None:
         room = max(0.15 * float(np.ptp(seen)), 1e-4)
         axes.set_ylim(seen.min() - room, seen.max() + 3 * room)
     axes.set(title="Energy", xlabel="iteration", ylabel=f"energy ({answer.controller.config.energy.distance})")
-    axes.legend(loc="upper right")
+    axes.legend(loc="upper right", fontsize=7.5)
 
 
 def _path(axes: Any, answer: PlanResult) -> None:
@@ -162,7 +157,7 @@ def _path(axes: Any, answer: PlanResult) -> None:
         reach = 1.2 * max(float(np.abs(way[:, space.position]).max()), 1.0)
         axes.set(xlabel="x from here (cm)", xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
         axes.set_title("Planned path of the flange,\nrobot base frame")
-    axes.legend()
+    axes.legend(fontsize=7.5)
 
 
 def _slices(part: Any, answer: PlanResult) -> None:
