@@ -301,7 +301,7 @@ def infer_axes(
     names = [start.episode_id for start in starts]
     centre_m, errors = _turn_of_least_error(model, starts, at_once)
     axes = Axes(math.radians(yaw_of_least_error(errors, names).value), centre_m)
-    executed = np.stack([_numbers(start.action)[_MOVE] for start in starts])
+    executed = np.stack([start.true[_MOVE] for start in starts])
     reach = min(1.0, max(_LEAST_M, _ROOM * float(np.linalg.norm(executed, axis=1).max())))
     planner = Planner(
         _SEARCH.model_copy(update={"limits": LimitsConfig(xyz=(reach, reach, reach), gripper_mode="held")})
@@ -330,10 +330,9 @@ def _turn_of_least_error(
 
 def _inferred(model: Predictor, start: RolloutStart, planner: Planner, at_once: int) -> Float[np.ndarray, " 3"]:
     """Return the move (dx, dy, dz) that predicts the next frame best; the rest of the action is the true one."""
-    true = _numbers(start.action)
 
     def cost(actions: Float[Tensor, "samples 1 7"]) -> Float[Tensor, " samples"]:
-        tried = np.tile(true, (len(actions), 1))
+        tried = np.tile(start.true, (len(actions), 1))
         tried[:, _MOVE] = actions[:, 0, _MOVE].double().numpy()
         return torch.from_numpy(evaluate_actions(model, start, tried, at_once=at_once).energy)
 

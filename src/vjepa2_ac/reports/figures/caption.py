@@ -25,12 +25,7 @@ def side_by_side(
         captions: One for each.
         title: A line, at most as long as all images are wide.
         enlarged: Pixels per pixel, along both axes.
-
-    Raises:
-        ValueError: The number of captions is not the number of images.
     """
-    if len(captions) != len(pictures):
-        raise ValueError(f"{len(captions)} captions for {len(pictures)} pictures")
     large = [picture.repeat(enlarged, axis=0).repeat(enlarged, axis=1) for picture in pictures]
     columns = [
         np.concatenate([_text_image(text, one.shape[1]), one]) for text, one in zip(captions, large, strict=True)

@@ -47,21 +47,11 @@ class StripRow:
 
 @dataclass(frozen=True, eq=False)
 class FilmStrip:
-    """Rows of equal length.
-
-    Raises:
-        ValueError: No rows, no frames, or of different lengths.
-    """
+    """Rows of equal length."""
 
     title: str
     rows: tuple[StripRow, ...]
     seconds: tuple[float, ...]  # of each frame since the start
-
-    def __post_init__(self) -> None:
-        lengths = {len(row.frames) for row in self.rows}
-        wrong = any(len(row.captions) not in {0, len(self.seconds)} for row in self.rows)
-        if not self.seconds or lengths != {len(self.seconds)} or wrong:
-            raise ValueError(f"rows of {sorted(lengths)} frames, at {len(self.seconds)} times")
 
 
 def draw_strip(film: FilmStrip, *, side: int = 128) -> UInt8[np.ndarray, "height width 3"]:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from jaxtyping import Float
 
 from vjepa2_ac.demonstrations.key_frames import GRIPPER
 from vjepa2_ac.demonstrations.make_goals import EnergyCourse, MadeGoals
@@ -19,7 +23,9 @@ _NAME = 70  # characters of a recording's name, its end
 def plot_goals(made: MadeGoals, path: Path) -> Path:
     """Write the contact sheet of goals as PNG; it is written atomically."""
     images = [made.first, *(goal.image for goal in made.goals)]
-    rows, plots = -(-len(images) // _ACROSS), _plots(made)
+    rows = -(-len(images) // _ACROSS)
+    drawn: list[tuple[Callable[..., None], Any]] = [(_gripper, made.recording.states), (_energy, made.course)]
+    plots = [(draw, given) for draw, given in drawn if given is not None]
     heights = [2.8 * rows, *(1.8 for _ in plots)]
     with written_figure(path, 13.0, 0.5 + sum(heights)) as figure:
         headline(figure, _title(made))
@@ -29,9 +35,9 @@ def plot_goals(made: MadeGoals, path: Path) -> Path:
             if place < len(images):
                 axes.imshow(images[place])
                 axes.set_title(_caption(made, place), fontsize=8)
-        for part, draw in zip(parts, plots, strict=True):
+        for part, (draw, given) in zip(parts, plots, strict=True):
             axes = part.subplots()
-            draw(axes, made)
+            draw(axes, made, given)
             for key in made.keys:
                 axes.axvline(key.frame, color=GREY, linewidth=0.8, linestyle=":")
             axes.set_xlim(0, made.recording.frames - 1)
@@ -63,25 +69,12 @@ def _bounds(goal: SubGoal) -> str:
     return f"{goal.at_least} to {goal.at_most} model steps"
 
 
-def _plots(made: MadeGoals) -> list[Any]:
-    drawn: list[Any] = []
-    if made.recording.states is not None:
-        drawn.append(_gripper)
-    if made.course is not None:
-        drawn.append(_energy)
-    return drawn
-
-
-def _gripper(axes: Any, made: MadeGoals) -> None:
-    if made.recording.states is not None:
-        axes.plot(made.recording.states[:, GRIPPER], color=ORANGE, linewidth=1.3)
+def _gripper(axes: Any, _: MadeGoals, states: Float[np.ndarray, "frames 7"]) -> None:
+    axes.plot(states[:, GRIPPER], color=ORANGE, linewidth=1.3)
     axes.set(title="Gripper: 0 open, 1 closed", ylim=(-0.05, 1.05))
 
 
-def _energy(axes: Any, made: MadeGoals) -> None:
-    course: EnergyCourse | None = made.course
-    if course is None:
-        return
+def _energy(axes: Any, made: MadeGoals, course: EnergyCourse) -> None:
     axes.plot(course.frames, course.energy, color=BLUE, linewidth=1.3, label="energy to the goal that applies")
     begins = [0, *(key.frame for key in made.keys)]
     for begin, end, goal, began in zip(begins, begins[1:], made.goals, course.began, strict=False):
