@@ -81,12 +81,6 @@ def test_a_turn_that_predicts_no_better_than_none_and_one_of_a_wide_interval_are
     assert (wide.problem or "").startswith("uncertain: yaw -60 degrees, 95 % interval -80 to -30")
 
 
-def test_a_direction_in_which_nothing_moved_is_no_axis() -> None:
-    actions = clips_batch(CLIPS).actions.clone()
-    actions[..., 1] = 0.0
-    assert "ill-conditioned" in (fitted(Oracle(), actions=actions).problem or "")
-
-
 def test_mirrored_axes_and_one_episode_are_refused_by_name() -> None:
     assert "mirrored" in (fitted(Turned(0.0, mirrored=True)).problem or "")
     batch = clips_batch(2)

@@ -171,14 +171,6 @@ def test_what_is_worse_than_persistence_is_no_better_reading() -> None:
     assert found(Estimate(0.9, 0.85, 0.95)) is not None
 
 
-def test_episodes_are_read_once_for_all_variants_of_a_batch_however_many_they_are() -> None:
-    dataset = dataset_of(at(0))
-    assert isinstance(dataset.source, MemorySource)
-    probed(dataset)
-    assert len(dataset.source.reads) == 16 + 2 * 4  # for each clip, and again those of 2 batches of 4 episodes
-    assert len(dataset.source.decoded) == 3 * 16 * 3
-
-
 def test_a_model_that_predicts_nothing_gives_no_result() -> None:
     probe = probed(dataset_of(FAULTS["y negated"]), Copier())
     assert probe.better is None
@@ -249,15 +241,6 @@ def test_commands_are_shifted_with_the_states() -> None:
     assert found.commands is not None
     assert found.commands[:, 0].tolist() == [10, 10, 10, 11, 12, 13]
     assert early.change(an_episode(states)).states[:, 0].tolist() == [2, 3, 4, 5, 5, 5]
-
-
-def test_exchanging_colours_leaves_the_rest() -> None:
-    variants = variants_of(DataConfig.model_validate({"path": "set"}), [])
-    variant, _ = [one for one in variants if one.changes_frames]
-    episode = an_episode(np.zeros((3, 7)))
-    changed = variant.change(episode)
-    assert changed.read_frames([2, 1]).tolist() == [[[[9, 0, 2]]], [[[9, 0, 1]]]]
-    assert changed.states is episode.states
 
 
 def test_of_changed_frames_persistence_is_another_one_too() -> None:

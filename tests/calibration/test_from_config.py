@@ -118,18 +118,3 @@ def test_a_latent_cache_is_probed_by_the_model_that_encoded_it_without_other_fra
         assert one.difference.value == pytest.approx(differences[one.name], rel=0.02, abs=0.02)
     assert check(config, tmp_path, "builtin:sim-tiny") == 2
     assert "encoder" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("model", ["gs://bucket/run", "https://example.org/model.pt", "no/such/model", "builtin:none"])
-def test_what_is_no_model_of_this_machine_is_refused(
-    make_config: MakeConfig, tmp_path: Path, capsys: Printed, model: str
-) -> None:
-    config = written(make_config(), tmp_path)
-    try:
-        status = main(["data", "check", config, "--limit", "2", "--model", model])
-    except SystemExit as ended:  # argparse's own
-        status = int(str(ended.code))
-    assert status == 2
-    errors = capsys.readouterr().err
-    assert model in errors
-    assert "Traceback" not in errors

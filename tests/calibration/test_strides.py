@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-import torch
 from torch import Tensor
 
 from vjepa2_ac.calibration.strides import Calibration, calibrate
@@ -132,19 +131,6 @@ def test_a_handful_of_episodes_gives_an_interval_but_no_certainty() -> None:
     assert "not certain on" in found.verdict()
 
 
-def test_one_episode_gives_no_certainty() -> None:
-    found = calibrated(GoesOn(8), Tracks([80]), split="train" if split_is_train() else "validation")
-    assert found.best.stride == 8
-    assert not found.is_certain
-    assert "not certain on 1 episodes" in found.verdict()
-
-
-def split_is_train() -> bool:
-    from clips import split_of
-
-    return split_of("track 0", dataset_of(Tracks([80])).config) == "train"
-
-
 def test_a_stride_that_fits_no_episode_is_named_and_the_others_are_measured() -> None:
     found = calibrated(GoesOn(4), Tracks([30] * 6))
     assert [one.stride for one in found.results] == [4, 8]
@@ -157,11 +143,6 @@ def test_one_long_episode_does_not_decide_for_all() -> None:
     assert [one.stride for one in found.results] == [4, 8]
     assert "1 episode only" in found.impossible[15]
     assert found.results[0].episodes >= 5
-
-
-def test_where_no_stride_fits_the_first_reason_is_the_error() -> None:
-    with pytest.raises(InputError, match="shorter than a clip"):
-        calibrated(GoesOn(4), Tracks([5] * 6))
 
 
 def test_clips_are_shortened_to_eight_frames_by_default() -> None:
@@ -188,24 +169,6 @@ def test_clips_that_cannot_be_read_are_left_out_and_all_of_them_are_an_error(mon
     damaged = set(range(20))
     with pytest.raises(InputError, match="none of the clips can be read; broken episodes: track"):
         calibrate(GoesOn(8), encode, dataset, ClipSample(batch_size=4))
-
-
-def test_progress_counts_every_clip_of_every_stride() -> None:
-    reported: list[tuple[int, int]] = []
-    calibrated(GoesOn(4), Tracks([80] * 4), clips=10, progress=lambda done, total: reported.append((done, total)))
-    assert reported[-1] == (30, 30)
-    assert [done for done, _ in reported] == sorted({done for done, _ in reported})
-
-
-def test_the_figures_are_plain_values() -> None:
-    import json
-
-    found = calibrated(GoesOn(4), Tracks([30] * 6))
-    read = json.loads(json.dumps(found.as_dict()))
-    assert read["stride"] == 4
-    assert read["strides"][0]["error_over_persistence"]["value"] == pytest.approx(0.0, abs=1e-3)
-    assert read["impossible"].keys() == {"15"}
-    assert torch.is_grad_enabled()
 
 
 def test_the_best_of_several_is_certain_only_by_twice_its_interval() -> None:

@@ -48,7 +48,7 @@ def test_a_robot_drives_it_and_every_decision_can_be_made_again(workshop: Path, 
     lines = [json.loads(line) for line in (record / "decisions.jsonl").read_text().splitlines()]
     assert len(lines) == 3
     monkeypatch.chdir(record)
-    monkeypatch.setattr("vjepa2_ac.reports.figures.plan.plot_plan", lambda _, path, *__: path)
+    monkeypatch.setattr("vjepa2_ac.reports.figures.planning.plot_plan", lambda _, path, *__: path)
     for number, (line, answer) in enumerate(zip(lines, answers, strict=True)):
         assert (
             main(["plan", str(workshop / "model"), *QUICK, *line["plan"], "--nodes", "0", "--out", f"again-{number}"])

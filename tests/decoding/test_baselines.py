@@ -58,12 +58,6 @@ def test_what_latents_do_not_say_is_the_mean() -> None:
     assert (shown - mean).abs().mean() < 0.25 * (pairs.images / 255.0 - mean).abs().mean()
 
 
-def test_latents_that_never_change_are_no_problem() -> None:
-    pairs = Linear()
-    pairs.latents = torch.ones_like(pairs.latents)
-    assert all(torch.isfinite(one).all() for one in fit(pairs).parameters())
-
-
 def test_a_frame_that_is_shown_exactly_has_no_decibels_but_is_counted() -> None:
     """Its PSNR is infinite, and so would be the mean, which JSON cannot hold."""
     pairs, black = Linear(frames=9), torch.zeros(3, 16, 16)

@@ -1,7 +1,5 @@
 """The images of a plan are those of the rollout that it was chosen by."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -54,7 +52,3 @@ def test_the_next_frame_is_the_first_step_of_the_plan(decoder: TrainedDecoder) -
     assert following is not None
     difference = following.astype(int) - imagine_plan(answer, decoder).steps[1]
     assert abs(difference).max() <= 1
-
-
-def test_a_decision_without_its_cost_is_no_error(decoder: TrainedDecoder) -> None:
-    assert imagined_next(replace(asked(nodes=0).decision, cost=None), decoder) is None

@@ -17,7 +17,7 @@ from decoders import EncodeSplit
 from killable import KILLED, Nursery
 from run_fixtures import TINY, MakeConfig, SilentReporter, as_yaml
 from vjepa2_ac.cli import main
-from vjepa2_ac.config import Config, DecoderConfig, ModelSizes
+from vjepa2_ac.config import DecoderConfig, ModelSizes
 from vjepa2_ac.data.sources.latents.cache_files import LatentFiles
 from vjepa2_ac.data.sources.rlds.source import RldsSource
 from vjepa2_ac.decoding import steps as optimizer_steps
@@ -102,29 +102,6 @@ def test_of_shuffled_pairs_it_learns_the_mean_image_at_best(
 
     monkeypatch.setattr(training, "_encoded", shuffled)
     assert max(gains("shuffled").values()) < 0.3
-
-
-def test_the_card_says_what_the_decoder_is(whole_decoder: Path, make_decoder: MakeConfig) -> None:
-    card, config = read_card(whole_decoder), make_decoder()
-    assert (card.frames, card.steps, card.episodes) == (len_of_training(config), 6, 2)
-    assert (card.crop, card.precision, card.data) == ("released", "fp32", config.data.path)
-    assert card.cameras == config.data.cameras
-    assert (card.shape.size, card.shape.dim, card.shape.grid, card.shape.patch_size) == ("tiny", 24, 2, 16)
-    assert {"frames", "episodes", "decoder", "linear", "mean_image"} == set(card.held_out)
-    for name in ("decoder", "linear", "mean_image"):
-        assert set(card.held_out[name]) == {"psnr_db", "ssim", "exact_frames"}
-    assert {path.name for path in whole_decoder.iterdir()} == FINISHED
-
-
-def len_of_training(config: Config) -> int:
-    from vjepa2_ac.data.dataset import open_dataset
-    from vjepa2_ac.decoding.frame_pairs import wanted_frames
-
-    return sum(len(one.steps) for one in wanted_frames(open_dataset(config.data), "train", frames=40))
-
-
-def test_without_test_episodes_nothing_is_measured(make_decoder: MakeConfig) -> None:
-    assert read_card(train_decoder(make_decoder(data__test_share=0.0))).held_out == {}
 
 
 # ---- whatever happens ----------------------------------------------------------------------------------------------
@@ -268,11 +245,6 @@ def test_a_model_whose_images_no_decoder_makes_is_refused(
     WorldModel.random(ModelSizes.model_validate(TINY | sizes), seed=0).save_pretrained(tmp_path / "odd")
     with pytest.raises(InputError, match="px in patches of"):
         train_decoder(make_decoder(model__base=str(tmp_path / "odd")))
-
-
-def test_without_training_episodes_the_shares_are_named(make_decoder: MakeConfig) -> None:
-    with pytest.raises(InputError, match=r"no frames of train episodes.*test_share"):
-        train_decoder(make_decoder(data__validation_share=0.0, data__test_share=0.99))
 
 
 def test_a_learning_rate_that_is_too_high_is_named(make_decoder: MakeConfig, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,7 +18,7 @@ from vjepa2_ac.evaluation.action_score import (
     planning_start,
     study_of,
 )
-from vjepa2_ac.evaluation.request import SCORED, ProbeOptions
+from vjepa2_ac.evaluation.request import SCORED
 from vjepa2_ac.evaluation.result import Evaluation, PlanningStudy, Plans
 from vjepa2_ac.planning.interfaces import Plan
 from vjepa2_ac.planning.planner import Planner
@@ -194,15 +194,6 @@ def test_three_steps_keep_to_the_protocol_whatever_the_config_says(monkeypatch: 
     assert far == SCORED.energy.model_copy(update={"samples_at_once": 5})
 
 
-@pytest.mark.usefixtures("quick")
-def test_gradients_can_plan_one_step() -> None:
-    config = PlanningConfig(planner="gradient", iterations=60, limits=LimitsConfig(rotation=0.1))
-    starts = starts_of_a_world()[:2]
-    plans = measure_plans(Oracle(), starts, config)
-    wanted = np.stack([start.demonstrated[0, :3] for start in starts])
-    np.testing.assert_allclose(plans.one_step[0, :, :3], wanted, atol=0.003)
-
-
 def test_poses_stay_exact_where_the_model_computes_in_bfloat16() -> None:
     start = starts_of_a_world()[0]
     start = type(start)(**{**vars(start), "state": torch.tensor([0.4, 0.1, 0.3, 3.1, 0.05, -0.4, 0.2])})
@@ -223,13 +214,6 @@ def test_planning_begins_anywhere_in_a_clip_and_aims_three_steps_on() -> None:
         for found, expected in zip((start.frame, start.following, start.goal), frames[[0, 1, 3]], strict=True):
             assert torch.equal(found, expected)
         np.testing.assert_array_equal(start.demonstrated, batch.actions[row, start.place : start.place + 3].numpy())
-
-
-def test_clips_of_three_frames_are_too_short_to_plan_on() -> None:
-    batch = clips_batch(2)
-    short = type(batch)(**{**vars(batch), "latents": batch.latents[:, :3]})
-    with pytest.raises(ValueError, match="3 frames, and planning 3 steps takes 4"):
-        planning_start(short, 0, 0, seed=0)
 
 
 def test_random_plans_are_uniform_within_the_limits() -> None:
@@ -254,25 +238,8 @@ def test_plans_without_a_finite_energy_do_nothing_and_are_counted() -> None:
     assert not plans.three_steps.any()
 
 
-@pytest.mark.usefixtures("quick")
-def test_progress_counts_every_plan_of_a_model() -> None:
-    reported: list[tuple[int, int]] = []
-    quick = ONE_STEP.model_copy(update={"samples": 10, "iterations": 1})
-    measure_plans(Copier(), starts_of_a_world()[:2], quick, lambda done, total: reported.append((done, total)))
-    assert reported == [(1, 4), (2, 4), (3, 4), (4, 4)]
-
-
 def test_there_are_no_plans_of_vectors_and_the_reason_is_given() -> None:
     found = planned(Copier(), space=vector_actions(7, "change"))
     assert found.planning is None
     assert found.models["adapter"].plans is None
     assert any("No plans" in note for note in found.notes)
-
-
-@pytest.mark.usefixtures("quick")
-def test_without_planning_the_file_holds_nothing_of_it() -> None:
-    metrics = metrics_as_dict(planned(Copier(), probes=ProbeOptions(sensitivity_clips=0, examples=0)))
-    assert metrics["planning"] is None
-    assert metrics["models"]["adapter"]["plans"] is None
-    assert not [row for row in metrics["rows"] if row["key"].startswith("plans")]
-    assert any(row["key"] == "plans.score" for row in metrics_as_dict(planned(Copier(), probes=QUICK))["rows"])

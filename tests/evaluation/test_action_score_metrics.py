@@ -11,7 +11,6 @@ from planned import study, with_plans
 from vjepa2_ac.evaluation.action_score import differences_of, metrics_of, missed_cm
 from vjepa2_ac.evaluation.result import Evaluation, Plans
 from vjepa2_ac.evaluation.rows import rows_of
-from vjepa2_ac.evaluation.verdict import verdict
 from vjepa2_ac.reports.comparison import compare
 from vjepa2_ac.reports.metrics_json import write_metrics
 
@@ -97,12 +96,6 @@ def test_several_draws_of_a_plan_count_with_their_mean_error() -> None:
     assert metrics_of(made_up, both).step_cm.value == pytest.approx((18**0.5 + 6) / 4)
 
 
-def test_intervals_are_over_episodes() -> None:
-    plans = Plans(PLANNED[None, :, 0], PLANNED[None])
-    assert metrics_of(study(DEMONSTRATED), plans).missed_cm.has_interval
-    assert not metrics_of(study(DEMONSTRATED, ("a", "a")), plans).missed_cm.has_interval
-
-
 @pytest.fixture
 def found() -> Evaluation:
     return with_plans(evaluation())
@@ -117,22 +110,6 @@ def test_rows_show_models_beside_what_takes_none_and_the_difference_to_the_base(
         difference = rows[f"plans.{name}", "adapter"] - rows[f"plans.{name}", "base"]
         assert rows[f"plans_minus_base.{name}", "adapter"] == pytest.approx(difference)
         assert (f"plans_minus_base.{name}", "base") not in rows
-
-
-def test_the_verdict_says_how_plans_end(found: Evaluation) -> None:
-    words = verdict(found)
-    assert "Its plans of 3 steps end" in words
-    assert "nearer than doing nothing" in words
-    assert "nearer than the base" in words
-    assert "the Action Score is" in words
-    bad = replace(found.models["adapter"], plans=found.models["base"].plans)
-    same = replace(found, models={**found.models, "adapter": bad})
-    assert "no clear difference to the base" in verdict(same)
-    away = bad.plans
-    assert away is not None
-    far = replace(bad, plans=replace(away, three_steps=away.three_steps + 0.3))
-    assert "FARTHER than doing nothing" in verdict(replace(found, models={**found.models, "adapter": far}))
-    assert "Its plans" not in verdict(evaluation())
 
 
 def test_compare_shows_the_score_where_there_is_one(found: Evaluation, tmp_path: Path) -> None:

@@ -11,7 +11,6 @@ import yaml
 
 from adapted_run import write_adapted_run
 from run_fixtures import SilentReporter
-from vjepa2_ac.cli import main
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation import action_score as measure
@@ -127,10 +126,3 @@ def test_clips_too_short_to_plan_on_are_refused_before_any_data_are_read(tmp_pat
     with pytest.raises(InputError, match=r"--planning: clips of 3 frames \(data\.frames\).*4 or more"):
         evaluate_subject("model", asked(path, tmp_path / "out"))
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("number", ["0", "-1", "many"])
-def test_a_number_of_clips_to_plan_from_is_one_or_more(number: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["evaluate", "run", "--planning", "--planning-clips", number])
-    assert "--planning-clips" in capsys.readouterr().err

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from torch import Tensor
 
-from run_fixtures import SilentReporter
 from vjepa2_ac.calibration.axes import infer_axes
 from vjepa2_ac.evaluation.estimates import (
     difference_to,
@@ -61,14 +60,6 @@ def test_a_perfect_predictor_scores_zero_in_every_metric(oracle: Evaluation) -> 
     assert [one.value for one in gain_over(*pair_of(oracle))] == pytest.approx([1.0] * (TIME - 1))
     assert "100% better than the base" in verdict(oracle)
     assert uses_actions(oracle)
-
-
-def test_persistence_scores_exactly_one_relative_to_itself_in_every_metric(oracle: Evaluation) -> None:
-    for mode in MODES:
-        for metric in METRICS:
-            assert {(r.value, r.low, r.high) for r in over_persistence(oracle.models["base"].errors, mode, metric)} == {
-                (1.0, 1.0, 1.0)
-            }
 
 
 def test_spread_and_discrepancy_of_the_rollouts_are_those_of_the_predicted_latents() -> None:
@@ -267,45 +258,6 @@ def test_the_axes_of_base_and_adapter_are_found_and_those_of_vectors_are_not() -
     assert {name: one["axes"]["yaw_degrees"]["value"] for name, one in written.items()} == yaws
     vectors = evaluated(Oracle(), space=vector_actions(7, "change"), find_axes=infer_axes)
     assert not vectors.models["adapter"].beside
-
-
-def test_progress_names_each_part_of_the_work() -> None:
-    reporter = SilentReporter()
-    evaluate(
-        [Contender("model", "trained", Oracle())],
-        again(clips_batch()),
-        about(),
-        probes=replace(PROBES, find_axes=infer_axes),
-        reporter=reporter,
-    )
-    assert {title: seen[-1] for title, seen in reporter.tasks.items()} == {
-        "measuring": (12, 12),
-        "other actions, model": (6, 6),
-        "action ranking, model": (12, 12),
-        "energy landscapes, model": (3, 3),
-        "axes, model": (6, 6),
-    }
-
-
-@pytest.mark.parametrize(
-    ("nothing", "note"),
-    [
-        (
-            {"sensitivity_clips": 0},
-            "--sensitivity-clips is 0: no other actions and no energy landscapes were asked for.",
-        ),
-        ({"landscape_clips": 0}, "--landscapes is 0: no energy landscapes were asked for."),
-        ({"axis_clips": 0}, "--axes is 0: no calibrated axes were asked for."),
-        ({"examples": 0}, "--examples is 0: no example clips were asked for."),
-        ({}, None),
-    ],
-)
-def test_what_was_not_asked_for_is_noted(nothing: dict[str, int], note: str | None) -> None:
-    probes = replace(PROBES, sensitivity_clips=2, samples=3, landscape_clips=1, nodes=3, examples=1)
-    contender = Contender("model", "trained", Oracle())
-    found = evaluate([contender], again(clips_batch()), about(), probes=replace(probes, **nothing))
-    assert found.notes == (() if note is None else (note,))
-    assert note is None or note in verdict(found)
 
 
 def test_nothing_but_errors_is_measured_where_nothing_else_is_asked_for() -> None:

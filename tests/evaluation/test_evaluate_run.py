@@ -1,7 +1,6 @@
 """Runs and models are evaluated on their own or other data, against others; invalid input is refused early."""
 
 import json
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -176,17 +175,6 @@ def test_strides_are_calibrated_where_it_is_asked_for(run: str, tmp_path: Path) 
     assert calibration["strides"]
 
 
-@pytest.mark.usefixtures("measured")
-def test_compare_prints_a_row_for_each_run(run: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "again").mkdir()
-    shutil.copy(Path(run) / "metrics.json", tmp_path / "again")
-    assert main(["compare", run, str(tmp_path / "again"), "--out", str(tmp_path / "plot.png")]) == 0
-    printed = capsys.readouterr().out
-    assert "Gain over run" in printed
-    assert "again" in printed
-    assert (tmp_path / "plot.png").is_file()
-
-
 def changed(config: Config, **data: object) -> Config:
     """Return a config with other settings of its data."""
     return config.model_copy(update={"data": config.data.model_copy(update=data)})
@@ -226,13 +214,6 @@ def test_several_processes_are_refused_since_all_would_write_the_same_files(
     monkeypatch.setenv("WORLD_SIZE", "2")
     assert main([command[0], run, *command[1:]]) == 2
     assert "torchrun: 2 processes" in capsys.readouterr().err
-
-
-def test_what_to_compare_with_and_is_not_there_is_named_as_it_was_given(run: str, tmp_path: Path) -> None:
-    with pytest.raises(
-        InputError, match=r"--against \S*nowhere: no such file or folder\. needed: base, the folder of a run"
-    ):
-        evaluate_subject(run, asked(against=(str(tmp_path / "nowhere"),)))
 
 
 def test_a_model_without_data_and_a_file_in_the_way_are_errors(run: str, tmp_path: Path, base_folder: Path) -> None:

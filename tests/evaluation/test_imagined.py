@@ -235,13 +235,3 @@ def test_under_vector_states_only_recorded_actions_can_be_imagined(make_config: 
     options = ImagineOptions(decoder="", actions=("true", "up"))
     with pytest.raises(InputError, match="--actions up: states that are no poses"):
         imagined._actions_of(options, batch, dataset, limits=None)
-
-
-def test_another_encoder_is_refused(imagine: Imagine, make_config: MakeConfig, tmp_path: Path) -> None:
-    from run_fixtures import TINY
-    from vjepa2_ac.config import ModelSizes
-
-    WorldModel.random(ModelSizes.model_validate(TINY), seed=9).save_pretrained(tmp_path / "other")
-    options = EvaluationOptions(data=make_config(), out=tmp_path)
-    with pytest.raises(InputError, match="another encoder"):
-        imagine(tmp_path / "other", evaluation=options)

@@ -95,10 +95,3 @@ def test_one_clip_has_no_spread_and_one_episode_no_interval() -> None:
     same.add(latents(1)[:3], ["only"] * 3)
     assert spread_of(same, same)[0].value == pytest.approx(1)
     assert not spread_of(same, same)[0].has_interval
-
-
-def test_latents_of_different_clips_are_refused() -> None:
-    one, other = summed(latents(1)), LatentSums()
-    other.add(latents(2)[:3], IDS[:3])
-    with pytest.raises(ValueError, match="different clips"):
-        distribution_of(one, other)

@@ -88,8 +88,3 @@ def test_figures_do_not_depend_on_the_batch_size() -> None:
     small, large = (prediction_errors(Oracle(), in_batches(clips_batch(), size)) for size in (1, 12))
     for kind in small.arrays:
         np.testing.assert_allclose(small.arrays[kind], large.arrays[kind], atol=1e-6)
-
-
-def test_no_clips_are_an_error() -> None:
-    with pytest.raises(ValueError, match="no clips"):
-        prediction_errors(Copier(), [])

@@ -147,9 +147,3 @@ def test_what_others_are_drawn_does_not_depend_on_the_moves_beside_it() -> None:
     pool = pool_of(begun, POSE_CHANGE, reach=REACH, samples=20, seed=3)
     whole, last = (rank_actions(Halfway(), some, pool, at_once=7) for some in (begun, begun[-2:]))
     assert np.array_equal(whole.ranks[-2:], last.ranks)
-
-
-def test_rankings_of_other_moves_are_not_compared() -> None:
-    one = ranked(Oracle(), line())
-    with pytest.raises(ValueError, match="different moves"):
-        rank_difference(one, replace(one, episode_ids=one.episode_ids[:-1]))

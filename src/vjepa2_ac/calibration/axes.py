@@ -48,6 +48,14 @@ MOST_CONDITION = 10.0  # beyond it, one direction is hardly inferred, or hardly 
 MOST_YAW_DEGREES = 15.0  # half the width of the interval of an angle that is known
 EPISODES_NEEDED = 2  # for an interval
 TRIED_DEGREES = tuple(range(-180, 180, 15))
+_ESTIMATES: dict[str, tuple[str, str, float | None]] = {  # of a fit: name, format, and value by chance
+    "yaw_degrees": ("yaw, degrees", ".0f", None),
+    "error": ("error at it / unturned", ".3f", 1.0),
+    "fitted_yaw_degrees": ("fitted yaw", ".0f", None),
+    "gain": ("gain", ".3f", 0.0),
+    "condition": ("condition", ".1f", None),
+    "residual_cm": ("off by, cm", ".1f", None),
+}
 
 
 @dataclass(frozen=True)
@@ -106,31 +114,19 @@ class AxisFit:
 
     def rows(self, model: str) -> list[Row]:
         """Return the numbers as rows of an evaluation."""
-        numbers = (
-            ("yaw, degrees", "yaw_degrees", ".0f", None),
-            ("error at it / unturned", "error", ".3f", 1.0),
-            ("fitted yaw", "fitted_yaw_degrees", ".0f", None),
-            ("gain", "gain", ".3f", 0.0),
-            ("condition", "condition", ".1f", None),
-            ("off by, cm", "residual_cm", ".1f", None),
-        )
         group, found = f"Axes of inferred moves ({self.pairs} pairs)", []
-        for name, field, form, chance in numbers:
+        for field, (name, form, chance) in _ESTIMATES.items():
             one: Estimate = getattr(self, field)
-            detail = field == "residual_cm"
-            found.append(
-                Row(group, name, f"axes.{field}", model, one.value, one.low, one.high, form, "", chance, detail=detail)
-            )
+            key, detail = f"axes.{field}", field == "residual_cm"
+            found.append(Row(group, name, key, model, one.value, one.low, one.high, form, "", chance, detail=detail))
         if self.problem is not None:
-            nothing = Row(group, "not to plan by", "axes.problem", model, math.nan, note=self.problem, detail=True)
-            found.append(nothing)
+            found.append(Row(group, "not to plan by", "axes.problem", model, math.nan, note=self.problem, detail=True))
         return found
 
     def as_dict(self) -> dict[str, Any]:
         """Return all numbers but the pairs as plain values, for JSON."""
-        estimates = ("yaw_degrees", "error", "fitted_yaw_degrees", "gain", "condition", "residual_cm")
         return {
-            **{name: getattr(self, name).as_dict() for name in estimates},
+            **{name: getattr(self, name).as_dict() for name in _ESTIMATES},
             "centre_m": list(self.centre_m),
             "matrix": self.matrix.tolist(),
             "pairs": self.pairs,
@@ -301,7 +297,7 @@ def infer_axes(
     names = [start.episode_id for start in starts]
     centre_m, errors = _turn_of_least_error(model, starts, at_once)
     axes = Axes(math.radians(yaw_of_least_error(errors, names).value), centre_m)
-    executed = np.stack([_numbers(start.action)[_MOVE] for start in starts])
+    executed = np.stack([start.true[_MOVE] for start in starts])
     reach = min(1.0, max(_LEAST_M, _ROOM * float(np.linalg.norm(executed, axis=1).max())))
     planner = Planner(
         _SEARCH.model_copy(update={"limits": LimitsConfig(xyz=(reach, reach, reach), gripper_mode="held")})
@@ -330,10 +326,9 @@ def _turn_of_least_error(
 
 def _inferred(model: Predictor, start: RolloutStart, planner: Planner, at_once: int) -> Float[np.ndarray, " 3"]:
     """Return the move (dx, dy, dz) that predicts the next frame best; the rest of the action is the true one."""
-    true = _numbers(start.action)
 
     def cost(actions: Float[Tensor, "samples 1 7"]) -> Float[Tensor, " samples"]:
-        tried = np.tile(true, (len(actions), 1))
+        tried = np.tile(start.true, (len(actions), 1))
         tried[:, _MOVE] = actions[:, 0, _MOVE].double().numpy()
         return torch.from_numpy(evaluate_actions(model, start, tried, at_once=at_once).energy)
 

@@ -228,7 +228,7 @@ def _calibrate_axes(options: argparse.Namespace, config: Config) -> int:
     from vjepa2_ac.calibration.axes import calibrate_axes
     from vjepa2_ac.console.data import axes_table
     from vjepa2_ac.console.progress import ConsoleReporter, console
-    from vjepa2_ac.reports.figures.axes import plot_axes
+    from vjepa2_ac.reports.figures.planning import plot_axes
 
     with ConsoleReporter() as reporter:
         pairs = options.limit or _PAIRS

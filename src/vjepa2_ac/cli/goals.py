@@ -73,7 +73,7 @@ def _goals(options: argparse.Namespace) -> int:
     from vjepa2_ac.console.goals import goals_notes, goals_table
     from vjepa2_ac.console.progress import ConsoleReporter, console
     from vjepa2_ac.demonstrations.make_goals import Energies, KeyFrameOptions, make_goals, recording_of_film
-    from vjepa2_ac.reports.figures.goals import GOALS_IMAGE, plot_goals
+    from vjepa2_ac.reports.figures.planning import GOALS_IMAGE, plot_goals
 
     still = None if options.still is None else recording_of_film(options.still)
     session = _session(options)

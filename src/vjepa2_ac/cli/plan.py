@@ -94,7 +94,7 @@ def _plan(options: argparse.Namespace) -> int:
     from vjepa2_ac.console.progress import ConsoleReporter, console
     from vjepa2_ac.decoding.imagined_plan import imagine_plan
     from vjepa2_ac.planning.decision import PLAN_FILE, PlanRequest, decide, summarize, write_plan
-    from vjepa2_ac.reports.figures.plan import PLAN_IMAGE, plot_plan
+    from vjepa2_ac.reports.figures.planning import PLAN_IMAGE, plot_plan
 
     say_places_elsewhere(options.subject)
     decoder = given_decoder(options)

@@ -117,7 +117,8 @@ def load_decoder(name: str | Path, *, where: str = "--decoder") -> TrainedDecode
     Raises:
         InputError: There is none, or it is incomplete or damaged.
     """
-    folder = _folder_of(str(name))
+    is_ours = str(name).startswith(BUILTIN)
+    folder = ASSETS / str(name).removeprefix(BUILTIN) / BUILTIN_DECODER if is_ours else Path(name)
     card = read_card(folder, where=where)
     linear_shape = DecoderShape("linear", card.shape.dim, card.shape.grid, card.shape.patch_size)
     decoder = _filled(card.shape, folder / WEIGHTS)
@@ -138,12 +139,6 @@ def read_card(folder: Path, *, where: str = "--decoder") -> DecoderCard:
         found = f"no {CARD} there ({error.strerror})"
         raise InputError(where=f"{where} {folder}", found=found, needed=_NEEDED, fix=fix) from None
     return record_of(DecoderCard, values, where=str(path), needed=_NEEDED, fix=_FIX)
-
-
-def _folder_of(name: str) -> Path:
-    if name.startswith(BUILTIN):
-        return ASSETS / name.removeprefix(BUILTIN) / BUILTIN_DECODER
-    return Path(name)
 
 
 def _filled(shape: DecoderShape, path: Path) -> Decoder:

@@ -85,12 +85,8 @@ def imagined_latents(
 
     A gripper changes as far as it can (`feasible_actions`), since a model has seen nothing else.
     """
-    if len(actions[0]) == len(start.state):
-        states = counterfactual_states(start.state, actions, start.space)[:-1]
-        actions = feasible_actions(start.state, actions, start.space)
-    else:
-        raise ValueError("states do not follow from these actions: give the recorded ones to `rolled_out`")
-    return rolled_out(model, start, actions, states)
+    states = counterfactual_states(start.state, actions, start.space)[:-1]
+    return rolled_out(model, start, feasible_actions(start.state, actions, start.space), states)
 
 
 @torch.no_grad()

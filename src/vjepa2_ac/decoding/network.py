@@ -15,6 +15,7 @@ from typing import Annotated, Literal
 import numpy as np
 import torch
 from einops import rearrange
+from einops.layers.torch import Rearrange
 from jaxtyping import Float, UInt8
 from pydantic import Field
 from torch import Generator, Tensor, nn
@@ -70,7 +71,8 @@ class Decoder(nn.Module):
         super().__init__()
         self.shape = shape
         self.linear = nn.Linear(shape.dim, 3 * shape.patch_size**2)
-        self.unfold = _Unfold(shape.grid, shape.patch_size)
+        patches = "n (rows columns) (c p q) -> n c (rows p) (columns q)"
+        self.unfold = Rearrange(patches, rows=shape.grid, c=3, p=shape.patch_size)
         self.further = None if shape.size == "linear" else _convolved(shape, _SIZES[shape.size])
 
     def initialise(self, generator: Generator) -> None:
@@ -135,7 +137,7 @@ def _convolved(shape: DecoderShape, widths: _Widths) -> nn.Sequential:
         _Positions(shape.grid, widths.width),
         *(_Block(widths.width, widths.heads) for _ in range(widths.blocks)),
         nn.LayerNorm(widths.width),
-        _AsImage(shape.grid),
+        Rearrange("n (rows columns) width -> n width rows columns", rows=shape.grid),
         nn.Conv2d(widths.width, 4 * first, 3, padding=1),
         nn.PixelShuffle(2),
         nn.GELU(),
@@ -181,30 +183,6 @@ class _Block(nn.Module):
         tokens = tokens + self.out(rearrange(attended, "n heads tokens d -> n tokens (heads d)"))
         added: Tensor = tokens + self.mlp(self.norm2(tokens))
         return added
-
-
-class _AsImage(nn.Module):
-    """Arranges tokens as a grid of channels."""
-
-    def __init__(self, grid: int) -> None:
-        super().__init__()
-        self.grid = grid
-
-    def forward(self, tokens: Float[Tensor, "frames tokens width"]) -> Float[Tensor, "frames width grid grid"]:
-        return rearrange(tokens, "n (rows columns) width -> n width rows columns", rows=self.grid)
-
-
-class _Unfold(nn.Module):
-    """Arranges the pixels of each token's patch as an image."""
-
-    def __init__(self, grid: int, patch_size: int) -> None:
-        super().__init__()
-        self.grid, self.patch_size = grid, patch_size
-
-    def forward(self, patches: Float[Tensor, "frames tokens pixels"]) -> Float[Tensor, "frames 3 size size"]:
-        return rearrange(
-            patches, "n (rows columns) (c p q) -> n c (rows p) (columns q)", rows=self.grid, c=3, p=self.patch_size
-        )
 
 
 def as_images(pixels: UInt8[Tensor, "*batch 3 size size"]) -> Float[Tensor, "*batch 3 size size"]:

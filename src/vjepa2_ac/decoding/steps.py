@@ -121,11 +121,7 @@ class DecoderSteps:
         return {"decoder": self.decoder.state_dict(), "average": self.average, "optimizer": self.optimizer.state_dict()}
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Continue from a checkpoint.
-
-        Raises:
-            KeyError, ValueError, RuntimeError, TypeError: It is of another decoder.
-        """
+        """Continue from a checkpoint of the same decoder."""
         self.decoder.load_state_dict(state["decoder"])
         self.average = {name: state["average"][name].to(self._device) for name in self.average}
         self.optimizer.load_state_dict(state["optimizer"])

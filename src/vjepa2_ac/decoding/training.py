@@ -255,7 +255,11 @@ def _encoded(ready: Setup, split: Split, reporter: Reporter, stop: StopRequest) 
 def _train(ready: Setup, steps: DecoderSteps, pairs: FramePairs, reporter: Reporter, stop: StopRequest) -> None:
     """Do the steps that are left after those that were saved."""
     config, saved = ready.config.decoder, ready.folder / STATE
-    first = _restore(steps, saved) if saved.is_file() else 0
+    first = 0
+    if saved.is_file():
+        state = read_torch(saved)
+        steps.restore(state)
+        first = int(state["step"])
     progress = reporter.task("training the decoder", "steps")
     with (
         MetricsLog(ready.folder, first_step=first) as log,
@@ -272,16 +276,6 @@ def _train(ready: Setup, steps: DecoderSteps, pairs: FramePairs, reporter: Repor
                     write_torch({"step": step, **steps.state()}, file)
             if stop.reason is not None and not is_last:
                 raise StoppedError(ready.folder, step, stop.reason)
-
-
-def _restore(steps: DecoderSteps, saved: Path) -> int:
-    """Continue from what was saved, and return how many steps were done."""
-    state = read_torch(saved)
-    try:
-        steps.restore(state)
-        return int(state["step"])
-    except (KeyError, ValueError, RuntimeError, TypeError) as error:
-        raise InputError(where=str(saved), found=f"not this decoder's ({error})", fix="Delete it") from None
 
 
 def _batches(pairs: FramePairs, config: Config, done: int) -> Generator[tuple[int, Pairs], None, None]:

@@ -18,7 +18,7 @@ from vjepa2_ac.config.planning import EnergyConfig, PlanningConfig
 from vjepa2_ac.episode import LatentBatch, Progress, no_progress
 from vjepa2_ac.evaluation.action_use import clip_generator
 from vjepa2_ac.evaluation.measure import Predictor
-from vjepa2_ac.evaluation.request import FRAMES, FRAMES_SEEN, SCORED, STEPS
+from vjepa2_ac.evaluation.request import FRAMES_SEEN, SCORED, STEPS
 from vjepa2_ac.evaluation.result import Evaluation, PlanningStudy, Plans
 from vjepa2_ac.intervals import Estimate, bootstrapped, mean_of, ratio
 from vjepa2_ac.planning.energy import distance
@@ -83,13 +83,7 @@ class WindowCost:
 
 
 def planning_start(batch: LatentBatch, row: int, clip: int, seed: int) -> PlanningStart:
-    """Return a frame of a clip with three steps after it; it is drawn from the seed and the clip's name.
-
-    Raises:
-        ValueError: The clip has fewer than four frames.
-    """
-    if batch.latents.shape[1] < FRAMES:
-        raise ValueError(f"{batch.latents.shape[1]} frames, and planning {STEPS} steps takes {FRAMES}")
+    """Return a frame of a clip with three steps after it; it is drawn from the seed and the clip's name."""
     generator = clip_generator(seed, batch.episode_ids[row], batch.starts[row])
     place = int(generator.integers(batch.latents.shape[1] - STEPS))
     one, scored, drawn = generator.integers(2**62, size=3).tolist()

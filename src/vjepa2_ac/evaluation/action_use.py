@@ -34,6 +34,11 @@ class RolloutStart:
     extrinsics: Float[Tensor, " 6"] | None
 
     @property
+    def true(self) -> Float[np.ndarray, " action_dim"]:
+        """The action, in float64."""
+        return np.asarray(self.action.cpu().numpy().astype(np.float64))
+
+    @property
     def persistence(self) -> float:
         """The L1 error of predicting that nothing changes."""
         return float(absolute_difference(self.frame, self.following).mean())
@@ -154,11 +159,6 @@ class ActionPool:
     samples: int  # drawn per start, from each of the two sources
     seed: int  # a start gets the same actions whatever else is measured
 
-    def drawn_for(self, start: RolloutStart) -> Float[np.ndarray, "others action_dim"]:
-        """Draw other actions for a start: those of other episodes, then those in the box."""
-        generator = start.generator(self.seed)
-        return np.concatenate([self.of_others(start, generator), self.in_box(start, generator)])
-
     def of_others(self, start: RolloutStart, generator: np.random.Generator) -> Float[np.ndarray, "samples action_dim"]:
         """Draw actions of other episodes, with replacement; of the same one if there is no other."""
         others = np.flatnonzero(np.array(self.episode_ids) != start.episode_id)
@@ -167,8 +167,7 @@ class ActionPool:
 
     def in_box(self, start: RolloutStart, generator: np.random.Generator) -> Float[np.ndarray, "samples action_dim"]:
         """Draw uniformly: for poses (dx, dy, dz) in the box, the rest being true; for vectors every number."""
-        true = start.action.cpu().numpy().astype(np.float64)
-        half = np.abs(self.actions).max(axis=0)
+        true, half = start.true, np.abs(self.actions).max(axis=0)
         drawn = generator.uniform(-1.0, 1.0, size=(self.samples, len(true)))
         if self.space.position is None:
             return np.asarray(drawn * half)
@@ -182,8 +181,8 @@ class ActionPool:
         A model that only knows whether the robot moves ranks the true action high in the box, and by chance here. Each
         number of a vector is measured in its largest size.
         """
-        true = start.action.cpu().numpy().astype(np.float64)
-        moved, unit = self.space.sized, np.ones(len(true))
+        true, moved = start.true, self.space.sized
+        unit = np.ones(len(true))
         if self.space.position is None:
             unit = np.abs(self.actions).max(axis=0)
         unit = unit[moved]
@@ -222,8 +221,9 @@ def measure_sensitivity(
     changes, persistence, samples = [], [], pool.samples
     ranks: dict[Literal["clips", "box"], list[tuple[float, float]]] = {"clips": [], "box": []}
     for done, start in enumerate(starts, start=1):
-        true = start.action.cpu().numpy().astype(np.float64)[None]
-        evaluated = evaluate_actions(model, start, np.concatenate([true, pool.drawn_for(start)]), at_once=at_once)
+        generator = start.generator(pool.seed)
+        drawn = pool.of_others(start, generator), pool.in_box(start, generator)
+        evaluated = evaluate_actions(model, start, np.concatenate([start.true[None], *drawn]), at_once=at_once)
         own, others, boxed = np.split(evaluated.energy, [1, 1 + samples])
         ranks["clips"].append(place_of(own[0], others))
         ranks["box"].append(place_of(own[0], boxed))
@@ -269,8 +269,9 @@ def _ranking(
 
 def pool_of(moves: Sequence[RolloutStart], space: ActionSpace, *, reach: float, samples: int, seed: int) -> ActionPool:
     """Return how other actions are drawn for moves: of vectors, the largest of each number bounds the box."""
-    actions = np.stack([move.action.cpu().numpy().astype(np.float64) for move in moves])
-    return ActionPool(actions, tuple(move.episode_id for move in moves), space, reach, samples, seed)
+    return ActionPool(
+        np.stack([move.true for move in moves]), tuple(move.episode_id for move in moves), space, reach, samples, seed
+    )
 
 
 def rank_actions(
@@ -288,8 +289,7 @@ def rank_actions(
     rows = []
     for done, move in enumerate(moves, start=1):
         generator = move.generator(pool.seed)
-        true = move.action.cpu().numpy().astype(np.float64)[None]
-        drawn = np.concatenate([true, pool.in_box(move, generator), pool.on_shell(move, generator)])
+        drawn = np.concatenate([move.true[None], pool.in_box(move, generator), pool.on_shell(move, generator)])
         own, box, shell = np.split(evaluate_actions(model, move, drawn, at_once=at_once).energy, [1, 1 + pool.samples])
         rows.append((_rank(own[0], box), _rank(own[0], shell), float(box.std()), move.persistence))
         progress(done, len(moves))
@@ -314,7 +314,6 @@ def _rank(true: float, others: np.ndarray) -> float:
 
 
 _ROOM = 1.25  # extent of the grid relative to the largest true action
-_SAME = 1e-6  # energies this close, as a share, are equally low
 _AXES = slice(0, 3)  # of the grid: of poses, the position
 
 
@@ -323,7 +322,7 @@ class LandscapeGrid:
     """A grid of actions over their first three numbers."""
 
     space: ActionSpace  # of the actions; positions are reported in cm
-    nodes: int  # along each axis
+    nodes: int  # along each axis, three or more
     reach: float  # it spans at least -reach .. reach (metres; of vectors: in its own numbers)
 
 
@@ -339,18 +338,13 @@ def measure_landscapes(
 
     Args:
         model: The predictor.
-        starts: One frame of each clip; one or more.
+        starts: One frame of each clip; one or more, with actions of three numbers or more.
         grid: The actions.
         at_once: Samples per batch.
         progress: Called with the number of finished starts.
-
-    Raises:
-        ValueError: No starts, fewer than three nodes, or actions of fewer than three numbers.
     """
     nodes, unit = grid.nodes, grid.space.shown_factor
-    if not starts or nodes < 3 or len(starts[0].action) < 3:
-        raise ValueError(f"{len(starts)} starts, {nodes} nodes")
-    trues = np.stack([start.action[_AXES].cpu().numpy().astype(np.float64) for start in starts])
+    trues = np.stack([start.true[_AXES] for start in starts])
     half = max(grid.reach, _ROOM * float(np.abs(trues).max())) or 1.0  # vectors that are all zero
     maps = []
     for done, (start, true) in enumerate(zip(starts, trues, strict=True), start=1):
@@ -377,7 +371,7 @@ def _landscape(
     model: Predictor, start: RolloutStart, axes: np.ndarray, true: np.ndarray, unit: float, at_once: int
 ) -> Landscape:
     nodes = axes.shape[1]
-    evaluated = np.tile(start.action.cpu().numpy().astype(np.float64), (nodes**3, 1))
+    evaluated = np.tile(start.true, (nodes**3, 1))
     evaluated[:, _AXES] = _places(axes)
     energy = evaluate_actions(model, start, evaluated, at_once=at_once).energy.reshape(nodes, nodes, nodes)
     minimum = evaluated[lowest(energy).ravel(), _AXES].mean(axis=0)

@@ -72,9 +72,6 @@ def measure_decoded(
         decoding: The decoder and what else is needed.
         examples: Clips whose images are returned, too.
         reporter: Shows the progress.
-
-    Raises:
-        ValueError: No clips.
     """
     progress = reporter.task("decoded rollouts")
     wanted = {(one.episode_id, one.start): one for one in examples}
@@ -91,8 +88,6 @@ def measure_decoded(
             if name in wanted:
                 strips[name] = images.strip(row, wanted[name], shown)
         progress(len(ids), clips.count)
-    if not ids:
-        raise ValueError("no clips to decode")
     return _result(values, ids, contenders, decoding, tuple(strips[name] for name in wanted if name in strips))
 
 
@@ -182,22 +177,18 @@ def _result(
     notes += [f"No SSIM: images of {side} pixels are too small for its window."] if side < LEAST_SSIM else []
     if decoding.lpips is not None and side < LEAST_LPIPS:
         notes.append(f"No LPIPS: images of {side} pixels; it needs {LEAST_LPIPS} a side.")
-    left_out: dict[str, str] = {}
+    measured, left_out = {source for source, _ in arrays}, dict[str, str]()
     for (source, metric), found in arrays.items():
         clips = int((~np.isfinite(found[:, -1])).sum())
         if clips and not (metric.endswith(DECODED_TRUTH) and source == DECODED_TRUTH):  # its own reference
             left_out[metric] = _LEFT_OUT.format(metric=metric, ahead="at the last horizon", clips=clips)
     return DecodedRollouts(
         decoder=_description(decoding.decoder),
-        sources=tuple(source for source in (*NEIGHBOURS, *(one.name for one in contenders)) if _is_in(source, arrays)),
+        sources=tuple(source for source in (*NEIGHBOURS, *(one.name for one in contenders)) if source in measured),
         curves={key: _means(found, ids) for key, found in arrays.items()},
         strips=strips,
         notes=(*notes, *left_out.values()),
     )
-
-
-def _is_in(source: str, arrays: Mapping[tuple[str, str], np.ndarray]) -> bool:
-    return any(key[0] == source for key in arrays)
 
 
 def _means(values: Float[np.ndarray, "clips horizon"], ids: Sequence[str]) -> tuple[Estimate, ...]:
@@ -215,7 +206,10 @@ def _description(trained: TrainedDecoder) -> dict[str, Any]:
 
 Backbone = Literal["alex", "vgg"]
 Features = list[Float[Tensor, "images channels rows columns"]]  # from fine to coarse
-_COMPARED: dict[Backbone, tuple[int, ...]] = {"alex": (1, 4, 7, 9, 11), "vgg": (3, 8, 15, 22, 29)}  # ReLUs
+_COMPARED: dict[Backbone, tuple[tuple[int, ...], tuple[int, ...]]] = {  # ReLUs, and how many channels they have
+    "alex": ((1, 4, 7, 9, 11), (64, 192, 384, 256, 256)),
+    "vgg": ((3, 8, 15, 22, 29), (64, 128, 256, 512, 512)),
+}
 
 
 class Lpips(nn.Module):
@@ -230,20 +224,14 @@ class Lpips(nn.Module):
 
     def __init__(self, backbone: Backbone) -> None:
         super().__init__()
-        self.backbone, self.compared = backbone, _COMPARED[backbone]
+        self.backbone, (self.compared, widths) = backbone, _COMPARED[backbone]
         self.features = _alexnet() if backbone == "alex" else _vgg16()
-        widths = [self._width_before(place) for place in self.compared]
         self.heads = nn.ParameterList([nn.Parameter(torch.zeros(width)) for width in widths])
         self.mean: Tensor
         self.deviation: Tensor
         self.register_buffer("mean", torch.tensor([-0.030, -0.088, -0.188])[:, None, None])  # of images in -1 .. 1
         self.register_buffer("deviation", torch.tensor([0.458, 0.448, 0.450])[:, None, None])
         self.requires_grad_(False).eval()
-
-    def _width_before(self, place: int) -> int:
-        layer = self.features[place - 1]
-        assert isinstance(layer, nn.Conv2d)  # noqa: S101  # for type checkers
-        return layer.out_channels
 
     def seen(self, images: Float[Tensor, "images 3 height width"]) -> Features:
         """Return the compared features of images in 0 .. 1: each place of length 1 over channels."""

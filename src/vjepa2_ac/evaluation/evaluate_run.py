@@ -207,7 +207,9 @@ def measure_subject(
     config, planning, folder = settle(subject, asked)
     if is_run(subject):
         select_checkpoint(Path(subject), asked.checkpoint)
-    _make_writable(folder)
+    with user_can_write(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        try_writing_at(folder)
     decoder = None if asked.decoder is None else load_decoder(asked.decoder)
     lpips = load_lpips(asked.lpips, asked.lpips_heads) if asked.lpips and asked.lpips_heads else None
     accelerator = make_accelerator(config)
@@ -224,8 +226,7 @@ def measure_subject(
         sample, progress = ClipSample(asked.split, asked.clips), reporter.task("calibrating strides")
         found["strides"] = beside.strides(world_model, dataset, config, accelerator, sample, progress)
     encode = partial(encode_batch, world_model, device=accelerator.device, chunk=config.model.encode_chunk)
-    read = partial(batches_of, batch_size=config.validation.batch_size)
-    clips = _clips(through_cache, chosen, read, encode, world_model.image_size)
+    clips = _clips(through_cache, chosen, config.validation.batch_size, encode, world_model.image_size)
     find_axes = beside.axes if dataset.spaces.state.is_base_pose else None
     with accelerator.autocast():
         evaluation = evaluate(
@@ -240,26 +241,15 @@ def measure_subject(
             lpips = None if lpips is None else lpips.to(accelerator.device)
             decoding = Decoding(decoder.to(accelerator.device), not through_cache.config.is_cache, lpips)
             decoded = measure_decoded(contenders, clips, decoding, evaluation.examples, reporter=reporter)
+    warned = warnings_of(Path(subject) / METRICS) if run else ()
     evaluation = replace(
         evaluation,
         decoded=decoded,
         training=training_curves(Path(subject)) if run else (),
         beside=found,
-        notes=(*loaded.notes, *(_warnings(Path(subject)) if run else ()), *evaluation.notes),
+        notes=(*loaded.notes, *(f"In training, {text}." for text in warned), *evaluation.notes),
     )
     return Measured(evaluation, run.chosen if run else "", folder)
-
-
-def _make_writable(folder: Path) -> None:
-    """Make the folder of the output, and write in it once, before anything takes long."""
-    with user_can_write(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        try_writing_at(folder)
-
-
-def _warnings(folder: Path) -> list[str]:
-    """Return the warnings of the training, as sentences."""
-    return [f"In training, {text}." for text in warnings_of(folder / METRICS)]
 
 
 def training_curves(folder: Path) -> tuple[TrainingCurve, ...]:
@@ -278,7 +268,7 @@ def training_curves(folder: Path) -> tuple[TrainingCurve, ...]:
 def _clips(
     dataset: Dataset,
     windows: Sequence[tuple[int, int]],
-    batches: Callable[[Dataset, Sequence[tuple[int, int]]], Iterable[Batch]],
+    batch_size: int,
     encode: Callable[[Batch], LatentBatch],
     image_size: int,
 ) -> RepeatableClips:
@@ -287,7 +277,7 @@ def _clips(
 
     def read(names: Sequence[ClipName] | None) -> Iterable[tuple[LatentBatch, FramesOfRow]]:
         wanted = windows if names is None else [by_name[name] for name in names]
-        for batch in batches(dataset, wanted):
+        for batch in batches_of(dataset, wanted, batch_size=batch_size):
             yield encode(batch), partial(_frames_of_row, dataset, batch, image_size)
 
     return RepeatableClips(len(windows), read)

@@ -83,15 +83,11 @@ def imagine_image(
     space = measured_space(config.data, len(seen.state))
     require_directions(space, where="--state")
     chosen = {name: actions_by_name(name, steps, size_m, config.planning.limits) for name in actions}
-    camera = None if seen.extrinsics is None else torch.as_tensor(seen.extrinsics, dtype=torch.float32)
-    start = Start(
-        latents=encode_frames(model, seen.image[None], config.data.crop)[0],
-        state=np.asarray(seen.state, dtype=np.float64),
-        space=space,
-        extrinsics=None if camera is None else camera.to(model.device),
-    )
-    first = frames_as_seen(view(seen.image[None], config.data.crop), model.image_size)[0]
-    decoded_first = shown(decoder.decoder, start.latents[None])[0]
+    camera = None if seen.extrinsics is None else torch.as_tensor(seen.extrinsics, dtype=torch.float32).to(model.device)
+    latents = encode_frames(model, seen.image[None], config.data.crop)[0]
+    start = Start(latents, np.asarray(seen.state, dtype=np.float64), space, camera)
+    first = _as_seen(config, model.image_size, seen.image[None])[0]
+    decoded_first = shown(decoder.decoder, latents[None])[0]
     return Imagination(
         subject=session.subject,
         episode_id="",
@@ -200,7 +196,8 @@ def imagine_clip(subject: str, asked: ImagineOptions, *, reporter: Reporter = SI
         latents = encode_batch(loaded.world_model, batch, device=accelerator.device, chunk=config.model.encode_chunk)
         rollouts = _rollouts(loaded.contenders, decoder, latents, chosen, dataset.spaces.state)
         decoded = shown(decoder.decoder, latents.latents[0])
-    frames = _seen(batch, size)
+    assert batch.frames is not None  # noqa: S101  # refused above: a cache
+    frames = frames_as_seen(batch.frames[0].numpy(), size)
     imagination = Imagination(
         subject=subject,
         episode_id=batch.episode_ids[0],
@@ -220,11 +217,13 @@ def with_outcomes(
     film: Film, outcomes: Callable[[Float[np.ndarray, "steps 7"]], UInt8[np.ndarray, "time h w 3"]]
 ) -> Film:
     """Return the film with what really happens under each sequence of actions, of those that were not recorded."""
-    found = []
-    for one in film.imagination.rollouts:
-        truth = film.imagination.truth if one.name == AS_RECORDED else film.outcome(outcomes(one.actions))[1:]
-        found.append(replace(one, truth=truth))
-    return replace(film, imagination=replace(film.imagination, rollouts=tuple(found)))
+    told = film.imagination
+
+    def truth(one: Imagined) -> UInt8[np.ndarray, "steps size size 3"] | None:
+        return told.truth if one.name == AS_RECORDED else film.outcome(outcomes(one.actions))[1:]
+
+    rollouts = tuple(replace(one, truth=truth(one)) for one in told.rollouts)
+    return replace(film, imagination=replace(told, rollouts=rollouts))
 
 
 def _rollouts(
@@ -299,13 +298,6 @@ def _motion(dataset: Dataset, episode: int, start: int) -> float:
     steps = range(start, start + dataset.config.clip_steps, dataset.config.model_stride)
     states = dataset.source.read(episode, None, dataset.needed_steps(episode)).states[list(steps)]
     return dataset.spaces.state.path_length(states)
-
-
-def _seen(batch: Batch, size: int) -> UInt8[np.ndarray, "time size size 3"]:
-    """Return the frames of the only clip of a batch as the encoder sees them."""
-    if batch.frames is None:
-        raise ValueError("a batch without frames")
-    return frames_as_seen(batch.frames[0].numpy(), size)
 
 
 def _as_seen(

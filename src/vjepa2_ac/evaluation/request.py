@@ -97,7 +97,14 @@ def settle(subject: str, asked: EvaluationOptions, *, frames: int | None = None)
             missing, or files of LPIPS are named without a decoder or incompletely.
     """
     require_one_process()
-    _check_metric_files(asked)
+    files = [asked.decoder, asked.lpips, asked.lpips_heads]
+    if any(files[1:]) and not all(files):
+        raise InputError(
+            where="--lpips, --lpips-heads",
+            found="one without the others",
+            needed="a backbone (--lpips), its heads (--lpips-heads) and a --decoder, whose images LPIPS compares",
+            fix="docs/decoding.md says where to get the files",
+        )
     config, folder = _config_of(subject, asked)
     if frames is not None:
         config = config.model_copy(update={"data": config.data.model_copy(update={"frames": frames})})
@@ -120,17 +127,6 @@ def require_one_process(environment: Mapping[str, str] = os.environ) -> None:
         )
 
 
-def _check_metric_files(asked: EvaluationOptions) -> None:
-    given = [asked.decoder, asked.lpips, asked.lpips_heads]
-    if any(given[1:]) and not all(given):
-        raise InputError(
-            where="--lpips, --lpips-heads",
-            found="one without the others",
-            needed="a backbone (--lpips), its heads (--lpips-heads) and a --decoder, whose images LPIPS compares",
-            fix="docs/decoding.md says where to get the files",
-        )
-
-
 def _config_of(subject: str, asked: EvaluationOptions) -> tuple[Config, Path]:
     """Return the config to measure with, and the output folder."""
     if is_run(subject):
@@ -139,7 +135,12 @@ def _config_of(subject: str, asked: EvaluationOptions) -> tuple[Config, Path]:
             return config, asked.out or Path(subject)
         config = config.model_copy(update={"data": asked.data.data})
     elif asked.data is None:
-        raise _nothing_to_measure(subject)
+        raise InputError(
+            where=subject,
+            found="no config.yaml: not the folder of a run" if Path(subject).exists() else "no such folder",
+            needed="the folder of a run, which `vjepa2-ac train CONFIG` makes",
+            fix="To measure a model, name the data with --data CONFIG and a folder with --out",
+        )
     else:
         config = asked.data
     if asked.out is None:
@@ -151,17 +152,6 @@ def _config_of(subject: str, asked: EvaluationOptions) -> tuple[Config, Path]:
         )
     require_stride(config.data, to="evaluate")
     return config, asked.out
-
-
-def _nothing_to_measure(subject: str) -> InputError:
-    path = Path(subject)
-    found = "no config.yaml: not the folder of a run" if path.exists() else "no such folder"
-    return InputError(
-        where=subject,
-        found=found,
-        needed="the folder of a run, which `vjepa2-ac train CONFIG` makes",
-        fix="To measure a model, name the data with --data CONFIG and a folder with --out",
-    )
 
 
 def _planning_of(subject: str, config: Config, asked: EvaluationOptions) -> PlanningConfig:

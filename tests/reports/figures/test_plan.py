@@ -11,7 +11,7 @@ from tiny_models import tiny_model
 from vjepa2_ac.decoding.decoder_folder import load_decoder
 from vjepa2_ac.decoding.imagined_plan import imagine_plan
 from vjepa2_ac.planning.decision import PlanResult
-from vjepa2_ac.reports.figures.plan import plot_plan
+from vjepa2_ac.reports.figures.planning import plot_plan
 
 
 def drawn(found: PlanResult, folder: Path) -> np.ndarray:

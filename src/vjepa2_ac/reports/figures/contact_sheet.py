@@ -10,21 +10,19 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
-from matplotlib.patches import Rectangle
+from matplotlib.patches import Patch, Rectangle
 
 from vjepa2_ac.data.coverage import ENOUGH_NEAR
 from vjepa2_ac.data.transforms import CropBox
-from vjepa2_ac.reports.figures.page import BLUE, GREEN, GREY, ORANGE, Page, written_page
+from vjepa2_ac.reports.figures.page import BLUE, GREEN, GREY, ORANGE, written_figure
 
-_INK, _FAINT, _SPEED, _GRIPPER, _IDLE = "#222222", GREY, BLUE, ORANGE, "#c9c9c9"
+_IDLE = "#c9c9c9"
 _OUTCOME = {True: ("success", GREEN), False: ("failure", "#c0392b"), None: ("", "#b5b5b5")}
 _STRIDES = ("#7fb3dd", BLUE, "#0b3558", "#7a4fa3", "#333333")
 
-# Inches.
-_WIDTH, _SIDE, _LABEL, _PICTURE, _PLOT, _AXIS, _BETWEEN = 16.0, 0.2, 1.75, 1.3, 0.5, 0.2, 0.14
-_TITLE, _LINE, _PANELS = 0.42, 0.2, 1.75
-_GAP = 0.06
-_LEAST, _MOST, _WELCOME = 4, 14, 1.15  # pictures in a row, and the height at which they are counted
+_WIDTH, _LABEL, _FILM, _ROW, _PANELS = 16.0, 1.8, 13.8, 2.1, 2.6  # inches
+_EDGE = 0.2 / _WIDTH  # of the sheet, left and right
+_LEAST, _MOST, _PICTURE = 4, 14, 1.15  # pictures in a row, and the height in inches at which they are counted
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,70 +62,65 @@ class ContactSheet:
 
 def pictures_per_row(height: int, width: int) -> int:
     """Return the number of frames of a size in a row of the sheet."""
-    across = _WIDTH - 2 * _SIDE - _LABEL
-    return int(min(max(across // (_WELCOME * width / height + _GAP), _LEAST), _MOST))
+    return int(min(max(_FILM // (_PICTURE * width / height + 0.06), _LEAST), _MOST))
 
 
 def plot_contact_sheet(sheet: ContactSheet, path: Path) -> Path:
     """Write the contact sheet of a data set as PNG; it is written atomically."""
     facts = [line for fact in sheet.facts for line in textwrap.wrap(fact, 205, subsequent_indent="    ")]
-    head = _TITLE + _LINE * len(facts) + 0.3 + _PANELS + 0.75
-    row = _PICTURE + _PLOT + _AXIS + _BETWEEN
-    height = head + row * len(sheet.strips) + 0.15
-    style = {"text.color": _INK, "font.size": 8, "axes.linewidth": 0.6}
-    with written_page(path, _WIDTH, height, dpi=100, style=style, facecolor="white") as page:
-        page.text(_SIDE, 0.16, sheet.title, size=13, weight="bold")
-        for number, line in enumerate(facts):
-            page.text(_SIDE, _TITLE + 0.06 + _LINE * number, line, size=9)
-        _panels(page, sheet, top=_TITLE + _LINE * len(facts) + 0.3)
-        _legend(page, sheet, top=head - 0.22)
+    heights = [0.7 + 0.18 * len(facts), _PANELS, *(_ROW for _ in sheet.strips)]
+    with written_figure(path, _WIDTH, sum(heights), layout="none", facecolor="white") as figure:
+        words, panels, *rows = figure.subfigures(len(heights), 1, height_ratios=heights)
+        words.text(_EDGE, 1 - 0.16 / heights[0], sheet.title, size=13, weight="bold", va="top")
+        words.text(_EDGE, 1 - 0.5 / heights[0], "\n".join(facts), size=9, va="top", linespacing=1.4)
+        _panels(panels, sheet)
         fastest = _fastest(sheet.strips)
-        for number, strip in enumerate(sheet.strips):
-            _strip(page, strip, sheet.control_rate_hz, fastest, top=head + row * number)
+        for part, strip in zip(rows, sheet.strips, strict=True):
+            _strip(part, strip, sheet.control_rate_hz, fastest)
     return path
 
 
-def _panels(page: Page, sheet: ContactSheet, top: float) -> None:
+def _panels(part: Any, sheet: ContactSheet) -> None:
     """Draw the small plots of the whole set: lengths, motion per model step, places and directions."""
-    lengths = page.axes(0.6, top, 2.4, _PANELS)
-    lengths.hist(sheet.lengths_s, bins=min(40, max(5, len(sheet.lengths_s) // 2)), color=_FAINT)
+    grid = part.add_gridspec(1, 4, left=0.035, right=0.975, bottom=0.3, top=0.92, width_ratios=(2.4, 4.6, 3.4, 3.0))
+    lengths = part.add_subplot(grid[0])
+    lengths.hist(sheet.lengths_s, bins=min(40, max(5, len(sheet.lengths_s) // 2)), color=GREY)
     lengths.set_title("Length of episodes (s)")
     lengths.locator_params(axis="y", nbins=4, integer=True)
-    _motion(page.axes(3.6, top, 4.6, _PANELS), sheet)
+    _motion(part.add_subplot(grid[1]), sheet)
     if sheet.places_m is not None:
-        _places(page, sheet.places_m, top)
+        _places(part, part.add_subplot(grid[2]), sheet.places_m)
     if sheet.directions is not None:
-        _directions(page, sheet.directions, top)
+        _directions(part, part.add_subplot(grid[3]), sheet.directions)
     if sheet.ranges is not None:
-        _ranges(page.axes(8.9, top, 6.7, _PANELS), sheet.ranges)
+        _ranges(part.add_subplot(grid[2:]), sheet.ranges)
+    part.legend(handles=_meanings(sheet), loc="lower right", ncols=4, fontsize=9, handlelength=1)
 
 
-def _places(page: Page, places_m: Float[np.ndarray, "points 3"], top: float) -> None:
-    places = page.axes(8.9, top, 3.2, _PANELS)
-    shown = places.scatter(-places_m[:, 1], places_m[:, 0], c=places_m[:, 2], s=2, cmap="viridis", linewidths=0)
-    places.set_aspect("equal", adjustable="datalim")
-    places.set(title="Where the flange was, from above (m; colour: height)")
-    places.set(xlabel="-y: to the robot's right", ylabel="x: forward")
-    places.locator_params(nbins=5)
-    page.figure.colorbar(shown, ax=places, fraction=0.04, pad=0.02)
+def _places(part: Any, axes: Any, places_m: Float[np.ndarray, "points 3"]) -> None:
+    shown = axes.scatter(-places_m[:, 1], places_m[:, 0], c=places_m[:, 2], s=2, cmap="viridis", linewidths=0)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set(title="Where the flange was, from above (m; colour: height)")
+    axes.set(xlabel="-y: to the robot's right", ylabel="x: forward")
+    axes.locator_params(nbins=5)
+    part.colorbar(shown, ax=axes, fraction=0.04, pad=0.02)
 
 
-def _directions(page: Page, directions: Float[np.ndarray, "rows columns"], top: float) -> None:
+def _directions(part: Any, axes: Any, directions: Float[np.ndarray, "rows columns"]) -> None:
     """Draw the sphere of directions, each of the same area, as a map: x forward in the middle, z up."""
-    axes = page.axes(12.75, top, 2.85, _PANELS)
     extent = (-180.0, 180.0, -1.0, 1.0)
     shown = axes.imshow(directions, extent=extent, origin="lower", aspect="auto", cmap="Blues", vmin=0, vmax=2)
     if directions.min() < ENOUGH_NEAR < directions.max():
-        axes.contour(directions, [ENOUGH_NEAR], extent=extent, origin="lower", colors=_GRIPPER, linewidths=1.2)
+        axes.contour(directions, [ENOUGH_NEAR], extent=extent, origin="lower", colors=ORANGE, linewidths=1.2)
     share = (directions >= ENOUGH_NEAR).mean()
     axes.set_title(f"Directions of steps: {share:.0%} are taught")
     axes.set_xticks([-180, -90, 0, 90, 180], ["-x", "-y", "+x", "+y", "-x"])
     axes.set_yticks([-1, 0, 1], ["-z", "", "+z"])
-    page.figure.colorbar(shown, ax=axes, fraction=0.04, pad=0.02, ticks=[0, ENOUGH_NEAR, 1, 2])
+    part.colorbar(shown, ax=axes, fraction=0.04, pad=0.02, ticks=[0, ENOUGH_NEAR, 1, 2])
 
 
 def _ranges(axes: Any, ranges: Float[np.ndarray, "state_dim 2"]) -> None:
-    axes.bar(np.arange(len(ranges)), ranges[:, 1] - ranges[:, 0], bottom=ranges[:, 0], color=_SPEED)
+    axes.bar(np.arange(len(ranges)), ranges[:, 1] - ranges[:, 0], bottom=ranges[:, 0], color=BLUE)
     axes.set(title="Range of each number of the state", xlabel="number, from 0")
     axes.locator_params(axis="x", integer=True)
 
@@ -145,24 +138,19 @@ def _motion(axes: Any, sheet: ContactSheet) -> None:
         label = f"stride {stride} ({stride / sheet.control_rate_hz:.2f} s): median {np.median(moved):.1f} {unit}"
         axes.plot(reached, share, color=colour, linewidth=1.5, label=label)
     if sheet.reference is not None:
-        axes.axvline(sheet.reference, color=_GRIPPER, linestyle="--", linewidth=1.2, label="upstream's example pair")
+        axes.axvline(sheet.reference, color=ORANGE, linestyle="--", linewidth=1.2, label="upstream's example pair")
     less = "move the flange less far than this (cm)" if has_poses else "change no number by more (% of its range)"
     axes.set(title=f"Share of model steps (%) that {less}", xlim=(0, far), ylim=(0, 102))
     axes.legend(frameon=True, framealpha=0.85, edgecolor="none", fontsize=8, loc="lower right")
 
 
-def _legend(page: Page, sheet: ContactSheet, top: float) -> None:
-    speed = "speed (cm/s)" if sheet.places_m is not None else "fastest number (% of its range per second)"
-    entries = [(speed, _SPEED)]
-    if sheet.places_m is not None:
-        entries.append(("gripper: 0 open, 1 closed", _GRIPPER))
-    if sheet.shaded_means:
-        entries.append((sheet.shaded_means, _FAINT))
-    left = _SIDE + _LABEL
-    for words, colour in entries:
-        page.text(left, top, f"■ {words}", color=colour, size=9)
-        left += 0.42 + 0.078 * len(words)
-    page.text(left, top, "bright part of a picture: what the model sees", color=_INK, size=9)
+def _meanings(sheet: ContactSheet) -> list[Patch]:
+    has_poses = sheet.places_m is not None
+    speed = "speed (cm/s)" if has_poses else "fastest number (% of its range per second)"
+    found = [Patch(color=BLUE, label=speed)]
+    found += [Patch(color=ORANGE, label="gripper: 0 open, 1 closed")] * has_poses
+    found += [Patch(color=_IDLE, label=sheet.shaded_means)] * bool(sheet.shaded_means)
+    return [*found, Patch(color="none", label="bright part of a picture: what the model sees")]
 
 
 def _fastest(strips: Sequence[Strip]) -> float:
@@ -170,26 +158,25 @@ def _fastest(strips: Sequence[Strip]) -> float:
     return max(float(np.percentile(speeds, 99.5)) * 1.15, 1.0)
 
 
-def _strip(page: Page, strip: Strip, control_rate_hz: float, fastest: float, top: float) -> None:
-    left, across = _SIDE + _LABEL, _WIDTH - 2 * _SIDE - _LABEL
-    words, colour = _OUTCOME[strip.success]
+def _strip(part: Any, strip: Strip, control_rate_hz: float, fastest: float) -> None:
+    outcome, colour = _OUTCOME[strip.success]
     steps = len(strip.speed)
-    mark = page.axes(_SIDE, top, 0.05, _PICTURE + _PLOT)
-    mark.set_axis_off()
-    mark.add_patch(Rectangle((0, 0), 1, 1, color=colour))
-    page.text(_SIDE + 0.14, top, _wrapped(strip.name), size=8)
-    page.text(_SIDE + 0.14, top + 0.84, words, color=colour, size=9, weight="bold")
-    page.text(_SIDE + 0.14, top + 1.02, f"{steps} steps, {steps / control_rate_hz:.1f} s", size=8, color=_FAINT)
-    slot = across / len(strip.frames)
-    height, width = strip.frames.shape[1:3]
-    shown_width = min(slot - _GAP, _PICTURE * width / height)
-    film = page.axes(left, top, across, _PICTURE)
-    film.set_axis_off()
-    for number, frame in enumerate(strip.frames):
-        start = (number + 0.5) * slot - shown_width / 2
-        _picture(film, frame, strip.seen, (start, start + shown_width, shown_width * height / width, 0.0))
-    film.set(xlim=(0, across), ylim=(_PICTURE, 0), aspect="auto")
-    _motion_of(page.axes(left, top + _PICTURE + 0.03, across, _PLOT), strip, control_rate_hz, fastest)
+    grid = part.add_gridspec(
+        2, 2, left=_EDGE, right=1 - _EDGE, bottom=0.15, top=0.97, wspace=0, hspace=0.04,
+        width_ratios=(_LABEL, _FILM), height_ratios=(1.3, 0.5),
+    )  # fmt: skip
+    label = part.add_subplot(grid[:, 0])
+    label.set_axis_off()
+    label.add_patch(Rectangle((0, 0), 0.03, 1, color=colour))
+    label.text(0.08, 1.0, _wrapped(strip.name), va="top")
+    label.text(0.08, 0.47, outcome, color=colour, size=9, weight="bold", va="top")
+    label.text(0.08, 0.37, f"{steps} steps, {steps / control_rate_hz:.1f} s", color=GREY, va="top")
+    film = grid[0, 1].subgridspec(1, len(strip.frames), wspace=0.03)
+    for place, frame in enumerate(strip.frames):
+        axes = part.add_subplot(film[place])
+        axes.set_axis_off()
+        axes.imshow(_paler(frame, strip.seen), interpolation="nearest" if len(frame) < 100 else "antialiased")
+    _motion_of(part.add_subplot(grid[1, 1]), strip, control_rate_hz, fastest)
 
 
 def _wrapped(name: str, across: int = 22, down: int = 5) -> str:
@@ -200,24 +187,23 @@ def _wrapped(name: str, across: int = 22, down: int = 5) -> str:
     return "\n".join(lines)
 
 
-def _picture(
-    axes: Any, frame: UInt8[np.ndarray, "height width 3"], seen: CropBox, extent: tuple[float, float, float, float]
-) -> None:
+def _paler(frame: UInt8[np.ndarray, "height width 3"], seen: CropBox) -> UInt8[np.ndarray, "height width 3"]:
+    """Return a frame that is pale where the model does not see it."""
     shown = (frame * 0.3 + 255 * 0.35).astype(np.uint8)
     part = np.s_[seen.top : seen.top + seen.height, seen.left : seen.left + seen.width]
     shown[part] = frame[part]
-    axes.imshow(shown, extent=extent, interpolation="nearest" if len(frame) < 100 else "bilinear")
+    return shown
 
 
 def _motion_of(axes: Any, strip: Strip, control_rate_hz: float, fastest: float) -> None:
     seconds = (np.arange(len(strip.speed)) + 0.5) / control_rate_hz
     for start, end in strip.shaded:
         axes.axvspan(start / control_rate_hz, end / control_rate_hz, color=_IDLE, alpha=0.6, linewidth=0)
-    axes.fill_between(seconds, strip.speed, color=_SPEED, alpha=0.25, linewidth=0)
-    axes.plot(seconds, strip.speed, color=_SPEED, linewidth=1)
+    axes.fill_between(seconds, strip.speed, color=BLUE, alpha=0.25, linewidth=0)
+    axes.plot(seconds, strip.speed, color=BLUE, linewidth=1)
     if strip.closedness is not None:
-        axes.plot(seconds, strip.closedness * fastest, color=_GRIPPER, linewidth=1.2)
+        axes.plot(seconds, strip.closedness * fastest, color=ORANGE, linewidth=1.2)
     axes.set(xlim=(0, len(strip.speed) / control_rate_hz), ylim=(0, fastest * 1.04))
     axes.locator_params(axis="x", nbins=14)
     axes.set_yticks([0, round(fastest / 1.15)])
-    axes.tick_params(labelsize=7, length=2, pad=1.5, colors=_FAINT)
+    axes.tick_params(labelsize=7, length=2, pad=1.5, colors=GREY)

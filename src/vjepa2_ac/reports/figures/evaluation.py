@@ -20,13 +20,12 @@ from vjepa2_ac.evaluation.result import ACTIONS, DecodedStrip, Evaluation, Examp
 from vjepa2_ac.evaluation.verdict import verdict
 from vjepa2_ac.reports.comparison import Comparison
 from vjepa2_ac.reports.figures.film import FilmStrip, Kind, StripRow, draw_strip
-from vjepa2_ac.reports.figures.page import BLUE, GREEN, GREY, ORANGE, RED, visible, written_page
+from vjepa2_ac.reports.figures.page import BLUE, GREEN, GREY, ORANGE, RED, headline, visible, written_figure
 
 _NOTHING = "persistence (doing nothing)"
 _COLOURS = {"base": ORANGE, "adapter": BLUE, "model": BLUE, "decoded truth": GREEN, "raw persistence": RED}
 _RUNS = (BLUE, ORANGE, GREEN, "#8f5bb0", RED, "#0b7f8a", "#8a6d0b", "#333333")
 _DASHES = ("-", "--", ":")  # after all colours
-_STYLE = {"font.size": 9}
 _OTHERS = ("#3a9155", "#8f5bb0", "#b0873a", "#4aa3a8")
 _MOST_POINTS = 300  # of a curve
 _MOST_CHARTS = 12  # of training
@@ -35,9 +34,9 @@ _DRAWN_FIRST = ("loss", "over_persistence", "learning_rate", "grad_norm")
 
 def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
     """Write the figure of an evaluation as PNG; it is written atomically."""
-    with written_page(path, 13.0, 6.2, dpi=110, style=_STYLE, layout="constrained") as page:
-        page.headline(verdict(evaluation))
-        halves = page.figure.subfigures(1, 2, width_ratios=[5, 6], wspace=0.02)
+    with written_figure(path, 13.0, 6.2, dpi=110, size=9) as figure:
+        headline(figure, verdict(evaluation))
+        halves = figure.subfigures(1, 2, width_ratios=[5, 6], wspace=0.02)
         upper, lower = halves[0].subplots(2, 1, height_ratios=[3, 2])
         draw_errors(upper, evaluation)
         draw_use_of_actions(lower, evaluation)
@@ -53,13 +52,13 @@ def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
 def plot_comparison(comparison: Comparison, path: Path) -> Path:
     """Write the curves of several runs as PNG; it is written atomically."""
     styles = itertools.cycle({"linestyle": dashes, "color": colour} for dashes in _DASHES for colour in _RUNS)
-    with written_page(path, 9.5, 4.5, dpi=110, style=_STYLE, layout="constrained") as page:
-        axes = page.figure.subplots()
+    with written_figure(path, 9.5, 4.5, dpi=110, size=9) as figure:
+        axes = figure.subplots()
         drawn = _curves(axes, comparison.seconds, zip(comparison.curves.values(), styles, strict=False))
         axes.set(title=f"{comparison.title} (band: 95 % over episodes)", ylabel="latent error / persistence")
         axes.set_ylim(0, None)
         names = [_NOTHING, *(textwrap.fill(visible(name), 34) for name in comparison.curves)]
-        page.figure.legend(drawn, names, loc="outside right upper")
+        figure.legend(drawn, names, loc="outside right upper")
     return path
 
 

@@ -6,17 +6,17 @@ Every image says what it is: recorded, what the simulator shows, decoded from th
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Literal
+from functools import lru_cache
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import UInt8
-from matplotlib.colors import to_rgb
+from matplotlib.patches import Patch
 
 from vjepa2_ac.data.windows import spread_with_ends
-from vjepa2_ac.media.image_file import resized
-from vjepa2_ac.reports.figures.caption import text_image
-from vjepa2_ac.reports.figures.page import BLUE, GREEN, GREY, ORANGE, RED
+from vjepa2_ac.reports.figures.page import BLUE, GREEN, GREY, ORANGE, RED, in_our_style, new_figure, pixels_of
 
 Kind = Literal["recorded", "simulated", "decoded", "imagined", "error", "latents"]
 
@@ -30,8 +30,8 @@ MEANING: dict[Kind, tuple[str, str]] = {
 }
 """Colour and meaning of each kind."""
 
-_BORDER, _GAP = 4, 6  # pixels
-_LABEL, _HEAD, _FOOT = 190, 34, 26
+_DOTS = 100  # per inch
+_LABEL, _HEAD, _GAP, _LINE, _LEGEND = 170, 90, 14, 17, 270  # pixels
 _MOST_COLUMNS = 9
 _HOLD = 3  # how many times as long the first and the last frame of a video are shown
 
@@ -48,21 +48,11 @@ class StripRow:
 
 @dataclass(frozen=True, eq=False)
 class FilmStrip:
-    """Rows of equal length.
-
-    Raises:
-        ValueError: No rows, no frames, or of different lengths.
-    """
+    """Rows of equal length."""
 
     title: str
     rows: tuple[StripRow, ...]
     seconds: tuple[float, ...]  # of each frame since the start
-
-    def __post_init__(self) -> None:
-        lengths = {len(row.frames) for row in self.rows}
-        wrong = any(len(row.captions) not in {0, len(self.seconds)} for row in self.rows)
-        if not self.seconds or lengths != {len(self.seconds)} or wrong:
-            raise ValueError(f"rows of {sorted(lengths)} frames, at {len(self.seconds)} times")
 
 
 def draw_strip(film: FilmStrip, *, side: int = 128) -> UInt8[np.ndarray, "height width 3"]:
@@ -70,22 +60,21 @@ def draw_strip(film: FilmStrip, *, side: int = 128) -> UInt8[np.ndarray, "height
 
     Args:
         film: What is shown.
-        side: Height and width of an image, in pixels.
+        side: Height and width of an image, in pixels, about.
     """
     places = spread_with_ends(len(film.seconds), _MOST_COLUMNS)
-    width = _LABEL + len(places) * (side + 2 * _BORDER + _GAP)
-    heads = [f"{film.seconds[place]:.2f} s" if place else "start, given" for place in places]
-    lines = [_line(text_image(film.title, width, height=_HEAD, points=10.5, bold=True), width)]
-    lines.append(_beside([_blank(_HEAD // 2, _LABEL), *(_head(text, side) for text in heads)]))
-    for row in film.rows:
-        label = text_image(row.label, _LABEL, height=side + 2 * _BORDER, points=8.5, colour=MEANING[row.kind][0])
-        panels = [_framed(resized(row.frames[place], side), _colour(row, place)) for place in places]
-        lines.append(_beside([label, *panels]))
-        if row.captions:
-            captions = [_head(row.captions[place], side) for place in places]
-            lines.append(_beside([_blank(_HEAD // 2, _LABEL), *captions]))
-    lines.append(_legend({row.kind for row in film.rows}, width))
-    return np.concatenate([_line(line, width) for line in lines])
+    captioned = sum(bool(row.captions) for row in film.rows)
+    size = _LABEL + len(places) * (side + _GAP), _HEAD + len(film.rows) * (side + _GAP) + _LINE * captioned
+    with _figure(film, size, title=film.title) as figure:
+        grid = figure.subplots(len(film.rows), len(places), squeeze=False)
+        for row, beside in zip(film.rows, grid, strict=True):
+            for place, axes in zip(places, beside, strict=True):
+                _show(axes, row, place)
+            beside[0].set_ylabel(row.label, color=MEANING[row.kind][0], rotation=0, ha="right", va="center")
+        for place, axes in zip(places, grid[0], strict=True):
+            text = f"{film.seconds[place]:.2f} s" if place else "start, given"
+            axes.set_title(text, fontsize=7, color=GREY, loc="left")
+        return pixels_of(figure)
 
 
 def film_frames(film: FilmStrip, *, side: int = 192, across: int = 4) -> Iterator[UInt8[np.ndarray, "_ _ 3"]]:
@@ -93,27 +82,22 @@ def film_frames(film: FilmStrip, *, side: int = 192, across: int = 4) -> Iterato
 
     Args:
         film: What is shown.
-        side: Height and width of an image, in pixels.
+        side: Height and width of an image, in pixels, about.
         across: Rows beside each other.
     """
     across = min(across, len(film.rows))
-    width = across * (side + 2 * _BORDER + _GAP)
+    down = -(-len(film.rows) // across)
     for place, seconds in enumerate(film.seconds):
         when = f"{seconds:.2f} s" if place else "start: all that is given"
-        lines = [text_image(f"{film.title}\n{when}", width, height=48, points=9.5, bold=True)]
-        for first in range(0, len(film.rows), across):
-            some = film.rows[first : first + across]
-            panels = []
-            for row in some:
-                outer = side + 2 * _BORDER
-                label = text_image(row.label, outer, height=40, points=8.0, colour=MEANING[row.kind][0])
-                below = [_head(row.captions[place], side)[:, :outer]] if row.captions else []
-                panel = _framed(resized(row.frames[place], side), _colour(row, place))
-                panels.append(np.concatenate([label, panel, *below]))
-            tallest = max(len(panel) for panel in panels)
-            lines.append(_beside([_padded(panel, tallest) for panel in panels]))
-        lines.append(_legend({row.kind for row in film.rows}, width))
-        yield np.concatenate([_line(line, width) for line in lines])
+        size = across * (side + _GAP), _HEAD + down * (side + 4 * _LINE)
+        with _figure(film, size, title=f"{film.title}\n{when}") as figure:
+            grid = figure.subplots(down, across, squeeze=False).flat
+            for row, axes in zip(film.rows, grid, strict=False):
+                _show(axes, row, place)
+                axes.set_title(row.label, fontsize=8, color=MEANING[row.kind][0])
+            for axes in grid:
+                axes.set_axis_off()
+            yield pixels_of(figure)
 
 
 def durations(film: FilmStrip, *, slower: float = 1.0) -> list[float]:
@@ -132,58 +116,60 @@ def held(frames: Sequence[np.ndarray], seconds: Sequence[float], rate_hz: float)
             yield frame
 
 
-def _colour(row: StripRow, place: int) -> str:
-    kind: Kind = "decoded" if row.kind == "imagined" and place == 0 else row.kind
-    return MEANING[kind][0]
+@contextmanager
+def _figure(film: FilmStrip, size: tuple[int, int], *, title: str) -> Iterator[Any]:
+    """Yield a figure of a width and a height in pixels, with a title, and below it what the colours mean."""
+    kinds = {row.kind for row in film.rows}
+    shown = [kind for kind in MEANING if kind in kinds or (kind == "decoded" and "imagined" in kinds)]
+    with in_our_style({"font.size": 8.5}):
+        figure = new_figure(*(pixels / _DOTS for pixels in size), dpi=_DOTS, layout="compressed", facecolor="white")
+        figure.suptitle(title, fontsize=10, weight="bold", x=0.01, ha="left")
+        patches = [Patch(color=MEANING[kind][0], label=MEANING[kind][1]) for kind in shown]
+        columns = max(1, size[0] // _LEGEND)
+        figure.legend(handles=patches, loc="outside lower left", ncols=columns, fontsize=8, handlelength=1)
+        yield figure
 
 
-def _framed(image: np.ndarray, colour: str) -> np.ndarray:
-    side = len(image) + 2 * _BORDER
-    framed = np.empty((side, side, 3), np.uint8)
-    framed[:] = [round(255 * part) for part in to_rgb(colour)]
-    framed[_BORDER:-_BORDER, _BORDER:-_BORDER] = image
-    return framed
+def show_framed(axes: Any, image: UInt8[np.ndarray, "height width 3"], kind: Kind) -> None:
+    """Show an image in a frame of the colour of its kind."""
+    axes.imshow(image)
+    axes.set(xticks=[], yticks=[])
+    axes.spines[:].set(visible=True, color=MEANING[kind][0], linewidth=3)
 
 
-def _head(text: str, side: int) -> np.ndarray:
-    return text_image(text, side + 2 * _BORDER, height=_HEAD // 2, points=7.0, colour=GREY)
+def _show(axes: Any, row: StripRow, place: int) -> None:
+    show_framed(axes, row.frames[place], "decoded" if row.kind == "imagined" and place == 0 else row.kind)
+    if row.captions:
+        axes.set_xlabel(row.captions[place] or " ", fontsize=7, color=GREY)
 
 
-def _beside(parts: Sequence[np.ndarray]) -> np.ndarray:
-    gap = _blank(len(parts[0]), _GAP)
-    return np.concatenate([one for part in parts for one in (part, gap)][:-1], axis=1)
+_CAPTION = 30  # pixels
+_BETWEEN = 6
 
 
-def _padded(panel: np.ndarray, height: int) -> np.ndarray:
-    return np.concatenate([panel, _blank(height - len(panel), panel.shape[1])])
+def side_by_side(
+    pictures: Sequence[UInt8[np.ndarray, "height width 3"]], captions: Sequence[str], title: str, *, enlarged: int = 2
+) -> UInt8[np.ndarray, "_ _ 3"]:
+    """Return images of one size in a row, a caption above each, a title above all.
+
+    Args:
+        pictures: The images.
+        captions: One for each.
+        title: A line, at most as long as all images are wide.
+        enlarged: Pixels per pixel, along both axes.
+    """
+    large = [picture.repeat(enlarged, axis=0).repeat(enlarged, axis=1) for picture in pictures]
+    columns = [
+        np.concatenate([_text_image(text, one.shape[1]), one]) for text, one in zip(captions, large, strict=True)
+    ]
+    gap = np.full((columns[0].shape[0], _BETWEEN, 3), 255, dtype=np.uint8)
+    row = np.concatenate([part for column in columns for part in (column, gap)][:-1], axis=1)
+    return np.concatenate([_text_image(title, row.shape[1], points=11.0), row])
 
 
-def _line(line: np.ndarray, width: int) -> np.ndarray:
-    """Return a line filled up with white, and a gap below it."""
-    return np.concatenate([_padded_across(line, width), _blank(_GAP, width)])
-
-
-def _legend(kinds: set[Kind], width: int) -> np.ndarray:
-    """Return what the colours mean, as many beside each other as fit."""
-    entries = []
-    for kind, (colour, meaning) in MEANING.items():
-        if kind in kinds or (kind == "decoded" and "imagined" in kinds):
-            swatch = _blank(_FOOT, 18)
-            swatch[8:-8, 4:-4] = [round(255 * part) for part in to_rgb(colour)]
-            words = text_image(meaning, 22 + round(6.2 * len(meaning)), height=_FOOT, points=8.0)
-            entries.append(np.concatenate([swatch, words], axis=1))
-    lines: list[np.ndarray] = []
-    for entry in entries:
-        if lines and lines[-1].shape[1] + entry.shape[1] <= width:
-            lines[-1] = np.concatenate([lines[-1], entry], axis=1)
-        else:
-            lines.append(entry)
-    return np.concatenate([_padded_across(line, width) for line in lines])
-
-
-def _padded_across(line: np.ndarray, width: int) -> np.ndarray:
-    return np.concatenate([line[:, :width], _blank(len(line), max(0, width - line.shape[1]))], axis=1)
-
-
-def _blank(height: int, width: int) -> np.ndarray:
-    return np.full((height, width, 3), 255, np.uint8)
+@lru_cache(maxsize=512)
+def _text_image(text: str, width: int, *, points: float = 9.0) -> UInt8[np.ndarray, "_ width 3"]:
+    """Return a line of text on white; read only, since it is drawn once."""
+    figure = new_figure(width / _DOTS, _CAPTION / _DOTS, dpi=_DOTS, facecolor="white")
+    figure.text(8 / width, 0.5, text, fontsize=points, va="center", ha="left", parse_math=False)
+    return pixels_of(figure)

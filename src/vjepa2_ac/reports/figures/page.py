@@ -1,4 +1,4 @@
-"""Figures as PNG files in one style, and their layout: positions in inches from the top left."""
+"""Figures in one style: as PNG files, as pixels, and as SVG for a page."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ import re
 import textwrap
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+import numpy as np
+from jaxtyping import UInt8
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -33,49 +34,41 @@ _STYLE = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Page:
-    """A matplotlib figure with a size in inches."""
-
-    figure: Any
-    width: float
-    height: float
-
-    def axes(self, left: float, top: float, width: float, height: float) -> Any:
-        """Return axes at this position."""
-        return self.figure.add_axes(
-            (left / self.width, 1 - (top + height) / self.height, width / self.width, height / self.height)
-        )
-
-    def text(self, left: float, top: float, words: str, **style: Any) -> None:
-        """Write text with its top left corner at this position."""
-        style = {"va": "top", "ha": "left", **style}
-        self.figure.text(left / self.width, 1 - top / self.height, words, **style)
-
-    def headline(self, words: str) -> None:
-        """Write lines of text above a page of 13 inches, whose layout makes room for them."""
-        self.figure.suptitle(textwrap.fill(words, 150), fontsize=10.5, x=0.01, ha="left")
+def headline(figure: Any, words: str, *, across: int = 150) -> None:
+    """Write lines of text above a figure, whose layout makes room for them."""
+    figure.suptitle(textwrap.fill(words, across), fontsize=10.5, x=0.01, ha="left")
 
 
 @contextmanager
-def written_page(
-    path: Path, width: float, height: float, *, dpi: int, style: dict[str, Any], **options: Any
-) -> Iterator[Page]:
-    """Yield a page of so many inches to draw on, which is then written as PNG, atomically.
+def written_figure(
+    path: Path, width: float, height: float, *, dpi: int = 100, size: float = 8, **options: Any
+) -> Iterator[Any]:
+    """Yield a figure of so many inches to draw on, which is then written as PNG, atomically.
 
     Args:
         path: The file.
         width: In inches.
         height: Likewise.
         dpi: Pixels per inch.
-        style: Settings of matplotlib beside those of all our figures.
+        size: Of the letters, in points.
         options: Of the figure.
     """
-    with mpl.rc_context(_STYLE | style):
-        page = Page(new_figure(width, height, **options), width, height)
-        yield page
+    with in_our_style({"font.size": size}):
+        figure = new_figure(width, height, **{"layout": "constrained", **options})
+        yield figure
         with atomic_writer(path) as file:
-            page.figure.savefig(file, format="png", dpi=dpi)
+            figure.savefig(file, format="png", dpi=dpi)
+
+
+def in_our_style(changes: dict[str, Any]) -> AbstractContextManager[None]:
+    """Return a context in which matplotlib draws in the style of all our figures, but for some changes."""
+    return mpl.rc_context(_STYLE | changes)
+
+
+def pixels_of(figure: Any) -> UInt8[np.ndarray, "height width 3"]:
+    """Draw a figure, and return its pixels."""
+    figure.canvas.draw()
+    return np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()
 
 
 def new_figure(width: float, height: float, **options: Any) -> Figure:
@@ -89,7 +82,7 @@ def svg_of(draw: Callable[[Any], None], width: float, height: float) -> str:
     """Return a figure of so many inches as SVG in a data: URL, in which nothing can run; always the same bytes."""
     style = {"font.size": 9, "legend.fontsize": 8, "svg.fonttype": "none", "svg.hashsalt": "vjepa2-ac"}
     text = io.StringIO()
-    with mpl.rc_context(_STYLE | style), warnings.catch_warnings():
+    with in_our_style(style), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing", category=UserWarning)  # a reader's fonts have it
         figure = new_figure(width, height, layout="constrained")
         draw(figure)

@@ -18,7 +18,7 @@ from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.media.video_writer import video_library, write_video
 from vjepa2_ac.planning.goal_folder import read_goal_folder
 from vjepa2_ac.reporter import SILENT, Reporter
-from vjepa2_ac.reports.figures.caption import side_by_side
+from vjepa2_ac.reports.figures.film import side_by_side
 from vjepa2_ac.simulation.closed_loop.policies import DoNothing, GoalsOf, Policy, RandomActions, oracle_for
 from vjepa2_ac.simulation.closed_loop.rollout import ClosedLoopResult, EpisodeResult, RolloutSpec, run_task
 from vjepa2_ac.simulation.closed_loop.steering import Steering

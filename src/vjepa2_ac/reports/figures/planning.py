@@ -1,27 +1,33 @@
-"""The figure of a plan: the observed image, the search, and the energy of other actions."""
+"""Figures of planning: a plan, the goals of a demonstration, and the axes of a model."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
 import numpy as np
+from jaxtyping import Float
 from matplotlib.patches import Rectangle
 
 from vjepa2_ac.data.transforms import crop_box
-from vjepa2_ac.decoding.imagined_plan import ImaginedPlan
 from vjepa2_ac.planning.decision import PlanResult, summarize
-from vjepa2_ac.planning.energy import EnergySlice
-from vjepa2_ac.planning.interfaces import Plan
-from vjepa2_ac.reports.figures.film import MEANING, Kind
-from vjepa2_ac.reports.figures.page import BLUE, GREY, RED, written_page
+from vjepa2_ac.reports.figures.film import MEANING, Kind, show_framed
+from vjepa2_ac.reports.figures.page import BLUE, GREY, ORANGE, RED, headline, written_figure
+from vjepa2_ac.spaces import POSE
 
-PLAN_IMAGE = "plan.png"
+if TYPE_CHECKING:  # of other rooms, which the figure of one need not load
+    from vjepa2_ac.calibration.axes import AxisFit
+    from vjepa2_ac.decoding.imagined_plan import ImaginedPlan
+    from vjepa2_ac.demonstrations.make_goals import EnergyCourse, MadeGoals
+    from vjepa2_ac.planning.energy import EnergySlice
+    from vjepa2_ac.planning.goals import SubGoal
+    from vjepa2_ac.planning.interfaces import Plan
 
-_STYLE = {"font.size": 9, "legend.fontsize": 7.5}
+PLAN_IMAGE, GOALS_IMAGE = "plan.png", "goals.png"
+
 _FRAME = "#e8b10c"
 _ROW, _ROW_OF_IMAGINED = 3.4, 2.3  # inches
 _MOST_NUMBERS = 8  # of a vector
@@ -46,9 +52,9 @@ def plot_plan(answer: PlanResult, path: Path, imagined: ImaginedPlan | None = No
         if answer.slices:
             rows.append((_ROW, partial(_slices, answer=answer)))
     heights = [height for height, _ in rows]
-    with written_page(path, 13.0, 0.9 + sum(heights), dpi=100, style=_STYLE, layout="constrained") as page:
-        page.headline(summarize(answer))
-        parts = page.figure.subfigures(len(rows), 1, squeeze=False, height_ratios=heights)[:, 0]
+    with written_figure(path, 13.0, 0.9 + sum(heights), size=9) as figure:
+        headline(figure, summarize(answer))
+        parts = figure.subfigures(len(rows), 1, squeeze=False, height_ratios=heights)[:, 0]
         for part, (_, draw) in zip(parts, rows, strict=True):
             draw(part)
     return path
@@ -81,12 +87,8 @@ def _imagined(part: Any, answer: PlanResult, imagined: ImaginedPlan) -> None:
         panels.append((name, "imagined", image))
     panels += [("goal, decoded", "decoded", imagined.decoded_goal), ("goal", "recorded", imagined.goal)]
     for axes, (title, kind, image) in zip(part.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
-        colour = MEANING[kind][0]
-        axes.imshow(image)
-        axes.set(xticks=[], yticks=[])
-        for spine in axes.spines.values():
-            spine.set(visible=True, color=colour, linewidth=3)
-        axes.set_title(title, color=colour, fontsize=8)
+        show_framed(axes, image, kind)
+        axes.set_title(title, color=MEANING[kind][0], fontsize=8)
     note = "Imagined from the start and the plan's actions alone: what the model predicts, no evidence that it happens."
     part.supxlabel(note, fontsize=8, color=GREY, x=0.01, ha="left")
 
@@ -145,7 +147,7 @@ def _energies(axes: Any, answer: PlanResult, plan: Plan) -> None:
         room = max(0.15 * float(np.ptp(seen)), 1e-4)
         axes.set_ylim(seen.min() - room, seen.max() + 3 * room)
     axes.set(title="Energy", xlabel="iteration", ylabel=f"energy ({answer.controller.config.energy.distance})")
-    axes.legend(loc="upper right")
+    axes.legend(loc="upper right", fontsize=7.5)
 
 
 def _path(axes: Any, answer: PlanResult) -> None:
@@ -162,7 +164,7 @@ def _path(axes: Any, answer: PlanResult) -> None:
         reach = 1.2 * max(float(np.abs(way[:, space.position]).max()), 1.0)
         axes.set(xlabel="x from here (cm)", xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
         axes.set_title("Planned path of the flange,\nrobot base frame")
-    axes.legend()
+    axes.legend(fontsize=7.5)
 
 
 def _slices(part: Any, answer: PlanResult) -> None:
@@ -192,3 +194,103 @@ def _slice(axes: Any, one: EnergySlice, answer: PlanResult, lowest: float, highe
 def _limits(axes: Any, across: float, up: float) -> None:
     axes.add_patch(Rectangle((-across, -up), 2 * across, 2 * up, fill=False, color=GREY, linewidth=1))
     axes.margins(0.08)
+
+
+_ACROSS = 6  # images in a row
+_NAME = 70  # characters of a recording's name, its end
+
+
+def plot_goals(made: MadeGoals, path: Path) -> Path:
+    """Write the contact sheet of goals as PNG; it is written atomically."""
+    images = [made.first, *(goal.image for goal in made.goals)]
+    rows = -(-len(images) // _ACROSS)
+    drawn: list[tuple[Callable[..., None], Any]] = [(_gripper, made.recording.states), (_energy, made.course)]
+    plots = [(draw, given) for draw, given in drawn if given is not None]
+    heights = [2.8 * rows, *(1.8 for _ in plots)]
+    with written_figure(path, 13.0, 0.5 + sum(heights)) as figure:
+        headline(figure, _title(made))
+        sheet, *parts = figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
+        for place, axes in enumerate(sheet.subplots(rows, _ACROSS, squeeze=False).flat):
+            axes.set_axis_off()
+            if place < len(images):
+                axes.imshow(images[place])
+                axes.set_title(_caption(made, place), fontsize=8)
+        for part, (draw, given) in zip(parts, plots, strict=True):
+            axes = part.subplots()
+            draw(axes, made, given)
+            for key in made.keys:
+                axes.axvline(key.frame, color=GREY, linewidth=0.8, linestyle=":")
+            axes.set_xlim(0, made.recording.frames - 1)
+            axes.locator_params(axis="x", integer=True)
+    return path
+
+
+def _title(made: MadeGoals) -> str:
+    how = f"every {made.options.every} frames" if made.options.by == "every" else f"by {made.options.by}"
+    count = f"{len(made.goals)} goal{'s' * (len(made.goals) > 1)}"
+    name = made.recording.name if len(made.recording.name) <= _NAME else f"…{made.recording.name[-_NAME:]}"
+    return f"{count}, {how}; {made.options.stride} frames are a model step. Of {name}"
+
+
+def _caption(made: MadeGoals, place: int) -> str:
+    if not place:
+        return "the start, frame 0"
+    goal, key = made.goals[place - 1], made.keys[place - 1]
+    lines = [f"goal {place}: {goal.name}" if goal.name else f"goal {place}", f"frame {key.frame}, {_bounds(goal)}"]
+    lines.append(f"gripper {goal.gripper or 'as planning.limits say'}")
+    if made.course is not None:
+        lines.append(f"energy {made.course.began[place - 1]:.3g} at its beginning")
+    return "\n".join(lines)
+
+
+def _bounds(goal: SubGoal) -> str:
+    if goal.at_most is None:
+        return f"{goal.at_least} model steps or more"
+    return f"{goal.at_least} to {goal.at_most} model steps"
+
+
+def _gripper(axes: Any, _: MadeGoals, states: Float[np.ndarray, "frames 7"]) -> None:
+    axes.plot(states[:, POSE.gripper], color=ORANGE, linewidth=1.3)
+    axes.set(title="Gripper: 0 open, 1 closed", ylim=(-0.05, 1.05))
+
+
+def _energy(axes: Any, made: MadeGoals, course: EnergyCourse) -> None:
+    axes.plot(course.frames, course.energy, color=BLUE, linewidth=1.3, label="energy to the goal that applies")
+    begins = [0, *(key.frame for key in made.keys)]
+    for begin, end, goal, began in zip(begins, begins[1:], made.goals, course.began, strict=False):
+        if goal.share is not None:
+            label = "its threshold" if goal is made.goals[0] else None
+            axes.plot([begin, end], [goal.share * began] * 2, color=ORANGE, linewidth=1.1, label=label)
+    if made.noise is not None:
+        axes.axhline(made.noise.energy, color=RED, linewidth=1.0, linestyle="--", label="noise of a resting arm")
+    axes.set(title="Energy along the demonstration", xlabel="frame", ylim=(0, None))
+    axes.legend(fontsize=7, loc="upper right", ncols=3)
+
+
+_EXECUTED, _INFERRED, _FITTED = "#8a8a8a", "#1f6fb4", "#d1762a"
+
+
+def plot_axes(fit: AxisFit, path: Path) -> Path:
+    """Write moves in the horizontal plane, and the robot's x and y as the model takes them, as PNG, atomically."""
+    with written_figure(path, 9.0, 4.6, dpi=110, size=9) as figure:
+        found = {
+            "yaw": fit.yaw_degrees,
+            "fitted yaw": fit.fitted_yaw_degrees,
+            "gain": fit.gain,
+            "condition": fit.condition,
+        }
+        headline(figure, ", ".join(f"{name} {number}" for name, number in found.items()), across=110)
+        left, right = figure.subplots(1, 2, sharex=True, sharey=True)
+        reach = 105 * max(float(np.abs(moves[:, :2]).max()) for moves in (fit.executed, fit.inferred)) or 1.0
+        left.scatter(*(100 * fit.executed[:, :2].T), s=9, color=_EXECUTED, label="executed")
+        left.scatter(*(100 * fit.inferred[:, :2].T), s=9, color=_INFERRED, label="inferred by the model")
+        for axis, name in enumerate("xy"):
+            for moved, colour in ((np.eye(3)[:2, axis], _EXECUTED), (fit.matrix[:2, axis], _FITTED)):
+                along = 0.8 * reach * moved
+                right.annotate("", along, (0, 0), arrowprops={"arrowstyle": "->", "color": colour, "lw": 2})
+                right.annotate(name, along, color=colour)
+        right.set_title("the robot's axes (grey), and what the model takes them for", fontsize=9)
+        left.legend(frameon=False, fontsize=8, loc="upper left")
+        for axes in (left, right):
+            axes.set(xlabel="dx (cm)", ylabel="dy (cm)", xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
+    return path
