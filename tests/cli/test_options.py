@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from vjepa2_ac.cli import main, program
+from vjepa2_ac.cli import main, program, setup
 from vjepa2_ac.cli.options import parsed
-from vjepa2_ac.cli.setup import config as config_command
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 from vjepa2_ac.simulation.closed_loop.benchmark import BenchmarkOptions
 from vjepa2_ac.simulation.recording.record import RecordingSpec
@@ -187,13 +186,13 @@ def raising(error: BaseException) -> Callable[..., int]:
 def test_what_the_system_does_not_give_is_one_line(
     error: BaseException, words: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(config_command, "_config", raising(error))
+    monkeypatch.setattr(setup, "_config", raising(error))
     assert main(["config", "schema"]) == 2
     assert re.search(words, capsys.readouterr().err)
 
 
 def test_a_mistake_of_ours_is_no_error_of_the_users(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(config_command, "_config", raising(RuntimeError("a mistake")))
+    monkeypatch.setattr(setup, "_config", raising(RuntimeError("a mistake")))
     with pytest.raises(RuntimeError, match="a mistake"):
         main(["config", "schema"])
 

@@ -12,16 +12,20 @@ from rich.table import Table
 
 from vjepa2_ac.calibration.data import VariantProbe, VariantResult
 from vjepa2_ac.calibration.strides import Calibration, StrideResult
-from vjepa2_ac.console.closed_loop import benchmark_table
-from vjepa2_ac.console.data import calibration_table, motion_table, probe_table
-from vjepa2_ac.console.evaluation import row_tables
-from vjepa2_ac.console.plan import plan_table
 from vjepa2_ac.console.progress import PlainConsole
+from vjepa2_ac.console.tables import (
+    benchmark_table,
+    calibration_table,
+    motion_table,
+    plan_table,
+    probe_table,
+    row_tables,
+)
 from vjepa2_ac.evaluation.evaluate import Contender, evaluate
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import Row
 from vjepa2_ac.evaluation.rows import rows_of
-from vjepa2_ac.inspection.statistics import Inspection
+from vjepa2_ac.inspection.statistics import CHANGED, MOVED, TURNED, StepSizes
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.planning.decision import PlanResult
 from vjepa2_ac.simulation.closed_loop.benchmark import ClosedLoopBenchmark
@@ -47,9 +51,8 @@ def probes() -> list[Table]:
 
 
 def motions() -> list[Table]:
-    one = Mock(stride=15, seconds=1.0, percentiles=lambda _: (1234.5, 2345.6, 3456.7, 4567.8))
-    both = [Mock(spec=Inspection, has_poses=poses, motions=[one], changes=[one]) for poses in (True, False)]
-    return [motion_table(inspection) for inspection in both]
+    sizes = np.array([1234.5, 2345.6, 3456.7, 4567.8])
+    return [motion_table([StepSizes(15, 1.0, dict.fromkeys(names, sizes))]) for names in ((MOVED, TURNED), (CHANGED,))]
 
 
 def evaluations() -> list[Table]:
