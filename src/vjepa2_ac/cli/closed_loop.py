@@ -57,12 +57,10 @@ def add_serve(commands: Commands) -> None:
     )
     parser = command(commands, "serve", _serve, text)
     add_planner(parser, such_as="such as planning.limits.xyz=[0.01,0.01,0.01]")
-    text = "goals that a client may name: pictures, and folders that `vjepa2-ac goals` made"
-    argument(parser, "--goals FOLDER", text, as_folder)
+    argument(parser, "--goals FOLDER", "that a client may name: pictures, and folders that `goals` made", as_folder)
     text = "delta: changes of each model step; pose: waypoints to the target pose, one a control step (delta)"
     argument(parser, "--actions delta|pose", text, choices=["delta", "pose"], default="delta")
-    text = "the key of the camera's picture in requests (the usual ones)"
-    argument(parser, "--image-key KEY", text)
+    argument(parser, "--image-key KEY", "the key of the camera's picture in requests (the usual ones)")
     text = "what is told on connect; roboarena: its six keys only (full)"
     argument(parser, "--metadata full|roboarena", text, choices=["full", "roboarena"], default="full")
     text = "of a decision; then the action is zero (60)"
@@ -71,17 +69,14 @@ def add_serve(commands: Commands) -> None:
     group = parser.add_argument_group("who may")
     argument(group, "--host ADDRESS", "where it listens (127.0.0.1: this machine only)", default="127.0.0.1")
     argument(group, "--port N", "0: a free one (8000)", whole_number(0, 65535), default=8000)
-    text = "a file with the key that clients send; needed where other machines can reach the address"
-    argument(group, "--key-file FILE", text, as_path)
+    argument(group, "--key-file FILE", "with the key that clients send; needed where others can reach it", as_path)
     argument(group, "--insecure", "no key, although others can reach the address", action="store_true")
-    text = "a name under which a proxy serves it; again for more"
-    argument(group, "--allow-host NAME", text, action="append", default=[])
+    argument(group, "--allow-host NAME", "a name that a proxy serves it under; repeatable", action="append", default=[])
     argument(group, "--certificate FILE", "TLS: the certificate and those it is signed by, PEM", as_path)
     argument(group, "--certificate-key FILE", "its private key, PEM (in the same file)", as_path)
     group = parser.add_argument_group("record")
     argument(group, "--record FOLDER", "every decision with its pictures, in a new folder", as_path)
-    text = "where the record ends (2)"
-    argument(group, "--record-gb GB", text, number_between(0, 10_000, "gigabytes"), default=2.0)
+    argument(group, "--record-gb GB", "where the record ends (2)", number_between(0, 10_000, "gigabytes"), default=2.0)
 
 
 def add_simulate(commands: Commands) -> None:
@@ -97,13 +92,11 @@ def add_simulate(commands: Commands) -> None:
         " ws://127.0.0.1:8000; or: record"
     )
     argument(parser, "subject RUN_OR_MODEL|ws://SERVER|record", text, as_planner)
-    text = "how it plans, such as planning.samples=64; record: where the data set goes"
-    argument(parser, "overrides key=value|FOLDER", text, nargs="*")
+    argument(parser, "overrides key=value|FOLDER", "such as planning.samples=64; record: where the data go", nargs="*")
     text = "A or B; record: or random, another world in every episode (A)"
     argument(parser, "--domain", text, choices=["A", "B", "random"], default="A")
     argument(parser, "--episodes N", "how many (50; record: 40)", count)
-    text = "of an episode: model steps (8; pick: 12, place: 18); record: control steps, 15/s (41; place: 81)"
-    argument(parser, "--steps N", text, count)
+    argument(parser, "--steps N", "model steps (8; pick: 12, place: 18); record: control steps (41; place: 81)", count)
     argument(parser, "--seed N", "which problems or demonstrations (0)", whole_number(0, 2**31 - 1))
     text = "what is to be done (reach); record: push, pick or place, with a block on the table (none: reaching around)"
     argument(parser, "--task", text, choices=["reach", "push", "pick", "place"])
@@ -119,8 +112,7 @@ def add_simulate(commands: Commands) -> None:
     argument(group, "--goals FOLDER", text, as_local)
     argument(group, "--films N", "episodes in the video; 0: none (6)", whole_number(0))
     add_decoder(group, "in the video what the model imagined of each frame, one step ago")
-    text = "where figures and video go (closed_loop/TASK-DOMAIN, in the run's)"
-    argument(group, "--out FOLDER", text, as_path)
+    argument(group, "--out FOLDER", "where figures and video go (closed_loop/TASK-DOMAIN, in the run's)", as_path)
     argument(group, "--key-file FILE", "of a server that needs a key: the file with it", as_path)
     group = parser.add_argument_group("of record")
     argument(group, "--cameras", "1: all three images are the same one (1)", whole_number(1, 3), choices=[1, 3])
@@ -128,11 +120,8 @@ def add_simulate(commands: Commands) -> None:
 
 
 def _serve(options: argparse.Namespace) -> int:
-    from vjepa2_ac.errors import require_library
     from vjepa2_ac.serving.access import Access, read_key
 
-    for module in ("websockets", "msgpack", "prometheus_client"):
-        require_library(module, where="serve", called=module, extra="serve")
     if options.metadata == "roboarena" and options.actions != "pose":
         found, needed = f"--actions {options.actions}", "--actions pose: RoboArena knows no changes of a pose"
         raise InputError(where="--metadata roboarena", found=found, needed=needed)
@@ -250,9 +239,6 @@ def _run_benchmark(options: argparse.Namespace) -> int:
 
     if options.domain == "random":
         raise InputError(where="--domain random", found="a model that steers", needed="A or B")
-    if options.decoder is not None and options.films == 0:
-        found, fix = "--films 0: no video in which anything could be shown", "Leave out one of the two"
-        raise InputError(where=f"--decoder {options.decoder}", found=found, needed="a video", fix=fix)
     if options.goals is not None and options.sub_goals is not None:
         found = f"--sub-goals {options.sub_goals}, too"
         raise InputError(where=f"--goals {options.goals}", found=found, needed="one of the two")

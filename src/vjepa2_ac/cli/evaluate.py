@@ -25,7 +25,6 @@ from vjepa2_ac.cli.options import (
     number_between,
     read_config,
     record_of_options,
-    require_overrides,
     require_subject,
     require_to_plan,
     say_places_elsewhere,
@@ -45,8 +44,7 @@ def add_evaluate(commands: Commands) -> None:
     parser = command(commands, "evaluate", _evaluate, text)
     text = "folder of a run, or (with --data) what model.base takes; several: their spread, too"
     argument(parser, "subjects RUN_OR_MODEL", text, as_subject, nargs="+")
-    text = "measure on the data of this config (and with its model.dtype, device, seed)"
-    argument(parser, "--data CONFIG", text, as_local)
+    argument(parser, "--data CONFIG", "measure on its data (with its model.dtype, device, seed)", as_local)
     text = "what to compare with, on the same latents; default: the base of a run, nothing for a model"
     argument(parser, "--against base|RUN|MODEL", text, as_model, nargs="+")
     argument(parser, "--out FOLDER", "where figures go; default: the run's folder", as_path)
@@ -54,8 +52,7 @@ def add_evaluate(commands: Commands) -> None:
     argument(parser, "--clips N", "at most this many clips, spread over the episodes (256)", count)
     add_checkpoint(parser)
     add_decoder(parser, "the rollouts, which are measured as images, too")
-    text = "LPIPS of the decoded images (docs/decoding.md), by: alexnet-owt-7be5be79.pth or vgg16-397923af.pth"
-    argument(parser, "--lpips FILE", text, as_path)
+    argument(parser, "--lpips FILE", "weights for LPIPS of the decoded images (docs/decoding.md)", as_path)
     argument(parser, "--lpips-heads FILE", "its heads: alex.pth or vgg.pth of version 0.1", as_path)
     argument(parser, "--calibrate", "measure the one-step error at other strides, too", action="store_true")
     _add_probes(parser.add_argument_group("use of the actions"))
@@ -83,8 +80,7 @@ def add_imagine(commands: Commands) -> None:
     )
     parser = command(commands, "imagine", _imagine, text)
     add_planner(parser, such_as="with --image: such as planning.limits.xyz=data")
-    text = "what draws the images: the folder that `vjepa2-ac decoder` made, or builtin:sim-tiny"
-    argument(parser, "--decoder FOLDER", text, as_model, required=True)
+    argument(parser, "--decoder FOLDER", "what `vjepa2-ac decoder` made, or builtin:sim-tiny", as_model, required=True)
     text = (
         "with commas between them: true (the recorded ones of a clip), none, up, down, left, right, forward, back,"
         " open, close, in the robot's frame; or files, .npy or .csv: a row of 7 numbers for each step"
@@ -92,10 +88,8 @@ def add_imagine(commands: Commands) -> None:
     )
     argument(parser, "--actions NAMES", text)
     argument(parser, "--steps N", "model steps to imagine (7)", count, default=7)
-    text = "length of a named action in each step, if planning.limits allow it (5)"
-    argument(parser, "--size CM", text, float, default=5.0)
-    text = "which clip, by its name in the data (default: of the split, that with the most motion)"
-    argument(parser, "--episode ID", text)
+    argument(parser, "--size CM", "of a named action in each step, within planning.limits (5)", float, default=5.0)
+    argument(parser, "--episode ID", "the clip's name in the data (that of the split with the most motion)")
     argument(parser, "--start N", "its first control step (0)", whole_number(0))
     group = parser.add_argument_group("instead of a clip")
     argument(group, "--image IMAGE", "what a camera sees: PNG or JPEG; actions by name only", as_local)
@@ -108,12 +102,10 @@ def add_imagine(commands: Commands) -> None:
 def _add_probes(group: argparse._ArgumentGroup) -> None:
     argument(group, "--sensitivity-clips N", "clips to try other actions on (32)", whole_number(0))
     argument(group, "--samples N", "other actions for each of them (64)", count)
-    text = "clips of those with an energy landscape (8)"
-    argument(group, "--landscapes N", text, whole_number(0), dest="landscape_clips")
-    text = "clips of those to calibrate the axes by (32)"
-    argument(group, "--axes N", text, whole_number(0), dest="axis_clips")
+    argument(group, "--landscapes N", "of those, with an energy landscape (8)", whole_number(0), dest="landscape_clips")
+    argument(group, "--axes N", "clips of those to calibrate the axes by (32)", whole_number(0), dest="axis_clips")
     argument(group, "--nodes N", "of a landscape along each axis (9)", whole_number(3, 51))
-    text = "half the width of landscape and box, in cm (7.5)"
+    text = "half the width of landscape and box (7.5)"
     argument(group, "--reach CM", text, number_between(0.0, 1000.0, "cm"), dest="reach_cm")
     argument(group, "--examples N", "clips to show (4)", whole_number(0))
     argument(group, "--at-once N", "actions computed together (64): lower it to save memory", count)
@@ -150,7 +142,6 @@ def _asked(options: argparse.Namespace) -> list[tuple[str, EvaluationOptions]]:
     """Return what is asked of each subject; refuse planning settings that would have no effect: without plans."""
     from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 
-    require_overrides(options.overrides, fix="Name all runs and models one behind the other, before the options")
     if options.overrides and options.plan_settings is None:
         found = f"{' '.join(options.overrides)}, and no plans are asked for"
         needed = "--planning beside settings of planning; what else a config says is not changed by evaluate"

@@ -89,9 +89,8 @@ def add_planner(parser: argparse.ArgumentParser, *, such_as: str) -> None:
     argument(parser, "subject RUN_OR_MODEL", "folder of a run, or what model.base takes", as_model)
     argument(parser, "overrides key=value", such_as, nargs="*")
     add_checkpoint(parser)
-    text = "for a model: the config whose planning, crop and dtype count"
-    argument(parser, "--config CONFIG", text, as_local)
-    text = "the camera in the robot base frame: x,y,z,roll,pitch,yaw; where the model uses it"
+    argument(parser, "--config CONFIG", "for a model: the config whose planning, crop and dtype count", as_local)
+    text = "the camera's x,y,z,roll,pitch,yaw in the robot base frame, if the model uses it"
     argument(parser, "--extrinsics NUMBERS", text)
 
 
@@ -233,9 +232,13 @@ def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> 
     the names of several runs or models for names.
     """
     options, rest = parser.parse_known_args(arguments)
-    unknown = [word for word in rest if _OPTION.match(word)]
-    if rest and (unknown or not hasattr(options, "overrides")):
-        parser.error(f"unrecognized arguments: {' '.join(word for word in rest if not _OVERRIDE.match(word))}")
+    others = [word for word in rest if "=" not in word or _OPTION.match(word)]
+    if rest and not hasattr(options, "overrides"):
+        parser.error(f"unrecognized arguments: {' '.join(rest)}")
+    if any(map(_OPTION.match, others)):
+        parser.error(f"unrecognized arguments: {' '.join(others)}")
+    if others and vars(options).get("subject") != "record":  # `simulate record` takes a folder there
+        parser.error(f"{' '.join(others)!r} is no key=value (numbers go in one word: 0.4,0,0.3; names side by side)")
     if "subjects" in options:
         rest = [*filter(_is_override, options.subjects), *rest]
         options.subjects = [word for word in options.subjects if not _is_override(word)]
@@ -253,18 +256,6 @@ def as_subject(text: str) -> str:
 
 def _is_override(word: str) -> bool:
     return _OVERRIDE.match(word) is not None and not Path(word).exists()
-
-
-def require_overrides(words: Sequence[str], *, fix: str) -> None:
-    """Refuse words that are no `key=value`.
-
-    Raises:
-        InputError: There is one.
-    """
-    others = [word for word in words if "=" not in word]
-    if others:
-        found, needed = f"{' '.join(others)!r}", "key=value, such as training.steps=100"
-        raise InputError(where="command line", found=found, needed=needed, fix=fix)
 
 
 def _reader(read: Callable[[str], _Read]) -> Callable[[str], _Read]:

@@ -27,7 +27,6 @@ from vjepa2_ac.cli.options import (
     read_config,
     record_of_options,
     require_new_place,
-    require_overrides,
     require_to_plan,
     say_places_elsewhere,
     whole_number,
@@ -64,12 +63,9 @@ def add_plan(commands: Commands) -> None:
     text = "what it shall see; again for goals that follow one another"
     goals = parser.add_mutually_exclusive_group(required=True)
     argument(goals, "--goal IMAGE", text, as_local, action="append")
-    text = "goals with rules of their own, that `vjepa2-ac goals` made; the first one applies"
-    argument(goals, "--goals FOLDER", text, as_folder)
-    text = "model steps of each goal but the last, as 2,1; default: equal shares of planning.horizon"
-    argument(parser, "--durations STEPS", text)
-    text = "what of the image counts: of the goal's size, black where it does not"
-    argument(parser, "--mask IMAGE", text, as_local)
+    argument(goals, "--goals FOLDER", "goals with rules of their own, that `vjepa2-ac goals` made", as_folder)
+    argument(parser, "--durations STEPS", "model steps of all goals but the last, as 2,1 (equal shares)")
+    argument(parser, "--mask IMAGE", "what of the image counts: of the goal's size, black where it does not", as_local)
     argument(parser, "--seed N", "default: the config's", whole_number(0, 2**31 - 1))
     text = (
         "of the image's energy maps along each axis; 0: no maps; default: 13, or as many as evaluate no more action"
@@ -105,12 +101,10 @@ def add_goals(commands: Commands) -> None:
     share, energy = number_between(0.0, 1.0, "the energy"), "of the energy at a goal's beginning, below which"
     argument(parser, "--share X", f"{energy} the next one follows (none: by steps only)", share)
     argument(parser, "--stop-share X", f"{energy} the last one is reached (none: an equal image)", share)
-    text = "of the resting arm, for the noise floor (default: where it rests in the episode)"
-    argument(parser, "--still VIDEO", text, as_path)
+    argument(parser, "--still VIDEO", "of the resting arm, for the noise floor (where the episode rests)", as_path)
 
 
 def _plan(options: argparse.Namespace) -> int:
-    require_overrides(options.overrides, fix="Numbers of --state or --extrinsics go in one word: --state 0.4,0,0.3,...")
     state, extrinsics = as_numbers(options.state, "--state"), camera_pose(options.extrinsics)
     durations = _durations(options)
     _require_state(state, require_to_plan(options))

@@ -97,23 +97,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=__version__)
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for add in (
-        setup.add_demo,
-        setup.add_init,
-        train.add_train,
-        evaluate.add_evaluate,
-        evaluate.add_imagine,
-        data.add_data,
-        train.add_encode,
-        train.add_decoder_command,
-        setup.add_doctor,
-        plan.add_plan,
-        plan.add_goals,
-        closed_loop.add_serve,
-        train.add_export,
-        setup.add_config_command,
-        setup.add_download,
-        closed_loop.add_simulate,
-    ):
+    first = (setup.add_demo, setup.add_init, train.add_train, evaluate.add_evaluate, evaluate.add_imagine)
+    of_data = (data.add_data, train.add_encode, train.add_decoder_command, setup.add_doctor)
+    of_planning = (plan.add_plan, plan.add_goals, closed_loop.add_serve, closed_loop.add_simulate)
+    for add in (*first, *of_data, *of_planning, train.add_export, setup.add_config_command, setup.add_download):
         add(commands)
     return parser

@@ -49,8 +49,7 @@ def add_init(commands: Commands) -> None:
         parser, "path PATH", "the data: a folder, or a URL (droid, lerobot, raw: DROID's own)", as_place, nargs="?"
     )
     argument(parser, "--out FILE", "the config (NAME.yaml, by the data's folder)", as_path)
-    text = "another one than the released: what model.base takes, such as builtin:sim-tiny; scratch: an encoder"
-    argument(parser, "--model MODEL", text, as_model)
+    argument(parser, "--model MODEL", "instead of the released: what model.base takes; scratch: an encoder", as_model)
     argument(parser, "--overwrite", "write over a config that is there", action="store_true")
 
 

@@ -29,10 +29,8 @@ def add_train(commands: Commands) -> None:
     what = "a YAML config, or with --resume the folder of a run"
     add_config(parser, such_as="training.learning_rate=3e-4", what=what)
     argument(parser, "--resume", "go on with the run in the folder CONFIG", action="store_true")
-    text = "do everything that can fail and stop before the first step"
-    argument(parser, "--check", text, action="store_true")
-    text = "go on with the run in run_dir though its config is another"
-    argument(parser, "--allow-config-change", text, action="store_true")
+    argument(parser, "--check", "do everything that can fail and stop before the first step", action="store_true")
+    argument(parser, "--allow-config-change", "go on though the config is another", action="store_true")
 
 
 def add_encode(commands: Commands) -> None:
@@ -44,8 +42,7 @@ def add_encode(commands: Commands) -> None:
     )
     parser = command(commands, "encode", _encode, text)
     add_config(parser, such_as="data.cache_dtype=int8")
-    text = "folder of the cache, for data.source: latents (default: where data.cache finds it)"
-    argument(parser, "--out FOLDER", text, as_path)
+    argument(parser, "--out FOLDER", "of the cache, for data.source: latents (where data.cache finds it)", as_path)
 
 
 def add_decoder_command(commands: Commands) -> None:
