@@ -1,7 +1,6 @@
 """`vjepa2-ac plan` writes a plan and its figure, or reports an error before anything is loaded."""
 
 import json
-import re
 from pathlib import Path
 
 import numpy as np
@@ -85,22 +84,6 @@ def test_a_plan_its_image_a_table_and_words_come_out(workshop: Path, capsys: pyt
     assert (file["seed"], file["goals"], len(file["slices"])) == (9, [str(workshop / "goal.png")], 3)
     assert len(file["model"]["predictor"]) == 64
     assert plan(workshop, *QUICK, "--seed", "9")[1]["actions"] == file["actions"]
-
-
-@pytest.mark.usefixtures("no_figure")
-def test_what_is_quicker_and_why_there_are_no_maps_is_said(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    few = ["planning.samples=8", "planning.cem.elites=4", "planning.budget_s=0.001"]
-    status, file = plan(workshop, *few, "planning.iterations=40")
-    assert (status, file["slices"]) == (0, [])
-    reported = capsys.readouterr().out
-    assert (
-        "320 action sequences in 40 iterations, 1 model step each, for 0.001 s at most. Quick, for a CPU: " in reported
-    )
-    assert "No energy maps: they take 75 action sequences or more, the search 8." in reported
-    (words,) = re.findall(r"Quick, for a CPU: (.*)", reported)
-    status, file = plan(workshop, *words.split(), "--nodes", "0")
-    assert (status, file["settings"]["samples"], file["evaluations"]) == (0, 64, 257)
-    assert "Quick" not in capsys.readouterr().out, "nothing is quicker"
 
 
 @pytest.mark.usefixtures("no_figure")

@@ -57,6 +57,7 @@ init nowhere somewhere
 init lerobot .
 init sim --model nope
 init sim --out /proc/nope/x.yaml
+goals nope.yaml --out out
 config show builtin:nope
 config list builtin:demo
 """

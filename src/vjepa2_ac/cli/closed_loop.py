@@ -17,7 +17,6 @@ from vjepa2_ac.cli.options import (
     add_decoder,
     add_planner,
     argument,
-    as_folder,
     as_local,
     as_path,
     as_planner,
@@ -29,6 +28,7 @@ from vjepa2_ac.cli.options import (
     load_planning_session,
     number_between,
     record_of_options,
+    require_goals,
     require_new_place,
     require_to_plan,
     whole_number,
@@ -57,7 +57,7 @@ def add_serve(commands: Commands) -> None:
     )
     parser = command(commands, "serve", _serve, text)
     add_planner(parser, such_as="such as planning.limits.xyz=[0.01,0.01,0.01]")
-    argument(parser, "--goals FOLDER", "that a client may name: pictures, and folders that `goals` made", as_folder)
+    argument(parser, "--goals FOLDER", "that a client may name: pictures, and folders that `goals` made", as_path)
     text = "delta: changes of each model step; pose: waypoints to the target pose, one a control step (delta)"
     argument(parser, "--actions delta|pose", text, choices=["delta", "pose"], default="delta")
     argument(parser, "--image-key KEY", "the key of the camera's picture in requests (the usual ones)")
@@ -128,6 +128,7 @@ def _serve(options: argparse.Namespace) -> int:
     key = None if options.key_file is None else read_key(options.key_file)
     access = Access(options.host, key, options.insecure, tuple(options.allow_host))
     extrinsics, tls = camera_pose(options.extrinsics), _tls(options)
+    require_goals(options.goals)
     require_to_plan(options)
 
     from vjepa2_ac.console.progress import show

@@ -212,6 +212,16 @@ def make_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
 
 
+def require_goals(folder: Path | None) -> None:
+    """Refuse a folder of `--goals` that is not there, before what takes seconds is imported.
+
+    Raises:
+        InputError: It is not.
+    """
+    if folder is not None and not folder.is_dir():
+        raise InputError(where=f"--goals {folder}", found="no such folder", needed="a folder with goals")
+
+
 def require_new_place(folder: Path) -> None:
     """Refuse a folder that is not empty or could not be made, before any long work.
 
@@ -270,15 +280,8 @@ def _reader(read: Callable[[str], _Read]) -> Callable[[str], _Read]:
     return value
 
 
-def _folder(text: str) -> Path:
-    if not (path := Path(places.on_this_machine(text))).is_dir():
-        raise ValueError("is no folder that is there")
-    return path
-
-
 as_local = _reader(places.on_this_machine)  # a path of this machine, in its spelling; `~` is the user's home
 as_path = _reader(lambda text: Path(places.on_this_machine(text)))
-as_folder = _reader(_folder)  # one that is there
 as_place = _reader(places.anywhere)  # a path of this machine, or a URL
 as_model = _reader(places.of_a_model)  # a path of this machine, or a model that comes with the package
 

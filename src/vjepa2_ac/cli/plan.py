@@ -12,7 +12,6 @@ from vjepa2_ac.cli.options import (
     add_decoder,
     add_planner,
     argument,
-    as_folder,
     as_local,
     as_model,
     as_numbers,
@@ -26,6 +25,7 @@ from vjepa2_ac.cli.options import (
     number_between,
     read_config,
     record_of_options,
+    require_goals,
     require_new_place,
     require_to_plan,
     say_places_elsewhere,
@@ -63,7 +63,7 @@ def add_plan(commands: Commands) -> None:
     text = "what it shall see; again for goals that follow one another"
     goals = parser.add_mutually_exclusive_group(required=True)
     argument(goals, "--goal IMAGE", text, as_local, action="append")
-    argument(goals, "--goals FOLDER", "goals with rules of their own, that `vjepa2-ac goals` made", as_folder)
+    argument(goals, "--goals FOLDER", "goals with rules of their own, that `vjepa2-ac goals` made", as_path)
     argument(parser, "--durations STEPS", "model steps of all goals but the last, as 2,1 (equal shares)")
     argument(parser, "--mask IMAGE", "what of the image counts: of the goal's size, black where it does not", as_local)
     argument(parser, "--seed N", "default: the config's", whole_number(0, 2**31 - 1))
@@ -107,6 +107,7 @@ def add_goals(commands: Commands) -> None:
 def _plan(options: argparse.Namespace) -> int:
     state, extrinsics = as_numbers(options.state, "--state"), camera_pose(options.extrinsics)
     durations = _durations(options)
+    require_goals(options.goals)
     _require_state(state, require_to_plan(options))
     make_folder(options.out)
     start, goals, mask = _images(options)
@@ -252,9 +253,9 @@ def _way(options: argparse.Namespace) -> tuple[str, int | None]:
 
 def _recording(options: argparse.Namespace) -> tuple[Recording, int]:
     """Return the demonstration, and the frames of a model step."""
-    from vjepa2_ac.demonstrations.make_goals import recording_of_episode, recording_of_film
-
     if _is_film(options):
+        from vjepa2_ac.demonstrations.make_goals import recording_of_film
+
         for name, given in {"--episode": options.episode, "key=value": options.overrides}.items():
             if given:
                 raise InputError(where=name, found=f"{options.source}, a film", needed="a config, of whose data it is")
@@ -270,6 +271,7 @@ def _recording(options: argparse.Namespace) -> tuple[Recording, int]:
         raise InputError(where="data.stride", found=found, needed="a number", fix=fix)
 
     from vjepa2_ac.console.progress import ConsoleReporter
+    from vjepa2_ac.demonstrations.make_goals import recording_of_episode
     from vjepa2_ac.reporter import INDEXING
 
     with ConsoleReporter() as reporter:
