@@ -3,15 +3,15 @@
 import argparse
 import errno
 import re
+import sys
 from collections.abc import Callable
 from dataclasses import MISSING, fields
 from pathlib import Path
 
 import pytest
 
-from vjepa2_ac.cli import main, program
+from vjepa2_ac.cli import main, program, setup
 from vjepa2_ac.cli.options import parsed
-from vjepa2_ac.cli.setup import config as config_command
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 from vjepa2_ac.simulation.closed_loop.benchmark import BenchmarkOptions
 from vjepa2_ac.simulation.recording.record import RecordingSpec
@@ -26,13 +26,9 @@ CALIBRATE = ["data", "calibrate", "config.yaml"]
         (EVALUATE, "--nodes", ["x", "2", "52", "3.5", ""], "a whole number from 3 to 51"),
         (EVALUATE, "--reach", ["x", "0", "1000", "nan", "-1"], "a number of cm above 0 and below 1000"),
         (EVALUATE, "--sensitivity-clips", ["-1", "many"], "a whole number from 0 to 1000000000"),
-        (EVALUATE, "--landscapes", ["-1"], "a whole number from 0 to 1000000000"),
-        (EVALUATE, "--examples", ["1e3"], "a whole number from 0 to 1000000000"),
-        (EVALUATE, "--clips", ["0", "x"], "a whole number from 1 to 1000000000"),
+        (EVALUATE, "--clips", ["0", "1e3", "100000000000"], "a whole number from 1 to 1000000000"),
         (CALIBRATE, "--frames", ["1", "257", "x"], "a whole number from 2 to 256"),
-        (CALIBRATE, "--limit", ["x"], "a whole number from 1 to 1000000000"),
         (SIMULATE, "--seed", ["x", "-1", "2147483648"], "a whole number from 0 to 2147483647"),
-        (SIMULATE, "--cameras", ["x"], "a whole number from 1 to 3"),
     ],
 )
 def test_an_invalid_number_is_refused_with_the_valid_range(
@@ -42,18 +38,6 @@ def test_an_invalid_number_is_refused_with_the_valid_range(
         with pytest.raises(SystemExit, match="2"):
             main([*command, option, text])
         assert re.search(rf"error: argument {option}.*: {re.escape(repr(text))} is not {needed}$", last_line(capsys))
-
-
-@pytest.mark.parametrize("number", ["3", "51"])
-def test_the_bounds_themselves_are_numbers_that_can_be(number: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["evaluate", "no-such-run", "--nodes", number, "--sensitivity-clips", "0"]) == 2
-    assert "no such folder" in last_line(capsys)
-
-
-def test_a_number_beyond_all_need_is_refused_before_anything_is_made_of_it(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit, match="2"):
-        main([*EVALUATE, "--clips", "100000000000"])
-    assert last_line(capsys).endswith("'100000000000' is not a whole number from 1 to 1000000000")
 
 
 def leaves(
@@ -147,22 +131,21 @@ def test_evaluate_needs_something_to_evaluate(capsys: pytest.CaptureFixture[str]
     ("arguments", "words"),
     [
         (["evaluate", "run", "--clips", "3", "planning.samples=64"], "no plans are asked for.*Add --planning"),
-        (["evaluate", "run", "--clips", "3", "other"], "'other'.*one behind the other"),
+        (["evaluate", "run", "--clips", "3", "other"], "'other' is no key=value"),
         (["config", "schema", "training.steps=3"], "config schema training.steps=3"),
-        (["plan", "run", "--start", "a", "--goal", "b", "--state", "1", "2", "-3"], r"'2 -3'.*--state 0\.4,0,"),
+        (["plan", "run", "--start", "a", "--goal", "b", "--state", "1", "2", "-3"], r"'2 -3'.*in one word"),
         (["simulate", "run", "--episodes", "3", "samples"], "'samples'"),
-        (["data", "check", "c.yaml", "--limit", "3", "samples"], "no such file"),
+        (["simulate", "record", "out", "--stepz", "3"], "unrecognized arguments: --stepz 3"),
+        (["data", "check", "c.yaml", "--limit", "3", "samples"], "'samples'"),
+        (["train", "c.yaml", "samples"], "no such file"),
     ],
 )
 def test_a_word_that_does_nothing_is_refused(
-    arguments: list[str],
-    words: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    arguments: list[str], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert main(arguments) == 2
+    with pytest.raises(SystemExit, match="2"):
+        sys.exit(main(arguments))
     assert re.search(words, capsys.readouterr().err)
 
 
@@ -177,9 +160,7 @@ def raising(error: BaseException) -> Callable[..., int]:
     ("error", "words"),
     [
         (OSError(errno.EMFILE, "Too many open files"), r"error: ulimit -n: too many open files: this process may have"),
-        (OSError(errno.ENFILE, "Too many open files", "a.mp4"), r"error: a\.mp4: too many .* `ulimit -n 4096`"),
         (MemoryError("Unable to allocate 9 TiB"), r"memory is not enough \(Unable to allocate 9 TiB\)"),
-        (MemoryError(), r"memory is not enough \(MemoryError\)"),
         (RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: 9 bytes"), "memory is not enough"),
         (OSError(errno.ENOSPC, "No space left on device", "run"), r"No space left on device: 'run'"),
     ],
@@ -187,13 +168,13 @@ def raising(error: BaseException) -> Callable[..., int]:
 def test_what_the_system_does_not_give_is_one_line(
     error: BaseException, words: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(config_command, "_config", raising(error))
+    monkeypatch.setattr(setup, "_config", raising(error))
     assert main(["config", "schema"]) == 2
     assert re.search(words, capsys.readouterr().err)
 
 
 def test_a_mistake_of_ours_is_no_error_of_the_users(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(config_command, "_config", raising(RuntimeError("a mistake")))
+    monkeypatch.setattr(setup, "_config", raising(RuntimeError("a mistake")))
     with pytest.raises(RuntimeError, match="a mistake"):
         main(["config", "schema"])
 

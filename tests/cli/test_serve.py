@@ -84,7 +84,6 @@ WRONG = {
     "--metadata roboarena: --actions delta": ["--metadata", "roboarena"],
     "--certificate none.pem": ["--certificate", "none.pem"],
     "--certificate-key key.pem: no --certificate": ["--certificate-key", "key.pem"],
-    "--goals nowhere: no such folder": ["--goals", "nowhere"],
     "--extrinsics": ["--extrinsics", "1,2"],
     "training.steps=3: a setting that planning does not use": ["training.steps=3"],
     "planning.limits: workspace: the corner": ["planning.limits.workspace=[[0,0,0],[0,1,1]]"],

@@ -34,6 +34,7 @@ data calibrate {demo} data.path=. --axes builtin:sim-tiny --model nope
 plan nope --start a.png --goal b.png --state 0.4,0,.3,3,0,0,0
 plan builtin:nope --start a.png --goal b.png --state 0.4,0,.3,3,0,0,0
 plan builtin:sim-tiny --start a.png --goal b.png --state 0.4,0,.3,3,0,0,0
+plan builtin:sim-tiny --start a.png --goals nope --state 0.4,0,.3,3,0,0,0
 plan builtin:sim-tiny planning.horizonn=2 --start a.png --goal b.png --state 0.4,0,.3,3,0,0,0
 export nope out
 config show nope.yaml
@@ -46,7 +47,6 @@ simulate builtin:sim-tiny --domain Q
 simulate builtin:sim-tiny planning.horizonn=2
 simulate builtin:sim-tiny planning.axes=nope.json
 simulate record /proc/x --episodes 2
-simulate record out --episodes 2 --domain Q
 download --url foo --to x.pt
 download x.pt
 download vjepa3
@@ -57,6 +57,7 @@ init nowhere somewhere
 init lerobot .
 init sim --model nope
 init sim --out /proc/nope/x.yaml
+goals nope.yaml --out out
 config show builtin:nope
 config list builtin:demo
 """
@@ -64,7 +65,10 @@ CODE = """
 import sys
 from vjepa2_ac.cli import main
 for line in sys.argv[1].strip().splitlines():
-    status = main(line.split())
+    try:
+        status = main(line.split())
+    except SystemExit as end:
+        status = end.code
     found = {"torch", "transformers", "matplotlib", "mujoco"} & set(sys.modules)
     if status != 2 or found:
         sys.exit(f"{line}: status {status}, imported {found}")

@@ -13,8 +13,8 @@ from rich.table import Table
 import vjepa2_ac
 from evaluation_results import ranking_of
 from vjepa2_ac.cli import main
-from vjepa2_ac.console import data, training
 from vjepa2_ac.console import progress as console_module
+from vjepa2_ac.console import tables, training
 from vjepa2_ac.console.progress import ConsoleReporter, ProgressBar
 from vjepa2_ac.console.training import TrainingConsole
 from vjepa2_ac.evaluation.measure import VALIDATED
@@ -138,8 +138,8 @@ def test_no_name_is_markup_wherever_it_is_shown(monkeypatch: pytest.MonkeyPatch,
 def test_a_finding_has_its_colour_and_its_name_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
     written = io.StringIO()
     shown = console_module.PlainConsole(file=written, force_terminal=True, width=140, color_system="standard")
-    monkeypatch.setattr(data, "console", shown)
-    data.print_finding(Finding("error", "source", HOSTILE))
+    monkeypatch.setattr(tables, "console", shown)
+    tables.print_finding(Finding("error", "source", HOSTILE))
     assert written.getvalue() == f"\x1b[31merror  \x1b[0m  source          {SHOWN}\n"
 
 

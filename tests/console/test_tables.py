@@ -12,11 +12,15 @@ from rich.table import Table
 
 from vjepa2_ac.calibration.data import VariantProbe, VariantResult
 from vjepa2_ac.calibration.strides import Calibration, StrideResult
-from vjepa2_ac.console.closed_loop import benchmark_table
-from vjepa2_ac.console.data import calibration_table, motion_table, probe_table
-from vjepa2_ac.console.evaluation import row_tables
-from vjepa2_ac.console.plan import plan_table
 from vjepa2_ac.console.progress import PlainConsole
+from vjepa2_ac.console.tables import (
+    benchmark_table,
+    calibration_table,
+    motion_table,
+    plan_table,
+    probe_table,
+    row_tables,
+)
 from vjepa2_ac.evaluation.evaluate import Contender, evaluate
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import Row
@@ -47,8 +51,8 @@ def probes() -> list[Table]:
 
 
 def motions() -> list[Table]:
-    wide = np.array([1234.5, 2345.6, 3456.7, 4567.8])
-    return [motion_table([StepSizes(15, 1.0, dict.fromkeys(names, wide))]) for names in ((MOVED, TURNED), (CHANGED,))]
+    sizes = np.array([1234.5, 2345.6, 3456.7, 4567.8])
+    return [motion_table([StepSizes(15, 1.0, dict.fromkeys(names, sizes))]) for names in ((MOVED, TURNED), (CHANGED,))]
 
 
 def evaluations() -> list[Table]:

@@ -231,7 +231,7 @@ def test_the_check_tells_numbers_that_teach_nothing(states: np.ndarray, about: s
 
 
 def test_inspection_and_frame_of_vectors(tmp_path: Path) -> None:
-    from vjepa2_ac.console.data import motion_table
+    from vjepa2_ac.console.tables import motion_table
 
     dataset = open_dataset(knobs(write_vectors(tmp_path / "set", width=14)))
     found = inspect_dataset(dataset)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from evaluation_results import ranking_of
-from vjepa2_ac.console.evaluation import row_tables
+from vjepa2_ac.console.tables import row_tables
 from vjepa2_ac.evaluation.clips import clips_of
 from vjepa2_ac.evaluation.result import (
     L1,

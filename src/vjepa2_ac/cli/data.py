@@ -16,6 +16,7 @@ from vjepa2_ac.cli.options import (
     as_path,
     command,
     count,
+    make_folder,
     read_config,
     require_subject,
     whole_number,
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 _CLIPS, _PAIRS = 64, 200  # to calibrate by: strides, axes (as the paper)
 
 
-def add_to(commands: Commands) -> None:
+def add_data(commands: Commands) -> None:
     """Add `data` with its commands to a parser."""
     text = "Look at a data set before training on it."
     parser = commands.add_parser("data", help=text, description=text)
@@ -96,7 +97,6 @@ def _check(options: argparse.Namespace) -> int:
     config = read_config(options.config, options.overrides)
     if options.model is not None:
         require_subject(options.model)
-
     status = check_and_print(config, clips=options.limit)
     if options.model is not None:
         _probe(config, options.model, clips=2 * options.limit)
@@ -105,30 +105,24 @@ def _check(options: argparse.Namespace) -> int:
 
 def check_and_print(config: Config, *, clips: int = 32) -> int:
     """Look at the data of a config and print what is found; return 1 where training would learn nothing."""
-    from vjepa2_ac.console.data import print_finding
     from vjepa2_ac.console.progress import ConsoleReporter
+    from vjepa2_ac.console.tables import print_finding
     from vjepa2_ac.inspection.check import check_data
     from vjepa2_ac.reporter import INDEXING
 
-    wrong = 0
+    status, batch_size = 0, config.training.batch_size
     with ConsoleReporter() as reporter:
-        findings = check_data(
-            config.data,
-            seed=config.seed,
-            batch_size=config.training.batch_size,
-            clips=clips,
-            progress=reporter.task(INDEXING),
-        )
-        for finding in findings:
-            print_finding(finding)
-            wrong += finding.level == "error"
-    return 1 if wrong else 0
+        progress = reporter.task(INDEXING)
+        for one in check_data(config.data, seed=config.seed, batch_size=batch_size, clips=clips, progress=progress):
+            print_finding(one)
+            status = 1 if one.level == "error" else status
+    return status
 
 
 def _probe(config: Config, model: str, *, clips: int) -> None:
     from vjepa2_ac.calibration.data import probe_config
-    from vjepa2_ac.console.data import print_finding, probe_table
-    from vjepa2_ac.console.progress import ConsoleReporter, console
+    from vjepa2_ac.console.progress import ConsoleReporter, show
+    from vjepa2_ac.console.tables import print_finding, probe_table
     from vjepa2_ac.data.dataset import open_dataset
     from vjepa2_ac.inspection.excerpts import Finding
     from vjepa2_ac.inspection.statistics import at_some_stride
@@ -136,15 +130,15 @@ def _probe(config: Config, model: str, *, clips: int) -> None:
     dataset = at_some_stride(open_dataset(config.data))
     with ConsoleReporter() as reporter:
         probe = probe_config(config, dataset, model=model, clips=clips, progress=reporter.task("probing"))
-    console.print(probe_table(probe))
+    show(probe_table(probe))
     print_finding(Finding("warning" if probe.better else "ok", "probe", probe.verdict()))
 
 
 def _index(options: argparse.Namespace) -> None:
     config = read_config(options.config, options.overrides).data
 
-    from vjepa2_ac.console.data import index_lines
-    from vjepa2_ac.console.progress import ConsoleReporter, console
+    from vjepa2_ac.console.progress import ConsoleReporter, show
+    from vjepa2_ac.console.tables import index_lines
     from vjepa2_ac.data.dataset import open_dataset
     from vjepa2_ac.data.index import record_usage
     from vjepa2_ac.reporter import INDEXING
@@ -152,16 +146,15 @@ def _index(options: argparse.Namespace) -> None:
     started = time.perf_counter()
     with ConsoleReporter() as reporter, record_usage(rebuild=options.rebuild) as watch:
         dataset = open_dataset(config, progress=reporter.task(INDEXING))
-    for line in index_lines(dataset.table, watch, time.perf_counter() - started):
-        console.print(line)
+    show(*index_lines(dataset.table, watch, time.perf_counter() - started))
 
 
 def _inspect(options: argparse.Namespace) -> None:
     config = read_config(options.config, options.overrides)
-    _make_folder(options.out)
+    make_folder(options.out)
 
-    from vjepa2_ac.console.data import motion_table
-    from vjepa2_ac.console.progress import ConsoleReporter, console
+    from vjepa2_ac.console.progress import ConsoleReporter, show
+    from vjepa2_ac.console.tables import motion_table
     from vjepa2_ac.data.dataset import open_dataset
     from vjepa2_ac.inspection.sheet import plot_dataset
     from vjepa2_ac.inspection.statistics import RELEASED, at_some_stride, inspect_dataset
@@ -170,20 +163,16 @@ def _inspect(options: argparse.Namespace) -> None:
 
     with ConsoleReporter() as reporter:
         dataset = at_some_stride(open_dataset(config.data, progress=reporter.task(INDEXING)))
-    if config.data.stride == "auto":
-        console.print(f"data.stride is auto: looked at the smallest candidate, {dataset.config.stride}")
-    with ConsoleReporter() as reporter:
+        if config.data.stride == "auto":
+            reporter.note(f"data.stride is auto: looked at the smallest candidate, {dataset.config.stride}")
         inspection = inspect_dataset(dataset, episodes=options.episodes, progress=reporter.task("reading states"))
-    for name, text in inspection.summary.items():
-        console.print(f"{name:<16}{text}")
-    console.print(motion_table(inspection.steps))
-    if inspection.has_poses:
-        console.print(f"For comparison: {RELEASED}.")
-    write_atomically(options.out / "inspect.json", json.dumps(inspection.values, indent=1).encode())
-    path = options.out / "contact_sheet.png"
-    with ConsoleReporter() as reporter:
-        image = plot_dataset(inspection, path, rows=options.rows, progress=reporter.task("reading frames"))
-    console.print(f"  {image}\n  {options.out / 'inspect.json'}")
+        show(*(f"{name:<16}{text}" for name, text in inspection.summary.items()), motion_table(inspection.steps))
+        if inspection.has_poses:
+            show(f"For comparison: {RELEASED}.")
+        values, sheet = options.out / "inspect.json", options.out / "contact_sheet.png"
+        write_atomically(values, json.dumps(inspection.values, indent=1).encode())
+        image = plot_dataset(inspection, sheet, rows=options.rows, progress=reporter.task("reading frames"))
+    show(files=[image, values])
 
 
 def _calibrate(options: argparse.Namespace) -> int:
@@ -192,22 +181,20 @@ def _calibrate(options: argparse.Namespace) -> int:
         return _calibrate_axes(options, config)
     if options.model is not None:
         require_subject(options.model)
-    _make_folder(options.out)
+    make_folder(options.out)
 
     from vjepa2_ac.calibration.strides import calibrate_config
-    from vjepa2_ac.console.data import calibration_table
-    from vjepa2_ac.console.progress import ConsoleReporter, console
+    from vjepa2_ac.console.progress import ConsoleReporter, show
+    from vjepa2_ac.console.tables import calibration_table
     from vjepa2_ac.evaluation.measure import ClipSample
     from vjepa2_ac.storage import write_atomically
 
     with ConsoleReporter() as reporter:
         sample = ClipSample(options.split, options.limit or _CLIPS, options.frames)
         calibration = calibrate_config(config, sample, model=options.model, reporter=reporter)
-    console.print(calibration_table(calibration))
-    console.print(calibration.verdict())
     path = options.out / "calibration.json"
     write_atomically(path, json.dumps(calibration.as_dict(), indent=1).encode())
-    console.print(f"  {path}")
+    show(calibration_table(calibration), calibration.verdict(), files=[path])
     return 0
 
 
@@ -215,33 +202,23 @@ def _calibrate_axes(options: argparse.Namespace, config: Config) -> int:
     """Fit the axes of a model; return 1 where nothing can be planned by them."""
     for name in ("model", "frames"):
         if getattr(options, name) is not None:
-            raise InputError(
-                where=f"--{name}", found="--axes beside it", needed="one of them: --model and --frames are of strides"
-            )
+            needed = "one of them: --model and --frames are of strides"
+            raise InputError(where=f"--{name}", found="--axes beside it", needed=needed)
     require_subject(options.axes)
 
     from vjepa2_ac.planning.axes.axes_file import AXES_FILE, require_axes_in
 
     require_axes_in(config.data)
-    _make_folder(options.out)
+    make_folder(options.out)
 
     from vjepa2_ac.calibration.axes import calibrate_axes
-    from vjepa2_ac.console.data import axes_table
-    from vjepa2_ac.console.progress import ConsoleReporter, console
+    from vjepa2_ac.console.progress import ConsoleReporter, show
+    from vjepa2_ac.console.tables import axes_table
     from vjepa2_ac.reports.figures.planning import plot_axes
 
     with ConsoleReporter() as reporter:
         pairs = options.limit or _PAIRS
         found = calibrate_axes(config, options.axes, pairs=pairs, split=options.split, reporter=reporter)
-    console.print(axes_table({options.axes: found.fit}))
-    console.print(found.verdict())
-    console.print(f"  {found.write(options.out / AXES_FILE)}\n  {plot_axes(found.fit, options.out / 'axes.png')}")
+    files = [found.write(options.out / AXES_FILE), plot_axes(found.fit, options.out / "axes.png")]
+    show(axes_table({options.axes: found.fit}), found.verdict(), files=files)
     return int(found.fit.problem is not None)
-
-
-def _make_folder(folder: Path) -> None:
-    """Create the folder for results before any long work."""
-    from vjepa2_ac.storage import user_can_write
-
-    with user_can_write(f"--out {folder}"):
-        folder.mkdir(parents=True, exist_ok=True)

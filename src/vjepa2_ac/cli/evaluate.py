@@ -1,4 +1,4 @@
-"""The evaluate and compare commands: metrics of runs and models on held-out episodes."""
+"""The commands evaluate, compare and imagine: what runs and models predict on held-out episodes."""
 
 from __future__ import annotations
 
@@ -10,47 +10,59 @@ from typing import TYPE_CHECKING
 from vjepa2_ac.cli.options import (
     Commands,
     add_checkpoint,
+    add_decoder,
+    add_planner,
     argument,
     as_local,
     as_model,
+    as_numbers,
     as_path,
     as_subject,
+    camera_pose,
     command,
     count,
+    load_planning_session,
     number_between,
     read_config,
     record_of_options,
-    require_overrides,
     require_subject,
+    require_to_plan,
     say_places_elsewhere,
     whole_number,
 )
 from vjepa2_ac.errors import InputError
 
 if TYPE_CHECKING:
+    from vjepa2_ac.decoding.imagine import Imagination
     from vjepa2_ac.evaluation.request import EvaluationOptions
+    from vjepa2_ac.reporter import Reporter
 
 
-def add_to(commands: Commands) -> None:
+def add_evaluate(commands: Commands) -> None:
     """Add `evaluate` and `compare` to a parser."""
     text = "Measure a run or a model on held-out episodes, beside its base, doing nothing and wrong actions."
     parser = command(commands, "evaluate", _evaluate, text)
     text = "folder of a run, or (with --data) what model.base takes; several: their spread, too"
     argument(parser, "subjects RUN_OR_MODEL", text, as_subject, nargs="+")
-    text = "measure on the data of this config (and with its model.dtype, device, seed)"
-    argument(parser, "--data CONFIG", text, as_local)
+    argument(parser, "--data CONFIG", "measure on its data (with its model.dtype, device, seed)", as_local)
     text = "what to compare with, on the same latents; default: the base of a run, nothing for a model"
     argument(parser, "--against base|RUN|MODEL", text, as_model, nargs="+")
     argument(parser, "--out FOLDER", "where figures go; default: the run's folder", as_path)
     argument(parser, "--split", "which held-out episodes (test)", choices=["test", "validation"])
     argument(parser, "--clips N", "at most this many clips, spread over the episodes (256)", count)
     add_checkpoint(parser)
-    text = "decode the rollouts and measure the images, too: what `vjepa2-ac decoder` made, or builtin:sim-tiny"
-    argument(parser, "--decoder FOLDER", text, as_model)
-    _add_metric_files(parser.add_argument_group("LPIPS of decoded images (see docs/decoding.md)"))
+    add_decoder(parser, "the rollouts, which are measured as images, too")
+    argument(parser, "--lpips FILE", "weights for LPIPS of the decoded images (docs/decoding.md)", as_path)
+    argument(parser, "--lpips-heads FILE", "its heads: alex.pth or vgg.pth of version 0.1", as_path)
     argument(parser, "--calibrate", "measure the one-step error at other strides, too", action="store_true")
     _add_probes(parser.add_argument_group("use of the actions"))
-    _add_planning(parser.add_argument_group("plans (they take long: see docs/evaluation.md)"))
+    group = parser.add_argument_group("plans (they take long: see docs/evaluation.md)")
+    text = (
+        "plan from held-out frames, and hold the plans against the demonstrations: action error, Action Score; settings"
+        " of the plan of one step, such as planning.samples=200, in place of the config's, here or anywhere"
+    )
+    argument(group, "--planning planning.key=value", text, nargs="*", dest="plan_settings")
+    argument(group, "--planning-clips N", "clips to plan from, one frame of each (32)", count, default=32)
     parser.set_defaults(overrides=[])
 
     text = "Put runs side by side that `evaluate` has measured on the same clips: one table, one image."
@@ -59,45 +71,56 @@ def add_to(commands: Commands) -> None:
     argument(parser, "--out PNG", "the image (comparison.png)", as_path, default=Path("comparison.png"))
 
 
-def _add_metric_files(group: argparse._ArgumentGroup) -> None:
-    text = "LPIPS of the decoded images, by these weights: alexnet-owt-7be5be79.pth or vgg16-397923af.pth"
-    argument(group, "--lpips FILE", text, as_path)
-    argument(group, "--lpips-heads FILE", "its heads: alex.pth or vgg.pth of version 0.1", as_path)
+def add_imagine(commands: Commands) -> None:
+    """Add `imagine` to a parser."""
+    text = (
+        "Show what a model imagines from one frame of a held-out clip: under the recorded actions, beside the truth and"
+        " the base, and under actions that were not taken. A strip, an MP4 and a GIF. Of data that `simulate record`"
+        " made, what really happens is shown, too. A decoded image is no evidence of success: docs/decoding.md."
+    )
+    parser = command(commands, "imagine", _imagine, text)
+    add_planner(parser, such_as="with --image: such as planning.limits.xyz=data")
+    argument(parser, "--decoder FOLDER", "what `vjepa2-ac decoder` made, or builtin:sim-tiny", as_model, required=True)
+    text = (
+        "with commas between them: true (the recorded ones of a clip), none, up, down, left, right, forward, back,"
+        " open, close, in the robot's frame; or files, .npy or .csv: a row of 7 numbers for each step"
+        " (true,none,up,left,close)"
+    )
+    argument(parser, "--actions NAMES", text)
+    argument(parser, "--steps N", "model steps to imagine (7)", count, default=7)
+    argument(parser, "--size CM", "of a named action in each step, within planning.limits (5)", float, default=5.0)
+    argument(parser, "--episode ID", "the clip's name in the data (that of the split with the most motion)")
+    argument(parser, "--start N", "its first control step (0)", whole_number(0))
+    group = parser.add_argument_group("instead of a clip")
+    argument(group, "--image IMAGE", "what a camera sees: PNG or JPEG; actions by name only", as_local)
+    argument(group, "--state NUMBERS", "measured then, as `plan --state`")
+    argument(parser, "--split", "of the clip (test)", choices=["test", "validation", "train"], default="test")
+    argument(parser, "--data CONFIG", "clips of other data; needed for a model", as_local)
+    argument(parser, "--out FOLDER", "where the film goes (imagined, in the run's)", as_path)
 
 
 def _add_probes(group: argparse._ArgumentGroup) -> None:
     argument(group, "--sensitivity-clips N", "clips to try other actions on (32)", whole_number(0))
     argument(group, "--samples N", "other actions for each of them (64)", count)
-    text = "clips of those with an energy landscape (8)"
-    argument(group, "--landscapes N", text, whole_number(0), dest="landscape_clips")
-    text = "clips of those to calibrate the axes by (32)"
-    argument(group, "--axes N", text, whole_number(0), dest="axis_clips")
+    argument(group, "--landscapes N", "of those, with an energy landscape (8)", whole_number(0), dest="landscape_clips")
+    argument(group, "--axes N", "clips of those to calibrate the axes by (32)", whole_number(0), dest="axis_clips")
     argument(group, "--nodes N", "of a landscape along each axis (9)", whole_number(3, 51))
-    text = "half the width of landscape and box, in cm (7.5)"
+    text = "half the width of landscape and box (7.5)"
     argument(group, "--reach CM", text, number_between(0.0, 1000.0, "cm"), dest="reach_cm")
     argument(group, "--examples N", "clips to show (4)", whole_number(0))
     argument(group, "--at-once N", "actions computed together (64): lower it to save memory", count)
-
-
-def _add_planning(group: argparse._ArgumentGroup) -> None:
-    text = (
-        "plan from held-out frames, and hold the plans against the demonstrations: action error, Action Score; settings"
-        " of the plan of one step, such as planning.samples=200, in place of the config's, here or anywhere"
-    )
-    argument(group, "--planning planning.key=value", text, nargs="*", dest="plan_settings")
-    argument(group, "--planning-clips N", "clips to plan from, one frame of each (32)", count, default=32)
 
 
 def _evaluate(options: argparse.Namespace) -> None:
     from vjepa2_ac.evaluation.request import settle
 
     asked = _asked(options)
-    for subject, how in asked:  # wrong words are told before what takes seconds is imported
+    for subject, how in asked:
         settle(subject, how)
         require_subject(subject, how.checkpoint)
 
-    from vjepa2_ac.console.evaluation import row_tables
-    from vjepa2_ac.console.progress import ConsoleReporter, console
+    from vjepa2_ac.console.progress import ConsoleReporter, show
+    from vjepa2_ac.console.tables import row_tables
     from vjepa2_ac.evaluation.rows import rows_of
     from vjepa2_ac.evaluation.verdict import spread, verdict
     from vjepa2_ac.reports.write import evaluate_subject
@@ -108,21 +131,17 @@ def _evaluate(options: argparse.Namespace) -> None:
         with ConsoleReporter() as reporter:
             measured = evaluate_subject(subject, how, reporter)
         evaluations.append(measured.evaluation)
-        console.print(f"{subject}: checkpoint {measured.checkpoint}" if measured.checkpoint else subject)
-        for table in row_tables(rows_of(measured.evaluation), "Held-out episodes"):
-            console.print(table)
-        console.print(verdict(measured.evaluation))
-        for path in measured.files:
-            console.print(f"  {path}")
+        name = f"{subject}: checkpoint {measured.checkpoint}" if measured.checkpoint else subject
+        tables = row_tables(rows_of(measured.evaluation), "Held-out episodes")
+        show(name, *tables, verdict(measured.evaluation), files=measured.files)
     if len(evaluations) > 1:
-        console.print(spread(evaluations))
+        show(spread(evaluations))
 
 
 def _asked(options: argparse.Namespace) -> list[tuple[str, EvaluationOptions]]:
     """Return what is asked of each subject; refuse planning settings that would have no effect: without plans."""
     from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 
-    require_overrides(options.overrides, fix="Name all runs and models one behind the other, before the options")
     if options.overrides and options.plan_settings is None:
         found = f"{' '.join(options.overrides)}, and no plans are asked for"
         needed = "--planning beside settings of planning; what else a config says is not changed by evaluate"
@@ -148,12 +167,71 @@ def _compare(options: argparse.Namespace) -> None:
 
     comparison = compare(options.runs)
 
-    from vjepa2_ac.console.evaluation import row_tables
-    from vjepa2_ac.console.progress import console
+    from vjepa2_ac.console.progress import show
+    from vjepa2_ac.console.tables import row_tables
     from vjepa2_ac.reports.figures.evaluation import plot_comparison
 
-    for table in row_tables(comparison.rows, comparison.title):
-        console.print(table)
-    for line in comparison.notes:
-        console.print(line)
-    console.print(f"  {plot_comparison(comparison, options.out)}")
+    tables = row_tables(comparison.rows, comparison.title)
+    show(*tables, *comparison.notes, files=[plot_comparison(comparison, options.out)])
+
+
+def _imagine(options: argparse.Namespace) -> None:
+    _require_one_start(options)
+
+    from vjepa2_ac.console.progress import ConsoleReporter, show
+    from vjepa2_ac.reports.imagined import write_film_of
+    from vjepa2_ac.runs.folder import is_run
+
+    home = Path(options.subject) if is_run(options.subject) else Path()
+    out = options.out or home / "imagined"
+    with ConsoleReporter() as reporter:
+        imagination = _of_image(options) if options.image is not None else _of_clip(options, out, reporter)
+        written = write_film_of(imagination, out, reporter=reporter)
+    show(*imagination.notes, files=written)
+
+
+def _require_one_start(options: argparse.Namespace) -> None:
+    """Refuse options that do not belong together."""
+    if options.start is not None and options.episode is None:
+        raise InputError(where="--start", found="no --episode", needed="the episode whose control step it is")
+    if (options.image is None) != (options.state is None):
+        raise InputError(where="--image, --state", found="one of them", needed="both: state and image of one moment")
+    clip = {"--episode": options.episode, "--data": options.data}
+    if options.image is not None and (given := [name for name, value in clip.items() if value is not None]):
+        raise InputError(where="--image", found=f"{', '.join(given)}, too", needed="a clip or an image, not both")
+
+
+def _words(options: argparse.Namespace) -> tuple[str, ...]:
+    usual = "none,up,left,close" if options.image is not None else "true,none,up,left,close"
+    return tuple(word for word in (options.actions or usual).split(",") if word)
+
+
+def _of_clip(options: argparse.Namespace, out: Path, reporter: Reporter) -> Imagination:
+    from vjepa2_ac.evaluation.imagined import ImagineOptions, imagine_clip
+    from vjepa2_ac.evaluation.request import EvaluationOptions
+    from vjepa2_ac.simulation.imagined_truth import with_what_happens
+
+    say_places_elsewhere(options.subject)
+    data = None if options.data is None else read_config(options.data, of_run=True)
+    asked = ImagineOptions(
+        decoder=options.decoder,
+        actions=_words(options),
+        steps=options.steps,
+        size_m=options.size / 100,
+        split=options.split,
+        episode=options.episode,
+        start=options.start,
+        evaluation=EvaluationOptions(checkpoint=options.checkpoint, data=data, out=out),
+    )
+    return with_what_happens(imagine_clip(options.subject, asked, reporter=reporter)).imagination
+
+
+def _of_image(options: argparse.Namespace) -> Imagination:
+    from vjepa2_ac.evaluation.imagined import Seen, imagine_image
+    from vjepa2_ac.media.image_file import read_image
+
+    state, extrinsics = as_numbers(options.state, "--state"), camera_pose(options.extrinsics)
+    require_to_plan(options)
+    seen = Seen(read_image(options.image), state, extrinsics)
+    session, words = load_planning_session(options), _words(options)
+    return imagine_image(session, options.decoder, seen, words, steps=options.steps, size_m=options.size / 100)

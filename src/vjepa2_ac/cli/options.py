@@ -24,16 +24,20 @@ if TYPE_CHECKING:
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 Handler = Callable[[argparse.Namespace], int | None]
 
-NEGATIVE_NUMBERS = re.compile(r"^-[\d.]")  # for a parser that takes several in one word
 _MOST = 10**9
 _OPTION = re.compile(r"-(?![\d.])")  # but a negative number is a value
 _OVERRIDE = re.compile(r"[a-z_]+(\.\w+)+=")
 _Record = TypeVar("_Record")
 _Number = TypeVar("_Number", int, float)
+_Read = TypeVar("_Read")
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose messages cannot move a terminal's cursor, whatever the arguments are."""
+    """A parser whose messages cannot move a terminal's cursor, and which takes `-0.3,0.1` for a value."""
+
+    def __init__(self, **how: Any) -> None:
+        super().__init__(**how)
+        self._negative_number_matcher = re.compile(r"^-[\d.]")
 
     def error(self, message: str) -> NoReturn:
         """Print the error, and exit with status 2."""
@@ -80,20 +84,41 @@ def add_checkpoint(parser: argparse._ActionsContainer, default: str | None = "se
     argument(parser, "--checkpoint selected|newest|best|STEP", text, default=default)
 
 
+def add_planner(parser: argparse.ArgumentParser, *, such_as: str) -> None:
+    """Add the run or the model that plans, `key=value` words behind it, and what else a `planning_session` is of."""
+    argument(parser, "subject RUN_OR_MODEL", "folder of a run, or what model.base takes", as_model)
+    argument(parser, "overrides key=value", such_as, nargs="*")
+    add_checkpoint(parser)
+    argument(parser, "--config CONFIG", "for a model: the config whose planning, crop and dtype count", as_local)
+    text = "the camera's x,y,z,roll,pitch,yaw in the robot base frame, if the model uses it"
+    argument(parser, "--extrinsics NUMBERS", text)
+
+
+def add_decoder(parser: argparse._ActionsContainer, shows: str) -> None:
+    """Add `--decoder`, with which something is drawn."""
+    text = f"shows {shows}: the folder that `vjepa2-ac decoder` made, or builtin:sim-tiny"
+    argument(parser, "--decoder FOLDER", text, as_model)
+
+
 def record_of_options(kind: Callable[..., _Record], options: argparse.Namespace, **others: Any) -> _Record:
     """Return a record whose fields are the options of their names that were given, and others."""
     given = {field.name: getattr(options, field.name, None) for field in fields(kind)}  # type: ignore[arg-type]
     return kind(**{name: value for name, value in given.items() if value is not None} | others)
 
 
+def speaks() -> bool:
+    """Return whether this is the only process, or the first of several."""
+    return os.environ.get("RANK", "0") == "0"
+
+
 def say_places_elsewhere(subject: str) -> None:
     """Print the addresses that the config of a run names, before any of them is contacted; nothing for a model."""
-    from vjepa2_ac.console.progress import console
+    from vjepa2_ac.console.progress import show
     from vjepa2_ac.runs.folder import is_run, places_elsewhere, read_run_config
 
-    if is_run(subject) and os.environ.get("RANK", "0") == "0":  # one of several processes
+    if is_run(subject) and speaks():
         for place in places_elsewhere(read_run_config(Path(subject))):
-            console.print(f"{subject} names a place elsewhere: {place}")
+            show(f"{subject} names a place elsewhere: {place}")
 
 
 def read_config(path: str | Path, overrides: Sequence[str] = (), *, base: bool = False, of_run: bool = False) -> Config:
@@ -163,19 +188,9 @@ def load_planning_session(options: argparse.Namespace) -> PlanningSession:
     """Load the run or the model that plans, with the settings that `require_to_plan` has checked."""
     from vjepa2_ac.planning.session import load_to_plan
 
+    say_places_elsewhere(options.subject)
     how = {"checkpoint": options.checkpoint, "config": options.config, "overrides": options.overrides}
     return load_to_plan(options.subject, **how)
-
-
-def add_decoder(parser: argparse._ActionsContainer, shows: str) -> None:
-    """Add `--decoder`.
-
-    Args:
-        parser: Gets the option.
-        shows: What is drawn with it.
-    """
-    text = f"shows {shows}: the folder that `vjepa2-ac decoder` made, or builtin:sim-tiny"
-    argument(parser, "--decoder FOLDER", text, as_model)
 
 
 def given_decoder(options: argparse.Namespace) -> TrainedDecoder | None:
@@ -185,6 +200,41 @@ def given_decoder(options: argparse.Namespace) -> TrainedDecoder | None:
     return None if options.decoder is None else load_decoder(options.decoder)
 
 
+def make_folder(folder: Path) -> None:
+    """Create the folder of `--out` before any long work.
+
+    Raises:
+        InputError: It cannot be.
+    """
+    from vjepa2_ac.storage import user_can_write
+
+    with user_can_write(f"--out {folder}"):
+        folder.mkdir(parents=True, exist_ok=True)
+
+
+def require_goals(folder: Path | None) -> None:
+    """Refuse a folder of `--goals` that is not there, before what takes seconds is imported.
+
+    Raises:
+        InputError: It is not.
+    """
+    if folder is not None and not folder.is_dir():
+        raise InputError(where=f"--goals {folder}", found="no such folder", needed="a folder with goals")
+
+
+def require_new_place(folder: Path) -> None:
+    """Refuse a folder that is not empty or could not be made, before any long work.
+
+    Raises:
+        InputError: It is one of these.
+    """
+    from vjepa2_ac.storage import require_new_folder, try_writing_at, user_can_write
+
+    require_new_folder(folder)
+    with user_can_write(folder):
+        try_writing_at(folder)
+
+
 def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argparse.Namespace:
     """Parse a command line; `key=value` may be anywhere after a command that takes it.
 
@@ -192,9 +242,13 @@ def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> 
     the names of several runs or models for names.
     """
     options, rest = parser.parse_known_args(arguments)
-    unknown = [word for word in rest if _OPTION.match(word)]
-    if rest and (unknown or not hasattr(options, "overrides")):
-        parser.error(f"unrecognized arguments: {' '.join(word for word in rest if not _OVERRIDE.match(word))}")
+    others = [word for word in rest if "=" not in word or _OPTION.match(word)]
+    if rest and not hasattr(options, "overrides"):
+        parser.error(f"unrecognized arguments: {' '.join(rest)}")
+    if any(map(_OPTION.match, others)):
+        parser.error(f"unrecognized arguments: {' '.join(others)}")
+    if others and vars(options).get("subject") != "record":  # `simulate record` takes a folder there
+        parser.error(f"{' '.join(others)!r} is no key=value (numbers go in one word: 0.4,0,0.3; names side by side)")
     if "subjects" in options:
         rest = [*filter(_is_override, options.subjects), *rest]
         options.subjects = [word for word in options.subjects if not _is_override(word)]
@@ -214,36 +268,22 @@ def _is_override(word: str) -> bool:
     return _OVERRIDE.match(word) is not None and not Path(word).exists()
 
 
-def require_overrides(words: Sequence[str], *, fix: str = "") -> None:
-    """Refuse words that are no `key=value`, before anything is read.
+def _reader(read: Callable[[str], _Read]) -> Callable[[str], _Read]:
+    """Return what reads a value of an option, of what raises a ValueError whose message continues after the value."""
 
-    Raises:
-        InputError: There is one.
-    """
-    others = [word for word in words if "=" not in word]
-    if others:
-        found, needed = f"{' '.join(others)!r}", "key=value, such as training.steps=100"
-        raise InputError(where="command line", found=found, needed=needed, fix=fix)
+    def value(text: str) -> _Read:
+        try:
+            return read(text)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(f"{text!r} {error}") from None
 
-
-def as_path(text: str) -> Path:
-    """Parse an option that is a path of this machine; `~` is the user's home, also after `--out=`."""
-    return Path(as_local(text))
+    return value
 
 
-def as_local(text: str) -> str:
-    """Parse a path of this machine, and keep its spelling."""
-    return _meant(places.on_this_machine, text)
-
-
-def as_place(text: str) -> str:
-    """Parse a path of this machine, or a URL."""
-    return _meant(places.anywhere, text)
-
-
-def as_model(text: str) -> str:
-    """Parse the name of a run or a model: a path of this machine, or a model that comes with the package."""
-    return _meant(places.of_a_model, text)
+as_local = _reader(places.on_this_machine)  # a path of this machine, in its spelling; `~` is the user's home
+as_path = _reader(lambda text: Path(places.on_this_machine(text)))
+as_place = _reader(places.anywhere)  # a path of this machine, or a URL
+as_model = _reader(places.of_a_model)  # a path of this machine, or a model that comes with the package
 
 
 def as_planner(text: str) -> str:
@@ -278,13 +318,6 @@ def _numbers(kind: Callable[[str], _Number], fits: Callable[[_Number], bool], me
 
 
 count = whole_number(1)  # a number of things
-
-
-def _meant(read: Callable[[str], str], text: str) -> str:
-    try:
-        return read(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(f"{text!r} {error}") from None
 
 
 def as_numbers(text: str, where: str) -> np.ndarray:

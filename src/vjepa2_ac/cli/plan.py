@@ -1,4 +1,4 @@
-"""The plan command: the next action of a robot for given images and states."""
+"""The commands plan and goals: the next action of a robot, and goals that follow one another, of a demonstration."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli.options import (
-    NEGATIVE_NUMBERS,
     Commands,
     add_checkpoint,
     add_decoder,
+    add_planner,
     argument,
     as_local,
     as_model,
@@ -18,9 +18,15 @@ from vjepa2_ac.cli.options import (
     as_path,
     camera_pose,
     command,
+    count,
     given_decoder,
     load_planning_session,
-    require_overrides,
+    make_folder,
+    number_between,
+    read_config,
+    record_of_options,
+    require_goals,
+    require_new_place,
     require_to_plan,
     say_places_elsewhere,
     whole_number,
@@ -32,22 +38,22 @@ if TYPE_CHECKING:
 
     from vjepa2_ac.config import Config
     from vjepa2_ac.config.planning import PlanningConfig
+    from vjepa2_ac.demonstrations.make_goals import Recording
     from vjepa2_ac.planning.goal_folder import GoalFolder
+    from vjepa2_ac.planning.session import PlanningSession
 
 _QUICK, _QUICK_SEQUENCES = "planning.samples=64 planning.iterations=4", 256  # docs/planning.md says how good it is
+_FILMS = (".mp4", ".m4v", ".mov")
 
 
-def add_to(commands: Commands) -> None:
+def add_plan(commands: Commands) -> None:
     """Add `plan` to a parser."""
     text = (
         "Plan from an image and a state to a goal image: plan.json, and an image of how the planner came to it."
         " Status 1 where the model gives no finite energy."
     )
     parser = command(commands, "plan", _plan, text)
-    parser._negative_number_matcher = NEGATIVE_NUMBERS  # "-0.3,0.1,..." is a value, not an option
-    argument(parser, "subject RUN_OR_MODEL", "folder of a run, or what model.base takes", as_model)
-    text = f"such as planning.horizon=2; quick, for a CPU: {_QUICK}"
-    argument(parser, "overrides key=value", text, nargs="*")
+    add_planner(parser, such_as=f"such as planning.horizon=2; quick, for a CPU: {_QUICK}")
     argument(parser, "--start IMAGE", "what the camera sees: PNG or JPEG", as_local, required=True)
     text = (
         "measured x,y,z (m), roll,pitch,yaw (radians, extrinsic xyz), gripper (0 open .. 1 closed); or the numbers of a"
@@ -57,17 +63,9 @@ def add_to(commands: Commands) -> None:
     text = "what it shall see; again for goals that follow one another"
     goals = parser.add_mutually_exclusive_group(required=True)
     argument(goals, "--goal IMAGE", text, as_local, action="append")
-    text = "goals with rules of their own, that `vjepa2-ac goals` made; the first one applies"
-    argument(goals, "--goals FOLDER", text, as_path)
-    text = "model steps of each goal but the last, as 2,1; default: equal shares of planning.horizon"
-    argument(parser, "--durations STEPS", text)
-    text = "what of the image counts: of the goal's size, black where it does not"
-    argument(parser, "--mask IMAGE", text, as_local)
-    text = "the camera in the robot base frame: x,y,z,roll,pitch,yaw; where the model uses it"
-    argument(parser, "--extrinsics NUMBERS", text)
-    text = "for a model: the config whose planning, crop and dtype count"
-    argument(parser, "--config CONFIG", text, as_local)
-    add_checkpoint(parser)
+    argument(goals, "--goals FOLDER", "goals with rules of their own, that `vjepa2-ac goals` made", as_path)
+    argument(parser, "--durations STEPS", "model steps of all goals but the last, as 2,1 (equal shares)")
+    argument(parser, "--mask IMAGE", "what of the image counts: of the goal's size, black where it does not", as_local)
     argument(parser, "--seed N", "default: the config's", whole_number(0, 2**31 - 1))
     text = (
         "of the image's energy maps along each axis; 0: no maps; default: 13, or as many as evaluate no more action"
@@ -78,25 +76,49 @@ def add_to(commands: Commands) -> None:
     argument(parser, "--out FOLDER", "for both files (plan)", as_path, default=Path("plan"))
 
 
-def _plan(options: argparse.Namespace) -> int:
-    from vjepa2_ac.storage import user_can_write
+def add_goals(commands: Commands) -> None:
+    """Add `goals` to a parser."""
+    text = (
+        "Make goals of one demonstration, an episode or a film: its key frames with durations and gripper, in a folder"
+        " that `plan --goals` and `simulate --goals` take, with a contact sheet."
+    )
+    parser = command(commands, "goals", _goals, text)
+    argument(parser, "source CONFIG|VIDEO", "a config, of whose data the episode is; or a film, MP4", as_local)
+    argument(parser, "overrides key=value", "of the config, such as data.camera=wrist_left", nargs="*")
+    argument(parser, "--out FOLDER", "where goals.json and the images go: new or empty", as_path, required=True)
+    argument(parser, "--episode ID|NUMBER", "which one: its name in the data, or its number, from 0 (0)")
+    text = (
+        "gripper: where it changes, the arm stops, and the end, from the states; latent: where images stop becoming"
+        " more like the next goal, with --model; every N: every N-th frame (gripper; of a film latent)"
+    )
+    argument(parser, "--by gripper|latent|every", text, nargs="+")
+    text = "that will plan: for latents, energies and the noise floor; the folder of a run, or what model.base takes"
+    argument(parser, "--model RUN_OR_MODEL", text, as_model)
+    add_checkpoint(parser, default=None)
+    argument(parser, "--stride N", "frames of a model step (data.stride); needed of a film", count)
+    argument(parser, "--apart N", "least frames from one goal to another (gripper: 4; latent: 4 model steps)", count)
+    argument(parser, "--slack N", "model steps that a goal may take fewer or more (3)", whole_number(0), default=3)
+    share, energy = number_between(0.0, 1.0, "the energy"), "of the energy at a goal's beginning, below which"
+    argument(parser, "--share X", f"{energy} the next one follows (none: by steps only)", share)
+    argument(parser, "--stop-share X", f"{energy} the last one is reached (none: an equal image)", share)
+    argument(parser, "--still VIDEO", "of the resting arm, for the noise floor (where the episode rests)", as_path)
 
-    # Wrong words are told before what takes seconds is imported.
-    require_overrides(options.overrides, fix="Numbers of --state or --extrinsics go in one word: --state 0.4,0,0.3,...")
+
+def _plan(options: argparse.Namespace) -> int:
     state, extrinsics = as_numbers(options.state, "--state"), camera_pose(options.extrinsics)
     durations = _durations(options)
+    require_goals(options.goals)
     _require_state(state, require_to_plan(options))
-    with user_can_write(options.out):
-        options.out.mkdir(parents=True, exist_ok=True)
+    make_folder(options.out)
     start, goals, mask = _images(options)
 
-    from vjepa2_ac.console.plan import plan_table
-    from vjepa2_ac.console.progress import ConsoleReporter, console
+    from vjepa2_ac.console.progress import ConsoleReporter, show
+    from vjepa2_ac.console.tables import plan_table
     from vjepa2_ac.decoding.imagined_plan import imagine_plan
     from vjepa2_ac.planning.decision import PLAN_FILE, PlanRequest, decide, summarize, write_plan
     from vjepa2_ac.reports.figures.planning import PLAN_IMAGE, plot_plan
+    from vjepa2_ac.storage import user_can_write
 
-    say_places_elsewhere(options.subject)
     decoder = given_decoder(options)
     session = load_planning_session(options)
     if decoder is not None:
@@ -122,10 +144,7 @@ def _plan(options: argparse.Namespace) -> int:
             write_plan(found, about, options.out / PLAN_FILE),
             plot_plan(found, options.out / PLAN_IMAGE, imagined),
         ]
-    console.print(plan_table(found))
-    console.print(summarize(found))
-    for path in written:
-        console.print(f"  {path}")
+    show(plan_table(found), summarize(found), files=written)
     return int(found.decision.why == "no finite energy")
 
 
@@ -153,16 +172,18 @@ def _images(
 ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | GoalFolder, np.ndarray | None]:
     """Return start, goals and mask; refuse what cannot be planned with, before a model is loaded."""
     from vjepa2_ac.media.image_file import read_image
-    from vjepa2_ac.planning.goal_folder import read_goal_folder
     from vjepa2_ac.planning.input_checks import require_image, require_mask
 
-    folder = None if options.goals is None else read_goal_folder(options.goals)
-    if folder is None:
+    folder = None
+    if options.goals is not None:
+        from vjepa2_ac.planning.goal_folder import read_goal_folder
+
+        folder = read_goal_folder(options.goals)
+        images = tuple(goal.image for goal in folder.goals)
+    else:
         images = tuple(read_image(path) for path in options.goal)
         for path, image in zip(options.goal, images, strict=True):
             require_image(image, where=f"--goal {path}", like=images[0])
-    else:
-        images = tuple(goal.image for goal in folder.goals)
     start = read_image(options.start)
     require_image(start, where=f"--start {options.start}", like=images[0])
     mask = None if options.mask is None else read_image(options.mask).max(axis=-1)
@@ -184,3 +205,83 @@ def _durations(options: argparse.Namespace) -> tuple[int, ...]:
         needed = f"{goals - 1} whole numbers from 1, with commas between them: of each goal but the last"
         raise InputError(where="--durations", found=found, needed=needed)
     return tuple(int(word) for word in words)
+
+
+def _goals(options: argparse.Namespace) -> None:
+    by, every = _way(options)
+    require_new_place(options.out)
+    recording, stride = _recording(options)
+
+    from vjepa2_ac.console.progress import ConsoleReporter, show
+    from vjepa2_ac.console.tables import goals_notes, goals_table
+    from vjepa2_ac.demonstrations.make_goals import Energies, KeyFrameOptions, make_goals, recording_of_film
+    from vjepa2_ac.reports.figures.planning import GOALS_IMAGE, plot_goals
+    from vjepa2_ac.storage import user_can_write
+
+    still = None if options.still is None else recording_of_film(options.still)
+    session = _session(options)
+    chosen = record_of_options(KeyFrameOptions, options, by=by, every=every, stride=stride)
+    with ConsoleReporter() as reporter:
+        energies = None if session is None else Energies(session)
+        made = make_goals(recording, chosen, energies, still=still, reporter=reporter)
+    with user_can_write(options.out):
+        written = [made.write(options.out), plot_goals(made, options.out / GOALS_IMAGE)]
+    show(goals_table(made), *goals_notes(made), files=written)
+
+
+def _is_film(options: argparse.Namespace) -> bool:
+    return Path(options.source).suffix.lower() in _FILMS
+
+
+def _way(options: argparse.Namespace) -> tuple[str, int | None]:
+    """Return how key frames are found, and of `every` how many frames apart; give back words that are no part of it."""
+    words = [word for word in options.by or () if "=" not in word]
+    options.overrides = [*options.overrides, *(word for word in options.by or () if "=" in word)]
+    way, *rest = words or ["latent" if _is_film(options) else "gripper"]
+    is_every = way == "every" and len(rest) == 1 and rest[0].isdecimal() and int(rest[0]) > 0
+    if not is_every and (way not in {"gripper", "latent"} or rest):
+        needed = "gripper, latent, or every N, with a number of frames"
+        raise InputError(where="--by", found=" ".join(words), needed=needed)
+    needs_model = {"--by latent": way == "latent", "--still": options.still, "--checkpoint": options.checkpoint}
+    for name, given in needs_model.items():
+        if given and options.model is None:
+            raise InputError(where=name, found="no model", needed="--model RUN_OR_MODEL")
+    if is_every and options.apart is not None:
+        raise InputError(where="--apart", found="--by every N", needed="one of them: N frames are between its goals")
+    return way, int(rest[0]) if is_every else None
+
+
+def _recording(options: argparse.Namespace) -> tuple[Recording, int]:
+    """Return the demonstration, and the frames of a model step."""
+    if _is_film(options):
+        from vjepa2_ac.demonstrations.make_goals import recording_of_film
+
+        for name, given in {"--episode": options.episode, "key=value": options.overrides}.items():
+            if given:
+                raise InputError(where=name, found=f"{options.source}, a film", needed="a config, of whose data it is")
+        if options.stride is None:
+            found = "a film, which has no model steps of its own"
+            fix = "Of 30 frames a second, 8 last 0.27 s, as a model step of the released weights does: --stride 8"
+            raise InputError(where="--stride", found=found, needed="how many frames are a model step", fix=fix)
+        return recording_of_film(Path(options.source)), options.stride
+    config = read_config(options.source, options.overrides, of_run=True)
+    stride = options.stride or config.data.stride
+    if stride == "auto":
+        found, fix = "auto", "Say how many control steps a model step has: --stride 4"
+        raise InputError(where="data.stride", found=found, needed="a number", fix=fix)
+
+    from vjepa2_ac.console.progress import ConsoleReporter
+    from vjepa2_ac.demonstrations.make_goals import recording_of_episode
+    from vjepa2_ac.reporter import INDEXING
+
+    with ConsoleReporter() as reporter:
+        return recording_of_episode(config.data, options.episode or "0", reporter.task(INDEXING)), stride
+
+
+def _session(options: argparse.Namespace) -> PlanningSession | None:
+    if options.model is None:
+        return None
+    from vjepa2_ac.planning.session import load_to_plan
+
+    say_places_elsewhere(options.model)
+    return load_to_plan(options.model, checkpoint=options.checkpoint or "selected")

@@ -10,21 +10,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from vjepa2_ac import __version__, output
-from vjepa2_ac.cli import (
-    data,
-    encode,
-    evaluate,
-    export,
-    goals,
-    plan,
-    serve,
-    simulate,
-    train,
-)
-from vjepa2_ac.cli.decoding import decoder, imagine
-from vjepa2_ac.cli.options import Handler, Parser, parsed
-from vjepa2_ac.cli.setup import config, demo, doctor, download, init
-from vjepa2_ac.distributed.signals import tidy_end
+from vjepa2_ac.cli import closed_loop, data, evaluate, plan, setup, train
+from vjepa2_ac.cli.options import Handler, Parser, parsed, speaks
+from vjepa2_ac.distributed.signals import EXIT_STATUS, StoppedError, tidy_end
 from vjepa2_ac.errors import InputError, UserError, extra_of, in_words, is_out_of_memory, pip_install, printable
 
 
@@ -53,20 +41,21 @@ def _run(arguments: Sequence[str] | None) -> int:
 
             name_plugins(options.plugin)
         return handler(options) or 0
-    except (UserError, OSError, MemoryError) as error:  # a full disk, a path that is no path: the message names it
-        _complain(in_words(error))
-        return 2
     except ModuleNotFoundError as error:  # most of those of extras are errors of their own
         library = (error.name or "vjepa2_ac").partition(".")[0]
         if library == "vjepa2_ac":
             raise
         _complain(f"{library}: it is not installed. Run {pip_install(extra_of(library))}")
         return 2
-    except RuntimeError as error:
-        if not is_out_of_memory(error):
+    except (UserError, OSError, MemoryError, RuntimeError) as error:  # a full disk, a path that is no path
+        if isinstance(error, RuntimeError) and not is_out_of_memory(error):
             raise
         _complain(in_words(error))
         return 2
+    except StoppedError as stopped:
+        if speaks():
+            print(printable(str(stopped)), file=sys.stderr)
+        return EXIT_STATUS
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
@@ -108,10 +97,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=__version__)
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    first, then = (
-        (demo, init, train, evaluate, imagine, data, encode, decoder, doctor),
-        (plan, goals, serve, export, config),
-    )
-    for one in (*first, *then, download, simulate):
-        one.add_to(commands)
+    first = (setup.add_demo, setup.add_init, train.add_train, evaluate.add_evaluate, evaluate.add_imagine)
+    of_data = (data.add_data, train.add_encode, train.add_decoder_command, setup.add_doctor)
+    of_planning = (plan.add_plan, plan.add_goals, closed_loop.add_serve, closed_loop.add_simulate)
+    for add in (*first, *of_data, *of_planning, train.add_export, setup.add_config_command, setup.add_download):
+        add(commands)
     return parser

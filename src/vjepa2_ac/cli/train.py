@@ -1,36 +1,77 @@
-"""The command train."""
+"""The commands that compute once what others use: train, encode, decoder and export."""
 
 from __future__ import annotations
 
 import argparse
-import os
-import sys
 from pathlib import Path
 
-from vjepa2_ac.cli.options import Commands, add_config, argument, command, read_config, say_places_elsewhere
-from vjepa2_ac.errors import InputError, printable
+from vjepa2_ac.cli.options import (
+    Commands,
+    add_checkpoint,
+    add_config,
+    argument,
+    as_path,
+    command,
+    read_config,
+    say_places_elsewhere,
+    speaks,
+)
+from vjepa2_ac.errors import InputError
 
 
-def add_to(commands: Commands) -> None:
+def add_train(commands: Commands) -> None:
     """Add `train` to a parser."""
-    parser = command(
-        commands,
-        "train",
-        _train,
+    text = (
         "Train an adapter (or the whole predictor) as a config says. SIGTERM, SIGINT, SIGUSR1, SIGHUP: finish the step,"
-        " write a checkpoint, end with status 75; the same command goes on from there. A second signal: end at once.",
+        " write a checkpoint, end with status 75; the same command goes on from there. A second signal: end at once."
     )
+    parser = command(commands, "train", _train, text)
     what = "a YAML config, or with --resume the folder of a run"
     add_config(parser, such_as="training.learning_rate=3e-4", what=what)
-    for words, text in (
-        ("--resume", "go on with the run in the folder CONFIG"),
-        ("--check", "do everything that can fail and stop before the first step"),
-        ("--allow-config-change", "go on with the run in run_dir though its config is another"),
-    ):
-        argument(parser, words, text, action="store_true")
+    argument(parser, "--resume", "go on with the run in the folder CONFIG", action="store_true")
+    argument(parser, "--check", "do everything that can fail and stop before the first step", action="store_true")
+    argument(parser, "--allow-config-change", "go on though the config is another", action="store_true")
 
 
-def _train(options: argparse.Namespace) -> int:
+def add_encode(commands: Commands) -> None:
+    """Add `encode` to a parser."""
+    text = (
+        "Run the frozen encoder once over all frames that the clips of a config need, and cache the latents."
+        " Stopping it costs the few episodes in progress at most: the same command goes on. Several processes"
+        " (torchrun) share the work."
+    )
+    parser = command(commands, "encode", _encode, text)
+    add_config(parser, such_as="data.cache_dtype=int8")
+    argument(parser, "--out FOLDER", "of the cache, for data.source: latents (where data.cache finds it)", as_path)
+
+
+def add_decoder_command(commands: Commands) -> None:
+    """Add `decoder` to a parser."""
+    text = (
+        "Train a decoder on the latents of true frames: what `imagine` and the option --decoder of other commands show"
+        " images with. It belongs to the config's encoder and camera, and serves every run on them. Stopping it costs"
+        " a checkpoint's distance at most: the same command goes on."
+    )
+    parser = command(commands, "decoder", _decoder, text)
+    add_config(parser, such_as="decoder.size=medium")
+    argument(parser, "--check", "do what can fail, and write nothing", action="store_true")
+
+
+def add_export(commands: Commands) -> None:
+    """Add `export` to a parser."""
+    text = "Write a run's model, adapter merged in, or its adapter, for others to use."
+    parser = command(commands, "export", _export, text)
+    argument(parser, "run RUN", "the folder of a run", as_path)
+    argument(parser, "folder FOLDER", "where to, new or empty; official: or a .pt file", as_path)
+    text = (
+        "merged: a folder that `model.base` takes. official: one .pt by Meta's names, for the official code. hub: the"
+        " adapter in PEFT's format with a model card, ready to upload"
+    )
+    argument(parser, "--to", text, choices=["merged", "official", "hub"], default="merged")
+    add_checkpoint(parser)
+
+
+def _train(options: argparse.Namespace) -> None:
     from vjepa2_ac.runs.folder import read_run_config
 
     path = Path(options.config)
@@ -44,19 +85,70 @@ def _train(options: argparse.Namespace) -> int:
         say_places_elsewhere(options.config)
     config = read_run_config(path) if options.resume else read_config(path, options.overrides, base=True)
 
-    from vjepa2_ac.console.progress import console
+    from vjepa2_ac.console.progress import show
     from vjepa2_ac.console.training import TrainingConsole
-    from vjepa2_ac.distributed.signals import EXIT_STATUS, StoppedError
     from vjepa2_ac.training.loop import train
 
-    speaks = os.environ.get("RANK", "0") == "0"  # one of several processes
-    try:
-        with TrainingConsole() as reporter:
-            folder = train(config, reporter, check_only=options.check, allow_config_change=options.allow_config_change)
-    except StoppedError as stopped:
-        if speaks:
-            print(printable(str(stopped)), file=sys.stderr)
-        return EXIT_STATUS
-    if speaks and not options.check:
-        console.print(f"The run is in {folder}; see how good it is: vjepa2-ac evaluate {folder}")
-    return 0
+    with TrainingConsole() as reporter:
+        folder = train(config, reporter, check_only=options.check, allow_config_change=options.allow_config_change)
+    if speaks() and not options.check:
+        show(f"The run is in {folder}; see how good it is: vjepa2-ac evaluate {folder}")
+
+
+def _encode(options: argparse.Namespace) -> None:
+    config = read_config(options.config, options.overrides, base=True)
+
+    from vjepa2_ac.console.progress import ConsoleReporter, show
+    from vjepa2_ac.encoding.encode_dataset import encode_config
+    from vjepa2_ac.reporter import SILENT
+
+    with ConsoleReporter() as reporter:
+        encoded = encode_config(config, reporter if speaks() else SILENT, out=options.out)
+        if config.replay is not None and options.out is None and not config.replay.data.is_cache:
+            encode_config(config.for_replay(), reporter if speaks() else SILENT)
+    if not encoded.is_finished:
+        show(f"This process has done its share; others are still at work on {encoded.folder}")
+        return
+    episodes = f"{encoded.encoded:,} of {encoded.episodes:,} episodes"
+    knobs = f"data.source=latents data.path={encoded.folder}" if options.out else "data.cache=auto"
+    show(
+        *(f"left out: {name}: {reason}" for name, reason in encoded.broken.items()),
+        f"{episodes}, {encoded.frames:,} frames, {encoded.bytes / 1e9:.3g} GB are in {encoded.folder}",
+        f"Train on them with {knobs}",
+    )
+
+
+def _decoder(options: argparse.Namespace) -> None:
+    config = read_config(options.config, options.overrides, base=True)
+
+    from vjepa2_ac.console.progress import ConsoleReporter, show
+    from vjepa2_ac.console.tables import held_out_table
+    from vjepa2_ac.decoding.decoder_folder import read_card
+    from vjepa2_ac.decoding.training import train_decoder
+
+    with ConsoleReporter() as reporter:
+        folder = train_decoder(config, reporter, check_only=options.check)
+    if options.check:
+        show("Everything is in place: data, model, folder and disk were checked; nothing was written.")
+        return
+    card = read_card(folder)
+    if card.held_out:
+        show(held_out_table(card))
+    show(f"See what a model imagines: vjepa2-ac imagine {config.run_dir} --decoder {folder}")
+
+
+def _export(options: argparse.Namespace) -> None:
+    from vjepa2_ac.runs.checkpoint import require_listed
+    from vjepa2_ac.runs.folder import read_run_config
+
+    read_run_config(options.run)
+    require_listed(options.run, options.checkpoint)
+
+    from vjepa2_ac.console.progress import show
+    from vjepa2_ac.export import export_run
+
+    written = export_run(options.run, options.folder, options.to, options.checkpoint)
+    what = {"merged": "merged model", "official": "official checkpoint", "hub": "adapter with its model card"}
+    show(f"The {what[options.to]} of checkpoint {written.checkpoint} is in {written.path}")
+    if options.to == "hub":
+        show("The card names base and data by their paths on this machine: read it before you upload it.")

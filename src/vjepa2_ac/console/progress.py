@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from datetime import timedelta
-from typing import TYPE_CHECKING, Any, Self
+from pathlib import Path
+from typing import Any, Self
 
 from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions
@@ -14,9 +15,6 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from vjepa2_ac.errors import printable
-
-if TYPE_CHECKING:
-    from vjepa2_ac.intervals import Estimate
 
 _LINE_EVERY_S = 10.0
 _WIDE = 120  # columns that leave room for a long bar
@@ -52,30 +50,20 @@ class MetricsTable(Table):
     def __init__(self, title: str, columns: Sequence[str], *, labelled: bool = True) -> None:
         super().__init__(title=title, title_justify="left", caption_justify="left")
         for place, name in enumerate(columns):
-            self.add_column(name, justify="left" if labelled and place == 0 else "right")
+            self.add_column(name, justify="left" if labelled and place == 0 else "right", overflow="fold")
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Any]:
-        """Yield what is shown."""
-        room = options.max_width - len(self.columns) * _BESIDE_A_CELL - 1
-        for column, width in zip(self.columns, self._widths(room), strict=True):
-            column.width, column.overflow = width, "fold"
-        yield from super().__rich_console__(console, options)
-
-    def _widths(self, room: int) -> list[int]:
-        """Return the widths of columns: as requested, or else the widest are reduced, down to whole words."""
+        """Yield what is shown. The widest columns give way first, down to their longest word that stays whole."""
         texts = [[str(text) for text in (column.header, *column.cells)] for column in self.columns]
-        widths = [max(map(cell_len, of_column), default=1) for of_column in texts]
         words = [[cell_len(word) for text in of_column for word in text.split()] for of_column in texts]
         least = [max((size for size in sizes if size <= _WHOLE), default=1) for sizes in words]
-        while sum(widths) > room and (shrinking := [n for n, width in enumerate(widths) if width > least[n]]):
-            widths[max(shrinking, key=lambda n: widths[n])] -= 1
-        return widths
-
-
-def with_interval(estimate: Estimate, form: str = ".3f") -> str:
-    """Return an estimate in a number format, with its interval if it has one."""
-    value, low, high = (f"{number:{form}}" for number in (estimate.value, estimate.low, estimate.high))
-    return f"{value} [{low}, {high}]" if estimate.has_interval else value
+        widths = [max(map(cell_len, of_column), default=1) for of_column in texts]
+        room = options.max_width - len(widths) * _BESIDE_A_CELL - 1
+        while sum(widths) > room and (giving := [n for n, width in enumerate(widths) if width > least[n]]):
+            widths[max(giving, key=lambda n: widths[n])] -= 1
+        for column, width in zip(self.columns, widths, strict=True):
+            column.width = width
+        yield from super().__rich_console__(console, options)
 
 
 class _Words(TextColumn):
@@ -92,6 +80,12 @@ class _Words(TextColumn):
 console = PlainConsole()
 if not console.is_terminal:
     console.width = 120  # a log file has room
+
+
+def show(*parts: str | Table, files: Iterable[str | Path] = ()) -> None:
+    """Print texts and tables one below another, and the files that were written."""
+    for part in (*parts, *(f"  {file}" for file in files)):
+        console.print(part)
 
 
 class ProgressBar:

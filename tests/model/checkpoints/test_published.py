@@ -2,8 +2,8 @@
 
 import pytest
 
-from vjepa2_ac.console.downloads import published_table
 from vjepa2_ac.console.progress import PlainConsole
+from vjepa2_ac.console.setup import published_table
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.checkpoints.published import PUBLISHED, find_published, published_as
 

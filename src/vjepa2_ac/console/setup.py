@@ -1,10 +1,20 @@
-"""Console output of doctor: the memory of a run, part by part."""
+"""Lines and tables of doctor and download: the memory of a run part by part, and the published checkpoints."""
 
 from __future__ import annotations
 
-from vjepa2_ac.config import Config
-from vjepa2_ac.training.cost.memory import ALLOWANCE, GIGABYTE, MemoryEstimate
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
+from rich import box
+from rich.table import Table
+
+if TYPE_CHECKING:
+    from vjepa2_ac.config import Config
+    from vjepa2_ac.model.checkpoints.published import Published
+    from vjepa2_ac.training.cost.memory import MemoryEstimate
+
+_MILLION, _GIGABYTE = 10**6, 10**9
+_COLUMNS = ("holds", "family", "encoder", "pixels", "file", "licence", "encoder's key")
 UNTESTED = (
     "Measured on tensors without numbers. It was compared with what PyTorch keeps on a CPU and with what lives at once"
     " on an imagined GPU, not yet with a GPU's measured peak."
@@ -13,6 +23,8 @@ UNTESTED = (
 
 def memory_lines(config: Config, estimate: MemoryEstimate) -> list[str]:
     """Return one line for every part, then both totals."""
+    from vjepa2_ac.training.cost.memory import ALLOWANCE
+
     training, counts = config.training, estimate.parameters
     clips = f"{training.batch_size} clips of {config.data.frames} frames"
     eight_bits = "8 bits where a tensor has 4,096 elements" if training.optimizer == "adamw_8bit" else "float32"
@@ -42,10 +54,10 @@ def memory_lines(config: Config, estimate: MemoryEstimate) -> list[str]:
         *([("encoding the cache", estimate.caching, "before all that: the encoder alone")] if estimate.caching else []),
         ("CUDA, cuBLAS, holes", ALLOWANCE, "an allowance, not computed"),
     ]  # fmt: skip
-    lines = [f"  {name:<28}{size / GIGABYTE:8.3f} GB  {about}" for name, size, about in parts]
+    lines = [f"  {name:<28}{size / _GIGABYTE:8.3f} GB  {about}" for name, size, about in parts]
     for checkpointing, word in ((False, "without"), (True, "with")):
         chosen = "  <- this config" if checkpointing == estimate.checkpointing else ""
-        total = estimate.total(checkpointing=checkpointing) / GIGABYTE
+        total = estimate.total(checkpointing=checkpointing) / _GIGABYTE
         lines.append(f"  peak {word + ' checkpointing':<23}{total:8.3f} GB{chosen}")
     return [*lines, UNTESTED]
 
@@ -59,10 +71,46 @@ def verdict(needed: int, available: int, gpu: str, knobs: list[str] | None) -> s
         gpu: Its name.
         knobs: Changes that make it fit, or None if none do.
     """
-    room = f"{gpu}, {available / GIGABYTE:.1f} GB"
+    room = f"{gpu}, {available / _GIGABYTE:.1f} GB"
     if needed <= available:
-        return f"It fits on {room}, with {(available - needed) / GIGABYTE:.1f} GB to spare."
-    short = f"It does not fit on {room}: {(needed - available) / GIGABYTE:.1f} GB too much."
+        return f"It fits on {room}, with {(available - needed) / _GIGABYTE:.1f} GB to spare."
+    short = f"It does not fit on {room}: {(needed - available) / _GIGABYTE:.1f} GB too much."
     if knobs is None:
         return f"{short} No knob makes it fit: it needs a larger GPU or a smaller model."
     return f"{short} It would with {', '.join(knobs)}."
+
+
+def published_table(published: Sequence[Published]) -> Table:
+    """Return a table with a row for each published checkpoint; names are not divided, however narrow it is."""
+    table = Table(box=box.SIMPLE_HEAD, title="Published checkpoints", title_justify="left")
+    table.add_column("name", no_wrap=True, min_width=max(len(one.name) for one in published))
+    for column in _COLUMNS:
+        table.add_column(column, overflow="fold")
+    for one in published:
+        encoder = f"{one.encoder.name}, {one.encoder_parameters / _MILLION:,.0f} M"
+        pixels = str(one.image_size)
+        table.add_row(one.name, one.holds, one.family, encoder, pixels, one.size, one.licence, one.key)
+    return table
+
+
+def published_notes(published: Sequence[Published]) -> list[str]:
+    """Return what the table does not say, a line each."""
+    encoders = (
+        "Beside an encoder: its parameters, and the key of its weights in the file; pixels are those of its images."
+    )
+    lines = [encoders, "The licence is that of Meta's repository. Sizes with 'about' are estimates."]
+    if not any(one.sha256 for one in published):
+        lines.append("No SHA-256 of these files is known: what is checked is the size.")
+    return lines
+
+
+def published_summary(one: Published, url: str) -> str:
+    """Return what a checkpoint is, its size and licence, and where it comes from; shown before it is fetched."""
+    parts = (
+        "encoder and action-conditioned predictor" if one.holds == "world model" else "without a predictor for actions"
+    )
+    checked = "size and SHA-256 are checked" if one.sha256 else "its size is checked, for no SHA-256 is known"
+    return (
+        f"{one.name}: {one.holds}, {parts}; V-JEPA {one.family.removeprefix('v')}, {one.encoder.name},"
+        f" {one.image_size} px\n{one.size}, licence {one.licence}; from {url}; {checked}"
+    )

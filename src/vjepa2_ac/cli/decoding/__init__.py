@@ -1,1 +1,0 @@
-"""The commands that show what latents hold, and what a model imagines."""

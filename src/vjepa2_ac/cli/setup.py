@@ -1,0 +1,283 @@
+"""The commands around a run: init, config, download, doctor and demo."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vjepa2_ac.cli.options import Commands, add_config, argument, as_local, as_model, as_path, as_place, command
+from vjepa2_ac.errors import InputError, UserError
+from vjepa2_ac.places import BUILTIN
+from vjepa2_ac.storage import is_url, try_writing_at, user_can_write, write_atomically
+
+if TYPE_CHECKING:
+    from vjepa2_ac.init.draft import Draft
+
+FORMS = ("droid", "lerobot", "npz", "raw", "rlds", "sim", "scratch")
+_SIMULATED = "demo/data"
+_WITHOUT_A_PATH = {
+    "droid": "gs://gresearch/robotics/droid/1.0.1",
+    "lerobot": "hf://datasets/lerobot/droid_1.0.1",
+    "raw": "gs://gresearch/robotics/droid_raw/1.0.1",
+    "sim": _SIMULATED,
+    "scratch": _SIMULATED,
+}
+_LOOKED_AT_AS = {"droid": "rlds", "sim": "rlds", "scratch": None}
+_TRIAL_STEPS = 100
+_RECORD = "simulate record {path} --domain B --episodes 60 --seed 5"
+
+
+def add_init(commands: Commands) -> None:
+    """Add `init` to a parser."""
+    text = (
+        "Write a commented config for the data and the machine that are there, look at the data as `data check` does,"
+        " and say what to do next. Guesses are marked. Exit status as of `data check`."
+    )
+    parser = command(commands, "init", _init, text)
+    text = (
+        f"one of {', '.join(FORMS)}; or left out: the files tell. sim: simulated data and the tiny model. scratch: a"
+        " fresh predictor on V-JEPA 2.1's ViT-B, without Meta's action-conditioned model"
+    )
+    argument(parser, "form FORM", text, as_place, nargs="?")
+    argument(
+        parser, "path PATH", "the data: a folder, or a URL (droid, lerobot, raw: DROID's own)", as_place, nargs="?"
+    )
+    argument(parser, "--out FILE", "the config (NAME.yaml, by the data's folder)", as_path)
+    argument(parser, "--model MODEL", "instead of the released: what model.base takes; scratch: an encoder", as_model)
+    argument(parser, "--overwrite", "write over a config that is there", action="store_true")
+
+
+def add_config_command(commands: Commands) -> None:
+    """Add `config` to a parser."""
+    text = (
+        "schema: every key with its range, as JSON schema. list: the configs that come with the package. text: one of"
+        " them with its comments, to begin a config of your own with. show: a config with every default."
+    )
+    parser = command(commands, "config", _config, text)
+    parser.add_argument("what", choices=["schema", "list", "show", "text"])
+    argument(parser, "config CONFIG", "for show and text: a YAML config, or builtin:NAME", as_local, nargs="?")
+    argument(parser, "overrides key=value", "for show: such as training.steps=100", nargs="*")
+
+
+def add_download(commands: Commands) -> None:
+    """Add `download` to a parser."""
+    text = (
+        "Fetch a published checkpoint: Meta's world model, or an encoder of V-JEPA 2 or 2.1. It goes on where it"
+        " stopped; size, and SHA-256 where it is known, are checked."
+    )
+    parser = command(commands, "download", _download, text)
+    argument(parser, "name NAME", "as --list shows it (default: vjepa2-ac-vitg, the world model, 11.7 GB)", nargs="?")
+    argument(parser, "--to PATH", "where to (default: checkpoints/NAME.pt)", as_path)
+    argument(parser, "--url", "another address of the same file than Meta's")
+    argument(parser, "--list", "show names, sizes and licences, and fetch nothing", action="store_true")
+
+
+def add_doctor(commands: Commands) -> None:
+    """Add `doctor` to a parser."""
+    text = (
+        "Estimate the GPU memory of a run, part by part, by a step on tensors without numbers: nothing is loaded."
+        " Exit status 0: it fits, 1: it does not, 2: something cannot be used."
+    )
+    add_config(command(commands, "doctor", _doctor, text), such_as="training.batch_size=4")
+
+
+def add_demo(commands: Commands) -> None:
+    """Add `demo` to a parser."""
+    text = (
+        "A simulated arm, a tiny world model, LoRA, whether it helped, and a film of what the model imagines: into the"
+        " folder demo, in 4 to 6 minutes on 2 cores, without a download. The same command goes on after a stop."
+    )
+    command(commands, "demo", _demo, text)
+
+
+def _init(options: argparse.Namespace) -> int:
+    form, path = _form_and_path(options.form, options.path)
+    name = _name_of(form, path)
+    out = options.out or Path(f"{name}.yaml")
+    if out.exists() and not options.overwrite:
+        fix = "--out another, or --overwrite"
+        raise InputError(where=str(out), found="a file is there", needed="a new one", fix=fix)
+    with user_can_write(f"--out {out}"):
+        try_writing_at(out.parent)
+
+    from vjepa2_ac.init.look import look_at, simulated
+    from vjepa2_ac.model.base_model import find_base, find_encoder_path
+
+    if options.model is not None:
+        (find_encoder_path if form == "scratch" else find_base)(options.model)
+    is_missing = path == _SIMULATED and not Path(path).exists()
+    found = simulated(path) if is_missing else look_at(path, _LOOKED_AT_AS.get(form or "", form))
+
+    from vjepa2_ac.console.progress import ConsoleReporter, show
+    from vjepa2_ac.init.choices import download_of
+    from vjepa2_ac.init.draft import TINY, choose_model, make_draft
+    from vjepa2_ac.init.found import guesses
+    from vjepa2_ac.init.look import measured
+    from vjepa2_ac.init.machine import this_machine
+    from vjepa2_ac.reporter import INDEXING
+
+    with ConsoleReporter() as reporter:
+        found = found if is_missing else measured(found, reporter.task(INDEXING))
+    model_path = options.model or (TINY if path == _SIMULATED or form == "sim" else None)
+    model = choose_model("scratch" if form == "scratch" else "released", model_path)
+    machine = this_machine(found.sample if is_url(found.path) else "")
+    show(f"Data: {'; '.join(found.about)}.\nMachine: {machine.about}.")
+    draft = make_draft(found, machine, model, run_dir=f"runs/{name}")
+    with user_can_write(f"--out {out}"):
+        write_atomically(out, draft.text(found, machine).encode())
+    guessed = [f"  guessed  {key}{': ' if why else ''}{why}" for key, why in guesses(draft.knobs).items()]
+    show(*draft.costs(machine), f"Written: {out}", *guessed)
+    status = 0 if is_missing else _check(draft, out)
+    if status:
+        show(f"\nMend this first, then: vjepa2-ac data check {out}")
+    first = [(f"vjepa2-ac {_RECORD.format(path=path)}", "the data; half a minute on a core of its own")] * is_missing
+    if not Path(model.path).exists() and (fetch := download_of(model, machine)):
+        first.append((fetch[0], f"the model, once: {fetch[1]}"))
+    show("\nNext:", *(f"  {line}   # {about}" for line, about in [*first, *_next(draft, out, name)]))
+    return status
+
+
+def _form_and_path(first: str | None, second: str | None) -> tuple[str | None, str]:
+    """Return the form, None if the files are to tell, and the place of the data."""
+    if first is None:
+        raise InputError(
+            where="init", found="no data", needed=f"a folder, a URL, or one of {', '.join(FORMS)}",
+            fix="Try `vjepa2-ac init sim`, or `vjepa2-ac init path/to/your/data`",
+        )  # fmt: skip
+    if first not in FORMS:
+        if second is not None:
+            raise InputError(where="init", found=f"{first!r}, no form of data", needed=f"one of {', '.join(FORMS)}")
+        return None, first
+    if second is None and first not in _WITHOUT_A_PATH:
+        raise InputError(where=f"init {first}", found="no path", needed="the folder or the URL of the data")
+    return first, second or _WITHOUT_A_PATH[first]
+
+
+def _name_of(form: str | None, path: str) -> str:
+    """Return a name for the config and the run: of the last folder that is not a version."""
+    if path == _SIMULATED:
+        return "scratch" if form == "scratch" else "sim"
+    parts = [re.sub(r"\W+", "-", part).strip("-") for part in path.split("/") if not re.fullmatch(r"[\d.v]*", part)]
+    name = next((part for part in reversed(parts) if part), "own")
+    return f"scratch-{name}" if form == "scratch" else name
+
+
+def _check(draft: Draft, out: Path) -> int:
+    """Run `data check` on the config; a reason why it cannot be is printed, and the config stays."""
+    from vjepa2_ac.cli.data import check_and_print
+    from vjepa2_ac.console.progress import show
+
+    show(f"\n$ vjepa2-ac data check {out}")
+    try:
+        return check_and_print(draft.config)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+
+
+def _next(draft: Draft, out: Path, name: str) -> list[tuple[str, str]]:
+    """Return the commands from a trial to the real run, and what each is for."""
+    trial, steps = f"runs/{name}-trial", draft.config.training.steps
+    short = f"training.steps={_TRIAL_STEPS} validation.every=50 checkpoint.every=50"
+    of_trial = ", ".join(filter(None, (f"{_TRIAL_STEPS} steps", draft.time_of(_TRIAL_STEPS))))
+    of_run = draft.time_of(steps) or f"time not known before the trial: its time a step, times {steps:,}"
+    return [
+        (f"vjepa2-ac train {out} --check", "everything that can fail, before the first step"),
+        (f"vjepa2-ac train {out} run_dir={trial} {short}", f"{of_trial}: does it learn, how long does a step take?"),
+        (f"vjepa2-ac evaluate {trial}", "against the base, on held-out episodes"),
+        (f"vjepa2-ac train {out}", f"the real run, {of_run}; the same command goes on after a stop"),
+    ]
+
+
+def _config(options: argparse.Namespace) -> None:
+    from vjepa2_ac.config.loading import config_as_yaml, config_path, config_schema, load_config, packaged_configs
+
+    what, of_one = options.what, options.what in {"show", "text"}
+    if of_one != (options.config is not None):
+        found = f"config {what} {options.config or 'without a file'}"
+        raise InputError(where="command line", found=found, needed=f"config {what}{' CONFIG' * of_one}")
+    if what == "schema":
+        print(json.dumps(config_schema(), indent=2))
+    elif what == "list":
+        for name, about in packaged_configs().items():
+            print(f"builtin:{name:<14}{about}")
+    elif what == "text":
+        print(config_path(options.config).read_text(encoding="utf-8"), end="")
+    else:
+        print(config_as_yaml(load_config(options.config, options.overrides)), end="")
+
+
+def _download(options: argparse.Namespace) -> None:
+    from vjepa2_ac.console.progress import ConsoleReporter, show
+    from vjepa2_ac.console.setup import published_notes, published_summary, published_table
+    from vjepa2_ac.model.checkpoints.download import download
+    from vjepa2_ac.model.checkpoints.published import OFFICIAL, PUBLISHED, find_published
+    from vjepa2_ac.places import literal
+
+    if options.list:
+        show(published_table(PUBLISHED), *published_notes(PUBLISHED))
+        return
+    known = find_published(options.name or OFFICIAL)
+    path, url = options.to or Path("checkpoints") / known.file, options.url or known.url
+    show(published_summary(known, url))
+    with ConsoleReporter() as reporter:
+        download(url, path, known=known, reporter=reporter)
+    show(f"It is in {path}. In a config:  {known.knob}: {literal(path)}")
+
+
+def _doctor(options: argparse.Namespace) -> int:
+    from vjepa2_ac.config.loading import load_config
+
+    config = load_config(options.config, options.overrides)
+
+    import torch
+
+    from vjepa2_ac.console.progress import show
+    from vjepa2_ac.console.setup import memory_lines, verdict
+    from vjepa2_ac.distributed.device import slow_bf16
+    from vjepa2_ac.model.checkpoints.loading import base_sizes
+    from vjepa2_ac.training.cost.memory import USUAL_GPU, estimate_memory, ways_to_fit
+
+    sizes = base_sizes(config.model)
+    gpu, available = "a GPU of 24 GB (there is none here)", USUAL_GPU
+    if torch.cuda.is_available():
+        device = torch.cuda.get_device_properties(torch.cuda.current_device())
+        gpu, available = device.name, device.total_memory
+    estimate = estimate_memory(config, sizes)
+    needed = estimate.total(checkpointing=estimate.checkpointing)
+    show(
+        f"PyTorch {torch.__version__}, CUDA {torch.version.cuda or 'not in this build'}",
+        *memory_lines(config, estimate),
+        verdict(needed, available, gpu, ways_to_fit(config, sizes, available)),
+    )
+    if unusual := config.adapter.out_of_line:
+        show(f"Warning: {unusual}.")
+    if not torch.cuda.is_available() and config.training.precision == "bf16" and (slow := slow_bf16()):
+        show(f"Without a GPU set training.precision=fp32 model.dtype=float32: in bfloat16 {slow}.")
+    show(f"The data are looked at by: vjepa2-ac data check {options.config}")
+    return 0 if needed <= available else 1
+
+
+def _demo(_options: argparse.Namespace) -> int:
+    from vjepa2_ac.simulation.world.scene import load_mujoco
+
+    load_mujoco()
+    commands = [
+        _RECORD.format(path=_SIMULATED),
+        f"train {BUILTIN}demo",
+        f"decoder {BUILTIN}demo",
+        "evaluate demo/run",
+        "imagine demo/run --decoder demo/decoder --actions true,left,close",
+    ]
+    for words in commands[Path(_SIMULATED).exists() :]:
+        print(f"$ vjepa2-ac {words}", flush=True)
+        program = [sys.executable, "-m", "vjepa2_ac.cli", *shlex.split(words)]
+        if status := subprocess.call(program):  # noqa: S603 - our own command
+            return status
+    return 0
