@@ -100,7 +100,6 @@ NOT_WALKED = {  # pattern: why
     r"^cd day1": "needs the record of a server; tests/serving/test_recording.py makes the decision again",
     r"planning.axes=": "refused where the axes were fitted to so few pairs; tests/planning/test_axes.py",
     r"^vjepa2-ac serve": "walked last, with the simulated arm as its client",
-    r"^python benchmarks/": "takes long; tests/benchmarks",
 }
 BEFORE = (  # as `vjepa2-ac demo`, and what other pages have of it
     "vjepa2-ac simulate record demo/data --domain B --seed 5",

@@ -124,7 +124,6 @@ WRONG = {
     "clips longer than episodes": (["train", "{here}/lora.yaml", "run_dir={here}/x", "data.frames=16"], "61"),
     "no test episodes": (["train", "{here}/lora.yaml", "run_dir={here}/x", "data.validation_share=0.0"], "validation"),
     "a target that is not there": (["train", "{here}/lora.yaml", "run_dir={here}/x", "adapter.targets=[qkv]"], "qkv"),
-    "an unknown domain": (["simulate", "record", "{here}/y", "--domain", "C"], "'C'"),
     "a data set over another": (["simulate", "record", "{here}/data"], "data"),
     "config show without a file": (["config", "show"], "CONFIG"),
     "a broken override": (["train", "{here}/lora.yaml", "seed"], "override"),

@@ -87,9 +87,9 @@ class _Steps(train_step_variants.Bench):
 
     def batch(self, setting: train_step_variants.Setting) -> Batch:
         batch = super().batch(setting)
-        if not (self.options.augment and setting.encoder):
+        if not (self.options.augment and setting.encoder) or batch.frames is None:
             return batch
-        sizes, clips = self.frames(setting).shape[2:4], range(setting.batch)
+        sizes, clips = batch.frames.shape[2:4], range(setting.batch)
         drawn = (draw(_AUGMENT, *sizes, seed=0, position=clip) for clip in clips)
         return replace(batch, augmentations=tuple(one for one in drawn if one is not None))
 

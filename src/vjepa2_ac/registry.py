@@ -121,10 +121,11 @@ class Registry:
 
         def add(schema: dict[str, Any]) -> None:
             sections = {name: self.section(name) for name in self.names()}
-            schema["properties"] = {
-                name: {} if section is None else section.model_json_schema() for name, section in sections.items()
-            }
-            schema["additionalProperties"] = False
+            if sections:
+                schema["properties"] = {
+                    name: {} if section is None else section.model_json_schema() for name, section in sections.items()
+                }
+                schema["additionalProperties"] = False
 
         return Field(json_schema_extra=add)
 

@@ -33,6 +33,7 @@ OTHERS = {
     "data.augment.crop_scale": (0.5, 1.0),
     "data.stride_candidates": (2, 3),
     "planning.budget_s": 1.0,
+    "tracking.others": {"a tracker": {}},
     "planning.limits.axes": (0.1,),
     "planning.goals.share": 0.3,
     "planning.goals.stop_share": 0.3,

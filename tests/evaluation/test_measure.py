@@ -10,7 +10,7 @@ from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persi
 from vjepa2_ac.evaluation.evaluate import Contender, evaluate
 from vjepa2_ac.evaluation.measure import ALL, VALIDATED, measured, prediction_errors, with_other_actions
 from vjepa2_ac.evaluation.request import ProbeOptions
-from vjepa2_ac.evaluation.result import ACTIONS, L1, L2, METRICS
+from vjepa2_ac.evaluation.result import ACTIONS, L1, L2
 from worlds import TIME, Copier, Halfway, Oracle, about, again, clips_batch, in_batches, rows
 
 
@@ -48,7 +48,7 @@ def test_errors_by_horizon_equal_a_case_computed_by_hand() -> None:
     latents[0, 1] = 1.0
     latents[0, 2] = torch.tensor([[3.0, 3.0], [5.0, 5.0]])
     batch = LatentBatch(latents, torch.zeros(1, 3, 7), torch.zeros(1, 2, 7), None, ("e",), (0,))
-    found = measured(Copier(), batch, ALL, METRICS, batch.actions)
+    found = measured(Copier(), batch, ALL, (L1, L2), batch.actions)
     assert found.of("rollout").tolist() == [[1.0, 4.0]], "from the first frame"
     assert found.of("teacher_forced").tolist() == [[1.0, 3.0]], "from the frame before"
     assert found.of("rollout", L2).tolist() == [[1.0, 17.0]]
@@ -67,7 +67,7 @@ def test_a_validation_is_the_evaluation_of_the_same_clips_without_what_takes_lon
     assert whole.episode_ids == errors.episode_ids
     for kind, values in errors.arrays.items():
         np.testing.assert_array_equal(values, whole.arrays[kind])
-    asked = prediction_errors(Halfway(), in_batches(clips_batch(), 4), METRICS)
+    asked = prediction_errors(Halfway(), in_batches(clips_batch(), 4), (L1, L2))
     assert {metric for _, _, metric in asked.arrays} == {"l1", "l2"}
 
 

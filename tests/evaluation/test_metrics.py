@@ -6,7 +6,7 @@ import pytest
 
 from vjepa2_ac.evaluation.evaluate import Contender, evaluate
 from vjepa2_ac.evaluation.request import ProbeOptions
-from vjepa2_ac.evaluation.result import L1, METRICS, MODES, Evaluation, Metric
+from vjepa2_ac.evaluation.result import L1, L2, MODES, Evaluation, Metric
 from vjepa2_ac.evaluation.rows import rows_of
 from vjepa2_ac.evaluation.verdict import verdict
 from vjepa2_ac.intervals import Estimate
@@ -21,7 +21,7 @@ PROBES = ProbeOptions(sensitivity_clips=0, landscape_clips=0, examples=0)
 
 def evaluated(trained: object, base: object, *more: Metric) -> Evaluation:
     contenders = [Contender("base", "base", base), Contender("adapter", "trained", trained)]  # type: ignore[arg-type]
-    return evaluate(contenders, again(clips_batch()), about(), metrics=(*METRICS, *more), probes=PROBES)
+    return evaluate(contenders, again(clips_batch()), about(), metrics=(L1, L2, *more), probes=PROBES)
 
 
 def test_an_added_metric_appears_in_rows_verdict_and_comparison(tmp_path: Path) -> None:
