@@ -50,12 +50,12 @@ class Registry:
         return list(dict.fromkeys([*self._things, *(one.name for one in entry_points(group=self.group))]))
 
     def known(self, name: str) -> str:
-        """Return a name that is registered.
+        """Return a name that is registered; installed packages are only looked through for one that is not yet known.
 
         Raises:
             ValueError: It is not; names those that are.
         """
-        if name not in (names := self.names()):
+        if name not in self._things and name not in (names := self.names()):
             close = difflib.get_close_matches(name, names, n=1)
             meant = f"did you mean {close[0]!r}? " if close else ""
             raise ValueError(f"no {self.kind} of this name; {meant}known are {', '.join(map(repr, names))}")

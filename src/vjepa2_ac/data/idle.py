@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import logging
 from collections.abc import Callable, Iterator, Sequence
@@ -23,7 +22,7 @@ from vjepa2_ac.data.selection import as_error, as_problem
 from vjepa2_ac.episode import Episode, EpisodeSource, Progress, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.spaces import POSE
-from vjepa2_ac.storage.npz_reader import read_arrays
+from vjepa2_ac.storage.npz_reader import arrays_as_bytes, read_arrays
 from vjepa2_ac.storage.structured import json_object, shown
 
 logger = logging.getLogger(__name__)
@@ -55,9 +54,8 @@ class FoundRanges:
     def to_bytes(self) -> bytes:
         """Return this as a file's content."""
         text = json.dumps({"problems": [[place, vars(problem)] for place, problem in self.problems]}).encode()
-        file = io.BytesIO()
-        np.savez(file, text=np.frombuffer(text, np.uint8), episode=self.episode, start=self.start, end=self.end)
-        return file.getvalue()
+        columns = {"episode": self.episode, "start": self.start, "end": self.end}
+        return arrays_as_bytes({"text": np.frombuffer(text, np.uint8), **columns})
 
     @classmethod
     def from_bytes(cls, data: bytes) -> FoundRanges:
@@ -73,19 +71,6 @@ class FoundRanges:
             return cls(episode, start, end, tuple((int(place), EpisodeProblem(**values)) for place, values in problems))
         except (InputError, LookupError, TypeError, ValueError) as error:
             raise NotATableError(f"no ranges of steps ({error})") from None
-
-    def require_of(self, table: EpisodeTable) -> None:
-        """Refuse ranges that do not belong to the episodes of a table.
-
-        Raises:
-            NotATableError: They do not.
-        """
-        places = np.array([*self.episode, *(place for place, _ in self.problems)], np.int64)
-        if places.min(initial=0) < 0 or places.max(initial=-1) >= len(table):
-            raise NotATableError(f"ranges of other episodes than these {len(table)}")
-        within = (self.start >= 0) & (self.start <= self.end) & (self.end <= table.num_steps[self.episode])
-        if not within.all() or (np.diff(self.episode) < 0).any():
-            raise NotATableError("ranges that are not in their episodes, or not in their order")
 
 
 def find_ranges(

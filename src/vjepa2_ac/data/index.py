@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import io
 import json
 import logging
 import os
@@ -24,7 +23,7 @@ from vjepa2_ac import places, storage
 from vjepa2_ac.config import DiskCacheConfig
 from vjepa2_ac.episode import EpisodeInfo
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage.npz_reader import read_arrays
+from vjepa2_ac.storage.npz_reader import arrays_as_bytes, read_arrays
 
 logger = logging.getLogger(__name__)
 
@@ -172,9 +171,7 @@ class EpisodeTable(Sequence[EpisodeInfo]):
         arrays |= {} if self.state_hash is None else {_HASH: self.state_hash}
         arrays |= {f"{_LOCATOR}{name}": column for name, column in self.locators.items()}
         arrays |= {f"{_LABEL}{name}": labels.number for name, labels in self.labels.items()}
-        file = io.BytesIO()
-        np.savez(file, text=np.frombuffer(text.encode(), np.uint8), **arrays)
-        return file.getvalue()
+        return arrays_as_bytes({"text": np.frombuffer(text.encode(), np.uint8), **arrays})
 
     @classmethod
     def from_bytes(cls, data: bytes) -> EpisodeTable:

@@ -80,11 +80,6 @@ def _no_jpeg(image: bytes, step: int, where: str, error: ValueError) -> InputErr
     )
 
 
-def looks_like_jpeg(image: bytes) -> bool:
-    """Return whether bytes begin and end like a JPEG."""
-    return image.startswith(b"\xff\xd8\xff") and image.endswith(b"\xff\xd9")
-
-
 def encode_jpeg(frame: UInt8[np.ndarray, "height width 3"], *, quality: int = 95) -> bytes:
     """Return an RGB image as JPEG; the default quality is TFDS's."""
     return bytes(

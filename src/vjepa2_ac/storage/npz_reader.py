@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import io
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from math import prod
@@ -121,6 +121,13 @@ class NpzFile:
             place = f"{self._where}: {name}" if name else self._where
             found = f"cannot be read ({str(error)[:200] or type(error).__name__})"
             raise InputError(where=place, found=found, needed="an undamaged .npz file", fix=_FIX) from None
+
+
+def arrays_as_bytes(arrays: Mapping[str, np.ndarray]) -> bytes:
+    """Return arrays as the content of a file that `read_arrays` reads; equal arrays give equal bytes."""
+    file = io.BytesIO()
+    np.savez(file, **arrays)  # type: ignore[arg-type] # none is called allow_pickle
+    return file.getvalue()
 
 
 def read_arrays(data: bytes, where: str = "its arrays") -> dict[str, np.ndarray]:

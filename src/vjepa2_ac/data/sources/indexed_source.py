@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -23,7 +22,7 @@ from vjepa2_ac.data.sources.listing import in_parallel
 from vjepa2_ac.episode import EpisodeInfo, Progress, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage.block_file import DiskCache
-from vjepa2_ac.storage.npz_reader import read_arrays
+from vjepa2_ac.storage.npz_reader import arrays_as_bytes, read_arrays
 
 
 @dataclass(frozen=True)
@@ -165,6 +164,4 @@ def stored_arrays(cache: DiskCache, key: str) -> dict[str, np.ndarray] | None:
 
 def store_arrays(cache: DiskCache, key: str, arrays: Mapping[str, np.ndarray]) -> None:
     """Keep what was parsed of an episode on this machine, within the limit of the disk cache."""
-    content = io.BytesIO()
-    np.savez(content, **arrays)  # type: ignore[arg-type] # none is called allow_pickle
-    cache.write(key, content.getvalue())
+    cache.write(key, arrays_as_bytes(arrays))

@@ -5,7 +5,6 @@ The only module that uses PEFT. Disabling an adapter, and merging it into the ba
 
 from __future__ import annotations
 
-import copy
 import math
 import re
 import warnings
@@ -166,17 +165,6 @@ def with_adapter(predictor: PredictorNetwork, config: AdapterConfig, start: bool
     return wrapped  # type: ignore[no-any-return]  # PEFT has no types
 
 
-def ranks_by_peft(predictor: PredictorNetwork, config: AdapterConfig) -> dict[str, int]:
-    """Return the rank of each layer that gets an adapter, by name; the predictor is not changed.
-
-    Raises:
-        InputError: A knob does not fit the predictor.
-    """
-    with torch.device("meta"):
-        wrapped: Any = with_adapter(copy.deepcopy(predictor).to("meta"), config)
-    return {name: layer.r["default"] for name, layer in _layers_of(wrapped.get_base_model()).items()}
-
-
 def trainable_report(model: WorldModel) -> TrainableReport:
     """Return the number of trained parameters, of the predictor's own, and of the model's without an adapter."""
     own = sum(value.numel() for value in base_weights(model.base_predictor).values())
@@ -190,13 +178,12 @@ def adapted_report(model: WorldModel) -> TrainableReport:
     return trainable_report(model)._replace(trained=sum(trained))
 
 
-def save_trained(model: WorldModel, folder: str | Path, weights: dict[str, Tensor] | None = None) -> None:
+def save_trained(model: WorldModel, folder: str | Path) -> None:
     """Write the trained weights: an adapter in PEFT's format, or the whole predictor; and the base's identity.
 
     Args:
         model: The adapted model.
         folder: Where to.
-        weights: The whole predictor, if the model itself has only a shard of each weight.
 
     Raises:
         ValueError: The model is not adapted.
@@ -206,7 +193,7 @@ def save_trained(model: WorldModel, folder: str | Path, weights: dict[str, Tenso
         write_trained(folder, _card_of(model), _lora_weights(model))
         _lora_config(model).save_pretrained(str(folder))
     else:
-        write_trained(folder, _card_of(model), weights or model.predictor.state_dict())
+        write_trained(folder, _card_of(model), model.predictor.state_dict())
 
 
 def load_trained(model: WorldModel, folder: str | Path, trainable: bool | None = None) -> None:

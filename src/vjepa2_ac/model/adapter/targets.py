@@ -36,16 +36,6 @@ def lora_arguments(predictor: PredictorNetwork, config: AdapterConfig) -> dict[s
     }
 
 
-def adapter_ranks(predictor: PredictorNetwork, config: AdapterConfig) -> dict[str, int]:
-    """Return the rank of each layer that gets an adapter, by name; with `adapter.peft` use `lora.ranks_by_peft`.
-
-    Raises:
-        InputError: As of `lora_arguments`.
-    """
-    targets = lora_arguments(predictor, config)["target_modules"]
-    return {name: config.rank for name in _linear(predictor) if {name, _last(name)} & set(targets)}
-
-
 def _chosen_targets(predictor: PredictorNetwork, config: AdapterConfig) -> list[str]:
     """Return the targets with sets replaced by their layers; `all` excludes layers that are trained directly."""
     layers = _linear(predictor)
