@@ -13,6 +13,7 @@ from PIL import Image
 
 from paths import ROOT
 from run_fixtures import as_yaml
+from vjepa2_ac.registry import ENERGIES, LOSSES, METRICS, PLANNERS
 
 RECIPES = ("A loss", "A planner", "An energy", "A metric", "A tracker", "A form of data")
 STATE = "0.4,0,0.4,3.1,0,0,0"
@@ -68,6 +69,15 @@ def test_training_loads_the_core_only() -> None:
         "export",
     }
     assert not rooms & beside
+
+
+def test_what_is_known_is_found_without_looking_through_installed_packages(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A search asks for its energy at each part of each iteration."""
+    monkeypatch.setattr("vjepa2_ac.registry.entry_points", lambda **_: pytest.fail("looked through"))
+    for registry in (LOSSES, PLANNERS, ENERGIES, METRICS):
+        first = next(iter(registry._things))
+        assert registry.find(registry.known(first)) is registry.find(first)
+        assert registry.options(first, {}) == {}
 
 
 def test_a_loss_trains_and_a_planner_and_an_energy_plan_by_yaml(at_home: Path, make_config) -> None:
