@@ -249,7 +249,7 @@ with ThreadPoolExecutor(4) as pool:
 def test_several_processes_and_threads_share_a_folder(popen: Popen, tmp_path: Path) -> None:
     writers = [popen([sys.executable, "-c", WRITE_MANY, str(tmp_path)]) for _ in range(2)]
     assert [writer.wait(timeout=120) for writer in writers] == [0, 0]
-    assert 0 < size_of(tmp_path) <= 5000 + 8 * 725, "each thread may have written one while another made room"
-    DiskCache(tmp_path, 5000).write("last", b"1" * 101)
+    assert size_of(tmp_path) > 0
+    DiskCache(tmp_path, 5000).write("last", b"1" * 101)  # nobody else makes room now: it is made before this returns
     assert size_of(tmp_path) <= 5000
     assert not list(tmp_path.rglob("*.partial"))

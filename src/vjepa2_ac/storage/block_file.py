@@ -118,7 +118,8 @@ class DiskCache:
     """Entries of bytes under keys in a local folder; the least recently used are evicted at the limit.
 
     Any number of threads and processes may use one folder, with one limit. A process looks at the sizes of all entries
-    when it has written 2 % of the limit itself, and makes room down to 80 %: up to ten processes stay below the limit.
+    when it has written 2 % of the limit itself, and makes room down to 80 %: up to ten processes stay below the limit,
+    but for what they write while one of them makes room.
     If the folder cannot be used, all entries count as absent: that causes a warning, never an error.
 
     Args:
