@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -33,13 +34,13 @@ _STEP_M, _STEPS, _STRIDE = 0.05, 3, 4
 _DIM, _EPISODES, _CLIPS, _SMOOTHED = 1408, 40, 6, 0.8
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Print both tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--starts", type=int, default=20)
     parser.add_argument("--futures", type=int, default=8, help="directions from each start")
     parser.add_argument("--draws", type=int, default=20, help="of features")
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     console = Console(width=110)
     console.print(_of_images(options.starts, options.futures))
     console.print(_of_features(options.draws))

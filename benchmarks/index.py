@@ -49,7 +49,7 @@ WIDTHS = {
 CAMERAS = ("exterior_image_1_left", "exterior_image_2_left", "wrist_image_left")
 
 
-def main() -> None:
+def main(options: Sequence[str] | None = None) -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--shards", type=int, default=128, help="shards that are served (default: %(default)s)")
@@ -57,7 +57,7 @@ def main() -> None:
         "--in-flight", type=int, nargs="+", default=[64, 128], help="reads at once (default: %(default)s)"
     )
     parser.add_argument("--latency-ms", type=float, default=40.0, help="of every answer (default: %(default)s)")
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(options)
     latency_s = arguments.latency_ms / 1e3
     print(f"{arguments.shards} shards of {PER_SHARD} episodes, {arguments.latency_ms:g} ms a read\n")
     print(f"{'order':12}{'in flight':>10}{'reads':>8}{'KB':>8}{'seconds':>9}{'all: arithmetic':>26}{'measured':>10}")

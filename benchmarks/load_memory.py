@@ -12,6 +12,7 @@ import argparse
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -23,20 +24,21 @@ from vjepa2_ac.model.network.world_model import WorldModel
 SMALL = ModelSizes(encoder=EncoderSizes(depth=4), predictor=PredictorSizes(depth=2))
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Write the file, load it in each type in a fresh process, print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--small", action="store_true", help="a few layers instead of the full size")
     parser.add_argument("--keep", action="store_true", help="leave the file there")
     parser.add_argument("--load", choices=("float32", "bfloat16"), help=argparse.SUPPRESS)
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     path = options.folder / "random-vjepa2-ac-vitg.pt"
     if options.load:
         report_load(path, getattr(torch, options.load))
         return
     try:
         if not path.exists():
+            options.folder.mkdir(parents=True, exist_ok=True)
             write_random(path, SMALL if options.small else ModelSizes())
         print(f"{path.stat().st_size / 1e9:.2f} GB in {path}")
         print(f"{'dtype':10} {'weights GB':>10} {'peak RSS GB':>11} {'over GB':>8} {'seconds':>8}", flush=True)

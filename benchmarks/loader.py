@@ -19,7 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -78,14 +78,14 @@ print(min(seconds))
 """
 
 
-def main() -> None:
+def main(options: Sequence[str] | None = None) -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--path", help="a data set in DROID's RLDS schema; default: one that is drawn for the purpose")
     parser.add_argument("--clips", type=int, default=48, help="clips per measurement (default: %(default)s)")
     parser.add_argument("--stride", type=int, default=4, help="control steps per model step (default: %(default)s)")
     parser.add_argument("--tfds-python", help="interpreter that can import tensorflow_datasets")
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(options)
     with tempfile.TemporaryDirectory() as scratch:
         path = arguments.path or str(write_droid_rlds(Path(scratch) / "droid", draw_episodes(), shards=4))
         cache = DiskCacheConfig(dir=str(Path(scratch) / "cache"))
@@ -96,7 +96,7 @@ def main() -> None:
         measure_workers(config)
         measure_index(config)
     print()
-    video.measure_all(arguments.clips // 4)
+    video.measure_all(max(arguments.clips // 4, 1))
 
 
 def measure_clips(config: RldsData, clips: int, tfds_python: str | None) -> None:

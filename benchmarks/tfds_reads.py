@@ -14,6 +14,7 @@ import json
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -45,12 +46,12 @@ for episode in tfds.builder_from_directory(sys.argv[1]).as_dataset(split="train"
 """
 
 
-def main() -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Compare every feature of every episode; print the differences and a count."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tfds-python", required=True)
     parser.add_argument("--path", type=Path)
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as scratch:
         folder = options.path or write_synthetic(Path(scratch) / "set")
         command = [options.tfds_python, "-c", TFDS_SCRIPT, str(folder)]

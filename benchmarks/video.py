@@ -15,7 +15,7 @@ import os
 import statistics
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -51,11 +51,11 @@ RECORDINGS = (
 )
 
 
-def main() -> None:
+def main(options: Sequence[str] | None = None) -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--clips", type=int, default=12, help="clips per measurement (default: %(default)s)")
-    measure_all(parser.parse_args().clips)
+    measure_all(parser.parse_args(options).clips)
 
 
 def measure_all(clips: int) -> None:
@@ -95,7 +95,7 @@ def measure(path: Path, recording: Recording, clips: int) -> None:
         steps = range(start, start + WINDOW, STRIDE)
         if not recording.is_shared:
             return read_frames(path, steps, where=path.name)
-        clock = Clock(start_s=start / RATE, rate_hz=RATE)
+        clock = Clock(start_s=start / RATE, rate_hz=float(RATE))
         return read_frames(path, range(0, WINDOW, STRIDE), where=path.name, clock=clock)
 
     ways: dict[str, Callable[[int], np.ndarray]] = {

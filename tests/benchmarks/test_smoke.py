@@ -1,0 +1,88 @@
+"""Every benchmark runs to its end, small: those that no other test runs."""
+
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from benches import imported
+from paths import ROOT
+from vjepa2_ac.cli import main as command_line
+from vjepa2_ac.config import EncoderSizes, ModelSizes, PredictorSizes
+from vjepa2_ac.config.loading import load_config
+
+OTHERS = "\n".join(path.read_text() for path in Path(__file__).parent.glob("test_*.py"))
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "printed"),
+    [
+        ("clip_bytes", "--episodes 2 --steps 70 --clips 3", "drawn"),
+        ("index", "--shards 2 --in-flight 4 --latency-ms 1", "a hash's"),
+        ("image_metrics", "--starts 3 --futures 3 --draws 2", "smoothed"),
+        ("load_memory", "{folder}/new --small", "bfloat16"),
+        ("video", "--clips 1", "ours"),
+        ("loader", "--clips 4", "index of 2,000 episodes"),
+    ],
+)
+def test_it_runs_to_its_end(
+    name: str,
+    options: str,
+    printed: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    for module in imported(name, monkeypatch):
+        if name in {"video", "loader"}:
+            video = sys.modules["video"]
+            short = [replace(one, steps=90, height=90, width=160) for one in video.RECORDINGS]
+            monkeypatch.setattr(video, "RECORDINGS", short)
+        if name == "load_memory":
+            monkeypatch.setattr(
+                module, "SMALL", ModelSizes(encoder=EncoderSizes(depth=1), predictor=PredictorSizes(depth=1))
+            )
+        if name == "loader":
+            monkeypatch.setattr(module, "DROID_EPISODES", 2_000)
+            monkeypatch.setattr(module.measure_workers, "__defaults__", (2, 2))
+        module.main(options.format(folder=tmp_path).split())
+    assert printed in capfd.readouterr().out
+
+
+def test_two_trainings_at_once_are_commands_that_are_there(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Here:
+        def __init__(self, words: list[str], folder: Path, _: str) -> None:
+            with monkeypatch.context() as within:
+                within.chdir(folder)
+                if words[0] == "train":  # which takes 7 s
+                    self.returncode = int(load_config(words[1], words[2:]).training.steps != 20)
+                else:
+                    self.returncode = command_line(words)
+
+        def communicate(self) -> tuple[None, bytes]:
+            return None, b""
+
+    for module in imported("two_at_once", monkeypatch):
+        monkeypatch.setattr(module, "_command", Here)
+        assert module.main(["--spins", "shipped", "--steps", "20", "--episodes", "6", "--rounds", "1"]) == 0
+    assert re.search(r"two at once +\S+ s \(\S+x\)", capsys.readouterr().out)
+
+
+def test_tfds_is_asked_in_an_environment_that_has_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in imported("tfds_reads", monkeypatch):
+        with pytest.raises(subprocess.CalledProcessError) as raised:
+            module.main(["--tfds-python", sys.executable])
+        assert b"tensorflow" in raised.value.stderr.encode()
+        folder = raised.value.cmd[3]
+        assert not Path(folder).exists()
+
+
+def test_no_benchmark_is_left_out() -> None:
+    scripts = {path.stem for path in (ROOT / "benchmarks").glob("*.py") if "__main__" in path.read_text()}
+    assert len(scripts) > 15
+    assert not {name for name in scripts if not re.search(rf"\b{name}\b", OTHERS)}
