@@ -89,7 +89,6 @@ ORDERS: dict[str, list[str]] = {
         "closed_loop",
         "recording",
         "counterfactual",
-        "imagined_truth",
     ],
 }
 

@@ -121,12 +121,11 @@ def test_progress_is_reported_after_every_episode(tmp_path: Path) -> None:
 
 
 def test_impossible_numbers_and_unknown_domains_are_refused_before_anything_is_written(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="at least 1 episode"):
-        record_dataset(tmp_path / "x", RecordingSpec("A"), episodes=0)
-    with pytest.raises(InputError, match="seed -1"):
-        record_dataset(tmp_path / "x", RecordingSpec("A", seed=-1), episodes=1)
-    with pytest.raises(InputError, match="shards 0"):
-        record_dataset(tmp_path / "x", RecordingSpec("A"), episodes=1, shards=0)
-    with pytest.raises(InputError, match="one of A, B, or random"):
-        record_dataset(tmp_path / "x", RecordingSpec("Z"), episodes=1)
+    for spec, episodes, wrong in (
+        (RecordingSpec("A"), 0, "at least 1 episode"),
+        (RecordingSpec("A", seed=-1), 1, "seed -1"),
+        (RecordingSpec("Z"), 1, "one of A, B, or random"),
+    ):
+        with pytest.raises(InputError, match=wrong):
+            record_dataset(tmp_path / "x", spec, episodes=episodes)
     assert not (tmp_path / "x").exists()

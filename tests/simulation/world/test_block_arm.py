@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from projections import pixel_of
 from vjepa2_ac.geometry import matrices_from_euler
 from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, HOLDING
-from vjepa2_ac.simulation.world.camera import exterior_pose, pixels_of
 from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B, Domain
 from vjepa2_ac.simulation.world.motion import downward_poses, poses_in_base
 from vjepa2_ac.simulation.world.scene import BLOCK_M, FINGERTIP_M
@@ -96,13 +96,10 @@ def test_a_grasped_block_is_lifted_held_and_let_go(arm: ContactArm) -> None:
 
 
 def test_the_camera_sees_the_block_where_it_is_now(arm: ContactArm) -> None:
-    camera = arm.extrinsics()
-    focal = 90.0 / np.tan(np.deg2rad(DOMAIN_B.camera.vertical_fov_deg) / 2)
     for y in (-0.15, 0.05):
         arm.place_block(block_at(DOMAIN_B, 0.55, y))
         image = arm.image().astype(int)
-        x, down, far = matrices_from_euler(camera[3:]).T @ (arm.block[:3] - camera[:3])
-        row, column = int(90 + focal * down / far), int(160 + focal * x / far)
+        column, row = pixel_of(arm, arm.block[:3]).astype(int)
         red, green, blue = image[row, column]
         assert green > 1.8 * max(red, blue)
         is_green = image[..., 1] > 1.8 * np.maximum(image[..., 0], image[..., 2])
@@ -160,6 +157,4 @@ def test_a_mark_is_seen_where_it_was_put_and_nothing_touches_it(arm: ContactArm)
     seen = marked.image().astype(int)
     rows, columns = np.nonzero(np.minimum(seen[..., 1], seen[..., 2]) > 2.5 * seen[..., 0])
     assert len(rows) > 100
-    at = DOMAIN_B.base_pose()[:3, :3] @ np.append(place, 0.0)
-    expected = pixels_of(at[None], exterior_pose(DOMAIN_B), DOMAIN_B, seen.shape[:2])[0]
-    np.testing.assert_allclose([columns.mean(), rows.mean()], expected, atol=2.0)
+    np.testing.assert_allclose([columns.mean(), rows.mean()], pixel_of(marked, np.append(place, 0.0)), atol=2.0)

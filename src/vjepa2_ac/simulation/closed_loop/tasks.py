@@ -75,6 +75,17 @@ class TaskProblem:
     block_goal: Float[np.ndarray, " 4"] | None = None
 
     @property
+    def ends(self) -> Float[np.ndarray, "2 4"]:
+        """Start and goal of the block.
+
+        Raises:
+            ValueError: There is none.
+        """
+        if self.block_start is None or self.block_goal is None:
+            raise ValueError(f"{self.task} is done without a block")
+        return np.stack([self.block_start, self.block_goal])
+
+    @property
     def mark(self) -> Float[np.ndarray, " 2"] | None:
         """Middle of the mark on the table, x and y: under the block's goal (place); None: there is none."""
         return self.block_goal[:2] if self.task == "place" and self.block_goal is not None else None
@@ -120,14 +131,10 @@ def make_problem(task: TaskName, domain: Domain, seed: int, index: int) -> TaskP
         domain: Determines only the frame of the problem.
         seed: Of the problems.
         index: Of the problem.
-
-    Raises:
-        ValueError: No such task, or a negative seed or index.
     """
-    if task not in _DRAWN:
-        raise ValueError(f"no task {task!r}: {', '.join(_DRAWN)}")
     drawn = _DRAWN[task](np.random.default_rng([seed, index, list(_DRAWN).index(task)]))
-    first, last = _states(drawn, domain)
+    poses = poses_in_base(downward_poses(_with(drawn.flange, drawn.turn)), domain)
+    first, last = np.concatenate([poses, np.array(drawn.closedness)[:, None]], axis=1)
     if drawn.blocks is None:
         return TaskProblem(task, index, first, last)
     turns = drawn.blocks[:, 3:] - np.deg2rad(domain.base_yaw_deg)
@@ -211,17 +218,11 @@ def _with(places: Float[np.ndarray, "places dim"], value: float) -> Float[np.nda
     return np.concatenate([places, np.full((len(places), 1), value)], axis=1)
 
 
-def _states(drawn: _Drawn, domain: Domain) -> Float[np.ndarray, "2 7"]:
-    """Return start and goal of the arm in the base frame: pointing down, rotated about z."""
-    poses = poses_in_base(downward_poses(_with(drawn.flange, drawn.turn)), domain)
-    return np.concatenate([poses, np.array(drawn.closedness)[:, None]], axis=1)
-
-
 def arm_for(task: TaskName, domain: Domain, *, size: tuple[int, int] = FRAME_SIZE) -> SimulatedArm:
     """Return an arm for a task: `reach` needs no contacts, `place` a mark on the table.
 
     Raises:
-        InputError: MuJoCo is not installed, or OpenGL does not work here.
+        UnreachableError: MuJoCo is not installed.
     """
     kinds: dict[TaskName, type[SimulatedArm]] = {"reach": SimulatedArm, "place": MarkedArm}
     return kinds.get(task, ContactArm)(domain, size=size)

@@ -1,16 +1,24 @@
-"""Demonstrations: what an episode of a recording is, and what the arm does in it."""
+"""Demonstrations: what an episode of a recording is, what the arm does in it, and its record, `simulation.json`."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import Field
 
+from vjepa2_ac import storage
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.simulation.closed_loop.tasks import arm_for
 from vjepa2_ac.simulation.world.arm import SimulatedArm
 from vjepa2_ac.simulation.world.domains import Domain, DomainRanges, named_domain, sample_domain
 from vjepa2_ac.simulation.world.motion import Motion, MotionRecipe, random_reaching
+from vjepa2_ac.storage.structured import read_json_object, record_of
 
 RecordedTask = Literal["push", "pick", "place"]
 
@@ -70,18 +78,19 @@ def arm_of(index: int, spec: RecordingSpec) -> SimulatedArm:
     """Return an arm in the world of an episode; with a task it has contacts.
 
     Raises:
-        InputError: MuJoCo or OpenGL is missing, or an unknown domain.
+        InputError: An unknown domain.
+        UnreachableError: MuJoCo is not installed.
     """
-    world = world_of(index, spec)
-    if spec.task is None:
-        return SimulatedArm(world)
-    from vjepa2_ac.simulation.closed_loop.tasks import arm_for  # it imports torch, which random reaching does not need
-
-    return arm_for(spec.task, world)
+    return arm_for(spec.task or "reach", world_of(index, spec))
 
 
 def carry_out(
-    arm: SimulatedArm, index: int, spec: RecordingSpec, *, look: Callable[[SimulatedArm], None] | None = None
+    arm: SimulatedArm,
+    index: int,
+    spec: RecordingSpec,
+    *,
+    until: int | None = None,
+    look: Callable[[SimulatedArm], None] | None = None,
 ) -> Motion:
     """Carry out an episode, and return its motion.
 
@@ -89,39 +98,21 @@ def carry_out(
         arm: From `arm_of`; its pose does not matter.
         index: Number of the episode.
         spec: What an episode is.
+        until: Control step at which arm and block are left, as they were when it was measured; None: after the last.
         look: Called at every control step, at the time of its measurements.
-    """
-    rng = _stream(index, spec, _MOTION)
-    if spec.task is not None:
-        from vjepa2_ac.simulation.recording.scripted_play import play  # imports torch
-
-        return play(arm, spec.task, spec.steps, rng, script=index % 2 == 0, look=look)
-    motion = random_reaching(arm.domain, spec.steps, rng, spec.recipe)
-    for joints, closedness in zip(motion.joints, motion.gripper, strict=True):
-        arm.set_joints(joints, float(closedness))
-        if look:
-            look(arm)
-    return motion
-
-
-def put_at(arm: SimulatedArm, index: int, spec: RecordingSpec, step: int) -> SimulatedArm:
-    """Bring arm and block to a control step of an episode, as they were when it was measured.
-
-    Args:
-        arm: From `arm_of`; its pose does not matter.
-        index: Number of the episode.
-        spec: What an episode is.
-        step: From 0 to the episode's last.
     """
     rng = _stream(index, spec, _MOTION)
     if spec.task is not None:  # contacts depend on all that happened before
         from vjepa2_ac.simulation.recording.scripted_play import play  # imports torch
 
-        play(arm, spec.task, step, rng, script=index % 2 == 0)
-        return arm
+        return play(arm, spec.task, spec.steps if until is None else until, rng, script=index % 2 == 0, look=look)
     motion = random_reaching(arm.domain, spec.steps, rng, spec.recipe)
-    arm.set_joints(motion.joints[step], float(motion.gripper[step]))
-    return arm
+    measured = slice(None if until is None else until + 1)
+    for joints, closedness in zip(motion.joints[measured], motion.gripper[measured], strict=True):
+        arm.set_joints(joints, float(closedness))
+        if look:
+            look(arm)
+    return motion
 
 
 def episode_folder(index: int, seed: int, domain_name: str) -> str:
@@ -134,3 +125,92 @@ def episode_folder(index: int, seed: int, domain_name: str) -> str:
 
 def _stream(index: int, spec: RecordingSpec, purpose: int) -> np.random.Generator:
     return np.random.default_rng([spec.seed, index, purpose])
+
+
+SIMULATION_FILE = "simulation.json"
+
+_PROGRAM, _LIBRARIES = "vjepa2-ac", ("mujoco", "numpy", "scipy", "simplejpeg")  # other versions may change last digits
+_NEEDED = "what `vjepa2-ac simulate record` writes"
+_AGAIN = "Record it again: the same options give the same episodes"
+_NUMBER = re.compile(r"_(\d{6,})/")  # as `episode_folder` writes it
+
+
+@dataclass(frozen=True)
+class RecordedSimulation:
+    """Everything that determines the episodes of a data set; exactly one of domain and ranges is given."""
+
+    version: str  # of this program
+    libraries: dict[str, str]  # and of those that determine last digits
+    episodes: Annotated[int, Field(ge=1)]
+    steps: Annotated[int, Field(ge=2, le=1_000_000)]
+    seed: Annotated[int, Field(ge=0)]
+    cameras: Literal[1, 3]
+    recipe: MotionRecipe
+    task: RecordedTask | None
+    domain: Domain | None = None
+    ranges: DomainRanges | None = None
+
+    @classmethod
+    def of(cls, spec: RecordingSpec, episodes: int) -> RecordedSimulation:
+        """Return the record of a data set, worlds and recipe written out, whatever names and defaults mean later."""
+        worlds, recipe = spec.worlds, spec.recipe or MotionRecipe()
+        domain, ranges = (worlds, None) if isinstance(worlds, Domain) else (None, worlds)
+        how = (spec.steps, spec.seed, spec.cameras, recipe, spec.task, domain, ranges)
+        return cls(version(_PROGRAM), {name: version(name) for name in _LIBRARIES}, episodes, *how)
+
+    @property
+    def spec(self) -> RecordingSpec:
+        """What an episode is."""
+        worlds = self.domain or self.ranges or DomainRanges()
+        return RecordingSpec(worlds, self.steps, self.seed, self.cameras, self.recipe, self.task)
+
+    @property
+    def other_versions(self) -> str:
+        """What has another version here than where it was recorded, such as "mujoco 3.5.0, here 3.6.0"."""
+        then = {**self.libraries, _PROGRAM: self.version}
+        here = {name: version(name) for name in (_PROGRAM, *_LIBRARIES)}
+        return "; ".join(f"{name} {then[name]}, here {now}" for name, now in here.items() if then.get(name, now) != now)
+
+    def number_of(self, episode_id: str) -> int:
+        """Return the number under which an episode was recorded, from its identity.
+
+        Raises:
+            InputError: It is no episode of this data set.
+        """
+        found = _NUMBER.search(episode_id)
+        number = int(found[1]) if found else self.episodes
+        name = "random" if self.domain is None else self.domain.name
+        if number < self.episodes and f"{episode_folder(number, self.seed, name)}/" in episode_id:
+            return number
+        raise InputError(
+            where=SIMULATION_FILE,
+            found=f"not the episode {episode_id!r}",
+            needed=f"one of the {self.episodes} simulated with seed {self.seed}",
+            fix="Episodes are told apart by the folder in their identity; keep data.fields.identity as it is",
+        )
+
+
+def read_simulation(folder: str | Path) -> RecordedSimulation:
+    """Read how a data set was simulated.
+
+    Args:
+        folder: Of the data set, on this machine or behind a URL.
+
+    Raises:
+        InputError: It was not simulated, or by an older version that did not write the file; or the file is damaged.
+        UnreachableError: The network fails.
+    """
+    where = storage.join(str(folder), SIMULATION_FILE)
+    try:
+        values = read_json_object(where, needed=_NEEDED, fix=_AGAIN)
+    except (FileNotFoundError, NotADirectoryError):
+        raise InputError(
+            where=where,
+            found="no such file: these are not simulated episodes, or an older version recorded them",
+            needed=_NEEDED,
+            fix=f"What happens under other actions can only be simulated. {_AGAIN}",
+        ) from None
+    simulation = record_of(RecordedSimulation, values, where=where, needed=_NEEDED, fix=_AGAIN)
+    if (simulation.domain is None) == (simulation.ranges is None):
+        raise InputError(where=where, found="not one of the keys domain and ranges", needed=_NEEDED, fix=_AGAIN)
+    return simulation

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import itertools
 import multiprocessing
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
@@ -23,11 +22,19 @@ from vjepa2_ac.data.sources.rlds.droid_writer import (
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.jpeg import encode_jpeg
-from vjepa2_ac.simulation.recording.demonstration import INSTRUCTIONS, RecordingSpec, arm_of, carry_out, episode_folder
-from vjepa2_ac.simulation.recording.simulation_file import SIMULATION_FILE, simulation_text
+from vjepa2_ac.simulation.recording.demonstration import (
+    INSTRUCTIONS,
+    SIMULATION_FILE,
+    RecordedSimulation,
+    RecordingSpec,
+    arm_of,
+    carry_out,
+    episode_folder,
+)
 from vjepa2_ac.simulation.world.arm import SimulatedArm
 from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ, Motion
 from vjepa2_ac.simulation.world.scene import load_mujoco
+from vjepa2_ac.storage.structured import json_text
 
 __all__ = ["RecordingSpec", "episode_folder", "record_dataset", "record_episode"]
 
@@ -57,8 +64,8 @@ def record_dataset(
         progress: Called with (episodes done, episodes in total).
 
     Raises:
-        InputError: MuJoCo or OpenGL is missing, an unknown domain, a number out of range, or a folder that is in use or
-            cannot be written.
+        InputError: An unknown domain, a number out of range, or a folder that is in use or cannot be written.
+        UnreachableError: MuJoCo is not installed.
     """
     load_mujoco()
     if min(episodes, spec.steps - 1, workers, 1 if shards is None else shards, spec.seed + 1) < 1:
@@ -74,7 +81,7 @@ def record_dataset(
             yield episode
             progress(done, episodes)
 
-    notes = {SIMULATION_FILE: simulation_text(spec, episodes)}
+    notes = {SIMULATION_FILE: json_text(asdict(RecordedSimulation.of(spec, episodes)))}
     return write_droid_rlds(folder, watched(), shards=shards or -(-episodes // 32), notes=notes)
 
 
@@ -82,7 +89,8 @@ def record_episode(index: int, spec: RecordingSpec) -> DroidEpisode:
     """Return one episode: a pure function of its arguments.
 
     Raises:
-        InputError: MuJoCo or OpenGL is missing, or an unknown domain.
+        InputError: An unknown domain.
+        UnreachableError: MuJoCo is not installed.
     """
     arm = arm_of(index, spec)
     images: dict[str, list[bytes]] = {}
@@ -130,14 +138,10 @@ def _velocity(positions: Float[np.ndarray, "steps dim"]) -> Float[np.ndarray, "s
 
 
 def _recorded(record: Callable[[int], DroidEpisode], episodes: int, workers: int) -> Iterator[DroidEpisode]:
-    """Yield the episodes in order; a few are recorded in parallel."""
+    """Yield the episodes in order; in parallel, if so many processes are wanted."""
     if workers == 1:
         yield from map(record, range(episodes))
         return
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, mp_context=context) as pool:
-        indices = iter(range(episodes))
-        waiting = [pool.submit(record, index) for index in itertools.islice(indices, 3 * workers)]
-        while waiting:
-            yield waiting.pop(0).result()
-            waiting += [pool.submit(record, index) for index in itertools.islice(indices, 1)]
+        yield from pool.map(record, range(episodes))

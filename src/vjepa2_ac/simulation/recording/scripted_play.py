@@ -15,7 +15,7 @@ from jaxtyping import Float
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.episode import ACTION_DIM
 from vjepa2_ac.geometry import apply_action
-from vjepa2_ac.simulation.closed_loop.policies import oracle_for, shortened
+from vjepa2_ac.simulation.closed_loop.policies import Oracle, shortened
 from vjepa2_ac.simulation.closed_loop.rollout import put, ways_along
 from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, TaskProblem, make_problem
 from vjepa2_ac.simulation.world.arm import SimulatedArm
@@ -49,12 +49,12 @@ def play(
         look: Called at every control step, at the time of its measurements.
 
     Raises:
-        InputError: MuJoCo or OpenGL is missing.
+        UnreachableError: MuJoCo is not installed.
     """
     recipe = MotionRecipe()
     problem = make_problem(task, arm.domain, int(rng.integers(2**31)), 0)
     limits = LimitsConfig(xyz=(recipe.reach_m,) * 3)
-    oracle = oracle_for(task, limits, arm)
+    oracle = Oracle(limits, arm)
     put(arm, problem.start, problem.block_start, problem.mark)
     unseen = np.zeros((1, 1, 3), dtype=np.uint8)
     oracle.reset(problem, unseen)

@@ -12,6 +12,9 @@ from scipy.spatial.transform import Rotation
 from vjepa2_ac.geometry import euler_from_matrices, matrices_from_euler
 from vjepa2_ac.simulation.world.domains import Domain
 
+Joints = Float[np.ndarray, " 7"]  # angles in radians
+Jacobian = Float[np.ndarray, "6 7"]
+
 FLANGE_OFFSET_M = 0.107
 
 
@@ -53,9 +56,7 @@ def forward_kinematics(joints: Float[np.ndarray, "*batch 7"]) -> Float[np.ndarra
     return np.concatenate([frame[..., :3, 3], euler_from_matrices(frame[..., :3, :3])], axis=-1)
 
 
-def inverse_kinematics(
-    pose: Float[np.ndarray, " 6"], start: Float[np.ndarray, " 7"] = HOME, *, rest: Float[np.ndarray, " 7"] = HOME
-) -> Float[np.ndarray, " 7"]:
+def inverse_kinematics(pose: Float[np.ndarray, " 6"], start: Joints = HOME, *, rest: Joints = HOME) -> Joints:
     """Return joint angles that bring the flange to a pose: to 0.01 mm and 0.006 degrees, within the limits.
 
     Damped least squares, the damping falling with the error; the redundant degree of freedom is pulled to `rest`: a
@@ -77,12 +78,7 @@ def inverse_kinematics(
     raise OutOfReachError(f"no joint angles within the limits bring the flange to {np.round(pose, 3).tolist()}")
 
 
-def _limited_step(
-    jacobian: Float[np.ndarray, "6 7"],
-    error: Float[np.ndarray, " 6"],
-    joints: Float[np.ndarray, " 7"],
-    rest: Float[np.ndarray, " 7"],
-) -> Float[np.ndarray, " 7"]:
+def _limited_step(jacobian: Jacobian, error: Float[np.ndarray, " 6"], joints: Joints, rest: Joints) -> Joints:
     """Return the joints after one step; a joint pushed against its limit stays, and the others compensate."""
     free = np.ones(7)
     for _ in range(3):
@@ -94,9 +90,7 @@ def _limited_step(
     return np.clip(joints + step * free, LOW, HIGH)
 
 
-def _step(
-    jacobian: Float[np.ndarray, "6 7"], error: Float[np.ndarray, " 6"], to_rest: Float[np.ndarray, " 7"]
-) -> Float[np.ndarray, " 7"]:
+def _step(jacobian: Jacobian, error: Float[np.ndarray, " 6"], to_rest: Joints) -> Joints:
     """Return one damped step towards the pose, and in its null space towards rest.
 
     The pull to rest fades with the error: near the pose it must not disturb the convergence.
@@ -108,7 +102,7 @@ def _step(
     return step * min(1.0, 0.4 / max(float(np.abs(step).max()), 1e-12))
 
 
-def _jacobian(frames: list[Float[np.ndarray, "4 4"]]) -> Float[np.ndarray, "6 7"]:
+def _jacobian(frames: list[Float[np.ndarray, "4 4"]]) -> Jacobian:
     axes = np.stack([frame[:3, 2] for frame in frames[:-1]])
     arms = frames[-1][:3, 3] - np.stack([frame[:3, 3] for frame in frames[:-1]])
     return np.concatenate([np.cross(axes, arms), axes], axis=1).T
