@@ -79,7 +79,6 @@ ORDERS: dict[str, list[str]] = {
         "network",
         "decoder_folder frame_pairs",
         "baselines imagine steps",
-        "imagined_plan",
         "training",
     ],
     "calibration": ["variants", "strides data axes"],

@@ -77,11 +77,6 @@ def test_frames_are_of_the_split_at_most_as_many_as_asked_and_spread(
         assert max(counts) - min(counts) <= 1
 
 
-def test_a_split_without_clips_has_no_frames(make_config: MakeConfig) -> None:
-    dataset = open_dataset(make_config(data__test_share=0.0).data)
-    assert wanted_frames(dataset, "test", frames=9) == []
-
-
 def test_an_episode_that_could_not_be_encoded_is_left_out_and_a_damaged_file_is_named(
     make_config: MakeConfig, encode_split: EncodeSplit
 ) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -85,8 +84,7 @@ def measure_decoders(
         mean: Of training frames.
         progress: Called with (done, total) in frames.
     """
-    metrics: dict[str, Callable[[Tensor, Tensor], Tensor]] = {"psnr_db": psnr, "ssim": ssim}
-    found: dict[tuple[str, str], list[np.ndarray]] = defaultdict(list)
+    found: dict[str, list[tuple[np.ndarray, np.ndarray]]] = defaultdict(list)
     ids: list[str] = []
     device = next(next(iter(decoders.values())).parameters()).device
     for first in range(0, len(pairs), _MEASURED_AT_ONCE):
@@ -95,21 +93,17 @@ def measure_decoders(
         shown = {name: decoder.decode(latents) for name, decoder in decoders.items()}
         shown["mean_image"] = mean.to(device).expand_as(true)
         for name, images in shown.items():
-            for metric, of in metrics.items():
-                found[name, metric].append(of(images, true).double().cpu().numpy())
+            decibels, similar = (of(images, true).double().cpu().numpy() for of in (psnr, ssim))
+            found[name].append((decibels, similar))
         ids += some.episode_ids
         progress(len(ids), len(pairs))
-    values = {key: np.concatenate(parts) for key, parts in found.items()}
-    means = {name: _means(values[name, "psnr_db"], values[name, "ssim"], ids) for name in (*decoders, "mean_image")}
-    return {"frames": len(ids), "episodes": len(set(ids)), **means}
-
-
-def _means(
-    decibels: Float[np.ndarray, " frames"], similar: Float[np.ndarray, " frames"], ids: list[str]
-) -> dict[str, Any]:
-    finite = np.isfinite(decibels)
-    return {
-        "psnr_db": mean_of(decibels[finite], np.array(ids)[finite].tolist()).as_dict(),
-        "ssim": mean_of(similar, ids).as_dict(),
-        "exact_frames": int((~finite).sum()),
-    }
+    means: dict[str, Any] = {"frames": len(ids), "episodes": len(set(ids))}
+    for name, parts in found.items():
+        decibels, similar = np.concatenate(parts, axis=1)
+        finite = np.isfinite(decibels)
+        means[name] = {
+            "psnr_db": mean_of(decibels[finite], np.array(ids)[finite].tolist()).as_dict(),
+            "ssim": mean_of(similar, ids).as_dict(),
+            "exact_frames": int((~finite).sum()),
+        }
+    return means

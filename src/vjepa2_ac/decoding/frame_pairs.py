@@ -55,18 +55,15 @@ class FramePairs:
         Raises:
             InputError: A file is gone or damaged.
         """
-        owners = np.searchsorted(self._ends, numbers, side="right")
-        order = np.argsort(owners, kind="stable")
+        owners = np.searchsorted(self._ends, numbers, side="right").tolist()
+        files = {owner: self.files.open(self.frames[owner].episode, self.frames[owner].camera) for owner in set(owners)}
         latents, images = list[Tensor](), list[Tensor]()
-        for owner in np.unique(owners).tolist():
-            one, end = self.frames[owner], self._ends[owner]
-            rows = [int(numbers[place] - end) + len(one.steps) for place in order if owners[place] == owner]
-            file = self.files.open(one.episode, one.camera)
-            latents.append(unpack_latents(file.latents(rows)))
-            images.append(torch.from_numpy(file.pictures(rows)).permute(0, 3, 1, 2))
-        back = torch.from_numpy(np.argsort(order))
+        for number, owner in zip(numbers, owners, strict=True):
+            row = int(number - self._ends[owner]) + len(self.frames[owner].steps)
+            latents.append(unpack_latents(files[owner].latents([row])))
+            images.append(torch.from_numpy(files[owner].pictures([row])).permute(0, 3, 1, 2))
         ids = tuple(self.episode_ids[owner] for owner in owners)
-        return Pairs(torch.cat(latents)[back], torch.cat(images)[back].contiguous(), ids)
+        return Pairs(torch.cat(latents), torch.cat(images).contiguous(), ids)
 
 
 def wanted_frames(dataset: Dataset, split: Split, *, frames: int) -> list[FramesToEncode]:

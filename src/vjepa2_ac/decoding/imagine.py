@@ -1,4 +1,4 @@
-"""What a model imagines: the images of a rollout from one frame, under actions that were taken or were not.
+"""What a model or a planner imagines: the images of a rollout from one frame, under actions taken, planned or neither.
 
 The first frame and its state are given; nothing after them is. The states along the way are integrated from the first
 one: those of a recording would tell a model what did happen.
@@ -14,10 +14,14 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from vjepa2_ac.decoding.decoder_folder import DecoderCard
+from vjepa2_ac.data.transforms import frames_as_seen, view
+from vjepa2_ac.data.windows import spread_with_ends
+from vjepa2_ac.decoding.decoder_folder import DecoderCard, TrainedDecoder
 from vjepa2_ac.decoding.network import Decoder, as_pixels
 from vjepa2_ac.episode import LatentBatch
+from vjepa2_ac.planning.controller import Decision
 from vjepa2_ac.planning.counterfactual import counterfactual_states, feasible_actions
+from vjepa2_ac.planning.decision import PlanResult
 from vjepa2_ac.spaces import StateSpace
 
 AS_RECORDED = "as recorded"
@@ -123,3 +127,52 @@ def worth_knowing(
 def shown(decoder: Decoder, latents: Float[Tensor, "steps tokens dim"]) -> UInt8[np.ndarray, "steps size size 3"]:
     """Return latents as images for people."""
     return as_pixels(decoder.decode(latents.float()))
+
+
+# ---- what a planner imagined: decoded from the predictions that its plan was chosen by ----
+
+_MOST_STEPS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class ImaginedPlan:
+    """Images of a plan, all as the encoder sees them."""
+
+    start: UInt8[np.ndarray, "size size 3"]  # decoded
+    steps: dict[int, UInt8[np.ndarray, "size size 3"]]  # imagined after so many model steps; empty without a plan
+    goal: UInt8[np.ndarray, "size size 3"]  # the one that applies at the end
+    decoded_goal: UInt8[np.ndarray, "size size 3"]
+
+
+def imagine_plan(answer: PlanResult, decoder: TrainedDecoder) -> ImaginedPlan:
+    """Decode the rollout of a plan, of some steps if there are many, and what it started from and aimed at.
+
+    Args:
+        answer: The decision.
+        decoder: Of the model's encoder; it is moved to the model's device.
+    """
+    controller, goal = answer.controller, answer.question.goals[answer.decision.goals[-1]]
+    decoder.to(controller.device)
+    given = torch.stack([controller.encoded(image) for image in (answer.question.start, goal)])
+    start, decoded_goal = shown(decoder.decoder, given)
+    frames = _rollout(answer.decision, decoder, steps=answer.space.steps)
+    places = spread_with_ends(len(frames), _MOST_STEPS)
+    seen = frames_as_seen(view(goal[None], controller.crop), decoder.card.shape.image_size)[0]
+    return ImaginedPlan(start, {place + 1: frames[place] for place in places}, seen, decoded_goal)
+
+
+def imagined_next(decision: Decision, decoder: TrainedDecoder) -> UInt8[np.ndarray, "size size 3"] | None:
+    """Return the next frame as the planner imagined it when it decided; None: it imagined none."""
+    frames = _rollout(decision, decoder, steps=1)
+    return frames[0] if len(frames) else None
+
+
+@torch.no_grad()
+def _rollout(decision: Decision, decoder: TrainedDecoder, *, steps: int) -> UInt8[np.ndarray, "steps size size 3"]:
+    """Return the images after the first steps of a plan; none without a plan, or if the predictions are not finite."""
+    side = decoder.card.shape.image_size
+    none = np.zeros((0, side, side, 3), np.uint8)
+    if decision.plan is None or decision.cost is None:
+        return none
+    latents: Float[torch.Tensor, "steps tokens dim"] = decision.cost.imagine(decision.plan.actions[None, :steps])[0][0]
+    return shown(decoder.decoder, latents) if bool(torch.isfinite(latents).all()) else none

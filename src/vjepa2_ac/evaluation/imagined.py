@@ -18,6 +18,7 @@ from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import batches_of, validation_windows
 from vjepa2_ac.data.sources.configured_spaces import measured_space
 from vjepa2_ac.data.transforms import frames_as_seen, view
+from vjepa2_ac.data.windows import require_frames
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
 from vjepa2_ac.decoding.imagine import (
     AS_RECORDED,
@@ -181,10 +182,7 @@ def imagine_clip(subject: str, asked: ImagineOptions, *, reporter: Reporter = SI
     config, planning, _ = settle(subject, asked.evaluation, frames=asked.steps + 1)
     accelerator = make_accelerator(config)
     dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
-    if config.data.is_cache:
-        raise InputError(
-            where="data.source", found="latents, without frames", needed="the data set itself, to show what is true"
-        )
+    require_frames(config.data, to="show what is true")
     window = _window(dataset, asked)
     loaded = load_subject(subject, config, asked.evaluation, dataset, decoder)
     loaded.put_on(accelerator.device)
