@@ -36,17 +36,6 @@ def test_the_oracle_solves_it_and_nothing_and_chance_do_not(task: str, domain) -
         assert result.final_distance_cm.value > 8.0
 
 
-def test_the_goal_image_shows_the_block_at_its_goal() -> None:
-    arm = arm_for("pick", DOMAIN_A)
-    episode = run_episode(arm, ZeroActions(), make_problem("pick", DOMAIN_A, 0, 0), steps=1, keep_frames=True)
-
-    def green(image: np.ndarray) -> np.ndarray:
-        seen = image.astype(int)
-        return np.argwhere(seen[..., 1] > 1.8 * np.maximum(seen[..., 0], seen[..., 2])).mean(axis=0)
-
-    assert green(episode.frames[0])[0] - green(episode.goal_image)[0] > 8  # it is lifted: higher in the image
-
-
 @pytest.mark.parametrize("seed", [11, 12])
 def test_a_block_is_placed_by_lifting_carrying_and_letting_go(seed: int) -> None:
     arm = arm_for("place", DOMAIN_B, size=(18, 32))
@@ -104,8 +93,3 @@ def test_the_goal_image_of_a_place_shows_the_block_on_the_mark() -> None:
             cyan = np.argwhere(np.minimum(seen[..., 1], seen[..., 2]) > 2.5 * seen[..., 0]).mean(axis=0)
             apart = np.linalg.norm(green - cyan)
             assert (apart < 8) == (block is problem.block_goal), apart
-
-
-def test_an_arm_without_a_block_cannot_push() -> None:
-    with pytest.raises(ValueError, match="no block"):
-        run_task(RolloutSpec("push", DOMAIN_A, 1), ZeroActions(), arm_for("reach", DOMAIN_A, size=(18, 32)))

@@ -1,7 +1,6 @@
 """A recorded data set says how it was simulated; what it says gives its episodes again."""
 
 import json
-import shutil
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -57,22 +56,6 @@ def test_the_file_gives_the_recorded_episodes_again(recorded: Path) -> None:
     assert sorted(numbers) == [0, 1, 2]
     again = record_episode(numbers[1], simulation.spec)
     assert f"{again.recording_folderpath}--{again.file_path}" == source.infos()[1].id
-
-
-def test_the_index_and_its_key_do_not_depend_on_the_file(
-    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    caches = []
-    for name in ("with", "without"):
-        shutil.copytree(recorded, tmp_path / "data")
-        if name == "without":
-            (tmp_path / "data" / SIMULATION_FILE).unlink()
-        monkeypatch.setenv("VJEPA2_AC_CACHE", str(tmp_path / name))
-        infos = RldsSource(DataConfig(path=str(tmp_path / "data"))).infos()
-        caches.append((sorted(path.name for path in (tmp_path / name).rglob("*") if path.is_file()), list(infos)))
-        shutil.rmtree(tmp_path / "data")
-    assert caches[0] == caches[1]
-    assert caches[0][0]
 
 
 def test_a_folder_without_the_file_is_refused(tmp_path: Path) -> None:

@@ -95,14 +95,6 @@ def test_closing_the_gripper_is_seen(arm: SimulatedArm) -> None:
     assert (opened != arm.image()).any()
 
 
-def test_the_three_cameras_see_different_things(arm: SimulatedArm) -> None:
-    images = [arm.image(name) for name in ("exterior_1", "exterior_2", "wrist")]
-    assert not (images[0] == images[1]).all()
-    assert not (images[1] == images[2]).all()
-    with pytest.raises(ValueError, match="no camera"):
-        arm.image("elbow")
-
-
 def test_the_wrist_camera_moves_with_the_arm(arm: SimulatedArm) -> None:
     views = []
     for joints in REACHES[:2]:

@@ -259,10 +259,7 @@ def put(
         raise ValueError("no place for the mark on the table: give problem.mark")
     arm.set_joints(rest_joints(arm.domain), 0.0)
     arm.set_state(state)
-    if block is not None:
-        arm.place_block(block)
-    if mark is not None:
-        arm.place_mark(mark)
+    arm.place(block, mark)
     return arm
 
 

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from vjepa2_ac.simulation.world.arm import ContactArm, MarkedArm, SimulatedArm
+from vjepa2_ac.simulation.world.arm import ContactArm, SimulatedArm
 from vjepa2_ac.simulation.world.camera import FRAME_SIZE
 from vjepa2_ac.simulation.world.domains import Domain
 from vjepa2_ac.simulation.world.motion import MotionRecipe, downward_poses, poses_in_base
@@ -43,14 +43,11 @@ STEPS: dict[TaskName, int] = {"reach": 8, "push": 8, "pick": 12, "place": 18}
 REACH_WAY_M, PUSH_WAY_M, LIFT_M, PLACE_WAY_M = (0.12, 0.25), (0.10, 0.16), (0.10, 0.14), (0.10, 0.20)
 """Distance between start and goal: of the flange (reach), of the block (push, place), of the block upwards (pick)."""
 
-GRASP_M = FINGERTIP_M - 0.02
-"""Height of the flange over the middle of a block that is to be grasped."""
+GRASP_M = FINGERTIP_M - 0.02  # height of the flange over the middle of a block that is to be grasped
 
-HOLDING = 1.0 - (BLOCK_M / 2 - FINGER_INSIDE_M) / FINGER_TRAVEL_M
-"""Closedness of a gripper that holds the block."""
+HOLDING = 1.0 - (BLOCK_M / 2 - FINGER_INSIDE_M) / FINGER_TRAVEL_M  # closedness of a gripper that holds the block
 
-RELEASED = HOLDING - 0.1
-"""A gripper that is less closed than this holds no block: 4 mm are left on each side."""
+RELEASED = HOLDING - 0.1  # A gripper that is less closed than this holds no block: 4 mm are left on each side
 
 _FLANGE_AREA = np.array([[0.32, -0.26], [0.62, 0.26]])  # low and high (x, y) in the world
 _BLOCK_AREA = np.array([[0.36, -0.26], [0.64, 0.26]])
@@ -224,5 +221,4 @@ def arm_for(task: TaskName, domain: Domain, *, size: tuple[int, int] = FRAME_SIZ
     Raises:
         UnreachableError: MuJoCo is not installed.
     """
-    kinds: dict[TaskName, type[SimulatedArm]] = {"reach": SimulatedArm, "place": MarkedArm}
-    return kinds.get(task, ContactArm)(domain, size=size)
+    return SimulatedArm(domain, size=size) if task == "reach" else ContactArm(domain, size=size, mark=task == "place")

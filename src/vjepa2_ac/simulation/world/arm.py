@@ -75,21 +75,14 @@ class SimulatedArm:
         """Middle of the mark on the table, as in `TaskProblem`; None: there is none."""
         return None
 
-    def place_block(self, block: Float[np.ndarray, " 4"]) -> None:
-        """Put the block at a pose at once, at rest.
+    def place(self, block: Float[np.ndarray, " 4"] | None, mark: Float[np.ndarray, " 2"] | None) -> None:
+        """Put the block (at a pose at once, at rest) and the mark on the table; None: it stays.
 
         Raises:
-            ValueError: There is none.
+            ValueError: One is to be put, and there is none.
         """
-        raise ValueError(f"no block to be put at {block.tolist()}: this arm touches nothing")
-
-    def place_mark(self, mark: Float[np.ndarray, " 2"]) -> None:
-        """Put the mark at a place on the table.
-
-        Raises:
-            ValueError: There is none.
-        """
-        raise ValueError(f"no mark to be put at {mark.tolist()}: this arm has none on its table")
+        if block is not None or mark is not None:
+            raise ValueError("neither a block nor a mark can be put: this arm touches nothing")
 
     def set_joints(self, joints: Joints, closedness: float) -> None:
         """Put the arm at joint angles at once."""
@@ -183,9 +176,16 @@ class ContactArm(SimulatedArm):
 
     A gripper that is stopped by an object is measured at its position, as on a real robot; commanded to stay there, it
     keeps holding.
+
+    Args:
+        domain: Its world.
+        size: Height and width of the images.
+        mark: Whether a mark lies on the table: a flat disc that is seen, and touched by nothing.
     """
 
-    _has_mark = False
+    def __init__(self, domain: Domain, *, size: tuple[int, int] = FRAME_SIZE, mark: bool = False) -> None:
+        self._has_mark = mark
+        super().__init__(domain, size=size)
 
     @property
     def closedness(self) -> float:
@@ -199,12 +199,27 @@ class ContactArm(SimulatedArm):
         rotation = turn.T @ Rotation.from_quat(place[3:], scalar_first=True).as_matrix()
         return np.append(turn.T @ place[:3], np.arctan2(rotation[1, 0], rotation[0, 0]))
 
-    def place_block(self, block: Float[np.ndarray, " 4"]) -> None:
-        """Put the block at a pose at once, upright and at rest."""
-        turn = Rotation.from_matrix(self.domain.base_pose()[:3, :3])
-        rotation = turn * Rotation.from_euler("z", block[3])
-        self._data.qpos[_BLOCK] = [*turn.apply(block[:3]), *rotation.as_quat(scalar_first=True)]
-        self._data.qvel[9:] = 0.0
+    @property
+    def mark(self) -> Float[np.ndarray, " 2"] | None:
+        """Middle of the mark in the robot base frame, x and y in metres; None: there is none."""
+        return np.asarray(self._data.mocap_pos[0] @ self.domain.base_pose()[:3, :2]) if self._has_mark else None
+
+    def place(self, block: Float[np.ndarray, " 4"] | None, mark: Float[np.ndarray, " 2"] | None) -> None:
+        """Put the block, upright and at rest, and the mark at once; None: it stays.
+
+        Raises:
+            ValueError: A mark is to be put, and there is none.
+        """
+        base = self.domain.base_pose()[:3, :3]
+        if block is not None:
+            turn = Rotation.from_matrix(base)
+            rotation = turn * Rotation.from_euler("z", block[3])
+            self._data.qpos[_BLOCK] = [*turn.apply(block[:3]), *rotation.as_quat(scalar_first=True)]
+            self._data.qvel[9:] = 0.0
+        if mark is not None:
+            if not self._has_mark:
+                raise ValueError(f"no mark to be put at {mark.tolist()}: this arm has none on its table")
+            self._data.mocap_pos[0, :2] = base[:2, :2] @ mark
         self._mujoco.mj_kinematics(self._model, self._data)
 
     def set_joints(self, joints: Joints, closedness: float) -> None:
@@ -234,20 +249,3 @@ class ContactArm(SimulatedArm):
         self._share = 1.0 - np.exp(-model.opt.timestep / lags)
         self._ahead = -model.actuator_biasprm[:, 2] / model.actuator_gainprm[:, 0] / model.opt.timestep
         return model
-
-
-class MarkedArm(ContactArm):
-    """An arm with contacts and a mark on its table: a flat disc that is seen, and touched by nothing."""
-
-    _has_mark = True
-
-    @property
-    def mark(self) -> Float[np.ndarray, " 2"]:
-        """Middle of the mark in the robot base frame: x and y in metres."""
-        place = self.domain.base_pose()[:3, :3].T @ self._data.mocap_pos[0]
-        return np.asarray(place[:2])
-
-    def place_mark(self, mark: Float[np.ndarray, " 2"]) -> None:
-        """Put the mark at a place on the table at once."""
-        self._data.mocap_pos[0, :2] = self.domain.base_pose()[:2, :2] @ mark
-        self._mujoco.mj_kinematics(self._model, self._data)

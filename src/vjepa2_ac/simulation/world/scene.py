@@ -12,21 +12,16 @@ import numpy as np
 from vjepa2_ac.errors import require_library
 from vjepa2_ac.simulation.world.domains import Domain
 
-STATIC_GROUP, ARM_GROUP = 0, 1
-"""Geom groups: static, and moving."""
+STATIC_GROUP, ARM_GROUP = 0, 1  # geom groups: static, and moving
 FINGER_TRAVEL_M = 0.04
 FINGER_INSIDE_M, FINGER_OUTSIDE_M, FINGER_HALF_M = 0.004, 0.028, 0.014
 """Of a closed finger: from the middle of the hand to its inner and outer side, and half its width across."""
-FINGERTIP_M = 0.15
-"""Length of the fingers beyond the flange."""
-BLOCK_M = 0.06
-"""Edge length of the block, a cube."""
-MARK_M = 0.055
-"""Radius of the mark, a flat disc: it is seen on all sides of a block that lies in its middle."""
+FINGERTIP_M = 0.15  # length of the fingers beyond the flange
+BLOCK_M = 0.06  # edge length of the block, a cube
+MARK_M = 0.055  # radius of the mark, a flat disc: it is seen on all sides of a block that lies in its middle
 WORK_AREA_M = ((0.28, 0.74), (-0.38, 0.38))
 """Ranges of x and y in the world that are kept free of other objects, for the block."""
-SUBSTEPS = 32
-"""Steps of physics per control step."""
+SUBSTEPS = 32  # steps of physics per control step
 
 _SCENE = "assets/simulation/arm.xml"
 _COLOURED = ("arm", "joints", "hand", "table", "floor", "wall")  # classes of geoms, and colours of a Look
