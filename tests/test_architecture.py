@@ -78,7 +78,7 @@ ORDERS: dict[str, list[str]] = {
     "decoding": [
         "network",
         "decoder_folder frame_pairs",
-        "baselines imagine steps",
+        "imagine steps",
         "training",
     ],
     "calibration": ["variants", "strides data axes"],

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import pytest
 import torch
 
-from vjepa2_ac.decoding.baselines import fit_linear, measure_decoders
-from vjepa2_ac.decoding.frame_pairs import Pairs
+from vjepa2_ac.decoding.frame_pairs import Pairs, fit_linear, measure_decoders
 from vjepa2_ac.decoding.network import Decoder, DecoderShape
 from vjepa2_ac.episode import no_progress
 

@@ -10,7 +10,7 @@ from random_decoder import write_decoder
 from tiny_models import tiny_model
 from vjepa2_ac.data.transforms import frames_as_seen, view
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
-from vjepa2_ac.decoding.imagine import Start, imagine_plan, imagined_latents, imagined_next, rolled_out, shown
+from vjepa2_ac.decoding.imagine import Start, imagine_plan, imagined_next, rolled_out, shown
 from vjepa2_ac.planning.counterfactual import counterfactual_states, named_actions
 from vjepa2_ac.spaces import POSE
 
@@ -36,7 +36,7 @@ def start_of(latents: Tensor, **more: Tensor) -> Start:
 
 def test_states_under_other_actions_are_integrated_from_the_first_one() -> None:
     latents, model = truth(), Remembering()
-    imagined_latents(model, start_of(latents), named_actions("left", STEPS, size_m=0.03))
+    rolled_out(model, start_of(latents), named_actions("left", STEPS, size_m=0.03))
     context, actions, states, extrinsics = model.given
     assert torch.equal(context, latents[None, :1]), "one frame"
     assert states.shape == actions.shape == (1, STEPS, 7)
@@ -47,7 +47,7 @@ def test_states_under_other_actions_are_integrated_from_the_first_one() -> None:
 
 def test_a_gripper_changes_as_far_as_it_can() -> None:
     model = Remembering()
-    imagined_latents(model, start_of(truth()), named_actions("close", STEPS))
+    rolled_out(model, start_of(truth()), named_actions("close", STEPS))
     _, actions, states, _ = model.given
     np.testing.assert_allclose(actions[0, :, 6].numpy(), [0.1, 0, 0, 0], atol=1e-6)
     np.testing.assert_allclose(states[0, :, 6].numpy(), [0.9, 1, 1, 1], atol=1e-6)
@@ -55,7 +55,7 @@ def test_a_gripper_changes_as_far_as_it_can() -> None:
 
 def test_the_camera_of_the_first_frame_holds_for_all_steps() -> None:
     model, camera = Remembering(), torch.arange(6.0)
-    imagined_latents(model, start_of(truth(), extrinsics=camera), named_actions("none", STEPS))
+    rolled_out(model, start_of(truth(), extrinsics=camera), named_actions("none", STEPS))
     assert torch.equal(model.given[3], camera.expand(1, STEPS, 6))
 
 

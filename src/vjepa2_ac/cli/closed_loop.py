@@ -221,8 +221,7 @@ def _record(options: argparse.Namespace) -> int:
     require_new_place(target)
 
     from vjepa2_ac.console.progress import ConsoleReporter, show
-    from vjepa2_ac.simulation.recording.demonstration import default_steps
-    from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
+    from vjepa2_ac.simulation.recording.record import RecordingSpec, default_steps, record_dataset
 
     task = None if options.task == "reach" else options.task
     spec = record_of_options(RecordingSpec, options, task=task, steps=options.steps or default_steps(task))

@@ -47,7 +47,7 @@ class DecoderCard:
     episodes: int  # learned from
     frames: int
     steps: int
-    held_out: Mapping[str, Any] = field(default_factory=dict)  # by `baselines.measure_decoders`
+    held_out: Mapping[str, Any] = field(default_factory=dict)  # by `frame_pairs.measure_decoders`
     version: str = __version__
     time: str = ""  # UTC
 

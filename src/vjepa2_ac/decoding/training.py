@@ -24,9 +24,8 @@ from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.sources.latents.cache_files import LatentFiles, bytes_per_frame
 from vjepa2_ac.data.sources.latents.cache_key import CacheKey, Encoding, require_own_folder
 from vjepa2_ac.data.windows import permuted, require_frames, require_stride
-from vjepa2_ac.decoding.baselines import fit_linear, mean_image, measure_decoders
 from vjepa2_ac.decoding.decoder_folder import CARD, DecoderCard, read_card, save_decoder
-from vjepa2_ac.decoding.frame_pairs import FramePairs, Pairs, wanted_frames
+from vjepa2_ac.decoding.frame_pairs import FramePairs, Pairs, fit_linear, mean_image, measure_decoders, wanted_frames
 from vjepa2_ac.decoding.network import UPSAMPLED, Decoder, DecoderShape
 from vjepa2_ac.decoding.steps import SMALLEST, DecoderSteps
 from vjepa2_ac.distributed.device import autocast, computing_device

@@ -231,10 +231,7 @@ class Timing:
     stride: int = 1  # frames of a model step
     slack: int = 3  # model steps that a goal may take fewer or more than the demonstration
     share: float | None = None  # of each goal but the last
-
-    def steps(self, begin: int, end: int) -> int:
-        """Return the model steps from one frame to another, 1 at least."""
-        return max(1, math.ceil((end - begin) / self.stride))
+    stop_share: float | None = None  # of the last one
 
 
 def sub_goals_of(
@@ -256,12 +253,12 @@ def sub_goals_of(
     """
     goals, before = [], 0
     for image, key in zip(images, keys, strict=True):
-        steps = timing.steps(before, key.frame)
+        steps = max(1, math.ceil((key.frame - before) / timing.stride))
         gripper = None if states is None else _gripper_mode(states[before], states[key.frame])
         low, high = max(1, steps - timing.slack), steps + timing.slack
         goals.append(SubGoal(image, key.name, low, high, timing.share, gripper))
         before = key.frame
-    return (*goals[:-1], replace(goals[-1], at_most=None, share=None))
+    return (*goals[:-1], replace(goals[-1], at_most=None, share=timing.stop_share))
 
 
 def _gripper_mode(before: Float[np.ndarray, " 7"], after: Float[np.ndarray, " 7"]) -> GripperMode:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -110,16 +110,13 @@ def recording_of_film(path: Path) -> Recording:
 
 
 @dataclass(frozen=True)
-class KeyFrameOptions:
+class KeyFrameOptions(Timing):
     """Which frames become goals, and how long each may take."""
 
     by: By = "gripper"
     every: int | None = None  # frames, by `every`
     apart: int | None = None  # least frames between a stop and another goal (4), or between goals by latents
     stride: int = 4  # frames of a model step
-    slack: int = 3  # model steps that a goal may take fewer or more than the demonstration
-    share: float | None = None  # of each goal but the last
-    stop_share: float | None = None  # of the last one
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,9 +182,7 @@ def make_goals(
     seen = None if session is None else _Encoded.of(session, recording, reporter)
     keys = _keys(recording, options, seen)
     first, *images = recording.read([0, *(key.frame for key in keys)])
-    timing = Timing(options.stride, options.slack, options.share)
-    goals = sub_goals_of(images, keys, timing, recording.states)
-    goals = (*goals[:-1], replace(goals[-1], share=options.stop_share))
+    goals = sub_goals_of(images, keys, options, recording.states)
     course = noise = None
     if session is not None and seen is not None:
         course = seen.course([key.frame for key in keys], options.stride)

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from torch import Tensor
 
 from vjepa2_ac.config import Config, LimitsConfig
 from vjepa2_ac.config.data import Split
@@ -25,7 +24,6 @@ from vjepa2_ac.decoding.imagine import (
     Imagination,
     Imagined,
     Start,
-    imagined_latents,
     rolled_out,
     shown,
     worth_knowing,
@@ -97,7 +95,7 @@ def imagine_image(
         first=first,
         decoded_first=decoded_first,
         rollouts=tuple(
-            Imagined("model", word, taken, shown(decoder.decoder, imagined_latents(model, start, taken)))
+            Imagined("model", word, taken, shown(decoder.decoder, rolled_out(model, start, taken)))
             for word, taken in chosen.items()
         ),
         notes=(
@@ -239,10 +237,8 @@ def _rollouts(
             if name != AS_RECORDED and contender.role != "trained":
                 continue
             with contender.switched():
-                if name == AS_RECORDED:
-                    latents: Tensor = rolled_out(contender.model, start, actions, states[:-1])
-                else:
-                    latents = imagined_latents(contender.model, start, actions)
+                known = states[:-1] if name == AS_RECORDED else None
+                latents = rolled_out(contender.model, start, actions, known)
             found.append(Imagined(contender.name, name, actions, shown(decoder.decoder, latents)))
     return found
 

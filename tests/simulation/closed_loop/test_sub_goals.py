@@ -20,7 +20,7 @@ from vjepa2_ac.simulation.closed_loop.sub_goals import (
     every_step,
 )
 from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, HOLDING, arm_for, make_problem
-from vjepa2_ac.simulation.recording.demonstration import RecordingSpec, arm_of, carry_out
+from vjepa2_ac.simulation.recording.record import RecordingSpec, arm_of, carry_out
 from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B
 
 SMALL = (36, 64)

@@ -15,8 +15,7 @@ pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.rlds.source import RldsSource
-from vjepa2_ac.simulation.recording.demonstration import default_steps
-from vjepa2_ac.simulation.recording.record import RecordingSpec, record_episode
+from vjepa2_ac.simulation.recording.record import RecordingSpec, default_steps, record_episode
 from vjepa2_ac.simulation.recording.scripted_play import play
 
 

@@ -14,13 +14,15 @@ from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B, CameraPlace, 
 
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 
-from vjepa2_ac.simulation.recording.demonstration import (
+from vjepa2_ac.simulation.recording.record import (
     SIMULATION_FILE,
     RecordedSimulation,
+    RecordingSpec,
     episode_folder,
     read_simulation,
+    record_dataset,
+    record_episode,
 )
-from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset, record_episode
 from vjepa2_ac.simulation.world.motion import MotionRecipe
 
 SPECS = [
