@@ -162,14 +162,17 @@ def test_a_killed_training_goes_on_as_if_it_had_not(
     assert_same_decoder(whole_decoder, out)
 
 
-def test_what_a_killed_start_left_in_a_finished_folder_is_removed(
-    make_decoder: MakeConfig, whole_decoder: Path, tmp_path: Path
+def test_what_a_killed_start_left_in_a_finished_folder_is_removed_and_a_check_writes_nothing(
+    make_decoder: MakeConfig, whole_decoder: Path, tmp_path: Path, reporter: SilentReporter
 ) -> None:
     shutil.copytree(whole_decoder, tmp_path / "decoder")
     (tmp_path / "decoder" / "pairs").mkdir()
     (tmp_path / "decoder" / "training.pt").touch()
     train_decoder(make_decoder(), check_only=True)
+    train_decoder(make_decoder("other"), reporter, check_only=True)
+    assert any("GB of disk" in note for note in reporter.notes)
     assert (tmp_path / "decoder" / "pairs").exists(), "--check changes nothing"
+    assert not (tmp_path / "other").exists()
     train_decoder(make_decoder())
     assert {path.name for path in (tmp_path / "decoder").iterdir()} == FINISHED
 
@@ -186,12 +189,6 @@ def test_a_finished_folder_is_left_as_it_is(
     assert any("there already" in note for note in reporter.notes)
     assert "training the decoder" not in reporter.tasks
     assert {path.name: path.read_bytes() for path in (tmp_path / "decoder").iterdir()} == before
-
-
-def test_check_writes_nothing(make_decoder: MakeConfig, tmp_path: Path, reporter: SilentReporter) -> None:
-    train_decoder(make_decoder(), reporter, check_only=True)
-    assert any("GB of disk" in note for note in reporter.notes)
-    assert not (tmp_path / "decoder").exists()
 
 
 @pytest.mark.parametrize(

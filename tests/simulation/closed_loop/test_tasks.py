@@ -173,19 +173,10 @@ def test_a_block_is_placed_when_it_lies_on_the_mark_and_is_released() -> None:
 
 
 def test_other_tasks_succeed_by_distance_alone() -> None:
-    picked = make_problem("pick", DOMAIN_A, 0, 0)
+    picked, reached = (make_problem(task, DOMAIN_A, 0, 0) for task in ("pick", "reach"))
     for height, done in ((0.049, True), (0.051, False)):
         assert picked.succeeded(picked.start, picked.block_goal - height * np.eye(4)[2]) == done
-    reached = make_problem("reach", DOMAIN_A, 0, 0)
     assert reached.succeeded(reached.goal)
     assert not reached.succeeded(reached.start)
-
-
-def test_the_distance_is_that_of_the_flange_in_metres() -> None:
-    problem = make_problem("reach", DOMAIN_A, 0, 0)
-    assert problem.distance_m(problem.goal) == 0.0
-    turned = problem.goal + np.array([0.03, 0.0, -0.04, 0.2, 0.0, 0.1, 1.0])
-    assert problem.distance_m(turned) == pytest.approx(0.05)
-    pushed = make_problem("push", DOMAIN_A, 0, 0)
-    with pytest.raises(ValueError, match="push is done by a block"):
-        pushed.distance_m(pushed.start)
+    turned = reached.goal + np.array([0.03, 0.0, -0.04, 0.2, 0.0, 0.1, 1.0])
+    assert reached.distance_m(turned) == pytest.approx(0.05), "neither turns nor the gripper count"

@@ -69,9 +69,10 @@ def test_commands_differ_from_measurements_and_velocities_from_zero() -> None:
 
 
 def test_the_same_seed_gives_the_same_bytes_in_any_number_of_processes(recorded: Path, tmp_path: Path) -> None:
-    again = record_dataset(
-        tmp_path / "again", RecordingSpec("B", STEPS, seed=3), episodes=EPISODES, shards=2, workers=2
-    )
+    reported = []
+    spec, how = RecordingSpec("B", STEPS, seed=3), {"episodes": EPISODES, "shards": 2, "workers": 2}
+    again = record_dataset(tmp_path / "again", spec, **how, progress=lambda *state: reported.append(state))
+    assert reported == [(done, EPISODES) for done in range(1, EPISODES + 1)]
     for file in sorted(recorded.iterdir()):
         assert file.read_bytes() == (again / file.name).read_bytes()
 
@@ -110,14 +111,6 @@ def test_every_episode_of_a_random_set_has_its_own_world() -> None:
         jpeg = record_episode(index, RecordingSpec(DomainRanges(), 2, 0)).images["exterior_image_1_left"][0]
         walls.append(simplejpeg.decode_jpeg(jpeg)[:20, :20].reshape(-1, 3).mean(axis=0))
     assert np.ptp(walls, axis=0).max() > 20
-
-
-def test_progress_is_reported_after_every_episode(tmp_path: Path) -> None:
-    reported: list[tuple[int, int]] = []
-    record_dataset(
-        tmp_path / "random", RecordingSpec("random", 2), episodes=2, progress=lambda *state: reported.append(state)
-    )
-    assert reported == [(1, 2), (2, 2)]
 
 
 def test_impossible_numbers_and_unknown_domains_are_refused_before_anything_is_written(tmp_path: Path) -> None:

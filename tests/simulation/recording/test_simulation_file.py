@@ -86,7 +86,6 @@ def record_name(spec: RecordingSpec, index: int) -> str:
     ("changes", "message"),
     [
         ({"steps": 0}, "steps: .*greater than or equal to 2"),
-        ({"robot": 1}, "robot: unknown"),
         ({"ranges": {}}, "not one of the keys domain and ranges"),
         ({"domain": None}, "not one of the keys domain and ranges"),
         ({"task": "stack"}, "task: "),

@@ -27,7 +27,6 @@ from vjepa2_ac.storage import user_can_write, write_atomically
 from vjepa2_ac.storage.structured import utc_now
 
 FILE, FILM = "closed_loop.json", "closed_loop.mp4"
-SubGoalsFrom = Literal["none", "demonstration", "every-step"]
 FORMAT = 1  # incremented when a reader of the file would have to change
 
 
@@ -36,7 +35,8 @@ class BenchmarkOptions(RolloutSpec):
     """The problems of a benchmark, and the goals on the way. The stride is the model's, the films are of the model."""
 
     films: int = 6  # episodes in the video; 0: no video
-    sub_goals: SubGoalsFrom = "none"  # demonstration: key frames of the oracle's solution; every-step: all of it
+    # demonstration: key frames of the oracle's solution; every-step: all of it
+    sub_goals: Literal["none", "demonstration", "every-step"] = "none"
     goals: str | None = None  # a folder of goals, the same in every problem
 
 
@@ -78,9 +78,12 @@ def run_benchmark(
         spec = options if policy is model else replace(options, films=0)
         results.append(run_task(spec, policy, arm, reporter.task(f"{options.task}: {policy.name}")))
     benchmark = ClosedLoopBenchmark(agent, options, tuple(results))
-    path = folder / FILE
-    write_atomically(path, json.dumps(benchmark_as_dict(benchmark), indent=1, allow_nan=False) + "\n")
-    return benchmark, (path, write_film(folder / FILM, results[0])) if options.films else (path,)
+    files = [folder / FILE]
+    write_atomically(files[0], json.dumps(benchmark_as_dict(benchmark), indent=1, allow_nan=False) + "\n")
+    if options.films:
+        rate_hz = CONTROL_RATE_HZ / options.stride
+        files.append(write_video(folder / FILM, film_frames(results[0]), rate_hz=rate_hz))
+    return benchmark, tuple(files)
 
 
 def benchmark_as_dict(benchmark: ClosedLoopBenchmark) -> dict[str, Any]:
@@ -149,20 +152,6 @@ def _rounded(numbers: Float[np.ndarray, "episodes _"]) -> list[list[float]]:
 
 
 _HOLD = 4  # number of repetitions of the first and the last image of an episode
-
-
-def write_film(path: str | Path, result: ClosedLoopResult) -> Path:
-    """Write the stored frames of a policy as a video, in real time.
-
-    Args:
-        path: Of an MP4.
-        result: One camera image beside the goal image.
-
-    Raises:
-        UnreachableError: PyAV is not installed.
-        ValueError: No frames were stored.
-    """
-    return write_video(path, film_frames(result), rate_hz=CONTROL_RATE_HZ / result.spec.stride)
 
 
 def film_frames(result: ClosedLoopResult) -> Iterator[UInt8[np.ndarray, "_ _ 3"]]:

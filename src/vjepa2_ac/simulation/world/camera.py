@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from vjepa2_ac.simulation.world.domains import CameraPlace, Domain, direction
+from vjepa2_ac.simulation.world.domains import CameraPlace, Domain
 from vjepa2_ac.simulation.world.scene import ARM_GROUP, STATIC_GROUP, load_mujoco
 
 FRAME_SIZE = FRAME_HEIGHT, FRAME_WIDTH = 180, 320  # size of DROID's images in RLDS
@@ -99,15 +99,6 @@ class View:
         return np.asarray(np.floor((slopes / self._half_view + 1.0) / 2.0 * self._cells))
 
 
-def lamp_view(lamp: Point, spots: Spots) -> View:
-    """Return points in the view of the lamp."""
-    distance = float(np.linalg.norm(lamp))
-    azimuth = float(np.rad2deg(np.arctan2(lamp[1], lamp[0])))
-    elevation = float(np.rad2deg(np.arcsin(lamp[2] / distance)))
-    pose = CameraPlace(azimuth, elevation, distance, look_at_m=(0.0, 0.0, 0.0)).pose()
-    return View(pose, unit(spots - lamp), np.array([_LAMP_HALF_VIEW] * 2), (_LAMP_CELLS, _LAMP_CELLS))
-
-
 def unit(ways: Float[np.ndarray, "ways 3"]) -> Float[np.ndarray, "ways 3"]:
     """Return vectors of length 1 in the same directions."""
     return np.asarray(ways / np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-9))
@@ -150,7 +141,9 @@ class RayCamera:
     ) -> None:
         self._caster, self._colours = Caster(model), _Colours(model)
         look = domain.look
-        self._lamp, self._ambient = _LAMP_M * direction(look.light_azimuth_deg, look.light_elevation_deg), look.ambient
+        lamp = CameraPlace(look.light_azimuth_deg, look.light_elevation_deg, _LAMP_M, look_at_m=(0.0, 0.0, 0.0))
+        self._lamp_pose, self._ambient = lamp.pose(), look.ambient
+        self._lamp = self._lamp_pose[:3, 3]
         self._height, self._width = size
         self._half_view = np.tan(np.deg2rad(vertical_fov_deg) / 2) * np.array([self._width / self._height, 1.0])
         self._pose = pose
@@ -187,7 +180,9 @@ class RayCamera:
         spots = view.origin + view.rays * distance[:, None]
         ambient, direct = self._light(data, spots, hits, STATIC_GROUP)
         lit, shaded = _as_bytes(ambient + direct), _as_bytes(ambient + _SHADOW * direct)
-        return _Background(lit, shaded, distance, spots, view, lamp_view(self._lamp, spots))
+        cells, half_view = (_LAMP_CELLS, _LAMP_CELLS), np.full(2, _LAMP_HALF_VIEW)
+        from_lamp = View(self._lamp_pose, unit(spots - self._lamp), half_view, cells)
+        return _Background(lit, shaded, distance, spots, view, from_lamp)
 
     def _light(self, data: Any, spots: Any, hits: Hits, group: int) -> tuple[Any, Any]:
         """Return the colour of points in ambient light, and the lamp's part; the group casts shadows on itself."""
