@@ -1,4 +1,4 @@
-"""Frames and latents of the decoder: what the encoder saw, of the right episodes; what is fitted to them and measured."""
+"""Frames and latents of the decoder: what the encoder saw, of the right episodes; what is fitted to them."""
 
 from dataclasses import dataclass
 
