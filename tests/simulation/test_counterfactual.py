@@ -91,7 +91,7 @@ def test_the_hand_goes_where_the_name_says_in_states_and_in_images(start: Resimu
     assert up.states[-1, 2] - none.states[-1, 2] > 0.08
     assert left.states[-1, 1] - right.states[-1, 1] > 0.15
     assert np.abs(left.states[-1, [0, 2]] - right.states[-1, [0, 2]]).max() < 0.01
-    arm = start._arm
+    arm = start.arm
     pixels = {name: hand_pixel(arm, one.states[-1]) for name, one in (("none", none), ("up", up), ("left", left))}
     assert pixels["up"][1] < pixels["none"][1] - 8
     across = pixel_of(arm, none.states[-1, :3] + [0, 0.05, 0])[0] - pixel_of(arm, none.states[-1, :3])[0]

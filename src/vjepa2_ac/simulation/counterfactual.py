@@ -20,11 +20,12 @@ from vjepa2_ac.simulation.closed_loop.rollout import send_action
 from vjepa2_ac.simulation.recording.record import (
     JPEG_QUALITY,
     SIMULATION_FILE,
-    RecordedSimulation,
+    RecordingSpec,
     arm_of,
     carry_out,
     read_simulation,
 )
+from vjepa2_ac.simulation.world.arm import SimulatedArm
 
 RECORDED_CAMERAS = {"exterior_1_left": "exterior_1", "exterior_2_left": "exterior_2", "wrist_left": "wrist"}
 """Camera of a data set, as in `data.fields.cameras` -> camera of the simulated arm."""
@@ -42,20 +43,15 @@ class Outcome:
     reached: Bool[np.ndarray, " time-1"]  # whether joint angles reach each action's target; else the arm went part way
 
 
+@dataclass(frozen=True, eq=False)
 class Resimulation:
-    """A recorded episode at a control step, simulated again; every outcome begins there. Use `resimulate` to make one.
+    """A recorded episode at a control step, simulated again: every outcome begins there. `resimulate` makes one."""
 
-    Args:
-        simulation: How the data set was recorded.
-        number: Under which the episode was recorded.
-        start: Control step.
-        camera: Of the data set: one of `RECORDED_CAMERAS`. Recorded with one camera, all are the same.
-    """
-
-    def __init__(self, simulation: RecordedSimulation, number: int, start: int, camera: str) -> None:
-        self._spec, self._number, self._start = simulation.spec, number, start
-        self._camera = RECORDED_CAMERAS[camera] if self._spec.cameras == 3 else "exterior_1"
-        self._arm = arm_of(number, self._spec)
+    spec: RecordingSpec
+    number: int  # under which the episode was recorded
+    start: int  # control step
+    camera: str  # of the simulated arm
+    arm: SimulatedArm
 
     def under(self, actions: Float[np.ndarray, "steps 7"], stride: int) -> Outcome:
         """Carry out actions of model steps (legend: episode.py), each from the state that is measured then.
@@ -64,12 +60,12 @@ class Resimulation:
             actions: One for each model step; none: only the start.
             stride: Control steps of a model step.
         """
-        arm = self._arm
-        carry_out(arm, self._number, self._spec, until=self._start)
-        images, states, blocks, reached = [arm.image(self._camera)], [arm.state], [arm.block], []
+        arm = self.arm
+        carry_out(arm, self.number, self.spec, until=self.start)
+        images, states, blocks, reached = [arm.image(self.camera)], [arm.state], [arm.block], []
         for action in actions:
             reached.append(send_action(arm, np.asarray(action, dtype=np.float64), stride))
-            images.append(arm.image(self._camera))
+            images.append(arm.image(self.camera))
             states.append(arm.state)
             blocks.append(arm.block)
         encoded = [encode_jpeg(image, quality=JPEG_QUALITY) for image in images]
@@ -104,7 +100,8 @@ def resimulate(folder: str | Path, episode: Episode, start: int, camera: str = "
     if episode.states.shape != (steps, 7):
         found, needed = "x".join(map(str, episode.states.shape)), f"{steps}x7, as simulated: data.states: pose"
         raise InputError(where=where, found=f"states of {found} numbers", needed=needed)
-    again = Resimulation(simulation, number, start, camera)
+    eye = RECORDED_CAMERAS[camera] if simulation.cameras == 3 else "exterior_1"  # recorded with one, all are the same
+    again = Resimulation(simulation.spec, number, start, eye, arm_of(number, simulation.spec))
     off = np.abs(again.under(np.zeros((0, 7)), 1).states[0] - np.asarray(episode.states[start], dtype=np.float64))
     off[3:6] = np.minimum(off[3:6], np.abs(2 * np.pi - off[3:6]))  # -pi and pi are one angle
     if off.max() > _STATE_TOLERANCE:

@@ -22,7 +22,7 @@ from vjepa2_ac.simulation.world.motion import (
 )
 from vjepa2_ac.simulation.world.scene import FINGER_TRAVEL_M, SUBSTEPS, compile_scene, load_mujoco
 
-State = Float[np.ndarray, " 7"]  # legend: episode.py
+State = Float[np.ndarray, " 7"]  # or an action; legend: episode.py
 
 WRIST_FOV_DEG = 70.0
 _EXTERIOR_TURNS_DEG = {"exterior_1": 0.0, "exterior_2": -100.0}  # of the cameras that stand still
