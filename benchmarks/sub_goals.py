@@ -29,9 +29,9 @@ import torch
 from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.planning.session import load_to_plan
 from vjepa2_ac.reporter import SILENT
-from vjepa2_ac.simulation.closed_loop.policies import GoalsOf, Policy, oracle_for
+from vjepa2_ac.simulation.closed_loop.agent import Agent, agent_of_session
+from vjepa2_ac.simulation.closed_loop.policies import GoalsOf, Oracle, Policy
 from vjepa2_ac.simulation.closed_loop.rollout import ClosedLoopResult, RolloutSpec, run_task
-from vjepa2_ac.simulation.closed_loop.steering import Steering, of_session
 from vjepa2_ac.simulation.closed_loop.sub_goals import DemonstratedGoals, DemonstrationSpec, every_step
 from vjepa2_ac.simulation.closed_loop.tasks import STEPS, TaskProblem, arm_for
 from vjepa2_ac.simulation.world.domains import named_domain
@@ -59,10 +59,10 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="file for the table")
     options = parser.parse_intermixed_args()
     torch.set_num_threads(1)
-    steering = of_session(load_to_plan(options.subject, overrides=options.overrides))
+    agent = agent_of_session(load_to_plan(options.subject, overrides=options.overrides))
     for way in (one for one in WAYS if options.only in one):
         if not file_of(options, way).exists():
-            found = as_dict(measure(way, steering, options))
+            found = as_dict(measure(way, agent, options))
             file_of(options, way).parent.mkdir(parents=True, exist_ok=True)
             write_atomically(file_of(options, way), json.dumps(found))
             print(f"{way}: {found['success']}", flush=True)
@@ -72,27 +72,27 @@ def main() -> None:
         write_atomically(options.out, text + "\n")
 
 
-def measure(way: str, steering: Steering, options: argparse.Namespace) -> ClosedLoopResult:
+def measure(way: str, agent: Agent, options: argparse.Namespace) -> ClosedLoopResult:
     """Let one way solve all problems."""
     domain = named_domain(options.domain)
     arm, steps = arm_for(options.task, domain), STEPS[options.task] + MORE
-    spec = RolloutSpec(options.task, domain, options.episodes, options.seed, steps, steering.stride)
+    spec = RolloutSpec(options.task, domain, options.episodes, options.seed, steps, agent.stride)
     policy: Policy
     if way == "oracle":
-        free = steering.limits.model_copy(update={"gripper_mode": "free"})
-        policy = oracle_for(options.task, free, arm)
+        free = agent.planning.limits.model_copy(update={"gripper_mode": "free"})
+        policy = Oracle(free, arm)
     else:
-        policy = steering.policy(arm, goals_of(way, steering, options))
+        policy = agent.policy(arm, goals_of(way, agent, options))
     return run_task(spec, policy, arm, SILENT.task(way))
 
 
-def goals_of(way: str, steering: Steering, options: argparse.Namespace) -> GoalsOf | None:
+def goals_of(way: str, agent: Agent, options: argparse.Namespace) -> GoalsOf | None:
     """Return what makes the goals of a problem; None: its goal image alone."""
     if way == "single goal":
         return None
     share = SHARE if way.startswith("advance") else None
     slack = 0 if way.startswith("durations") else SLACK
-    spec = DemonstrationSpec(steering.limits, None, steering.stride, slack, share)
+    spec = DemonstrationSpec(agent.planning.limits, None, agent.stride, slack, share)
     if way == "every step":
         spec = every_step(spec)
     demonstrated = DemonstratedGoals(options.task, named_domain(options.domain), spec)
@@ -110,7 +110,7 @@ def as_dict(result: ClosedLoopResult) -> dict[str, Any]:
         "success": result.success_rate.as_dict(),
         "left_cm": result.final_distance_cm.as_dict(),
         "by_episode": result.successes.tolist(),
-        "steps": result.steps,
+        "steps": result.spec.model_steps,
     }
 
 

@@ -78,8 +78,7 @@ ORDERS: dict[str, list[str]] = {
     "decoding": [
         "network",
         "decoder_folder frame_pairs",
-        "baselines imagine steps",
-        "imagined_plan",
+        "imagine steps",
         "training",
     ],
     "calibration": ["variants", "strides data axes"],
@@ -89,7 +88,6 @@ ORDERS: dict[str, list[str]] = {
         "closed_loop",
         "recording",
         "counterfactual",
-        "imagined_truth",
     ],
 }
 

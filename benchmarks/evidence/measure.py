@@ -34,7 +34,7 @@ from vjepa2_ac.planning.model_setup import Fingerprints
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.checkpoint import NEWEST
 from vjepa2_ac.runs.loading import load_run
-from vjepa2_ac.simulation.closed_loop.policies import DoNothing, Oracle, Planning, Policy, RandomActions
+from vjepa2_ac.simulation.closed_loop.policies import Oracle, Planning, Policy, RandomActions, ZeroActions
 from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, run_task
 from vjepa2_ac.training.cost.memory import count_parameters
 from vjepa2_ac.training.loop import train
@@ -123,7 +123,7 @@ def config_of(cell: Cell, folder: Path) -> Config:
 def baselines(cell: Cell, *, goals: int = GOALS) -> dict[str, Any]:
     """Return how far those get who need no model, on the same goals."""
     limits = PLANNING.limits
-    policies: tuple[Policy, ...] = (DoNothing(), RandomActions(limits, cell.seed), Oracle(limits))
+    policies: tuple[Policy, ...] = (ZeroActions(), RandomActions(limits, cell.seed), Oracle(limits))
     return {policy.name: reach(cell, policy, seed=TEST_GOALS + cell.seed, goals=goals) for policy in policies}
 
 

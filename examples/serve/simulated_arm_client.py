@@ -12,9 +12,9 @@ import sys
 from openpi_client.websocket_client_policy import WebsocketClientPolicy
 
 from vjepa2_ac.media.video_writer import write_gif
+from vjepa2_ac.simulation.closed_loop.agent import ServedPlanner
 from vjepa2_ac.simulation.closed_loop.benchmark import film_frames
 from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, run_task
-from vjepa2_ac.simulation.closed_loop.steering import ServedPlanner
 from vjepa2_ac.simulation.closed_loop.sub_goals import DemonstratedGoals, DemonstrationSpec, every_step
 from vjepa2_ac.simulation.world.domains import named_domain
 
@@ -24,7 +24,7 @@ def main(url: str, film: str, episodes: str = "4", seed: str = "3") -> None:
     shown = DemonstratedGoals("pick", named_domain("A"), every_step(DemonstrationSpec()))
     policy = ServedPlanner(WebsocketClientPolicy(url), "openpi-client", shown)
     count = int(episodes)
-    result = run_task(RolloutSpec("pick", "A", count, int(seed), steps=18, keep_frames=count), policy)
+    result = run_task(RolloutSpec("pick", "A", count, int(seed), steps=18, films=count), policy)
     for number, episode in enumerate(result.episodes, start=1):
         print(
             f"problem {number}: {100 * episode.distances_m[-1]:.1f} cm left, {'lifted' if episode.success else 'not'}"

@@ -10,7 +10,7 @@ import pytest
 
 from benches import imported
 from vjepa2_ac.planning.session import load_to_plan
-from vjepa2_ac.simulation.closed_loop.steering import of_session
+from vjepa2_ac.simulation.closed_loop.agent import agent_of_session
 from vjepa2_ac.simulation.closed_loop.tasks import make_problem
 from vjepa2_ac.simulation.world.domains import named_domain
 
@@ -32,11 +32,11 @@ def served(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 
 
 def test_each_way_gives_other_goals(sub_goals: Any) -> None:
-    steering = of_session(load_to_plan("builtin:sim-tiny", overrides=SMALL))
+    agent = agent_of_session(load_to_plan("builtin:sim-tiny", overrides=SMALL))
     options, problem = argparse.Namespace(task="pick", domain="A"), make_problem("pick", named_domain("A"), 3, 0)
     found = {}
     for way in sub_goals.WAYS:
-        goals_of = None if way == "oracle" else sub_goals.goals_of(way, steering, options)
+        goals_of = None if way == "oracle" else sub_goals.goals_of(way, agent, options)
         goals = () if goals_of is None else goals_of(problem)
         found[way] = [(goal.at_least, goal.at_most, goal.share, goal.gripper) for goal in goals]
     assert found["single goal"] == found["oracle"] == []

@@ -86,12 +86,12 @@ def plans() -> list[Table]:
 def benchmarks() -> list[Table]:
     result = Mock(
         spec=ClosedLoopResult,
-        policy="the model of runs/of-another-day", steps=20, success_rate=SHARE, success_ever_rate=SHARE,
+        policy="the model of runs/of-another-day", success_rate=SHARE, success_ever_rate=SHARE,
         final_distance_cm=Estimate(12.3, 10.1, 14.5), steps_needed=SHARE,
         seconds_per_decision=Estimate(16.2, 15.0, 17.0),
     )  # fmt: skip
-    options = Mock(task="reach", domain="B", episodes=100, seed=5)
-    return [benchmark_table(Mock(spec=ClosedLoopBenchmark, options=options, results=(result,), seconds_per_step=0.27))]
+    options = Mock(task="reach", domain="B", episodes=100, seed=5, model_steps=20, seconds_per_step=0.27)
+    return [benchmark_table(Mock(spec=ClosedLoopBenchmark, options=options, results=(result,)))]
 
 
 @pytest.mark.parametrize("width", [80, 120])

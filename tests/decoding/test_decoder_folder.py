@@ -66,7 +66,6 @@ def test_a_decoder_is_read_as_it_was_written_bit_for_bit(whole_decoder: Path, tm
     [
         (Path.unlink, "no such file"),
         (truncated, "not a whole safetensors file"),
-        (lambda path: path.write_bytes(b""), "not a whole safetensors file"),
         (with_nan, "NaN"),
         (without_a_tensor, "missing: linear.bias"),
         (with_another_tensor, "unknown: more"),
@@ -89,11 +88,8 @@ def test_damaged_weights_are_refused_and_named(
     [
         ({"format": "vjepa2-ac decoder 2"}, "format"),
         ({"more": 1}, "more: unknown"),
-        ({"encoder": None}, "encoder"),
         ({"shape": {"size": "huge", "dim": 24, "grid": 2, "patch_size": 16}}, "shape.size"),
         ({"shape": {"size": "tiny", "dim": 10**12, "grid": 2, "patch_size": 16}}, "shape.dim"),
-        ({"shape": {"size": "tiny", "dim": 24, "grid": 10**6, "patch_size": 16}}, "shape.grid"),
-        ({"shape": {"size": "tiny", "dim": 24, "grid": 2, "patch_size": 14}}, "shape.patch_size"),
     ],
 )
 def test_a_card_with_wrong_values_is_refused_and_names_them(folder: Path, changes: dict, found: str) -> None:
@@ -118,11 +114,11 @@ def test_a_model_of_another_encoder_crop_or_size_is_refused(whole_decoder: Path,
     decoder, model = load_decoder(whole_decoder), WorldModel.from_pretrained(base_folder)
     decoder.require_fit(model, "released", subject="run")
     other = WorldModel.random(ModelSizes.model_validate(TINY), seed=4)
-    with pytest.raises(InputError, match=r"another encoder than that of run.*vjepa2-ac decoder CONFIG"):
+    with pytest.raises(InputError, match=r"another encoder or crop than that of run.*vjepa2-ac decoder CONFIG"):
         decoder.require_fit(other, "released", subject="run")
-    with pytest.raises(InputError, match=r"data\.crop released.*square, as of run"):
+    with pytest.raises(InputError, match=r"data\.crop released, not square"):
         decoder.require_fit(model, "square", subject="run")
     larger = WorldModel.random(ModelSizes.model_validate(TINY | {"image_size": 64}), seed=3)
     same = replace(decoder, card=replace(decoder.card, encoder=larger.encoder_fingerprint()))  # the same weights
-    with pytest.raises(InputError, match="4x24 latents to images of 32 px"):
+    with pytest.raises(InputError, match="image size 32, not 64"):
         same.require_fit(larger, "released", subject="run")

@@ -1,10 +1,16 @@
-"""Imagination is given one frame and its state, and nothing of what happened after."""
+"""Imagination is given one frame and its state, and nothing after it; a plan's images are those it was chosen by."""
 
 import numpy as np
+import pytest
 import torch
 from torch import Tensor
 
-from vjepa2_ac.decoding.imagine import Start, imagined_latents, rolled_out
+from decisions import asked, image
+from random_decoder import write_decoder
+from tiny_models import tiny_model
+from vjepa2_ac.data.transforms import frames_as_seen, view
+from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
+from vjepa2_ac.decoding.imagine import Start, imagine_plan, imagined_next, rolled_out, shown
 from vjepa2_ac.planning.counterfactual import counterfactual_states, named_actions
 from vjepa2_ac.spaces import POSE
 
@@ -13,15 +19,11 @@ STATE = np.array([0.4, 0.1, 0.3, 3.1, 0.0, -3.1, 0.9])
 
 
 class Remembering:
-    """A model that answers with given latents, and remembers what it was given."""
-
-    def __init__(self, answer: Tensor | None = None) -> None:
-        self.answer = answer
+    """A model that answers with the first frame, and remembers what it was given."""
 
     def rollout(self, context: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
         self.given = context, actions, states, extrinsics
-        answer = context[:, -1:].expand(-1, actions.shape[1], -1, -1) if self.answer is None else self.answer[None]
-        return answer.clone()
+        return context[:, -1:].expand(-1, actions.shape[1], -1, -1).clone()
 
 
 def truth() -> Tensor:
@@ -34,7 +36,7 @@ def start_of(latents: Tensor, **more: Tensor) -> Start:
 
 def test_states_under_other_actions_are_integrated_from_the_first_one() -> None:
     latents, model = truth(), Remembering()
-    imagined_latents(model, start_of(latents), named_actions("left", STEPS, size_m=0.03))
+    rolled_out(model, start_of(latents), named_actions("left", STEPS, size_m=0.03))
     context, actions, states, extrinsics = model.given
     assert torch.equal(context, latents[None, :1]), "one frame"
     assert states.shape == actions.shape == (1, STEPS, 7)
@@ -45,7 +47,7 @@ def test_states_under_other_actions_are_integrated_from_the_first_one() -> None:
 
 def test_a_gripper_changes_as_far_as_it_can() -> None:
     model = Remembering()
-    imagined_latents(model, start_of(truth()), named_actions("close", STEPS))
+    rolled_out(model, start_of(truth()), named_actions("close", STEPS))
     _, actions, states, _ = model.given
     np.testing.assert_allclose(actions[0, :, 6].numpy(), [0.1, 0, 0, 0], atol=1e-6)
     np.testing.assert_allclose(states[0, :, 6].numpy(), [0.9, 1, 1, 1], atol=1e-6)
@@ -53,7 +55,7 @@ def test_a_gripper_changes_as_far_as_it_can() -> None:
 
 def test_the_camera_of_the_first_frame_holds_for_all_steps() -> None:
     model, camera = Remembering(), torch.arange(6.0)
-    imagined_latents(model, start_of(truth(), extrinsics=camera), named_actions("none", STEPS))
+    rolled_out(model, start_of(truth(), extrinsics=camera), named_actions("none", STEPS))
     assert torch.equal(model.given[3], camera.expand(1, STEPS, 6))
 
 
@@ -62,3 +64,44 @@ def test_known_states_are_given_as_they_are() -> None:
     states = counterfactual_states(STATE, actions)[:-1] + 0.5
     rolled_out(model, start_of(truth()), actions, states)
     np.testing.assert_allclose(model.given[2][0].numpy(), states, atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def decoder(tmp_path_factory: pytest.TempPathFactory) -> TrainedDecoder:
+    return load_decoder(write_decoder(tmp_path_factory.mktemp("decoder") / "d", tiny_model()))
+
+
+def test_the_imagined_steps_are_the_decoded_rollout_of_the_chosen_actions(decoder: TrainedDecoder) -> None:
+    answer = asked(100, 101, nodes=0, horizon=3)
+    found = imagine_plan(answer, decoder)
+    plan, cost = answer.decision.plan, answer.decision.cost
+    assert plan is not None
+    assert cost is not None
+    with torch.no_grad():
+        latents, _ = cost.imagine(plan.actions[None])
+    assert list(found.steps) == [1, 2, 3]
+    assert np.array_equal(np.stack([*found.steps.values()]), shown(decoder.decoder, latents[0]))
+    encoded = torch.stack([answer.controller.encoded(image(seed)) for seed in (0, 101)])
+    assert np.array_equal(np.stack([found.start, found.decoded_goal]), shown(decoder.decoder, encoded))
+    assert np.array_equal(found.goal, frames_as_seen(view(image(101)[None]), 48)[0])
+
+
+def test_of_a_long_plan_eight_steps_are_shown_the_end_among_them(decoder: TrainedDecoder) -> None:
+    steps = imagine_plan(asked(nodes=0, horizon=11), decoder).steps
+    assert len(steps) == 8
+    assert [min(steps), max(steps)] == [1, 11]
+
+
+@pytest.mark.parametrize("answer", [{"start": 100}, {"broken": True}])
+def test_without_a_plan_or_finite_predictions_nothing_is_imagined(decoder: TrainedDecoder, answer: dict) -> None:
+    answer = asked(nodes=0, **answer)
+    assert imagine_plan(answer, decoder).steps == {}
+    assert imagined_next(answer.decision, decoder) is None
+
+
+def test_the_next_frame_is_the_first_step_of_the_plan(decoder: TrainedDecoder) -> None:
+    answer = asked(nodes=0)
+    following = imagined_next(answer.decision, decoder)
+    assert following is not None
+    difference = following.astype(int) - imagine_plan(answer, decoder).steps[1]
+    assert abs(difference).max() <= 1

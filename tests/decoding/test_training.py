@@ -162,14 +162,17 @@ def test_a_killed_training_goes_on_as_if_it_had_not(
     assert_same_decoder(whole_decoder, out)
 
 
-def test_what_a_killed_start_left_in_a_finished_folder_is_removed(
-    make_decoder: MakeConfig, whole_decoder: Path, tmp_path: Path
+def test_what_a_killed_start_left_in_a_finished_folder_is_removed_and_a_check_writes_nothing(
+    make_decoder: MakeConfig, whole_decoder: Path, tmp_path: Path, reporter: SilentReporter
 ) -> None:
     shutil.copytree(whole_decoder, tmp_path / "decoder")
     (tmp_path / "decoder" / "pairs").mkdir()
     (tmp_path / "decoder" / "training.pt").touch()
     train_decoder(make_decoder(), check_only=True)
+    train_decoder(make_decoder("other"), reporter, check_only=True)
+    assert any("GB of disk" in note for note in reporter.notes)
     assert (tmp_path / "decoder" / "pairs").exists(), "--check changes nothing"
+    assert not (tmp_path / "other").exists()
     train_decoder(make_decoder())
     assert {path.name for path in (tmp_path / "decoder").iterdir()} == FINISHED
 
@@ -188,13 +191,6 @@ def test_a_finished_folder_is_left_as_it_is(
     assert {path.name: path.read_bytes() for path in (tmp_path / "decoder").iterdir()} == before
 
 
-def test_check_writes_nothing(make_decoder: MakeConfig, tmp_path: Path, reporter: SilentReporter) -> None:
-    train_decoder(make_decoder(), reporter, check_only=True)
-    assert any("GB of disk" in note for note in reporter.notes)
-    assert not (tmp_path / "decoder").exists()
-
-
-@pytest.mark.parametrize("is_finished", [True, False])
 @pytest.mark.parametrize(
     ("changes", "name"),
     [
@@ -205,13 +201,13 @@ def test_check_writes_nothing(make_decoder: MakeConfig, tmp_path: Path, reporter
     ],
 )
 def test_the_folder_of_another_decoder_is_refused_and_what_differs_is_named(
-    make_decoder: MakeConfig, whole_decoder: Path, tmp_path: Path, changes: dict, name: str, is_finished: bool
+    make_decoder: MakeConfig, whole_decoder: Path, tmp_path: Path, changes: dict, name: str
 ) -> None:
     shutil.copytree(whole_decoder, tmp_path / "decoder")
-    if not is_finished:
-        (tmp_path / "decoder" / CARD).unlink()
-    with pytest.raises(InputError, match=name):
-        train_decoder(make_decoder(**changes))
+    for _ in ("finished", "begun"):
+        with pytest.raises(InputError, match=name):
+            train_decoder(make_decoder(**changes))
+        (tmp_path / "decoder" / CARD).unlink(missing_ok=True)
 
 
 @pytest.mark.parametrize("there", ["thesis.tex", CARD])
@@ -226,7 +222,7 @@ def test_a_folder_with_other_things_is_refused(make_decoder: MakeConfig, tmp_pat
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"data__source": "latents"}, r"data\.source: latents"),
+        ({"data__source": "latents"}, r"data\.source: latents, without frames"),
         ({"data__stride": "auto"}, r"data\.stride"),
     ],
 )
@@ -275,16 +271,16 @@ def test_the_learning_rate_rises_to_its_peak_and_falls_to_none(steps: int, warmu
 def test_noise_is_a_function_of_the_step(make_decoder: MakeConfig) -> None:
     """A step of a resumed training has the noise that it would have had; another step another one."""
     config = make_decoder()
-    with training._setup(config, SilentReporter(), check_only=True) as ready:
-        one, other = ready.steps_from(None), ready.steps_from(None)
-        latents = torch.zeros(64, 4, 24)
-        one._noise(1, latents)
-        torch.rand(3)
-        assert torch.equal(one._noise(2, latents), other._noise(2, latents))
-        assert not torch.equal(one._noise(2, latents), one._noise(3, latents))
-        strengths = one._noise(5, latents).flatten(1).std(dim=1)
-        assert 0.07 < strengths.max() < 0.14  # up to decoder.noise
-        assert strengths.min() < 0.02
+    ready = training._setup(config, SilentReporter())
+    one, other = ready.steps_from(None), ready.steps_from(None)
+    latents = torch.zeros(64, 4, 24)
+    one._noise(1, latents)
+    torch.rand(3)
+    assert torch.equal(one._noise(2, latents), other._noise(2, latents))
+    assert not torch.equal(one._noise(2, latents), one._noise(3, latents))
+    strengths = one._noise(5, latents).flatten(1).std(dim=1)
+    assert 0.07 < strengths.max() < 0.14  # up to decoder.noise
+    assert strengths.min() < 0.02
 
 
 def test_knobs_that_change_no_number_are_no_other_decoder(

@@ -13,6 +13,8 @@ pytest.importorskip("av", reason="the extra `video` is not installed")
 
 from tiny_models import tiny_model
 from vjepa2_ac.cli import main
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.sources.registry import open_source
 from vjepa2_ac.media.video_writer import write_video
 from vjepa2_ac.planning.goal_folder import read_goal_folder
 from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
@@ -84,19 +86,11 @@ def test_a_model_adds_energies_and_the_noise_of_a_resting_arm(
 
 
 def test_the_arm_of_an_episode_may_rest_itself(workshop: Path, tmp_path: Path) -> None:
-    from vjepa2_ac.data.sources.registry import open_source
-
-    states = open_source_of(workshop, open_source)
+    states = open_source(DataConfig(path=str(workshop / "set"))).read(0).states
     rests = (np.abs(np.diff(states, axis=0)) < 5e-4).all(axis=1)
     status, file = goals(workshop, tmp_path / "goals", "--model", str(workshop / "model"))
     assert status == 0
     assert (file["noise"] is not None) == bool(rests.any())
-
-
-def open_source_of(here: Path, open_source) -> np.ndarray:
-    from vjepa2_ac.config import DataConfig
-
-    return open_source(DataConfig(path=str(here / "set"))).read(0).states
 
 
 def test_an_episode_is_named_or_numbered_and_every_so_many_frames_are_taken(workshop: Path, tmp_path: Path) -> None:
@@ -168,9 +162,7 @@ def test_a_folder_that_cannot_be_followed_is_told_before_anything_is_planned(
     ("words", "wrong"),
     [
         (["config.yaml", "--by", "every"], "--by: every. needed: gripper, latent, or every N"),
-        (["config.yaml", "--by", "every", "0"], "--by: every 0"),
         (["config.yaml", "--by", "sound"], "--by: sound"),
-        (["config.yaml", "--by", "gripper", "3"], "--by: gripper 3"),
         (["config.yaml", "--by", "latent"], "--by latent: no model"),
         (["config.yaml", "--still", "still.mp4"], "--still: no model"),
         (["config.yaml", "--episode", "9"], "--episode 9: no such episode"),
@@ -181,7 +173,6 @@ def test_a_folder_that_cannot_be_followed_is_told_before_anything_is_planned(
         (["film.mp4", "--by", "gripper", "--stride", "4"], "--by gripper: film.mp4: no measured poses"),
         (["film.mp4", "--by", "every", "9"], "--stride: a film"),
         (["film.mp4", "--by", "every", "9", "--episode", "0"], "--episode"),
-        (["film.mp4", "--by", "every", "9", "data.stride=3"], "key=value"),
         (["none.mp4", "--by", "every", "9", "--stride", "4"], "none.mp4: cannot be read"),
         (["text.mp4", "--by", "every", "9", "--stride", "4"], "text.mp4: cannot be read as a video"),
     ],

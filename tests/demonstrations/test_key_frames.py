@@ -36,8 +36,33 @@ def named(states: np.ndarray) -> list[tuple[int, str]]:
     return [(key.frame, key.name) for key in gripper_key_frames(states)]
 
 
-def test_a_grasp_begins_and_ends_and_the_lift_is_the_last() -> None:
-    assert named(way((10, 0.2, 0), (5, 0, 0.5), (10, 0.2, 0))) == [(10, "before closing"), (15, "closed"), (25, "end")]
+GO, LIFT = (10, 0.2, 0), (9, 0.2, 0)  # without the gripper
+CASES = {
+    "a grasp begins and ends, and the lift is the last": (
+        (GO, (5, 0, 0.5), GO), [(10, "before closing"), (15, "closed"), (25, "end")],
+    ),
+    "a stop counts if it lasts": ((GO, (6, 0, 0), GO), [(10, "stop"), (26, "end")]),
+    "too short": ((GO, (3, 0, 0), GO), [(23, "end")]),
+    "a rest at the start is none": (((6, 0, 0), GO), [(16, "end")]),
+    "an arm that rests at the end had ended before": ((GO, (20, 0, 0)), [(10, "end")]),
+    "likewise after a grasp": ((GO, (4, 0, 0.4), (20, 0, 0)), [(10, "before closing"), (14, "closed")]),
+    "a stop to grip is no key frame of its own": (
+        (GO, (2, 0, 0), (5, 0, 0.5), (3, 0, 0), LIFT), [(12, "before closing"), (17, "closed"), (29, "end")],
+    ),
+    "a grip at the very start has no goal before it": (((5, 0, 0.5), GO), [(5, "closed"), (15, "end")]),
+    "an arm that leaves while the fingers still close has gripped before": (
+        (GO, (4, 0, 0.25), (2, 0.04, 0.1), LIFT), [(10, "before closing"), (14, "closed"), (25, "end")],
+    ),
+    "it never stood still": ((GO, (6, 0.12, 0.6), LIFT), [(10, "before closing"), (16, "closed"), (25, "end")]),
+    "a pause of the fingers does not divide a grip": (
+        (LIFT, (2, 0, 0.2), (2, 0, 0), (2, 0, 0.2), LIFT), [(9, "before closing"), (15, "closed"), (24, "end")],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("parts", "keys"), CASES.values(), ids=CASES)
+def test_key_frames_are_where_the_gripper_changes_and_the_arm_stops(parts: tuple, keys: list) -> None:
+    assert named(way(*parts)) == keys
 
 
 def test_pick_and_place_opens_again() -> None:
@@ -45,44 +70,10 @@ def test_pick_and_place_opens_again() -> None:
     assert names == ["before closing", "closed", "before opening", "opened", "end"]
 
 
-def test_a_stop_counts_if_it_lasts_and_only_once() -> None:
-    assert named(way((10, 0.2, 0), (6, 0, 0), (10, 0.2, 0))) == [(10, "stop"), (26, "end")]
-    assert named(way((10, 0.2, 0), (3, 0, 0), (10, 0.2, 0))) == [(23, "end")], "too short"
-    assert named(way((6, 0, 0), (10, 0.2, 0))) == [(16, "end")], "a rest at the start is none"
-
-
-def test_an_arm_that_rests_at_the_end_had_ended_before() -> None:
-    assert named(way((10, 0.2, 0), (20, 0, 0))) == [(10, "end")]
-    assert named(way((10, 0.2, 0), (4, 0, 0.4), (20, 0, 0))) == [(10, "before closing"), (14, "closed")]
-
-
-def test_a_stop_to_grip_is_no_key_frame_of_its_own() -> None:
-    assert named(way((10, 0.2, 0), (2, 0, 0), (5, 0, 0.5), (3, 0, 0), (9, 0.2, 0))) == [
-        (12, "before closing"), (17, "closed"), (29, "end"),
-    ]  # fmt: skip
-
-
 def test_fingers_that_tremble_change_nothing() -> None:
     states = way((10, 0.2, 0), (20, 0.2, 0))
     states[:, 6] += 0.05 * np.random.default_rng(0).random(len(states))
     assert named(states) == [(30, "end")]
-
-
-def test_a_grip_at_the_very_start_has_no_goal_before_it() -> None:
-    assert named(way((5, 0, 0.5), (10, 0.2, 0))) == [(5, "closed"), (15, "end")]
-
-
-def test_an_arm_that_leaves_while_the_fingers_still_close_has_gripped_before() -> None:
-    parts = (10, 0.2, 0), (4, 0, 0.25), (2, 0.04, 0.1), (9, 0.2, 0)
-    assert named(way(*parts)) == [(10, "before closing"), (14, "closed"), (25, "end")]
-    on_the_way = (10, 0.2, 0), (6, 0.12, 0.6), (9, 0.2, 0)
-    assert named(way(*on_the_way)) == [(10, "before closing"), (16, "closed"), (25, "end")], "it never stood still"
-
-
-def test_a_pause_of_the_fingers_does_not_divide_a_grip() -> None:
-    assert named(way((9, 0.2, 0), (2, 0, 0.2), (2, 0, 0), (2, 0, 0.2), (9, 0.2, 0)))[:2] == [
-        (9, "before closing"), (15, "closed"),
-    ]  # fmt: skip
 
 
 @given(

@@ -19,7 +19,7 @@ from vjepa2_ac.evaluation.imagined import ImagineOptions, imagine_clip
 from vjepa2_ac.evaluation.request import EvaluationOptions
 from vjepa2_ac.geometry import actions_from_states
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.simulation.imagined_truth import with_what_happens
+from vjepa2_ac.simulation.counterfactual import with_what_happens
 
 STEPS = 3
 Imagine = Callable[..., Imagination]

@@ -1,7 +1,8 @@
-"""What happens under other actions: the recording itself under its own commands, and plain physics under others."""
+"""What happens under other actions: from what was recorded, plain physics; and it stands beside what was imagined."""
 
 import json
 import re
+import shutil
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -9,7 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from decoders import whole_decoder  # noqa: F401 - a fixture
 from paths import ROOT
+from projections import hand_pixel, pixel_of
+from run_fixtures import MakeConfig
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.rlds.source import RldsSource
 from vjepa2_ac.episode import Episode
@@ -18,13 +22,15 @@ from vjepa2_ac.geometry import actions_from_states
 
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 
+from vjepa2_ac.decoding.imagine import AS_RECORDED
+from vjepa2_ac.evaluation.imagined import Film, ImagineOptions, imagine_clip
+from vjepa2_ac.evaluation.request import EvaluationOptions
 from vjepa2_ac.planning.counterfactual import named_actions
-from vjepa2_ac.simulation.counterfactual import RECORDED_CAMERAS, Resimulation, resimulate
-from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset, record_episode
-from vjepa2_ac.simulation.recording.simulation_file import SIMULATION_FILE
-from vjepa2_ac.simulation.world.camera import exterior_pose, hand_pixels
+from vjepa2_ac.simulation.counterfactual import RECORDED_CAMERAS, Resimulation, resimulate, with_what_happens
+from vjepa2_ac.simulation.recording.record import SIMULATION_FILE, RecordingSpec, record_dataset, record_episode
 
 STEPS, START, STRIDE = 13, 4, 4
+FILMED = 3
 SPECS = {
     "A": RecordingSpec("A", STEPS, seed=2),
     "random": RecordingSpec("random", STEPS, seed=2),
@@ -53,15 +59,17 @@ def start(request: pytest.FixtureRequest, recorded) -> Resimulation:
     return resimulate(folder, episode_of(folder), START)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", SPECS)
 @pytest.mark.parametrize("index", [0, 1])  # with a task: a script, and play
-def test_under_the_recorded_commands_happens_what_was_recorded(name: str, index: int, recorded) -> None:
-    episode = episode_of(recorded(name), index)
-    outcome = resimulate(recorded(name), episode, START).as_recorded(2, STRIDE)
-    seen = range(START, STEPS, STRIDE)
-    np.testing.assert_allclose(outcome.states, episode.states[seen], atol=1e-6, rtol=0)
-    assert np.abs(outcome.frames.astype(int) - episode.read_frames(seen)).mean() < 0.5
-    assert np.abs(np.diff(outcome.states[:, :3], axis=0)).max() > 0.003  # else persistence would pass
+def test_what_is_simulated_again_is_what_was_recorded_in_states_and_images(name: str, index: int, recorded) -> None:
+    cameras = RECORDED_CAMERAS if SPECS[name].cameras == 3 else ["exterior_1_left"]
+    for camera in cameras:
+        source = RldsSource(DataConfig(path=str(recorded(name)), camera=tuple(cameras)))
+        episode = source.read(index, camera)
+        for step in (0, len(episode.states) - 1):
+            seen = resimulate(recorded(name), episode, step, camera).under(np.zeros((0, 7)), STRIDE)
+            np.testing.assert_allclose(seen.states[0], episode.states[step], atol=1e-6, rtol=0)
+            assert np.abs(seen.frames[0].astype(int) - episode.read_frames([step])[0]).mean() < 0.5
 
 
 def test_the_actions_that_a_script_took_lead_to_what_was_recorded(recorded) -> None:
@@ -83,13 +91,11 @@ def test_the_hand_goes_where_the_name_says_in_states_and_in_images(start: Resimu
     assert up.states[-1, 2] - none.states[-1, 2] > 0.08
     assert left.states[-1, 1] - right.states[-1, 1] > 0.15
     assert np.abs(left.states[-1, [0, 2]] - right.states[-1, [0, 2]]).max() < 0.01
-    pixels = {
-        name: hand_pixels(outcome.states, start.domain)[-1]
-        for name, outcome in (("none", none), ("up", up), ("left", left), ("right", right))
-    }
+    arm = start.arm
+    pixels = {name: hand_pixel(arm, one.states[-1]) for name, one in (("none", none), ("up", up), ("left", left))}
     assert pixels["up"][1] < pixels["none"][1] - 8
-    across = exterior_pose(start.domain)[:3, 0] @ start.domain.base_pose()[:3, 1]  # of the robot's left in the image
-    assert (pixels["left"][0] - pixels["right"][0]) * np.sign(across) > 15
+    across = pixel_of(arm, none.states[-1, :3] + [0, 0.05, 0])[0] - pixel_of(arm, none.states[-1, :3])[0]
+    assert (pixels["left"][0] - hand_pixel(arm, right.states[-1])[0]) * np.sign(across) > 15
     for name, outcome in (("up", up), ("left", left)):  # what moved there is the hand
         x, y = pixels[name].astype(int)
         changed = np.abs(outcome.frames[-1].astype(int) - none.frames[-1])
@@ -137,15 +143,6 @@ def test_what_cannot_be_reached_is_said(recorded) -> None:
     assert np.isfinite(outcome.states).all()
 
 
-@pytest.mark.parametrize("actions", [np.zeros((2, 6)), np.full((1, 7), np.nan), np.zeros(7)])
-def test_no_actions_are_carried_out_that_are_none(recorded, actions: np.ndarray) -> None:
-    start = resimulate(recorded("A"), episode_of(recorded("A")), START)
-    with pytest.raises(ValueError, match="steps x 7 finite"):
-        start.under(actions, STRIDE)
-    with pytest.raises(ValueError, match="13 were recorded"):
-        start.as_recorded(3, STRIDE)
-
-
 def test_other_data_are_refused(recorded, droid: Path) -> None:
     real = episode_of(droid)
     with pytest.raises(InputError, match=r"no such file.*can only be simulated"):
@@ -161,16 +158,6 @@ def test_other_data_are_refused(recorded, droid: Path) -> None:
     ):
         with pytest.raises(InputError, match=message):
             resimulate(recorded("A"), ours, step, camera)
-
-
-def test_each_camera_of_three_shows_its_own_frames(recorded) -> None:
-    folder = recorded("three cameras")
-    source = RldsSource(DataConfig(path=str(folder), camera=tuple(RECORDED_CAMERAS)))
-    frames = []
-    for camera in RECORDED_CAMERAS:
-        episode = source.read(0, camera)
-        frames.append(resimulate(folder, episode, 2, camera).as_recorded(1, 2).frames)
-        assert np.abs(frames[-1].astype(int) - episode.read_frames([2, 4])).mean() < 0.5
 
 
 def test_the_pages_example_runs(recorded, capsys: pytest.CaptureFixture[str]) -> None:
@@ -190,3 +177,38 @@ def test_a_recording_that_shows_something_else_is_refused(recorded, tmp_path: Pa
     (tmp_path / SIMULATION_FILE).write_text(json.dumps(values))
     with pytest.raises(InputError, match=r"the state differs.*recorded with vjepa2-ac 0\.0\.1, here"):
         resimulate(tmp_path, episode, START)
+
+
+@pytest.fixture
+def film_of(base_folder: Path, whole_decoder: Path, make_config: MakeConfig, tmp_path: Path):  # noqa: F811
+    def film(data: Path, *actions: str) -> Film:
+        config = make_config(data__path=str(data), data__validation_share=0.0, data__test_share=0.5)
+        evaluation = EvaluationOptions(data=config, out=tmp_path)
+        asked = ImagineOptions(str(whole_decoder), actions=actions, steps=FILMED, evaluation=evaluation)
+        return imagine_clip(str(base_folder), asked)
+
+    return film
+
+
+def test_of_simulated_data_the_truth_of_every_sequence_is_shown(simulated: Path, film_of) -> None:
+    film = film_of(simulated, "true", "none", "up")
+    found = with_what_happens(film).imagination
+    truths = {one.name: one.truth for one in found.rollouts}
+    np.testing.assert_array_equal(truths[AS_RECORDED], found.truth)
+    for truth in truths.values():
+        assert truth.shape == (FILMED, 32, 32, 3)
+    still = np.abs(truths["none"].astype(int) - found.first).mean()
+    moved = np.abs(truths["up"].astype(int) - found.first).mean()
+    assert moved > 1.5 * still
+    assert all("does not know this scene" in note for note in found.notes)  # the decoder is of other data
+    for one, before in zip(found.rollouts, film.imagination.rollouts, strict=True):
+        np.testing.assert_array_equal(one.frames, before.frames)
+
+
+def test_if_it_cannot_be_simulated_again_a_note_says_why(simulated: Path, film_of, tmp_path: Path) -> None:
+    data = shutil.copytree(simulated, tmp_path / "data")
+    film = film_of(data, "up")
+    (data / SIMULATION_FILE).write_text("{}")
+    found = with_what_happens(film).imagination
+    assert found.notes[-1].startswith("What really happens under other actions is not known: ")
+    assert [one.truth for one in found.rollouts] == [None]

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
     from vjepa2_ac.serving.about import KeptGoals
     from vjepa2_ac.serving.server import Served
-    from vjepa2_ac.simulation.closed_loop.steering import Steering
+    from vjepa2_ac.simulation.closed_loop.agent import Agent
 
 _GB = 10**9
 _OF_RECORD = ("cameras", "workers")
@@ -221,8 +221,7 @@ def _record(options: argparse.Namespace) -> int:
     require_new_place(target)
 
     from vjepa2_ac.console.progress import ConsoleReporter, show
-    from vjepa2_ac.simulation.recording.demonstration import default_steps
-    from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
+    from vjepa2_ac.simulation.recording.record import RecordingSpec, default_steps, record_dataset
 
     task = None if options.task == "reach" else options.task
     spec = record_of_options(RecordingSpec, options, task=task, steps=options.steps or default_steps(task))
@@ -260,28 +259,28 @@ def _run_benchmark(options: argparse.Namespace) -> int:
     chosen = replace(chosen, films=min(chosen.films, chosen.episodes))
     name = f"closed_loop/{chosen.task}-{chosen.domain}"
     home = Path(options.subject) if is_run(options.subject) else Path()
-    with _steering(options) as steering, ConsoleReporter() as reporter:
-        benchmark, files = run_benchmark(steering, chosen, options.out or home / name, reporter)
-    if benchmark.checkpoint:
-        show(f"{options.subject}: checkpoint {benchmark.checkpoint}")
+    with _agent(options) as agent, ConsoleReporter() as reporter:
+        benchmark, files = run_benchmark(agent, chosen, options.out or home / name, reporter)
+    if benchmark.agent.checkpoint:
+        show(f"{options.subject}: checkpoint {benchmark.agent.checkpoint}")
     show(benchmark_table(benchmark), *benchmark_notes(benchmark), files=files)
     return int(any(set(result.why_counts) == {"no finite energy"} for result in benchmark.results))
 
 
 @contextmanager
-def _steering(options: argparse.Namespace) -> Iterator[Steering]:
-    """Return who steers; a server as long as the context lasts."""
+def _agent(options: argparse.Namespace) -> Iterator[Agent]:
+    """Return who acts; a server as long as the context lasts."""
     from vjepa2_ac.serving.access import read_key
     from vjepa2_ac.serving.client import PlanningClient
-    from vjepa2_ac.simulation.closed_loop.steering import of_server, of_session
+    from vjepa2_ac.simulation.closed_loop.agent import agent_of_server, agent_of_session
 
     if not is_server(options.subject):
         decoder = given_decoder(options)
-        yield of_session(load_planning_session(options), decoder)
+        yield agent_of_session(load_planning_session(options), decoder)
         return
     key = None if options.key_file is None else read_key(options.key_file)
     with PlanningClient(options.subject, key) as client:
-        yield of_server(client)
+        yield agent_of_server(client)
 
 
 def _refuse(options: argparse.Namespace, names: Sequence[str], *, needed: str) -> None:

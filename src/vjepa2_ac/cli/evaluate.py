@@ -209,7 +209,7 @@ def _words(options: argparse.Namespace) -> tuple[str, ...]:
 def _of_clip(options: argparse.Namespace, out: Path, reporter: Reporter) -> Imagination:
     from vjepa2_ac.evaluation.imagined import ImagineOptions, imagine_clip
     from vjepa2_ac.evaluation.request import EvaluationOptions
-    from vjepa2_ac.simulation.imagined_truth import with_what_happens
+    from vjepa2_ac.simulation.counterfactual import with_what_happens
 
     say_places_elsewhere(options.subject)
     data = None if options.data is None else read_config(options.data, of_run=True)

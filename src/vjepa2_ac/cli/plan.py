@@ -114,7 +114,7 @@ def _plan(options: argparse.Namespace) -> int:
 
     from vjepa2_ac.console.progress import ConsoleReporter, show
     from vjepa2_ac.console.tables import plan_table
-    from vjepa2_ac.decoding.imagined_plan import imagine_plan
+    from vjepa2_ac.decoding.imagine import imagine_plan
     from vjepa2_ac.planning.decision import PLAN_FILE, PlanRequest, decide, summarize, write_plan
     from vjepa2_ac.reports.figures.planning import PLAN_IMAGE, plot_plan
     from vjepa2_ac.storage import user_can_write
@@ -214,7 +214,7 @@ def _goals(options: argparse.Namespace) -> None:
 
     from vjepa2_ac.console.progress import ConsoleReporter, show
     from vjepa2_ac.console.tables import goals_notes, goals_table
-    from vjepa2_ac.demonstrations.make_goals import Energies, KeyFrameOptions, make_goals, recording_of_film
+    from vjepa2_ac.demonstrations.make_goals import KeyFrameOptions, make_goals, recording_of_film
     from vjepa2_ac.reports.figures.planning import GOALS_IMAGE, plot_goals
     from vjepa2_ac.storage import user_can_write
 
@@ -222,8 +222,7 @@ def _goals(options: argparse.Namespace) -> None:
     session = _session(options)
     chosen = record_of_options(KeyFrameOptions, options, by=by, every=every, stride=stride)
     with ConsoleReporter() as reporter:
-        energies = None if session is None else Energies(session)
-        made = make_goals(recording, chosen, energies, still=still, reporter=reporter)
+        made = make_goals(recording, chosen, session, still=still, reporter=reporter)
     with user_can_write(options.out):
         written = [made.write(options.out), plot_goals(made, options.out / GOALS_IMAGE)]
     show(goals_table(made), *goals_notes(made), files=written)

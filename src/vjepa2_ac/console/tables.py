@@ -118,7 +118,7 @@ def benchmark_table(benchmark: ClosedLoopBenchmark) -> Table:
     criterion = f"within {100 * SUCCESS_M[options.task]:g} cm{also}"
     table = MetricsTable(
         f"{options.task} in domain {options.domain}: {options.episodes} problems of seed {options.seed},"
-        f" {benchmark.results[0].steps} steps of {benchmark.seconds_per_step:.2f} s (95 % interval over episodes)",
+        f" {options.model_steps} steps of {options.seconds_per_step:.2f} s (95 % interval over episodes)",
         ["", f"{criterion} at the end", "once on the way", "left at the end, cm", "steps", "s per decision"],
     )
     for result in benchmark.results:

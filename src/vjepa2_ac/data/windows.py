@@ -251,6 +251,21 @@ def require_stride(config: DataConfig, *, to: str, fix: str = "`vjepa2-ac data c
     return config.stride
 
 
+def require_frames(config: DataConfig, *, to: str) -> None:
+    """Refuse a latent cache, which has no frames but JPEGs to look at.
+
+    Args:
+        config: The data.
+        to: What frames are needed for.
+
+    Raises:
+        InputError: It is a cache.
+    """
+    if config.is_cache:
+        needed = f"the data set itself, to {to}"
+        raise InputError(where="data.source", found="latents, without frames", needed=needed)
+
+
 def spread(size: int, count: int) -> list[int]:
     """Return at most `count` of `range(size)`, evenly spread, each once."""
     count = min(size, count)

@@ -47,7 +47,7 @@ class DecoderCard:
     episodes: int  # learned from
     frames: int
     steps: int
-    held_out: Mapping[str, Any] = field(default_factory=dict)  # by `baselines.measure_decoders`
+    held_out: Mapping[str, Any] = field(default_factory=dict)  # by `frame_pairs.measure_decoders`
     version: str = __version__
     time: str = ""  # UTC
 
@@ -78,21 +78,21 @@ class TrainedDecoder:
         Raises:
             InputError: One of them is another.
         """
-        shape = self.card.shape
-        sizes = (world_model.num_tokens, world_model.latent_dim, world_model.image_size)
-        fix = "Train one with `vjepa2-ac decoder CONFIG`, on the config of this model"
-        if sizes != (shape.grid**2, shape.dim, shape.image_size):
-            found = f"a decoder of {shape.grid**2}x{shape.dim} latents to images of {shape.image_size} px"
-            needed = f"{sizes[0]}x{sizes[1]} latents of images of {sizes[2]} px, as those of {subject}"
-        elif world_model.encoder_fingerprint() != self.card.encoder:
-            found = f"the decoder of another encoder than that of {subject}"
-            needed = "one that was trained on the latents of this encoder: others would be read wrongly"
-        elif crop != self.card.crop:
-            found = f"a decoder of frames with data.crop {self.card.crop}"
-            needed = f"{crop}, as of {subject}: frames that are cut otherwise look otherwise to it"
-        else:
-            return
-        raise InputError(where=f"{self.where} {self.name}", found=found, needed=needed, fix=fix)
+        card, shape, model = self.card, self.card.shape, world_model
+        compared = (
+            ("tokens", shape.grid**2, model.num_tokens),
+            ("dimensions", shape.dim, model.latent_dim),
+            ("image size", shape.image_size, model.image_size),
+            ("encoder", card.encoder, model.encoder_fingerprint()),
+            ("data.crop", card.crop, crop),
+        )
+        if differing := [f"{name} {ours}, not {theirs}" for name, ours, theirs in compared if ours != theirs]:
+            raise InputError(
+                where=f"{self.where} {self.name}",
+                found=f"the decoder of another encoder or crop than that of {subject} ({'; '.join(differing)})",
+                needed="one that was trained on the latents of both: others would be read wrongly",
+                fix="Train one with `vjepa2-ac decoder CONFIG`, on the config of this model",
+            )
 
 
 def save_decoder(folder: Path, card: DecoderCard, decoder: Mapping[str, Tensor], linear: Mapping[str, Tensor]) -> None:

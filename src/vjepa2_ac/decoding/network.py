@@ -20,6 +20,8 @@ from jaxtyping import Float, UInt8
 from pydantic import Field
 from torch import Generator, Tensor, nn
 
+Latents = Float[Tensor, "*batch tokens dim"]
+Images = Float[Tensor, "*batch 3 size size"]  # black 0 to white 1
 Size = Literal["linear", "tiny", "small", "medium"]
 
 _MIDDLE, _RANGE = 0.5, 0.25  # of pixels: the network's numbers are about -2 .. 2
@@ -93,7 +95,7 @@ class Decoder(nn.Module):
             for one in self.further[_LAST].parameters():
                 one.zero_()
 
-    def forward(self, latents: Float[Tensor, "*batch tokens dim"]) -> Float[Tensor, "*batch 3 size size"]:
+    def forward(self, latents: Latents) -> Images:
         """Return images, black 0 to white 1; not clipped.
 
         Args:
@@ -107,22 +109,19 @@ class Decoder(nn.Module):
             found = "x".join(map(str, latents.shape[-2:]))
             raise ValueError(f"latents of {found} numbers; this decoder takes {shape.grid**2}x{shape.dim}")
         frames = latents.reshape(-1, *latents.shape[-2:])
-        images: Tensor = self._numbers(frames).float() * _RANGE + _MIDDLE
+        numbers: Tensor = self.unfold(self.linear(frames))
+        if self.further is not None:
+            numbers = numbers + self.further(frames)
+        images = numbers.float() * _RANGE + _MIDDLE
         return images.reshape(*latents.shape[:-2], *images.shape[-3:])
 
-    def _numbers(self, frames: Float[Tensor, "frames tokens dim"]) -> Float[Tensor, "frames 3 size size"]:
-        numbers: Tensor = self.unfold(self.linear(frames))
-        return numbers if self.further is None else numbers + self.further(frames)
-
     @staticmethod
-    def as_numbers(images: Float[Tensor, "*batch 3 size size"]) -> Float[Tensor, "*batch 3 size size"]:
+    def as_numbers(images: Images) -> Images:
         """Return what the layers have to give for an image."""
         return (images - _MIDDLE) / _RANGE
 
     @torch.no_grad()
-    def decode(
-        self, latents: Float[Tensor, "*batch tokens dim"], *, chunk: int = 64
-    ) -> Float[Tensor, "*batch 3 size size"]:
+    def decode(self, latents: Latents, *, chunk: int = 64) -> Images:
         """Return images between 0 and 1, in float32, some frames at a time: bounds the memory."""
         frames = latents.reshape(-1, *latents.shape[-2:])
         images: Tensor = torch.cat([self(part).clamp(0.0, 1.0) for part in torch.split(frames, chunk)])
@@ -185,12 +184,12 @@ class _Block(nn.Module):
         return added
 
 
-def as_images(pixels: UInt8[Tensor, "*batch 3 size size"]) -> Float[Tensor, "*batch 3 size size"]:
+def as_images(pixels: UInt8[Tensor, "*batch 3 size size"]) -> Images:
     """Return images as the decoder gives them: black 0, white 1."""
     return pixels.float() / 255.0
 
 
-def as_pixels(images: Float[Tensor, "*batch 3 size size"]) -> UInt8[np.ndarray, "*batch size size 3"]:
+def as_pixels(images: Images) -> UInt8[np.ndarray, "*batch size size 3"]:
     """Return images between 0 and 1 for files: rounded to 8 bits, colours last."""
     rounded = (images.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu()
     return np.asarray(rearrange(rounded, "... c h w -> ... h w c").numpy())

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from vjepa2_ac.config import DecoderConfig
 from vjepa2_ac.decoding.frame_pairs import Pairs
-from vjepa2_ac.decoding.network import Decoder, DecoderShape, as_images
+from vjepa2_ac.decoding.network import Decoder, DecoderShape, Images, as_images
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.image_similarity import ms_ssim
 
@@ -25,9 +25,7 @@ _YOUNG = 9.0  # steps: the average of fewer forgets the first ones faster
 Autocast = Callable[[], AbstractContextManager[object]]
 
 
-def decoder_loss(
-    images: Float[Tensor, "frames 3 size size"], targets: Float[Tensor, "frames 3 size size"]
-) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
+def decoder_loss(images: Images, targets: Images) -> tuple[Float[Tensor, ""], dict[str, Tensor]]:
     """Return L1 + 0.2 (1 - MS-SSIM) + 0.1 L1 of the gradients along both axes; and the parts.
 
     Args:
@@ -39,8 +37,8 @@ def decoder_loss(
     structure = 1.0 - ms_ssim(images, targets, scales=scales).mean()
     rows, columns = ((images.diff(dim=axis) - targets.diff(dim=axis)).abs().mean() for axis in (-2, -1))
     edges = rows + columns
-    parts = {"l1": absolute, "structure": structure, "edges": edges}
-    return absolute + STRUCTURE * structure + EDGES * edges, parts
+    loss = absolute + STRUCTURE * structure + EDGES * edges
+    return loss, {"l1": absolute, "structure": structure, "edges": edges}
 
 
 def learning_rate_at(step: int, config: DecoderConfig) -> float:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import shutil
-from collections.abc import Generator, Iterator
+from collections.abc import Generator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -18,15 +18,14 @@ from typing import Any
 
 import torch
 
-from vjepa2_ac.config import Config, DecoderConfig
+from vjepa2_ac.config import Config
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.sources.latents.cache_files import LatentFiles, bytes_per_frame
 from vjepa2_ac.data.sources.latents.cache_key import CacheKey, Encoding, require_own_folder
-from vjepa2_ac.data.windows import permuted, require_stride
-from vjepa2_ac.decoding.baselines import fit_linear, mean_image, measure_decoders
+from vjepa2_ac.data.windows import permuted, require_frames, require_stride
 from vjepa2_ac.decoding.decoder_folder import CARD, DecoderCard, read_card, save_decoder
-from vjepa2_ac.decoding.frame_pairs import FramePairs, Pairs, wanted_frames
+from vjepa2_ac.decoding.frame_pairs import FramePairs, Pairs, fit_linear, mean_image, measure_decoders, wanted_frames
 from vjepa2_ac.decoding.network import UPSAMPLED, Decoder, DecoderShape
 from vjepa2_ac.decoding.steps import SMALLEST, DecoderSteps
 from vjepa2_ac.distributed.device import autocast, computing_device
@@ -37,7 +36,6 @@ from vjepa2_ac.encoding.pipeline import EncoderOnDevice, FramesToEncode, encode_
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.pretrained_folder import first_not_finite
-from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
 from vjepa2_ac.runs.files import read_torch, write_torch
 from vjepa2_ac.runs.folder import RunLock
@@ -64,46 +62,60 @@ def train_decoder(config: Config, reporter: Reporter = SILENT, *, check_only: bo
         InputError: An input cannot be used, or the folder holds something else.
         StoppedError: A signal asked to stop; the same command goes on.
     """
-    with _setup(config, reporter, check_only=check_only) as ready:
+    ready = _setup(config, reporter)
+    folder = ready.folder
+    with RunLock(folder) as lock:
+        if is_done := (folder / CARD).is_file():
+            read_card(folder)
+            reporter.note(f"The decoder is there already, in {folder}")
+        else:
+            _require_space(ready, reporter)
         if check_only:
-            return ready.folder
-        if not ready.is_done:
-            with _out_of_memory_explained():
+            return folder
+        if not is_done:
+            lock.take()
+            with user_can_write(folder):
+                write_atomically(folder / KEY, json.dumps({"key": dict(ready.key.parts)}, indent=1) + "\n")
+            try:
                 _try_one_step(ready)
                 _make(ready, reporter)
-            reporter.note(f"The decoder is in {ready.folder}: {ready.folder / CARD} says how good it is")
-        shutil.rmtree(ready.pairs.folder, ignore_errors=True)  # also after a start that was killed by then
-        (ready.folder / STATE).unlink(missing_ok=True)
-    return ready.folder
+            except torch.OutOfMemoryError as error:
+                found = f"the GPU's memory is not enough ({str(error).splitlines()[0]})"
+                fix = "Lower decoder.batch_size or model.encode_chunk, or set decoder.size: tiny"
+                raise InputError(where="decoder", found=found, fix=fix) from error
+            reporter.note(f"The decoder is in {folder}: {folder / CARD} says how good it is")
+        shutil.rmtree(ready.files.folder, ignore_errors=True)  # also after a start that was killed by then
+        (folder / STATE).unlink(missing_ok=True)
+    return folder
 
 
 def _make(ready: Setup, reporter: Reporter) -> None:
     """Encode, fit, train, measure, and write the decoder."""
+    device, config = ready.encoder.device, ready.config
     with stop_on_signals() as stop:
         pairs, held_out = (_encoded(ready, split, reporter, stop) for split in ("train", "test"))
-        linear = fit_linear(pairs, ready.shape, ready.on_device.device, reporter.task("fitting the linear decoder"))
+        linear = fit_linear(pairs, ready.shape, device, reporter.task("fitting the linear decoder"))
         steps = ready.steps_from(linear)
         _train(ready, steps, pairs, reporter, stop)
     if (name := first_not_finite(steps.average)) is not None:
         raise InputError(where=str(ready.folder), found=f"{name} holds NaN or infinity", fix="Lower the learning rate")
-    decoder = Decoder(ready.shape).to(ready.on_device.device).eval()
+    decoder = Decoder(ready.shape).to(device).eval()
     decoder.load_state_dict(steps.average)
     found: dict[str, Any] = {}
     if len(held_out):
-        decoders = {"decoder": decoder, "linear": linear.to(ready.on_device.device)}
+        decoders = {"decoder": decoder, "linear": linear.to(device)}
         found = measure_decoders(held_out, decoders, mean_image(pairs), reporter.task("measuring", "frames"))
-    data = ready.config.data
     card = DecoderCard(
         format="vjepa2-ac decoder 1",
         shape=ready.shape,
         encoder=ready.encoding.encoder,
-        crop=data.crop,
-        precision=ready.config.training.precision,
-        data=data.path,
-        cameras=tuple(data.cameras),
+        crop=config.data.crop,
+        precision=config.training.precision,
+        data=config.data.path,
+        cameras=tuple(config.data.cameras),
         episodes=len(set(pairs.episode_ids)),
         frames=len(pairs),
-        steps=ready.config.decoder.steps,
+        steps=config.decoder.steps,
         held_out=found,
         time=utc_now(),
     )
@@ -118,117 +130,76 @@ class Setup:
     folder: Path
     shape: DecoderShape
     encoding: Encoding
+    key: CacheKey
     dataset: Dataset
-    on_device: EncoderOnDevice
+    encoder: EncoderOnDevice
     wanted: dict[Split, list[FramesToEncode]]
-    pairs: LatentFiles  # frames and latents, while it is trained
 
     @property
-    def is_done(self) -> bool:
-        """Whether the folder holds the decoder already."""
-        return (self.folder / CARD).is_file()
+    def files(self) -> LatentFiles:
+        """Frames and latents, while it is trained."""
+        return LatentFiles(self.folder / PAIRS, self.key.digest)
 
     def steps_from(self, linear: Decoder | None) -> DecoderSteps:
         """Return its first optimizer steps, from the linear decoder or from fresh weights."""
-        config, device = self.config, self.on_device.device
+        config, device = self.config, self.encoder.device
         needs_loss_scale = config.training.precision == "fp16"  # and there is none here
         arithmetic = contextlib.nullcontext if needs_loss_scale else partial(autocast, config.training, device)
         return DecoderSteps(self.shape, config.decoder, config.seed, device, arithmetic, linear)
 
 
-@contextlib.contextmanager
-def _setup(config: Config, reporter: Reporter, *, check_only: bool) -> Iterator[Setup]:
-    """Check config, folder, data, model and disk, and hold the folder's lock to the end of the block.
+def _setup(config: Config, reporter: Reporter) -> Setup:
+    """Check config, folder, data and model.
 
     Raises:
         InputError: One of them cannot be used.
     """
-    named = config.decoder.folder
-    folder = Path(config.run_dir).parent / "decoder" if named is None else Path(named)
-    _require_frames(config)
+    decoder = config.decoder
+    folder = Path(config.run_dir).parent / "decoder" if decoder.folder is None else Path(decoder.folder)
+    require_frames(config.data, to="learn from")
+    require_stride(config.data, to="know which frames clips use")
     device = computing_device(config.training)
     with user_can_write(folder):
         try_writing_at(folder)
     dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
-    wanted = _wanted(dataset, config.decoder)
+    wanted: dict[Split, list[FramesToEncode]] = {
+        "train": wanted_frames(dataset, "train", frames=decoder.frames),
+        "test": wanted_frames(dataset, "test", frames=decoder.held_out_frames),  # may be none
+    }
+    if not wanted["train"]:
+        found, needed = "no frames of train episodes", "one episode or more that is as long as a clip"
+        fix = "Lower data.validation_share or data.test_share"
+        raise InputError(where=f"data.path: {config.data.path}", found=found, needed=needed, fix=fix)
     model = load_base(config.model, seed=config.seed)
-    shape, encoding = _shape_for(model, config.decoder), encoding_of(model, config)
+    encoding, size, patch = encoding_of(model, config), model.image_size, model.sizes.patch_size
+    if patch % UPSAMPLED or size < SMALLEST:
+        needed = f"{SMALLEST} px or more, and patches of a multiple of {UPSAMPLED} px"
+        raise InputError(where="model", found=f"images of {size} px in patches of {patch} px", needed=needed)
     key = CacheKey({
-        "decoder": config.decoder.model_dump(mode="json", exclude={"folder", "checkpoint_every"}),
+        "decoder": decoder.model_dump(mode="json", exclude={"folder", "checkpoint_every"}),
         "seed": config.seed,
         "latents": dict(key_for(dataset, encoding).parts),
         "data": config.data.model_dump(mode="json", include={"validation_share", "test_share", "split_by"}),
     })  # fmt: skip
     require_own_folder(folder / KEY, key, where=f"decoder.folder {folder}")
-    pairs, on_device = LatentFiles(folder / PAIRS, key.digest), EncoderOnDevice.of(config, model, device)
-    ready = Setup(config, folder, shape, encoding, dataset, on_device, wanted, pairs)
-    with RunLock(folder) as lock:
-        if ready.is_done:
-            read_card(folder)
-            reporter.note(f"The decoder is there already, in {folder}")
-        else:
-            _require_space(ready, reporter)
-            if not check_only:
-                lock.take()
-                with user_can_write(folder):
-                    write_atomically(folder / KEY, json.dumps({"key": dict(key.parts)}, indent=1) + "\n")
-        yield ready
-
-
-def _wanted(dataset: Dataset, decoder: DecoderConfig) -> dict[Split, list[FramesToEncode]]:
-    """Return the frames of each split; the test split may be empty."""
-    found: dict[Split, list[FramesToEncode]] = {
-        "train": wanted_frames(dataset, "train", frames=decoder.frames),
-        "test": wanted_frames(dataset, "test", frames=decoder.held_out_frames),
-    }
-    if not found["train"]:
-        raise InputError(
-            where=f"data.path: {dataset.config.path}",
-            found="no frames of train episodes",
-            needed="one episode or more that is as long as a clip",
-            fix="Lower data.validation_share or data.test_share",
-        )
-    return found
+    shape = DecoderShape(decoder.size, model.latent_dim, size // patch, patch)
+    return Setup(config, folder, shape, encoding, key, dataset, EncoderOnDevice.of(config, model, device), wanted)
 
 
 def _require_space(ready: Setup, reporter: Reporter) -> None:
     encoding, kind = ready.encoding, ready.config.data.cache_dtype
     per_frame = bytes_per_frame(encoding.tokens, encoding.dim, kind) + 3 * encoding.image_size**2
     everything = [one for some in ready.wanted.values() for one in some]
-    left = frames_in([one for one in everything if not ready.pairs.has(one.episode, one.camera)])
+    left = frames_in([one for one in everything if not ready.files.has(one.episode, one.camera)])
     fix = "Lower decoder.frames, set data.cache_dtype: int8, or put decoder.folder on a larger disk"
     require_space(ready.folder, left, per_frame, fix=fix)
-    taken = left * per_frame / 1e9
-    reporter.note(
-        f"{frames_in(everything):,} frames; {taken:.3g} GB of disk for them and their latents, while training"
-    )
-
-
-def _require_frames(config: Config) -> None:
-    if config.data.is_cache:
-        raise InputError(
-            where="data.source",
-            found="latents: a cache has no frames to learn from, only JPEGs to look at",
-            needed="the data set itself",
-            fix="Use the config of the data set; data.cache does not matter here",
-        )
-    require_stride(config.data, to="know which frames clips use")
-
-
-def _shape_for(model: WorldModel, decoder: DecoderConfig) -> DecoderShape:
-    patch = model.sizes.patch_size
-    if patch % UPSAMPLED or model.image_size < SMALLEST:
-        raise InputError(
-            where="model",
-            found=f"images of {model.image_size} px in patches of {patch} px",
-            needed=f"{SMALLEST} px or more, and patches of a multiple of {UPSAMPLED} px",
-        )
-    return DecoderShape(decoder.size, model.latent_dim, model.image_size // patch, patch)
+    size = f"{left * per_frame / 1e9:.3g} GB of disk for them and their latents, while training"
+    reporter.note(f"{frames_in(everything):,} frames; {size}")
 
 
 def _try_one_step(ready: Setup) -> None:
     """Run out of memory now, not after the frames are encoded."""
-    if ready.on_device.device.type == "cuda":
+    if ready.encoder.device.type == "cuda":
         shape, count = ready.shape, ready.config.decoder.batch_size
         latents = torch.zeros(count, shape.grid**2, shape.dim)
         images = torch.zeros(count, 3, shape.image_size, shape.image_size).byte()
@@ -237,7 +208,7 @@ def _try_one_step(ready: Setup) -> None:
 
 def _encoded(ready: Setup, split: Split, reporter: Reporter, stop: StopRequest) -> FramePairs:
     """Encode the frames of a split that are not there yet; episodes that cannot be read are left out by policy."""
-    shown, wanted, files = reporter.task(f"encoding {split} frames", "frames"), ready.wanted[split], ready.pairs
+    shown, wanted, files = reporter.task(f"encoding {split} frames", "frames"), ready.wanted[split], ready.files
 
     def progress(done: int, total: int) -> None:
         shown(done, total)
@@ -245,7 +216,7 @@ def _encoded(ready: Setup, split: Split, reporter: Reporter, stop: StopRequest) 
             raise StoppedError(ready.folder, 0, stop.reason)
 
     left = [one for one in wanted if not files.is_done(one.episode, one.camera)]
-    encode_files(ready.dataset, left, ready.on_device, files, progress, exact_pictures=True)
+    encode_files(ready.dataset, left, ready.encoder, files, progress, exact_pictures=True)
     pairs = FramePairs.of(ready.dataset, wanted, files)
     if wanted and not len(pairs):
         raise InputError(where=ready.config.data.path, found="no frame that can be read", needed="one or more")
@@ -292,13 +263,3 @@ def _batches(pairs: FramePairs, config: Config, done: int) -> Generator[tuple[in
             batch = ahead.result()
             ahead = pool.submit(read, step + 1)
             yield step, batch
-
-
-@contextlib.contextmanager
-def _out_of_memory_explained() -> Iterator[None]:
-    try:
-        yield
-    except torch.OutOfMemoryError as error:
-        found = f"the GPU's memory is not enough ({str(error).splitlines()[0]})"
-        fix = "Lower decoder.batch_size or model.encode_chunk, or set decoder.size: tiny"
-        raise InputError(where="decoder", found=found, fix=fix) from error

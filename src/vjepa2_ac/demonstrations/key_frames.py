@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float, Int
 
 from vjepa2_ac.geometry import actions_from_states
 from vjepa2_ac.planning.goals import GripperMode, SubGoal
+from vjepa2_ac.planning.search_space import GRIPPER
 
-GRIPPER = 6  # which number of a state
 GRIPS = 0.15  # of closedness: less is no change of the gripper
 _MOVES = 0.02  # of closedness, from one frame to the next: less is no motion of the fingers
 _PAUSE = 2  # frames that the fingers may rest within one change
@@ -142,7 +142,7 @@ def _are_below(
     return np.asarray((moved < metres) & (turned < radians) & (np.abs(changes[:, GRIPPER]) < closedness))
 
 
-def with_frames_between(keys: Sequence[KeyFrame], step: int) -> tuple[KeyFrame, ...]:
+def with_frames_between(keys: Sequence[KeyFrame], step: int, name: str = "on the way") -> tuple[KeyFrame, ...]:
     """Return key frames, and on the way to each of them every `step`-th frame from the one before, or from the start.
 
     A planner that sees one step ahead goes straight for a distant goal, with every axis at its limit. Near goals show
@@ -151,6 +151,7 @@ def with_frames_between(keys: Sequence[KeyFrame], step: int) -> tuple[KeyFrame, 
     Args:
         keys: In order.
         step: Frames from one goal to the next.
+        name: Of the further ones, `{}` in it their number.
 
     Raises:
         ValueError: A step below 1.
@@ -160,7 +161,7 @@ def with_frames_between(keys: Sequence[KeyFrame], step: int) -> tuple[KeyFrame, 
     found: list[KeyFrame] = []
     for before, key in itertools.pairwise((KeyFrame(0, "start"), *keys)):
         ways = [one for one in range(before.frame + step, key.frame, step) if 2 * (key.frame - one) >= step]
-        found += [*(KeyFrame(one, "on the way") for one in ways), key]
+        found += [*(KeyFrame(one, name.format(one)) for one in ways), key]
     return tuple(found)
 
 
@@ -174,10 +175,9 @@ def every_key_frame(frames: int, step: int) -> tuple[KeyFrame, ...]:
     Raises:
         ValueError: Fewer than two frames, or a step below 1.
     """
-    if frames < 2 or step < 1:
-        raise ValueError(f"every {step} of {frames} frames")
-    taken = [frame for frame in range(step, frames - 1, step) if 2 * (frames - 1 - frame) >= step]
-    return (*(KeyFrame(frame, f"frame {frame}") for frame in taken), KeyFrame(frames - 1, "end"))
+    if frames < 2:
+        raise ValueError(f"{frames} frames are no demonstration")
+    return with_frames_between([KeyFrame(frames - 1, "end")], step, "frame {}")
 
 
 def latent_key_frames(
@@ -231,10 +231,7 @@ class Timing:
     stride: int = 1  # frames of a model step
     slack: int = 3  # model steps that a goal may take fewer or more than the demonstration
     share: float | None = None  # of each goal but the last
-
-    def steps(self, begin: int, end: int) -> int:
-        """Return the model steps from one frame to another, 1 at least."""
-        return max(1, math.ceil((end - begin) / self.stride))
+    stop_share: float | None = None  # of the last one
 
 
 def sub_goals_of(
@@ -256,12 +253,12 @@ def sub_goals_of(
     """
     goals, before = [], 0
     for image, key in zip(images, keys, strict=True):
-        steps = timing.steps(before, key.frame)
+        steps = max(1, math.ceil((key.frame - before) / timing.stride))
         gripper = None if states is None else _gripper_mode(states[before], states[key.frame])
         low, high = max(1, steps - timing.slack), steps + timing.slack
         goals.append(SubGoal(image, key.name, low, high, timing.share, gripper))
         before = key.frame
-    return (*goals[:-1], replace(goals[-1], at_most=None, share=None))
+    return (*goals[:-1], replace(goals[-1], at_most=None, share=timing.stop_share))
 
 
 def _gripper_mode(before: Float[np.ndarray, " 7"], after: Float[np.ndarray, " 7"]) -> GripperMode:

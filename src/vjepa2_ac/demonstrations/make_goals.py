@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from vjepa2_ac import __version__
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.data.windows import spread_with_ends
+from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.data.windows import require_frames, spread_with_ends
 from vjepa2_ac.demonstrations.key_frames import (
     KeyFrame,
     StillRule,
@@ -48,19 +49,25 @@ _APART = 4  # model steps from one goal to the next, by latents
 _AT_ONCE = 16  # frames that are read and encoded together
 _MOST_PAIRS = 64
 _UPPER = 0.95  # quantile of the energies between resting frames that is their floor
-_LEAST_FRAMES = 2
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A demonstration. A frame is a control step of an episode, or a frame of a film."""
+    """A demonstration. A frame is a control step of an episode, or a frame of a film.
+
+    Raises:
+        InputError: It has one frame.
+    """
 
     name: str
     frames: int
     read: FrameReader  # of frames at these positions
     states: Float[np.ndarray, "frames 7"] | None  # None: nothing was measured, or the states are no poses
-    rate_hz: float | None  # frames per second; None: not known
     origin: Mapping[str, Any]  # where it comes from, as plain values
+
+    def __post_init__(self) -> None:
+        if self.frames < 2:
+            raise InputError(where=self.name, found=f"{self.frames} frames", needed="2 at least")
 
 
 def recording_of_episode(config: DataConfig, wanted: str, progress: Progress | None = None) -> Recording:
@@ -74,31 +81,18 @@ def recording_of_episode(config: DataConfig, wanted: str, progress: Progress | N
     Raises:
         InputError: There is no such episode, it cannot be read, or the data are latents without frames.
     """
-    if config.is_cache:
-        fix = "Name the data set itself"
-        raise InputError(
-            where="data.source", found="latents, without frames", needed="frames to make goals of", fix=fix
-        )
+    require_frames(config, to="make goals of")
     dataset = open_dataset(config, progress=progress)
-    index = _place_of(dataset, wanted)
-    episode, name = dataset.source.read(index), dataset.table.identity(index)
-    frames, where = len(episode.states), f"episode {name}"
-    if frames < _LEAST_FRAMES:
-        raise InputError(where=where, found=f"{frames} frames", needed=f"{_LEAST_FRAMES} at least")
+    table, index = dataset.table, dataset.table.find(wanted)
+    if index is None and wanted.isdecimal() and len(wanted) < 10 and int(wanted) < len(table):
+        index = int(wanted)
+    if index is None:
+        needed = f"a name such as {table.identity(int(dataset.episodes[0]))}, or a number from 0 to {len(table) - 1}"
+        raise InputError(where=f"--episode {wanted}", found=f"no such episode in {config.path}", needed=needed)
+    episode, name = dataset.source.read(index), table.identity(index)
     origin = {"data": config.path, "episode": name, "camera": config.camera}
     states = episode.states if config.states == "pose" else None
-    return Recording(name, frames, episode.read_frames, states, episode.control_rate_hz, origin)
-
-
-def _place_of(dataset: Dataset, wanted: str) -> int:
-    place = dataset.table.find(wanted)
-    if place is None and wanted.isdecimal() and len(wanted) < 10 and int(wanted) < len(dataset.table):
-        return int(wanted)
-    if place is None:
-        example = dataset.table.identity(int(dataset.episodes[0]))
-        needed = f"a name such as {example}, or a number from 0 to {len(dataset.table) - 1}"
-        raise InputError(where=f"--episode {wanted}", found=f"no such episode in {dataset.config.path}", needed=needed)
-    return place
+    return Recording(name, len(episode.states), episode.read_frames, states, origin)
 
 
 def recording_of_film(path: Path) -> Recording:
@@ -112,71 +106,17 @@ def recording_of_film(path: Path) -> Recording:
         frames = count_frames(path, where=where)
     except OSError as error:
         raise unreadable(where, error, needed="an MP4") from None
-    if frames < _LEAST_FRAMES:
-        raise InputError(where=where, found=f"{frames} frames", needed=f"{_LEAST_FRAMES} at least")
-    return Recording(path.name, frames, partial(read_frames, path, where=where), None, None, {"film": where})
+    return Recording(path.name, frames, partial(read_frames, path, where=where), None, {"film": where})
 
 
 @dataclass(frozen=True)
-class Energies:
-    """What a session's model makes of frames: with its crop, its distance, and no mask."""
-
-    session: PlanningSession
-
-    def latents(
-        self, read: FrameReader, frames: Sequence[int], progress: Progress = no_progress
-    ) -> Float[Tensor, "frames tokens dim"]:
-        """Return the latents of some frames; only so many pixels at a time are in memory."""
-        model, crop, found = self.session.world_model, self.session.config.data.crop, []
-        for start in range(0, len(frames), _AT_ONCE):
-            part = frames[start : start + _AT_ONCE]
-            found.append(encode_frames(model, read(part), crop))
-            progress(min(start + _AT_ONCE, len(frames)), len(frames))
-        return torch.cat(found)
-
-    def between(
-        self, seen: Float[Tensor, "frames tokens dim"], wanted: Float[Tensor, "*frames tokens dim"]
-    ) -> Float[np.ndarray, " frames"]:
-        """Return the energy of each frame to a wanted one, or to one of its own."""
-        energy = self.session.config.planning.energy
-        return np.array([
-            float(distance(one, to, energy)) for one, to in zip(seen, wanted.expand_as(seen), strict=True)
-        ])  # fmt: skip
-
-    def noise(
-        self, read: FrameReader, rests: Bool[np.ndarray, " neighbours"], gap: int, progress: Progress = no_progress
-    ) -> NoiseFloor | None:
-        """Return the 95th percentile of energies between frames of a resting arm; None: it never rests.
-
-        Args:
-            read: Reads frames.
-            rests: Of each frame but the last whether the arm rests until the next one.
-            gap: Frames from one of a pair to the other.
-            progress: Called with the number of encoded frames.
-        """
-        pairs = resting_pairs(rests, gap)
-        if not len(pairs):
-            return None
-        taken = pairs[list(spread_with_ends(len(pairs), _MOST_PAIRS))]
-        places = {frame: place for place, frame in enumerate(np.unique(taken).tolist())}
-        latents = self.latents(read, list(places), progress)
-        one, other = ([places[frame] for frame in taken[:, side].tolist()] for side in (0, 1))
-        energies = self.between(latents[one], latents[other])
-        kind = self.session.config.planning.energy.distance
-        return NoiseFloor(float(np.quantile(energies, _UPPER)), len(taken), self.session.encoder, kind)
-
-
-@dataclass(frozen=True)
-class KeyFrameOptions:
+class KeyFrameOptions(Timing):
     """Which frames become goals, and how long each may take."""
 
     by: By = "gripper"
     every: int | None = None  # frames, by `every`
     apart: int | None = None  # least frames between a stop and another goal (4), or between goals by latents
     stride: int = 4  # frames of a model step
-    slack: int = 3  # model steps that a goal may take fewer or more than the demonstration
-    share: float | None = None  # of each goal but the last
-    stop_share: float | None = None  # of the last one
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,7 +162,7 @@ class MadeGoals:
 def make_goals(
     recording: Recording,
     options: KeyFrameOptions,
-    energies: Energies | None = None,
+    session: PlanningSession | None = None,
     *,
     still: Recording | None = None,
     reporter: Reporter = SILENT,
@@ -232,69 +172,25 @@ def make_goals(
     Args:
         recording: The demonstration.
         options: Which frames, and how long they may take.
-        energies: Of the model that will plan; needed by latents, and for the noise floor.
+        session: Of the model that will plan; needed by latents, and for the noise floor.
         still: A film of the resting arm, for the noise floor; None: where the arm rests in the demonstration.
         reporter: Shows the progress.
 
     Raises:
         InputError: The demonstration has no poses, or there is no model, and the options need them.
     """
-    seen = None if energies is None else _Seen.of(energies, recording, reporter)
+    seen = None if session is None else _Encoded.of(session, recording, reporter)
     keys = _keys(recording, options, seen)
     first, *images = recording.read([0, *(key.frame for key in keys)])
-    timing = Timing(options.stride, options.slack, options.share)
-    goals = sub_goals_of(images, keys, timing, recording.states)
-    goals = (*goals[:-1], replace(goals[-1], share=options.stop_share))
+    goals = sub_goals_of(images, keys, options, recording.states)
     course = noise = None
-    if seen is not None:
+    if session is not None and seen is not None:
         course = seen.course([key.frame for key in keys], options.stride)
-        noise = _noise(seen.energies, recording, options.stride, still, reporter)
+        noise = _noise_floor(session, recording, still, options.stride, reporter)
     return MadeGoals(recording, options, keys, goals, first, course, noise)
 
 
-@dataclass(frozen=True, eq=False)
-class _Seen:
-    """The latents of a demonstration: of all its frames, or of so many that they fit into memory."""
-
-    energies: Energies
-    recording: Recording
-    frames: Int[np.ndarray, " encoded"]
-    latents: Float[Tensor, "encoded tokens dim"]
-
-    @classmethod
-    def of(cls, energies: Energies, recording: Recording, reporter: Reporter) -> _Seen:
-        step = math.ceil(recording.frames / _MOST_ENCODED)
-        frames = np.unique(np.append(np.arange(0, recording.frames, step), recording.frames - 1))
-        latents = energies.latents(recording.read, frames.tolist(), reporter.task("encoding frames"))
-        return cls(energies, recording, frames, latents)
-
-    def key_frames(self, apart: int) -> tuple[KeyFrame, ...]:
-        least = max(1, math.ceil(apart / int(self.frames[1] - self.frames[0])))
-        found = latent_key_frames(
-            len(self.frames), lambda goal: self.energies.between(self.latents, self.latents[goal]), least
-        )
-        frames = [int(self.frames[key.frame]) for key in found]
-        return tuple(KeyFrame(frame, _name(frame, self.recording.frames)) for frame in frames)
-
-    def course(self, goals: Sequence[int], stride: int) -> EnergyCourse:
-        """Return the energies of all frames to the goal that applies then: the next key frame."""
-        begins = [0, *goals[:-1]]
-        before = [max(begin, goal - stride) for begin, goal in zip(begins, goals, strict=True)]
-        taken = self.energies.latents(self.recording.read, [*begins, *before, *goals])
-        began, step_before, wanted = taken.split(len(goals))  # type: ignore[no-untyped-call]  # torch
-        places = np.searchsorted(goals, self.frames).clip(max=len(goals) - 1)
-        energy = np.empty(len(self.frames))
-        for place, goal in enumerate(wanted):
-            energy[places == place] = self.energies.between(self.latents[np.flatnonzero(places == place)], goal)
-        ends = (self.energies.between(one, wanted) for one in (began, step_before))
-        return EnergyCourse(self.frames, energy, *(tuple(one.tolist()) for one in ends))
-
-
-def _name(frame: int, frames: int) -> str:
-    return "end" if frame == frames - 1 else f"frame {frame}"
-
-
-def _keys(recording: Recording, options: KeyFrameOptions, seen: _Seen | None) -> tuple[KeyFrame, ...]:
+def _keys(recording: Recording, options: KeyFrameOptions, seen: _Encoded | None) -> tuple[KeyFrame, ...]:
     if options.by == "every":
         return every_key_frame(recording.frames, options.every or 1)
     if options.by == "latent":
@@ -309,12 +205,81 @@ def _keys(recording: Recording, options: KeyFrameOptions, seen: _Seen | None) ->
     )
 
 
-def _noise(
-    energies: Energies, recording: Recording, gap: int, still: Recording | None, reporter: Reporter
+@dataclass(frozen=True, eq=False)
+class _Encoded:
+    """The latents of a demonstration: of all its frames, or of so many that they fit into memory."""
+
+    session: PlanningSession
+    recording: Recording
+    frames: Int[np.ndarray, " encoded"]
+    latents: Float[Tensor, "encoded tokens dim"]
+
+    @classmethod
+    def of(cls, session: PlanningSession, recording: Recording, reporter: Reporter) -> _Encoded:
+        step = math.ceil(recording.frames / _MOST_ENCODED)
+        frames = np.unique(np.append(np.arange(0, recording.frames, step), recording.frames - 1))
+        latents = _latents(session, recording.read, frames.tolist(), reporter.task("encoding frames"))
+        return cls(session, recording, frames, latents)
+
+    def key_frames(self, apart: int) -> tuple[KeyFrame, ...]:
+        least = max(1, math.ceil(apart / int(self.frames[1] - self.frames[0])))
+
+        def distances(goal: int) -> Float[np.ndarray, " frames"]:
+            return _energies(self.session, self.latents, itertools.repeat(self.latents[goal]))
+
+        found = latent_key_frames(len(self.frames), distances, least)
+        frames = [int(self.frames[key.frame]) for key in found]
+        return (*(KeyFrame(frame, f"frame {frame}") for frame in frames[:-1]), KeyFrame(frames[-1], "end"))
+
+    def course(self, goals: Sequence[int], stride: int) -> EnergyCourse:
+        """Return the energies of all frames to the goal that applies then: the next key frame."""
+        begins = [0, *goals[:-1]]
+        before = [max(begin, goal - stride) for begin, goal in zip(begins, goals, strict=True)]
+        taken = _latents(self.session, self.recording.read, [*begins, *before, *goals])
+        began, step_before, wanted = taken.split(len(goals))  # type: ignore[no-untyped-call]  # torch
+        places = np.searchsorted(goals, self.frames).clip(max=len(goals) - 1)
+        energy = _energies(self.session, self.latents, (wanted[place] for place in places.tolist()))
+        ends = (_energies(self.session, one, wanted) for one in (began, step_before))
+        return EnergyCourse(self.frames, energy, *(tuple(one.tolist()) for one in ends))
+
+
+def _latents(
+    session: PlanningSession, read: FrameReader, frames: Sequence[int], progress: Progress = no_progress
+) -> Float[Tensor, "frames tokens dim"]:
+    """Return the latents of some frames, as the session's model sees them; few pixels at a time are in memory."""
+    found = []
+    for start in range(0, len(frames), _AT_ONCE):
+        part = frames[start : start + _AT_ONCE]
+        found.append(encode_frames(session.world_model, read(part), session.config.data.crop))
+        progress(min(start + _AT_ONCE, len(frames)), len(frames))
+    return torch.cat(found)
+
+
+def _energies(
+    session: PlanningSession, seen: Iterable[Tensor], wanted: Iterable[Tensor]
+) -> Float[np.ndarray, " frames"]:
+    """Return the energy of latents of each frame to those of the wanted one: without a mask."""
+    energy = session.config.planning.energy
+    return np.array([float(distance(one, to, energy)) for one, to in zip(seen, wanted, strict=False)])
+
+
+def _noise_floor(
+    session: PlanningSession, recording: Recording, still: Recording | None, gap: int, reporter: Reporter
 ) -> NoiseFloor | None:
-    progress = reporter.task("encoding frames of a resting arm")
+    """Return the 95th percentile of energies between frames of a resting arm, `gap` apart; None: none rests."""
     if still is not None:
-        return energies.noise(still.read, np.ones(still.frames - 1, dtype=bool), gap, progress)
-    if recording.states is None:
+        shown, rests = still, np.ones(still.frames - 1, dtype=bool)
+    elif recording.states is not None:
+        shown, rests = recording, resting(recording.states)
+    else:
         return None
-    return energies.noise(recording.read, resting(recording.states), gap, progress)
+    pairs = resting_pairs(rests, gap)
+    if not len(pairs):
+        return None
+    taken = pairs[list(spread_with_ends(len(pairs), _MOST_PAIRS))]
+    frames, places = np.unique(taken, return_inverse=True)
+    latents = _latents(session, shown.read, frames.tolist(), reporter.task("encoding frames of a resting arm"))
+    one, other = latents[torch.from_numpy(places.reshape(taken.shape).T)]
+    energies = _energies(session, one, other)
+    kind = session.config.planning.energy.distance
+    return NoiseFloor(float(np.quantile(energies, _UPPER)), len(taken), session.encoder, kind)

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from torch import Tensor
 
 from vjepa2_ac.config import Config, LimitsConfig
 from vjepa2_ac.config.data import Split
@@ -18,13 +17,13 @@ from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import batches_of, validation_windows
 from vjepa2_ac.data.sources.configured_spaces import measured_space
 from vjepa2_ac.data.transforms import frames_as_seen, view
+from vjepa2_ac.data.windows import require_frames
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
 from vjepa2_ac.decoding.imagine import (
     AS_RECORDED,
     Imagination,
     Imagined,
     Start,
-    imagined_latents,
     rolled_out,
     shown,
     worth_knowing,
@@ -96,7 +95,7 @@ def imagine_image(
         first=first,
         decoded_first=decoded_first,
         rollouts=tuple(
-            Imagined("model", word, taken, shown(decoder.decoder, imagined_latents(model, start, taken)))
+            Imagined("model", word, taken, shown(decoder.decoder, rolled_out(model, start, taken)))
             for word, taken in chosen.items()
         ),
         notes=(
@@ -181,10 +180,7 @@ def imagine_clip(subject: str, asked: ImagineOptions, *, reporter: Reporter = SI
     config, planning, _ = settle(subject, asked.evaluation, frames=asked.steps + 1)
     accelerator = make_accelerator(config)
     dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
-    if config.data.is_cache:
-        raise InputError(
-            where="data.source", found="latents, without frames", needed="the data set itself, to show what is true"
-        )
+    require_frames(config.data, to="show what is true")
     window = _window(dataset, asked)
     loaded = load_subject(subject, config, asked.evaluation, dataset, decoder)
     loaded.put_on(accelerator.device)
@@ -241,10 +237,8 @@ def _rollouts(
             if name != AS_RECORDED and contender.role != "trained":
                 continue
             with contender.switched():
-                if name == AS_RECORDED:
-                    latents: Tensor = rolled_out(contender.model, start, actions, states[:-1])
-                else:
-                    latents = imagined_latents(contender.model, start, actions)
+                known = states[:-1] if name == AS_RECORDED else None
+                latents = rolled_out(contender.model, start, actions, known)
             found.append(Imagined(contender.name, name, actions, shown(decoder.decoder, latents)))
     return found
 

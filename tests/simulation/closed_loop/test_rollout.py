@@ -13,11 +13,11 @@ pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 from tiny_models import tiny_model
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.simulation.closed_loop.policies import (
-    DoNothing,
     Moves,
     Oracle,
     Planning,
     RandomActions,
+    ZeroActions,
     farthest,
     shortened,
 )
@@ -27,7 +27,6 @@ from vjepa2_ac.simulation.closed_loop.rollout import (
     RolloutSpec,
     run_episode,
     run_task,
-    ways_along,
 )
 from vjepa2_ac.simulation.world.arm import SimulatedArm
 from vjepa2_ac.simulation.world.motion import HIGH, forward_kinematics
@@ -64,7 +63,7 @@ def way(*numbers: float) -> np.ndarray:
 def test_the_oracle_succeeds_and_nothing_and_chance_do_not(arm: SimulatedArm) -> None:
     results = [
         run_task(RolloutSpec("reach", DOMAIN_B, 5), policy, arm)
-        for policy in (Oracle(LIMITS), DoNothing(), RandomActions(SMALL))
+        for policy in (Oracle(LIMITS), ZeroActions(), RandomActions(SMALL))
     ]
     oracle, nothing, chance = results
     assert oracle.success_rate.value == 1.0
@@ -115,14 +114,10 @@ def test_joints_are_observed_moved_and_kept_within_their_limits(arm: SimulatedAr
     np.testing.assert_allclose(result.states[1][:6], forward_kinematics(after[:7]), atol=1e-6)
     assert result.unreachable == 1, "no joint turns by 9 radians"
     assert arm.joints[1] == pytest.approx(HIGH[1], abs=1e-3)
-    with pytest.raises(ValueError, match="no action of 8 finite numbers"):
-        run_episode(arm, policy_of(np.zeros(7), Moves.JOINTS), problem, steps=1)
-
-
-def policy_of(action: np.ndarray, moves: Moves) -> Scripted:
-    policy = Scripted(action)
-    policy.moves = moves
-    return policy
+    policy.actions = [np.zeros(7)]
+    for actor, of in ((policy, 8), (Scripted(np.full(7, np.nan)), 7)):
+        with pytest.raises(ValueError, match=f"no action of {of} finite numbers"):
+            run_episode(arm, actor, problem, steps=1)
 
 
 def test_the_same_problem_has_the_same_result_whatever_was_before(arm: SimulatedArm) -> None:
@@ -145,26 +140,11 @@ def test_a_command_out_of_reach_takes_the_arm_part_of_the_way_and_is_counted(arm
     assert inside.unreachable == 0
 
 
-def test_parts_of_a_way_are_even_and_end_at_its_end() -> None:
-    state, action = make_problem("reach", DOMAIN_A, 0, 0).start, way(0.08, 0.0, 0.0, 0.0, 0.0, 0.4)
-    parts = ways_along(state, action)[1::2]  # of eight
-    np.testing.assert_allclose([part[0] - state[0] for part in parts], [0.02, 0.04, 0.06, 0.08])
-    turns = [np.unwrap([state[5], part[5]])[1] - state[5] for part in parts]
-    np.testing.assert_allclose(turns, [0.1, 0.2, 0.3, 0.4], atol=1e-9)
-
-
-def test_what_is_no_action_is_refused(arm: SimulatedArm) -> None:
-    problem = make_problem("reach", DOMAIN_B, 0, 0)
-    for action in (np.full(7, np.nan), np.zeros(6)):
-        with pytest.raises(ValueError, match=r"scripted: .* is no action"):
-            run_episode(arm, Scripted(action), problem, steps=1)
-
-
 def test_a_world_model_plans_within_its_limits_and_says_why(arm: SimulatedArm) -> None:
     config = PlanningConfig(samples=8, iterations=2, limits=SMALL, cem=CemConfig(elites=3))
     policy = Planning(Controller(tiny_model(), config), name="tiny")
     reported = []
-    spec = RolloutSpec("reach", DOMAIN_B, episodes=2, steps=2, keep_frames=1)
+    spec = RolloutSpec("reach", DOMAIN_B, episodes=2, steps=2, films=1)
     result = run_task(spec, policy, arm, lambda *n: reported.append(n))
     assert result.policy == "tiny"
     assert result.why_counts == {"planned": 4}
@@ -195,7 +175,7 @@ def fake(*distances_m: float, unreachable: int = 0) -> EpisodeResult:
 
 def test_success_counts_at_the_end_and_passing_is_separate() -> None:
     episodes = (fake(0.04, 0.03, 0.2), fake(0.2, 0.1, 0.049), fake(0.01, 0.2, 0.051, unreachable=2))
-    result = ClosedLoopResult("reach", "A", "x", 0, 2, 4, episodes)
+    result = ClosedLoopResult(RolloutSpec(), "x", episodes)
     assert result.successes.tolist() == [False, True, False]
     assert result.success_rate.value == pytest.approx(1 / 3)
     assert [episode.success_ever for episode in episodes] == [True, True, False]
@@ -206,16 +186,12 @@ def test_success_counts_at_the_end_and_passing_is_separate() -> None:
     assert result.seconds_per_decision.value == pytest.approx(1.5)
     assert result.why_counts == {"planned": 3, "out of time": 3}
     assert result.unreachable.tolist() == [0, 0, 2]
-
-
-def test_steps_are_counted_until_it_is_done_for_good() -> None:
-    episodes = (fake(0.2, 0.04, 0.1, 0.03, 0.02), fake(0.2, 0.1, 0.04, 0.04, 0.04), fake(0.2, 0.01, 0.2, 0.2, 0.2))
-    assert [episode.steps_needed for episode in episodes] == [3, 2, None]
+    late = (fake(0.2, 0.04, 0.1, 0.03, 0.02), fake(0.2, 0.1, 0.04, 0.04, 0.04), fake(0.2, 0.01, 0.2, 0.2, 0.2))
+    assert [episode.steps_needed for episode in late] == [3, 2, None], "until it is done for good"
     assert fake(0.01, 0.02).steps_needed == 0
-    result = ClosedLoopResult("reach", "A", "x", 0, 4, 4, episodes)
-    assert result.steps_needed is not None
-    assert result.steps_needed.value == 2.5
-    assert ClosedLoopResult("reach", "A", "x", 0, 4, 4, episodes[2:]).steps_needed is None
+    needed = ClosedLoopResult(RolloutSpec(), "x", late).steps_needed
+    assert needed is not None
+    assert needed.value == 2.5
 
 
 def test_ways_are_shortened_in_their_direction_and_held_axes_left_out() -> None:

@@ -18,10 +18,9 @@ from vjepa2_ac.simulation.closed_loop.sub_goals import (
     DemonstrationSpec,
     demonstrate,
     every_step,
-    goals_of_demonstration,
 )
 from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, HOLDING, arm_for, make_problem
-from vjepa2_ac.simulation.recording.demonstration import RecordingSpec, arm_of, carry_out
+from vjepa2_ac.simulation.recording.record import RecordingSpec, arm_of, carry_out
 from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B
 
 SMALL = (36, 64)
@@ -32,7 +31,7 @@ def test_the_grasp_is_among_the_goals_of_a_pick(domain) -> None:
     arm = arm_for("pick", domain, size=SMALL)
     for index in range(3):
         problem = make_problem("pick", domain, 4, index)
-        goals = goals_of_demonstration(problem, arm)
+        goals = DemonstratedGoals("pick", domain, size=SMALL)(problem)
         assert [goal.name for goal in goals] == ["before closing", "closed", "end"]
         assert [goal.gripper for goal in goals] == ["held", "close", "held"]
         shown = demonstrate(problem, arm, DemonstrationSpec())
@@ -50,22 +49,23 @@ def test_the_grasp_is_among_the_goals_of_a_pick(domain) -> None:
 
 def test_a_task_without_the_gripper_has_its_end_as_the_only_goal() -> None:
     for task in ("reach", "push"):
-        arm = arm_for(task, DOMAIN_A, size=SMALL)
-        (goal,) = goals_of_demonstration(make_problem(task, DOMAIN_A, 0, 1), arm)
+        (goal,) = DemonstratedGoals(task, DOMAIN_A, size=SMALL)(make_problem(task, DOMAIN_A, 0, 1))
         assert (goal.name, goal.gripper, goal.at_most) == ("end", "held", None)
 
 
 def test_the_gripper_of_who_demonstrates_is_free_whatever_the_planner_may_do() -> None:
     arm, problem = arm_for("pick", DOMAIN_A, size=SMALL), make_problem("pick", DOMAIN_A, 0, 0)
     held = DemonstrationSpec(LimitsConfig(gripper_mode="held"), slack=0)
-    assert [goal.at_most for goal in goals_of_demonstration(problem, arm, held)] == [3, 1, None]
+    assert [goal.at_most for goal in DemonstratedGoals("pick", DOMAIN_A, held, SMALL)(problem)] == [3, 1, None]
     with pytest.raises(InputError, match=r"problem 0 \(pick\): the oracle ends .* after 3 model steps"):
         demonstrate(problem, arm, DemonstrationSpec(steps=3))
 
 
 def test_every_step_of_a_demonstration_is_a_goal_up_to_where_it_rests() -> None:
     arm, problem = arm_for("pick", DOMAIN_A, size=SMALL), make_problem("pick", DOMAIN_A, 4, 0)
-    key_goals, goals = (goals_of_demonstration(problem, arm, one) for one in (None, every_step(DemonstrationSpec())))
+    key_goals, goals = (
+        DemonstratedGoals("pick", DOMAIN_A, one, SMALL)(problem) for one in (None, every_step(DemonstrationSpec()))
+    )
     shown = demonstrate(problem, arm, DemonstrationSpec())
     for goal, frame in zip(goals, shown.frames[1:], strict=False):
         np.testing.assert_array_equal(goal.image, frame)
@@ -80,7 +80,7 @@ def test_every_step_of_a_demonstration_is_a_goal_up_to_where_it_rests() -> None:
 def test_an_arm_that_is_steered_is_not_moved_by_the_demonstration() -> None:
     arm, problem = arm_for("pick", DOMAIN_A, size=SMALL), make_problem("pick", DOMAIN_A, 0, 0)
     before = put(arm, problem.start, problem.block_start).state
-    DemonstratedGoals("pick", DOMAIN_A)(problem)
+    DemonstratedGoals("pick", DOMAIN_A, size=SMALL)(problem)
     np.testing.assert_array_equal(arm.state, before)
 
 

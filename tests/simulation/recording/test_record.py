@@ -69,9 +69,10 @@ def test_commands_differ_from_measurements_and_velocities_from_zero() -> None:
 
 
 def test_the_same_seed_gives_the_same_bytes_in_any_number_of_processes(recorded: Path, tmp_path: Path) -> None:
-    again = record_dataset(
-        tmp_path / "again", RecordingSpec("B", STEPS, seed=3), episodes=EPISODES, shards=2, workers=2
-    )
+    reported = []
+    spec, how = RecordingSpec("B", STEPS, seed=3), {"episodes": EPISODES, "shards": 2, "workers": 2}
+    again = record_dataset(tmp_path / "again", spec, **how, progress=lambda *state: reported.append(state))
+    assert reported == [(done, EPISODES) for done in range(1, EPISODES + 1)]
     for file in sorted(recorded.iterdir()):
         assert file.read_bytes() == (again / file.name).read_bytes()
 
@@ -112,21 +113,12 @@ def test_every_episode_of_a_random_set_has_its_own_world() -> None:
     assert np.ptp(walls, axis=0).max() > 20
 
 
-def test_progress_is_reported_after_every_episode(tmp_path: Path) -> None:
-    reported: list[tuple[int, int]] = []
-    record_dataset(
-        tmp_path / "random", RecordingSpec("random", 2), episodes=2, progress=lambda *state: reported.append(state)
-    )
-    assert reported == [(1, 2), (2, 2)]
-
-
 def test_impossible_numbers_and_unknown_domains_are_refused_before_anything_is_written(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="at least 1 episode"):
-        record_dataset(tmp_path / "x", RecordingSpec("A"), episodes=0)
-    with pytest.raises(InputError, match="seed -1"):
-        record_dataset(tmp_path / "x", RecordingSpec("A", seed=-1), episodes=1)
-    with pytest.raises(InputError, match="shards 0"):
-        record_dataset(tmp_path / "x", RecordingSpec("A"), episodes=1, shards=0)
-    with pytest.raises(InputError, match="one of A, B, or random"):
-        record_dataset(tmp_path / "x", RecordingSpec("Z"), episodes=1)
+    for spec, episodes, wrong in (
+        (RecordingSpec("A"), 0, "at least 1 episode"),
+        (RecordingSpec("A", seed=-1), 1, "seed -1"),
+        (RecordingSpec("Z"), 1, "one of A, B, or random"),
+    ):
+        with pytest.raises(InputError, match=wrong):
+            record_dataset(tmp_path / "x", spec, episodes=episodes)
     assert not (tmp_path / "x").exists()

@@ -15,8 +15,7 @@ pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.rlds.source import RldsSource
-from vjepa2_ac.simulation.recording.demonstration import default_steps
-from vjepa2_ac.simulation.recording.record import RecordingSpec, record_episode
+from vjepa2_ac.simulation.recording.record import RecordingSpec, default_steps, record_episode
 from vjepa2_ac.simulation.recording.scripted_play import play
 
 
@@ -92,12 +91,3 @@ def test_play_of_place_goes_down_to_the_block_and_uses_the_gripper() -> None:
     told = motion.commanded_gripper - motion.gripper  # at the first control step of each model step
     assert (np.abs(told[::4]) > 0.4).any()
     assert motion.poses[:, 2].min() < BLOCK_M / 2 + GRASP_M + 0.02  # at the height of a grasp
-
-
-def test_the_command_records_a_task(tmp_path: Path) -> None:
-    words = ["simulate", "record", str(tmp_path / "data"), "--task", "push", "--episodes", "2", "--steps", "5"]
-    assert main(words) == 0
-    source = RldsSource(DataConfig(path=str(tmp_path / "data")))
-    assert [info.num_steps for info in source.infos()] == [5, 5]
-    frame = source.read(0).read_frames([0])[0].astype(int)
-    assert (frame[..., 1] > 1.8 * np.maximum(frame[..., 0], frame[..., 2])).sum() > 20  # the green block

@@ -1,8 +1,7 @@
 """A recorded data set says how it was simulated; what it says gives its episodes again."""
 
 import json
-import shutil
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +14,14 @@ from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B, CameraPlace, 
 
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 
-from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset, record_episode
-from vjepa2_ac.simulation.recording.simulation_file import (
+from vjepa2_ac.simulation.recording.record import (
     SIMULATION_FILE,
-    other_versions,
+    RecordedSimulation,
+    RecordingSpec,
+    episode_folder,
     read_simulation,
-    simulation_text,
+    record_dataset,
+    record_episode,
 )
 from vjepa2_ac.simulation.world.motion import MotionRecipe
 
@@ -34,8 +35,7 @@ SPECS = [
 
 
 def written(folder: Path, spec: RecordingSpec, **changes: Any) -> Path:
-    values = json.loads(simulation_text(spec, 2)) | changes
-    (folder / SIMULATION_FILE).write_text(json.dumps(values))
+    (folder / SIMULATION_FILE).write_text(json.dumps(asdict(RecordedSimulation.of(spec, 2)) | changes))
     return folder
 
 
@@ -44,7 +44,7 @@ def test_the_spec_that_is_read_is_the_one_that_was_recorded(tmp_path: Path, spec
     read = read_simulation(written(tmp_path, spec))
     assert read.spec == replace(spec, domain=spec.worlds, recipe=spec.recipe or MotionRecipe())
     assert read.episodes == 2
-    assert other_versions(read) == ""
+    assert read.other_versions == ""
 
 
 @pytest.fixture(scope="module")
@@ -58,23 +58,6 @@ def test_the_file_gives_the_recorded_episodes_again(recorded: Path) -> None:
     assert sorted(numbers) == [0, 1, 2]
     again = record_episode(numbers[1], simulation.spec)
     assert f"{again.recording_folderpath}--{again.file_path}" == source.infos()[1].id
-    assert simulation.world_of(source.infos()[0].id) != simulation.world_of(source.infos()[1].id)
-
-
-def test_the_index_and_its_key_do_not_depend_on_the_file(
-    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    caches = []
-    for name in ("with", "without"):
-        shutil.copytree(recorded, tmp_path / "data")
-        if name == "without":
-            (tmp_path / "data" / SIMULATION_FILE).unlink()
-        monkeypatch.setenv("VJEPA2_AC_CACHE", str(tmp_path / name))
-        infos = RldsSource(DataConfig(path=str(tmp_path / "data"))).infos()
-        caches.append((sorted(path.name for path in (tmp_path / name).rglob("*") if path.is_file()), list(infos)))
-        shutil.rmtree(tmp_path / "data")
-    assert caches[0] == caches[1]
-    assert caches[0][0]
 
 
 def test_a_folder_without_the_file_is_refused(tmp_path: Path) -> None:
@@ -96,8 +79,6 @@ def test_episodes_of_others_are_refused(tmp_path: Path) -> None:
 
 
 def record_name(spec: RecordingSpec, index: int) -> str:
-    from vjepa2_ac.simulation.recording.record import episode_folder
-
     return f"{episode_folder(index, spec.seed, str(spec.domain))}/trajectory.h5"
 
 
@@ -105,10 +86,8 @@ def record_name(spec: RecordingSpec, index: int) -> str:
     ("changes", "message"),
     [
         ({"steps": 0}, "steps: .*greater than or equal to 2"),
-        ({"steps": "5"}, "steps: .*valid integer"),
-        ({"robot": 1}, "robot: unknown"),
-        ({"ranges": {}}, "2 of the keys domain and ranges"),
-        ({"domain": None}, "0 of the keys"),
+        ({"ranges": {}}, "not one of the keys domain and ranges"),
+        ({"domain": None}, "not one of the keys domain and ranges"),
         ({"task": "stack"}, "task: "),
     ],
 )
@@ -119,5 +98,6 @@ def test_a_damaged_file_is_refused(tmp_path: Path, changes: dict[str, Any], mess
 
 def test_what_has_another_version_here_is_named(tmp_path: Path) -> None:
     folder = written(tmp_path, RecordingSpec("A", 5), version="0.0.1", libraries={"mujoco": "2.0"})
-    assert other_versions(read_simulation(folder)).startswith("vjepa2-ac 0.0.1, here ")
-    assert "mujoco 2.0, here " in other_versions(read_simulation(folder))
+    versions = read_simulation(folder).other_versions
+    assert versions.startswith("vjepa2-ac 0.0.1, here ")
+    assert "mujoco 2.0, here " in versions

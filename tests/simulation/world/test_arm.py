@@ -1,21 +1,32 @@
 """Camera images show the arm at its pose, in the domain's colours."""
 
 import sys
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from vjepa2_ac.errors import InputError
+from projections import hand_pixel
+from vjepa2_ac.errors import InputError, UnreachableError
 from vjepa2_ac.geometry import matrices_from_euler
 from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B, Domain, DomainRanges, named_domain, sample_domain
-from vjepa2_ac.simulation.world.motion import HOME, LOW, forward_kinematics, rest_joints
+from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ, HIGH, HOME, LOW, forward_kinematics, rest_joints
 
 mujoco = pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 
 from vjepa2_ac.simulation.world.arm import SimulatedArm  # noqa: E402
 from vjepa2_ac.simulation.world.camera import View  # noqa: E402
-from vjepa2_ac.simulation.world.scene import compile_scene, load_mujoco  # noqa: E402
+from vjepa2_ac.simulation.world.scene import (  # noqa: E402
+    BLOCK_M,
+    FINGER_HALF_M,
+    FINGER_INSIDE_M,
+    FINGER_OUTSIDE_M,
+    FINGER_TRAVEL_M,
+    FINGERTIP_M,
+    MARK_M,
+    SUBSTEPS,
+    compile_scene,
+    load_mujoco,
+)
 
 REACHES = HOME + np.array([[0] * 7, [0.4, 0.3, 0.0, 0.4, 0.1, 0.2, 0.5], [-0.6, 0.2, 0.3, -0.2, 0.0, -0.3, 0.0]])
 
@@ -25,17 +36,9 @@ def arm() -> SimulatedArm:
     return SimulatedArm(DOMAIN_A)
 
 
-def hand_pixel(arm: SimulatedArm) -> tuple[int, int]:
-    """Project the middle of the hand into the image by the extrinsics and the state that the arm reports."""
-    camera, pose = arm.extrinsics(), arm.state
-    middle = pose[:3] + 0.035 * matrices_from_euler(pose[3:6])[:, 2]
-    x, y, z = matrices_from_euler(camera[3:]).T @ (middle - camera[:3])
-    focal = 90.0 / np.tan(np.deg2rad(arm.domain.camera.vertical_fov_deg) / 2)
-    return int(160.0 + focal * x / z), int(90.0 + focal * y / z)
-
-
 def test_the_scene_and_the_arithmetic_agree_on_where_the_flange_is() -> None:
     model = compile_scene(DOMAIN_A)
+    np.testing.assert_array_equal(model.jnt_range[:7].T, [LOW, HIGH])
     data = mujoco.MjData(model)
     for joints in np.random.default_rng(0).uniform(LOW, -LOW, size=(10, 7)):
         data.qpos[:7] = joints
@@ -45,6 +48,20 @@ def test_the_scene_and_the_arithmetic_agree_on_where_the_flange_is() -> None:
         np.testing.assert_allclose(data.site("flange").xmat.reshape(3, 3), matrices_from_euler(pose[3:]), atol=1e-6)
 
 
+def test_the_scene_has_the_sizes_that_tasks_and_oracles_count_with() -> None:
+    model = compile_scene(DOMAIN_A, block=True, mark=True)
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    finger = model.body("finger1").geomadr[0]
+    middle, half = model.geom_pos[finger], model.geom_size[finger]
+    np.testing.assert_allclose([middle[1] - half[1], middle[1] + half[1]], [FINGER_INSIDE_M, FINGER_OUTSIDE_M])
+    np.testing.assert_allclose([half[0], middle[2] + half[2]], [FINGER_HALF_M, FINGERTIP_M])
+    np.testing.assert_array_equal(model.joint("finger1").range, [0.0, FINGER_TRAVEL_M])
+    np.testing.assert_array_equal(model.geom("block").size, [BLOCK_M / 2] * 3)
+    assert model.geom("mark").size[0] == MARK_M
+    assert model.opt.timestep * SUBSTEPS == pytest.approx(1 / CONTROL_RATE_HZ, rel=1e-12)
+
+
 @pytest.mark.parametrize("domain", [DOMAIN_A, DOMAIN_B], ids=["A", "B"])
 def test_the_hand_is_in_the_image_where_the_reported_poses_say(domain: Domain) -> None:
     arm = SimulatedArm(domain)
@@ -52,20 +69,12 @@ def test_the_hand_is_in_the_image_where_the_reported_poses_say(domain: Domain) -
     for joints in REACHES:
         arm.set_joints(joints + rest_joints(domain) - HOME, 0.0)
         image = arm.image().astype(int)
-        column, row = hand_pixel(arm)
+        column, row = hand_pixel(arm, arm.state).astype(int)
         red, _, blue = image[row, column]
         assert red > 2 * blue  # the hand's colour, which nothing else has
         images.append(image)
     changed = (np.abs(images[0] - images[1]) > 40).any(axis=-1).mean()
     assert 0.03 < changed < 0.6
-
-
-def test_the_arm_is_large_in_the_image(arm: SimulatedArm) -> None:
-    arm.set_joints(HOME, 0.0)
-    image = arm.image()[:, 38:281].astype(int)  # what the model sees of it
-    white, orange = image.min(axis=-1) > 130, image[..., 0] > 2 * image[..., 2]
-    assert (white | orange).mean() > 0.08
-    assert orange.mean() > 0.01
 
 
 def test_leaving_out_rays_that_pass_the_arm_by_changes_no_pixel(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -77,28 +86,6 @@ def test_leaving_out_rays_that_pass_the_arm_by_changes_no_pixel(monkeypatch: pyt
             seen = sparing.image()
             patch.setattr(View, "near_arm", lambda view, *_: np.arange(len(view.rays)))
             np.testing.assert_array_equal(seen, thorough.image())
-
-
-def test_closing_the_gripper_is_seen(arm: SimulatedArm) -> None:
-    arm.set_joints(HOME, 0.0)
-    opened = arm.image()
-    arm.set_joints(HOME, 1.0)
-    assert (opened != arm.image()).any()
-
-
-def test_another_look_gives_another_image_of_the_same_arm() -> None:
-    other = SimulatedArm(replace(DOMAIN_A, look=DOMAIN_B.look))
-    first = SimulatedArm(DOMAIN_A)
-    np.testing.assert_array_equal(first.state, other.state)
-    assert (np.abs(first.image().astype(int) - other.image()).max(axis=-1) > 20).mean() > 0.5
-
-
-def test_the_three_cameras_see_different_things(arm: SimulatedArm) -> None:
-    images = [arm.image(name) for name in ("exterior_1", "exterior_2", "wrist")]
-    assert not (images[0] == images[1]).all()
-    assert not (images[1] == images[2]).all()
-    with pytest.raises(ValueError, match="no camera"):
-        arm.image("elbow")
 
 
 def test_the_wrist_camera_moves_with_the_arm(arm: SimulatedArm) -> None:
@@ -128,14 +115,10 @@ def test_a_commanded_state_is_approached_and_reached() -> None:
     np.testing.assert_allclose(last[:3], target[:3], atol=1e-4)
     assert abs(last[6] - 1.0) < 1e-3
     np.testing.assert_array_equal(last, arm.state)
-
-
-def test_a_state_that_is_set_is_the_state_that_is_measured() -> None:
-    arm = SimulatedArm(DOMAIN_A)
-    state = np.array([0.5, 0.1, 0.3, np.pi, 0.0, -0.6, 0.5])
-    arm.set_state(state)
-    np.testing.assert_allclose(arm.state[:3], state[:3], atol=1e-4)
-    assert arm.state[6] == 0.5
+    closed = arm.image()
+    arm.set_state(np.append(target[:6], 0.5))
+    np.testing.assert_allclose(arm.state[[0, 1, 2, 6]], [*target[:3], 0.5], atol=1e-4)
+    assert (closed != arm.image()).any(), "the gripper is seen"
 
 
 def test_sampled_domains_stay_in_their_ranges_and_differ() -> None:
@@ -161,5 +144,5 @@ def test_an_unknown_domain_is_refused_by_name() -> None:
 
 def test_missing_mujoco_is_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(InputError, match=r"pip install .*\[sim\]"):
+    with pytest.raises(UnreachableError, match=r"MuJoCo.*\[sim\]"):
         load_mujoco()

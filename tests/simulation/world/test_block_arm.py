@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from projections import pixel_of
 from vjepa2_ac.geometry import matrices_from_euler
 from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, HOLDING
-from vjepa2_ac.simulation.world.camera import exterior_pose, pixels_of
 from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B, Domain
 from vjepa2_ac.simulation.world.motion import downward_poses, poses_in_base
 from vjepa2_ac.simulation.world.scene import BLOCK_M, FINGERTIP_M
@@ -51,7 +51,7 @@ def test_where_nothing_is_in_the_way_the_arm_follows_as_without_contacts(domain:
 
 def test_a_block_is_where_it_was_put_in_the_frame_of_the_base(arm: ContactArm) -> None:
     block = np.array([0.4, 0.2, 0.25, 0.3])
-    arm.place_block(block)
+    arm.place(block, None)
     np.testing.assert_allclose(arm.block, block, atol=1e-9)
     in_world = DOMAIN_B.base_pose()[:3, :3] @ block[:3]
     np.testing.assert_allclose(arm._data.body("block").xpos, in_world, atol=1e-9)
@@ -62,7 +62,7 @@ def test_a_block_is_where_it_was_put_in_the_frame_of_the_base(arm: ContactArm) -
 
 def test_a_hand_that_goes_through_a_block_pushes_it_ahead(arm: ContactArm) -> None:
     arm.set_state(state_over(DOMAIN_B, 0.42, 0.0, 0.17, 1.0))
-    arm.place_block(block_at(DOMAIN_B, 0.50, 0.0))
+    arm.place(block_at(DOMAIN_B, 0.50, 0.0), None)
     before = arm.block
     for step in range(1, 5):
         state = arm.command(state_over(DOMAIN_B, 0.42 + 0.035 * step, 0.0, 0.17, 1.0), 4)
@@ -82,7 +82,7 @@ def test_the_table_stops_the_fingers(arm: ContactArm) -> None:
 
 def test_a_grasped_block_is_lifted_held_and_let_go(arm: ContactArm) -> None:
     arm.set_state(state_over(DOMAIN_B, 0.48, 0.05, BLOCK_M / 2 + GRASP_M))
-    arm.place_block(block_at(DOMAIN_B, 0.48, 0.05))
+    arm.place(block_at(DOMAIN_B, 0.48, 0.05), None)
     closed = arm.command(moved(arm.state, 0.0, 0.0, 0.0, closedness=0.9), 8)
     assert closed[6] == pytest.approx(HOLDING, abs=0.06)  # measured where the block stops it
     for _ in range(3):
@@ -96,13 +96,10 @@ def test_a_grasped_block_is_lifted_held_and_let_go(arm: ContactArm) -> None:
 
 
 def test_the_camera_sees_the_block_where_it_is_now(arm: ContactArm) -> None:
-    camera = arm.extrinsics()
-    focal = 90.0 / np.tan(np.deg2rad(DOMAIN_B.camera.vertical_fov_deg) / 2)
     for y in (-0.15, 0.05):
-        arm.place_block(block_at(DOMAIN_B, 0.55, y))
+        arm.place(block_at(DOMAIN_B, 0.55, y), None)
         image = arm.image().astype(int)
-        x, down, far = matrices_from_euler(camera[3:]).T @ (arm.block[:3] - camera[:3])
-        row, column = int(90 + focal * down / far), int(160 + focal * x / far)
+        column, row = pixel_of(arm, arm.block[:3]).astype(int)
         red, green, blue = image[row, column]
         assert green > 1.8 * max(red, blue)
         is_green = image[..., 1] > 1.8 * np.maximum(image[..., 0], image[..., 2])
@@ -116,27 +113,22 @@ def test_a_placed_arm_is_at_rest_whatever_it_did_before(arm: ContactArm) -> None
     for first in (0.05, -0.05):
         arm.command(moved(arm.state, first, 0.0, 0.0, closedness=1.0), 2)
         arm.set_joints(arm.joints * 0 + [0.0, -0.4, 0.0, -2.4, 0.0, 2.0, 0.8], 0.2)
-        arm.place_block(block_at(DOMAIN_B, 0.5, 0.2))
+        arm.place(block_at(DOMAIN_B, 0.5, 0.2), None)
         found.append(arm.command_joints(arm.joints, 0.2, 4))
         arm.command(moved(arm.state, 0.02, 0.0, 0.0), 2)
     np.testing.assert_array_equal(found[0], found[1])
     assert found[0][6] == pytest.approx(0.2, abs=1e-3)
 
 
-def test_only_tasks_with_a_block_have_one() -> None:
-    reaching = arm_for("reach", DOMAIN_A)
-    assert reaching.block is None
-    with pytest.raises(ValueError, match="no block to be put"):
-        reaching.place_block(np.zeros(4))
-    assert all(arm_for(task, DOMAIN_A).block is not None for task in ("push", "pick", "place"))
-
-
-def test_only_place_has_a_mark_and_it_has_to_be_put_somewhere() -> None:
+def test_only_tasks_with_a_block_have_one_and_only_place_has_a_mark_which_has_to_be_put_somewhere() -> None:
     for task in ("reach", "push", "pick"):
         other = arm_for(task, DOMAIN_A, size=(18, 32))
         assert other.mark is None
-        with pytest.raises(ValueError, match="no mark to be put"):
+        assert (other.block is None) == (task == "reach")
+        with pytest.raises(ValueError, match="mark"):
             put(other, other.state, None, np.array([0.5, 0.0]))
+    with pytest.raises(ValueError, match="neither a block nor a mark"):
+        put(arm_for("reach", DOMAIN_A), other.state, np.zeros(4))
     marked = arm_for("place", DOMAIN_A, size=(18, 32))
     with pytest.raises(ValueError, match=r"give problem\.mark"):
         put(marked, marked.state, None)
@@ -154,12 +146,10 @@ def test_a_mark_is_seen_where_it_was_put_and_nothing_touches_it(arm: ContactArm)
     np.testing.assert_allclose(found[:5], found[5:], atol=1e-9)
     assert max(seen[2] for seen in found) > BLOCK_M
     place = block_at(DOMAIN_B, 0.45, 0.15)[:2]
-    marked.place_mark(place)
+    marked.place(None, place)
     np.testing.assert_allclose(marked.mark, place, atol=1e-12)
     marked.command(moved(marked.state, 0.0, 0.0, 0.1), 8)
     seen = marked.image().astype(int)
     rows, columns = np.nonzero(np.minimum(seen[..., 1], seen[..., 2]) > 2.5 * seen[..., 0])
     assert len(rows) > 100
-    at = DOMAIN_B.base_pose()[:3, :3] @ np.append(place, 0.0)
-    expected = pixels_of(at[None], exterior_pose(DOMAIN_B), DOMAIN_B, seen.shape[:2])[0]
-    np.testing.assert_allclose([columns.mean(), rows.mean()], expected, atol=2.0)
+    np.testing.assert_allclose([columns.mean(), rows.mean()], pixel_of(marked, np.append(place, 0.0)), atol=2.0)

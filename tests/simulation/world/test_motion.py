@@ -11,7 +11,6 @@ from vjepa2_ac.simulation.world.motion import (
     HOME,
     LOW,
     MotionRecipe,
-    follow,
     forward_kinematics,
     random_reaching,
     rest_joints,
@@ -53,24 +52,11 @@ def test_measurements_lag_behind_the_commands() -> None:
     np.testing.assert_allclose(np.diff(motion.joints, axis=0), ways, atol=1e-12)
 
 
-def test_a_command_that_holds_is_reached() -> None:
-    measured = follow(np.concatenate([np.zeros((1, 1)), np.ones((40, 1))]), 0.5)
-    assert measured[0] == 0.0
-    assert measured[1] == 0.5
-    assert abs(measured[-1] - 1.0) < 1e-9
-
-
 def test_the_gripper_opens_and_closes() -> None:
     motion = random_reaching(DOMAIN_A, 200, np.random.default_rng(2))
     assert set(motion.commanded_gripper) == {0.0, 1.0}
     assert ((motion.gripper >= 0.0) & (motion.gripper <= 1.0)).all()
     assert ((motion.gripper > 0.1) & (motion.gripper < 0.9)).any()
-
-
-def test_another_look_leaves_the_motion_as_it_was() -> None:
-    other = replace(DOMAIN_A, look=DOMAIN_B.look, camera=DOMAIN_B.camera)
-    first, second = (random_reaching(domain, 9, np.random.default_rng(3)) for domain in (DOMAIN_A, other))
-    np.testing.assert_array_equal(first.joints, second.joints)
 
 
 def test_a_turned_arm_rests_over_the_same_spot() -> None:

@@ -20,7 +20,7 @@ from vjepa2_ac.spaces import POSE
 
 if TYPE_CHECKING:  # of other rooms, which the figure of one need not load
     from vjepa2_ac.calibration.axes import AxisFit
-    from vjepa2_ac.decoding.imagined_plan import ImaginedPlan
+    from vjepa2_ac.decoding.imagine import ImaginedPlan
     from vjepa2_ac.demonstrations.make_goals import EnergyCourse, MadeGoals
     from vjepa2_ac.planning.energy import EnergySlice
     from vjepa2_ac.planning.goals import SubGoal

@@ -1,11 +1,11 @@
-"""Policies of the simulated robot: a planner, and its references: doing nothing, random actions and an oracle."""
+"""Policies of the simulated robot: a planner, and its references: zero actions, random actions and an oracle."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from enum import Enum
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -13,13 +13,15 @@ from jaxtyping import Float, UInt8
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.data.transforms import frame_of_seen
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
-from vjepa2_ac.decoding.imagined_plan import imagined_next
+from vjepa2_ac.decoding.imagine import imagined_next
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, RELEASED, TaskName, TaskProblem
-from vjepa2_ac.simulation.world.arm import SimulatedArm
+from vjepa2_ac.simulation.world.arm import SimulatedArm, State
 
 GoalsOf = Callable[[TaskProblem], Sequence[SubGoal]]
+Image = UInt8[np.ndarray, "height width 3"]
+Block = Float[np.ndarray, " 4"]  # as in `TaskProblem`
 
 _ALMOST = 1 - 1e-9  # of a limit: rounding must not exceed it
 
@@ -31,7 +33,6 @@ class Moves(Enum):
     JOINTS = 8
 
 
-@runtime_checkable
 class Policy(Protocol):
     """Chooses the action of the next model step (legend of actions: episode.py; of joints, radians and closedness)."""
 
@@ -39,70 +40,38 @@ class Policy(Protocol):
     why: str  # reason of the last action, short enough to be counted
     moves: Moves  # what its states and actions are: poses of the flange, or joint angles and gripper
 
-    def reset(self, problem: TaskProblem, goal_image: UInt8[np.ndarray, "height width 3"]) -> None:
+    def reset(self, problem: TaskProblem, goal_image: Image) -> None:
         """Begin an episode. Only an oracle uses more of the problem than the images."""
 
-    def act(
-        self, image: UInt8[np.ndarray, "height width 3"], state: Float[np.ndarray, " dim"]
-    ) -> Float[np.ndarray, " dim"]:
+    def act(self, image: Image, state: Float[np.ndarray, " dim"]) -> Float[np.ndarray, " dim"]:
         """Return the action of the next model step from the camera image and the measured state, in base frame."""
 
 
-@runtime_checkable
-class Imagines(Protocol):
-    """A policy that can show what it expected of its last action."""
-
-    def imagined(self) -> UInt8[np.ndarray, "height width 3"] | None:
-        """Return the next camera image as it was imagined when the last action was chosen; None: nothing was."""
-
-
-class Reference:
-    """Base of the references, which look at no image: does not move the arm, unless a `_way` does.
+class ZeroActions:
+    """Does not move the arm. Base of the references, which look at no image.
 
     Args:
-        limits: The allowed actions; None: they do not matter.
+        limits: The allowed actions.
     """
 
-    name, why, moves = "oracle", "scripted", Moves.FLANGE
+    name, why, moves = "do nothing", "nothing", Moves.FLANGE
 
     def __init__(self, limits: LimitsConfig | None = None) -> None:
         self._limits = limits or LimitsConfig()
-        self._begun: TaskProblem | None = None
 
-    def reset(self, problem: TaskProblem, goal_image: UInt8[np.ndarray, "height width 3"]) -> None:  # noqa: ARG002
-        """Set the goal."""
-        self._begun = problem
+    def reset(self, problem: TaskProblem, goal_image: Image) -> None:
+        """Begin an episode."""
 
-    def act(
-        self,
-        image: UInt8[np.ndarray, "height width 3"],  # noqa: ARG002 - of the protocol
-        state: Float[np.ndarray, " 7"],
-    ) -> Float[np.ndarray, " 7"]:
-        """Return the next action, within the limits.
-
-        Raises:
-            ValueError: There is no problem yet.
-        """
+    def act(self, image: Image, state: State) -> State:  # noqa: ARG002 - of the protocol
+        """Return the next action, within the limits."""
         return shortened(self._way(state), self._limits)
 
-    @property
-    def _problem(self) -> TaskProblem:
-        if self._begun is None:
-            raise ValueError("no problem: call reset first")
-        return self._begun
-
-    def _way(self, state: Float[np.ndarray, " 7"]) -> Float[np.ndarray, " 7"]:
+    def _way(self, state: State) -> State:
         """Return the action before it is shortened."""
         return np.zeros_like(state)
 
 
-class DoNothing(Reference):
-    """Does not move the arm."""
-
-    name, why = "do nothing", "nothing"
-
-
-class RandomActions(Reference):
+class RandomActions(ZeroActions):
     """Draws actions uniformly from the allowed ones; the same problem gets the same actions.
 
     Args:
@@ -116,21 +85,36 @@ class RandomActions(Reference):
         super().__init__(limits)
         self._seed, self._rng = seed, np.random.default_rng(seed)
 
-    def reset(self, problem: TaskProblem, goal_image: UInt8[np.ndarray, "height width 3"]) -> None:  # noqa: ARG002
+    def reset(self, problem: TaskProblem, goal_image: Image) -> None:  # noqa: ARG002
         """Seed the generator for this problem."""
         self._rng = np.random.default_rng([self._seed, problem.index])
 
-    def _way(self, state: Float[np.ndarray, " 7"]) -> Float[np.ndarray, " 7"]:
+    def _way(self, state: State) -> State:
         return np.asarray(self._rng.uniform(-1.0, 1.0, size=len(state)) * farthest(self._limits))
 
 
-class Oracle(Reference):
-    """Knows the goal state, moves straight to it as fast as allowed. Does not rotate (`reach` needs no rotation)."""
+class Oracle(ZeroActions):
+    """Knows the goal state and observes the block, and does the task as fast as allowed. Does not rotate.
 
-    def _way(self, state: Float[np.ndarray, " 7"]) -> Float[np.ndarray, " 7"]:
-        way: np.ndarray = self._problem.goal - state
-        way[3:6] = 0.0
-        return way
+    Args:
+        limits: The allowed actions.
+        arm: The arm whose block is observed; None: the task is `reach`, which has none.
+    """
+
+    name, why = "oracle", "scripted"
+
+    def __init__(self, limits: LimitsConfig, arm: SimulatedArm | None = None) -> None:
+        super().__init__(limits)
+        self._arm = arm
+
+    def reset(self, problem: TaskProblem, goal_image: Image) -> None:  # noqa: ARG002
+        """Set the goal."""
+        self._problem = problem
+
+    def _way(self, state: State) -> State:
+        way = _WAYS.get(self._problem.task)
+        block = None if self._arm is None else self._arm.block
+        return _reach_way(self._problem, state) if way is None or block is None else way(self._problem, state, block)
 
 
 class Planning:
@@ -156,7 +140,7 @@ class Planning:
         self._size = (0, 0)  # of the last image
         self.moves = Moves.FLANGE if controller.spaces.state.position is not None else Moves.JOINTS
 
-    def reset(self, problem: TaskProblem, goal_image: UInt8[np.ndarray, "height width 3"]) -> None:
+    def reset(self, problem: TaskProblem, goal_image: Image) -> None:
         """Give the planner the goal image, or the goals on the way."""
         if self._goals_of is None:
             self.controller.reset(goal_image)
@@ -164,16 +148,14 @@ class Planning:
         goals, has_gripper = self._goals_of(problem), self.controller.spaces.state.is_pose
         self.controller.follow(goals if has_gripper else [replace(goal, gripper=None) for goal in goals])
 
-    def act(
-        self, image: UInt8[np.ndarray, "height width 3"], state: Float[np.ndarray, " dim"]
-    ) -> Float[np.ndarray, " dim"]:
+    def act(self, image: Image, state: Float[np.ndarray, " dim"]) -> Float[np.ndarray, " dim"]:
         """Return the first action of a plan; for joints as a change, whatever the model was taught."""
         action = self.controller.act(image, state)
         self._size = image.shape[0], image.shape[1]
         self.why = self.controller.decision.why if self.controller.decision else ""
         return action - state if self.controller.spaces.action.follows == "target" else action
 
-    def imagined(self) -> UInt8[np.ndarray, "height width 3"] | None:
+    def imagined(self) -> Image | None:
         """Return the next camera image as it was imagined with the last action; white where the model sees nothing.
 
         None: there is no decoder, or nothing was imagined, for example since the goal is reached.
@@ -214,92 +196,77 @@ _CARRY_M, _LIFTED_M = 0.08, 0.03  # height over the table of a carried block, an
 _TO_MARK_M = 0.03  # a block that is closer to the mark's middle goes down
 
 
-class _BlockOracle(Reference):
-    """Base of the oracles with a block, which they observe.
-
-    Args:
-        limits: The allowed actions.
-        arm: The arm whose block is observed.
-    """
-
-    def __init__(self, limits: LimitsConfig, arm: SimulatedArm) -> None:
-        super().__init__(limits)
-        self._arm = arm
+def _reach_way(problem: TaskProblem, state: State) -> State:
+    """Straight to the goal."""
+    way: np.ndarray = problem.goal - state
+    way[3:6] = 0.0
+    return way
 
 
-class PushOracle(_BlockOracle):
-    """Pushes the block along the line to its goal: forwards, straight behind the block. Does not rotate."""
-
-    def _way(self, state: Float[np.ndarray, " 7"]) -> Float[np.ndarray, " 7"]:
-        goal, end = _block(self._problem.block_goal)[:2], self._problem.goal
-        direction = goal - _block(self._problem.block_start)[:2]
-        direction = direction / np.linalg.norm(direction)
-        block, way = _block(self._arm.block)[:2], np.zeros_like(state)
-        if (goal - block) @ direction < _NEAR_M:  # the rest is too short, or it slid past
-            return way
-        to_block = block - state[:2]
-        beside = to_block - direction * (to_block @ direction)
-        ahead = direction * ((end[:2] - state[:2]) @ direction)
-        way[:2], way[2], way[6] = ahead + beside, end[2] - state[2], 1.0 - state[6]
-        way[:3] *= min(1.0, _PUSH_M / float(np.linalg.norm(way[:3])))
+def _push_way(problem: TaskProblem, state: State, block: Block) -> State:
+    """Push the block along the line to its goal: forwards, straight behind the block."""
+    goal, way = problem.ends[1, :2], np.zeros_like(state)
+    direction = goal - problem.ends[0, :2]
+    direction = direction / np.linalg.norm(direction)
+    if (goal - block[:2]) @ direction < _NEAR_M:  # the rest is too short, or it slid past
         return way
+    to_block = block[:2] - state[:2]
+    beside = to_block - direction * (to_block @ direction)
+    ahead = direction * ((problem.goal[:2] - state[:2]) @ direction)
+    way[:2], way[2], way[6] = ahead + beside, problem.goal[2] - state[2], 1.0 - state[6]
+    way[:3] *= min(1.0, _PUSH_M / float(np.linalg.norm(way[:3])))
+    return way
 
 
-class PickOracle(_BlockOracle):
-    """Moves over the block, down, closes, and lifts. Does not rotate."""
+def _pick_way(problem: TaskProblem, state: State, block: Block) -> State:
+    """Move over the block, down, close, and lift."""
+    if not _holds(state, block):
+        return _grasp_way(state, block)
+    way = np.zeros_like(state)
+    way[:3], way[6] = problem.goal[:3] - state[:3], 1.0 - state[6]  # lift, and keep closing
+    return way
 
-    def _way(self, state: Float[np.ndarray, " 7"]) -> Float[np.ndarray, " 7"]:
-        if not self._holds(state):
-            return self._grasp(state)
-        way = np.zeros_like(state)
-        way[:3], way[6] = self._problem.goal[:3] - state[:3], 1.0 - state[6]  # lift, and keep closing
+
+def _place_way(problem: TaskProblem, state: State, block: Block) -> State:
+    """Pick the block up, carry it over the mark, put it down, open, and move up."""
+    goal, way = problem.ends[1], np.zeros_like(state)
+    to_goal = goal[:3] - block[:3]
+    if np.linalg.norm(to_goal[:2]) < _PLACED_M and -to_goal[2] < _LOW_M:
+        way[6] = -state[6]
+        if state[6] < RELEASED:
+            way[:3] = problem.goal[:3] - state[:3]
         return way
-
-    def _holds(self, state: Float[np.ndarray, " 7"]) -> bool:
-        return bool(np.linalg.norm(self._to_grasp(state)) < _OVER_M * 1.5 and state[6] > RELEASED)
-
-    def _to_grasp(self, state: Float[np.ndarray, " 7"]) -> Float[np.ndarray, " 3"]:
-        return np.asarray(_block(self._arm.block)[:3] + np.array([0.0, 0.0, GRASP_M]) - state[:3])
-
-    def _grasp(self, state: Float[np.ndarray, " 7"]) -> Float[np.ndarray, " 7"]:
-        """Return the way over the block, down, and closing."""
-        way, to_place = np.zeros_like(state), self._to_grasp(state)
-        if np.linalg.norm(to_place) < _OVER_M:
-            way[6] = 1.0 - state[6]
-        else:
-            way[:3], way[6] = to_place, -state[6]
-            if np.linalg.norm(to_place[:2]) > _OVER_M:
-                way[2] = max(way[2], min(0.0, way[2] + _CLEAR_M))  # not down on the block's edge
-        return way
+    if not _holds(state, block):
+        return _grasp_way(state, block)
+    way[:3], way[6] = to_goal, 1.0 - state[6]
+    if np.linalg.norm(to_goal[:2]) > _TO_MARK_M:
+        way[2] += _CARRY_M
+        way[:2] *= float(block[2] - goal[2] > _LIFTED_M)  # first up
+    return way
 
 
-class PlaceOracle(PickOracle):
-    """Picks the block up, carries it over the mark, puts it down, opens, and moves up. Does not rotate."""
-
-    def _way(self, state: Float[np.ndarray, " 7"]) -> Float[np.ndarray, " 7"]:
-        block, goal = _block(self._arm.block)[:3], _block(self._problem.block_goal)[:3]
-        to_goal, way = goal - block, np.zeros_like(state)
-        if np.linalg.norm(to_goal[:2]) < _PLACED_M and -to_goal[2] < _LOW_M:
-            way[6] = -state[6]
-            if state[6] < RELEASED:
-                way[:3] = self._problem.goal[:3] - state[:3]
-            return way
-        if not self._holds(state):
-            return self._grasp(state)
-        way[:3], way[6] = to_goal, 1.0 - state[6]
-        if np.linalg.norm(to_goal[:2]) > _TO_MARK_M:
-            way[2] += _CARRY_M
-            way[:2] *= float(block[2] - goal[2] > _LIFTED_M)  # first up
-        return way
+_WAYS: dict[TaskName, Callable[[TaskProblem, np.ndarray, np.ndarray], np.ndarray]] = {
+    "push": _push_way,
+    "pick": _pick_way,
+    "place": _place_way,
+}
 
 
-def oracle_for(task: TaskName, limits: LimitsConfig, arm: SimulatedArm) -> Policy:
-    """Return the oracle of a task, for an arm from `arm_for`."""
-    kinds: dict[TaskName, type[_BlockOracle]] = {"push": PushOracle, "pick": PickOracle, "place": PlaceOracle}
-    return kinds[task](limits, arm) if task in kinds else Oracle(limits)
+def _to_grasp(state: State, block: Block) -> Float[np.ndarray, " 3"]:
+    return np.asarray(block[:3] + np.array([0.0, 0.0, GRASP_M]) - state[:3])
 
 
-def _block(block: Float[np.ndarray, " 4"] | None) -> Float[np.ndarray, " 4"]:
-    if block is None:
-        raise ValueError("no block to push, pick or place")
-    return block
+def _holds(state: State, block: Block) -> bool:
+    return bool(np.linalg.norm(_to_grasp(state, block)) < _OVER_M * 1.5 and state[6] > RELEASED)
+
+
+def _grasp_way(state: State, block: Block) -> State:
+    """Move over the block, down, and close."""
+    way, to_place = np.zeros_like(state), _to_grasp(state, block)
+    if np.linalg.norm(to_place) < _OVER_M:
+        way[6] = 1.0 - state[6]
+    else:
+        way[:3], way[6] = to_place, -state[6]
+        if np.linalg.norm(to_place[:2]) > _OVER_M:
+            way[2] = max(way[2], min(0.0, way[2] + _CLEAR_M))  # not down on the block's edge
+    return way

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -15,11 +15,11 @@ from jaxtyping import Bool, Float, Int, UInt8
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.geometry import apply_action
 from vjepa2_ac.intervals import Estimate, mean_of, share_of
-from vjepa2_ac.simulation.closed_loop.policies import Imagines, Moves, Policy
+from vjepa2_ac.simulation.closed_loop.policies import Moves, Planning, Policy
 from vjepa2_ac.simulation.closed_loop.tasks import STEPS, TaskName, TaskProblem, arm_for, make_problem
 from vjepa2_ac.simulation.world.arm import SimulatedArm
 from vjepa2_ac.simulation.world.domains import Domain, named_domain
-from vjepa2_ac.simulation.world.motion import HIGH, LOW, OutOfReachError, rest_joints
+from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ, HIGH, LOW, OutOfReachError, rest_joints
 
 
 @dataclass(frozen=True)
@@ -59,15 +59,48 @@ class EpisodeResult:
 
 
 @dataclass(frozen=True)
+class RolloutSpec:
+    """Problems of a task, and how long a policy may take for each."""
+
+    task: TaskName = "reach"
+    domain: str | Domain = "A"  # A, B, or a domain
+    episodes: int = 50  # number of problems, from number 0 on
+    seed: int = 0  # of the problems; settings that were chosen on one seed have to be reported on another
+    steps: int | None = None  # model steps of an episode; None: the task's default
+    stride: int = 4  # control steps of a model step (15 per second)
+    films: int = 0  # number of episodes, the first ones, whose frames are stored for a video
+
+    @property
+    def world(self) -> Domain:
+        """The domain.
+
+        Raises:
+            InputError: There is none of this name.
+        """
+        return named_domain(self.domain) if isinstance(self.domain, str) else self.domain
+
+    @property
+    def model_steps(self) -> int:
+        """Model steps of an episode."""
+        return self.steps or STEPS[self.task]
+
+    @property
+    def seconds_per_step(self) -> float:
+        """Length of a model step."""
+        return self.stride / CONTROL_RATE_HZ
+
+    @property
+    def problems(self) -> Iterator[TaskProblem]:
+        """The problems: the same for every policy, so that metrics can be paired."""
+        return (make_problem(self.task, self.world, self.seed, index) for index in range(self.episodes))
+
+
+@dataclass(frozen=True)
 class ClosedLoopResult:
     """A policy's episodes of a task; arrays hold one row per episode, estimates have 95 % intervals over episodes."""
 
-    task: TaskName
-    domain: str
+    spec: RolloutSpec
     policy: str
-    seed: int
-    steps: int  # model steps of an episode
-    stride: int  # control steps of a model step
     episodes: tuple[EpisodeResult, ...]
 
     @property
@@ -128,23 +161,10 @@ class ClosedLoopResult:
 _PARTS = 8  # of a displacement that cannot be completed
 
 
-@dataclass(frozen=True)
-class RolloutSpec:
-    """Problems of a task, and how long a policy may take for each."""
-
-    task: TaskName
-    domain: str | Domain  # A, B, or a domain
-    episodes: int = 50  # number of problems, from number 0 on
-    seed: int = 0  # of the problems; settings that were chosen on one seed have to be reported on another
-    steps: int | None = None  # model steps of an episode; None: the task's default
-    stride: int = 4  # control steps of a model step (15 per second)
-    keep_frames: int = 0  # number of episodes, the first ones, whose frames are stored for a video
-
-
 def run_task(
     spec: RolloutSpec, policy: Policy, arm: SimulatedArm | None = None, progress: Progress = no_progress
 ) -> ClosedLoopResult:
-    """Let a policy do a task repeatedly. Every policy gets the same problems, so metrics can be paired by row.
+    """Let a policy do a task repeatedly.
 
     Args:
         spec: The problems.
@@ -153,29 +173,25 @@ def run_task(
         progress: Called with the number of finished episodes.
 
     Raises:
-        InputError: MuJoCo is not installed, or no such domain.
-        ValueError: No episodes, or an action that is no action.
+        InputError: No such domain.
+        UnreachableError: MuJoCo is not installed.
+        ValueError: An action that is no action.
     """
-    domain = named_domain(spec.domain) if isinstance(spec.domain, str) else spec.domain
-    if spec.episodes < 1:
-        raise ValueError(f"{spec.episodes} episodes")
-    arm, steps = arm or arm_for(spec.task, domain), spec.steps or STEPS[spec.task]
-    done: list[EpisodeResult] = []
-    for index in range(spec.episodes):
-        problem = make_problem(spec.task, domain, spec.seed, index)
-        kept = index < spec.keep_frames
-        done.append(run_episode(arm, policy, problem, steps=steps, stride=spec.stride, keep_frames=kept))
-        progress(index + 1, spec.episodes)
-    return ClosedLoopResult(spec.task, domain.name, policy.name, spec.seed, steps, spec.stride, tuple(done))
+    arm, done = arm or arm_for(spec.task, spec.world), list[EpisodeResult]()
+    for problem in spec.problems:
+        is_filmed = problem.index < spec.films
+        done.append(run_episode(arm, policy, problem, spec.model_steps, spec.stride, keep_frames=is_filmed))
+        progress(len(done), spec.episodes)
+    return ClosedLoopResult(spec, policy.name, tuple(done))
 
 
 def run_episode(
     arm: SimulatedArm,
     policy: Policy,
     problem: TaskProblem,
-    *,
     steps: int = 8,
     stride: int = 4,
+    *,
     keep_frames: bool = False,
 ) -> EpisodeResult:
     """Let a policy solve a problem, and return the record.
@@ -192,10 +208,8 @@ def run_episode(
 
     Raises:
         OutOfReachError: The problem's own start or goal cannot be reached.
-        ValueError: No steps, an action that is not 7 finite numbers, or a block to be moved but an arm without one.
+        ValueError: An action that is not 7 finite numbers, or a block to be moved but an arm without one.
     """
-    if min(steps, stride) < 1:
-        raise ValueError(f"{steps} model steps of {stride} control steps")
     goal_image = put(arm, problem.goal, problem.block_goal, problem.mark).image()
     put(arm, problem.start, problem.block_start, problem.mark)
     policy.reset(problem, goal_image)
@@ -208,7 +222,7 @@ def run_episode(
         seconds.append(time.perf_counter() - began)
         actions.append(_checked(action, policy))
         whys.append(policy.why)
-        if keep_frames and isinstance(policy, Imagines):
+        if keep_frames and isinstance(policy, Planning):
             imagined.append(policy.imagined())
         unreachable += not (send_action if policy.moves == Moves.FLANGE else _send_joints)(arm, action, stride)
         states.append(arm.state)
@@ -245,10 +259,7 @@ def put(
         raise ValueError("no place for the mark on the table: give problem.mark")
     arm.set_joints(rest_joints(arm.domain), 0.0)
     arm.set_state(state)
-    if block is not None:
-        arm.place_block(block)
-    if mark is not None:
-        arm.place_mark(mark)
+    arm.place(block, mark)
     return arm
 
 

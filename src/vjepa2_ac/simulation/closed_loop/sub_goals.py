@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -18,10 +18,11 @@ from vjepa2_ac.demonstrations.key_frames import (
 )
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.goals import SubGoal
-from vjepa2_ac.simulation.closed_loop.policies import oracle_for
+from vjepa2_ac.simulation.closed_loop.policies import Oracle
 from vjepa2_ac.simulation.closed_loop.rollout import run_episode
 from vjepa2_ac.simulation.closed_loop.tasks import STEPS, TaskName, TaskProblem, arm_for
 from vjepa2_ac.simulation.world.arm import SimulatedArm
+from vjepa2_ac.simulation.world.camera import FRAME_SIZE
 from vjepa2_ac.simulation.world.domains import Domain
 
 _SMALL = (18, 32)  # height and width of images that nobody looks at
@@ -55,19 +56,28 @@ def every_step(spec: DemonstrationSpec) -> DemonstrationSpec:
 class DemonstratedGoals:
     """Makes the sub-goals of each problem of a task from one demonstration of it, in an arm of its own.
 
+    They are the key frames of the demonstration: where the gripper changes, the arm stops, and the end. With `every` in
+    the spec, also frames on the way to them.
+
     Args:
         task: The task.
-        domain: Its world, the same as of the arm that is steered.
+        domain: Its world, the same as of the arm that the model moves.
         spec: How it is demonstrated.
+        size: Height and width of the images.
 
     Raises:
-        InputError: MuJoCo is not installed, or OpenGL does not work here.
+        UnreachableError: MuJoCo is not installed.
     """
 
-    def __init__(self, task: TaskName, domain: Domain, spec: DemonstrationSpec | None = None) -> None:
+    def __init__(
+        self,
+        task: TaskName,
+        domain: Domain,
+        spec: DemonstrationSpec | None = None,
+        size: tuple[int, int] = FRAME_SIZE,
+    ) -> None:
         self.spec = spec or DemonstrationSpec()
-        self._arm = arm_for(task, domain)
-        self._unseen = arm_for(task, domain, size=_SMALL)
+        self._arm, self._unseen = (arm_for(task, domain, size=one) for one in (size, _SMALL))
 
     def __call__(self, problem: TaskProblem) -> tuple[SubGoal, ...]:
         """Return the goals of a problem.
@@ -75,7 +85,12 @@ class DemonstratedGoals:
         Raises:
             InputError: As `demonstrate`.
         """
-        return goals_of_demonstration(problem, self._arm, self.spec)
+        shown = demonstrate(problem, self._arm, self.spec)
+        keys = gripper_key_frames(shown.states, OF_MODEL_STEPS)
+        if self.spec.every is not None:
+            keys = with_frames_between(keys, self.spec.every)
+        images = [shown.frames[key.frame] for key in keys]
+        return sub_goals_of(images, keys, Timing(1, self.spec.slack, self.spec.share), shown.states)
 
     def require(self, problems: Iterable[TaskProblem]) -> None:
         """Refuse problems of which one cannot be demonstrated, before any of them is worked on.
@@ -98,10 +113,9 @@ def demonstrate(problem: TaskProblem, arm: SimulatedArm, spec: DemonstrationSpec
     Raises:
         InputError: It does not succeed within these limits and steps.
     """
-    free = {"gripper_mode": "free", "gripper": LimitsConfig().gripper}
-    oracle = oracle_for(problem.task, spec.limits.model_copy(update=free), arm)
+    limits = spec.limits.model_copy(update={"gripper_mode": "free", "gripper": LimitsConfig().gripper})
     steps = spec.steps or STEPS[problem.task]
-    shown = run_episode(arm, oracle, problem, steps=steps, stride=spec.stride, keep_frames=True)
+    shown = run_episode(arm, Oracle(limits, arm), problem, steps, spec.stride, keep_frames=True)
     if not shown.success or shown.frames is None:
         raise InputError(
             where=f"demonstration of problem {problem.index} ({problem.task})",
@@ -110,27 +124,3 @@ def demonstrate(problem: TaskProblem, arm: SimulatedArm, spec: DemonstrationSpec
             fix="Allow it longer steps along each axis (planning.limits.xyz, planning.limits.ball), or more of them",
         )
     return Demonstration(shown.frames, shown.states)
-
-
-def goals_of_demonstration(
-    problem: TaskProblem, arm: SimulatedArm, spec: DemonstrationSpec | None = None
-) -> tuple[SubGoal, ...]:
-    """Return the key frames of one demonstration of a problem: where the gripper changes, the arm stops, and the end.
-
-    With `every` in the spec, also frames on the way to them.
-
-    Args:
-        problem: The problem.
-        arm: As of `demonstrate`: never the one that is about to be steered.
-        spec: How it is demonstrated.
-
-    Raises:
-        InputError: As `demonstrate`.
-    """
-    spec = spec or DemonstrationSpec()
-    shown = demonstrate(problem, arm, spec)
-    keys = gripper_key_frames(shown.states, OF_MODEL_STEPS)
-    if spec.every is not None:
-        keys = with_frames_between(keys, spec.every)
-    images: Sequence[np.ndarray] = [shown.frames[key.frame] for key in keys]
-    return sub_goals_of(images, keys, Timing(1, spec.slack, spec.share), shown.states)

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from vjepa2_ac.simulation.world.arm import ContactArm, MarkedArm, SimulatedArm
+from vjepa2_ac.simulation.world.arm import ContactArm, SimulatedArm
 from vjepa2_ac.simulation.world.camera import FRAME_SIZE
 from vjepa2_ac.simulation.world.domains import Domain
 from vjepa2_ac.simulation.world.motion import MotionRecipe, downward_poses, poses_in_base
@@ -43,14 +43,11 @@ STEPS: dict[TaskName, int] = {"reach": 8, "push": 8, "pick": 12, "place": 18}
 REACH_WAY_M, PUSH_WAY_M, LIFT_M, PLACE_WAY_M = (0.12, 0.25), (0.10, 0.16), (0.10, 0.14), (0.10, 0.20)
 """Distance between start and goal: of the flange (reach), of the block (push, place), of the block upwards (pick)."""
 
-GRASP_M = FINGERTIP_M - 0.02
-"""Height of the flange over the middle of a block that is to be grasped."""
+GRASP_M = FINGERTIP_M - 0.02  # height of the flange over the middle of a block that is to be grasped
 
-HOLDING = 1.0 - (BLOCK_M / 2 - FINGER_INSIDE_M) / FINGER_TRAVEL_M
-"""Closedness of a gripper that holds the block."""
+HOLDING = 1.0 - (BLOCK_M / 2 - FINGER_INSIDE_M) / FINGER_TRAVEL_M  # closedness of a gripper that holds the block
 
-RELEASED = HOLDING - 0.1
-"""A gripper that is less closed than this holds no block: 4 mm are left on each side."""
+RELEASED = HOLDING - 0.1  # A gripper that is less closed than this holds no block: 4 mm are left on each side
 
 _FLANGE_AREA = np.array([[0.32, -0.26], [0.62, 0.26]])  # low and high (x, y) in the world
 _BLOCK_AREA = np.array([[0.36, -0.26], [0.64, 0.26]])
@@ -73,6 +70,17 @@ class TaskProblem:
     goal: Float[np.ndarray, " 7"]  # of the arm in the goal image
     block_start: Float[np.ndarray, " 4"] | None = None  # None: there is no block
     block_goal: Float[np.ndarray, " 4"] | None = None
+
+    @property
+    def ends(self) -> Float[np.ndarray, "2 4"]:
+        """Start and goal of the block.
+
+        Raises:
+            ValueError: There is none.
+        """
+        if self.block_start is None or self.block_goal is None:
+            raise ValueError(f"{self.task} is done without a block")
+        return np.stack([self.block_start, self.block_goal])
 
     @property
     def mark(self) -> Float[np.ndarray, " 2"] | None:
@@ -120,14 +128,10 @@ def make_problem(task: TaskName, domain: Domain, seed: int, index: int) -> TaskP
         domain: Determines only the frame of the problem.
         seed: Of the problems.
         index: Of the problem.
-
-    Raises:
-        ValueError: No such task, or a negative seed or index.
     """
-    if task not in _DRAWN:
-        raise ValueError(f"no task {task!r}: {', '.join(_DRAWN)}")
     drawn = _DRAWN[task](np.random.default_rng([seed, index, list(_DRAWN).index(task)]))
-    first, last = _states(drawn, domain)
+    poses = poses_in_base(downward_poses(_with(drawn.flange, drawn.turn)), domain)
+    first, last = np.concatenate([poses, np.array(drawn.closedness)[:, None]], axis=1)
     if drawn.blocks is None:
         return TaskProblem(task, index, first, last)
     turns = drawn.blocks[:, 3:] - np.deg2rad(domain.base_yaw_deg)
@@ -211,17 +215,10 @@ def _with(places: Float[np.ndarray, "places dim"], value: float) -> Float[np.nda
     return np.concatenate([places, np.full((len(places), 1), value)], axis=1)
 
 
-def _states(drawn: _Drawn, domain: Domain) -> Float[np.ndarray, "2 7"]:
-    """Return start and goal of the arm in the base frame: pointing down, rotated about z."""
-    poses = poses_in_base(downward_poses(_with(drawn.flange, drawn.turn)), domain)
-    return np.concatenate([poses, np.array(drawn.closedness)[:, None]], axis=1)
-
-
 def arm_for(task: TaskName, domain: Domain, *, size: tuple[int, int] = FRAME_SIZE) -> SimulatedArm:
     """Return an arm for a task: `reach` needs no contacts, `place` a mark on the table.
 
     Raises:
-        InputError: MuJoCo is not installed, or OpenGL does not work here.
+        UnreachableError: MuJoCo is not installed.
     """
-    kinds: dict[TaskName, type[SimulatedArm]] = {"reach": SimulatedArm, "place": MarkedArm}
-    return kinds.get(task, ContactArm)(domain, size=size)
+    return SimulatedArm(domain, size=size) if task == "reach" else ContactArm(domain, size=size, mark=task == "place")

@@ -1,18 +1,25 @@
-"""Recording of a simulated data set: demonstrations, filmed, written as RLDS in DROID's schema."""
+"""Recording of a simulated data set: demonstrations, filmed, written as RLDS in DROID's schema; and `simulation.json`.
+
+The latter has everything that determines the episodes, so that each can be simulated again.
+"""
 
 from __future__ import annotations
 
-import itertools
 import multiprocessing
+import re
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float
+from pydantic import Field
 
+from vjepa2_ac import storage
 from vjepa2_ac.data.sources.rlds.droid_writer import (
     CAMERAS,
     DroidCommands,
@@ -23,13 +30,121 @@ from vjepa2_ac.data.sources.rlds.droid_writer import (
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.jpeg import encode_jpeg
-from vjepa2_ac.simulation.recording.demonstration import INSTRUCTIONS, RecordingSpec, arm_of, carry_out, episode_folder
-from vjepa2_ac.simulation.recording.simulation_file import SIMULATION_FILE, simulation_text
+from vjepa2_ac.simulation.closed_loop.tasks import arm_for
 from vjepa2_ac.simulation.world.arm import SimulatedArm
-from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ, Motion
+from vjepa2_ac.simulation.world.domains import Domain, DomainRanges, named_domain, sample_domain
+from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ, Motion, MotionRecipe, random_reaching
 from vjepa2_ac.simulation.world.scene import load_mujoco
+from vjepa2_ac.storage.structured import json_text, read_json_object, record_of
 
-__all__ = ["RecordingSpec", "episode_folder", "record_dataset", "record_episode"]
+RecordedTask = Literal["push", "pick", "place"]
+
+INSTRUCTIONS: dict[RecordedTask | None, str] = {
+    None: "reach around over the table",
+    "push": "push the block",
+    "pick": "pick up the block",
+    "place": "put the block on the mark",
+}
+"""Language instruction of an episode; None: random reaching, without a block."""
+
+
+def default_steps(task: RecordedTask | None) -> int:
+    """Return the control steps of an episode, enough for its task: the script of `place` releases the block late."""
+    return 81 if task == "place" else 41
+
+
+SUCCESS_SHARE = 0.9
+
+_MOTION, _WORLD, _SUCCESS = range(3)  # random streams of an episode
+
+
+@dataclass(frozen=True)
+class RecordingSpec:
+    """What an episode of a simulated data set is."""
+
+    domain: str | Domain | DomainRanges  # or its name; ranges, or `random`: another world in every episode
+    steps: int = 41  # control steps (15 per second); see `default_steps`
+    seed: int = 0  # determines motion, outcome and worlds
+    cameras: Literal[1, 3] = 1  # 1: the three images of a step are the same one; 3: one image per camera
+    recipe: MotionRecipe | None = None  # ranges of the motion, without a task
+    task: RecordedTask | None = None  # with a block: half of the episodes by script, half at random
+
+    @property
+    def worlds(self) -> Domain | DomainRanges:
+        """The world of all episodes, or the ranges to draw each one's from.
+
+        Raises:
+            InputError: No domain has this name.
+        """
+        if not isinstance(self.domain, str):
+            return self.domain
+        return DomainRanges() if self.domain == "random" else named_domain(self.domain)
+
+
+def world_of(index: int, spec: RecordingSpec) -> Domain:
+    """Return the world of an episode.
+
+    Raises:
+        InputError: No domain has this name.
+    """
+    worlds = spec.worlds
+    return worlds if isinstance(worlds, Domain) else sample_domain(_stream(index, spec, _WORLD), worlds)
+
+
+def arm_of(index: int, spec: RecordingSpec) -> SimulatedArm:
+    """Return an arm in the world of an episode; with a task it has contacts.
+
+    Raises:
+        InputError: An unknown domain.
+        UnreachableError: MuJoCo is not installed.
+    """
+    return arm_for(spec.task or "reach", world_of(index, spec))
+
+
+def carry_out(
+    arm: SimulatedArm,
+    index: int,
+    spec: RecordingSpec,
+    *,
+    until: int | None = None,
+    look: Callable[[SimulatedArm], None] | None = None,
+) -> Motion:
+    """Carry out an episode, and return its motion.
+
+    Args:
+        arm: From `arm_of`; its pose does not matter.
+        index: Number of the episode.
+        spec: What an episode is.
+        until: Control step at which arm and block are left, as they were when it was measured; None: after the last.
+        look: Called at every control step, at the time of its measurements.
+    """
+    rng = _stream(index, spec, _MOTION)
+    if spec.task is not None:  # contacts depend on all that happened before
+        from vjepa2_ac.simulation.recording.scripted_play import play  # imports torch
+
+        return play(arm, spec.task, spec.steps if until is None else until, rng, script=index % 2 == 0, look=look)
+    motion = random_reaching(arm.domain, spec.steps, rng, spec.recipe)
+    measured = slice(None if until is None else until + 1)
+    for joints, closedness in zip(motion.joints[measured], motion.gripper[measured], strict=True):
+        arm.set_joints(joints, float(closedness))
+        if look:
+            look(arm)
+    return motion
+
+
+def episode_folder(index: int, seed: int, domain_name: str) -> str:
+    """Return the source folder stored in the episode; as in DROID, the only record of success or failure."""
+    succeeded = np.random.default_rng([seed, index, _SUCCESS]).uniform() < SUCCESS_SHARE
+    minute, hour, day = index % 60, index // 60 % 24, 1 + index // 1440 % 28
+    place = f"{domain_name}_seed{seed}_{hour:02d}h{minute:02d}_{index:06d}"
+    return f"/simulated/SIM/{'success' if succeeded else 'failure'}/2026-01-{day:02d}/{place}"
+
+
+def _stream(index: int, spec: RecordingSpec, purpose: int) -> np.random.Generator:
+    return np.random.default_rng([spec.seed, index, purpose])
+
+
+# ---- the data set ----
 
 JPEG_QUALITY = 85  # some 11 KB an image, as in DROID
 _SIMULATED_CAMERAS = dict(zip(CAMERAS, ("exterior_1", "exterior_2", "wrist"), strict=True))
@@ -57,8 +172,8 @@ def record_dataset(
         progress: Called with (episodes done, episodes in total).
 
     Raises:
-        InputError: MuJoCo or OpenGL is missing, an unknown domain, a number out of range, or a folder that is in use or
-            cannot be written.
+        InputError: An unknown domain, a number out of range, or a folder that is in use or cannot be written.
+        UnreachableError: MuJoCo is not installed.
     """
     load_mujoco()
     if min(episodes, spec.steps - 1, workers, 1 if shards is None else shards, spec.seed + 1) < 1:
@@ -74,7 +189,7 @@ def record_dataset(
             yield episode
             progress(done, episodes)
 
-    notes = {SIMULATION_FILE: simulation_text(spec, episodes)}
+    notes = {SIMULATION_FILE: json_text(asdict(RecordedSimulation.of(spec, episodes)))}
     return write_droid_rlds(folder, watched(), shards=shards or -(-episodes // 32), notes=notes)
 
 
@@ -82,11 +197,17 @@ def record_episode(index: int, spec: RecordingSpec) -> DroidEpisode:
     """Return one episode: a pure function of its arguments.
 
     Raises:
-        InputError: MuJoCo or OpenGL is missing, or an unknown domain.
+        InputError: An unknown domain.
+        UnreachableError: MuJoCo is not installed.
     """
     arm = arm_of(index, spec)
-    images: dict[str, list[bytes]] = {}
-    motion = carry_out(arm, index, spec, look=partial(_take, films=images, cameras=spec.cameras))
+    images: dict[str, list[bytes]] = {feature: [] for feature in CAMERAS[: spec.cameras]}
+
+    def take(arm: SimulatedArm) -> None:
+        for feature, taken in images.items():
+            taken.append(encode_jpeg(arm.image(_SIMULATED_CAMERAS[feature]), quality=JPEG_QUALITY))
+
+    motion = carry_out(arm, index, spec, look=take)
     folder = episode_folder(index, spec.seed, arm.domain.name)
     return DroidEpisode(
         file_path=f"{folder}/trajectory.h5",
@@ -99,13 +220,6 @@ def record_episode(index: int, spec: RecordingSpec) -> DroidEpisode:
         images={feature: images.get(feature, images[CAMERAS[0]]) for feature in CAMERAS},
         language_instruction=INSTRUCTIONS[spec.task],
     )
-
-
-def _take(arm: SimulatedArm, films: dict[str, list[bytes]], cameras: int) -> None:
-    """Append the current camera images to the films."""
-    for feature in CAMERAS[:cameras]:
-        image = arm.image(_SIMULATED_CAMERAS[feature])
-        films.setdefault(feature, []).append(encode_jpeg(image, quality=JPEG_QUALITY))
 
 
 def _commands(motion: Motion) -> DroidCommands:
@@ -130,14 +244,101 @@ def _velocity(positions: Float[np.ndarray, "steps dim"]) -> Float[np.ndarray, "s
 
 
 def _recorded(record: Callable[[int], DroidEpisode], episodes: int, workers: int) -> Iterator[DroidEpisode]:
-    """Yield the episodes in order; a few are recorded in parallel."""
+    """Yield the episodes in order; in parallel, if so many processes are wanted."""
     if workers == 1:
         yield from map(record, range(episodes))
         return
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, mp_context=context) as pool:
-        indices = iter(range(episodes))
-        waiting = [pool.submit(record, index) for index in itertools.islice(indices, 3 * workers)]
-        while waiting:
-            yield waiting.pop(0).result()
-            waiting += [pool.submit(record, index) for index in itertools.islice(indices, 1)]
+        yield from pool.map(record, range(episodes))
+
+
+# ---- simulation.json ----
+
+SIMULATION_FILE = "simulation.json"
+
+_PROGRAM, _LIBRARIES = "vjepa2-ac", ("mujoco", "numpy", "scipy", "simplejpeg")  # other versions may change last digits
+_NEEDED = "what `vjepa2-ac simulate record` writes"
+_AGAIN = "Record it again: the same options give the same episodes"
+_NUMBER = re.compile(r"_(\d{6,})/")  # as `episode_folder` writes it
+
+
+@dataclass(frozen=True)
+class RecordedSimulation:
+    """Everything that determines the episodes of a data set; exactly one of domain and ranges is given."""
+
+    version: str  # of this program
+    libraries: dict[str, str]  # and of those that determine last digits
+    episodes: Annotated[int, Field(ge=1)]
+    steps: Annotated[int, Field(ge=2, le=1_000_000)]
+    seed: Annotated[int, Field(ge=0)]
+    cameras: Literal[1, 3]
+    recipe: MotionRecipe
+    task: RecordedTask | None
+    domain: Domain | None = None
+    ranges: DomainRanges | None = None
+
+    @classmethod
+    def of(cls, spec: RecordingSpec, episodes: int) -> RecordedSimulation:
+        """Return the record of a data set, worlds and recipe written out, whatever names and defaults mean later."""
+        worlds, recipe = spec.worlds, spec.recipe or MotionRecipe()
+        domain, ranges = (worlds, None) if isinstance(worlds, Domain) else (None, worlds)
+        how = (spec.steps, spec.seed, spec.cameras, recipe, spec.task, domain, ranges)
+        return cls(version(_PROGRAM), {name: version(name) for name in _LIBRARIES}, episodes, *how)
+
+    @property
+    def spec(self) -> RecordingSpec:
+        """What an episode is."""
+        worlds = self.domain or self.ranges or DomainRanges()
+        return RecordingSpec(worlds, self.steps, self.seed, self.cameras, self.recipe, self.task)
+
+    @property
+    def other_versions(self) -> str:
+        """What has another version here than where it was recorded, such as "mujoco 3.5.0, here 3.6.0"."""
+        then = {**self.libraries, _PROGRAM: self.version}
+        here = {name: version(name) for name in (_PROGRAM, *_LIBRARIES)}
+        return "; ".join(f"{name} {then[name]}, here {now}" for name, now in here.items() if then.get(name, now) != now)
+
+    def number_of(self, episode_id: str) -> int:
+        """Return the number under which an episode was recorded, from its identity.
+
+        Raises:
+            InputError: It is no episode of this data set.
+        """
+        found = _NUMBER.search(episode_id)
+        number = int(found[1]) if found else self.episodes
+        name = "random" if self.domain is None else self.domain.name
+        if number < self.episodes and f"{episode_folder(number, self.seed, name)}/" in episode_id:
+            return number
+        raise InputError(
+            where=SIMULATION_FILE,
+            found=f"not the episode {episode_id!r}",
+            needed=f"one of the {self.episodes} simulated with seed {self.seed}",
+            fix="Episodes are told apart by the folder in their identity; keep data.fields.identity as it is",
+        )
+
+
+def read_simulation(folder: str | Path) -> RecordedSimulation:
+    """Read how a data set was simulated.
+
+    Args:
+        folder: Of the data set, on this machine or behind a URL.
+
+    Raises:
+        InputError: It was not simulated, or by an older version that did not write the file; or the file is damaged.
+        UnreachableError: The network fails.
+    """
+    where = storage.join(str(folder), SIMULATION_FILE)
+    try:
+        values = read_json_object(where, needed=_NEEDED, fix=_AGAIN)
+    except (FileNotFoundError, NotADirectoryError):
+        raise InputError(
+            where=where,
+            found="no such file: these are not simulated episodes, or an older version recorded them",
+            needed=_NEEDED,
+            fix=f"What happens under other actions can only be simulated. {_AGAIN}",
+        ) from None
+    simulation = record_of(RecordedSimulation, values, where=where, needed=_NEEDED, fix=_AGAIN)
+    if (simulation.domain is None) == (simulation.ranges is None):
+        raise InputError(where=where, found="not one of the keys domain and ranges", needed=_NEEDED, fix=_AGAIN)
+    return simulation

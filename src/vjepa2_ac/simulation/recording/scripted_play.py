@@ -15,7 +15,7 @@ from jaxtyping import Float
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.episode import ACTION_DIM
 from vjepa2_ac.geometry import apply_action
-from vjepa2_ac.simulation.closed_loop.policies import oracle_for, shortened
+from vjepa2_ac.simulation.closed_loop.policies import Oracle, shortened
 from vjepa2_ac.simulation.closed_loop.rollout import put, ways_along
 from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, TaskProblem, make_problem
 from vjepa2_ac.simulation.world.arm import SimulatedArm
@@ -49,37 +49,31 @@ def play(
         look: Called at every control step, at the time of its measurements.
 
     Raises:
-        InputError: MuJoCo or OpenGL is missing.
+        UnreachableError: MuJoCo is not installed.
     """
     recipe = MotionRecipe()
     problem = make_problem(task, arm.domain, int(rng.integers(2**31)), 0)
     limits = LimitsConfig(xyz=(recipe.reach_m,) * 3)
-    oracle = oracle_for(task, limits, arm)
+    oracle = Oracle(limits, arm)
     put(arm, problem.start, problem.block_start, problem.mark)
     unseen = np.zeros((1, 1, 3), dtype=np.uint8)
     oracle.reset(problem, unseen)
-    rows: list[tuple[np.ndarray, float, np.ndarray, float]] = []
+    motion = Motion(np.empty((steps, 7)), np.empty(steps), np.empty((steps, 7)), np.empty(steps))
     joints, grip = arm.joints, float(problem.start[6])
     for step in range(steps):
         if step % recipe.stride == 0:
             if script:
-                exact = oracle.act(unseen, arm.state)
                 noise = np.append(rng.normal(0.0, _NOISE_M, size=3), np.zeros(4))
-                action = shortened(exact + noise, limits)
+                action = shortened(oracle.act(unseen, arm.state) + noise, limits)
             else:
                 action = _play_action(arm, problem, limits, rng)
             joints, grip = _sent(arm, action)
-        rows.append((joints, grip, arm.joints, arm.closedness))
+        motion.commanded_joints[step], motion.commanded_gripper[step] = joints, grip
+        motion.joints[step], motion.gripper[step] = arm.joints, arm.closedness
         if look:
             look(arm)
         arm.command_joints(joints, grip)
-    commanded, commanded_grip, measured, measured_grip = zip(*rows, strict=True) if rows else ((), (), (), ())
-    return Motion(
-        np.reshape(commanded, (-1, 7)),
-        np.array(commanded_grip),
-        np.reshape(measured, (-1, 7)),
-        np.array(measured_grip),
-    )
+    return motion
 
 
 def _play_action(arm: SimulatedArm, problem: TaskProblem, limits: LimitsConfig, rng: np.random.Generator) -> np.ndarray:

@@ -9,25 +9,23 @@ from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
 from vjepa2_ac.geometry import euler_from_matrices
-from vjepa2_ac.simulation.world.camera import FRAME_SIZE, RayCamera, exterior_pose
+from vjepa2_ac.simulation.world.camera import FRAME_SIZE, RayCamera
 from vjepa2_ac.simulation.world.domains import Domain
 from vjepa2_ac.simulation.world.motion import (
     GRIPPER_LAG_S,
+    Joints,
     OutOfReachError,
     forward_kinematics,
     inverse_kinematics,
     rest_joints,
     tracking_share,
 )
-from vjepa2_ac.simulation.world.scene import (
-    FINGER_TRAVEL_M,
-    SUBSTEPS,
-    compile_contact_scene,
-    compile_scene,
-    load_mujoco,
-)
+from vjepa2_ac.simulation.world.scene import FINGER_TRAVEL_M, SUBSTEPS, compile_scene, load_mujoco
+
+State = Float[np.ndarray, " 7"]  # or an action; legend: episode.py
 
 WRIST_FOV_DEG = 70.0
+_EXTERIOR_TURNS_DEG = {"exterior_1": 0.0, "exterior_2": -100.0}  # of the cameras that stand still
 
 
 class SimulatedArm:
@@ -40,7 +38,7 @@ class SimulatedArm:
         size: Height and width of the images.
 
     Raises:
-        InputError: MuJoCo is not installed.
+        UnreachableError: MuJoCo is not installed.
     """
 
     def __init__(self, domain: Domain, *, size: tuple[int, int] = FRAME_SIZE) -> None:
@@ -49,16 +47,16 @@ class SimulatedArm:
         self._model = self._compiled(domain)
         self._data = self._mujoco.MjData(self._model)
         self._size = size
-        self._cameras: dict[str, Any] = {}
+        self._cameras: dict[str, RayCamera] = {}
         self.set_joints(rest_joints(domain), 0.0)
 
     @property
-    def joints(self) -> Float[np.ndarray, " 7"]:
+    def joints(self) -> Joints:
         """Measured joint angles in radians."""
         return np.array(self._data.qpos[:7])
 
     @property
-    def state(self) -> Float[np.ndarray, " 7"]:
+    def state(self) -> State:
         """Measured pose of the flange, and closedness of the gripper."""
         return np.append(forward_kinematics(self.joints), self.closedness)
 
@@ -72,35 +70,28 @@ class SimulatedArm:
         """Pose of the block, as in `TaskProblem`; None: there is none."""
         return None
 
-    def place_block(self, block: Float[np.ndarray, " 4"]) -> None:
-        """Put the block at a pose at once, at rest.
-
-        Raises:
-            ValueError: There is none.
-        """
-        raise ValueError(f"no block to be put at {block.tolist()}: this arm touches nothing")
-
     @property
     def mark(self) -> Float[np.ndarray, " 2"] | None:
         """Middle of the mark on the table, as in `TaskProblem`; None: there is none."""
         return None
 
-    def place_mark(self, mark: Float[np.ndarray, " 2"]) -> None:
-        """Put the mark at a place on the table.
+    def place(self, block: Float[np.ndarray, " 4"] | None, mark: Float[np.ndarray, " 2"] | None) -> None:
+        """Put the block (at a pose at once, at rest) and the mark on the table; None: it stays.
 
         Raises:
-            ValueError: There is none.
+            ValueError: One is to be put, and there is none.
         """
-        raise ValueError(f"no mark to be put at {mark.tolist()}: this arm has none on its table")
+        if block is not None or mark is not None:
+            raise ValueError("neither a block nor a mark can be put: this arm touches nothing")
 
-    def set_joints(self, joints: Float[np.ndarray, " 7"], closedness: float) -> None:
+    def set_joints(self, joints: Joints, closedness: float) -> None:
         """Put the arm at joint angles at once."""
         self._closedness = closedness
         self._data.qpos[:7] = joints
         self._data.qpos[7:9] = FINGER_TRAVEL_M * (1.0 - closedness)
         self._mujoco.mj_kinematics(self._model, self._data)
 
-    def joints_for(self, state: Float[np.ndarray, " 7"]) -> Float[np.ndarray, " 7"]:
+    def joints_for(self, state: State) -> Joints:
         """Return joint angles that bring the flange from here to a pose.
 
         Raises:
@@ -108,7 +99,7 @@ class SimulatedArm:
         """
         return inverse_kinematics(state[:6], self.joints, rest=rest_joints(self.domain))
 
-    def set_state(self, state: Float[np.ndarray, " 7"]) -> None:
+    def set_state(self, state: State) -> None:
         """Put the flange at a pose, at once.
 
         Raises:
@@ -116,7 +107,7 @@ class SimulatedArm:
         """
         self.set_joints(self.joints_for(state), float(state[6]))
 
-    def can_reach(self, state: Float[np.ndarray, " 7"]) -> bool:
+    def can_reach(self, state: State) -> bool:
         """Return whether a command to move the flange from here to this pose can be followed."""
         try:
             self.joints_for(state)
@@ -124,7 +115,7 @@ class SimulatedArm:
             return False
         return True
 
-    def command(self, target: Float[np.ndarray, " 7"], control_steps: int = 1) -> Float[np.ndarray, " 7"]:
+    def command(self, target: State, control_steps: int = 1) -> State:
         """Move the flange towards a state for some control steps and return the measured state.
 
         Raises:
@@ -132,9 +123,7 @@ class SimulatedArm:
         """
         return self.command_joints(self.joints_for(target), float(target[6]), control_steps)
 
-    def command_joints(
-        self, goal: Float[np.ndarray, " 7"], closedness: float, control_steps: int = 1
-    ) -> Float[np.ndarray, " 7"]:
+    def command_joints(self, goal: Joints, closedness: float, control_steps: int = 1) -> State:
         """Move joints (radians) and gripper towards a target for some control steps; return the measured state."""
         left = (1.0 - tracking_share(self.domain.lag_s)) ** control_steps
         grip_left = (1.0 - tracking_share(GRIPPER_LAG_S)) ** control_steps
@@ -143,11 +132,18 @@ class SimulatedArm:
         return self.state
 
     def image(self, camera: str = "exterior_1") -> UInt8[np.ndarray, "height width 3"]:
-        """Return the current image of `exterior_1`, `exterior_2` or `wrist`."""
-        eye = self._camera(camera)
-        if camera == "wrist":
-            eye.move(self._wrist_pose())
-        return np.asarray(eye.image(self._data))
+        """Return the current image of `exterior_1`, `exterior_2` or `wrist`.
+
+        Raises:
+            ValueError: No such camera.
+        """
+        pose = self._camera_pose(camera)
+        if camera not in self._cameras:
+            fov = WRIST_FOV_DEG if camera == "wrist" else self.domain.camera.vertical_fov_deg
+            self._cameras[camera] = RayCamera(self._model, self.domain, pose, fov, self._size)
+        elif camera == "wrist":
+            self._cameras[camera].move(pose)
+        return self._cameras[camera].image(self._data)
 
     def extrinsics(self, camera: str = "exterior_1") -> Float[np.ndarray, " 6"]:
         """Return the pose of a camera in the robot base frame: x right, y down, z into the image."""
@@ -157,24 +153,16 @@ class SimulatedArm:
     def _compiled(self, domain: Domain) -> Any:
         return compile_scene(domain)
 
-    def _camera(self, name: str) -> Any:
-        if name not in self._cameras:
-            fov = WRIST_FOV_DEG if name == "wrist" else self.domain.camera.vertical_fov_deg
-            self._cameras[name] = RayCamera(self._model, self.domain, self._camera_pose(name), fov, self._size)
-        return self._cameras[name]
-
-    def _camera_pose(self, name: str) -> Float[np.ndarray, "4 4"]:
-        if name == "wrist":
-            return self._wrist_pose()
-        return exterior_pose(self.domain, name)
-
-    def _wrist_pose(self) -> Float[np.ndarray, "4 4"]:
-        """Return the frame of a camera on the hand that looks past the fingers."""
+    def _camera_pose(self, camera: str) -> Float[np.ndarray, "4 4"]:
+        """Return the frame of a camera in the world; the one on the hand looks past the fingers."""
+        if camera in _EXTERIOR_TURNS_DEG:
+            return self.domain.camera.turned(_EXTERIOR_TURNS_DEG[camera]).pose()
+        if camera != "wrist":
+            raise ValueError(f"no camera {camera!r}: wrist, {', '.join(_EXTERIOR_TURNS_DEG)}")
         site = self._data.site("flange")
-        mount = np.eye(4)
+        mount, flange = np.eye(4), np.eye(4)
         mount[:3, :3] = Rotation.from_euler("ZX", [45.0, 12.0], degrees=True).as_matrix()
         mount[:3, 3] = mount[:3, :3] @ [0.0, -0.09, -0.02]
-        flange = np.eye(4)
         flange[:3, :3], flange[:3, 3] = site.xmat.reshape(3, 3), site.xpos
         return np.asarray(flange @ mount)
 
@@ -192,12 +180,12 @@ class ContactArm(SimulatedArm):
     Args:
         domain: Its world.
         size: Height and width of the images.
-
-    Raises:
-        InputError: MuJoCo is not installed.
+        mark: Whether a mark lies on the table: a flat disc that is seen, and touched by nothing.
     """
 
-    _has_mark = False
+    def __init__(self, domain: Domain, *, size: tuple[int, int] = FRAME_SIZE, mark: bool = False) -> None:
+        self._has_mark = mark
+        super().__init__(domain, size=size)
 
     @property
     def closedness(self) -> float:
@@ -211,15 +199,30 @@ class ContactArm(SimulatedArm):
         rotation = turn.T @ Rotation.from_quat(place[3:], scalar_first=True).as_matrix()
         return np.append(turn.T @ place[:3], np.arctan2(rotation[1, 0], rotation[0, 0]))
 
-    def place_block(self, block: Float[np.ndarray, " 4"]) -> None:
-        """Put the block at a pose at once, upright and at rest."""
-        turn = Rotation.from_matrix(self.domain.base_pose()[:3, :3])
-        rotation = turn * Rotation.from_euler("z", block[3])
-        self._data.qpos[_BLOCK] = [*turn.apply(block[:3]), *rotation.as_quat(scalar_first=True)]
-        self._data.qvel[9:] = 0.0
+    @property
+    def mark(self) -> Float[np.ndarray, " 2"] | None:
+        """Middle of the mark in the robot base frame, x and y in metres; None: there is none."""
+        return np.asarray(self._data.mocap_pos[0] @ self.domain.base_pose()[:3, :2]) if self._has_mark else None
+
+    def place(self, block: Float[np.ndarray, " 4"] | None, mark: Float[np.ndarray, " 2"] | None) -> None:
+        """Put the block, upright and at rest, and the mark at once; None: it stays.
+
+        Raises:
+            ValueError: A mark is to be put, and there is none.
+        """
+        base = self.domain.base_pose()[:3, :3]
+        if block is not None:
+            turn = Rotation.from_matrix(base)
+            rotation = turn * Rotation.from_euler("z", block[3])
+            self._data.qpos[_BLOCK] = [*turn.apply(block[:3]), *rotation.as_quat(scalar_first=True)]
+            self._data.qvel[9:] = 0.0
+        if mark is not None:
+            if not self._has_mark:
+                raise ValueError(f"no mark to be put at {mark.tolist()}: this arm has none on its table")
+            self._data.mocap_pos[0, :2] = base[:2, :2] @ mark
         self._mujoco.mj_kinematics(self._model, self._data)
 
-    def set_joints(self, joints: Float[np.ndarray, " 7"], closedness: float) -> None:
+    def set_joints(self, joints: Joints, closedness: float) -> None:
         """Put the arm at joint angles at once, at rest; it drops what it held."""
         super().set_joints(joints, closedness)
         self._data.qvel[_MOVED] = 0.0
@@ -227,9 +230,7 @@ class ContactArm(SimulatedArm):
         self._wanted = self._data.qpos[_MOVED].copy()
         self._grip = closedness
 
-    def command_joints(
-        self, goal: Float[np.ndarray, " 7"], closedness: float, control_steps: int = 1
-    ) -> Float[np.ndarray, " 7"]:
+    def command_joints(self, goal: Joints, closedness: float, control_steps: int = 1) -> State:
         """Move joints (radians) and gripper towards a target for some control steps; return the measured state."""
         if abs(closedness - self.closedness) > _GRIP_STAYS:
             self._grip = closedness
@@ -243,33 +244,8 @@ class ContactArm(SimulatedArm):
         return self.state
 
     def _compiled(self, domain: Domain) -> Any:
-        model = compile_contact_scene(domain, mark=self._has_mark)
+        model = compile_scene(domain, block=True, mark=self._has_mark)
         lags = np.array([domain.lag_s] * 7 + [GRIPPER_LAG_S] * 2)
         self._share = 1.0 - np.exp(-model.opt.timestep / lags)
         self._ahead = -model.actuator_biasprm[:, 2] / model.actuator_gainprm[:, 0] / model.opt.timestep
         return model
-
-
-class MarkedArm(ContactArm):
-    """An arm with contacts and a mark on its table: a flat disc that is seen, and touched by nothing.
-
-    Args:
-        domain: Its world.
-        size: Height and width of the images.
-
-    Raises:
-        InputError: MuJoCo is not installed.
-    """
-
-    _has_mark = True
-
-    @property
-    def mark(self) -> Float[np.ndarray, " 2"]:
-        """Middle of the mark in the robot base frame: x and y in metres."""
-        place = self.domain.base_pose()[:3, :3].T @ self._data.mocap_pos[0]
-        return np.asarray(place[:2])
-
-    def place_mark(self, mark: Float[np.ndarray, " 2"]) -> None:
-        """Put the mark at a place on the table at once."""
-        self._data.mocap_pos[0, :2] = self.domain.base_pose()[:2, :2] @ mark
-        self._mujoco.mj_kinematics(self._model, self._data)

@@ -1,4 +1,4 @@
-"""The camera: where it stands, which rays meet what, and the image that they make. No OpenGL is needed."""
+"""The camera: which rays meet what, and the image that they make. No OpenGL is needed."""
 
 from __future__ import annotations
 
@@ -8,73 +8,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from vjepa2_ac.geometry import matrices_from_euler
 from vjepa2_ac.simulation.world.domains import CameraPlace, Domain
-from vjepa2_ac.simulation.world.scene import ARM_GROUP, STATIC_GROUP, light_position, load_mujoco
+from vjepa2_ac.simulation.world.scene import ARM_GROUP, STATIC_GROUP, load_mujoco
 
-FRAME_SIZE = FRAME_HEIGHT, FRAME_WIDTH = 180, 320
-"""Size of DROID's images in RLDS."""
+FRAME_SIZE = FRAME_HEIGHT, FRAME_WIDTH = 180, 320  # size of DROID's images in RLDS
 
-SECOND_CAMERA_TURN_DEG = -100.0
-HAND_MIDDLE_M = 0.035
-"""Distance of the middle of the hand from the flange, towards the fingers."""
-FINGERS_MIDDLE_M = 0.11
-"""Distance of the middle of the fingers from the flange."""
-
-
-def exterior_pose(domain: Domain, camera: str = "exterior_1") -> Float[np.ndarray, "4 4"]:
-    """Return the frame of a fixed camera in the world: x right, y down, z into the image.
-
-    Raises:
-        ValueError: No such camera.
-    """
-    turns = {"exterior_1": 0.0, "exterior_2": SECOND_CAMERA_TURN_DEG}
-    if camera not in turns:
-        raise ValueError(f"no camera {camera!r} that stands still: exterior_1 or exterior_2")
-    return domain.camera.turned(turns[camera]).pose()
-
-
-def hand_pixels(
-    states: Float[np.ndarray, "time 7"],
-    domain: Domain,
-    camera: str = "exterior_1",
-    size: tuple[int, int] = FRAME_SIZE,
-    *,
-    along_m: float = HAND_MIDDLE_M,
-) -> Float[np.ndarray, "time 2"]:
-    """Return where the middle of the hand is in the image: x, y in pixels (legend: this file's docstring).
-
-    It may be outside of the image, or behind a part of the arm. NaN: behind the camera.
-
-    Args:
-        states: Measured, in the robot base frame.
-        domain: Their world.
-        camera: `exterior_1` or `exterior_2`; the wrist's camera is fixed to the hand.
-        size: Height and width of the image.
-        along_m: Distance of the point from the flange, towards the fingers.
-
-    Raises:
-        ValueError: No such camera.
-    """
-    hand = states[:, :3] + along_m * matrices_from_euler(states[:, 3:6])[:, :, 2]
-    return pixels_of(hand @ domain.base_pose()[:3, :3].T, exterior_pose(domain, camera), domain, size)
-
-
-def pixels_of(
-    points: Float[np.ndarray, "points 3"],
-    pose: Float[np.ndarray, "4 4"],
-    domain: Domain,
-    size: tuple[int, int] = FRAME_SIZE,
-) -> Float[np.ndarray, "points 2"]:
-    """Return where points of the world (metres) are in the image of a fixed camera at a pose; NaN: behind it."""
-    height, width = size
-    across, down, ahead = ((points - pose[:3, 3]) @ pose[:3, :3]).T
-    focal = height / 2 / np.tan(np.deg2rad(domain.camera.vertical_fov_deg) / 2)
-    depth = np.where(ahead > 0, ahead, np.nan)
-    return np.stack([width / 2 + focal * across / depth, height / 2 + focal * down / depth], axis=1)
-
+Pose = Float[np.ndarray, "4 4"]  # x right, y down, z into the image, in the world
+Point = Float[np.ndarray, " 3"]
+Spots = Float[np.ndarray, "spots 3"]
+Rays = Float[np.ndarray, "rays 3"]  # of length 1
 
 _SKIN_M = 6e-3  # a point does not shade itself
+_LAMP_M = 2.2  # distance of the lamp from the origin of the world
 _LAMP_CELLS = 160  # cells along each edge of the lamp's view
 _LAMP_HALF_VIEW = 1.6  # tangent of half its opening angle; the arm is always inside
 
@@ -88,18 +33,14 @@ class Hits(NamedTuple):
 
 
 class Caster:
-    """MuJoCo's ray casting on one group of geoms, and bounding spheres of the arm's geoms."""
+    """MuJoCo's ray casting on one group of geoms, and bounding spheres of the arm's geoms (indices and radii)."""
 
     def __init__(self, model: Any) -> None:
         self._mujoco, self._model = load_mujoco(), model
-        self._arm = np.flatnonzero(model.geom_group == ARM_GROUP)
-        self._radii = np.array(model.geom_rbound[self._arm])
+        self.arm = np.flatnonzero(model.geom_group == ARM_GROUP)
+        self.radii = np.array(model.geom_rbound[self.arm])
 
-    def arm_spheres(self, data: Any) -> tuple[Float[np.ndarray, "geoms 3"], Float[np.ndarray, " geoms"]]:
-        """Return centre and radius of a sphere around each geom of the arm."""
-        return data.geom_xpos[self._arm], self._radii
-
-    def cast(self, data: Any, origin: Float[np.ndarray, " 3"], rays: Float[np.ndarray, "rays 3"], group: int) -> Hits:
+    def cast(self, data: Any, origin: Point, rays: Rays, group: int) -> Hits:
         """Return the hits of unit rays from one point."""
         count = len(rays)
         geoms = np.full(count, -1, dtype=np.int32)
@@ -112,9 +53,7 @@ class Caster:
             self._mujoco.mj_multiRay(self._model, data, origin, flat, groups, True, -1, *out, count, 1e10)
         return Hits(distance, geoms, normals)
 
-    def shaded(
-        self, data: Any, lamp: Float[np.ndarray, " 3"], spots: Float[np.ndarray, "spots 3"], group: int
-    ) -> Bool[np.ndarray, " spots"]:
+    def shaded(self, data: Any, lamp: Point, spots: Spots, group: int) -> Bool[np.ndarray, " spots"]:
         """Return which points are in the shadow of one group of geoms."""
         reach = np.linalg.norm(spots - lamp, axis=1)
         hits = self.cast(data, lamp, unit(spots - lamp), group)
@@ -131,13 +70,7 @@ class View:
         cells: Cells of the grid, across and down.
     """
 
-    def __init__(
-        self,
-        pose: Float[np.ndarray, "4 4"],
-        rays: Float[np.ndarray, "rays 3"],
-        half_view: Float[np.ndarray, " 2"],
-        cells: tuple[int, int],
-    ) -> None:
+    def __init__(self, pose: Pose, rays: Rays, half_view: Float[np.ndarray, " 2"], cells: tuple[int, int]) -> None:
         self.origin, self._rotation = pose[:3, 3].copy(), pose[:3, :3]
         self.rays = rays
         self._half_view, self._cells = half_view, np.array(cells)
@@ -149,8 +82,7 @@ class View:
 
     def near_arm(self, caster: Caster, data: Any) -> Int[np.ndarray, " near"]:
         """Return the rays in the cells that a sphere around one of the arm's geoms touches."""
-        centres, radii = caster.arm_spheres(data)
-        inside = (centres - self.origin) @ self._rotation
+        radii, inside = caster.radii, (data.geom_xpos[caster.arm] - self.origin) @ self._rotation
         ends = inside[:, 2] - radii, inside[:, 2] + radii
         if ends[0].min() <= 0.0:  # the view is inside the arm
             return np.arange(len(self.rays))
@@ -165,15 +97,6 @@ class View:
     def _cell(self, slopes: Float[np.ndarray, "rays 2"]) -> Float[np.ndarray, "rays 2"]:
         """Return column and row, as whole numbers in floating point."""
         return np.asarray(np.floor((slopes / self._half_view + 1.0) / 2.0 * self._cells))
-
-
-def lamp_view(lamp: Float[np.ndarray, " 3"], spots: Float[np.ndarray, "spots 3"]) -> View:
-    """Return points in the view of the lamp."""
-    distance = float(np.linalg.norm(lamp))
-    azimuth = float(np.rad2deg(np.arctan2(lamp[1], lamp[0])))
-    elevation = float(np.rad2deg(np.arcsin(lamp[2] / distance)))
-    pose = CameraPlace(azimuth, elevation, distance, look_at_m=(0.0, 0.0, 0.0)).pose()
-    return View(pose, unit(spots - lamp), np.array([_LAMP_HALF_VIEW] * 2), (_LAMP_CELLS, _LAMP_CELLS))
 
 
 def unit(ways: Float[np.ndarray, "ways 3"]) -> Float[np.ndarray, "ways 3"]:
@@ -212,18 +135,21 @@ class RayCamera:
         self,
         model: Any,
         domain: Domain,
-        pose: Float[np.ndarray, "4 4"],
+        pose: Pose,
         vertical_fov_deg: float,
         size: tuple[int, int] = FRAME_SIZE,
     ) -> None:
         self._caster, self._colours = Caster(model), _Colours(model)
-        self._lamp, self._ambient = light_position(domain.look), domain.look.ambient
+        look = domain.look
+        lamp = CameraPlace(look.light_azimuth_deg, look.light_elevation_deg, _LAMP_M, look_at_m=(0.0, 0.0, 0.0))
+        self._lamp_pose, self._ambient = lamp.pose(), look.ambient
+        self._lamp = self._lamp_pose[:3, 3]
         self._height, self._width = size
         self._half_view = np.tan(np.deg2rad(vertical_fov_deg) / 2) * np.array([self._width / self._height, 1.0])
         self._pose = pose
         self._background: _Background | None = None
 
-    def move(self, pose: Float[np.ndarray, "4 4"]) -> None:
+    def move(self, pose: Pose) -> None:
         """Move the camera; the next image is cast anew, including walls and table."""
         self._pose = pose
         self._background = None
@@ -254,7 +180,9 @@ class RayCamera:
         spots = view.origin + view.rays * distance[:, None]
         ambient, direct = self._light(data, spots, hits, STATIC_GROUP)
         lit, shaded = _as_bytes(ambient + direct), _as_bytes(ambient + _SHADOW * direct)
-        return _Background(lit, shaded, distance, spots, view, lamp_view(self._lamp, spots))
+        cells, half_view = (_LAMP_CELLS, _LAMP_CELLS), np.full(2, _LAMP_HALF_VIEW)
+        from_lamp = View(self._lamp_pose, unit(spots - self._lamp), half_view, cells)
+        return _Background(lit, shaded, distance, spots, view, from_lamp)
 
     def _light(self, data: Any, spots: Any, hits: Hits, group: int) -> tuple[Any, Any]:
         """Return the colour of points in ambient light, and the lamp's part; the group casts shadows on itself."""

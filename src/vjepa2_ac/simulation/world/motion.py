@@ -12,31 +12,25 @@ from scipy.spatial.transform import Rotation
 from vjepa2_ac.geometry import euler_from_matrices, matrices_from_euler
 from vjepa2_ac.simulation.world.domains import Domain
 
+Joints = Float[np.ndarray, " 7"]  # angles in radians
+Jacobian = Float[np.ndarray, "6 7"]
+
 FLANGE_OFFSET_M = 0.107
 
 
-@dataclass(frozen=True)
-class Joint:
-    """A revolute joint and its frame in that of the previous joint: Rx(twist) Tx(length) Rz(angle) Tz(offset)."""
+LENGTH_M, TWIST_DEG, OFFSET_M, LOW, HIGH = np.array([
+    [0.0, 0.0, 0.333, -2.8973, 2.8973],
+    [0.0, -90.0, 0.0, -1.7628, 1.7628],
+    [0.0, 90.0, 0.316, -2.8973, 2.8973],
+    [0.0825, 90.0, 0.0, -3.0718, -0.0698],
+    [-0.0825, -90.0, 0.384, -2.8973, 2.8973],
+    [0.0, 90.0, 0.0, -0.0175, 3.7525],
+    [0.088, 90.0, 0.0, -2.8973, 2.8973],
+]).T  # fmt: skip
+"""Seven revolute joints, each in the frame of the one before: Rx(twist) Tx(length) Rz(angle) Tz(offset); limits in rad.
 
-    length_m: float
-    twist_deg: float
-    offset_m: float
-    low_rad: float
-    high_rad: float
-
-
-JOINTS = (  # Source: Franka Emika, robot and interface specifications: DH parameters (Craig) and joint limits
-    Joint(0.0, 0.0, 0.333, -2.8973, 2.8973),
-    Joint(0.0, -90.0, 0.0, -1.7628, 1.7628),
-    Joint(0.0, 90.0, 0.316, -2.8973, 2.8973),
-    Joint(0.0825, 90.0, 0.0, -3.0718, -0.0698),
-    Joint(-0.0825, -90.0, 0.384, -2.8973, 2.8973),
-    Joint(0.0, 90.0, 0.0, -0.0175, 3.7525),
-    Joint(0.088, 90.0, 0.0, -2.8973, 2.8973),
-)
-LOW = np.array([joint.low_rad for joint in JOINTS])
-HIGH = np.array([joint.high_rad for joint in JOINTS])
+Source: Franka Emika, robot and interface specifications: DH parameters (Craig) and joint limits.
+"""
 HOME = np.array([0.0, -0.4, 0.0, -2.4, 0.0, 2.0, 0.8])
 """The gripper points down in front of the robot; the flange is near (0.42, 0, 0.46)."""
 
@@ -53,9 +47,7 @@ def forward_kinematics(joints: Float[np.ndarray, "*batch 7"]) -> Float[np.ndarra
     return np.concatenate([frame[..., :3, 3], euler_from_matrices(frame[..., :3, :3])], axis=-1)
 
 
-def inverse_kinematics(
-    pose: Float[np.ndarray, " 6"], start: Float[np.ndarray, " 7"] = HOME, *, rest: Float[np.ndarray, " 7"] = HOME
-) -> Float[np.ndarray, " 7"]:
+def inverse_kinematics(pose: Float[np.ndarray, " 6"], start: Joints = HOME, *, rest: Joints = HOME) -> Joints:
     """Return joint angles that bring the flange to a pose: to 0.01 mm and 0.006 degrees, within the limits.
 
     Damped least squares, the damping falling with the error; the redundant degree of freedom is pulled to `rest`: a
@@ -77,12 +69,7 @@ def inverse_kinematics(
     raise OutOfReachError(f"no joint angles within the limits bring the flange to {np.round(pose, 3).tolist()}")
 
 
-def _limited_step(
-    jacobian: Float[np.ndarray, "6 7"],
-    error: Float[np.ndarray, " 6"],
-    joints: Float[np.ndarray, " 7"],
-    rest: Float[np.ndarray, " 7"],
-) -> Float[np.ndarray, " 7"]:
+def _limited_step(jacobian: Jacobian, error: Float[np.ndarray, " 6"], joints: Joints, rest: Joints) -> Joints:
     """Return the joints after one step; a joint pushed against its limit stays, and the others compensate."""
     free = np.ones(7)
     for _ in range(3):
@@ -94,9 +81,7 @@ def _limited_step(
     return np.clip(joints + step * free, LOW, HIGH)
 
 
-def _step(
-    jacobian: Float[np.ndarray, "6 7"], error: Float[np.ndarray, " 6"], to_rest: Float[np.ndarray, " 7"]
-) -> Float[np.ndarray, " 7"]:
+def _step(jacobian: Jacobian, error: Float[np.ndarray, " 6"], to_rest: Joints) -> Joints:
     """Return one damped step towards the pose, and in its null space towards rest.
 
     The pull to rest fades with the error: near the pose it must not disturb the convergence.
@@ -108,7 +93,7 @@ def _step(
     return step * min(1.0, 0.4 / max(float(np.abs(step).max()), 1e-12))
 
 
-def _jacobian(frames: list[Float[np.ndarray, "4 4"]]) -> Float[np.ndarray, "6 7"]:
+def _jacobian(frames: list[Float[np.ndarray, "4 4"]]) -> Jacobian:
     axes = np.stack([frame[:3, 2] for frame in frames[:-1]])
     arms = frames[-1][:3, 3] - np.stack([frame[:3, 3] for frame in frames[:-1]])
     return np.concatenate([np.cross(axes, arms), axes], axis=1).T
@@ -119,7 +104,7 @@ def _frames(joints: Float[np.ndarray, "*batch 7"]) -> list[Float[np.ndarray, "*b
     cos, sin = np.cos(joints)[..., None], np.sin(joints)[..., None]
     links = _CONSTANT + _COSINE * cos[..., None] + _SINE * sin[..., None]
     frames = [links[..., 0, :, :]]
-    for index in range(1, len(JOINTS)):
+    for index in range(1, 7):
         frames.append(frames[-1] @ links[..., index, :, :])
     frames.append(frames[-1] @ _FLANGE)
     return frames
@@ -127,14 +112,14 @@ def _frames(joints: Float[np.ndarray, "*batch 7"]) -> list[Float[np.ndarray, "*b
 
 def _link_terms() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the link transforms as constant + cosine * cos(angle) + sine * sin(angle), each [7, 4, 4]."""
-    constant, cosine, sine = (np.zeros((len(JOINTS), 4, 4)) for _ in range(3))
-    for index, joint in enumerate(JOINTS):
-        twist = np.deg2rad(joint.twist_deg)
+    constant, cosine, sine = (np.zeros((7, 4, 4)) for _ in range(3))
+    for index, (length, twist_deg, offset) in enumerate(zip(LENGTH_M, TWIST_DEG, OFFSET_M, strict=True)):
+        twist = np.deg2rad(twist_deg)
         ct, st = np.cos(twist), np.sin(twist)
         cosine[index, :3, :2] = [[1, 0], [0, ct], [0, st]]
         sine[index, :3, :2] = [[0, -1], [ct, 0], [st, 0]]
         constant[index, :3, 2] = [0, -st, ct]
-        constant[index, :3, 3] = [joint.length_m, -st * joint.offset_m, ct * joint.offset_m]
+        constant[index, :3, 3] = [length, -st * offset, ct * offset]
         constant[index, 3, 3] = 1.0
     return constant, cosine, sine
 
