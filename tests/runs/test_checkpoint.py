@@ -28,10 +28,12 @@ from vjepa2_ac.runs.checkpoint import (
     find_damage,
     newest_checkpoint,
     read_state,
+    read_torch,
     select_checkpoint,
     write_checkpoint,
+    write_manifest,
+    write_torch,
 )
-from vjepa2_ac.runs.files import read_torch, write_manifest, write_torch
 from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.resume import save_checkpoint
 

@@ -16,8 +16,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from paths import GOLDEN
 from vjepa2_ac.config import TrainingConfig
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.runs.checkpoint import newest_checkpoint
-from vjepa2_ac.runs.files import read_torch, write_manifest, write_torch
+from vjepa2_ac.runs.checkpoint import newest_checkpoint, read_torch, write_manifest, write_torch
 from vjepa2_ac.training import optim
 from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.optim import learning_rate_at, load_moments, make_optimizer, parameter_groups

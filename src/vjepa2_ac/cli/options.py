@@ -160,7 +160,7 @@ def require_subject(subject: str, checkpoint: str | None = None) -> None:
         InputError: There is no such run, checkpoint or model.
     """
     from vjepa2_ac.model.base_model import find_base
-    from vjepa2_ac.runs.checkpoint import require_listed
+    from vjepa2_ac.runs.checkpoint import select_checkpoint
     from vjepa2_ac.runs.folder import is_run, read_run_config
 
     if not is_run(subject):
@@ -168,7 +168,7 @@ def require_subject(subject: str, checkpoint: str | None = None) -> None:
         return
     read_run_config(Path(subject))
     if checkpoint is not None:
-        require_listed(Path(subject), checkpoint)
+        select_checkpoint(Path(subject), checkpoint)
 
 
 def require_to_plan(options: argparse.Namespace) -> Config:

@@ -138,11 +138,11 @@ def _decoder(options: argparse.Namespace) -> None:
 
 
 def _export(options: argparse.Namespace) -> None:
-    from vjepa2_ac.runs.checkpoint import require_listed
+    from vjepa2_ac.runs.checkpoint import select_checkpoint
     from vjepa2_ac.runs.folder import read_run_config
 
     read_run_config(options.run)
-    require_listed(options.run, options.checkpoint)
+    select_checkpoint(options.run, options.checkpoint)
 
     from vjepa2_ac.console.progress import show
     from vjepa2_ac.export import export_run

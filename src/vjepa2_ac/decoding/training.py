@@ -39,7 +39,7 @@ from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.pretrained_folder import first_not_finite
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
-from vjepa2_ac.runs.files import read_torch, write_torch
+from vjepa2_ac.runs.checkpoint import read_torch, write_torch
 from vjepa2_ac.runs.folder import RunLock
 from vjepa2_ac.runs.metrics_log import MetricsLog
 from vjepa2_ac.storage import atomic_writer, try_writing_at, user_can_write, write_atomically

@@ -31,9 +31,8 @@ from vjepa2_ac.distributed.signals import StoppedError, stop_on_signals
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.checkpoint import CheckpointClock
-from vjepa2_ac.runs.folder import CALIBRATION, CHANGES
+from vjepa2_ac.runs.folder import CALIBRATION, CHANGES, OpenRun, open_run
 from vjepa2_ac.runs.metrics_log import MetricsLog
-from vjepa2_ac.runs.open_run import OpenRun, open_run
 from vjepa2_ac.runs.trackers import open_trackers, require_installed
 from vjepa2_ac.storage import write_atomically
 from vjepa2_ac.training.monitoring import NullMetricsLog, Throughput, TimedBatches, TrainingReporter, WatchedMetricsLog
@@ -51,7 +50,7 @@ from vjepa2_ac.training.validation import (
 
 if TYPE_CHECKING:
     from vjepa2_ac.evaluation.result import Validation
-    from vjepa2_ac.runs.mirror.background_sync import Mirror
+    from vjepa2_ac.runs.mirror import Mirror
 
 _IN_PLACE = "Everything is in place: data, model, validation and gradients were checked; nothing was written."
 

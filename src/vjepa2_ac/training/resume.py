@@ -30,10 +30,11 @@ from vjepa2_ac.runs.checkpoint import (
     checkpoint_name,
     newest_checkpoint,
     read_state,
+    read_torch,
     write_checkpoint,
+    write_torch,
     written_state,
 )
-from vjepa2_ac.runs.files import read_torch, write_torch
 from vjepa2_ac.runs.folder import CONFIG, read_run_config, run_id
 from vjepa2_ac.runs.metrics_log import warn_if_stalled
 from vjepa2_ac.training.optim import load_moments
