@@ -41,7 +41,7 @@ from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.loader import validation_batches
 from vjepa2_ac.data.sources.latents.cache_files import DTYPES, bytes_per_frame, pack_latents, unpack_latents
-from vjepa2_ac.distributed.device import autocast, matmul_speed
+from vjepa2_ac.distributed import autocast, matmul_speed
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.encoding.encode_dataset import encode_config
 from vjepa2_ac.encoding.latent_cache import picture_bytes as small_frame_bytes

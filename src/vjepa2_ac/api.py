@@ -24,7 +24,7 @@ from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.loader import validation_batches
 from vjepa2_ac.data.transforms import Crop
 from vjepa2_ac.data.windows import require_stride
-from vjepa2_ac.distributed.device import has_bf16, no_cuda, require_type_of_weights
+from vjepa2_ac.distributed import has_bf16, no_cuda, require_type_of_weights
 from vjepa2_ac.encoding.batch import encode_batch, encode_frames
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError
@@ -248,7 +248,7 @@ def train(
 
     Raises:
         InputError: Something cannot be used; raised before the first step wherever possible.
-        StoppedError: A signal ended it, see `distributed.signals`; the same call resumes.
+        StoppedError: A signal ended it, see `process`; the same call resumes.
 
     Example:
         >>> run = train(load_config("configs/demo.yaml", ["training.steps=200"]), note=print)

@@ -16,8 +16,8 @@ from same_run import assert_same_run
 from vjepa2_ac import storage
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_yaml
-from vjepa2_ac.distributed.signals import StoppedError
 from vjepa2_ac.errors import InputError, UnreachableError
+from vjepa2_ac.process import StoppedError
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.checkpoint import RunState, checkpoint_name, newest_checkpoint, read_state, write_checkpoint
 from vjepa2_ac.runs.folder import RunLock, check_run_folder

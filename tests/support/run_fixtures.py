@@ -17,9 +17,9 @@ from killable import Nursery
 from synthetic import write_synthetic_droid
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict, parse_config
-from vjepa2_ac.distributed.signals import HANG_UP, SIGNALS
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.process import HANG_UP, SIGNALS
 from vjepa2_ac.reporter import SILENT, NullReporter
 
 if TYPE_CHECKING:

@@ -13,12 +13,12 @@ import torch
 from recording_cuda import RecordingCuda
 from run_fixtures import TINY
 from same_run import assert_same_run
+from vjepa2_ac import distributed
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.data.clips import no_clips
-from vjepa2_ac.distributed import device
-from vjepa2_ac.distributed.device import matmul_speed
+from vjepa2_ac.distributed import matmul_speed
 from vjepa2_ac.episode import POSE_WIDTHS, Batch
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.runs.metrics_log import read_metrics_log, warnings_of
@@ -67,7 +67,7 @@ def test_the_ceiling_is_the_best_product_that_was_timed(clock: list[float], monk
 
     monkeypatch.setattr(torch, "mm", product)
     speed = matmul_speed.__wrapped__(CPU, torch.float32)
-    assert speed == pytest.approx(2 * device._CPU_MATRIX**3 / 0.05)
+    assert speed == pytest.approx(2 * distributed._CPU_MATRIX**3 / 0.05)
 
 
 def test_peak_memory_grows_with_what_is_held() -> None:

@@ -15,7 +15,7 @@ from run_fixtures import set_up
 from vjepa2_ac.config import Config
 from vjepa2_ac.data import loader
 from vjepa2_ac.data.loader import training_loader
-from vjepa2_ac.distributed.processes import make_accelerator
+from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.encoding.batch import extrinsics_for
 from vjepa2_ac.episode import Batch, Clip
 from vjepa2_ac.errors import InputError

@@ -9,11 +9,11 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from vjepa2_ac import __version__, output
+from vjepa2_ac import __version__, process
 from vjepa2_ac.cli import closed_loop, data, evaluate, plan, setup, train
 from vjepa2_ac.cli.options import Handler, Parser, parsed, speaks
-from vjepa2_ac.distributed.signals import EXIT_STATUS, StoppedError, tidy_end
 from vjepa2_ac.errors import InputError, UserError, extra_of, in_words, is_out_of_memory, pip_install, printable
+from vjepa2_ac.process import EXIT_STATUS, StoppedError, tidy_end
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -23,7 +23,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     130 interrupted. A reader that closes early, as `head` does, changes nothing; a full disk for the output is an
     error, in the end.
     """
-    with output.own_streams() as lost, _our_warnings(), tidy_end():
+    with process.own_streams() as lost, _our_warnings(), tidy_end():
         status = _run(arguments)
         if problem := lost():
             _complain(f"standard output: cannot be written ({problem}): some output is missing")
@@ -50,7 +50,8 @@ def _run(arguments: Sequence[str] | None) -> int:
     except (UserError, OSError, MemoryError, RuntimeError) as error:  # a full disk, a path that is no path
         if isinstance(error, RuntimeError) and not is_out_of_memory(error):
             raise
-        _complain(in_words(error))
+        if not getattr(error, "is_told", False):
+            _complain(in_words(error))
         return 2
     except StoppedError as stopped:
         if speaks():

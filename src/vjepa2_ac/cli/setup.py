@@ -240,7 +240,7 @@ def _doctor(options: argparse.Namespace) -> int:
 
     from vjepa2_ac.console.progress import show
     from vjepa2_ac.console.setup import memory_lines, verdict
-    from vjepa2_ac.distributed.device import slow_bf16
+    from vjepa2_ac.distributed import slow_bf16
     from vjepa2_ac.model.checkpoints.loading import base_sizes
     from vjepa2_ac.training.cost.memory import USUAL_GPU, estimate_memory, ways_to_fit
 

@@ -10,25 +10,22 @@ import contextlib
 import json
 import signal
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import torch
-
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict
-from vjepa2_ac.distributed.processes import (
+from vjepa2_ac.distributed import (
     agreed,
     all_reduce_max,
     broadcast_object,
     first_only,
     make_accelerator,
+    out_of_memory_explained,
     require_same,
 )
-from vjepa2_ac.distributed.signals import StoppedError, stop_on_signals
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.process import StoppedError, stop_on_signals
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.checkpoint import CheckpointClock
 from vjepa2_ac.runs.folder import CALIBRATION, CHANGES, OpenRun, open_run
@@ -52,6 +49,10 @@ if TYPE_CHECKING:
     from vjepa2_ac.evaluation.result import Validation
     from vjepa2_ac.runs.mirror import Mirror
 
+_LESS_MEMORY = (
+    "Set training.gradient_checkpointing=true, or lower training.batch_size (and raise training.accumulation),"
+    " model.encode_chunk or validation.batch_size"
+)
 _IN_PLACE = "Everything is in place: data, model, validation and gradients were checked; nothing was written."
 
 
@@ -71,14 +72,14 @@ def train(
 
     Raises:
         InputError: An input cannot be used; raised before the first step wherever possible.
-        StoppedError: A signal asked the run to stop between its first and last step; see `distributed.signals`.
+        StoppedError: A signal asked the run to stop between its first and last step; see `process`.
     """
     accelerator = make_accelerator(config)
     require_same(accelerator, config_as_dict(config), what="the config", fix="Start all processes with one config")
     require_optimizer(config.training)
     reporter = reporter if accelerator.is_main_process else SILENT
 
-    with contextlib.ExitStack() as until_the_end, _out_of_memory_explained():
+    with contextlib.ExitStack() as until_the_end, out_of_memory_explained("training", _LESS_MEMORY):
 
         def opening() -> OpenRun:
             require_installed(config.tracking)
@@ -208,16 +209,3 @@ def _timed_step(
     metrics = training_step(run, batches, step, measure_update=measure_update)
     clips = run.clips_per_step - metrics.get("clips_left_out", 0.0)
     return metrics | throughput.metrics(clips, time.perf_counter() - started, batches.waited_s - waited_s)
-
-
-@contextlib.contextmanager
-def _out_of_memory_explained() -> Iterator[None]:
-    try:
-        yield
-    except torch.OutOfMemoryError as error:
-        raise InputError(
-            where="training",
-            found=f"the GPU's memory is not enough ({str(error).splitlines()[0]})",
-            fix="Set training.gradient_checkpointing=true, or lower training.batch_size (and raise"
-            " training.accumulation), model.encode_chunk or validation.batch_size",
-        ) from error

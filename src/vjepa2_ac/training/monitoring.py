@@ -31,7 +31,7 @@ from torch import Tensor
 from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.data.loader import prefetch_next
 from vjepa2_ac.data.streams import Cuda
-from vjepa2_ac.distributed.device import PRECISIONS, matmul_speed
+from vjepa2_ac.distributed import PRECISIONS, matmul_speed
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.metrics_log import WARNING, MetricsLog, read_metrics_log

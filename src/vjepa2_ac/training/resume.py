@@ -17,7 +17,7 @@ from vjepa2_ac.config.section import Affects, knobs_that_affect
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.index import fingerprint_of
 from vjepa2_ac.data.loader import validation_windows
-from vjepa2_ac.distributed.processes import broadcast_object, broadcast_tensors, first_only, require_same
+from vjepa2_ac.distributed import broadcast_object, broadcast_tensors, first_only, require_same
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.lora import load_trained, save_trained
 from vjepa2_ac.model.network.world_model import WorldModel

@@ -19,8 +19,7 @@ from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import Batches, Mixed, ProcessShare, training_loader, validation_batches
 from vjepa2_ac.data.streams import Copies, copies_for
-from vjepa2_ac.distributed.device import PRECISIONS
-from vjepa2_ac.distributed.processes import broadcast_object, first_of_machine, make_accelerator
+from vjepa2_ac.distributed import PRECISIONS, broadcast_object, first_of_machine, make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, extrinsics_for, require_same_encoder
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError

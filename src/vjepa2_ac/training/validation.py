@@ -7,7 +7,7 @@ from typing import Any
 
 from vjepa2_ac.data.loader import batches_of, validation_windows
 from vjepa2_ac.data.windows import spread
-from vjepa2_ac.distributed.processes import agreed, broadcast_object
+from vjepa2_ac.distributed import agreed, broadcast_object
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.action_use import RolloutStart, moves_of, pool_of, rank_actions
