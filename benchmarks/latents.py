@@ -48,7 +48,7 @@ from vjepa2_ac.encoding.latent_cache import picture_bytes as small_frame_bytes
 from vjepa2_ac.episode import LatentBatch, Progress
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.reporter import NullReporter
+from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
 from vjepa2_ac.training.cost.flops import frame_flops
 from vjepa2_ac.training.setup import Run, batches_from, open_data, open_model
@@ -185,7 +185,7 @@ def encode(config: Config, device: str) -> float:
     """Write the cache of a run, and return the frames per second, decoding and writing included."""
     told: list[tuple[float, int]] = []
 
-    class Timed(NullReporter):
+    class Timed(Reporter):
         def task(self, title: str, unit: str = "") -> Progress:
             if not unit:
                 return super().task(title)

@@ -32,7 +32,7 @@ from vjepa2_ac.model.adapter.adapter_folder import ADAPTER_FILE
 from vjepa2_ac.model.adapter.lora import load_trained
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.reporter import NullReporter
+from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs import loading
 from vjepa2_ac.runs.folder import is_run
 from vjepa2_ac.storage.structured import message_of
@@ -310,7 +310,7 @@ def evaluate(
     return evaluate_subject(str(subject), asked)
 
 
-class _Told(NullReporter):
+class _Told(Reporter):
     """Calls functions of the user."""
 
     def __init__(self, note: Callable[[str], None], on_step: Callable[[int, dict[str, float]], None] | None) -> None:

@@ -8,9 +8,10 @@ import pytest
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.runs.checkpoint import RunState
-from vjepa2_ac.runs.folder import RunLock, open_run, with_stride
+from vjepa2_ac.runs.folder import RunLock, with_stride
+from vjepa2_ac.runs.open_run import open_run
 
-OPEN_REMOTE = "vjepa2_ac.runs.mirror.open_remote"
+OPEN_REMOTE = "vjepa2_ac.runs.open_run.open_remote"
 
 
 def test_a_new_folder_is_made_and_locked_when_the_run_begins_and_not_before(make_config, reporter) -> None:

@@ -216,7 +216,10 @@ def test_a_validation_that_is_worse_than_at_the_start_is_reported_once(config: C
     found = warned(config, (0, validation(0.8)), (3, validation(0.85)), (6, validation(0.86)), (9, validation(0.7)))
     assert list(found) == [3]
     (text,) = found[3]
-    assert "at step 3 the one-step error is 0.850 (before training 0.800) and the rollout error" in text
+    assert (
+        "at step 3 the one-step error is 0.850 of persistence's in the validation (before training 0.800); the rollout"
+        in text
+    )
     assert "copying" not in text
 
 

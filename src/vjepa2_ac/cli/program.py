@@ -7,6 +7,7 @@ import contextlib
 import logging
 import sys
 from collections.abc import Iterator, Sequence
+from importlib.metadata import entry_points
 from pathlib import Path
 
 from vjepa2_ac import __version__, process
@@ -32,7 +33,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: Sequence[str] | None) -> int:
-    options = parsed(_parser(), arguments)
+    words = sys.argv[1:] if arguments is None else arguments
+    options = parsed(_parser(words), words)
     handler: Handler = options.handler
     try:
         _require_working_directory()
@@ -92,7 +94,7 @@ def _our_warnings() -> Iterator[None]:
         ours.removeHandler(handler)
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser(words: Sequence[str] = ()) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = Parser(
         prog="vjepa2-ac", description="Fine-tune V-JEPA 2-AC with LoRA, and know whether it helped."
     )
@@ -103,4 +105,9 @@ def _parser() -> argparse.ArgumentParser:
     of_planning = (plan.add_plan, plan.add_goals, closed_loop.add_serve, closed_loop.add_simulate)
     for add in (*first, *of_data, *of_planning, train.add_export, setup.add_config_command, setup.add_download):
         add(commands)
+    for one in entry_points(group="vjepa2_ac.commands"):  # of other packages; imported only if it is asked for
+        if next(iter(words), None) == one.name:
+            one.load()(commands)
+        else:
+            commands.add_parser(one.name, help=f"of {one.value.partition(':')[0]}")
     return parser

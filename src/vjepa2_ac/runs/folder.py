@@ -1,4 +1,4 @@
-"""The folder of a run: its files, its owner, and how it is opened.
+"""The folder of a run: its files, and its owner.
 
 RUN/config.yaml         the resolved config, defaults and a chosen stride included
 RUN/environment.json    versions, machine, command and folder of every start
@@ -17,7 +17,6 @@ RUN/.lock               a kernel lock, held by the process that is training: rel
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import importlib.metadata
 import json
@@ -28,11 +27,9 @@ import re
 import secrets
 import shutil
 import sys
-import tempfile
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from filelock import FileLock, Timeout
 
@@ -41,13 +38,9 @@ from vjepa2_ac.config.loading import changed_keys, config_as_flat_dict, config_a
 from vjepa2_ac.config.section import Affects, mark_of
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.places import BUILTIN, is_url, literal
-from vjepa2_ac.reporter import Reporter
-from vjepa2_ac.runs.checkpoint import CHECKPOINTS, RunState, find_damage, listed, remove_leavings, step_of
+from vjepa2_ac.runs.checkpoint import CHECKPOINTS, remove_leavings
 from vjepa2_ac.storage import read_bounded, try_writing_at, user_can_write, write_atomically
 from vjepa2_ac.storage.structured import MOST_BYTES, json_list, shown, utc_now
-
-if TYPE_CHECKING:
-    from vjepa2_ac.runs.mirror import Mirror, Remote
 
 logger = logging.getLogger(__name__)
 
@@ -311,83 +304,3 @@ def last_start(path: str | Path) -> str:
     if "host" not in last:
         return "another process"
     return f"process {last.get('process')} on {last['host']}, since {last.get('time')}"
-
-
-# ---- opening ----
-
-
-@dataclass(frozen=True)
-class OpenRun:
-    """A run that can begin or go on, in the process that writes its files."""
-
-    config: Config  # with the stride that the run has chosen; its run_dir has the checkpoints to resume from
-    lock: RunLock
-    remote: Remote | None
-    allow_config_change: bool
-
-    def changes(self, config: Config) -> list[str]:
-        """Return a line per setting in which a config differs from the run's, where that is allowed."""
-        return config_changes(config) if self.allow_config_change else []
-
-    def begin(self, config: Config, state: RunState) -> None:
-        """Lock the folder, and record this start in it; a new folder is only created now.
-
-        Args:
-            config: Of the run; its stride is a number.
-            state: Where it begins.
-
-        Raises:
-            InputError: Another process trains in the folder, or has done so since it was inspected; or as
-                `open_run_folder`.
-        """
-        self.lock.take()
-        # Checkpoints up to its own step were inspected when the run was resumed.
-        further = [path for path in listed(Path(config.run_dir, CHECKPOINTS)) if (step_of(path.name) or 0) > state.step]
-        newest = next((path for path in reversed(further) if find_damage(path) is None), None)
-        if newest is not None:
-            there = f"a checkpoint of step {step_of(newest.name)}"
-            found = f"{there}, which another start wrote while this one stood at {state.step}"
-            raise InputError(where=str(newest), found=found, fix="Start again: the run continues from there")
-        open_run_folder(config, state.run_id, allow_config_change=self.allow_config_change)
-
-    def mirror(self, run_id: str) -> Mirror | None:
-        """Return what keeps `checkpoint.remote` up to date."""
-        if self.remote is None:
-            return None
-        from vjepa2_ac.runs.mirror import Mirror
-
-        return Mirror(self.remote, run_id)
-
-
-@contextlib.contextmanager
-def open_run(
-    config: Config, reporter: Reporter, *, check_only: bool = False, allow_config_change: bool = False
-) -> Iterator[OpenRun]:
-    """Check the folder of a run, fetch what is newer in `checkpoint.remote`, and hold the lock to the end of the block.
-
-    Args:
-        config: The run.
-        reporter: Receives messages.
-        check_only: Lock nothing, and download into a temporary folder.
-        allow_config_change: The run in the folder may have another config.
-
-    Raises:
-        InputError: The folder is not this run's, is in use or cannot be written; or as `open_remote`.
-    """
-    folder, remote, trial = Path(config.run_dir), None, None
-    config = with_settled_stride(config)
-    check_run_folder(config, allow_config_change=allow_config_change)
-    with contextlib.ExitStack() as until_the_end:
-        lock = until_the_end.enter_context(RunLock(folder))
-        if check_only:
-            trial = Path(until_the_end.enter_context(tempfile.TemporaryDirectory()), "run")
-        elif folder.is_dir():  # a new one is created, and locked, after all checks
-            lock.take()
-        if config.checkpoint.remote is not None:
-            from vjepa2_ac.runs.mirror import open_remote
-
-            # Locked before anything is downloaded into the run's folder: another process could still be writing there.
-            claim = lock.take if trial is None else lambda: None
-            remote = open_remote(config, reporter, claim=claim, allow_config_change=allow_config_change, into=trial)
-            config = with_settled_stride(remote.config if remote else config)
-        yield OpenRun(config, lock, remote, allow_config_change)

@@ -26,13 +26,14 @@ from vjepa2_ac.distributed import (
     require_same,
 )
 from vjepa2_ac.process import StoppedError, stop_on_signals
-from vjepa2_ac.reporter import SILENT
+from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import CheckpointClock
-from vjepa2_ac.runs.folder import CALIBRATION, CHANGES, OpenRun, open_run
+from vjepa2_ac.runs.folder import CALIBRATION, CHANGES
 from vjepa2_ac.runs.metrics_log import MetricsLog
+from vjepa2_ac.runs.open_run import OpenRun, open_run
 from vjepa2_ac.runs.trackers import open_trackers, require_installed
 from vjepa2_ac.storage import write_atomically
-from vjepa2_ac.training.monitoring import NullMetricsLog, Throughput, TimedBatches, TrainingReporter, WatchedMetricsLog
+from vjepa2_ac.training.monitoring import Throughput, TimedBatches, WatchedMetricsLog
 from vjepa2_ac.training.optim import require_optimizer
 from vjepa2_ac.training.resume import require_same_data, restore, save_checkpoint
 from vjepa2_ac.training.setup import Run, batches_from, open_data, open_model
@@ -56,9 +57,7 @@ _LESS_MEMORY = (
 _IN_PLACE = "Everything is in place: data, model, validation and gradients were checked; nothing was written."
 
 
-def train(
-    config: Config, reporter: TrainingReporter, *, check_only: bool = False, allow_config_change: bool = False
-) -> Path:
+def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow_config_change: bool = False) -> Path:
     """Train by a config, from the newest checkpoint of its run folder if there is one.
 
     Args:
@@ -103,7 +102,7 @@ def train(
     return run.folder
 
 
-def _train(run: Run, opened: OpenRun | None, first: Validation | None, reporter: TrainingReporter) -> None:
+def _train(run: Run, opened: OpenRun | None, first: Validation | None, reporter: Reporter) -> None:
     with contextlib.ExitStack() as until_the_end:
 
         def beginning() -> tuple[MetricsLog, Mirror | None] | None:
@@ -115,7 +114,7 @@ def _train(run: Run, opened: OpenRun | None, first: Validation | None, reporter:
             mirror = opened.mirror(run.state.run_id)
             return metrics_log, mirror and until_the_end.enter_context(mirror)
 
-        metrics_log, mirror = agreed(run.accelerator, beginning) or (NullMetricsLog(), None)
+        metrics_log, mirror = agreed(run.accelerator, beginning) or (None, None)
         if first is not None and record(run, validation_metrics(first), metrics_log):
             _save(run, metrics_log)  # the base: nothing that is worse is ever selected
         try:
@@ -137,25 +136,23 @@ def _write_measured(run: Run) -> None:
         write_atomically(folder / CHANGES, json.dumps(coverage.noted()).encode())
 
 
-def _open_metrics_log(run: Run, reporter: TrainingReporter) -> MetricsLog:
+def _open_metrics_log(run: Run, reporter: Reporter) -> MetricsLog:
     done = run.state.step
     trackers = open_trackers(run.config, run.folder, run_id=run.state.run_id, first_step=done)
     return WatchedMetricsLog(run.folder, config=run.config, reporter=reporter, first_step=done, trackers=trackers)
 
 
-def _save(run: Run, metrics_log: MetricsLog | NullMetricsLog) -> None:
+def _save(run: Run, metrics_log: MetricsLog | None) -> None:
     """Write a checkpoint, after the metrics that lead to it."""
 
     def save() -> None:
-        with metrics_log.before_a_checkpoint():
+        with metrics_log.before_a_checkpoint() if metrics_log else contextlib.nullcontext():
             save_checkpoint(run, run.folder)
 
     agreed(run.accelerator, save)
 
 
-def _loop(
-    run: Run, metrics_log: MetricsLog | NullMetricsLog, mirror: Mirror | None, reporter: TrainingReporter
-) -> None:
+def _loop(run: Run, metrics_log: MetricsLog | None, mirror: Mirror | None, reporter: Reporter) -> None:
     training = run.config.training
     device, processes = run.accelerator.device, run.accelerator.num_processes
     throughput = Throughput.of(run.config, run.world_model.sizes, device, processes, encodes=run.encodes)
@@ -169,12 +166,12 @@ def _loop(
             is_logged = step % training.log_every == 0 or step == training.steps
             metrics = _timed_step(run, timed, step, throughput, measure_update=is_logged)
             reporter.stepped(step, metrics)
-            if is_logged:
+            if is_logged and metrics_log:
                 metrics_log.write("train", step, metrics)
             run.state = replace(run.state, step=step, clips_done=run.state.clips_done + run.clips_per_step)
             is_best = validate_if_due(run, metrics_log, reporter)
             # Agreed among all processes, and read once: a signal after this takes effect at the next step.
-            is_due = clock.is_due(step) or is_best or _is_done(run) or metrics_log.is_behind
+            is_due = clock.is_due(step) or is_best or _is_done(run) or bool(metrics_log and metrics_log.is_behind)
             stopped_by, due = all_reduce_max(run.accelerator, [stop.number, is_due])
             if due or stopped_by:
                 _save(run, metrics_log)

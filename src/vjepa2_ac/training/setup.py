@@ -5,7 +5,7 @@ What only some runs use is imported where they use it: a stride chosen by the mo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,6 +17,7 @@ from torch import nn
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.duplicates import find_duplicates
 from vjepa2_ac.data.loader import Batches, Mixed, ProcessShare, training_loader, validation_batches
 from vjepa2_ac.data.streams import Copies, copies_for
 from vjepa2_ac.distributed import PRECISIONS, broadcast_object, first_of_machine, make_accelerator
@@ -122,17 +123,16 @@ def open_data(config: Config, reporter: Reporter = SILENT, accelerator: Accelera
         require_learned(config.model)
     decoder = None
     if config.validation.decoder is not None:
-        from vjepa2_ac.training.imagined_strip import decoder_of
+        from vjepa2_ac.decoding.decoder_folder import load_decoder
 
-        decoder = decoder_of(config)
+        decoder = load_decoder(config.validation.decoder, where="validation.decoder:")
     # The others find the index of the first one on this machine, however long it takes.
     dataset, replayed = first_of_machine(accelerator, lambda: _open_data_sets(config, reporter))
-    _report_duplicates(dataset, reporter)
+    if (duplicates := find_duplicates(dataset)).episodes:
+        reporter.note(f"Warning: {duplicates}.")
     _check_heads(config, dataset)
     world_model, calibration = None, None
     if is_auto:
-        from vjepa2_ac.training.stride_choice import choose_stride
-
         world_model = load_base(config.model, seed=config.seed).to(accelerator.device)
         calibration = broadcast_object(accelerator, choose_stride(world_model, dataset, config, accelerator, reporter))
         config, dataset = with_stride(config, calibration.best.stride), dataset.with_stride(calibration.best.stride)
@@ -161,10 +161,10 @@ def open_model(data: RunData, reporter: Reporter = SILENT, *, check_only: bool =
     dataset = _with_latents(config, data.dataset, world_model, accelerator, reporter, check_only=check_only)
     replayed = data.replayed
     if replayed is not None:
-        extrinsics_for(world_model, _first_of(replayed, "train"))
+        extrinsics_for(world_model, _first_of(replayed))
         alone = config.for_replay()
         replayed = _with_latents(alone, replayed, world_model, accelerator, reporter, check_only=check_only)
-        _require_fitting_clips(dataset, replayed, _first_of(dataset, "train"))
+        _require_fitting_clips(dataset, replayed, _first_of(dataset))
     _fit_heads(world_model, config, dataset, reporter)
     add_adapter(world_model, config.adapter, seed=config.seed)
     reporter.note(str(trainable_report(world_model)))
@@ -179,6 +179,11 @@ def open_model(data: RunData, reporter: Reporter = SILENT, *, check_only: bool =
     if dataset.config.is_cache:
         world_model.set_encoder_aside()
     world_model.to(accelerator.device)
+    strip = None
+    if data.decoder is not None:
+        from vjepa2_ac.training.imagined_strip import ImaginedStrip
+
+        strip = ImaginedStrip(data.decoder, dataset, world_model.image_size)
     return Run(
         config=config,
         accelerator=accelerator,
@@ -191,7 +196,7 @@ def open_model(data: RunData, reporter: Reporter = SILENT, *, check_only: bool =
         micro_batches=training.accumulation,
         calibration=data.calibration,
         replayed=replayed,
-        strip=_strip_of(data.decoder, dataset, world_model),
+        strip=strip,
     )
 
 
@@ -221,13 +226,6 @@ def _open_data_sets(config: Config, reporter: Reporter) -> tuple[Dataset, Datase
     from vjepa2_ac.training.replay import open_replay
 
     return dataset, open_replay(config.replay, dataset, reporter)
-
-
-def _report_duplicates(dataset: Dataset, reporter: Reporter) -> None:
-    from vjepa2_ac.data.duplicates import find_duplicates
-
-    if (duplicates := find_duplicates(dataset)).episodes:
-        reporter.note(f"Warning: {duplicates}.")
 
 
 def _check_heads(config: Config, dataset: Dataset) -> None:
@@ -280,23 +278,48 @@ def _with_latents(
     return with_latents(config, dataset, model, accelerator, reporter, check_only=check_only)
 
 
-def _strip_of(decoder: TrainedDecoder | None, dataset: Dataset, model: WorldModel) -> ImaginedStrip | None:
-    if decoder is None:
-        return None
-    from vjepa2_ac.training.imagined_strip import ImaginedStrip
+def choose_stride(
+    world_model: WorldModel, dataset: Dataset, config: Config, accelerator: Accelerator, reporter: Reporter
+) -> Calibration:
+    """Let the model of a run, before training, choose among the candidates at which the run's clips fit into episodes.
 
-    return ImaginedStrip(decoder, dataset, model.image_size)
+    Raises:
+        InputError: There is none, or as `calibrate_model`.
+    """
+    from vjepa2_ac.calibration.strides import calibrate_model
+    from vjepa2_ac.evaluation.measure import ClipSample
+
+    reporter.note("data.stride is auto: measuring the model at each candidate stride")
+    fitting, errors = [], []
+    for stride in dataset.config.strides_to_try(dataset.control_rate_hz):
+        view = dataset.with_stride(stride)
+        try:
+            view.windows("train"), view.windows("validation")
+        except InputError as error:
+            errors.append(error)
+            reporter.note(f"  stride {stride}: not possible: no clip of {dataset.config.frames} frames fits")
+        else:
+            fitting.append(stride)
+    if not fitting:
+        raise errors[0]
+    candidates = replace(dataset, config=dataset.config.model_copy(update={"stride_candidates": tuple(fitting)}))
+    calibration = calibrate_model(
+        world_model, candidates, config, accelerator, ClipSample(clips=config.validation.clips)
+    )
+    for line in calibration.lines():
+        reporter.note(line)
+    return calibration
 
 
 def _read_one_clip_of_each_split(dataset: Dataset) -> Batch:
     """Fail early: an empty split, a broken clip. A test split of share 0 is no error."""
     splits: tuple[Split, ...] = ("train", "validation", "test")
     splits = splits if dataset.config.test_share else splits[:2]
-    firsts = [_first_of(dataset, split) for split in splits]
-    return firsts[0]
+    first, *_ = [_first_of(dataset, split) for split in splits]
+    return first
 
 
-def _first_of(dataset: Dataset, split: Split) -> Batch:
+def _first_of(dataset: Dataset, split: Split = "train") -> Batch:
     return next(validation_batches(dataset, split, clips=_CLIPS_TRIED, batch_size=1))
 
 
@@ -305,4 +328,4 @@ def _require_fitting_clips(dataset: Dataset, replayed: Dataset, first_clip: Batc
     if all(one.config.is_cache or not one.config.takes_latents for one in (dataset, replayed)):
         from vjepa2_ac.training.replay import require_same_form
 
-        require_same_form(first_clip, _first_of(replayed, "train"))
+        require_same_form(first_clip, _first_of(replayed))
