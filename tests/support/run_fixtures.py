@@ -86,10 +86,10 @@ def dying_reporter(reporter: SilentReporter, last_step: int) -> SilentReporter:
 
 def set_up(config: Config, reporter: Reporter = SILENT, accelerator: Accelerator | None = None) -> Run:
     """Return a run as `train` has it before its first step."""
+    from vjepa2_ac.training import setup
     from vjepa2_ac.training.resume import restore
-    from vjepa2_ac.training.setup import open_data, open_model
 
-    return restore(open_model(open_data(config, reporter, accelerator), reporter), reporter)
+    return restore(setup.set_up(config, reporter, accelerator), reporter)
 
 
 @pytest.fixture(scope="session")

@@ -102,7 +102,7 @@ def test_a_run_that_replays_died_and_went_on_equals_the_one_that_did_not(
     assert any("Replay: 25% of the clips are from" in note for note in reporter.notes)
     assert (tmp_path / "b").exists() == (cache == "auto")
     state = read_state(newest_checkpoint(tmp_path / "broken/checkpoints"))
-    assert state.replayed_windows == len(open_dataset(config.replay.data).windows("train"))
+    assert state.data[1].windows == len(open_dataset(config.replay.data).windows("train"))
 
 
 def test_what_is_replayed_is_learned_from_and_validation_stays_on_the_first_set(replaying, make_config, reporter):

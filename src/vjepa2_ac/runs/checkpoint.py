@@ -16,7 +16,7 @@ import shutil
 import time
 import zipfile
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, BinaryIO
 
@@ -50,6 +50,15 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 @dataclass(frozen=True)
+class DataState:
+    """What a run has seen of a data set."""
+
+    fingerprint: str  # of its episodes
+    windows: Count  # clips of an epoch: their order depends on the number
+    broken: Mapping[str, str]  # episodes whose clips could not be read, and why
+
+
+@dataclass(frozen=True)
 class RunState:
     """Progress of a run. Data order, learning rate and random numbers are functions of the step."""
 
@@ -59,18 +68,13 @@ class RunState:
     clips_per_step: PositiveInt | None = None  # of all processes
     clips_asked: PositiveInt | None = None  # of one process, by the config: batch_size * accumulation
     processes: PositiveInt = 1
-    broken: Mapping[str, str] = field(default_factory=dict)  # episodes whose clips could not be read, and why
-    windows: Count | None = None  # clips of an epoch: their order depends on the number
     best_step: Count | None = None  # the best validation by checkpoint.keep_best; 0: the base's
     best_error: Finite | None = None  # its rollout error
     best_rank: Finite | None = None  # its mean rank of the true action, if that selects
     lowest_rank: Finite | None = None  # of all validations
     measured_on: Mapping[str, str] | None = None  # what validation errors depend on, see `training.resume`
     loss_scale: Mapping[str, int | float] | None = None  # of fp16: state of the gradient scaler
-    data: str | None = None  # the fingerprint of the episodes
-    replayed_broken: Mapping[str, str] = field(default_factory=dict)  # the same of the second data set
-    replayed_windows: Count | None = None
-    replayed_data: str | None = None
+    data: tuple[DataState, ...] = ()  # of its data set, and of the replayed one
 
     @property
     def best_name(self) -> str | None:

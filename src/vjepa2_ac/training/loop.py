@@ -10,6 +10,7 @@ import contextlib
 import json
 import signal
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -36,7 +37,7 @@ from vjepa2_ac.storage import write_atomically
 from vjepa2_ac.training.monitoring import Throughput, TimedBatches, WatchedMetricsLog
 from vjepa2_ac.training.optim import require_optimizer
 from vjepa2_ac.training.resume import require_same_data, restore, save_checkpoint
-from vjepa2_ac.training.setup import Run, batches_from, open_data, open_model
+from vjepa2_ac.training.setup import Run, batches_from, set_up
 from vjepa2_ac.training.step import gradients, training_step
 from vjepa2_ac.training.validation import (
     is_out_of_patience,
@@ -47,6 +48,7 @@ from vjepa2_ac.training.validation import (
 )
 
 if TYPE_CHECKING:
+    from vjepa2_ac.data.dataset import Dataset
     from vjepa2_ac.evaluation.result import Validation
     from vjepa2_ac.runs.mirror import Mirror
 
@@ -87,10 +89,13 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow
 
         # The first process is the only one that reports, has trackers and needs to see the run's folder.
         opened = first_only(accelerator, opening)
-        data = open_data(broadcast_object(accelerator, opened.config if opened else config), reporter, accelerator)
-        if not allow_config_change:
-            first_only(accelerator, lambda: require_same_data(data.config, data.dataset, data.replayed))
-        run = restore(open_model(data, reporter, check_only=check_only), reporter)
+        config = broadcast_object(accelerator, opened.config if opened else config)
+
+        def same_data(config: Config, datasets: Sequence[Dataset]) -> None:
+            if not allow_config_change:
+                first_only(accelerator, lambda: require_same_data(config, datasets))
+
+        run = restore(set_up(config, reporter, accelerator, require_same=same_data, check_only=check_only), reporter)
         first = validate_base(run, reporter)
         for line in opened.changes(run.config) if opened else ():
             reporter.note(f"The config changes: {line}")

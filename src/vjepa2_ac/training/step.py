@@ -159,7 +159,7 @@ def _tell_of_broken_episodes(run: Run) -> None:
     Raises:
         InputError: There are too many; in all processes.
     """
-    for dataset in filter(None, (run.dataset, run.replayed)):
+    for dataset in run.datasets:
         for reasons in all_gather_object(run.accelerator, dataset.broken.reasons):
             for name, reason in reasons.items():
                 dataset.broken.met(name, reason)
