@@ -249,15 +249,13 @@ def agreed(accelerator: Accelerator, work: Callable[[], _T]) -> _T:
 def raise_first(accelerator: Accelerator, error: Exception | None) -> None:
     """Raise, in all processes, the error of the first of them that has one. All have to call."""
     told = error if error is None or isinstance(error, InputError) else RuntimeError(f"{type(error).__name__}: {error}")
-    rank, first = next(
-        ((rank, one) for rank, one in enumerate(all_gather_object(accelerator, told)) if one is not None), (0, None)
-    )
-    if error is not None and rank == accelerator.process_index:
-        raise error
-    if first is not None:
-        if isinstance(first, InputError):
-            first.is_told = True
-        raise first
+    for rank, first in enumerate(all_gather_object(accelerator, told)):
+        if first is not None and error is not None and rank == accelerator.process_index:
+            raise error
+        if first is not None:
+            if isinstance(first, InputError):
+                first.is_told = True
+            raise first
 
 
 def all_reduce_sum(accelerator: Accelerator, values: Sequence[float | int]) -> list[float]:
@@ -325,10 +323,8 @@ def require_same(accelerator: Accelerator, value: object, *, what: str, fix: str
     values = all_gather_object(accelerator, value)
     differing = [str(rank) for rank, other in enumerate(values) if other != values[0]]
     if differing:
-        raise InputError(
-            where=what, found=f"another one in process {', '.join(differing)} than in process 0",
-            needed="the same for all processes of a run", fix=fix,
-        )  # fmt: skip
+        found = f"another one in process {', '.join(differing)} than in process 0"
+        raise InputError(where=what, found=found, needed="the same for all processes of a run", fix=fix)
 
 
 @cache

@@ -20,8 +20,8 @@ from vjepa2_ac.errors import InputError, UnreachableError
 from vjepa2_ac.process import StoppedError
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.checkpoint import RunState, checkpoint_name, newest_checkpoint, read_state, write_checkpoint
-from vjepa2_ac.runs.folder import RunLock, check_run_folder
-from vjepa2_ac.runs.mirror import SMALL_FILES, Mirror, Remote, RemoteCheckpoints, complete, open_remote
+from vjepa2_ac.runs.folder import SMALL_FILES, RunLock, check_run_folder
+from vjepa2_ac.runs.mirror import Mirror, Remote, RemoteCheckpoints, complete, open_remote
 from vjepa2_ac.training.loop import train
 
 PLACE = "gs://bucket/run"
@@ -213,21 +213,6 @@ def test_the_runs_own_folder_is_no_mirror(make_config: Callable[..., Config], in
         open_remote(make_config(checkpoint__remote=str(folder / inner)), SILENT)
 
 
-def test_a_check_fetches_elsewhere_and_leaves_the_runs_folder_alone(
-    bucket: Gcs, config: Config, tmp_path: Path
-) -> None:
-    run_there(bucket, config, 10, 20)
-    write(local(config), 10)
-    before = files_of(local(config))
-    remote = open_remote(config, SILENT, into=tmp_path / "trial")
-    assert remote.config.run_dir == str(tmp_path / "trial")
-    assert newest_checkpoint(tmp_path / "trial/checkpoints").name == checkpoint_name(20)
-    assert files_of(local(config)) == before
-    shutil.rmtree(local(config))
-    write(local(config), 30)
-    assert open_remote(config, SILENT, into=tmp_path / "other").config == config
-
-
 def test_a_folder_is_claimed_before_anything_is_fetched_into_it(bucket: Gcs, config: Config) -> None:
     """Two that start at once in a new folder: the second would put older metrics over those of the first."""
     run_there(bucket, config, 10)
@@ -349,19 +334,6 @@ def test_a_machine_killed_while_sending_leaves_the_last_complete_checkpoint_to_t
 
 
 @pytest.mark.usefixtures("bucket", "default_signals")
-def test_a_damaged_checkpoint_there_costs_the_steps_after_the_one_before(
-    bucket: Gcs, make_config: MakeConfig, reporter, tmp_path: Path, whole_run: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    stop_after(3, mirrored(make_config, tmp_path, "one", checkpoint__keep_best=False), reporter)
-    stop_after(5, mirrored(make_config, tmp_path, "one", checkpoint__keep_best=False), reporter)
-    bucket.put(f"bucket/run/checkpoints/{checkpoint_name(5)}/optimizer.pt", b"?")
-    train(mirrored(make_config, tmp_path, "two", checkpoint__keep_best=False), reporter)
-    assert reporter.steps[0] in {4, 5}  # 4, too, may have been sent
-    assert f"{checkpoint_name(5)}: optimizer.pt is damaged" in caplog.text
-    assert_same_run(whole_run, tmp_path / "two")
-
-
-@pytest.mark.usefixtures("bucket", "default_signals")
 def test_a_place_that_is_down_for_the_whole_run_costs_warnings_and_no_step(
     bucket: Gcs, make_config: MakeConfig, reporter, tmp_path: Path, whole_run: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -395,18 +367,6 @@ def test_a_check_tries_the_place_and_leaves_nothing_there_or_here(
     assert any(note.startswith("Going on from") for note in reporter.notes)
     assert bucket.names("bucket") == before
     assert not Path(config.run_dir).exists()
-
-
-@pytest.mark.usefixtures("bucket", "default_signals")
-def test_two_runs_do_not_share_a_place(make_config: MakeConfig, reporter, tmp_path: Path) -> None:
-    stop_after(2, mirrored(make_config, tmp_path, "one"), reporter)
-    stop_after(1, make_config(run_dir=str(tmp_path / "two")), reporter)
-    with pytest.raises(InputError, match="another run"):
-        train(mirrored(make_config, tmp_path, "two"), reporter)
-    with pytest.raises(InputError, match=r"differs in training\.learning_rate"):
-        train(mirrored(make_config, tmp_path, "three", training__learning_rate=0.5), reporter)
-    assert reporter.steps == []
-    assert not (tmp_path / "three").exists()
 
 
 @pytest.mark.usefixtures("bucket", "default_signals")

@@ -131,10 +131,8 @@ def _init(options: argparse.Namespace) -> int:
 def _form_and_path(first: str | None, second: str | None) -> tuple[str | None, str]:
     """Return the form, None if the files are to tell, and the place of the data."""
     if first is None:
-        raise InputError(
-            where="init", found="no data", needed=f"a folder, a URL, or one of {', '.join(FORMS)}",
-            fix="Try `vjepa2-ac init sim`, or `vjepa2-ac init path/to/your/data`",
-        )  # fmt: skip
+        needed = f"a folder, a URL, or one of {', '.join(FORMS)}"
+        raise InputError(where="init", found="no data", needed=needed, fix="Try `vjepa2-ac init sim`")
     if first not in FORMS:
         if second is not None:
             raise InputError(where="init", found=f"{first!r}, no form of data", needed=f"one of {', '.join(FORMS)}")
@@ -248,7 +246,7 @@ def _doctor(options: argparse.Namespace) -> int:
     needed = estimate.total(checkpointing=estimate.checkpointing)
     cli.show(
         f"PyTorch {torch.__version__}, CUDA {torch.version.cuda or 'not in this build'}",
-        *memory_lines(config, estimate),
+        *memory_lines(estimate),
         verdict(needed, available, gpu, ways_to_fit(config, sizes, available)),
     )
     if unusual := config.adapter.out_of_line:

@@ -53,6 +53,7 @@ CHANGES = "changes.json"  # of states in a model step
 HELD = ".mirror"
 METRICS = "metrics.jsonl"
 TENSORBOARD = "tensorboard"
+SMALL_FILES = (CONFIG, ENVIRONMENT, CALIBRATION, CHANGES, RUN_ID, METRICS)  # with which a run goes on elsewhere
 _ID = re.compile(r"[\w.-]{0,128}")
 _MOST_BYTES_OF_ID = 1_000
 IMAGINED = "imagined"  # images of what the model imagines

@@ -41,13 +41,10 @@ from vjepa2_ac.runs.checkpoint import (
     written_state,
 )
 from vjepa2_ac.runs.folder import (
-    CALIBRATION,
-    CHANGES,
     CONFIG,
     ENVIRONMENT,
     HELD,
-    METRICS,
-    RUN_ID,
+    SMALL_FILES,
     check_run_folder,
     last_start,
     with_settled_stride,
@@ -57,7 +54,6 @@ from vjepa2_ac.storage.structured import MOST_BYTES, read_json_object
 
 logger = logging.getLogger(__name__)
 
-SMALL_FILES = (CONFIG, ENVIRONMENT, CALIBRATION, CHANGES, RUN_ID, METRICS)
 SENDING = ".sending.json"
 LONGEST_WAIT_S = 3600.0  # for the mirror at the end of a run
 _LOOK_EVERY_S = 0.1  # whether the machine is about to stop

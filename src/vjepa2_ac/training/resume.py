@@ -126,11 +126,8 @@ def read_checkpoint(
         load_moments(optimizer, moments)
         return read_state(checkpoint), moments
     except (OSError, ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:
-        raise InputError(
-            where=str(checkpoint),
-            found=f"not the state of this run ({error})",
-            fix="Set back what was changed in the config; or delete this checkpoint, to use an older one",
-        ) from None
+        fix = "Set back what was changed in the config; or delete this checkpoint, to use an older one"
+        raise InputError(where=str(checkpoint), found=f"not the state of this run ({error})", fix=fix) from None
 
 
 def measured_on(config: Config, dataset: Dataset) -> Mapping[str, str]:
@@ -205,10 +202,6 @@ def require_same_data(config: Config, datasets: Sequence[Dataset]) -> None:
     began = read_run_config(folder).data_sets
     for key, dataset, old, now, before in zip(keys, datasets, began, config.data_sets, seen, strict=False):
         if old.path != now.path and before.fingerprint != fingerprint_of(dataset.table):
-            raise InputError(
-                where=f"{key}: {now.path}",
-                found="other episodes or files than the run has seen",
-                needed=f"the data set that was at {old.path}",
-                fix=f"Set {key} to where that is now (its files keep names, sizes and times when they are moved); where"
-                " the change is meant, add --allow-config-change",
-            )
+            found, needed = "other episodes or files than the run has seen", f"the data set that was at {old.path}"
+            fix = f"Set {key} to where that is now; where the change is meant, add --allow-config-change"
+            raise InputError(where=f"{key}: {now.path}", found=found, needed=needed, fix=fix)

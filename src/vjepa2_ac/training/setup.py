@@ -235,12 +235,9 @@ def _check_heads(config: Config, dataset: Dataset) -> None:
     """
     heads, widths = heads_to_replace(base_sizes(config.model), dataset.widths), dataset.widths
     if heads and config.data.stride == "auto":
-        raise InputError(
-            where="data.stride",
-            found=f"auto, for states of {widths.state} and actions of {widths.action} numbers",
-            needed="widths that the base knows: it is asked at which stride it predicts best",
-            fix="Set data.stride to a number of control steps",
-        )
+        found = f"auto, for states of {widths.state} and actions of {widths.action} numbers"
+        needed = "widths that the base knows: it is asked at which stride it predicts best"
+        raise InputError(where="data.stride", found=found, needed=needed, fix="Set it to a number of control steps")
     require_trained(heads, config.adapter)
 
 
