@@ -41,6 +41,7 @@ _SLOW = 2.0  # times as long as in float32: of a CPU that computes bfloat16 with
 
 _T = TypeVar("_T")
 
+_OTHER_LAUNCHES = ("FSDP", "DEEPSPEED", "MEGATRON_LM", "PARALLELISM_CONFIG")
 _LONGEST_STEP = timedelta(hours=2)  # until a process is given up that does not come to a sum: its disk may have stalled
 _AS_LONG_AS_IT_TAKES = timedelta(days=7)
 
@@ -197,9 +198,13 @@ def make_accelerator(config: Config) -> Accelerator:
     """Return the device and precision of a run. With several processes it joins them.
 
     Raises:
-        InputError: CUDA was requested and there is none, or the device does not compute so (fp16 on a CPU, bf16 on an
-            old GPU).
+        InputError: CUDA was requested and there is none, the device does not compute so (fp16 on a CPU, bf16 on an old
+            GPU), or the launch would share weights.
     """
+    for name in _OTHER_LAUNCHES:
+        if os.environ.get(f"ACCELERATE_USE_{name}", "false").lower() in {"1", "true", "yes", "on"}:
+            found, needed = f"{name} is asked for", "processes that share the clips, each with the whole model"
+            raise InputError(where="accelerate launch", found=found, needed=needed, fix="Start it without that")
     training, on_cpu = config.training, computing_device(config.training).type == "cpu"
     _patient_group.cache_clear()
     AcceleratorState._reset_state(reset_partial_state=False)  # or a second run keeps the first's precision
