@@ -41,17 +41,17 @@ from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.loader import validation_batches
 from vjepa2_ac.data.sources.latents.cache_files import DTYPES, bytes_per_frame, pack_latents, unpack_latents
-from vjepa2_ac.distributed.device import autocast, matmul_speed
+from vjepa2_ac.distributed import autocast, matmul_speed
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.encoding.encode_dataset import encode_config
 from vjepa2_ac.encoding.latent_cache import picture_bytes as small_frame_bytes
 from vjepa2_ac.episode import LatentBatch, Progress
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.reporter import NullReporter
+from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
 from vjepa2_ac.training.cost.flops import frame_flops
-from vjepa2_ac.training.setup import Run, batches_from, open_data, open_model
+from vjepa2_ac.training.setup import Run, batches_from, set_up
 from vjepa2_ac.training.step import training_step
 
 RATE_HZ, STRIDE = 15, 4
@@ -117,7 +117,7 @@ def measure_speed(options: argparse.Namespace, folder: Path, rows: Rows) -> None
         f"{'frames':>6}{'encoder frames/s':>18}{'MFU':>7}{'encode frames/s':>17}{'of encoder':>12}{'pictures, ms':>14}"
         f"{'min':>8}{'latents, ms':>13}{'min':>8}{'ratio':>8}"
     )
-    alone = encoder_speed(open_model(open_data(config_of(options, folder, options.frames[0], "off"))), options)
+    alone = encoder_speed(set_up(config_of(options, folder, options.frames[0], "off")), options)
     mfu = alone * frame_flops(sizes) / matmul_speed(torch.device(options.device), dtype)
     rows.add({"measured": "encoder alone", "frames_per_s": alone, "mfu": mfu})
     for frames in options.frames:
@@ -138,7 +138,7 @@ def speed_row(options: argparse.Namespace, folder: Path, frames: int, rows: Rows
     pictures, latents = (config_of(options, folder, frames, cache) for cache in ("off", "require"))
     row: Row = {"measured": "speed", "frames": frames, "encode_frames_per_s": encode(latents, options.device)}
     rows.so_far(row)
-    runs = {"pictures": open_model(open_data(pictures)), "latents": open_model(open_data(latents))}
+    runs = {"pictures": set_up(pictures), "latents": set_up(latents)}
     batches = {name: batches_from(run) for name, run in runs.items()}
     steps = {name: partial(training_step, run, batches[name], PAST_WARM_UP) for name, run in runs.items()}
     turns: dict[str, Turns] = {}
@@ -185,7 +185,7 @@ def encode(config: Config, device: str) -> float:
     """Write the cache of a run, and return the frames per second, decoding and writing included."""
     told: list[tuple[float, int]] = []
 
-    class Timed(NullReporter):
+    class Timed(Reporter):
         def task(self, title: str, unit: str = "") -> Progress:
             if not unit:
                 return super().task(title)

@@ -42,7 +42,7 @@ from planning_variants import Bench
 from rows import Row, Rows, cell
 from timing import Turns, about, add_options, introduction, prepare, profiled, ratio, rounds, settle
 
-from vjepa2_ac.distributed.device import matmul_speed
+from vjepa2_ac.distributed import matmul_speed
 
 QUICK = {
     "layers": 1, "width": 128, "latent_dim": 128, "image_size": 32, "samples": 6, "iterations": 2, "at_once": [4, 2],

@@ -43,7 +43,7 @@ from step_memory import MEMORY_TITLES, NAMES, asked, found, memory_line, memory_
 from timing import Turns, about, add_options, introduction, prepare, profiled, ratio, rounds, settle
 from train_step_variants import OFFICIAL, OFFICIAL_FULL, PRECISIONS, Bench, Setting, Started, has_checkout, our_ways
 
-from vjepa2_ac.distributed.device import matmul_speed
+from vjepa2_ac.distributed import matmul_speed
 from vjepa2_ac.model.adapter.lora import trainable_report
 
 QUICK = {

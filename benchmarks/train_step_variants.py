@@ -32,7 +32,7 @@ from vjepa2_ac.config import (
 )
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.transforms import pixels_to_input
-from vjepa2_ac.distributed.processes import make_accelerator
+from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.model.adapter.lora import add_adapter
 from vjepa2_ac.model.checkpoints.loading import to_official

@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 from vjepa2_ac import UserError, evaluate, load_config, load_run, train
-from vjepa2_ac.distributed.signals import StoppedError
+from vjepa2_ac.process import StoppedError
 from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
 
 RECORDED = Path("demo/examples/data")

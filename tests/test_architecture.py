@@ -19,7 +19,7 @@ PACKAGE = Path(vjepa2_ac.__file__).parent
 # A room imports only what stands before it; those in one line do not know each other. A folder has its own order.
 ORDERS: dict[str, list[str]] = {
     "": [
-        "__init__ errors places output episode geometry distances intervals",
+        "__init__ errors places process episode geometry distances intervals",
         "spaces reporter registry",
         "storage",
         "config",
@@ -94,7 +94,7 @@ ORDERS: dict[str, list[str]] = {
 HOMES = {
     "PIL": ["media/"],
     "accelerate": [
-        "distributed/",
+        "distributed.py",
         "runs/trackers.py",
         "training/",
         "runs/trackers.py",

@@ -28,8 +28,7 @@ from vjepa2_ac.model.checkpoints.loading import load_official
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reports.metrics_json import METRICS_FILE
 from vjepa2_ac.reports.write import PLOT
-from vjepa2_ac.runs.checkpoint import checkpoint_name, select_checkpoint
-from vjepa2_ac.runs.files import write_manifest
+from vjepa2_ac.runs.checkpoint import checkpoint_name, select_checkpoint, write_manifest
 from vjepa2_ac.runs.loading import load_run
 from vjepa2_ac.training.loop import train
 

@@ -134,19 +134,33 @@ def test_the_schema_has_what_a_plug_in_brings() -> None:
     assert "scale" in training["loss_options"]["anyOf"][0]["properties"]
 
 
-def test_an_installed_package_is_known_without_being_named(at_home: Path, make_config) -> None:
-    """Its metadata is what an installation leaves on the path."""
+def installed(at_home: Path, entry_points: str, code: str, *words: str) -> subprocess.CompletedProcess[str]:
+    """Run a command where a package of the user's is installed: its metadata is what an installation leaves."""
     about = at_home / "site/my_package-1.0.dist-info"
-    about.mkdir(parents=True)
+    about.mkdir(parents=True, exist_ok=True)
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: my-package\nVersion: 1.0\n")
-    (about / "entry_points.txt").write_text("[vjepa2_ac.losses]\nlog_cosh = my_package:LogCosh\n")
-    (at_home / "site/my_package.py").write_text(recipes("A loss"))
+    (about / "entry_points.txt").write_text(entry_points)
+    (at_home / "site/my_package.py").write_text(code)
+    program = "import sys; sys.path.append('site'); from vjepa2_ac.cli import main; sys.exit(main())"
+    return subprocess.run([sys.executable, "-P", "-c", program, *words], capture_output=True, text=True, check=False)
+
+
+def test_an_installed_package_is_known_without_being_named(at_home: Path, make_config) -> None:
     (at_home / "own.yaml").write_text(as_yaml(make_config()))
-    code = "import sys; sys.path.append('site'); from vjepa2_ac.cli import main; sys.exit(main())"
     words = ["config", "show", "own.yaml", "training.loss=log_cosh", "training.loss_options={scale: 3}"]
-    done = subprocess.run([sys.executable, "-P", "-c", code, *words], capture_output=True, text=True, check=False)
+    done = installed(at_home, "[vjepa2_ac.losses]\nlog_cosh = my_package:LogCosh\n", recipes("A loss"), *words)
     assert done.returncode == 0, done.stderr
     assert yaml.safe_load(done.stdout)["training"]["loss_options"] == {"scale": 3}
+
+
+def test_an_installed_package_adds_a_command_that_is_imported_when_it_is_asked_for(at_home: Path, make_config) -> None:
+    (at_home / "own.yaml").write_text(as_yaml(make_config()))
+    group = "[vjepa2_ac.commands]\nlongest = my_package:add_longest\n"
+    done = installed(at_home, group, recipes("A command"), "longest", "own.yaml", "--episodes", "2", "data.frames=3")
+    assert done.returncode == 0, done.stderr
+    assert len(re.findall(r"^ +\d+ steps  ", done.stdout, flags=re.MULTILINE)) == 2
+    broken = installed(at_home, group, "raise RuntimeError", "--help")
+    assert (broken.returncode, "longest" in broken.stdout) == (0, True)
 
 
 def test_a_form_of_data_is_found_trained_on_and_measured_by_a_metric(at_home: Path, base_folder: Path) -> None:

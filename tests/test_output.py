@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 
 from run_fixtures import Popen
-from vjepa2_ac import output
+from vjepa2_ac.process import own_streams
 
 BEGINNING = """
 import sys, os
-from vjepa2_ac import output
-with output.own_streams() as lost:
+from vjepa2_ac import process
+with process.own_streams() as lost:
 """
 Start = Callable[..., subprocess.Popen]
 
@@ -126,7 +126,7 @@ def test_a_pipe_that_others_made_unblocking_is_waited_for(start: Start) -> None:
 
 def test_streams_of_a_test_or_a_notebook_stay_theirs(capsys: pytest.CaptureFixture[str]) -> None:
     before = sys.stdout
-    with output.own_streams() as lost:
+    with own_streams() as lost:
         assert sys.stdout is before
         assert lost() == ""
         sys.stdout.write("seen\n")

@@ -17,7 +17,6 @@ from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.monitoring import TrainingReporter
 
 BUILTIN = "builtin:sim-tiny"
 EPISODES_A, EPISODES_SHIFTED = 400, 100
@@ -52,7 +51,7 @@ def base_model(folder: Path, base: Base, seed: int) -> str:
     return str(folder / (f"scratch-{seed}" if base == "none" else "base-one-camera"))
 
 
-def prepare(folder: Path, seeds: int, reporter: TrainingReporter = SILENT) -> None:
+def prepare(folder: Path, seeds: int, reporter: Reporter = SILENT) -> None:
     """Make everything that is not there yet: some 25 minutes on one core, nearly all of it the base of one camera."""
     folder.mkdir(parents=True, exist_ok=True)
     _record(data_a(folder), "A", EPISODES_A, SEED_A)

@@ -24,7 +24,7 @@ from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.loader import validation_batches
 from vjepa2_ac.data.transforms import Crop
 from vjepa2_ac.data.windows import require_stride
-from vjepa2_ac.distributed.device import has_bf16, no_cuda, require_type_of_weights
+from vjepa2_ac.distributed import has_bf16, no_cuda, require_type_of_weights
 from vjepa2_ac.encoding.batch import encode_batch, encode_frames
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError
@@ -32,7 +32,7 @@ from vjepa2_ac.model.adapter.adapter_folder import ADAPTER_FILE
 from vjepa2_ac.model.adapter.lora import load_trained
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.reporter import NullReporter
+from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs import loading
 from vjepa2_ac.runs.folder import is_run
 from vjepa2_ac.storage.structured import message_of
@@ -248,7 +248,7 @@ def train(
 
     Raises:
         InputError: Something cannot be used; raised before the first step wherever possible.
-        StoppedError: A signal ended it, see `distributed.signals`; the same call resumes.
+        StoppedError: A signal ended it, see `process`; the same call resumes.
 
     Example:
         >>> run = train(load_config("configs/demo.yaml", ["training.steps=200"]), note=print)
@@ -310,7 +310,7 @@ def evaluate(
     return evaluate_subject(str(subject), asked)
 
 
-class _Told(NullReporter):
+class _Told(Reporter):
     """Calls functions of the user."""
 
     def __init__(self, note: Callable[[str], None], on_step: Callable[[int, dict[str, float]], None] | None) -> None:

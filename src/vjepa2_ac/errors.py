@@ -34,6 +34,8 @@ class UserError(Exception):
         fix: How to fix it, as a sentence.
     """
 
+    is_told = False  # by another process of the run, which met it
+
     def __init__(self, *, where: str, found: str, needed: str = "", fix: str = "") -> None:
         self.where, self.found, self.needed, self.fix = where, found, needed, fix
         sentences = [_short(found), f"needed: {_short(needed)}" if needed else "", _short(fix)]

@@ -25,8 +25,7 @@ from vjepa2_ac.model.network.input_heads import widths_as_text, widths_of_model
 from vjepa2_ac.model.network.pretrained_folder import require_finite
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, Metrics, read_metrics
 from vjepa2_ac.reports.write import PLOT
-from vjepa2_ac.runs.checkpoint import ADAPTER, SELECTED, read_state
-from vjepa2_ac.runs.files import write_torch
+from vjepa2_ac.runs.checkpoint import ADAPTER, SELECTED, read_state, write_torch
 from vjepa2_ac.runs.folder import read_run_config
 from vjepa2_ac.runs.loading import TrainedRun, load_run
 from vjepa2_ac.storage import atomic_writer, folder_writer, is_empty, try_writing_at, user_can_write, write_atomically

@@ -135,28 +135,3 @@ def test_axes_are_fitted_written_and_drawn_and_a_model_that_knows_none_is_told(
     assert main(["plan", "builtin:sim-tiny", f"planning.axes={out / 'axes.json'}", "--start", "a.png", "--goal",
                  "a.png", "--state", "0.4,0,.3,3,0,0,0"]) == 2  # fmt: skip
     assert read["problem"][:12] in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("more", "complaint"),
-    [
-        (["--model", "builtin:sim-tiny"], "--model: --axes beside it"),
-        (["data.stride=auto"], "axes are those of a model step"),
-        (["data.states=vector"], "base frame"),
-    ],
-)
-def test_axes_that_cannot_be_asked_for_are_refused(
-    config: str, capsys: Printed, more: list[str], complaint: str
-) -> None:
-    assert main(["data", "calibrate", config, "--axes", "builtin:sim-tiny", *more]) == 2
-    assert complaint in " ".join(capsys.readouterr().err.split())
-
-
-def test_a_random_model_cannot_choose(config: str, tmp_path: Path, capsys: Printed) -> None:
-    values = yaml.safe_load(Path(config).read_text())
-    values["model"] = {"random": {}, "dtype": "float32"}
-    values["adapter"] = {"kind": "none"}
-    path = tmp_path / "random.yaml"
-    path.write_text(yaml.safe_dump(values))
-    assert main(["data", "calibrate", str(path), "--out", str(tmp_path / "o")]) == 2
-    assert "learned nothing" in capsys.readouterr().err

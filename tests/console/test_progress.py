@@ -100,21 +100,6 @@ def test_a_task_with_a_unit_shows_its_speed_and_the_next_one_ends_it(monkeypatch
     assert "done" in shown
 
 
-@pytest.mark.parametrize("terminal", [False, True])
-def test_time_left_is_shown_after_the_first_part_however_slow(
-    monkeypatch: pytest.MonkeyPatch, *, terminal: bool
-) -> None:
-    written = shown_on(monkeypatch, terminal=terminal)
-    now = [0.0]
-    monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    bar = ProgressBar("planning")
-    bar(0, 800)
-    now[0] = 100.0
-    bar(64, 800)
-    bar.close()
-    assert "0:19:10 left" in written.getvalue()
-
-
 HOSTILE = "run[lr=0.01] [/b] :smile: \x1b[31m\x1b]0;x\x07"
 SHOWN = r"run[lr=0.01] [/b] :smile: \x1b[31m\x1b]0;x\x07"
 

@@ -27,10 +27,10 @@ from vjepa2_ac.decoding.frame_pairs import FramePairs, Pairs
 from vjepa2_ac.decoding.network import as_images
 from vjepa2_ac.decoding.steps import DecoderSteps, learning_rate_at
 from vjepa2_ac.decoding.training import train_decoder
-from vjepa2_ac.distributed.signals import EXIT_STATUS, StoppedError
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.image_similarity import psnr
 from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.process import EXIT_STATUS, StoppedError
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 
 FINISHED = {CARD, WEIGHTS, LINEAR, "key.json", "metrics.jsonl", ".lock"}

@@ -46,6 +46,16 @@ def test_what_the_first_rank_alone_meets_ends_both_with_its_error(
         assert found in said
 
 
+def test_a_command_of_several_processes_prints_an_error_once(make_config, tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run/thesis.tex").write_text("years of work")
+    path, port = tmp_path / "config.yaml", free_port()
+    path.write_text(config_as_yaml(make_config()))
+    ranks = [start_rank(["-m", "vjepa2_ac.cli", "train", str(path)], rank, 2, port) for rank in range(2)]
+    said = [err for _, err in finish(ranks, 2, timeout=60)]
+    assert ["other things in it" in err for err in said] == [True, False]
+
+
 def test_the_share_of_broken_episodes_is_that_of_all_ranks_together(make_config, tmp_path: Path) -> None:
     config = make_config(data__broken_episodes="skip")
     for said in start_both(config, tmp_path, "each_meets_another_broken_episode", status=3):

@@ -14,11 +14,11 @@ import torch
 import yaml
 from PIL import Image
 
+from vjepa2_ac import distributed
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import parse_config
-from vjepa2_ac.distributed import device
-from vjepa2_ac.distributed.device import computing_device, require_type_of_weights
+from vjepa2_ac.distributed import computing_device, require_type_of_weights
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.session import load_to_plan
 
@@ -65,8 +65,10 @@ def products(monkeypatch: pytest.MonkeyPatch) -> dict[torch.dtype, float]:
     """Milliseconds that a product takes on a CPU without a GPU."""
     taken = {torch.bfloat16: 238.0, torch.float32: 4.0}
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    monkeypatch.setattr(device, "matmul_speed", lambda _cpu, dtype: 2e3 * device._CPU_MATRIX**3 / taken[dtype])
-    device._warn.cache_clear()
+    monkeypatch.setattr(
+        distributed, "matmul_speed", lambda _cpu, dtype: 2e3 * distributed._CPU_MATRIX**3 / taken[dtype]
+    )
+    distributed._warn.cache_clear()
     return taken
 
 
@@ -129,7 +131,7 @@ def test_a_slow_bfloat16_of_a_cpu_is_told_once_with_the_way_out(
     assert "a product of matrices takes 238 ms on this CPU, 4 ms in float32 (60 times)" in told
     way_out = "training.precision=fp32 with model.dtype=float32" if door in UNDER_AUTOCAST else "model.dtype=float32"
     assert told.endswith(f"Set {way_out}")
-    device._warn.cache_clear()
+    distributed._warn.cache_clear()
     products[torch.bfloat16] = 4.0
     through(door, monkeypatch, tmp_path)
     assert "warning" not in capsys.readouterr().err
@@ -137,7 +139,7 @@ def test_a_slow_bfloat16_of_a_cpu_is_told_once_with_the_way_out(
 
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="the variable is of x86")
 def test_a_cpu_that_is_held_to_avx2_is_found_slow() -> None:
-    program = "from vjepa2_ac.distributed.device import slow_bf16; print(slow_bf16())"
+    program = "from vjepa2_ac.distributed import slow_bf16; print(slow_bf16())"
     environment = os.environ | {"ONEDNN_MAX_CPU_ISA": "AVX2", "ATEN_CPU_CAPABILITY": "avx2"}
     found = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
     assert "a product of matrices takes" in found.stdout

@@ -15,8 +15,8 @@ from run_fixtures import set_up
 from same_run import metrics, trained_weights
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.data.loader import training_loader
-from vjepa2_ac.distributed.signals import EXIT_STATUS, StoppedError
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.process import EXIT_STATUS, StoppedError
 from vjepa2_ac.runs.checkpoint import RunState, newest_checkpoint, read_state
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.training.loop import train

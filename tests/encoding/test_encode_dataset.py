@@ -19,10 +19,10 @@ from latent_sets import NUMBERS, write_cache
 from ranks import finish, free_port, start_rank
 from run_fixtures import MakeConfig, SilentReporter, as_yaml, set_up
 from same_run import assert_same_run
+from vjepa2_ac import distributed as collectives
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.loader import validation_batches
-from vjepa2_ac.distributed import processes as collectives
 from vjepa2_ac.encoding import encode_dataset, latent_cache
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.encoding.encode_dataset import EncodedSet, encode_config

@@ -23,15 +23,18 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.runs.checkpoint import (
     CheckpointClock,
+    DataState,
     RunState,
     checkpoint_name,
     find_damage,
     newest_checkpoint,
     read_state,
+    read_torch,
     select_checkpoint,
     write_checkpoint,
+    write_manifest,
+    write_torch,
 )
-from vjepa2_ac.runs.files import read_torch, write_manifest, write_torch
 from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.resume import save_checkpoint
 
@@ -316,8 +319,8 @@ DEEP = "[" * 20_000 + "]" * 20_000
 
 def test_every_field_of_a_state_comes_back(tmp_path: Path) -> None:
     state = RunState(
-        10, run_id="a", clips_done=40, clips_per_step=4, clips_asked=2, processes=2, broken={"e": "why"}, windows=0,
-        best_step=10, best_error=0.5, measured_on={"data.frames": "16"},
+        10, run_id="a", clips_done=40, clips_per_step=4, clips_asked=2, processes=2,
+        data=(DataState("f", 3, {"e": "why"}),), best_step=10, best_error=0.5, measured_on={"data.frames": "16"},
         loss_scale={"scale": 65536.0, "growth_interval": 2000, "_growth_tracker": 0, "growth_factor": float("inf")},
     )  # fmt: skip
     found = read_state(write_checkpoint(tmp_path, state, lambda _: None, keep=1))
@@ -327,8 +330,8 @@ def test_every_field_of_a_state_comes_back(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "changes",
-    [{"step": "10"}, {"step": -1}, {"clips_done": None}, {"processes": 0}, {"broken": {"a": 3}}, {"best_error": "low"},
-     {"loss_scale": [1]}, {"run_id": 3}, {"unheard_of": 3}],
+    [{"step": "10"}, {"step": -1}, {"clips_done": None}, {"processes": 0}, {"data": [{"broken": {"a": 3}}]},
+     {"best_error": "low"}, {"loss_scale": [1]}, {"run_id": 3}, {"unheard_of": 3}],
     ids=str,
 )  # fmt: skip
 def test_a_state_of_other_types_is_refused_by_name(tmp_path: Path, changes: dict[str, object]) -> None:

@@ -11,7 +11,7 @@ from vjepa2_ac.runs.checkpoint import RunState
 from vjepa2_ac.runs.folder import RunLock, with_stride
 from vjepa2_ac.runs.open_run import open_run
 
-OPEN_REMOTE = "vjepa2_ac.runs.mirror.open_remote.open_remote"
+OPEN_REMOTE = "vjepa2_ac.runs.open_run.open_remote"
 
 
 def test_a_new_folder_is_made_and_locked_when_the_run_begins_and_not_before(make_config, reporter) -> None:

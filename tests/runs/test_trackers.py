@@ -210,16 +210,6 @@ def test_weights_and_biases_goes_on_in_the_same_run_without_a_network(tmp_path: 
         assert word in written
 
 
-def test_weights_and_biases_without_a_login_costs_one_warning(tmp_path: Path, caplog, monkeypatch) -> None:
-    pytest.importorskip("wandb")
-    monkeypatch.setattr("sys.stdin", None)
-    trackers = open_trackers(run_config(tmp_path, wandb="online"), tmp_path, run_id="abc123", first_step=0)
-    trackers.log("train", 1, {"loss": 0.25})
-    trackers.close()
-    (said,) = warnings_in(caplog)
-    assert said.startswith("Weights & Biases cannot be opened")
-
-
 def test_a_tracker_is_asked_to_resume_the_run_by_its_id(tmp_path: Path, monkeypatch) -> None:
     asked: dict[str, dict[str, Any]] = {}
     kept = Kept()
@@ -253,19 +243,6 @@ def test_trackio_goes_on_in_the_same_run(tmp_path: Path) -> None:
 
 
 IMAGE = np.arange(60, dtype=np.uint8).reshape(4, 5, 3)
-
-
-def test_images_come_after_the_rows_before_them_and_one_that_fails_costs_one_warning(caplog) -> None:
-    kept, bad = Kept(), Kept("log")
-    trackers = Trackers({"good": lambda: kept, "bad": lambda: bad})
-    trackers.log_image("validation", "imagined", 7, IMAGE)
-    trackers.log("validation", 7, {"error": 0.5})
-    trackers.close()
-    ((step, name, image),) = kept.images
-    assert (step, name) == (7, "validation/imagined")
-    assert np.array_equal(image, IMAGE)
-    assert len(kept.rows) == 1
-    assert [text.split(" (")[0] for text in warnings_in(caplog)] == ["bad failed"]
 
 
 def test_tensorboard_gets_images(tmp_path: Path) -> None:

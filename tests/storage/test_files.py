@@ -15,15 +15,15 @@ import pytest
 
 from run_fixtures import Popen
 from vjepa2_ac import storage
-from vjepa2_ac.distributed.signals import tidy_end
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.process import tidy_end
 from vjepa2_ac.storage.files import remove_abandoned
 
 WRITING = """
 import sys, time
 from pathlib import Path
 from vjepa2_ac import storage
-from vjepa2_ac.distributed.signals import tidy_end
+from vjepa2_ac.process import tidy_end
 target = Path(sys.argv[1])
 with tidy_end():
     if sys.argv[2] == "file":

@@ -24,7 +24,7 @@ from pathlib import Path
 
 import psutil
 
-from vjepa2_ac import output
+from vjepa2_ac import process as output
 
 KILLED = -signal.SIGKILL
 

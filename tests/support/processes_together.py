@@ -11,7 +11,7 @@ import torch
 from run_fixtures import set_up
 from vjepa2_ac.config.loading import load_config
 from vjepa2_ac.data.loader import training_loader
-from vjepa2_ac.distributed.processes import (
+from vjepa2_ac.distributed import (
     all_gather_object,
     all_reduce_max,
     all_reduce_sum,

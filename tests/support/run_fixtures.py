@@ -17,15 +17,14 @@ from killable import Nursery
 from synthetic import write_synthetic_droid
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict, parse_config
-from vjepa2_ac.distributed.signals import HANG_UP, SIGNALS
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.reporter import SILENT, NullReporter
+from vjepa2_ac.process import HANG_UP, SIGNALS
+from vjepa2_ac.reporter import SILENT, Reporter
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
 
-    from vjepa2_ac.training.monitoring import TrainingReporter
     from vjepa2_ac.training.setup import Run
 
 TINY = {
@@ -47,7 +46,7 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(threads)
 
 
-class SilentReporter(NullReporter):
+class SilentReporter(Reporter):
     """Keeps what it is told."""
 
     def __init__(self) -> None:
@@ -85,12 +84,12 @@ def dying_reporter(reporter: SilentReporter, last_step: int) -> SilentReporter:
     return reporter
 
 
-def set_up(config: Config, reporter: TrainingReporter = SILENT, accelerator: Accelerator | None = None) -> Run:
+def set_up(config: Config, reporter: Reporter = SILENT, accelerator: Accelerator | None = None) -> Run:
     """Return a run as `train` has it before its first step."""
+    from vjepa2_ac.training import setup
     from vjepa2_ac.training.resume import restore
-    from vjepa2_ac.training.setup import open_data, open_model
 
-    return restore(open_model(open_data(config, reporter, accelerator), reporter), reporter)
+    return restore(setup.set_up(config, reporter, accelerator), reporter)
 
 
 @pytest.fixture(scope="session")

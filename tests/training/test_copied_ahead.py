@@ -120,7 +120,7 @@ def test_a_checkpoint_knows_nothing_of_the_clips_of_the_next_step(make_config, r
     request.getfixturevalue("on_device")
     train(config, reporter)
     folders = [Path(config.run_dir) / f"checkpoints/step-{step:08d}" for step in (2, 3)]
-    assert [dict(read_state(folder).broken) for folder in folders] == [{}, {bad[0]: "here: damaged."}]
+    assert [dict(read_state(folder).data[0].broken) for folder in folders] == [{}, {bad[0]: "here: damaged."}]
 
 
 def test_a_clip_that_cannot_be_read_stops_the_run_at_its_own_step(

@@ -53,7 +53,7 @@ def test_the_clip_is_the_one_with_the_most_motion_and_its_rows_are_true(make_con
     run = set_up(make_config(validation__decoder=decoder), reporter)
     validate(run, reporter)
     assert run.strip is not None
-    found = run.strip._imagine(run.strip._clip, run.world_model, run.accelerator.device, "run")
+    found = run.strip.imagine(run.world_model, run.accelerator.device, "run")
     windows = validation_windows(run.dataset, "validation", clips=4)
     moved = {}
     for episode, start in windows:
@@ -72,7 +72,7 @@ def test_a_model_without_an_adapter_is_drawn_without_a_base(make_config, reporte
     run = set_up(make_config(validation__decoder=decoder, adapter__kind="none"), reporter)
     validate(run, reporter)
     assert run.strip is not None
-    found = run.strip._imagine(run.strip._clip, run.world_model, torch.device("cpu"), "run")
+    found = run.strip.imagine(run.world_model, torch.device("cpu"), "run")
     assert [one.model for one in found.rollouts] == ["model now"]
 
 

@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from vjepa2_ac.cli import main
-from vjepa2_ac.errors import InputError, pip_install
+from vjepa2_ac.errors import UserError, pip_install
 from vjepa2_ac.training.loop import train
 
 
@@ -25,7 +25,7 @@ def test_missing_libraries_are_reported_before_mirror_or_data_are_opened(
     for name in (library, f"{library}.optim"):
         monkeypatch.setitem(sys.modules, name, None)
     config = make_config(data__path="nowhere", checkpoint__remote="nothing://reads/this", **{knob: value})
-    with pytest.raises(InputError, match=rf"{library} is not installed.*{re.escape(pip_install(extra))}"):
+    with pytest.raises(UserError, match=rf"{library}.* is not installed.*{re.escape(pip_install(extra))}"):
         train(config, reporter)
 
 

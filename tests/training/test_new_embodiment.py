@@ -1,6 +1,5 @@
 """A robot with other states or actions than the base's: from its recordings to a trained model."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,6 @@ from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.input_heads import widths_of_model
 from vjepa2_ac.reports.metrics_json import metrics_as_dict
 from vjepa2_ac.reports.write import evaluate_subject
-from vjepa2_ac.runs.checkpoint import newest_checkpoint
 from vjepa2_ac.runs.loading import load_run
 from vjepa2_ac.training.loop import train
 
@@ -160,27 +158,3 @@ def test_a_model_of_one_robot_is_not_measured_on_another(make_robot: MakeConfig,
     with pytest.raises(InputError, match=r"states of 8 and actions of 8 numbers\. needed: states of 14") as caught:
         evaluate_subject(str(folder), QUICK)
     assert str(folder) in str(caught.value)
-
-
-def test_the_card_on_the_hub_describes_the_new_heads(make_robot: MakeConfig, reporter: Any, tmp_path: Path) -> None:
-    folder = train(make_robot(ROBOTS["8/7"], training__steps=1), reporter)
-    card = (export_run(folder, tmp_path / "hub", "hub").path / "README.md").read_text()
-    assert "fresh, for states of 8 and actions of 7 numbers" in card
-    assert "recorded, joined by sum" in card
-    lines = card.split("With PEFT's own loading")[1].split("```python")[1].split("```")[0]
-    names: dict[str, Any] = {}
-    exec("from vjepa2_ac import load_model\n" + lines.replace("FOLDER", str(tmp_path / "hub")), names)  # noqa: S102 - the card's own words
-    generator = torch.Generator().manual_seed(1)
-    latents, states, actions = (torch.randn(1, 2, *shape, generator=generator) for shape in ((4, 24), (8,), (7,)))
-    with torch.no_grad():
-        alone = names["predictor"].eval()(latents, actions, states)
-        trained = load_run(folder).world_model.predictor.eval()(latents, actions, states)
-    assert torch.equal(alone, trained)
-
-
-def test_the_checkpoint_says_which_heads_are_fresh(make_robot: MakeConfig, reporter: Any) -> None:
-    folder = train(make_robot(training__steps=1), reporter)
-    checkpoint = newest_checkpoint(folder / "checkpoints")
-    assert checkpoint is not None
-    card = json.loads((checkpoint / "adapter/vjepa2_ac.json").read_text())
-    assert card["fresh_heads"] == {"action_dim": 14, "state_dim": 14, "seed": 0}

@@ -3,7 +3,6 @@
 import importlib.util
 import io
 import json
-import sys
 from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
@@ -16,8 +15,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from paths import GOLDEN
 from vjepa2_ac.config import TrainingConfig
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.runs.checkpoint import newest_checkpoint
-from vjepa2_ac.runs.files import read_torch, write_manifest, write_torch
+from vjepa2_ac.runs.checkpoint import newest_checkpoint, read_torch, write_manifest, write_torch
 from vjepa2_ac.training import optim
 from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.optim import learning_rate_at, load_moments, make_optimizer, parameter_groups
@@ -180,13 +178,6 @@ def test_the_8_bit_optimizer_resumes_exactly_and_spares_biases() -> None:
     take_steps(resumed, again, range(3, 6))
     assert torch.equal(module.weight, resumed.weight)
     assert torch.equal(module.bias, resumed.bias)
-
-
-def test_an_8_bit_optimizer_without_its_library_names_the_way_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "bitsandbytes", None)
-    monkeypatch.setitem(sys.modules, "bitsandbytes.optim", None)
-    with pytest.raises(InputError, match=r"bitsandbytes is not installed.*\[8bit\]"):
-        make_optimizer(torch.nn.Linear(2, 2), TrainingConfig(optimizer="adamw_8bit"))
 
 
 @pytest.mark.parametrize(

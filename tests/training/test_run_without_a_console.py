@@ -13,7 +13,7 @@ import pytest
 from killable import Child, Nursery
 from same_run import assert_same_run
 from vjepa2_ac.config.loading import config_as_yaml
-from vjepa2_ac.distributed.signals import EXIT_STATUS
+from vjepa2_ac.process import EXIT_STATUS
 from vjepa2_ac.runs.checkpoint import newest_checkpoint
 from vjepa2_ac.training.loop import train
 

@@ -27,7 +27,7 @@ from vjepa2_ac.config.planning import CemConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import validation_batches
 from vjepa2_ac.distances import squared_difference
-from vjepa2_ac.distributed.processes import make_accelerator
+from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.evaluation.action_use import RolloutStart, evaluate_actions, start_of

@@ -27,7 +27,7 @@ from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.loader import validation_windows
 from vjepa2_ac.data.windows import spread
-from vjepa2_ac.distributed.processes import make_accelerator
+from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, EpisodeSource, LatentBatch, Progress, StepRanges, no_progress
 from vjepa2_ac.errors import InputError

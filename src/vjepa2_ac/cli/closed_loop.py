@@ -11,28 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vjepa2_ac.cli.options import (
-    Commands,
-    add_checkpoint,
-    add_decoder,
-    add_planner,
-    argument,
-    as_local,
-    as_path,
-    as_planner,
-    camera_pose,
-    command,
-    count,
-    given_decoder,
-    is_server,
-    load_planning_session,
-    number_between,
-    record_of_options,
-    require_goals,
-    require_new_place,
-    require_to_plan,
-    whole_number,
-)
+from vjepa2_ac.cli import options as cli
 from vjepa2_ac.errors import InputError
 
 if TYPE_CHECKING:
@@ -49,77 +28,76 @@ _OF_RECORD = ("cameras", "workers")
 _OF_A_MODEL = ("sub_goals", "goals", "films", "decoder", "checkpoint", "config", "out", "key_file")
 
 
-def add_serve(commands: Commands) -> None:
+def add_serve(commands: cli.Commands) -> None:
     """Add `serve` to a parser."""
-    text = (
-        "Serve a planner to a robot over a websocket, in the protocol of openpi's clients: pictures, states and goals"
-        " in, actions within planning.limits out (docs/serving.md). Runs until SIGTERM or Ctrl-C."
-    )
-    parser = command(commands, "serve", _serve, text)
-    add_planner(parser, such_as="such as planning.limits.xyz=[0.01,0.01,0.01]")
-    argument(parser, "--goals FOLDER", "that a client may name: pictures, and folders that `goals` made", as_path)
+    parser = cli.command(commands, "serve", _serve)
+    cli.add_planner(parser, such_as="such as planning.limits.xyz=[0.01,0.01,0.01]")
+    cli.add(parser, "--goals FOLDER", "that a client may name: pictures, and folders that `goals` made", cli.as_path)
     text = "delta: changes of each model step; pose: waypoints to the target pose, one a control step (delta)"
-    argument(parser, "--actions delta|pose", text, choices=["delta", "pose"], default="delta")
-    argument(parser, "--image-key KEY", "the key of the camera's picture in requests (the usual ones)")
+    cli.add(parser, "--actions delta|pose", text, choices=["delta", "pose"], default="delta")
+    cli.add(parser, "--image-key KEY", "the key of the camera's picture in requests (the usual ones)")
     text = "what is told on connect; roboarena: its six keys only (full)"
-    argument(parser, "--metadata full|roboarena", text, choices=["full", "roboarena"], default="full")
+    cli.add(parser, "--metadata full|roboarena", text, choices=["full", "roboarena"], default="full")
     text = "of a decision; then the action is zero (60)"
-    argument(parser, "--deadline SECONDS", text, number_between(0, 3600, "seconds"), default=60.0)
-    argument(parser, "--dry-run", "plan, and answer zeros", action="store_true")
+    cli.add(parser, "--deadline SECONDS", text, cli.number_between(0, 3600, "seconds"), default=60.0)
+    cli.add(parser, "--dry-run", "plan, and answer zeros", action="store_true")
     group = parser.add_argument_group("who may")
-    argument(group, "--host ADDRESS", "where it listens (127.0.0.1: this machine only)", default="127.0.0.1")
-    argument(group, "--port N", "0: a free one (8000)", whole_number(0, 65535), default=8000)
-    argument(group, "--key-file FILE", "with the key that clients send; needed where others can reach it", as_path)
-    argument(group, "--insecure", "no key, although others can reach the address", action="store_true")
-    argument(group, "--allow-host NAME", "a name that a proxy serves it under; repeatable", action="append", default=[])
-    argument(group, "--certificate FILE", "TLS: the certificate and those it is signed by, PEM", as_path)
-    argument(group, "--certificate-key FILE", "its private key, PEM (in the same file)", as_path)
+    cli.add(group, "--host ADDRESS", "where it listens (127.0.0.1: this machine only)", default="127.0.0.1")
+    cli.add(group, "--port N", "0: a free one (8000)", cli.whole_number(0, 65535), default=8000)
+    cli.add(group, "--key-file FILE", "with the key that clients send; needed where others can reach it", cli.as_path)
+    cli.add(group, "--insecure", "no key, although others can reach the address", action="store_true")
+    cli.add(group, "--allow-host NAME", "a name that a proxy serves it under; repeatable", action="append", default=[])
+    cli.add(group, "--certificate FILE", "TLS: the certificate and those it is signed by, PEM", cli.as_path)
+    cli.add(group, "--certificate-key FILE", "its private key, PEM (in the same file)", cli.as_path)
     group = parser.add_argument_group("record")
-    argument(group, "--record FOLDER", "every decision with its pictures, in a new folder", as_path)
-    argument(group, "--record-gb GB", "where the record ends (2)", number_between(0, 10_000, "gigabytes"), default=2.0)
-
-
-def add_simulate(commands: Commands) -> None:
-    """Add `simulate` to a parser: it records if its first word is `record`, else it tests a model in closed loop."""
-    text = (
-        "Let a model steer a simulated arm to a goal image, beside doing nothing, chance and an oracle. Or, as"
-        " `simulate record FOLDER`: record demonstrations of the arm as a DROID data set. Status 1 where the model gave"
-        " no finite energy in any decision."
+    cli.add(group, "--record FOLDER", "every decision with its pictures, in a new folder", cli.as_path)
+    cli.add(
+        group, "--record-gb GB", "where the record ends (2)", cli.number_between(0, 10_000, "gigabytes"), default=2.0
     )
-    parser = command(commands, "simulate", _simulate, text)
+
+
+def add_simulate(commands: cli.Commands) -> None:
+    """Add `simulate` to a parser: it records if its first word is `record`, else it tests a model in closed loop."""
+    parser = cli.command(commands, "simulate", _simulate)
     text = (
         "who steers: the folder of a run, or what model.base takes, such as builtin:sim-tiny; or a server of one, as"
         " ws://127.0.0.1:8000; or: record"
     )
-    argument(parser, "subject RUN_OR_MODEL|ws://SERVER|record", text, as_planner)
-    argument(parser, "overrides key=value|FOLDER", "such as planning.samples=64; record: where the data go", nargs="*")
+    cli.add(parser, "subject RUN_OR_MODEL|ws://SERVER|record", text, cli.as_planner)
+    cli.add(parser, "overrides key=value|FOLDER", "such as planning.samples=64; record: where the data go", nargs="*")
     text = "A or B; record: or random, another world in every episode (A)"
-    argument(parser, "--domain", text, choices=["A", "B", "random"], default="A")
-    argument(parser, "--episodes N", "how many (50; record: 40)", count)
-    argument(parser, "--steps N", "model steps (8; pick: 12, place: 18); record: control steps (41; place: 81)", count)
-    argument(parser, "--seed N", "which problems or demonstrations (0)", whole_number(0, 2**31 - 1))
+    cli.add(parser, "--domain", text, choices=["A", "B", "random"], default="A")
+    cli.add(parser, "--episodes N", "how many (50; record: 40)", cli.count)
+    cli.add(
+        parser, "--steps N", "model steps (8; pick: 12, place: 18); record: control steps (41; place: 81)", cli.count
+    )
+    cli.add(parser, "--seed N", "which problems or demonstrations (0)", cli.whole_number(0, 2**31 - 1))
     text = "what is to be done (reach); record: push, pick or place, with a block on the table (none: reaching around)"
-    argument(parser, "--task", text, choices=["reach", "push", "pick", "place"])
+    cli.add(parser, "--task", text, choices=["reach", "push", "pick", "place"])
     group = parser.add_argument_group("of a model that steers")
-    add_checkpoint(group, default=None)
-    argument(group, "--config CONFIG", "of a model: a config whose `planning` is used", as_local)
+    cli.add_checkpoint(group, default=None)
+    cli.add(group, "--config CONFIG", "of a model: a config whose `planning` is used", cli.as_local)
     text = (
         "goals on the way: demonstration takes them from the oracle's solution of the same problem, where the gripper"
         " changes or the arm stops; every-step: each model step of it (none)"
     )
-    argument(group, "--sub-goals", text, choices=["none", "demonstration", "every-step"])
+    cli.add(group, "--sub-goals", text, choices=["none", "demonstration", "every-step"])
     text = "a folder of goals on the way, that `vjepa2-ac goals` made: the same in every problem, of a fixed scene"
-    argument(group, "--goals FOLDER", text, as_local)
-    argument(group, "--films N", "episodes in the video; 0: none (6)", whole_number(0))
-    add_decoder(group, "in the video what the model imagined of each frame, one step ago")
-    argument(group, "--out FOLDER", "where figures and video go (closed_loop/TASK-DOMAIN, in the run's)", as_path)
-    argument(group, "--key-file FILE", "of a server that needs a key: the file with it", as_path)
+    cli.add(group, "--goals FOLDER", text, cli.as_local)
+    cli.add(group, "--films N", "episodes in the video; 0: none (6)", cli.whole_number(0))
+    cli.add_decoder(group, "in the video what the model imagined of each frame, one step ago")
+    cli.add(group, "--out FOLDER", "where figures and video go (closed_loop/TASK-DOMAIN, in the run's)", cli.as_path)
+    cli.add(group, "--key-file FILE", "of a server that needs a key: the file with it", cli.as_path)
     group = parser.add_argument_group("of record")
-    argument(group, "--cameras", "1: all three images are the same one (1)", whole_number(1, 3), choices=[1, 3])
-    argument(group, "--workers N", "processes; the data are the same whatever their number (1)", count)
+    cli.add(group, "--cameras", "1: all three images are the same one (1)", cli.whole_number(1, 3), choices=[1, 3])
+    cli.add(group, "--workers N", "processes; the data are the same whatever their number (1)", cli.count)
 
 
 def _serve(options: argparse.Namespace) -> int:
+    """Serve a planner to a robot over a websocket, in the protocol of openpi's clients.
+
+    Pictures, states and goals in, actions within planning.limits out (docs/serving.md). Runs until SIGTERM or Ctrl-C.
+    """
     from vjepa2_ac.serving.access import Access, read_key
 
     if options.metadata == "roboarena" and options.actions != "pose":
@@ -127,11 +105,10 @@ def _serve(options: argparse.Namespace) -> int:
         raise InputError(where="--metadata roboarena", found=found, needed=needed)
     key = None if options.key_file is None else read_key(options.key_file)
     access = Access(options.host, key, options.insecure, tuple(options.allow_host))
-    extrinsics, tls = camera_pose(options.extrinsics), _tls(options)
-    require_goals(options.goals)
-    require_to_plan(options)
+    extrinsics, tls = cli.camera_pose(options.extrinsics), _tls(options)
+    cli.require_goals(options.goals)
+    cli.require_to_plan(options)
 
-    from vjepa2_ac.console.progress import show
     from vjepa2_ac.serving.about import read_kept_goals
     from vjepa2_ac.serving.recording import require_new_record
     from vjepa2_ac.serving.server import ServerOptions, serve
@@ -139,7 +116,7 @@ def _serve(options: argparse.Namespace) -> int:
     if options.record is not None:
         require_new_record(options.record)
     goals = None if options.goals is None else read_kept_goals(options.goals)
-    ended = serve(lambda: _loaded(options, goals, extrinsics), ServerOptions(access, options.port, tls), show)
+    ended = serve(lambda: _loaded(options, goals, extrinsics), ServerOptions(access, options.port, tls), cli.show)
     if not ended:  # a search or a loading that takes longer than anybody waits: nothing of it is to be kept
         sys.stdout.flush()
         sys.stderr.flush()
@@ -175,14 +152,13 @@ def _no_password() -> str:
 
 def _loaded(options: argparse.Namespace, goals: KeptGoals | None, extrinsics: np.ndarray | None) -> Served:
     """Load the model, and make a first decision; runs in the planning thread."""
-    from vjepa2_ac.console.progress import show
     from vjepa2_ac.serving.about import in_words, metadata_of, require_steps, roboarena_metadata, warm_up
     from vjepa2_ac.serving.recording import Recorder
     from vjepa2_ac.serving.request import IMAGE_KEYS
     from vjepa2_ac.serving.server import Served
     from vjepa2_ac.serving.session import Session, SessionOptions
 
-    loaded = load_planning_session(options)
+    loaded = cli.load_planning_session(options)
     how = SessionOptions(
         options.actions,
         control_steps=require_steps(loaded.config),
@@ -195,7 +171,7 @@ def _loaded(options: argparse.Namespace, goals: KeptGoals | None, extrinsics: np
     session = Session(controller, kept, how)
     about = metadata_of(loaded, session)
     told = about if options.metadata == "full" else roboarena_metadata(session)
-    show(in_words(about, options.subject), f"a first decision took {warm_up(controller):.1f} s")
+    cli.show(in_words(about, options.subject), f"a first decision took {warm_up(controller):.1f} s")
     if options.record is not None:
         about = {**about, "overrides": options.overrides, "config": options.config, **loaded.as_dict()}
         session.recorder = Recorder(options.record, about, int(_GB * options.record_gb))
@@ -203,6 +179,11 @@ def _loaded(options: argparse.Namespace, goals: KeptGoals | None, extrinsics: np
 
 
 def _simulate(options: argparse.Namespace) -> int:
+    """Let a model steer a simulated arm to a goal image, beside doing nothing, chance and an oracle.
+
+    Or, as `simulate record FOLDER`: record demonstrations of the arm as a DROID data set. Status 1 where the model
+    gave no finite energy in any decision.
+    """
     if options.subject == "record":
         _refuse(options, _OF_A_MODEL, needed="a model that steers")
         return _record(options)
@@ -215,22 +196,21 @@ def _record(options: argparse.Namespace) -> int:
         found = " ".join(options.overrides) or "no folder"
         raise InputError(where="simulate record", found=found, needed="one folder, where the data set goes")
     try:
-        target = as_path(options.overrides[0])
+        target = cli.as_path(options.overrides[0])
     except argparse.ArgumentTypeError as error:
         raise InputError(where="simulate record", found=str(error), needed="a folder of this machine") from None
-    require_new_place(target)
+    cli.require_new_place(target)
 
-    from vjepa2_ac.console.progress import ConsoleReporter, show
     from vjepa2_ac.simulation.recording.record import RecordingSpec, default_steps, record_dataset
 
     task = None if options.task == "reach" else options.task
-    spec = record_of_options(RecordingSpec, options, task=task, steps=options.steps or default_steps(task))
+    spec = cli.record_of_options(RecordingSpec, options, task=task, steps=options.steps or default_steps(task))
     episodes, workers = options.episodes or 40, options.workers or 1
-    with ConsoleReporter() as reporter:
+    with cli.reporter() as reporter:
         progress = reporter.task("recording")
         progress(0, episodes)
         folder = record_dataset(target, spec, episodes=episodes, workers=workers, progress=progress)
-    show(f"{episodes} episodes are in {folder}")
+    cli.show(f"{episodes} episodes are in {folder}")
     return 0
 
 
@@ -242,28 +222,27 @@ def _run_benchmark(options: argparse.Namespace) -> int:
     if options.goals is not None and options.sub_goals is not None:
         found = f"--sub-goals {options.sub_goals}, too"
         raise InputError(where=f"--goals {options.goals}", found=found, needed="one of the two")
-    if not is_server(options.subject):
+    if not cli.is_server(options.subject):
         _refuse(options, ("key_file",), needed="a server: ws://HOST:PORT")
         options.checkpoint = options.checkpoint or "selected"
-        require_to_plan(options)
+        cli.require_to_plan(options)
     else:
         _refuse(options, ("checkpoint", "config", "decoder", "overrides"), needed="the model itself; not its server")
 
-    from vjepa2_ac.console.progress import ConsoleReporter, show
     from vjepa2_ac.console.tables import benchmark_notes, benchmark_table
     from vjepa2_ac.simulation.closed_loop.benchmark import BenchmarkOptions, run_benchmark
     from vjepa2_ac.simulation.world.scene import load_mujoco
 
     load_mujoco()
-    chosen = record_of_options(BenchmarkOptions, options)
+    chosen = cli.record_of_options(BenchmarkOptions, options)
     chosen = replace(chosen, films=min(chosen.films, chosen.episodes))
     name = f"closed_loop/{chosen.task}-{chosen.domain}"
     home = Path(options.subject) if is_run(options.subject) else Path()
-    with _agent(options) as agent, ConsoleReporter() as reporter:
+    with _agent(options) as agent, cli.reporter() as reporter:
         benchmark, files = run_benchmark(agent, chosen, options.out or home / name, reporter)
     if benchmark.agent.checkpoint:
-        show(f"{options.subject}: checkpoint {benchmark.agent.checkpoint}")
-    show(benchmark_table(benchmark), *benchmark_notes(benchmark), files=files)
+        cli.show(f"{options.subject}: checkpoint {benchmark.agent.checkpoint}")
+    cli.show(benchmark_table(benchmark), *benchmark_notes(benchmark), files=files)
     return int(any(set(result.why_counts) == {"no finite energy"} for result in benchmark.results))
 
 
@@ -274,9 +253,9 @@ def _agent(options: argparse.Namespace) -> Iterator[Agent]:
     from vjepa2_ac.serving.client import PlanningClient
     from vjepa2_ac.simulation.closed_loop.agent import agent_of_server, agent_of_session
 
-    if not is_server(options.subject):
-        decoder = given_decoder(options)
-        yield agent_of_session(load_planning_session(options), decoder)
+    if not cli.is_server(options.subject):
+        decoder = cli.given_decoder(options)
+        yield agent_of_session(cli.load_planning_session(options), decoder)
         return
     key = None if options.key_file is None else read_key(options.key_file)
     with PlanningClient(options.subject, key) as client:

@@ -8,19 +8,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vjepa2_ac.cli.options import (
-    Commands,
-    add_config,
-    argument,
-    as_model,
-    as_path,
-    command,
-    count,
-    make_folder,
-    read_config,
-    require_subject,
-    whole_number,
-)
+from vjepa2_ac.cli import options as cli
 from vjepa2_ac.errors import InputError
 
 if TYPE_CHECKING:
@@ -29,61 +17,51 @@ if TYPE_CHECKING:
 _CLIPS, _PAIRS = 64, 200  # to calibrate by: strides, axes (as the paper)
 
 
-def add_data(commands: Commands) -> None:
+def add_data(commands: cli.Commands) -> None:
     """Add `data` with its commands to a parser."""
     text = "Look at a data set before training on it."
     parser = commands.add_parser("data", help=text, description=text)
     inner = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     such_as, out = "data.camera=wrist_left", Path("inspection")
 
-    text = (
-        "Open the data, load some clips as training would, and look at every number. Exit status 0: all is well or"
-        " only warnings, 1: training would learn nothing or not begin, 2: something cannot be used."
-    )
-    parser = command(inner, "check", _check, text)
-    add_config(parser, such_as=such_as)
-    argument(parser, "--limit N", "clips to load (32); to probe, twice as many", count, default=32)
+    parser = cli.command(inner, "check", _check)
+    cli.add_config(parser, such_as=such_as)
+    cli.add(parser, "--limit N", "clips to load (32); to probe, twice as many", cli.count, default=32)
     text = (
         "probe the data with a model that knows robots (a run, or what model.base takes): does it predict better where"
         " frames are shifted, mirrored, reversed, BGR, or the gripper is inverted?"
     )
-    argument(parser, "--model RUN_OR_MODEL", text, as_model)
+    cli.add(parser, "--model RUN_OR_MODEL", text, cli.as_model)
 
-    text = "Build the index of a data set, or show the one that is kept on this machine."
-    parser = command(inner, "index", _index, text)
-    add_config(parser, such_as=such_as)
-    argument(parser, "--rebuild", "build it again, also where one is kept", action="store_true")
+    parser = cli.command(inner, "index", _index)
+    cli.add_config(parser, such_as=such_as)
+    cli.add(parser, "--rebuild", "build it again, also where one is kept", action="store_true")
 
-    text = "Say what is in a data set, and draw it: text, inspect.json, a contact sheet."
-    parser = command(inner, "inspect", _inspect, text)
-    add_config(parser, such_as=such_as)
-    argument(parser, "--out DIR", "where to (inspection)", as_path, default=out)
-    argument(parser, "--episodes --limit N", "episodes whose motion is looked at (100)", count, default=100)
-    argument(parser, "--rows N", "episodes on the contact sheet (8)", count, default=8)
+    parser = cli.command(inner, "inspect", _inspect)
+    cli.add_config(parser, such_as=such_as)
+    cli.add(parser, "--out DIR", "where to (inspection)", cli.as_path, default=out)
+    cli.add(parser, "--episodes --limit N", "episodes whose motion is looked at (100)", cli.count, default=100)
+    cli.add(parser, "--rows N", "episodes on the contact sheet (8)", cli.count, default=8)
 
-    text = (
-        "Let a model say how many control steps its model step is: its error over persistence at each stride. Or, with"
-        " --axes: how its axes lie to the robot's; status 1 where that stays unknown."
-    )
-    parser = command(inner, "calibrate", _calibrate, text)
-    add_config(parser, such_as=such_as)
+    parser = cli.command(inner, "calibrate", _calibrate)
+    cli.add_config(parser, such_as=such_as)
     text = (
         "fit the moves that this model infers from pairs of frames to the executed ones: axes.json, for planning.axes"
     )
-    argument(parser, "--axes RUN_OR_MODEL", text, as_model)
-    argument(parser, "--model MODEL", "of strides: another than model.base: a .pt, a folder, or a run", as_model)
+    cli.add(parser, "--axes RUN_OR_MODEL", text, cli.as_model)
+    cli.add(parser, "--model MODEL", "of strides: another than model.base: a .pt, a folder, or a run", cli.as_model)
     splits = ["train", "validation", "test"]
-    argument(parser, "--split", "(validation)", choices=splits, default="validation")
-    argument(parser, "--limit N", "clips at each stride (64), or pairs of frames (200)", count)
-    argument(parser, "--frames N", "of a clip (the config's, 8 at most)", whole_number(2, 256))
-    argument(parser, "--out DIR", "where to (inspection)", as_path, default=out)
+    cli.add(parser, "--split", "(validation)", choices=splits, default="validation")
+    cli.add(parser, "--limit N", "clips at each stride (64), or pairs of frames (200)", cli.count)
+    cli.add(parser, "--frames N", "of a clip (the config's, 8 at most)", cli.whole_number(2, 256))
+    cli.add(parser, "--out DIR", "where to (inspection)", cli.as_path, default=out)
 
-    text = "Print a script that makes a readable data set of another form, such as ROS bags; without NAME, list them."
-    parser = command(inner, "converter", _converter, text)
-    argument(parser, "name NAME", "which one", nargs="?")
+    parser = cli.command(inner, "converter", _converter)
+    cli.add(parser, "name NAME", "which one", nargs="?")
 
 
 def _converter(options: argparse.Namespace) -> None:
+    """Print a script that makes a readable data set of another form, such as ROS bags; without NAME, list them."""
     from vjepa2_ac.init.converters import converter_text, converters
 
     if options.name is not None:
@@ -94,9 +72,14 @@ def _converter(options: argparse.Namespace) -> None:
 
 
 def _check(options: argparse.Namespace) -> int:
-    config = read_config(options.config, options.overrides)
+    """Open the data, load some clips as training would, and look at every number.
+
+    Exit status 0: all is well or only warnings, 1: training would learn nothing or not begin, 2: something cannot
+    be used.
+    """
+    config = cli.read_config(options.config, options.overrides)
     if options.model is not None:
-        require_subject(options.model)
+        cli.require_subject(options.model)
     status = check_and_print(config, clips=options.limit)
     if options.model is not None:
         _probe(config, options.model, clips=2 * options.limit)
@@ -105,13 +88,12 @@ def _check(options: argparse.Namespace) -> int:
 
 def check_and_print(config: Config, *, clips: int = 32) -> int:
     """Look at the data of a config and print what is found; return 1 where training would learn nothing."""
-    from vjepa2_ac.console.progress import ConsoleReporter
     from vjepa2_ac.console.tables import print_finding
     from vjepa2_ac.inspection.check import check_data
     from vjepa2_ac.reporter import INDEXING
 
     status, batch_size = 0, config.training.batch_size
-    with ConsoleReporter() as reporter:
+    with cli.reporter() as reporter:
         progress = reporter.task(INDEXING)
         for one in check_data(config.data, seed=config.seed, batch_size=batch_size, clips=clips, progress=progress):
             print_finding(one)
@@ -121,39 +103,38 @@ def check_and_print(config: Config, *, clips: int = 32) -> int:
 
 def _probe(config: Config, model: str, *, clips: int) -> None:
     from vjepa2_ac.calibration.data import probe_config
-    from vjepa2_ac.console.progress import ConsoleReporter, show
     from vjepa2_ac.console.tables import print_finding, probe_table
     from vjepa2_ac.data.dataset import open_dataset
     from vjepa2_ac.inspection.excerpts import Finding
     from vjepa2_ac.inspection.statistics import at_some_stride
 
     dataset = at_some_stride(open_dataset(config.data))
-    with ConsoleReporter() as reporter:
+    with cli.reporter() as reporter:
         probe = probe_config(config, dataset, model=model, clips=clips, progress=reporter.task("probing"))
-    show(probe_table(probe))
+    cli.show(probe_table(probe))
     print_finding(Finding("warning" if probe.better else "ok", "probe", probe.verdict()))
 
 
 def _index(options: argparse.Namespace) -> None:
-    config = read_config(options.config, options.overrides).data
+    """Build the index of a data set, or show the one that is kept on this machine."""
+    config = cli.read_config(options.config, options.overrides).data
 
-    from vjepa2_ac.console.progress import ConsoleReporter, show
     from vjepa2_ac.console.tables import index_lines
     from vjepa2_ac.data.dataset import open_dataset
     from vjepa2_ac.data.index import record_usage
     from vjepa2_ac.reporter import INDEXING
 
     started = time.perf_counter()
-    with ConsoleReporter() as reporter, record_usage(rebuild=options.rebuild) as watch:
+    with cli.reporter() as reporter, record_usage(rebuild=options.rebuild) as watch:
         dataset = open_dataset(config, progress=reporter.task(INDEXING))
-    show(*index_lines(dataset.table, watch, time.perf_counter() - started))
+    cli.show(*index_lines(dataset.table, watch, time.perf_counter() - started))
 
 
 def _inspect(options: argparse.Namespace) -> None:
-    config = read_config(options.config, options.overrides)
-    make_folder(options.out)
+    """Say what is in a data set, and draw it: text, inspect.json, a contact sheet."""
+    config = cli.read_config(options.config, options.overrides)
+    cli.make_folder(options.out)
 
-    from vjepa2_ac.console.progress import ConsoleReporter, show
     from vjepa2_ac.console.tables import motion_table
     from vjepa2_ac.data.dataset import open_dataset
     from vjepa2_ac.inspection.sheet import plot_dataset
@@ -161,40 +142,43 @@ def _inspect(options: argparse.Namespace) -> None:
     from vjepa2_ac.reporter import INDEXING
     from vjepa2_ac.storage import write_atomically
 
-    with ConsoleReporter() as reporter:
+    with cli.reporter() as reporter:
         dataset = at_some_stride(open_dataset(config.data, progress=reporter.task(INDEXING)))
         if config.data.stride == "auto":
             reporter.note(f"data.stride is auto: looked at the smallest candidate, {dataset.config.stride}")
         inspection = inspect_dataset(dataset, episodes=options.episodes, progress=reporter.task("reading states"))
-        show(*(f"{name:<16}{text}" for name, text in inspection.summary.items()), motion_table(inspection.steps))
+        cli.show(*(f"{name:<16}{text}" for name, text in inspection.summary.items()), motion_table(inspection.steps))
         if inspection.has_poses:
-            show(f"For comparison: {RELEASED}.")
+            cli.show(f"For comparison: {RELEASED}.")
         values, sheet = options.out / "inspect.json", options.out / "contact_sheet.png"
         write_atomically(values, json.dumps(inspection.values, indent=1).encode())
         image = plot_dataset(inspection, sheet, rows=options.rows, progress=reporter.task("reading frames"))
-    show(files=[image, values])
+    cli.show(files=[image, values])
 
 
 def _calibrate(options: argparse.Namespace) -> int:
-    config = read_config(options.config, options.overrides, base=options.axes is None)
+    """Let a model say how many control steps its model step is: its error over persistence at each stride.
+
+    Or, with --axes: how its axes lie to the robot's; status 1 where that stays unknown.
+    """
+    config = cli.read_config(options.config, options.overrides, base=options.axes is None)
     if options.axes is not None:
         return _calibrate_axes(options, config)
     if options.model is not None:
-        require_subject(options.model)
-    make_folder(options.out)
+        cli.require_subject(options.model)
+    cli.make_folder(options.out)
 
     from vjepa2_ac.calibration.strides import calibrate_config
-    from vjepa2_ac.console.progress import ConsoleReporter, show
     from vjepa2_ac.console.tables import calibration_table
     from vjepa2_ac.evaluation.measure import ClipSample
     from vjepa2_ac.storage import write_atomically
 
-    with ConsoleReporter() as reporter:
+    with cli.reporter() as reporter:
         sample = ClipSample(options.split, options.limit or _CLIPS, options.frames)
         calibration = calibrate_config(config, sample, model=options.model, reporter=reporter)
     path = options.out / "calibration.json"
     write_atomically(path, json.dumps(calibration.as_dict(), indent=1).encode())
-    show(calibration_table(calibration), calibration.verdict(), files=[path])
+    cli.show(calibration_table(calibration), calibration.verdict(), files=[path])
     return 0
 
 
@@ -204,21 +188,20 @@ def _calibrate_axes(options: argparse.Namespace, config: Config) -> int:
         if getattr(options, name) is not None:
             needed = "one of them: --model and --frames are of strides"
             raise InputError(where=f"--{name}", found="--axes beside it", needed=needed)
-    require_subject(options.axes)
+    cli.require_subject(options.axes)
 
     from vjepa2_ac.planning.axes.axes_file import AXES_FILE, require_axes_in
 
     require_axes_in(config.data)
-    make_folder(options.out)
+    cli.make_folder(options.out)
 
     from vjepa2_ac.calibration.axes import calibrate_axes
-    from vjepa2_ac.console.progress import ConsoleReporter, show
     from vjepa2_ac.console.tables import axes_table
     from vjepa2_ac.reports.figures.planning import plot_axes
 
-    with ConsoleReporter() as reporter:
+    with cli.reporter() as reporter:
         pairs = options.limit or _PAIRS
         found = calibrate_axes(config, options.axes, pairs=pairs, split=options.split, reporter=reporter)
     files = [found.write(options.out / AXES_FILE), plot_axes(found.fit, options.out / "axes.png")]
-    show(axes_table({options.axes: found.fit}), found.verdict(), files=files)
+    cli.show(axes_table({options.axes: found.fit}), found.verdict(), files=files)
     return int(found.fit.problem is not None)

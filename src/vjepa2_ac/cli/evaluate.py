@@ -7,29 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vjepa2_ac.cli.options import (
-    Commands,
-    add_checkpoint,
-    add_decoder,
-    add_planner,
-    argument,
-    as_local,
-    as_model,
-    as_numbers,
-    as_path,
-    as_subject,
-    camera_pose,
-    command,
-    count,
-    load_planning_session,
-    number_between,
-    read_config,
-    record_of_options,
-    require_subject,
-    require_to_plan,
-    say_places_elsewhere,
-    whole_number,
-)
+from vjepa2_ac.cli import options as cli
 from vjepa2_ac.errors import InputError
 
 if TYPE_CHECKING:
@@ -38,88 +16,85 @@ if TYPE_CHECKING:
     from vjepa2_ac.reporter import Reporter
 
 
-def add_evaluate(commands: Commands) -> None:
+def add_evaluate(commands: cli.Commands) -> None:
     """Add `evaluate` and `compare` to a parser."""
-    text = "Measure a run or a model on held-out episodes, beside its base, doing nothing and wrong actions."
-    parser = command(commands, "evaluate", _evaluate, text)
+    parser = cli.command(commands, "evaluate", _evaluate)
     text = "folder of a run, or (with --data) what model.base takes; several: their spread, too"
-    argument(parser, "subjects RUN_OR_MODEL", text, as_subject, nargs="+")
-    argument(parser, "--data CONFIG", "measure on its data (with its model.dtype, device, seed)", as_local)
+    cli.add(parser, "subjects RUN_OR_MODEL", text, cli.as_subject, nargs="+")
+    cli.add(parser, "--data CONFIG", "measure on its data (with its model.dtype, device, seed)", cli.as_local)
     text = "what to compare with, on the same latents; default: the base of a run, nothing for a model"
-    argument(parser, "--against base|RUN|MODEL", text, as_model, nargs="+")
-    argument(parser, "--out FOLDER", "where figures go; default: the run's folder", as_path)
-    argument(parser, "--split", "which held-out episodes (test)", choices=["test", "validation"])
-    argument(parser, "--clips N", "at most this many clips, spread over the episodes (256)", count)
-    add_checkpoint(parser)
-    add_decoder(parser, "the rollouts, which are measured as images, too")
-    argument(parser, "--lpips FILE", "weights for LPIPS of the decoded images (docs/decoding.md)", as_path)
-    argument(parser, "--lpips-heads FILE", "its heads: alex.pth or vgg.pth of version 0.1", as_path)
-    argument(parser, "--calibrate", "measure the one-step error at other strides, too", action="store_true")
+    cli.add(parser, "--against base|RUN|MODEL", text, cli.as_model, nargs="+")
+    cli.add(parser, "--out FOLDER", "where figures go; default: the run's folder", cli.as_path)
+    cli.add(parser, "--split", "which held-out episodes (test)", choices=["test", "validation"])
+    cli.add(parser, "--clips N", "at most this many clips, spread over the episodes (256)", cli.count)
+    cli.add_checkpoint(parser)
+    cli.add_decoder(parser, "the rollouts, which are measured as images, too")
+    cli.add(parser, "--lpips FILE", "weights for LPIPS of the decoded images (docs/decoding.md)", cli.as_path)
+    cli.add(parser, "--lpips-heads FILE", "its heads: alex.pth or vgg.pth of version 0.1", cli.as_path)
+    cli.add(parser, "--calibrate", "measure the one-step error at other strides, too", action="store_true")
     _add_probes(parser.add_argument_group("use of the actions"))
     group = parser.add_argument_group("plans (they take long: see docs/evaluation.md)")
     text = (
         "plan from held-out frames, and hold the plans against the demonstrations: action error, Action Score; settings"
         " of the plan of one step, such as planning.samples=200, in place of the config's, here or anywhere"
     )
-    argument(group, "--planning planning.key=value", text, nargs="*", dest="plan_settings")
-    argument(group, "--planning-clips N", "clips to plan from, one frame of each (32)", count, default=32)
+    cli.add(group, "--planning planning.key=value", text, nargs="*", dest="plan_settings")
+    cli.add(group, "--planning-clips N", "clips to plan from, one frame of each (32)", cli.count, default=32)
     parser.set_defaults(overrides=[])
 
-    text = "Put runs side by side that `evaluate` has measured on the same clips: one table, one image."
-    parser = command(commands, "compare", _compare, text)
-    argument(parser, "runs RUN", "folders with a metrics.json, two or more", as_path, nargs="+")
-    argument(parser, "--out PNG", "the image (comparison.png)", as_path, default=Path("comparison.png"))
+    parser = cli.command(commands, "compare", _compare)
+    cli.add(parser, "runs RUN", "folders with a metrics.json, two or more", cli.as_path, nargs="+")
+    cli.add(parser, "--out PNG", "the image (comparison.png)", cli.as_path, default=Path("comparison.png"))
 
 
-def add_imagine(commands: Commands) -> None:
+def add_imagine(commands: cli.Commands) -> None:
     """Add `imagine` to a parser."""
-    text = (
-        "Show what a model imagines from one frame of a held-out clip: under the recorded actions, beside the truth and"
-        " the base, and under actions that were not taken. A strip, an MP4 and a GIF. Of data that `simulate record`"
-        " made, what really happens is shown, too. A decoded image is no evidence of success: docs/decoding.md."
+    parser = cli.command(commands, "imagine", _imagine)
+    cli.add_planner(parser, such_as="with --image: such as planning.limits.xyz=data")
+    cli.add(
+        parser, "--decoder FOLDER", "what `vjepa2-ac decoder` made, or builtin:sim-tiny", cli.as_model, required=True
     )
-    parser = command(commands, "imagine", _imagine, text)
-    add_planner(parser, such_as="with --image: such as planning.limits.xyz=data")
-    argument(parser, "--decoder FOLDER", "what `vjepa2-ac decoder` made, or builtin:sim-tiny", as_model, required=True)
     text = (
         "with commas between them: true (the recorded ones of a clip), none, up, down, left, right, forward, back,"
         " open, close, in the robot's frame; or files, .npy or .csv: a row of 7 numbers for each step"
         " (true,none,up,left,close)"
     )
-    argument(parser, "--actions NAMES", text)
-    argument(parser, "--steps N", "model steps to imagine (7)", count, default=7)
-    argument(parser, "--size CM", "of a named action in each step, within planning.limits (5)", float, default=5.0)
-    argument(parser, "--episode ID", "the clip's name in the data (that of the split with the most motion)")
-    argument(parser, "--start N", "its first control step (0)", whole_number(0))
+    cli.add(parser, "--actions NAMES", text)
+    cli.add(parser, "--steps N", "model steps to imagine (7)", cli.count, default=7)
+    cli.add(parser, "--size CM", "of a named action in each step, within planning.limits (5)", float, default=5.0)
+    cli.add(parser, "--episode ID", "the clip's name in the data (that of the split with the most motion)")
+    cli.add(parser, "--start N", "its first control step (0)", cli.whole_number(0))
     group = parser.add_argument_group("instead of a clip")
-    argument(group, "--image IMAGE", "what a camera sees: PNG or JPEG; actions by name only", as_local)
-    argument(group, "--state NUMBERS", "measured then, as `plan --state`")
-    argument(parser, "--split", "of the clip (test)", choices=["test", "validation", "train"], default="test")
-    argument(parser, "--data CONFIG", "clips of other data; needed for a model", as_local)
-    argument(parser, "--out FOLDER", "where the film goes (imagined, in the run's)", as_path)
+    cli.add(group, "--image IMAGE", "what a camera sees: PNG or JPEG; actions by name only", cli.as_local)
+    cli.add(group, "--state NUMBERS", "measured then, as `plan --state`")
+    cli.add(parser, "--split", "of the clip (test)", choices=["test", "validation", "train"], default="test")
+    cli.add(parser, "--data CONFIG", "clips of other data; needed for a model", cli.as_local)
+    cli.add(parser, "--out FOLDER", "where the film goes (imagined, in the run's)", cli.as_path)
 
 
 def _add_probes(group: argparse._ArgumentGroup) -> None:
-    argument(group, "--sensitivity-clips N", "clips to try other actions on (32)", whole_number(0))
-    argument(group, "--samples N", "other actions for each of them (64)", count)
-    argument(group, "--landscapes N", "of those, with an energy landscape (8)", whole_number(0), dest="landscape_clips")
-    argument(group, "--axes N", "clips of those to calibrate the axes by (32)", whole_number(0), dest="axis_clips")
-    argument(group, "--nodes N", "of a landscape along each axis (9)", whole_number(3, 51))
+    cli.add(group, "--sensitivity-clips N", "clips to try other actions on (32)", cli.whole_number(0))
+    cli.add(group, "--samples N", "other actions for each of them (64)", cli.count)
+    cli.add(
+        group, "--landscapes N", "of those, with an energy landscape (8)", cli.whole_number(0), dest="landscape_clips"
+    )
+    cli.add(group, "--axes N", "clips of those to calibrate the axes by (32)", cli.whole_number(0), dest="axis_clips")
+    cli.add(group, "--nodes N", "of a landscape along each axis (9)", cli.whole_number(3, 51))
     text = "half the width of landscape and box (7.5)"
-    argument(group, "--reach CM", text, number_between(0.0, 1000.0, "cm"), dest="reach_cm")
-    argument(group, "--examples N", "clips to show (4)", whole_number(0))
-    argument(group, "--at-once N", "actions computed together (64): lower it to save memory", count)
+    cli.add(group, "--reach CM", text, cli.number_between(0.0, 1000.0, "cm"), dest="reach_cm")
+    cli.add(group, "--examples N", "clips to show (4)", cli.whole_number(0))
+    cli.add(group, "--at-once N", "actions computed together (64): lower it to save memory", cli.count)
 
 
 def _evaluate(options: argparse.Namespace) -> None:
+    """Measure a run or a model on held-out episodes, beside its base, doing nothing and wrong actions."""
     from vjepa2_ac.evaluation.request import settle
 
     asked = _asked(options)
     for subject, how in asked:
         settle(subject, how)
-        require_subject(subject, how.checkpoint)
+        cli.require_subject(subject)
 
-    from vjepa2_ac.console.progress import ConsoleReporter, show
     from vjepa2_ac.console.tables import row_tables
     from vjepa2_ac.evaluation.rows import rows_of
     from vjepa2_ac.evaluation.verdict import spread, verdict
@@ -127,15 +102,15 @@ def _evaluate(options: argparse.Namespace) -> None:
 
     evaluations = []
     for subject, how in asked:
-        say_places_elsewhere(subject)
-        with ConsoleReporter() as reporter:
+        cli.say_places_elsewhere(subject)
+        with cli.reporter() as reporter:
             measured = evaluate_subject(subject, how, reporter)
         evaluations.append(measured.evaluation)
         name = f"{subject}: checkpoint {measured.checkpoint}" if measured.checkpoint else subject
         tables = row_tables(rows_of(measured.evaluation), "Held-out episodes")
-        show(name, *tables, verdict(measured.evaluation), files=measured.files)
+        cli.show(name, *tables, verdict(measured.evaluation), files=measured.files)
     if len(evaluations) > 1:
-        show(spread(evaluations))
+        cli.show(spread(evaluations))
 
 
 def _asked(options: argparse.Namespace) -> list[tuple[str, EvaluationOptions]]:
@@ -148,12 +123,12 @@ def _asked(options: argparse.Namespace) -> list[tuple[str, EvaluationOptions]]:
         raise InputError(where="command line", found=found, needed=needed, fix="Add --planning")
     several, plan_settings = len(options.subjects) > 1, options.plan_settings
     clips = 0 if plan_settings is None else options.planning_clips
-    every = record_of_options(
+    every = cli.record_of_options(
         EvaluationOptions,
         options,
-        data=read_config(options.data, of_run=True) if options.data else None,
+        data=cli.read_config(options.data, of_run=True) if options.data else None,
         against=tuple(options.against) if options.against else None,
-        probes=record_of_options(ProbeOptions, options, planning_clips=clips),
+        probes=cli.record_of_options(ProbeOptions, options, planning_clips=clips),
         planning=(*(plan_settings or ()), *options.overrides),
     )
     return [
@@ -163,31 +138,36 @@ def _asked(options: argparse.Namespace) -> list[tuple[str, EvaluationOptions]]:
 
 
 def _compare(options: argparse.Namespace) -> None:
+    """Put runs side by side that `evaluate` has measured on the same clips: one table, one image."""
     from vjepa2_ac.reports.comparison import compare
 
     comparison = compare(options.runs)
 
-    from vjepa2_ac.console.progress import show
     from vjepa2_ac.console.tables import row_tables
     from vjepa2_ac.reports.figures.evaluation import plot_comparison
 
     tables = row_tables(comparison.rows, comparison.title)
-    show(*tables, *comparison.notes, files=[plot_comparison(comparison, options.out)])
+    cli.show(*tables, *comparison.notes, files=[plot_comparison(comparison, options.out)])
 
 
 def _imagine(options: argparse.Namespace) -> None:
+    """Show what a model imagines from one frame of a held-out clip, or from an image.
+
+    Under the recorded actions, beside the truth and the base, and under actions that were not taken: a strip, an MP4
+    and a GIF. Of data that `simulate record` made, what really happens is shown, too. A decoded image is no evidence of
+    success: docs/decoding.md.
+    """
     _require_one_start(options)
 
-    from vjepa2_ac.console.progress import ConsoleReporter, show
     from vjepa2_ac.reports.imagined import write_film_of
     from vjepa2_ac.runs.folder import is_run
 
     home = Path(options.subject) if is_run(options.subject) else Path()
     out = options.out or home / "imagined"
-    with ConsoleReporter() as reporter:
+    with cli.reporter() as reporter:
         imagination = _of_image(options) if options.image is not None else _of_clip(options, out, reporter)
         written = write_film_of(imagination, out, reporter=reporter)
-    show(*imagination.notes, files=written)
+    cli.show(*imagination.notes, files=written)
 
 
 def _require_one_start(options: argparse.Namespace) -> None:
@@ -211,8 +191,8 @@ def _of_clip(options: argparse.Namespace, out: Path, reporter: Reporter) -> Imag
     from vjepa2_ac.evaluation.request import EvaluationOptions
     from vjepa2_ac.simulation.counterfactual import with_what_happens
 
-    say_places_elsewhere(options.subject)
-    data = None if options.data is None else read_config(options.data, of_run=True)
+    cli.say_places_elsewhere(options.subject)
+    data = None if options.data is None else cli.read_config(options.data, of_run=True)
     asked = ImagineOptions(
         decoder=options.decoder,
         actions=_words(options),
@@ -230,8 +210,8 @@ def _of_image(options: argparse.Namespace) -> Imagination:
     from vjepa2_ac.evaluation.imagined import Seen, imagine_image
     from vjepa2_ac.media.image_file import read_image
 
-    state, extrinsics = as_numbers(options.state, "--state"), camera_pose(options.extrinsics)
-    require_to_plan(options)
+    state, extrinsics = cli.as_numbers(options.state, "--state"), cli.camera_pose(options.extrinsics)
+    cli.require_to_plan(options)
     seen = Seen(read_image(options.image), state, extrinsics)
-    session, words = load_planning_session(options), _words(options)
+    session, words = cli.load_planning_session(options), _words(options)
     return imagine_image(session, options.decoder, seen, words, steps=options.steps, size_m=options.size / 100)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import inspect
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias, TypeVar
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from vjepa2_ac.config import Config
+    from vjepa2_ac.console.progress import ConsoleReporter
     from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
     from vjepa2_ac.planning.session import PlanningSession
 
@@ -44,16 +46,17 @@ class Parser(argparse.ArgumentParser):
         super().error(printable(message))
 
 
-def command(commands: Commands, name: str, handler: Handler, text: str) -> argparse.ArgumentParser:
-    """Add a command with its handler, and return its parser."""
-    parser = commands.add_parser(name, help=text, description=text)
+def command(commands: Commands, name: str, handler: Handler) -> argparse.ArgumentParser:
+    """Add a command with its handler, whose docstring is the help, and return its parser."""
+    text = inspect.getdoc(handler) or ""
+    parser = commands.add_parser(name, help=text.partition("\n\n")[0], description=text)
     parser.set_defaults(handler=handler)
     about = "a module of yours that registers a form of data, a loss, a planner, ... (docs/extending.md); repeatable"
-    argument(parser, "--plugin MODULE", about, action="append", default=[])
+    add(parser, "--plugin MODULE", about, action="append", default=[])
     return parser
 
 
-def argument(
+def add(
     parser: argparse._ActionsContainer, words: str, text: str, read: Callable[[str], Any] | None = None, **how: Any
 ) -> None:
     """Add an argument to a parser.
@@ -74,36 +77,50 @@ def argument(
 
 def add_config(parser: argparse.ArgumentParser, *, such_as: str, what: str = "a YAML config") -> None:
     """Add the config that a command reads, and `key=value` words behind it."""
-    argument(parser, "config CONFIG", what, as_local)
-    argument(parser, "overrides key=value", f"such as {such_as}", nargs="*")
+    add(parser, "config CONFIG", what, as_local)
+    add(parser, "overrides key=value", f"such as {such_as}", nargs="*")
 
 
 def add_checkpoint(parser: argparse._ActionsContainer, default: str | None = "selected") -> None:
     """Add the option that selects a checkpoint of a run."""
     text = "which one: the selected (default: the best by validation, else the newest), or that of a step"
-    argument(parser, "--checkpoint selected|newest|best|STEP", text, default=default)
+    add(parser, "--checkpoint selected|newest|best|STEP", text, default=default)
 
 
 def add_planner(parser: argparse.ArgumentParser, *, such_as: str) -> None:
     """Add the run or the model that plans, `key=value` words behind it, and what else a `planning_session` is of."""
-    argument(parser, "subject RUN_OR_MODEL", "folder of a run, or what model.base takes", as_model)
-    argument(parser, "overrides key=value", such_as, nargs="*")
+    add(parser, "subject RUN_OR_MODEL", "folder of a run, or what model.base takes", as_model)
+    add(parser, "overrides key=value", such_as, nargs="*")
     add_checkpoint(parser)
-    argument(parser, "--config CONFIG", "for a model: the config whose planning, crop and dtype count", as_local)
+    add(parser, "--config CONFIG", "for a model: the config whose planning, crop and dtype count", as_local)
     text = "the camera's x,y,z,roll,pitch,yaw in the robot base frame, if the model uses it"
-    argument(parser, "--extrinsics NUMBERS", text)
+    add(parser, "--extrinsics NUMBERS", text)
 
 
 def add_decoder(parser: argparse._ActionsContainer, shows: str) -> None:
     """Add `--decoder`, with which something is drawn."""
     text = f"shows {shows}: the folder that `vjepa2-ac decoder` made, or builtin:sim-tiny"
-    argument(parser, "--decoder FOLDER", text, as_model)
+    add(parser, "--decoder FOLDER", text, as_model)
 
 
 def record_of_options(kind: Callable[..., _Record], options: argparse.Namespace, **others: Any) -> _Record:
     """Return a record whose fields are the options of their names that were given, and others."""
     given = {field.name: getattr(options, field.name, None) for field in fields(kind)}  # type: ignore[arg-type]
     return kind(**{name: value for name, value in given.items() if value is not None} | others)
+
+
+def show(*parts: Any, files: Iterable[str | Path] = ()) -> None:
+    """Print texts and tables one below another, and the files that were written."""
+    from vjepa2_ac.console.progress import show
+
+    show(*parts, files=files)
+
+
+def reporter() -> ConsoleReporter:
+    """Return what shows messages and progress."""
+    from vjepa2_ac.console.progress import ConsoleReporter
+
+    return ConsoleReporter()
 
 
 def speaks() -> bool:
@@ -113,7 +130,6 @@ def speaks() -> bool:
 
 def say_places_elsewhere(subject: str) -> None:
     """Print the addresses that the config of a run names, before any of them is contacted; nothing for a model."""
-    from vjepa2_ac.console.progress import show
     from vjepa2_ac.runs.folder import is_run, places_elsewhere, read_run_config
 
     if is_run(subject) and speaks():
@@ -149,26 +165,22 @@ def read_config(path: str | Path, overrides: Sequence[str] = (), *, base: bool =
     return config
 
 
-def require_subject(subject: str, checkpoint: str | None = None) -> None:
+def require_subject(subject: str) -> None:
     """Refuse a run or a model that is not there, before what takes seconds is imported.
 
     Args:
         subject: The folder of a run; or a model: what `model.base` takes.
-        checkpoint: Of a run: selected, newest, best, or a number of optimizer steps; None: it is not looked for.
 
     Raises:
-        InputError: There is no such run, checkpoint or model.
+        InputError: There is no such run or model.
     """
     from vjepa2_ac.model.base_model import find_base
-    from vjepa2_ac.runs.checkpoint import require_listed
     from vjepa2_ac.runs.folder import is_run, read_run_config
 
-    if not is_run(subject):
+    if is_run(subject):
+        read_run_config(Path(subject))
+    else:
         find_base(subject)
-        return
-    read_run_config(Path(subject))
-    if checkpoint is not None:
-        require_listed(Path(subject), checkpoint)
 
 
 def require_to_plan(options: argparse.Namespace) -> Config:
@@ -180,7 +192,7 @@ def require_to_plan(options: argparse.Namespace) -> Config:
     from vjepa2_ac.planning.settings import planning_settings
 
     config = planning_settings(options.subject, config=options.config, overrides=options.overrides)
-    require_subject(options.subject, options.checkpoint)
+    require_subject(options.subject)
     return config
 
 

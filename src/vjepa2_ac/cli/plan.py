@@ -6,31 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vjepa2_ac.cli.options import (
-    Commands,
-    add_checkpoint,
-    add_decoder,
-    add_planner,
-    argument,
-    as_local,
-    as_model,
-    as_numbers,
-    as_path,
-    camera_pose,
-    command,
-    count,
-    given_decoder,
-    load_planning_session,
-    make_folder,
-    number_between,
-    read_config,
-    record_of_options,
-    require_goals,
-    require_new_place,
-    require_to_plan,
-    say_places_elsewhere,
-    whole_number,
-)
+from vjepa2_ac.cli import options as cli
 from vjepa2_ac.errors import InputError
 
 if TYPE_CHECKING:
@@ -46,81 +22,78 @@ _QUICK, _QUICK_SEQUENCES = "planning.samples=64 planning.iterations=4", 256  # d
 _FILMS = (".mp4", ".m4v", ".mov")
 
 
-def add_plan(commands: Commands) -> None:
+def add_plan(commands: cli.Commands) -> None:
     """Add `plan` to a parser."""
-    text = (
-        "Plan from an image and a state to a goal image: plan.json, and an image of how the planner came to it."
-        " Status 1 where the model gives no finite energy."
-    )
-    parser = command(commands, "plan", _plan, text)
-    add_planner(parser, such_as=f"such as planning.horizon=2; quick, for a CPU: {_QUICK}")
-    argument(parser, "--start IMAGE", "what the camera sees: PNG or JPEG", as_local, required=True)
+    parser = cli.command(commands, "plan", _plan)
+    cli.add_planner(parser, such_as=f"such as planning.horizon=2; quick, for a CPU: {_QUICK}")
+    cli.add(parser, "--start IMAGE", "what the camera sees: PNG or JPEG", cli.as_local, required=True)
     text = (
         "measured x,y,z (m), roll,pitch,yaw (radians, extrinsic xyz), gripper (0 open .. 1 closed); or the numbers of a"
         " vector, as the data had them"
     )
-    argument(parser, "--state NUMBERS", text, required=True)
+    cli.add(parser, "--state NUMBERS", text, required=True)
     text = "what it shall see; again for goals that follow one another"
     goals = parser.add_mutually_exclusive_group(required=True)
-    argument(goals, "--goal IMAGE", text, as_local, action="append")
-    argument(goals, "--goals FOLDER", "goals with rules of their own, that `vjepa2-ac goals` made", as_path)
-    argument(parser, "--durations STEPS", "model steps of all goals but the last, as 2,1 (equal shares)")
-    argument(parser, "--mask IMAGE", "what of the image counts: of the goal's size, black where it does not", as_local)
-    argument(parser, "--seed N", "default: the config's", whole_number(0, 2**31 - 1))
+    cli.add(goals, "--goal IMAGE", text, cli.as_local, action="append")
+    cli.add(goals, "--goals FOLDER", "goals with rules of their own, that `vjepa2-ac goals` made", cli.as_path)
+    cli.add(parser, "--durations STEPS", "model steps of all goals but the last, as 2,1 (equal shares)")
+    cli.add(
+        parser, "--mask IMAGE", "what of the image counts: of the goal's size, black where it does not", cli.as_local
+    )
+    cli.add(parser, "--seed N", "default: the config's", cli.whole_number(0, 2**31 - 1))
     text = (
         "of the image's energy maps along each axis; 0: no maps; default: 13, or as many as evaluate no more action"
         " sequences than the search"
     )
-    argument(parser, "--nodes N", text, whole_number(0, 101))
-    add_decoder(parser, "what the planner imagined, beside the goal, in the image")
-    argument(parser, "--out FOLDER", "for both files (plan)", as_path, default=Path("plan"))
+    cli.add(parser, "--nodes N", text, cli.whole_number(0, 101))
+    cli.add_decoder(parser, "what the planner imagined, beside the goal, in the image")
+    cli.add(parser, "--out FOLDER", "for both files (plan)", cli.as_path, default=Path("plan"))
 
 
-def add_goals(commands: Commands) -> None:
+def add_goals(commands: cli.Commands) -> None:
     """Add `goals` to a parser."""
-    text = (
-        "Make goals of one demonstration, an episode or a film: its key frames with durations and gripper, in a folder"
-        " that `plan --goals` and `simulate --goals` take, with a contact sheet."
-    )
-    parser = command(commands, "goals", _goals, text)
-    argument(parser, "source CONFIG|VIDEO", "a config, of whose data the episode is; or a film, MP4", as_local)
-    argument(parser, "overrides key=value", "of the config, such as data.camera=wrist_left", nargs="*")
-    argument(parser, "--out FOLDER", "where goals.json and the images go: new or empty", as_path, required=True)
-    argument(parser, "--episode ID|NUMBER", "which one: its name in the data, or its number, from 0 (0)")
+    parser = cli.command(commands, "goals", _goals)
+    cli.add(parser, "source CONFIG|VIDEO", "a config, of whose data the episode is; or a film, MP4", cli.as_local)
+    cli.add(parser, "overrides key=value", "of the config, such as data.camera=wrist_left", nargs="*")
+    cli.add(parser, "--out FOLDER", "where goals.json and the images go: new or empty", cli.as_path, required=True)
+    cli.add(parser, "--episode ID|NUMBER", "which one: its name in the data, or its number, from 0 (0)")
     text = (
         "gripper: where it changes, the arm stops, and the end, from the states; latent: where images stop becoming"
         " more like the next goal, with --model; every N: every N-th frame (gripper; of a film latent)"
     )
-    argument(parser, "--by gripper|latent|every", text, nargs="+")
+    cli.add(parser, "--by gripper|latent|every", text, nargs="+")
     text = "that will plan: for latents, energies and the noise floor; the folder of a run, or what model.base takes"
-    argument(parser, "--model RUN_OR_MODEL", text, as_model)
-    add_checkpoint(parser, default=None)
-    argument(parser, "--stride N", "frames of a model step (data.stride); needed of a film", count)
-    argument(parser, "--apart N", "least frames from one goal to another (gripper: 4; latent: 4 model steps)", count)
-    argument(parser, "--slack N", "model steps that a goal may take fewer or more (3)", whole_number(0), default=3)
-    share, energy = number_between(0.0, 1.0, "the energy"), "of the energy at a goal's beginning, below which"
-    argument(parser, "--share X", f"{energy} the next one follows (none: by steps only)", share)
-    argument(parser, "--stop-share X", f"{energy} the last one is reached (none: an equal image)", share)
-    argument(parser, "--still VIDEO", "of the resting arm, for the noise floor (where the episode rests)", as_path)
+    cli.add(parser, "--model RUN_OR_MODEL", text, cli.as_model)
+    cli.add_checkpoint(parser, default=None)
+    cli.add(parser, "--stride N", "frames of a model step (data.stride); needed of a film", cli.count)
+    cli.add(parser, "--apart N", "least frames from one goal to another (gripper: 4; latent: 4 model steps)", cli.count)
+    cli.add(parser, "--slack N", "model steps that a goal may take fewer or more (3)", cli.whole_number(0), default=3)
+    share, energy = cli.number_between(0.0, 1.0, "the energy"), "of the energy at a goal's beginning, below which"
+    cli.add(parser, "--share X", f"{energy} the next one follows (none: by steps only)", share)
+    cli.add(parser, "--stop-share X", f"{energy} the last one is reached (none: an equal image)", share)
+    cli.add(parser, "--still VIDEO", "of the resting arm, for the noise floor (where the episode rests)", cli.as_path)
 
 
 def _plan(options: argparse.Namespace) -> int:
-    state, extrinsics = as_numbers(options.state, "--state"), camera_pose(options.extrinsics)
+    """Plan from an image and a state to a goal image: plan.json, and an image of how the planner came to it.
+
+    Status 1 where the model gives no finite energy.
+    """
+    state, extrinsics = cli.as_numbers(options.state, "--state"), cli.camera_pose(options.extrinsics)
     durations = _durations(options)
-    require_goals(options.goals)
-    _require_state(state, require_to_plan(options))
-    make_folder(options.out)
+    cli.require_goals(options.goals)
+    _require_state(state, cli.require_to_plan(options))
+    cli.make_folder(options.out)
     start, goals, mask = _images(options)
 
-    from vjepa2_ac.console.progress import ConsoleReporter, show
     from vjepa2_ac.console.tables import plan_table
     from vjepa2_ac.decoding.imagine import imagine_plan
     from vjepa2_ac.planning.decision import PLAN_FILE, PlanRequest, decide, summarize, write_plan
     from vjepa2_ac.reports.figures.planning import PLAN_IMAGE, plot_plan
     from vjepa2_ac.storage import user_can_write
 
-    decoder = given_decoder(options)
-    session = load_planning_session(options)
+    decoder = cli.given_decoder(options)
+    session = cli.load_planning_session(options)
     if decoder is not None:
         decoder.require_fit(session.world_model, session.config.data.crop, subject=options.subject)
     if isinstance(goals, tuple):
@@ -131,7 +104,7 @@ def _plan(options: argparse.Namespace) -> int:
         names = [str(options.goals)]
     if not options.durations and isinstance(goals, tuple):
         request = request.with_equal_durations(session.config.planning.horizon)
-    with ConsoleReporter() as reporter:
+    with cli.reporter() as reporter:
         reporter.note(_search_line(session.config.planning, on_cpu=session.world_model.device.type == "cpu"))
         progress = reporter.task("planning", "action sequences")
         controller = session.controller(seed=options.seed, extrinsics=extrinsics, progress=progress)
@@ -144,7 +117,7 @@ def _plan(options: argparse.Namespace) -> int:
             write_plan(found, about, options.out / PLAN_FILE),
             plot_plan(found, options.out / PLAN_IMAGE, imagined),
         ]
-    show(plan_table(found), summarize(found), files=written)
+    cli.show(plan_table(found), summarize(found), files=written)
     return int(found.decision.why == "no finite energy")
 
 
@@ -208,11 +181,14 @@ def _durations(options: argparse.Namespace) -> tuple[int, ...]:
 
 
 def _goals(options: argparse.Namespace) -> None:
+    """Make goals of one demonstration, an episode or a film: its key frames with durations and gripper.
+
+    They are in a folder that `plan --goals` and `simulate --goals` take, with a contact sheet.
+    """
     by, every = _way(options)
-    require_new_place(options.out)
+    cli.require_new_place(options.out)
     recording, stride = _recording(options)
 
-    from vjepa2_ac.console.progress import ConsoleReporter, show
     from vjepa2_ac.console.tables import goals_notes, goals_table
     from vjepa2_ac.demonstrations.make_goals import KeyFrameOptions, make_goals, recording_of_film
     from vjepa2_ac.reports.figures.planning import GOALS_IMAGE, plot_goals
@@ -220,12 +196,12 @@ def _goals(options: argparse.Namespace) -> None:
 
     still = None if options.still is None else recording_of_film(options.still)
     session = _session(options)
-    chosen = record_of_options(KeyFrameOptions, options, by=by, every=every, stride=stride)
-    with ConsoleReporter() as reporter:
+    chosen = cli.record_of_options(KeyFrameOptions, options, by=by, every=every, stride=stride)
+    with cli.reporter() as reporter:
         made = make_goals(recording, chosen, session, still=still, reporter=reporter)
     with user_can_write(options.out):
         written = [made.write(options.out), plot_goals(made, options.out / GOALS_IMAGE)]
-    show(goals_table(made), *goals_notes(made), files=written)
+    cli.show(goals_table(made), *goals_notes(made), files=written)
 
 
 def _is_film(options: argparse.Namespace) -> bool:
@@ -263,17 +239,16 @@ def _recording(options: argparse.Namespace) -> tuple[Recording, int]:
             fix = "Of 30 frames a second, 8 last 0.27 s, as a model step of the released weights does: --stride 8"
             raise InputError(where="--stride", found=found, needed="how many frames are a model step", fix=fix)
         return recording_of_film(Path(options.source)), options.stride
-    config = read_config(options.source, options.overrides, of_run=True)
+    config = cli.read_config(options.source, options.overrides, of_run=True)
     stride = options.stride or config.data.stride
     if stride == "auto":
         found, fix = "auto", "Say how many control steps a model step has: --stride 4"
         raise InputError(where="data.stride", found=found, needed="a number", fix=fix)
 
-    from vjepa2_ac.console.progress import ConsoleReporter
     from vjepa2_ac.demonstrations.make_goals import recording_of_episode
     from vjepa2_ac.reporter import INDEXING
 
-    with ConsoleReporter() as reporter:
+    with cli.reporter() as reporter:
         return recording_of_episode(config.data, options.episode or "0", reporter.task(INDEXING)), stride
 
 
@@ -282,5 +257,5 @@ def _session(options: argparse.Namespace) -> PlanningSession | None:
         return None
     from vjepa2_ac.planning.session import load_to_plan
 
-    say_places_elsewhere(options.model)
+    cli.say_places_elsewhere(options.model)
     return load_to_plan(options.model, checkpoint=options.checkpoint or "selected")

@@ -7,13 +7,14 @@ import contextlib
 import logging
 import sys
 from collections.abc import Iterator, Sequence
+from importlib.metadata import entry_points
 from pathlib import Path
 
-from vjepa2_ac import __version__, output
+from vjepa2_ac import __version__, process
 from vjepa2_ac.cli import closed_loop, data, evaluate, plan, setup, train
 from vjepa2_ac.cli.options import Handler, Parser, parsed, speaks
-from vjepa2_ac.distributed.signals import EXIT_STATUS, StoppedError, tidy_end
 from vjepa2_ac.errors import InputError, UserError, extra_of, in_words, is_out_of_memory, pip_install, printable
+from vjepa2_ac.process import EXIT_STATUS, StoppedError, tidy_end
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -23,7 +24,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     130 interrupted. A reader that closes early, as `head` does, changes nothing; a full disk for the output is an
     error, in the end.
     """
-    with output.own_streams() as lost, _our_warnings(), tidy_end():
+    with process.own_streams() as lost, _our_warnings(), tidy_end():
         status = _run(arguments)
         if problem := lost():
             _complain(f"standard output: cannot be written ({problem}): some output is missing")
@@ -32,7 +33,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: Sequence[str] | None) -> int:
-    options = parsed(_parser(), arguments)
+    words = sys.argv[1:] if arguments is None else arguments
+    options = parsed(_parser(words), words)
     handler: Handler = options.handler
     try:
         _require_working_directory()
@@ -50,7 +52,8 @@ def _run(arguments: Sequence[str] | None) -> int:
     except (UserError, OSError, MemoryError, RuntimeError) as error:  # a full disk, a path that is no path
         if isinstance(error, RuntimeError) and not is_out_of_memory(error):
             raise
-        _complain(in_words(error))
+        if not getattr(error, "is_told", False):
+            _complain(in_words(error))
         return 2
     except StoppedError as stopped:
         if speaks():
@@ -91,7 +94,7 @@ def _our_warnings() -> Iterator[None]:
         ours.removeHandler(handler)
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser(words: Sequence[str] = ()) -> argparse.ArgumentParser:
     parser: argparse.ArgumentParser = Parser(
         prog="vjepa2-ac", description="Fine-tune V-JEPA 2-AC with LoRA, and know whether it helped."
     )
@@ -102,4 +105,9 @@ def _parser() -> argparse.ArgumentParser:
     of_planning = (plan.add_plan, plan.add_goals, closed_loop.add_serve, closed_loop.add_simulate)
     for add in (*first, *of_data, *of_planning, train.add_export, setup.add_config_command, setup.add_download):
         add(commands)
+    for one in entry_points(group="vjepa2_ac.commands"):  # of other packages; imported only if it is asked for
+        if next(iter(words), None) == one.name:
+            one.load()(commands)
+        else:
+            commands.add_parser(one.name, help=f"of {one.value.partition(':')[0]}")
     return parser

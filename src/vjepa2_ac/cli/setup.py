@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vjepa2_ac.cli.options import Commands, add_config, argument, as_local, as_model, as_path, as_place, command
+from vjepa2_ac.cli import options as cli
 from vjepa2_ac.errors import InputError, UserError
 from vjepa2_ac.places import BUILTIN
 from vjepa2_ac.storage import is_url, try_writing_at, user_can_write, write_atomically
@@ -33,70 +33,56 @@ _TRIAL_STEPS = 100
 _RECORD = "simulate record {path} --domain B --episodes 60 --seed 5"
 
 
-def add_init(commands: Commands) -> None:
+def add_init(commands: cli.Commands) -> None:
     """Add `init` to a parser."""
-    text = (
-        "Write a commented config for the data and the machine that are there, look at the data as `data check` does,"
-        " and say what to do next. Guesses are marked. Exit status as of `data check`."
-    )
-    parser = command(commands, "init", _init, text)
+    parser = cli.command(commands, "init", _init)
     text = (
         f"one of {', '.join(FORMS)}; or left out: the files tell. sim: simulated data and the tiny model. scratch: a"
         " fresh predictor on V-JEPA 2.1's ViT-B, without Meta's action-conditioned model"
     )
-    argument(parser, "form FORM", text, as_place, nargs="?")
-    argument(
-        parser, "path PATH", "the data: a folder, or a URL (droid, lerobot, raw: DROID's own)", as_place, nargs="?"
+    cli.add(parser, "form FORM", text, cli.as_place, nargs="?")
+    cli.add(
+        parser, "path PATH", "the data: a folder, or a URL (droid, lerobot, raw: DROID's own)", cli.as_place, nargs="?"
     )
-    argument(parser, "--out FILE", "the config (NAME.yaml, by the data's folder)", as_path)
-    argument(parser, "--model MODEL", "instead of the released: what model.base takes; scratch: an encoder", as_model)
-    argument(parser, "--overwrite", "write over a config that is there", action="store_true")
+    cli.add(parser, "--out FILE", "the config (NAME.yaml, by the data's folder)", cli.as_path)
+    cli.add(
+        parser, "--model MODEL", "instead of the released: what model.base takes; scratch: an encoder", cli.as_model
+    )
+    cli.add(parser, "--overwrite", "write over a config that is there", action="store_true")
 
 
-def add_config_command(commands: Commands) -> None:
+def add_config_command(commands: cli.Commands) -> None:
     """Add `config` to a parser."""
-    text = (
-        "schema: every key with its range, as JSON schema. list: the configs that come with the package. text: one of"
-        " them with its comments, to begin a config of your own with. show: a config with every default."
-    )
-    parser = command(commands, "config", _config, text)
+    parser = cli.command(commands, "config", _config)
     parser.add_argument("what", choices=["schema", "list", "show", "text"])
-    argument(parser, "config CONFIG", "for show and text: a YAML config, or builtin:NAME", as_local, nargs="?")
-    argument(parser, "overrides key=value", "for show: such as training.steps=100", nargs="*")
+    cli.add(parser, "config CONFIG", "for show and text: a YAML config, or builtin:NAME", cli.as_local, nargs="?")
+    cli.add(parser, "overrides key=value", "for show: such as training.steps=100", nargs="*")
 
 
-def add_download(commands: Commands) -> None:
+def add_download(commands: cli.Commands) -> None:
     """Add `download` to a parser."""
-    text = (
-        "Fetch a published checkpoint: Meta's world model, or an encoder of V-JEPA 2 or 2.1. It goes on where it"
-        " stopped; size, and SHA-256 where it is known, are checked."
-    )
-    parser = command(commands, "download", _download, text)
-    argument(parser, "name NAME", "as --list shows it (default: vjepa2-ac-vitg, the world model, 11.7 GB)", nargs="?")
-    argument(parser, "--to PATH", "where to (default: checkpoints/NAME.pt)", as_path)
-    argument(parser, "--url", "another address of the same file than Meta's")
-    argument(parser, "--list", "show names, sizes and licences, and fetch nothing", action="store_true")
+    parser = cli.command(commands, "download", _download)
+    cli.add(parser, "name NAME", "as --list shows it (default: vjepa2-ac-vitg, the world model, 11.7 GB)", nargs="?")
+    cli.add(parser, "--to PATH", "where to (default: checkpoints/NAME.pt)", cli.as_path)
+    cli.add(parser, "--url", "another address of the same file than Meta's")
+    cli.add(parser, "--list", "show names, sizes and licences, and fetch nothing", action="store_true")
 
 
-def add_doctor(commands: Commands) -> None:
+def add_doctor(commands: cli.Commands) -> None:
     """Add `doctor` to a parser."""
-    text = (
-        "Estimate the GPU memory of a run, part by part, by a step on tensors without numbers: nothing is loaded."
-        " Exit status 0: it fits, 1: it does not, 2: something cannot be used."
-    )
-    add_config(command(commands, "doctor", _doctor, text), such_as="training.batch_size=4")
+    cli.add_config(cli.command(commands, "doctor", _doctor), such_as="training.batch_size=4")
 
 
-def add_demo(commands: Commands) -> None:
+def add_demo(commands: cli.Commands) -> None:
     """Add `demo` to a parser."""
-    text = (
-        "A simulated arm, a tiny world model, LoRA, whether it helped, and a film of what the model imagines: into the"
-        " folder demo, in 4 to 6 minutes on 2 cores, without a download. The same command goes on after a stop."
-    )
-    command(commands, "demo", _demo, text)
+    cli.command(commands, "demo", _demo)
 
 
 def _init(options: argparse.Namespace) -> int:
+    """Write a commented config for the data and the machine that are there, and say what to do next.
+
+    Guesses are marked, and the data are looked at as `data check` does; exit status as of that.
+    """
     form, path = _form_and_path(options.form, options.path)
     name = _name_of(form, path)
     out = options.out or Path(f"{name}.yaml")
@@ -114,7 +100,6 @@ def _init(options: argparse.Namespace) -> int:
     is_missing = path == _SIMULATED and not Path(path).exists()
     found = simulated(path) if is_missing else look_at(path, _LOOKED_AT_AS.get(form or "", form))
 
-    from vjepa2_ac.console.progress import ConsoleReporter, show
     from vjepa2_ac.init.choices import download_of
     from vjepa2_ac.init.draft import TINY, choose_model, make_draft
     from vjepa2_ac.init.found import guesses
@@ -122,34 +107,32 @@ def _init(options: argparse.Namespace) -> int:
     from vjepa2_ac.init.machine import this_machine
     from vjepa2_ac.reporter import INDEXING
 
-    with ConsoleReporter() as reporter:
+    with cli.reporter() as reporter:
         found = found if is_missing else measured(found, reporter.task(INDEXING))
     model_path = options.model or (TINY if path == _SIMULATED or form == "sim" else None)
     model = choose_model("scratch" if form == "scratch" else "released", model_path)
     machine = this_machine(found.sample if is_url(found.path) else "")
-    show(f"Data: {'; '.join(found.about)}.\nMachine: {machine.about}.")
+    cli.show(f"Data: {'; '.join(found.about)}.\nMachine: {machine.about}.")
     draft = make_draft(found, machine, model, run_dir=f"runs/{name}")
     with user_can_write(f"--out {out}"):
         write_atomically(out, draft.text(found, machine).encode())
     guessed = [f"  guessed  {key}{': ' if why else ''}{why}" for key, why in guesses(draft.knobs).items()]
-    show(*draft.costs(machine), f"Written: {out}", *guessed)
+    cli.show(*draft.costs(machine), f"Written: {out}", *guessed)
     status = 0 if is_missing else _check(draft, out)
     if status:
-        show(f"\nMend this first, then: vjepa2-ac data check {out}")
+        cli.show(f"\nMend this first, then: vjepa2-ac data check {out}")
     first = [(f"vjepa2-ac {_RECORD.format(path=path)}", "the data; half a minute on a core of its own")] * is_missing
     if not Path(model.path).exists() and (fetch := download_of(model, machine)):
         first.append((fetch[0], f"the model, once: {fetch[1]}"))
-    show("\nNext:", *(f"  {line}   # {about}" for line, about in [*first, *_next(draft, out, name)]))
+    cli.show("\nNext:", *(f"  {line}   # {about}" for line, about in [*first, *_next(draft, out, name)]))
     return status
 
 
 def _form_and_path(first: str | None, second: str | None) -> tuple[str | None, str]:
     """Return the form, None if the files are to tell, and the place of the data."""
     if first is None:
-        raise InputError(
-            where="init", found="no data", needed=f"a folder, a URL, or one of {', '.join(FORMS)}",
-            fix="Try `vjepa2-ac init sim`, or `vjepa2-ac init path/to/your/data`",
-        )  # fmt: skip
+        needed = f"a folder, a URL, or one of {', '.join(FORMS)}"
+        raise InputError(where="init", found="no data", needed=needed, fix="Try `vjepa2-ac init sim`")
     if first not in FORMS:
         if second is not None:
             raise InputError(where="init", found=f"{first!r}, no form of data", needed=f"one of {', '.join(FORMS)}")
@@ -171,9 +154,8 @@ def _name_of(form: str | None, path: str) -> str:
 def _check(draft: Draft, out: Path) -> int:
     """Run `data check` on the config; a reason why it cannot be is printed, and the config stays."""
     from vjepa2_ac.cli.data import check_and_print
-    from vjepa2_ac.console.progress import show
 
-    show(f"\n$ vjepa2-ac data check {out}")
+    cli.show(f"\n$ vjepa2-ac data check {out}")
     try:
         return check_and_print(draft.config)
     except UserError as error:
@@ -196,6 +178,11 @@ def _next(draft: Draft, out: Path, name: str) -> list[tuple[str, str]]:
 
 
 def _config(options: argparse.Namespace) -> None:
+    """schema: every key with its range, as JSON schema.
+
+    list: the configs that come with the package. text: one of them with its comments, to begin a config of your own
+    with. show: a config with every default.
+    """
     from vjepa2_ac.config.loading import config_as_yaml, config_path, config_schema, load_config, packaged_configs
 
     what, of_one = options.what, options.what in {"show", "text"}
@@ -214,33 +201,39 @@ def _config(options: argparse.Namespace) -> None:
 
 
 def _download(options: argparse.Namespace) -> None:
-    from vjepa2_ac.console.progress import ConsoleReporter, show
+    """Fetch a published checkpoint: Meta's world model, or an encoder of V-JEPA 2 or 2.1.
+
+    It goes on where it stopped; size, and SHA-256 where it is known, are checked.
+    """
     from vjepa2_ac.console.setup import published_notes, published_summary, published_table
     from vjepa2_ac.model.checkpoints.download import download
     from vjepa2_ac.model.checkpoints.published import OFFICIAL, PUBLISHED, find_published
     from vjepa2_ac.places import literal
 
     if options.list:
-        show(published_table(PUBLISHED), *published_notes(PUBLISHED))
+        cli.show(published_table(PUBLISHED), *published_notes(PUBLISHED))
         return
     known = find_published(options.name or OFFICIAL)
     path, url = options.to or Path("checkpoints") / known.file, options.url or known.url
-    show(published_summary(known, url))
-    with ConsoleReporter() as reporter:
+    cli.show(published_summary(known, url))
+    with cli.reporter() as reporter:
         download(url, path, known=known, reporter=reporter)
-    show(f"It is in {path}. In a config:  {known.knob}: {literal(path)}")
+    cli.show(f"It is in {path}. In a config:  {known.knob}: {literal(path)}")
 
 
 def _doctor(options: argparse.Namespace) -> int:
+    """Estimate the GPU memory of a run, part by part, by a step on tensors without numbers: nothing is loaded.
+
+    Exit status 0: it fits, 1: it does not, 2: something cannot be used.
+    """
     from vjepa2_ac.config.loading import load_config
 
     config = load_config(options.config, options.overrides)
 
     import torch
 
-    from vjepa2_ac.console.progress import show
     from vjepa2_ac.console.setup import memory_lines, verdict
-    from vjepa2_ac.distributed.device import slow_bf16
+    from vjepa2_ac.distributed import slow_bf16
     from vjepa2_ac.model.checkpoints.loading import base_sizes
     from vjepa2_ac.training.cost.memory import USUAL_GPU, estimate_memory, ways_to_fit
 
@@ -251,20 +244,25 @@ def _doctor(options: argparse.Namespace) -> int:
         gpu, available = device.name, device.total_memory
     estimate = estimate_memory(config, sizes)
     needed = estimate.total(checkpointing=estimate.checkpointing)
-    show(
+    cli.show(
         f"PyTorch {torch.__version__}, CUDA {torch.version.cuda or 'not in this build'}",
-        *memory_lines(config, estimate),
+        *memory_lines(estimate),
         verdict(needed, available, gpu, ways_to_fit(config, sizes, available)),
     )
     if unusual := config.adapter.out_of_line:
-        show(f"Warning: {unusual}.")
+        cli.show(f"Warning: {unusual}.")
     if not torch.cuda.is_available() and config.training.precision == "bf16" and (slow := slow_bf16()):
-        show(f"Without a GPU set training.precision=fp32 model.dtype=float32: in bfloat16 {slow}.")
-    show(f"The data are looked at by: vjepa2-ac data check {options.config}")
+        cli.show(f"Without a GPU set training.precision=fp32 model.dtype=float32: in bfloat16 {slow}.")
+    cli.show(f"The data are looked at by: vjepa2-ac data check {options.config}")
     return 0 if needed <= available else 1
 
 
 def _demo(_options: argparse.Namespace) -> int:
+    """Record a simulated arm, train a tiny world model with LoRA, say whether it helped, and film what it imagines.
+
+    All of it is in the folder demo, in 4 to 6 minutes on 2 cores, without a download. The same command goes on after a
+    stop.
+    """
     from vjepa2_ac.simulation.world.scene import load_mujoco
 
     load_mujoco()

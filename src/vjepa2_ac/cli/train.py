@@ -5,73 +5,53 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from vjepa2_ac.cli.options import (
-    Commands,
-    add_checkpoint,
-    add_config,
-    argument,
-    as_path,
-    command,
-    read_config,
-    say_places_elsewhere,
-    speaks,
-)
+from vjepa2_ac.cli import options as cli
 from vjepa2_ac.errors import InputError
 
 
-def add_train(commands: Commands) -> None:
+def add_train(commands: cli.Commands) -> None:
     """Add `train` to a parser."""
-    text = (
-        "Train an adapter (or the whole predictor) as a config says. SIGTERM, SIGINT, SIGUSR1, SIGHUP: finish the step,"
-        " write a checkpoint, end with status 75; the same command goes on from there. A second signal: end at once."
-    )
-    parser = command(commands, "train", _train, text)
+    parser = cli.command(commands, "train", _train)
     what = "a YAML config, or with --resume the folder of a run"
-    add_config(parser, such_as="training.learning_rate=3e-4", what=what)
-    argument(parser, "--resume", "go on with the run in the folder CONFIG", action="store_true")
-    argument(parser, "--check", "do everything that can fail and stop before the first step", action="store_true")
-    argument(parser, "--allow-config-change", "go on though the config is another", action="store_true")
+    cli.add_config(parser, such_as="training.learning_rate=3e-4", what=what)
+    cli.add(parser, "--resume", "go on with the run in the folder CONFIG", action="store_true")
+    cli.add(parser, "--check", "do everything that can fail and stop before the first step", action="store_true")
+    cli.add(parser, "--allow-config-change", "go on though the config is another", action="store_true")
 
 
-def add_encode(commands: Commands) -> None:
+def add_encode(commands: cli.Commands) -> None:
     """Add `encode` to a parser."""
-    text = (
-        "Run the frozen encoder once over all frames that the clips of a config need, and cache the latents."
-        " Stopping it costs the few episodes in progress at most: the same command goes on. Several processes"
-        " (torchrun) share the work."
-    )
-    parser = command(commands, "encode", _encode, text)
-    add_config(parser, such_as="data.cache_dtype=int8")
-    argument(parser, "--out FOLDER", "of the cache, for data.source: latents (where data.cache finds it)", as_path)
+    parser = cli.command(commands, "encode", _encode)
+    cli.add_config(parser, such_as="data.cache_dtype=int8")
+    cli.add(parser, "--out FOLDER", "of the cache, for data.source: latents (where data.cache finds it)", cli.as_path)
 
 
-def add_decoder_command(commands: Commands) -> None:
+def add_decoder_command(commands: cli.Commands) -> None:
     """Add `decoder` to a parser."""
-    text = (
-        "Train a decoder on the latents of true frames: what `imagine` and the option --decoder of other commands show"
-        " images with. It belongs to the config's encoder and camera, and serves every run on them. Stopping it costs"
-        " a checkpoint's distance at most: the same command goes on."
-    )
-    parser = command(commands, "decoder", _decoder, text)
-    add_config(parser, such_as="decoder.size=medium")
-    argument(parser, "--check", "do what can fail, and write nothing", action="store_true")
+    parser = cli.command(commands, "decoder", _decoder)
+    cli.add_config(parser, such_as="decoder.size=medium")
+    cli.add(parser, "--check", "do what can fail, and write nothing", action="store_true")
 
 
-def add_export(commands: Commands) -> None:
+def add_export(commands: cli.Commands) -> None:
     """Add `export` to a parser."""
-    text = "Write a run's model, adapter merged in, or its adapter, for others to use."
-    parser = command(commands, "export", _export, text)
-    argument(parser, "run RUN", "the folder of a run", as_path)
-    argument(parser, "folder FOLDER", "where to, new or empty; official: or a .pt file", as_path)
+    parser = cli.command(commands, "export", _export)
+    cli.add(parser, "run RUN", "the folder of a run", cli.as_path)
+    cli.add(parser, "folder FOLDER", "where to, new or empty; official: or a .pt file", cli.as_path)
     text = (
         "merged: a folder that `model.base` takes. official: one .pt by Meta's names, for the official code. hub: the"
         " adapter in PEFT's format with a model card, ready to upload"
     )
-    argument(parser, "--to", text, choices=["merged", "official", "hub"], default="merged")
-    add_checkpoint(parser)
+    cli.add(parser, "--to", text, choices=["merged", "official", "hub"], default="merged")
+    cli.add_checkpoint(parser)
 
 
 def _train(options: argparse.Namespace) -> None:
+    """Train an adapter (or the whole predictor) as a config says.
+
+    SIGTERM, SIGINT, SIGUSR1, SIGHUP: finish the step, write a checkpoint, end with status 75; the same command goes
+    on from there. A second signal: end at once.
+    """
     from vjepa2_ac.runs.folder import read_run_config
 
     path = Path(options.config)
@@ -82,36 +62,39 @@ def _train(options: argparse.Namespace) -> None:
         fix = "To go on with a run, add --resume"
         raise InputError(where=options.config, found="a folder", needed="a config file", fix=fix)
     if options.resume:
-        say_places_elsewhere(options.config)
-    config = read_run_config(path) if options.resume else read_config(path, options.overrides, base=True)
+        cli.say_places_elsewhere(options.config)
+    config = read_run_config(path) if options.resume else cli.read_config(path, options.overrides, base=True)
 
-    from vjepa2_ac.console.progress import show
     from vjepa2_ac.console.training import TrainingConsole
     from vjepa2_ac.training.loop import train
 
     with TrainingConsole() as reporter:
         folder = train(config, reporter, check_only=options.check, allow_config_change=options.allow_config_change)
-    if speaks() and not options.check:
-        show(f"The run is in {folder}; see how good it is: vjepa2-ac evaluate {folder}")
+    if cli.speaks() and not options.check:
+        cli.show(f"The run is in {folder}; see how good it is: vjepa2-ac evaluate {folder}")
 
 
 def _encode(options: argparse.Namespace) -> None:
-    config = read_config(options.config, options.overrides, base=True)
+    """Run the frozen encoder once over all frames that the clips of a config need, and cache the latents.
 
-    from vjepa2_ac.console.progress import ConsoleReporter, show
+    Stopping it costs the few episodes in progress at most: the same command goes on. Several processes (torchrun)
+    share the work.
+    """
+    config = cli.read_config(options.config, options.overrides, base=True)
+
     from vjepa2_ac.encoding.encode_dataset import encode_config
     from vjepa2_ac.reporter import SILENT
 
-    with ConsoleReporter() as reporter:
-        encoded = encode_config(config, reporter if speaks() else SILENT, out=options.out)
+    with cli.reporter() as reporter:
+        encoded = encode_config(config, reporter if cli.speaks() else SILENT, out=options.out)
         if config.replay is not None and options.out is None and not config.replay.data.is_cache:
-            encode_config(config.for_replay(), reporter if speaks() else SILENT)
+            encode_config(config.for_replay(), reporter if cli.speaks() else SILENT)
     if not encoded.is_finished:
-        show(f"This process has done its share; others are still at work on {encoded.folder}")
+        cli.show(f"This process has done its share; others are still at work on {encoded.folder}")
         return
     episodes = f"{encoded.encoded:,} of {encoded.episodes:,} episodes"
     knobs = f"data.source=latents data.path={encoded.folder}" if options.out else "data.cache=auto"
-    show(
+    cli.show(
         *(f"left out: {name}: {reason}" for name, reason in encoded.broken.items()),
         f"{episodes}, {encoded.frames:,} frames, {encoded.bytes / 1e9:.3g} GB are in {encoded.folder}",
         f"Train on them with {knobs}",
@@ -119,36 +102,38 @@ def _encode(options: argparse.Namespace) -> None:
 
 
 def _decoder(options: argparse.Namespace) -> None:
-    config = read_config(options.config, options.overrides, base=True)
+    """Train a decoder on the latents of true frames: what `imagine` and --decoder show images with.
 
-    from vjepa2_ac.console.progress import ConsoleReporter, show
+    It belongs to the config's encoder and camera, and serves every run on them. Stopping it costs a checkpoint's
+    distance at most: the same command goes on.
+    """
+    config = cli.read_config(options.config, options.overrides, base=True)
+
     from vjepa2_ac.console.tables import held_out_table
     from vjepa2_ac.decoding.decoder_folder import read_card
     from vjepa2_ac.decoding.training import train_decoder
 
-    with ConsoleReporter() as reporter:
+    with cli.reporter() as reporter:
         folder = train_decoder(config, reporter, check_only=options.check)
     if options.check:
-        show("Everything is in place: data, model, folder and disk were checked; nothing was written.")
+        cli.show("Everything is in place: data, model, folder and disk were checked; nothing was written.")
         return
     card = read_card(folder)
     if card.held_out:
-        show(held_out_table(card))
-    show(f"See what a model imagines: vjepa2-ac imagine {config.run_dir} --decoder {folder}")
+        cli.show(held_out_table(card))
+    cli.show(f"See what a model imagines: vjepa2-ac imagine {config.run_dir} --decoder {folder}")
 
 
 def _export(options: argparse.Namespace) -> None:
-    from vjepa2_ac.runs.checkpoint import require_listed
+    """Write a run's model, adapter merged in, or its adapter, for others to use."""
     from vjepa2_ac.runs.folder import read_run_config
 
     read_run_config(options.run)
-    require_listed(options.run, options.checkpoint)
 
-    from vjepa2_ac.console.progress import show
     from vjepa2_ac.export import export_run
 
     written = export_run(options.run, options.folder, options.to, options.checkpoint)
     what = {"merged": "merged model", "official": "official checkpoint", "hub": "adapter with its model card"}
-    show(f"The {what[options.to]} of checkpoint {written.checkpoint} is in {written.path}")
+    cli.show(f"The {what[options.to]} of checkpoint {written.checkpoint} is in {written.path}")
     if options.to == "hub":
-        show("The card names base and data by their paths on this machine: read it before you upload it.")
+        cli.show("The card names base and data by their paths on this machine: read it before you upload it.")

@@ -15,6 +15,7 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from vjepa2_ac.errors import printable
+from vjepa2_ac.reporter import Reporter
 
 _LINE_EVERY_S = 10.0
 _WIDE = 120  # columns that leave room for a long bar
@@ -146,7 +147,7 @@ class ProgressBar:
         return f"{timedelta(seconds=round((now - self._began) / advanced * remaining))} left"
 
 
-class ConsoleReporter:
+class ConsoleReporter(Reporter):
     """Shows messages, and one task after another as a bar; at the end of its `with` block the terminal is restored."""
 
     def __init__(self) -> None:

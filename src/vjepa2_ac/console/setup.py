@@ -9,7 +9,6 @@ from rich import box
 from rich.table import Table
 
 if TYPE_CHECKING:
-    from vjepa2_ac.config import Config
     from vjepa2_ac.model.checkpoints.published import Published
     from vjepa2_ac.training.cost.memory import MemoryEstimate
 
@@ -21,40 +20,11 @@ UNTESTED = (
 )
 
 
-def memory_lines(config: Config, estimate: MemoryEstimate) -> list[str]:
+def memory_lines(estimate: MemoryEstimate) -> list[str]:
     """Return one line for every part, then both totals."""
-    from vjepa2_ac.training.cost.memory import ALLOWANCE
-
-    training, counts = config.training, estimate.parameters
-    clips = f"{training.batch_size} clips of {config.data.frames} frames"
-    eight_bits = "8 bits where a tensor has 4,096 elements" if training.optimizer == "adamw_8bit" else "float32"
-    parts = [
-        (
-            "encoder, frozen", estimate.encoder_weights,
-            "none: latents come from a cache" if config.data.takes_latents
-            else f"{counts.encoder:,} weights in {config.model.dtype}",
-        ),
-        (
-            "predictor, frozen", estimate.predictor_weights,
-            f"{counts.predictor:,} weights" if estimate.predictor_weights else "none: all of it is trained",
-        ),
-        ("trained", estimate.trained, f"{counts.trained:,} weights in float32"),
-        ("gradients", estimate.gradients, "float32"),
-        ("optimizer", estimate.moments, f"AdamW's two moments, {eight_bits}"),
-        ("next batch", estimate.arriving, "on its way while this one is computed"),
-        ("latents", estimate.latents, f"{clips}, float32"),
-        ("encoder, at work", estimate.encoding, f"{config.model.encode_chunk} frames at once; before the predictor"),
-        ("predictor, at work", estimate.step.stored, "forward, losses and backward, without checkpointing"),
-        ("the same, checkpointed", estimate.step.checkpointed, "inputs of blocks, and one block computed again"),
-        ("copies", estimate.step.casts, f"of adapters in {training.precision}"),
-        (
-            "validation", estimate.validating,
-            f"instead of all that: {config.validation.batch_size} clips, and the keys and values of their rollout",
-        ),
-        *([("encoding the cache", estimate.caching, "before all that: the encoder alone")] if estimate.caching else []),
-        ("CUDA, cuBLAS, holes", ALLOWANCE, "an allowance, not computed"),
-    ]  # fmt: skip
-    lines = [f"  {name:<28}{size / _GIGABYTE:8.3f} GB  {about}" for name, size, about in parts]
+    weights = estimate.parameters
+    lines = [f"  weights: encoder {weights.encoder:,}, predictor {weights.predictor:,}, trained {weights.trained:,}"]
+    lines += [f"  {name:<28}{size / _GIGABYTE:8.3f} GB  {about}" for name, size, about in estimate.parts]
     for checkpointing, word in ((False, "without"), (True, "with")):
         chosen = "  <- this config" if checkpointing == estimate.checkpointing else ""
         total = estimate.total(checkpointing=checkpointing) / _GIGABYTE

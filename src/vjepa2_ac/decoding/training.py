@@ -28,22 +28,23 @@ from vjepa2_ac.decoding.decoder_folder import CARD, DecoderCard, read_card, save
 from vjepa2_ac.decoding.frame_pairs import FramePairs, Pairs, fit_linear, mean_image, measure_decoders, wanted_frames
 from vjepa2_ac.decoding.network import UPSAMPLED, Decoder, DecoderShape
 from vjepa2_ac.decoding.steps import SMALLEST, DecoderSteps
-from vjepa2_ac.distributed.device import autocast, computing_device
-from vjepa2_ac.distributed.signals import StoppedError, StopRequest, stop_on_signals
+from vjepa2_ac.distributed import autocast, computing_device, out_of_memory_explained
 from vjepa2_ac.encoding.batch import encoding_of
 from vjepa2_ac.encoding.latent_cache import frames_in, key_for, require_space
 from vjepa2_ac.encoding.pipeline import EncoderOnDevice, FramesToEncode, encode_files
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.pretrained_folder import first_not_finite
+from vjepa2_ac.process import StoppedError, StopRequest, stop_on_signals
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
-from vjepa2_ac.runs.files import read_torch, write_torch
+from vjepa2_ac.runs.checkpoint import read_torch, write_torch
 from vjepa2_ac.runs.folder import RunLock
 from vjepa2_ac.runs.metrics_log import MetricsLog
 from vjepa2_ac.storage import atomic_writer, try_writing_at, user_can_write, write_atomically
 from vjepa2_ac.storage.structured import utc_now
 
 KEY, PAIRS, STATE = "key.json", "pairs", "training.pt"
+_LESS_MEMORY = "Lower decoder.batch_size or model.encode_chunk, or set decoder.size: tiny"
 _LOG_EVERY = 50  # steps
 
 
@@ -76,13 +77,9 @@ def train_decoder(config: Config, reporter: Reporter = SILENT, *, check_only: bo
             lock.take()
             with user_can_write(folder):
                 write_atomically(folder / KEY, json.dumps({"key": dict(ready.key.parts)}, indent=1) + "\n")
-            try:
+            with out_of_memory_explained("decoder", _LESS_MEMORY):
                 _try_one_step(ready)
                 _make(ready, reporter)
-            except torch.OutOfMemoryError as error:
-                found = f"the GPU's memory is not enough ({str(error).splitlines()[0]})"
-                fix = "Lower decoder.batch_size or model.encode_chunk, or set decoder.size: tiny"
-                raise InputError(where="decoder", found=found, fix=fix) from error
             reporter.note(f"The decoder is in {folder}: {folder / CARD} says how good it is")
         shutil.rmtree(ready.files.folder, ignore_errors=True)  # also after a start that was killed by then
         (folder / STATE).unlink(missing_ok=True)

@@ -23,8 +23,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import ProcessShare
 from vjepa2_ac.data.windows import require_stride
-from vjepa2_ac.distributed.device import computing_device
-from vjepa2_ac.distributed.processes import broadcast_object, first_only
+from vjepa2_ac.distributed import broadcast_object, computing_device, first_only
 from vjepa2_ac.encoding.batch import encoding_of, require_same_encoder
 from vjepa2_ac.encoding.latent_cache import LatentCache, frames_in, through_cache
 from vjepa2_ac.encoding.pipeline import EncoderOnDevice, FramesToEncode, encode_files

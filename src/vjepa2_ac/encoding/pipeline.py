@@ -23,7 +23,7 @@ from vjepa2_ac.data.clips import joined_latents
 from vjepa2_ac.data.dataset import Dataset, require_widths
 from vjepa2_ac.data.sources.latents.cache_files import CacheType, EncodedEpisode, LatentFiles, pack_latents
 from vjepa2_ac.data.transforms import input_to_pixels, pixels_to_input, view
-from vjepa2_ac.distributed.device import autocast
+from vjepa2_ac.distributed import autocast
 from vjepa2_ac.episode import Episode, Progress, StoredLatents, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.world_model import WorldModel

@@ -28,7 +28,7 @@ from vjepa2_ac.decoding.imagine import (
     shown,
     worth_knowing,
 )
-from vjepa2_ac.distributed.processes import make_accelerator
+from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, encode_frames
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError

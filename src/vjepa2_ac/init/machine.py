@@ -72,7 +72,7 @@ def this_machine(sample: str = "") -> Machine:
     """
     import torch
 
-    from vjepa2_ac.distributed.device import cuda_index, has_bf16, matmul_speed
+    from vjepa2_ac.distributed import cuda_index, has_bf16, matmul_speed
 
     cores, free = len(os.sched_getaffinity(0)), storage.free_bytes(Path.cwd())
     speed = _speed_of(sample) if sample else None

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from vjepa2_ac import __version__
 from vjepa2_ac.config import Config
-from vjepa2_ac.distributed.device import has_bf16, is_on_cpu, require_type_of_weights
+from vjepa2_ac.distributed import has_bf16, is_on_cpu, require_type_of_weights
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.merging import merge_adapter

@@ -10,30 +10,32 @@ from __future__ import annotations
 import json
 import logging
 import math
+import pickle
 import re
 import shutil
 import time
+import zipfile
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
-from typing import Annotated
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Any, BinaryIO
 
 from pydantic import Field
 
 from vjepa2_ac.config import CheckpointConfig
 from vjepa2_ac.config.section import PositiveInt
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.runs.files import verify_manifest, write_manifest
-from vjepa2_ac.storage import sync
-from vjepa2_ac.storage.structured import read_json_object, record_of
+from vjepa2_ac.storage import read_bounded, sha256_of_file, sync
+from vjepa2_ac.storage.structured import MOST_BYTES, json_object, read_json_object, record_of, shown
 
 logger = logging.getLogger(__name__)
 
 CHECKPOINTS = "checkpoints"  # of a run's folder
 STATE = "state.json"
+MANIFEST = "manifest.json"
 ADAPTER = "adapter"  # a folder: what `model.adapter.lora.save_trained` writes
 OPTIMIZER = "optimizer.pt"
-FETCHING = ".fetching-"  # a checkpoint being fetched, see `runs.mirror.open_remote`
+FETCHING = ".fetching-"  # a checkpoint being fetched, see `runs.mirror`
 
 _WRITING = ".writing-"
 SELECTED, NEWEST, BEST = "selected", "newest", "best"
@@ -48,6 +50,15 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 @dataclass(frozen=True)
+class DataState:
+    """What a run has seen of a data set."""
+
+    fingerprint: str  # of its episodes
+    windows: Count  # clips of an epoch: their order depends on the number
+    broken: Mapping[str, str]  # episodes whose clips could not be read, and why
+
+
+@dataclass(frozen=True)
 class RunState:
     """Progress of a run. Data order, learning rate and random numbers are functions of the step."""
 
@@ -57,18 +68,13 @@ class RunState:
     clips_per_step: PositiveInt | None = None  # of all processes
     clips_asked: PositiveInt | None = None  # of one process, by the config: batch_size * accumulation
     processes: PositiveInt = 1
-    broken: Mapping[str, str] = field(default_factory=dict)  # episodes whose clips could not be read, and why
-    windows: Count | None = None  # clips of an epoch: their order depends on the number
     best_step: Count | None = None  # the best validation by checkpoint.keep_best; 0: the base's
     best_error: Finite | None = None  # its rollout error
     best_rank: Finite | None = None  # its mean rank of the true action, if that selects
     lowest_rank: Finite | None = None  # of all validations
     measured_on: Mapping[str, str] | None = None  # what validation errors depend on, see `training.resume`
     loss_scale: Mapping[str, int | float] | None = None  # of fp16: state of the gradient scaler
-    data: str | None = None  # the fingerprint of the episodes
-    replayed_broken: Mapping[str, str] = field(default_factory=dict)  # the same of the second data set
-    replayed_windows: Count | None = None
-    replayed_data: str | None = None
+    data: tuple[DataState, ...] = ()  # of its data set, and of the replayed one
 
     @property
     def best_name(self) -> str | None:
@@ -199,7 +205,18 @@ def newest_checkpoint(folder: Path) -> Path | None:
 
 def find_damage(checkpoint: Path) -> str | None:
     """Return what is wrong with a checkpoint, or None if every file matches the manifest."""
-    return verify_manifest(checkpoint, needed={STATE})
+    try:
+        files = named_files(read_bounded(checkpoint / MANIFEST, MOST_BYTES))
+        if STATE not in files:
+            return f"{MANIFEST} does not name {STATE}"
+        for name, digest in files.items():
+            if not (checkpoint / name).is_file():
+                return f"{name} is missing"
+            if sha256_of_file(checkpoint / name) != digest:
+                return f"{name} is damaged (its SHA-256 is not the manifest's)"
+    except (InputError, OSError) as error:
+        return f"no readable {MANIFEST} ({error})"
+    return None
 
 
 def read_state(checkpoint: Path) -> RunState:
@@ -231,6 +248,93 @@ def _remove(checkpoint: Path) -> None:
         shutil.rmtree(checkpoint)
 
 
+# ---- its files: neither manifest nor tensors are trusted, for a checkpoint may come from elsewhere ----
+
+
+def write_manifest(folder: Path) -> None:
+    """Flush every file of a folder to the disk, then write the manifest.
+
+    Raises:
+        OSError: The folder cannot be read or written.
+    """
+    manifest = folder / MANIFEST
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and path != manifest)
+    digests = {}
+    for path in files:
+        sync(path)
+        digests[str(path.relative_to(folder))] = sha256_of_file(path)
+    for inner in {path.parent for path in files} - {folder}:
+        sync(inner)
+    manifest.write_text(json.dumps({"files": digests}, indent=1))
+    sync(manifest)
+    sync(folder)
+
+
+def named_files(manifest: bytes) -> dict[str, str]:
+    """Return the files that a manifest names, in its own folder, with the SHA-256 of each.
+
+    Raises:
+        InputError: It is no manifest, or names a file elsewhere.
+    """
+    files = json_object(manifest, where=MANIFEST).get("files")
+    if not isinstance(files, dict) or not all(isinstance(digest, str) for digest in files.values()):
+        raise InputError(where=MANIFEST, found=f"files {shown(files)}", needed="the SHA-256 of each file, by its name")
+    for name in files:
+        path = PurePosixPath(name)
+        if path.is_absolute() or ".." in path.parts or not path.parts or str(path) != name:
+            raise InputError(where=MANIFEST, found=f"it names {name}, which is outside", needed="files beside it")
+    return files
+
+
+def write_torch(value: object, file: BinaryIO) -> None:
+    """Write tensors and plain values.
+
+    Raises:
+        OSError: The disk is full, or another system error, which torch itself would hide.
+    """
+    import torch  # checkpoints are listed without it
+
+    try:
+        torch.save(value, file)
+    except RuntimeError as error:
+        if isinstance(error.__context__, OSError):
+            raise error.__context__ from None
+        raise
+
+
+def read_torch(path: Path) -> Any:
+    """Return the tensors and plain values of a file, on the CPU. Nothing in it is executed.
+
+    Raises:
+        InputError: The file cannot be read, or contains more than tensors and plain values.
+    """
+    import torch
+
+    try:
+        _require_as_written(path)
+        return torch.load(path, weights_only=True, map_location="cpu")
+    except Exception as error:  # of a damaged file torch raises anything
+        found = f"cannot be read ({error})"
+        if isinstance(error, pickle.UnpicklingError):
+            found = "more than tensors and plain values: such a file can run foreign code"
+        raise InputError(where=str(path), found=found, needed="a file that this program wrote") from None
+
+
+def _require_as_written(path: Path) -> None:
+    """Refuse other formats that torch reads, too: a small file of these may take any memory.
+
+    Raises:
+        OSError: The file cannot be read.
+        ValueError: It is no zip archive, or its parts are compressed.
+    """
+    with zipfile.ZipFile(path) as archive:
+        if any(part.compress_type != zipfile.ZIP_STORED for part in archive.infolist()):
+            raise ValueError("its parts are compressed")
+
+
+# ---- selection ----
+
+
 @dataclass(frozen=True)
 class SelectedCheckpoint:
     """A complete checkpoint, and how it was selected."""
@@ -257,57 +361,28 @@ def select_checkpoint(run: Path, by: str = SELECTED) -> SelectedCheckpoint:
     folder = run / CHECKPOINTS
     newest = newest_checkpoint(folder)
     if newest is None:
-        raise InputError(
-            where=str(run),
-            found="a run without a whole checkpoint",
-            needed="at least one",
-            fix=f"Train on with `vjepa2-ac train {run} --resume`",
-        )
+        fix = f"Train on with `vjepa2-ac train {run} --resume`"
+        raise InputError(where=str(run), found="a run without a whole checkpoint", needed="at least one", fix=fix)
     state = written_state(newest)
     if by == NEWEST or (by == SELECTED and state.best_step is None):
         return SelectedCheckpoint(newest, "the newest" if by == NEWEST else "the newest: none was selected")
-    step = _best_step(newest, state) if by in {SELECTED, BEST} else _number(by, folder)
-    path = folder / checkpoint_name(step)
-    if not path.is_dir():
-        raise _not_there(folder, f"no checkpoint of step {step:,}")
-    if (problem := find_damage(path)) is not None:
-        raise _not_there(folder, f"{path.name} is damaged: {problem}")
-    return SelectedCheckpoint(path, _why(state, step) if by in {SELECTED, BEST} else "as asked for")
-
-
-def require_listed(run: Path, by: str = SELECTED) -> None:
-    """Refuse a checkpoint that is not there, without reading any: whether it is whole is checked when it is loaded.
-
-    Raises:
-        InputError: There is no such checkpoint.
-    """
-    there = {str(step_of(path.name)) for path in listed(run / CHECKPOINTS)}
-    if not there or (by not in {SELECTED, NEWEST, BEST} and by not in there):
-        select_checkpoint(run, by)  # says what there is
-
-
-def _why(state: RunState, step: int) -> str:
-    by = "error" if state.best_rank is None else "action ranking"
-    return f"the best by {by}" if step else f"the base: none of its checkpoints is better by {by}"
-
-
-def _best_step(newest: Path, state: RunState) -> int:
-    if state.best_step is None:
-        found = (
+    step = state.best_step if by in {SELECTED, BEST} else step_of(f"step-{by.zfill(8)}")
+    path = folder / checkpoint_name(step or 0)
+    if step is None and by == BEST:
+        problem: str | None = (
             "no best checkpoint: checkpoint.keep_best was off, there was no validation yet, what it measures was"
             " changed since, or it was deleted"
         )
-        raise _not_there(newest.parent, found)
-    return state.best_step
-
-
-def _number(by: str, folder: Path) -> int:
-    step = step_of(f"step-{by.zfill(8)}")
-    if step is None:
-        raise _not_there(folder, f"--checkpoint {by}")
-    return step
-
-
-def _not_there(folder: Path, found: str) -> InputError:
-    steps = ", ".join(str(step_of(path.name)) for path in listed(folder) if find_damage(path) is None)
-    return InputError(where=str(folder), found=found, needed=f"selected, newest, best or one of the steps {steps}")
+    elif step is None or not path.is_dir():
+        problem = f"--checkpoint {by}" if step is None else f"no checkpoint of step {step:,}"
+    else:
+        problem = (damage := find_damage(path)) and f"{path.name} is damaged: {damage}"
+    if problem:
+        steps = ", ".join(str(step_of(path.name)) for path in listed(folder) if find_damage(path) is None)
+        raise InputError(where=str(folder), found=problem, needed=f"selected, newest, best or one of the steps {steps}")
+    if by not in {SELECTED, BEST}:
+        return SelectedCheckpoint(path, "as asked for")
+    measure = "error" if state.best_rank is None else "action ranking"
+    return SelectedCheckpoint(
+        path, f"the best by {measure}" if step else f"the base: none of its checkpoints is better by {measure}"
+    )

@@ -53,6 +53,7 @@ CHANGES = "changes.json"  # of states in a model step
 HELD = ".mirror"
 METRICS = "metrics.jsonl"
 TENSORBOARD = "tensorboard"
+SMALL_FILES = (CONFIG, ENVIRONMENT, CALIBRATION, CHANGES, RUN_ID, METRICS)  # with which a run goes on elsewhere
 _ID = re.compile(r"[\w.-]{0,128}")
 _MOST_BYTES_OF_ID = 1_000
 IMAGINED = "imagined"  # images of what the model imagines
@@ -87,7 +88,8 @@ def check_run_folder(config: Config, *, allow_config_change: bool = False) -> No
         found = "a folder with other things in it, and no config.yaml"
         needed = "an empty or new folder, or one of a run"
         raise InputError(where=str(folder), found=found, needed=needed, fix="Set another run_dir")
-    _check_writable(folder)
+    with user_can_write(folder):
+        try_writing_at(folder)
 
 
 def open_run_folder(config: Config, run_name: str, *, allow_config_change: bool = False) -> Path:
@@ -210,7 +212,7 @@ def _is_without_config(path: Path) -> bool:
     return path.name in {LOCK, NOT_FINITE} or (path.name.startswith(f".{CONFIG}.") and path.name.endswith(".partial"))
 
 
-def _earlier_starts(path: Path) -> list[dict[str, Any]]:
+def _earlier_starts(path: str | Path) -> list[dict[str, Any]]:
     try:
         starts = json_list(read_bounded(path, MOST_BYTES), where=str(path))
     except (OSError, InputError):
@@ -234,14 +236,6 @@ def _refuse_another_config(folder: Path, config: Config) -> None:
             " meant, add --allow-config-change"
         )
         raise InputError(where=str(folder), found=found, needed="the same config, to go on with it", fix=fix)
-
-
-def _check_writable(folder: Path) -> None:
-    try:
-        try_writing_at(folder)
-    except OSError as error:
-        found = f"cannot be written ({error.strerror})"
-        raise InputError(where=str(folder), found=found, fix="Set run_dir to a folder of yours") from None
 
 
 def with_settled_stride(config: Config) -> Config:
@@ -286,7 +280,7 @@ class RunLock:
             try:
                 self._lock.acquire(blocking=False)
             except Timeout:
-                found = f"a run that is being trained right now, by {_last_start(self._folder)}"
+                found = f"a run that is being trained right now, by {last_start(self._folder / ENVIRONMENT)}"
                 needed = "a folder that no other process writes to"
                 fix = "Wait until it ends, stop it, or set another run_dir"
                 raise InputError(where=str(self._folder), found=found, needed=needed, fix=fix) from None
@@ -305,8 +299,9 @@ class RunLock:
         self._lock.release()
 
 
-def _last_start(folder: Path) -> str:
-    last: dict[str, Any] = (_earlier_starts(folder / ENVIRONMENT) or [{}])[-1]
+def last_start(path: str | Path) -> str:
+    """Return by which process, where and when the last start in a list of them was made, here or elsewhere."""
+    last: dict[str, Any] = (_earlier_starts(path) or [{}])[-1]
     if "host" not in last:
         return "another process"
     return f"process {last.get('process')} on {last['host']}, since {last.get('time')}"

@@ -11,7 +11,6 @@ import json
 import logging
 import os
 import threading
-import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -149,23 +148,15 @@ def warnings_of(path: Path) -> list[str]:
 
 @contextmanager
 def warn_if_stalled(path: Path) -> Iterator[None]:
-    """Warn if the block, which writes a file, lasts longer than a minute; and when it ends, how long it took.
+    """Warn if the block, which writes a file, lasts longer than a minute.
 
     A network disk may block for minutes, and training has to wait: without a message it would look like one that hangs.
     """
-    patience_s, begun_s, is_over = STALLED_S, time.monotonic(), threading.Lock()
-
-    def warn() -> None:
-        if is_over.acquire(blocking=False):
-            logger.warning("%s: the disk has not taken it for %g s; training waits for it", path, patience_s)
-
-    timer = threading.Timer(patience_s, warn)
+    text = "%s: the disk has not taken it for %g s; training waits for it"
+    timer = threading.Timer(STALLED_S, logger.warning, (text, path, STALLED_S))
     timer.daemon = True
     timer.start()
     try:
         yield
     finally:
         timer.cancel()
-        if not is_over.acquire(blocking=False):
-            timer.join()
-            logger.warning("%s: the disk took it after %.0f s; training goes on", path, time.monotonic() - begun_s)

@@ -7,17 +7,13 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.checkpoint import CHECKPOINTS, RunState, find_damage, listed, step_of
 from vjepa2_ac.runs.folder import RunLock, check_run_folder, config_changes, open_run_folder, with_settled_stride
-
-if TYPE_CHECKING:
-    from vjepa2_ac.runs.mirror.background_sync import Mirror
-    from vjepa2_ac.runs.mirror.open_remote import Remote
+from vjepa2_ac.runs.mirror import Mirror, Remote, open_remote
 
 
 @dataclass(frozen=True)
@@ -45,12 +41,18 @@ class OpenRun:
                 `open_run_folder`.
         """
         self.lock.take()
-        _refuse_if_overtaken(Path(config.run_dir), state)
+        # Checkpoints up to its own step were inspected when the run was resumed.
+        further = [path for path in listed(Path(config.run_dir, CHECKPOINTS)) if (step_of(path.name) or 0) > state.step]
+        newest = next((path for path in reversed(further) if find_damage(path) is None), None)
+        if newest is not None:
+            there = f"a checkpoint of step {step_of(newest.name)}"
+            found = f"{there}, which another start wrote while this one stood at {state.step}"
+            raise InputError(where=str(newest), found=found, fix="Start again: the run continues from there")
         open_run_folder(config, state.run_id, allow_config_change=self.allow_config_change)
 
     def mirror(self, run_id: str) -> Mirror | None:
         """Return what keeps `checkpoint.remote` up to date."""
-        return None if self.remote is None else self.remote.mirror(run_id)
+        return None if self.remote is None else Mirror(self.remote, run_id)
 
 
 @contextlib.contextmanager
@@ -78,21 +80,8 @@ def open_run(
         elif folder.is_dir():  # a new one is created, and locked, after all checks
             lock.take()
         if config.checkpoint.remote is not None:
-            from vjepa2_ac.runs.mirror.open_remote import open_remote
-
             # Locked before anything is downloaded into the run's folder: another process could still be writing there.
             claim = lock.take if trial is None else lambda: None
             remote = open_remote(config, reporter, claim=claim, allow_config_change=allow_config_change, into=trial)
             config = with_settled_stride(remote.config if remote else config)
         yield OpenRun(config, lock, remote, allow_config_change)
-
-
-def _refuse_if_overtaken(folder: Path, state: RunState) -> None:
-    """Check that no other process trained in a new run's folder between its first inspection and its lock."""
-    # Checkpoints up to its own step were inspected when the run was resumed.
-    further = [path for path in listed(folder / CHECKPOINTS) if (step_of(path.name) or 0) > state.step]
-    newest = next((path for path in reversed(further) if find_damage(path) is None), None)
-    if newest is not None:
-        there = f"a checkpoint of step {step_of(newest.name)}"
-        found = f"{there}, which another start wrote while this one stood at {state.step}"
-        raise InputError(where=str(newest), found=found, fix="Start again: the run continues from there")

@@ -7,19 +7,17 @@ strip is left out, and a warning says why.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
-from torch import Tensor
+from jaxtyping import UInt8
 
-from vjepa2_ac.config import Config
 from vjepa2_ac.data.clips import frames_of
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.transforms import frames_as_seen
-from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
+from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
 from vjepa2_ac.decoding.imagine import AS_RECORDED, Imagination, Imagined, Start, rolled_out, shown
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.media.image_file import encode_png
@@ -36,21 +34,8 @@ logger = logging.getLogger(__name__)
 Image = UInt8[np.ndarray, "height width 3"]
 
 
-@dataclass(frozen=True, eq=False)
-class _Clip:
-    """A clip of a batch, whose frames are read only if it is the one."""
-
-    batch: Batch  # without latents
-    row: int
-    latents: Float[Tensor, "time tokens dim"]
-    actions: Float[np.ndarray, "time-1 action_dim"]
-    states: Float[np.ndarray, "time state_dim"]
-    extrinsics: Float[Tensor, " 6"] | None
-    motion: float
-
-
 class ImaginedStrip:
-    """Finds the clip among those of the first validation of this process, and draws it at each.
+    """Finds the clip among those of the validations of this process, and draws it at each.
 
     Args:
         decoder: Of the run's encoder.
@@ -60,28 +45,24 @@ class ImaginedStrip:
 
     def __init__(self, decoder: TrainedDecoder, dataset: Dataset, size: int) -> None:
         self._decoder, self._dataset, self._size = decoder, dataset, size
-        self._clip: _Clip | None = None
-        self._is_found = False  # from the first drawing on
-        self._base: dict[str, Tensor] = {}  # what the base imagines: [steps, tokens, dim]
-        self._frames: UInt8[np.ndarray, "time size size 3"] | None = None  # what happened
+        self._most = -1.0  # motion of a clip
+        self._clip: tuple[Batch, int, LatentBatch] | None = None  # its row in a batch; its latents and states alone
+        self._frames: UInt8[np.ndarray, "time size size 3"] | None = None  # what happened; read once
 
     def seen(self, batch: Batch, encoded: LatentBatch) -> LatentBatch:
         """Return the latents of a batch of validation clips, after looking for the clip with the most motion."""
-        if not self._is_found:
-            for row, states in enumerate(encoded.states.double().cpu().numpy()):
-                motion = self._dataset.spaces.state.path_length(states)
-                if self._clip is None or motion > self._clip.motion:
-                    self._clip = _clip_of(batch, encoded, row, motion)
+        for row, states in enumerate(encoded.states.double().cpu().numpy()):
+            motion = self._dataset.spaces.state.path_length(states)
+            if motion > self._most:
+                clip = encoded.clip(row)
+                own = replace(clip, latents=clip.latents.detach().float().cpu().clone())  # or all clips would stay
+                self._most, self._clip = motion, (replace(batch, latents=None, on_device=None), row, own)
         return encoded
 
     def draw(self, world_model: WorldModel, device: torch.device, run: Path, step: int) -> Image | None:
         """Write RUN/imagined/step-XXXXXXXX.png; return the image, None if none was drawn."""
-        if self._clip is None:
-            return None
-        self._is_found = True
         try:
-            imagination = self._imagine(self._clip, world_model, device, f"{run.name}, step {step:,}")
-            image: Image = draw_strip(strip_of(imagination))
+            image: Image = draw_strip(strip_of(self.imagine(world_model, device, f"{run.name}, step {step:,}")))
             (run / IMAGINED).mkdir(exist_ok=True)
             write_atomically(run / IMAGINED / f"{checkpoint_name(step)}.png", encode_png(image))
         except Exception as error:  # an image is not worth a run
@@ -90,59 +71,40 @@ class ImaginedStrip:
         return image
 
     @torch.no_grad()
-    def _imagine(self, clip: _Clip, world_model: WorldModel, device: torch.device, subject: str) -> Imagination:
+    def imagine(self, world_model: WorldModel, device: torch.device, subject: str) -> Imagination:
+        """Return what the model imagines of the clip, and the base where an adapter can be switched off.
+
+        Raises:
+            ValueError: No clip was seen.
+        """
+        if self._clip is None:
+            raise ValueError("no clip was seen")
+        batch, row, clip = self._clip
         if self._frames is None:
-            self._frames = frames_as_seen(frames_of(self._dataset, clip.batch, clip.row), self._size)
-        decoder = self._decoder.to(device).decoder
-        decoded = shown(decoder, clip.latents.to(device))
+            self._frames = frames_as_seen(frames_of(self._dataset, batch, row), self._size)
+        decoder, latents = self._decoder.to(device).decoder, clip.latents[0].to(device)
+        actions, states = (values[0].double().cpu().numpy() for values in (clip.actions, clip.states))
+        extrinsics = None if clip.extrinsics is None else clip.extrinsics[0, 0].to(device)
+        start = Start(latents[0], states[0], self._dataset.spaces.state, extrinsics)
+        world_model.eval()
+
+        def rollout(name: str) -> Imagined:
+            rolled = rolled_out(world_model, start, actions, states[:-1])
+            return Imagined(name, AS_RECORDED, actions, shown(decoder, rolled))
+
+        rollouts, adaptation = [rollout("model now")], world_model.adaptation
+        if adaptation is not None and adaptation.kind == "lora" and world_model.fresh_heads is None:
+            with base_only(world_model):
+                rollouts.insert(0, rollout("base"))
+        decoded = shown(decoder, latents)
         return Imagination(
             subject=subject,
-            episode_id=clip.batch.episode_ids[clip.row],
-            start=clip.batch.starts[clip.row],
+            episode_id=batch.episode_ids[row],
+            start=batch.starts[row],
             seconds_per_step=self._dataset.config.model_stride / self._dataset.control_rate_hz,
             first=self._frames[0],
             decoded_first=decoded[0],
-            rollouts=tuple(
-                Imagined(name, AS_RECORDED, clip.actions, shown(decoder, latents.to(device)))
-                for name, latents in self._rollouts(clip, world_model, device).items()
-            ),
+            rollouts=tuple(rollouts),
             truth=self._frames[1:],
             decoded_truth=decoded[1:],
         )
-
-    def _rollouts(self, clip: _Clip, world_model: WorldModel, device: torch.device) -> dict[str, Tensor]:
-        """Return the latents that base and model imagine.
-
-        The base is asked once, and only where an adapter can be switched off; before training, the model is the base.
-        """
-        world_model.eval()
-        extrinsics = None if clip.extrinsics is None else clip.extrinsics.to(device)
-        start = Start(clip.latents[0].to(device), clip.states[0], self._dataset.spaces.state, extrinsics)
-        adaptation = world_model.adaptation
-        if not self._base and adaptation is not None and adaptation.kind == "lora" and world_model.fresh_heads is None:
-            with base_only(world_model):
-                self._base = {"base": rolled_out(world_model, start, clip.actions, clip.states[:-1]).cpu()}
-        return {**self._base, "model now": rolled_out(world_model, start, clip.actions, clip.states[:-1])}
-
-
-def decoder_of(config: Config) -> TrainedDecoder | None:
-    """Load `validation.decoder`; None if it is not set.
-
-    Raises:
-        InputError: It is no decoder.
-    """
-    name = config.validation.decoder
-    return None if name is None else load_decoder(name, where="validation.decoder:")
-
-
-def _clip_of(batch: Batch, encoded: LatentBatch, row: int, motion: float) -> _Clip:
-    """Return a clip with its own memory: latents of whole batches would stay."""
-    return _Clip(
-        batch=replace(batch, latents=None, on_device=None),
-        row=row,
-        latents=encoded.latents[row].detach().float().cpu().clone(),
-        actions=encoded.actions[row].double().cpu().numpy(),
-        states=encoded.states[row].double().cpu().numpy(),
-        extrinsics=None if encoded.extrinsics is None else encoded.extrinsics[row, 0].cpu(),
-        motion=motion,
-    )

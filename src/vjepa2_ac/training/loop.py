@@ -10,36 +10,34 @@ import contextlib
 import json
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import torch
-
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict
-from vjepa2_ac.distributed.processes import (
+from vjepa2_ac.distributed import (
     agreed,
     all_reduce_max,
     broadcast_object,
     first_only,
     make_accelerator,
+    out_of_memory_explained,
     require_same,
 )
-from vjepa2_ac.distributed.signals import StoppedError, stop_on_signals
-from vjepa2_ac.errors import InputError
-from vjepa2_ac.reporter import SILENT
+from vjepa2_ac.process import StoppedError, stop_on_signals
+from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import CheckpointClock
 from vjepa2_ac.runs.folder import CALIBRATION, CHANGES
 from vjepa2_ac.runs.metrics_log import MetricsLog
 from vjepa2_ac.runs.open_run import OpenRun, open_run
 from vjepa2_ac.runs.trackers import open_trackers, require_installed
 from vjepa2_ac.storage import write_atomically
-from vjepa2_ac.training.monitoring import NullMetricsLog, Throughput, TimedBatches, TrainingReporter, WatchedMetricsLog
+from vjepa2_ac.training.monitoring import Throughput, TimedBatches, WatchedMetricsLog
 from vjepa2_ac.training.optim import require_optimizer
 from vjepa2_ac.training.resume import require_same_data, restore, save_checkpoint
-from vjepa2_ac.training.setup import Run, batches_from, open_data, open_model
+from vjepa2_ac.training.setup import Run, batches_from, set_up
 from vjepa2_ac.training.step import gradients, training_step
 from vjepa2_ac.training.validation import (
     is_out_of_patience,
@@ -50,15 +48,18 @@ from vjepa2_ac.training.validation import (
 )
 
 if TYPE_CHECKING:
+    from vjepa2_ac.data.dataset import Dataset
     from vjepa2_ac.evaluation.result import Validation
-    from vjepa2_ac.runs.mirror.background_sync import Mirror
+    from vjepa2_ac.runs.mirror import Mirror
 
+_LESS_MEMORY = (
+    "Set training.gradient_checkpointing=true, or lower training.batch_size (and raise training.accumulation),"
+    " model.encode_chunk or validation.batch_size"
+)
 _IN_PLACE = "Everything is in place: data, model, validation and gradients were checked; nothing was written."
 
 
-def train(
-    config: Config, reporter: TrainingReporter, *, check_only: bool = False, allow_config_change: bool = False
-) -> Path:
+def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow_config_change: bool = False) -> Path:
     """Train by a config, from the newest checkpoint of its run folder if there is one.
 
     Args:
@@ -72,14 +73,14 @@ def train(
 
     Raises:
         InputError: An input cannot be used; raised before the first step wherever possible.
-        StoppedError: A signal asked the run to stop between its first and last step; see `distributed.signals`.
+        StoppedError: A signal asked the run to stop between its first and last step; see `process`.
     """
     accelerator = make_accelerator(config)
     require_same(accelerator, config_as_dict(config), what="the config", fix="Start all processes with one config")
     require_optimizer(config.training)
     reporter = reporter if accelerator.is_main_process else SILENT
 
-    with contextlib.ExitStack() as until_the_end, _out_of_memory_explained():
+    with contextlib.ExitStack() as until_the_end, out_of_memory_explained("training", _LESS_MEMORY):
 
         def opening() -> OpenRun:
             require_installed(config.tracking)
@@ -88,10 +89,13 @@ def train(
 
         # The first process is the only one that reports, has trackers and needs to see the run's folder.
         opened = first_only(accelerator, opening)
-        data = open_data(broadcast_object(accelerator, opened.config if opened else config), reporter, accelerator)
-        if not allow_config_change:
-            first_only(accelerator, lambda: require_same_data(data.config, data.dataset, data.replayed))
-        run = restore(open_model(data, reporter, check_only=check_only), reporter)
+        config = broadcast_object(accelerator, opened.config if opened else config)
+
+        def same_data(config: Config, datasets: Sequence[Dataset]) -> None:
+            if not allow_config_change:
+                first_only(accelerator, lambda: require_same_data(config, datasets))
+
+        run = restore(set_up(config, reporter, accelerator, require_same=same_data, check_only=check_only), reporter)
         first = validate_base(run, reporter)
         for line in opened.changes(run.config) if opened else ():
             reporter.note(f"The config changes: {line}")
@@ -103,7 +107,7 @@ def train(
     return run.folder
 
 
-def _train(run: Run, opened: OpenRun | None, first: Validation | None, reporter: TrainingReporter) -> None:
+def _train(run: Run, opened: OpenRun | None, first: Validation | None, reporter: Reporter) -> None:
     with contextlib.ExitStack() as until_the_end:
 
         def beginning() -> tuple[MetricsLog, Mirror | None] | None:
@@ -115,7 +119,7 @@ def _train(run: Run, opened: OpenRun | None, first: Validation | None, reporter:
             mirror = opened.mirror(run.state.run_id)
             return metrics_log, mirror and until_the_end.enter_context(mirror)
 
-        metrics_log, mirror = agreed(run.accelerator, beginning) or (NullMetricsLog(), None)
+        metrics_log, mirror = agreed(run.accelerator, beginning) or (None, None)
         if first is not None and record(run, validation_metrics(first), metrics_log):
             _save(run, metrics_log)  # the base: nothing that is worse is ever selected
         try:
@@ -137,25 +141,23 @@ def _write_measured(run: Run) -> None:
         write_atomically(folder / CHANGES, json.dumps(coverage.noted()).encode())
 
 
-def _open_metrics_log(run: Run, reporter: TrainingReporter) -> MetricsLog:
+def _open_metrics_log(run: Run, reporter: Reporter) -> MetricsLog:
     done = run.state.step
     trackers = open_trackers(run.config, run.folder, run_id=run.state.run_id, first_step=done)
     return WatchedMetricsLog(run.folder, config=run.config, reporter=reporter, first_step=done, trackers=trackers)
 
 
-def _save(run: Run, metrics_log: MetricsLog | NullMetricsLog) -> None:
+def _save(run: Run, metrics_log: MetricsLog | None) -> None:
     """Write a checkpoint, after the metrics that lead to it."""
 
     def save() -> None:
-        with metrics_log.before_a_checkpoint():
+        with metrics_log.before_a_checkpoint() if metrics_log else contextlib.nullcontext():
             save_checkpoint(run, run.folder)
 
     agreed(run.accelerator, save)
 
 
-def _loop(
-    run: Run, metrics_log: MetricsLog | NullMetricsLog, mirror: Mirror | None, reporter: TrainingReporter
-) -> None:
+def _loop(run: Run, metrics_log: MetricsLog | None, mirror: Mirror | None, reporter: Reporter) -> None:
     training = run.config.training
     device, processes = run.accelerator.device, run.accelerator.num_processes
     throughput = Throughput.of(run.config, run.world_model.sizes, device, processes, encodes=run.encodes)
@@ -169,12 +171,12 @@ def _loop(
             is_logged = step % training.log_every == 0 or step == training.steps
             metrics = _timed_step(run, timed, step, throughput, measure_update=is_logged)
             reporter.stepped(step, metrics)
-            if is_logged:
+            if is_logged and metrics_log:
                 metrics_log.write("train", step, metrics)
             run.state = replace(run.state, step=step, clips_done=run.state.clips_done + run.clips_per_step)
             is_best = validate_if_due(run, metrics_log, reporter)
             # Agreed among all processes, and read once: a signal after this takes effect at the next step.
-            is_due = clock.is_due(step) or is_best or _is_done(run) or metrics_log.is_behind
+            is_due = clock.is_due(step) or is_best or _is_done(run) or bool(metrics_log and metrics_log.is_behind)
             stopped_by, due = all_reduce_max(run.accelerator, [stop.number, is_due])
             if due or stopped_by:
                 _save(run, metrics_log)
@@ -209,16 +211,3 @@ def _timed_step(
     metrics = training_step(run, batches, step, measure_update=measure_update)
     clips = run.clips_per_step - metrics.get("clips_left_out", 0.0)
     return metrics | throughput.metrics(clips, time.perf_counter() - started, batches.waited_s - waited_s)
-
-
-@contextlib.contextmanager
-def _out_of_memory_explained() -> Iterator[None]:
-    try:
-        yield
-    except torch.OutOfMemoryError as error:
-        raise InputError(
-            where="training",
-            found=f"the GPU's memory is not enough ({str(error).splitlines()[0]})",
-            fix="Set training.gradient_checkpointing=true, or lower training.batch_size (and raise"
-            " training.accumulation), model.encode_chunk or validation.batch_size",
-        ) from error

@@ -1,4 +1,4 @@
-"""What is watched while a run trains: its reporter, its speed, and whether it diverges.
+"""What is watched while a run trains: its speed, and whether it diverges.
 
 Metrics of one optimizer step, for the metrics log and the console:
 
@@ -20,10 +20,10 @@ import statistics
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -31,15 +31,14 @@ from torch import Tensor
 from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.data.loader import prefetch_next
 from vjepa2_ac.data.streams import Cuda
-from vjepa2_ac.distributed.device import PRECISIONS, matmul_speed
+from vjepa2_ac.distributed import PRECISIONS, matmul_speed
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.metrics_log import WARNING, MetricsLog, read_metrics_log
 from vjepa2_ac.training.cost.flops import clip_flops
 
 if TYPE_CHECKING:
-    from vjepa2_ac.evaluation.result import Validation
-    from vjepa2_ac.runs.trackers import Image, Trackers
+    from vjepa2_ac.runs.trackers import Trackers
 
 MEASURED = frozenset({"data_wait_share", "samples_per_second", "tokens_per_second", "mfu", "memory_gb"})
 """Metrics of the machine: they differ between identical runs."""
@@ -52,39 +51,6 @@ _NOISE = 1.01  # validation clips are always the same; smaller changes mean noth
 _LOSSES = 10  # number of `train` rows whose median is compared
 _FEWEST_LOSSES = 5
 _FAR_ABOVE = 2.0  # times the lowest such median
-
-
-@runtime_checkable
-class TrainingReporter(Reporter, Protocol):
-    """Shows the progress of a run, too; it is silent in all processes but the first."""
-
-    def started(self, done: int, total: int) -> None:
-        """The loop begins after `done` of `total` optimizer steps."""
-        ...
-
-    def stepped(self, step: int, metrics: dict[str, float]) -> None:
-        """An optimizer step is done."""
-        ...
-
-    def validated(self, step: int, found: Validation) -> None:
-        """Held-out clips were measured after `step` optimizer steps."""
-        ...
-
-
-class NullMetricsLog:
-    """The metrics log of the processes that write nothing."""
-
-    is_behind = False
-
-    def write(self, kind: str, step: int, metrics: Mapping[str, Any]) -> None:
-        """Write nothing."""
-
-    def show(self, kind: str, name: str, step: int, image: Image) -> None:
-        """Show nothing."""
-
-    def before_a_checkpoint(self) -> nullcontext[None]:
-        """Do nothing."""
-        return nullcontext()
 
 
 class WatchedMetricsLog(MetricsLog):
@@ -131,36 +97,30 @@ class Watch:
         self._lowest = math.inf
 
     def __call__(self, kind: str, step: int, metrics: Mapping[str, Any]) -> list[str]:
-        """Return the warnings of a row: none if it is fine or the cause is known already."""
+        """Return the warning of a row: none if it is fine or the cause is known already."""
         found: Iterable[tuple[str, str]] = ()
         if kind == "train":
             found = self._of_loss(_number(metrics, "loss"))
         elif kind == "validation" and step == 0:
             self._at_start = metrics
         elif kind == "validation":
-            found = (*self._of_errors(metrics), *self._of_ranking(metrics))
+            found = self._of_validation(metrics)
         new = {cause: text for cause, text in found if cause not in self._reported}
         self._reported |= set(new)
-        return [f"at step {step:,} {text}. {advice(self._config)}" for text in new.values()]
+        return [f"at step {step:,} {'; '.join(new.values())}. {advice(self._config)}"] if new else []
 
-    def _of_errors(self, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-        now = {name: _number(metrics, key) for key, name in _ERRORS.items()}
-        before = {name: _number(self._at_start, key) for key, name in _ERRORS.items()}
-        if not all(map(math.isfinite, now.values())):
-            yield "not finite", "an error of the validation is not a finite number"
-        worse = [name for name in now if now[name] > _NOISE * before[name]]
-        if worse:
-            errors = " and ".join(
-                f"the {name} is {now[name]:.3f} (before training {before[name]:.3f})" for name in worse
-            )
-            beyond = any(now[name] > 1.0 > before[name] for name in worse)
-            copying = "; copying the last frame would be better" if beyond else ""
-            yield f"{worse} {beyond}", f"{errors} of persistence's in the validation{copying}"
-
-    def _of_ranking(self, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-        """Warn of a model that planning would not want, though it may predict better: the intervals are apart."""
-        if _number(metrics, "action_rank_low") > _number(self._at_start, "action_rank_high"):
-            better = all(_number(metrics, key) < _number(self._at_start, key) for key in _ERRORS)
+    def _of_validation(self, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+        better = True
+        for key, name in _ERRORS.items():
+            now, before = _number(metrics, key), _number(self._at_start, key)
+            better &= now < before
+            if not math.isfinite(now):
+                yield "not finite", "an error of the validation is not a finite number"
+            elif now > _NOISE * before:
+                copying = "; copying the last frame would be better" if now > 1.0 > before else ""
+                text = f"the {name} is {now:.3f} of persistence's in the validation (before training {before:.3f})"
+                yield name + copying, text + copying
+        if _number(metrics, "action_rank_low") > _number(self._at_start, "action_rank_high"):  # intervals are apart
             words = "predicts better and plans worse than the base" if better else "plans worse than the base"
             rank, before = _number(metrics, "action_rank"), _number(self._at_start, "action_rank")
             text = f"the model {words}: the mean rank of the true action among others is {rank:.3f}"
@@ -171,10 +131,9 @@ class Watch:
         if not math.isfinite(loss):  # a step without clips, or one that was refused
             return
         self._losses.append(loss)
-        if len(self._losses) < _FEWEST_LOSSES:
-            return
         typical = statistics.median(self._losses)
-        self._lowest = min(self._lowest, typical)
+        if len(self._losses) >= _FEWEST_LOSSES:
+            self._lowest = min(self._lowest, typical)
         if typical > _FAR_ABOVE * self._lowest:
             yield "loss", f"the loss is {typical:.4g}, and was {self._lowest:.4g} (medians of {_LOSSES} rows)"
 

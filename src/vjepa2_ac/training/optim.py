@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from vjepa2_ac.config import TrainingConfig
-from vjepa2_ac.errors import InputError, pip_install
+from vjepa2_ac.errors import require_library
 
 
 def parameter_groups(module: nn.Module, weight_decay: float) -> list[dict[str, object]]:
@@ -32,7 +32,7 @@ def make_optimizer(module: nn.Module, training: TrainingConfig) -> torch.optim.O
     involving the host. It rounds differently than on a CPU.
 
     Raises:
-        InputError: It needs a library that is not installed.
+        UnreachableError: It needs a library that is not installed.
     """
     groups = parameter_groups(module, training.weight_decay)
     if training.optimizer == "adamw_8bit":
@@ -45,7 +45,7 @@ def require_optimizer(training: TrainingConfig) -> None:
     """Check that the optimizer is installed.
 
     Raises:
-        InputError: It needs a library that is not installed.
+        UnreachableError: It needs a library that is not installed.
     """
     if training.optimizer == "adamw_8bit":
         _adamw_8bit()
@@ -56,15 +56,8 @@ def _are_on_cuda(parameters: Iterable[nn.Parameter]) -> bool:
 
 
 def _adamw_8bit() -> Any:
-    try:
-        from bitsandbytes.optim import AdamW8bit
-    except ImportError:
-        raise InputError(
-            where="training.optimizer",
-            found="adamw_8bit, but bitsandbytes is not installed",
-            fix=f"Run {pip_install('8bit')}, or set training.optimizer=adamw",
-        ) from None
-    return AdamW8bit
+    called = "bitsandbytes, which training.optimizer=adamw_8bit needs"
+    return require_library("bitsandbytes.optim", where="training.optimizer", called=called, extra="8bit").AdamW8bit
 
 
 def load_moments(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> None:

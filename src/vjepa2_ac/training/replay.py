@@ -37,15 +37,10 @@ def open_replay(replay: ReplayConfig, dataset: Dataset, reporter: Reporter) -> D
         raise InputError(where=where, found=found, needed=f"{needed}, as data have them", fix=fix)
     found_s, needed_s = (one.config.model_stride / one.control_rate_hz for one in (replayed, dataset))
     if not math.isclose(found_s, needed_s, rel_tol=_STEP_TOLERANCE):  # data sets have different control rates
-        raise InputError(
-            where="replay.data.stride",
-            found=f"{replayed.config.stride} at {replayed.control_rate_hz:g} control steps a second: model steps of"
-            f" {found_s:.3g} s",
-            needed=f"{needed_s:.3g} s, as those of data (stride {dataset.config.stride} at"
-            f" {dataset.control_rate_hz:g} a second)",
-            fix="Choose strides whose steps last equally long:"
-            f" replay.data.stride={needed_s * replayed.control_rate_hz:.3g} would",
-        )
+        found = f"{replayed.config.stride}: model steps of {found_s:.3g} s"
+        needed = f"{needed_s:.3g} s, as those of data (stride {dataset.config.stride})"
+        fix = f"Set replay.data.stride={needed_s * replayed.control_rate_hz:.3g}, or the other one"
+        raise InputError(where="replay.data.stride", found=found, needed=needed, fix=fix)
     windows = replayed.windows("train")
     reporter.note(f"Replay: {replay.share:.0%} of the clips are from {replay.data.path}, which has {len(windows):,}.")
     if held_out := _held_out(dataset, replayed):
@@ -68,13 +63,9 @@ def require_same_form(first: Batch, replayed: Batch) -> None:
     """
     found, needed = (_form(batch) for batch in (replayed, first))
     if found != needed:
-        raise InputError(
-            where="replay.data",
-            found=f"clips of {found}",
-            needed=f"{needed}, as data have them: clips of both are in one micro-batch",
-            fix="Take latents instead of frames: set data.cache and replay.data.cache to auto, with the same"
-            " cache_dtype",
-        )
+        needed = f"{needed}, as data have them: clips of both are in one micro-batch"
+        fix = "Take latents instead of frames: set data.cache and replay.data.cache to auto, with the same cache_dtype"
+        raise InputError(where="replay.data", found=f"clips of {found}", needed=needed, fix=fix)
 
 
 def _held_out(dataset: Dataset, replayed: Dataset) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from vjepa2_ac.config.section import Affects, knobs_that_affect
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.index import fingerprint_of
 from vjepa2_ac.data.loader import validation_windows
-from vjepa2_ac.distributed.processes import broadcast_object, broadcast_tensors, first_only, require_same
+from vjepa2_ac.distributed import broadcast_object, broadcast_tensors, first_only, require_same
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.lora import load_trained, save_trained
 from vjepa2_ac.model.network.world_model import WorldModel
@@ -26,14 +26,16 @@ from vjepa2_ac.runs.checkpoint import (
     ADAPTER,
     CHECKPOINTS,
     OPTIMIZER,
+    DataState,
     RunState,
     checkpoint_name,
     newest_checkpoint,
     read_state,
+    read_torch,
     write_checkpoint,
+    write_torch,
     written_state,
 )
-from vjepa2_ac.runs.files import read_torch, write_torch
 from vjepa2_ac.runs.folder import CONFIG, read_run_config, run_id
 from vjepa2_ac.runs.metrics_log import warn_if_stalled
 from vjepa2_ac.training.optim import load_moments
@@ -52,15 +54,11 @@ def save_checkpoint(run: Run, folder: Path) -> None:
         with (inner / OPTIMIZER).open("wb") as file:
             write_torch(run.optimizer.state_dict(), file)
 
-    replayed = run.replayed
     run.state = replace(
         run.state,
-        broken=run.dataset.broken.reasons,
-        windows=len(run.dataset.windows("train")),
-        data=fingerprint_of(run.dataset.table),
-        replayed_broken=replayed.broken.reasons if replayed else {},
-        replayed_windows=len(replayed.windows("train")) if replayed else None,
-        replayed_data=fingerprint_of(replayed.table) if replayed else None,
+        data=tuple(
+            DataState(fingerprint_of(one.table), len(one.windows("train")), one.broken.reasons) for one in run.datasets
+        ),
         clips_per_step=run.clips_per_step,
         clips_asked=run.config.training.batch_size * run.config.training.accumulation,
         processes=run.accelerator.num_processes,
@@ -80,11 +78,13 @@ def restore(run: Run, reporter: Reporter) -> Run:
     state = _state_of_all(run, reporter)
     if state.loss_scale is not None and run.scaler.is_enabled():
         run.scaler.load_state_dict(dict(state.loss_scale))
-    run.dataset.broken.recall(state.broken)
-    _report_data_changes(run.dataset, state.windows, reporter)
-    if run.replayed is not None:
-        run.replayed.broken.recall(state.replayed_broken)
-        _report_data_changes(run.replayed, state.replayed_windows, reporter)
+    for dataset, before in zip(run.datasets, state.data, strict=False):
+        dataset.broken.recall(before.broken)
+        if (windows := len(dataset.windows("train"))) != before.windows:
+            reporter.note(
+                f"The data has changed: {windows:,} training clips instead of {before.windows:,}."
+                " From here on their order is another, and some may be seen twice in this epoch or not at all."
+            )
     run.state = best_so_far(state, measured_on(run.config, run.dataset), reporter)
     run.micro_batches = micro_batches_of(run.config, state, run.accelerator.num_processes, reporter)
     return run
@@ -126,11 +126,8 @@ def read_checkpoint(
         load_moments(optimizer, moments)
         return read_state(checkpoint), moments
     except (OSError, ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:
-        raise InputError(
-            where=str(checkpoint),
-            found=f"not the state of this run ({error})",
-            fix="Set back what was changed in the config; or delete this checkpoint, to use an older one",
-        ) from None
+        fix = "Set back what was changed in the config; or delete this checkpoint, to use an older one"
+        raise InputError(where=str(checkpoint), found=f"not the state of this run ({error})", fix=fix) from None
 
 
 def measured_on(config: Config, dataset: Dataset) -> Mapping[str, str]:
@@ -190,7 +187,7 @@ def micro_batches_of(config: Config, state: RunState, processes: int, reporter: 
     return micro_batches
 
 
-def require_same_data(config: Config, dataset: Dataset, replayed: Dataset | None = None) -> None:
+def require_same_data(config: Config, datasets: Sequence[Dataset]) -> None:
     """Refuse to go on with other data sets than those that the run in its folder began with.
 
     At the place where it began the data may have changed, which is reported; elsewhere they must be the same.
@@ -199,29 +196,12 @@ def require_same_data(config: Config, dataset: Dataset, replayed: Dataset | None
         InputError: They are others.
     """
     folder = Path(config.run_dir)
-    before = read_run_config(folder).data_sets if (folder / CONFIG).is_file() else config.data_sets
-    keys, datasets = ("data.path", "replay.data.path"), [one for one in (dataset, replayed) if one is not None]
-    for number, (key, one, began, now) in enumerate(zip(keys, datasets, before, config.data_sets, strict=False)):
-        if began.path == now.path or (checkpoint := newest_checkpoint(folder / CHECKPOINTS)) is None:
-            continue
-        state = written_state(checkpoint)
-        seen = (state.data, state.replayed_data)[number]
-        if seen == fingerprint_of(one.table):
-            continue
-        raise InputError(
-            where=f"{key}: {now.path}",
-            found="other episodes or files than the run has seen",
-            needed=f"the data set that was at {began.path}",
-            fix=f"Set {key} to where that is now (its files keep names, sizes and times when they are moved); where the"
-            " change is meant, add --allow-config-change",
-        )
-
-
-def _report_data_changes(dataset: Dataset, before: int | None, reporter: Reporter) -> None:
-    """Report if the data has changed since the checkpoint was written, with so many training clips then."""
-    windows = len(dataset.windows("train"))
-    if before not in {None, windows}:
-        reporter.note(
-            f"The data has changed: {windows:,} training clips instead of {before:,}."
-            " From here on their order is another, and some may be seen twice in this epoch or not at all."
-        )
+    if not (folder / CONFIG).is_file() or (checkpoint := newest_checkpoint(folder / CHECKPOINTS)) is None:
+        return
+    keys, seen = ("data.path", "replay.data.path"), written_state(checkpoint).data
+    began = read_run_config(folder).data_sets
+    for key, dataset, old, now, before in zip(keys, datasets, began, config.data_sets, seen, strict=False):
+        if old.path != now.path and before.fingerprint != fingerprint_of(dataset.table):
+            found, needed = "other episodes or files than the run has seen", f"the data set that was at {old.path}"
+            fix = f"Set {key} to where that is now; where the change is meant, add --allow-config-change"
+            raise InputError(where=f"{key}: {now.path}", found=found, needed=needed, fix=fix)

@@ -5,7 +5,8 @@ What only some runs use is imported where they use it: a stride chosen by the mo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,10 +18,10 @@ from torch import nn
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.duplicates import find_duplicates
 from vjepa2_ac.data.loader import Batches, Mixed, ProcessShare, training_loader, validation_batches
 from vjepa2_ac.data.streams import Copies, copies_for
-from vjepa2_ac.distributed.device import PRECISIONS
-from vjepa2_ac.distributed.processes import broadcast_object, first_of_machine, make_accelerator
+from vjepa2_ac.distributed import PRECISIONS, broadcast_object, first_of_machine, make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, extrinsics_for, require_same_encoder
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError
@@ -41,20 +42,6 @@ if TYPE_CHECKING:
     from vjepa2_ac.training.imagined_strip import ImaginedStrip
 
 _CLIPS_TRIED = 8  # one is read; the others are for clips skipped by data.broken_episodes
-
-
-@dataclass(frozen=True)
-class RunData:
-    """The data of a run, open and checked."""
-
-    config: Config  # of the run; its stride is a number
-    accelerator: Accelerator
-    dataset: Dataset
-    first_clip: Batch  # of training, as it is read from the data set
-    calibration: Calibration | None  # if data.stride was auto and is now chosen
-    world_model: WorldModel | None  # the base, if it has chosen the stride
-    replayed: Dataset | None = None  # the second data set, if there is one
-    decoder: TrainedDecoder | None = None  # of `validation.decoder`
 
 
 @dataclass
@@ -78,6 +65,11 @@ class Run:
     def folder(self) -> Path:
         """The run's folder."""
         return Path(self.config.run_dir)
+
+    @property
+    def datasets(self) -> list[Dataset]:
+        """Its data set, and the replayed one."""
+        return [one for one in (self.dataset, self.replayed) if one is not None]
 
     @property
     def encodes(self) -> bool:
@@ -105,13 +97,24 @@ class Run:
         return self.micro_batches * self.config.training.batch_size * int(self.accelerator.num_processes)
 
 
-def open_data(config: Config, reporter: Reporter = SILENT, accelerator: Accelerator | None = None) -> RunData:
-    """Open the data of a run, let its model choose the stride where that is auto, and read a clip of each split.
+def set_up(
+    config: Config,
+    reporter: Reporter = SILENT,
+    accelerator: Accelerator | None = None,
+    *,
+    require_same: Callable[[Config, Sequence[Dataset]], None] = lambda _config, _datasets: None,
+    check_only: bool = False,
+) -> Run:
+    """Return a run before step 1: its data, and its model with an adapter; data are encoded if `data.cache` says so.
+
+    A model chooses the stride where that is auto; and a clip of each split is read before one is loaded.
 
     Args:
         config: The run.
-        reporter: Receives messages, and the progress of indexing.
+        reporter: Receives messages, and the progress of indexing and encoding.
         accelerator: The result of `make_accelerator` for this config; None: it is created here.
+        require_same: Refuses open data sets, before the model is loaded.
+        check_only: Encode nothing, and report how much that would be.
 
     Raises:
         InputError: Something cannot be used.
@@ -121,51 +124,65 @@ def open_data(config: Config, reporter: Reporter = SILENT, accelerator: Accelera
         from vjepa2_ac.calibration.variants import require_learned
 
         require_learned(config.model)
-    decoder = None
-    if config.validation.decoder is not None:
-        from vjepa2_ac.training.imagined_strip import decoder_of
-
-        decoder = decoder_of(config)
+    decoder = _decoder_of(config)
     # The others find the index of the first one on this machine, however long it takes.
-    dataset, replayed = first_of_machine(accelerator, lambda: _open_data_sets(config, reporter))
-    _report_duplicates(dataset, reporter)
+    dataset, *others = first_of_machine(accelerator, lambda: _open_data_sets(config, reporter))
+    if (duplicates := find_duplicates(dataset)).episodes:
+        reporter.note(f"Warning: {duplicates}.")
     _check_heads(config, dataset)
-    world_model, calibration = None, None
+    chooser, calibration = None, None
     if is_auto:
-        from vjepa2_ac.training.stride_choice import choose_stride
-
-        world_model = load_base(config.model, seed=config.seed).to(accelerator.device)
-        calibration = broadcast_object(accelerator, choose_stride(world_model, dataset, config, accelerator, reporter))
+        chooser = load_base(config.model, seed=config.seed).to(accelerator.device)
+        calibration = broadcast_object(accelerator, choose_stride(chooser, dataset, config, accelerator, reporter))
         config, dataset = with_stride(config, calibration.best.stride), dataset.with_stride(calibration.best.stride)
-    first_clip = _read_one_clip_of_each_split(dataset)
-    if replayed is not None:
-        _require_fitting_clips(dataset, replayed, first_clip)
-    return RunData(config, accelerator, dataset, first_clip, calibration, world_model, replayed, decoder)
+    splits: tuple[Split, ...] = ("train", "validation", "test") if config.data.test_share else ("train", "validation")
+    clip, *_ = [_first_of(dataset, split) for split in splits]  # fails early: an empty split, a broken clip
+    _require_fitting_clips(dataset, others, clip)
+    require_same(config, (dataset, *others))
+
+    world_model = chooser or load_base(config.model, seed=config.seed)
+    extrinsics_for(world_model, clip)
+    if decoder is not None:
+        decoder.require_fit(world_model, config.data.crop, subject=str(config.model.base or "the random model"))
+
+    def encoded(config: Config, dataset: Dataset) -> Dataset:
+        if config.data.is_cache or config.data.cache == "off":
+            require_same_encoder(world_model, dataset, config)
+            return dataset
+        from vjepa2_ac.encoding.encode_dataset import with_latents
+
+        return with_latents(config, dataset, world_model, accelerator, reporter, check_only=check_only)
+
+    dataset = encoded(config, dataset)
+    for replayed in others:
+        extrinsics_for(world_model, _first_of(replayed))
+    others = [encoded(config.for_replay(), replayed) for replayed in others]
+    _require_fitting_clips(dataset, others, _first_of(dataset))
+    _make_trainable(world_model, config, dataset, reporter)
+    strip = None
+    if decoder is not None:
+        from vjepa2_ac.training.imagined_strip import ImaginedStrip
+
+        strip = ImaginedStrip(decoder, dataset, world_model.image_size)
+    world_model.to(accelerator.device)
+    return Run(
+        config=config,
+        accelerator=accelerator,
+        world_model=world_model,
+        objective=Objective(world_model, config.training),
+        optimizer=make_optimizer(world_model, config.training),
+        scaler=torch.amp.GradScaler(accelerator.device.type, enabled=config.training.precision == "fp16"),
+        dataset=dataset,
+        state=RunState(step=0),
+        micro_batches=config.training.accumulation,
+        calibration=calibration,
+        replayed=others[0] if others else None,
+        strip=strip,
+    )
 
 
-def open_model(data: RunData, reporter: Reporter = SILENT, *, check_only: bool = False) -> Run:
-    """Load the model of a run, attach its adapter, and encode its data if `data.cache` says so: a run before step 1.
-
-    Args:
-        data: The open data of the run.
-        reporter: Receives messages, and the progress of encoding.
-        check_only: Encode nothing, and report how much that would be.
-
-    Raises:
-        InputError: Something cannot be used.
-    """
-    config, accelerator, training = data.config, data.accelerator, data.config.training
-    world_model = data.world_model or load_base(config.model, seed=config.seed)
-    extrinsics_for(world_model, data.first_clip)
-    if data.decoder is not None:
-        data.decoder.require_fit(world_model, config.data.crop, subject=str(config.model.base or "the random model"))
-    dataset = _with_latents(config, data.dataset, world_model, accelerator, reporter, check_only=check_only)
-    replayed = data.replayed
-    if replayed is not None:
-        extrinsics_for(world_model, _first_of(replayed, "train"))
-        alone = config.for_replay()
-        replayed = _with_latents(alone, replayed, world_model, accelerator, reporter, check_only=check_only)
-        _require_fitting_clips(dataset, replayed, _first_of(dataset, "train"))
+def _make_trainable(world_model: WorldModel, config: Config, dataset: Dataset, reporter: Reporter) -> None:
+    """Put heads of the data's widths and an adapter on a base, and let it compute as `training` says."""
     _fit_heads(world_model, config, dataset, reporter)
     add_adapter(world_model, config.adapter, seed=config.seed)
     reporter.note(str(trainable_report(world_model)))
@@ -174,26 +191,11 @@ def open_model(data: RunData, reporter: Reporter = SILENT, *, check_only: bool =
     copies = config.model.random is not None and config.model.random_start == "persistence"
     if copies and (narrow := world_model.sizes.too_narrow_to_copy):
         reporter.note(f"Warning: {narrow}.")
-    world_model.set_gradient_checkpointing(training.gradient_checkpointing)
-    world_model.set_attention(training.attention)
-    world_model.set_compiled("with gradients" if training.compile == "blocks" else "never")
+    world_model.set_gradient_checkpointing(config.training.gradient_checkpointing)
+    world_model.set_attention(config.training.attention)
+    world_model.set_compiled("with gradients" if config.training.compile == "blocks" else "never")
     if dataset.config.is_cache:
         world_model.set_encoder_aside()
-    world_model.to(accelerator.device)
-    return Run(
-        config=config,
-        accelerator=accelerator,
-        world_model=world_model,
-        objective=Objective(world_model, training),
-        optimizer=make_optimizer(world_model, training),
-        scaler=torch.amp.GradScaler(accelerator.device.type, enabled=training.precision == "fp16"),
-        dataset=dataset,
-        state=RunState(step=0),
-        micro_batches=training.accumulation,
-        calibration=data.calibration,
-        replayed=replayed,
-        strip=_strip_of(data.decoder, dataset, world_model),
-    )
 
 
 def batches_from(run: Run) -> Batches:
@@ -215,20 +217,13 @@ def encode(run: Run, batch: Batch) -> LatentBatch:
         return encode_batch(run.world_model, batch, device=run.accelerator.device, chunk=run.config.model.encode_chunk)
 
 
-def _open_data_sets(config: Config, reporter: Reporter) -> tuple[Dataset, Dataset | None]:
+def _open_data_sets(config: Config, reporter: Reporter) -> list[Dataset]:
     dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
     if config.replay is None:
-        return dataset, None
+        return [dataset]
     from vjepa2_ac.training.replay import open_replay
 
-    return dataset, open_replay(config.replay, dataset, reporter)
-
-
-def _report_duplicates(dataset: Dataset, reporter: Reporter) -> None:
-    from vjepa2_ac.data.duplicates import find_duplicates
-
-    if (duplicates := find_duplicates(dataset)).episodes:
-        reporter.note(f"Warning: {duplicates}.")
+    return [dataset, open_replay(config.replay, dataset, reporter)]
 
 
 def _check_heads(config: Config, dataset: Dataset) -> None:
@@ -240,12 +235,9 @@ def _check_heads(config: Config, dataset: Dataset) -> None:
     """
     heads, widths = heads_to_replace(base_sizes(config.model), dataset.widths), dataset.widths
     if heads and config.data.stride == "auto":
-        raise InputError(
-            where="data.stride",
-            found=f"auto, for states of {widths.state} and actions of {widths.action} numbers",
-            needed="widths that the base knows: it is asked at which stride it predicts best",
-            fix="Set data.stride to a number of control steps",
-        )
+        found = f"auto, for states of {widths.state} and actions of {widths.action} numbers"
+        needed = "widths that the base knows: it is asked at which stride it predicts best"
+        raise InputError(where="data.stride", found=found, needed=needed, fix="Set it to a number of control steps")
     require_trained(heads, config.adapter)
 
 
@@ -264,46 +256,55 @@ def _fit_heads(world_model: WorldModel, config: Config, dataset: Dataset, report
             )
 
 
-def _with_latents(
-    config: Config,
-    dataset: Dataset,
-    model: WorldModel,
-    accelerator: Accelerator,
-    reporter: Reporter,
-    *,
-    check_only: bool,
-) -> Dataset:
-    if config.data.is_cache or config.data.cache == "off":
-        require_same_encoder(model, dataset, config)
-        return dataset
-    from vjepa2_ac.encoding.encode_dataset import with_latents
+def choose_stride(
+    world_model: WorldModel, dataset: Dataset, config: Config, accelerator: Accelerator, reporter: Reporter
+) -> Calibration:
+    """Let the model of a run, before training, choose among the candidates at which the run's clips fit into episodes.
 
-    return with_latents(config, dataset, model, accelerator, reporter, check_only=check_only)
+    Raises:
+        InputError: There is none, or as `calibrate_model`.
+    """
+    from vjepa2_ac.calibration.strides import calibrate_model
+    from vjepa2_ac.evaluation.measure import ClipSample
+
+    reporter.note("data.stride is auto: measuring the model at each candidate stride")
+    fitting, errors = [], []
+    for stride in dataset.config.strides_to_try(dataset.control_rate_hz):
+        view = dataset.with_stride(stride)
+        try:
+            view.windows("train"), view.windows("validation")
+        except InputError as error:
+            errors.append(error)
+            reporter.note(f"  stride {stride}: not possible: no clip of {dataset.config.frames} frames fits")
+        else:
+            fitting.append(stride)
+    if not fitting:
+        raise errors[0]
+    candidates = replace(dataset, config=dataset.config.model_copy(update={"stride_candidates": tuple(fitting)}))
+    calibration = calibrate_model(
+        world_model, candidates, config, accelerator, ClipSample(clips=config.validation.clips)
+    )
+    for line in calibration.lines():
+        reporter.note(line)
+    return calibration
 
 
-def _strip_of(decoder: TrainedDecoder | None, dataset: Dataset, model: WorldModel) -> ImaginedStrip | None:
-    if decoder is None:
-        return None
-    from vjepa2_ac.training.imagined_strip import ImaginedStrip
-
-    return ImaginedStrip(decoder, dataset, model.image_size)
-
-
-def _read_one_clip_of_each_split(dataset: Dataset) -> Batch:
-    """Fail early: an empty split, a broken clip. A test split of share 0 is no error."""
-    splits: tuple[Split, ...] = ("train", "validation", "test")
-    splits = splits if dataset.config.test_share else splits[:2]
-    firsts = [_first_of(dataset, split) for split in splits]
-    return firsts[0]
-
-
-def _first_of(dataset: Dataset, split: Split) -> Batch:
+def _first_of(dataset: Dataset, split: Split = "train") -> Batch:
     return next(validation_batches(dataset, split, clips=_CLIPS_TRIED, batch_size=1))
 
 
-def _require_fitting_clips(dataset: Dataset, replayed: Dataset, first_clip: Batch) -> None:
+def _require_fitting_clips(dataset: Dataset, others: Sequence[Dataset], first_clip: Batch) -> None:
     """Refuse a second data set whose clips differ in form; frames that are still to be encoded may."""
-    if all(one.config.is_cache or not one.config.takes_latents for one in (dataset, replayed)):
-        from vjepa2_ac.training.replay import require_same_form
+    for replayed in others:
+        if all(one.config.is_cache or not one.config.takes_latents for one in (dataset, replayed)):
+            from vjepa2_ac.training.replay import require_same_form
 
-        require_same_form(first_clip, _first_of(replayed, "train"))
+            require_same_form(first_clip, _first_of(replayed))
+
+
+def _decoder_of(config: Config) -> TrainedDecoder | None:
+    if config.validation.decoder is None:
+        return None
+    from vjepa2_ac.decoding.decoder_folder import load_decoder
+
+    return load_decoder(config.validation.decoder, where="validation.decoder:")

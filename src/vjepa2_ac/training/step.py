@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from vjepa2_ac.data.loader import prefetch_next
 from vjepa2_ac.data.sources.latents.cache_files import unpack_latents
-from vjepa2_ac.distributed.processes import all_gather_object, all_reduce_gradients, all_reduce_sum, raise_first
+from vjepa2_ac.distributed import all_gather_object, all_reduce_gradients, all_reduce_sum, raise_first
 from vjepa2_ac.episode import Batch, StoredLatents
 from vjepa2_ac.errors import InputError, UserError
 from vjepa2_ac.runs.checkpoint import checkpoint_name
@@ -159,7 +159,7 @@ def _tell_of_broken_episodes(run: Run) -> None:
     Raises:
         InputError: There are too many; in all processes.
     """
-    for dataset in filter(None, (run.dataset, run.replayed)):
+    for dataset in run.datasets:
         for reasons in all_gather_object(run.accelerator, dataset.broken.reasons):
             for name, reason in reasons.items():
                 dataset.broken.met(name, reason)

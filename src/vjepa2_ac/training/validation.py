@@ -7,15 +7,15 @@ from typing import Any
 
 from vjepa2_ac.data.loader import batches_of, validation_windows
 from vjepa2_ac.data.windows import spread
-from vjepa2_ac.distributed.processes import agreed, broadcast_object
+from vjepa2_ac.distributed import agreed, broadcast_object
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.action_use import RolloutStart, moves_of, pool_of, rank_actions
 from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persistence
 from vjepa2_ac.evaluation.measure import prediction_errors
 from vjepa2_ac.evaluation.result import ActionRanking, Validation
+from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.metrics_log import MetricsLog
-from vjepa2_ac.training.monitoring import NullMetricsLog, TrainingReporter
 from vjepa2_ac.training.setup import Run, encode
 
 BEST_BY = "rollout_over_persistence_last"  # checkpoint.keep_best error: planning depends on the longest horizon
@@ -27,7 +27,7 @@ _NOT_ASKED = (
 )
 
 
-def validate_if_due(run: Run, metrics_log: MetricsLog | NullMetricsLog, reporter: TrainingReporter) -> bool:
+def validate_if_due(run: Run, metrics_log: MetricsLog | None, reporter: Reporter) -> bool:
     """Measure and log the validation, if it is due; return whether it is the best so far."""
     step, config = run.state.step, run.config
     if step % config.validation.every != 0 and step != config.training.steps:
@@ -35,19 +35,20 @@ def validate_if_due(run: Run, metrics_log: MetricsLog | NullMetricsLog, reporter
     return record(run, validation_metrics(validate(run, reporter)), metrics_log)
 
 
-def record(run: Run, metrics: dict[str, Any], metrics_log: MetricsLog | NullMetricsLog) -> bool:
+def record(run: Run, metrics: dict[str, Any], metrics_log: MetricsLog | None) -> bool:
     """Log a validation's metrics; return whether it is the best so far, by `checkpoint.keep_best`."""
-    metrics_log.write("validation", run.state.step, metrics)
-    _draw_strip(run, metrics_log)
+    if metrics_log is not None:
+        metrics_log.write("validation", run.state.step, metrics)
+        _draw_strip(run, metrics_log)
     by, before = run.config.checkpoint.keep_best, run.state
     if by != "off":
         run.state = before.measured(metrics[BEST_BY], metrics[RANK] if by == "ranking" else None)
     return run.state.best_step != before.best_step
 
 
-def _draw_strip(run: Run, metrics_log: MetricsLog | NullMetricsLog) -> None:
+def _draw_strip(run: Run, metrics_log: MetricsLog) -> None:
     """Show what the model imagines now, if `validation.decoder` is set."""
-    if run.strip is None or not run.accelerator.is_main_process:
+    if run.strip is None:
         return
     with run.accelerator.autocast():
         image = run.strip.draw(run.world_model, run.accelerator.device, run.folder, run.state.step)
@@ -80,7 +81,7 @@ def validation_metrics(found: Validation) -> dict[str, Any]:
     return metrics
 
 
-def validate(run: Run, reporter: TrainingReporter) -> Validation:
+def validate(run: Run, reporter: Reporter) -> Validation:
     """Measure the held-out clips, and rank the true actions of moves in some of them.
 
     Each process measures, and what the first one found counts in all: with other kernels the last digits differ, and
@@ -123,7 +124,7 @@ def _ranking(run: Run, moves: list[RolloutStart]) -> ActionRanking:
     return rank_actions(run.world_model, moves, pool, at_once=_AT_ONCE)
 
 
-def validate_base(run: Run, reporter: TrainingReporter) -> Validation | None:
+def validate_base(run: Run, reporter: Reporter) -> Validation | None:
     """Measure a run before its first step, and refuse a base that is no better than copying the last frame.
 
     None is returned of a run that goes on.

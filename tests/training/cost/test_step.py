@@ -12,7 +12,7 @@ from torch.utils._pytree import tree_leaves
 
 from sized_runs import LORA, built, model_sizes, run_config
 from vjepa2_ac.config import Config, ModelSizes
-from vjepa2_ac.distributed.device import PRECISIONS
+from vjepa2_ac.distributed import PRECISIONS
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.model.adapter.low_rank import CastMatrices
 from vjepa2_ac.model.network.rotary import TokenLayout, rotary_tables

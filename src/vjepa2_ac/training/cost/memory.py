@@ -8,8 +8,9 @@ GPU measures.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.encoding.pipeline import FRAMES_AT_ONCE
@@ -42,24 +43,40 @@ class Parameters:
         return sum(self.trained_tensors)
 
 
-@dataclass(frozen=True)
+def _part(name: str, about: str) -> Any:
+    return field(metadata={"part": (name, about)})
+
+
+@dataclass(frozen=True, kw_only=True)
 class MemoryEstimate:
     """Bytes on the GPU, part by part. `total` is the largest of five moments: they do not occur at once."""
 
     parameters: Parameters
     checkpointing: bool  # as the config requests
-    encoder_weights: int
-    predictor_weights: int  # frozen; 0 if the whole predictor is trained
-    trained: int
-    gradients: int
-    moments: int
-    arriving: int  # the next batch, on its way to the GPU; frames as if they were of the model's size
-    latents: int
-    encoding: int  # activations of the encoder, for one chunk of frames, and the frames
+    encoder_weights: int = _part("encoder, frozen", "in model.dtype; none where latents come from a cache")
+    predictor_weights: int = _part("predictor, frozen", "in model.dtype; none if all of it is trained")
+    trained: int = _part("trained", "float32")
+    gradients: int = _part("gradients", "float32")
+    moments: int = _part("optimizer", "AdamW's two moments; adamw_8bit: in 8 bits where a tensor has 4,096 elements")
+    arriving: int = _part("next batch", "on its way while this one is computed; as if of the model's size")
+    latents: int = _part("latents", "of training.batch_size clips, float32")
+    encoding: int = _part("encoder, at work", "on model.encode_chunk frames at once; before the predictor")
     step: StepBytes  # the predictor's
     optimizer_temporaries: int  # AdamW is fused; but on logged steps `update_to_weight` needs the old weights
-    validating: int  # all of a batch of validation
-    caching: int  # all of encoding a cache, which ends before the rest begins
+    validating: int = _part("validation", "instead of all that: clips, keys and values of their rollout")
+    caching: int = _part("encoding the cache", "before all that: the encoder alone")
+
+    @property
+    def parts(self) -> Iterator[tuple[str, int, str]]:
+        """The name of each part, its bytes, and what it is."""
+        for one in fields(self):
+            if "part" in one.metadata:
+                name, about = one.metadata["part"]
+                yield name, getattr(self, one.name), about
+        yield "predictor, at work", self.step.stored, "forward, losses and backward, without checkpointing"
+        yield "the same, checkpointed", self.step.checkpointed, "inputs of blocks, and one block computed again"
+        yield "copies", self.step.casts, "of adapters in training.precision"
+        yield "CUDA, cuBLAS, holes", ALLOWANCE, "an allowance, not computed"
 
     @property
     def standing(self) -> int:

@@ -24,7 +24,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
 from vjepa2_ac.config import Config, ModelSizes
-from vjepa2_ac.distributed.device import PRECISIONS
+from vjepa2_ac.distributed import PRECISIONS
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.model.adapter.low_rank import CastMatrices
 from vjepa2_ac.model.network.dynamics import LatentDynamics

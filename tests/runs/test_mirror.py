@@ -1,24 +1,27 @@
-"""Background upload: the mirror follows the run over any network, and belongs to this run only."""
+"""The mirror follows the run over any network, belongs to this run only, and is given up to a later start."""
 
+import errno
 import json
 import logging
+import os
 import shutil
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import BinaryIO
 
 import pytest
 
 from gcs import Failure, Gcs
 from vjepa2_ac import storage
-from vjepa2_ac.config import CheckpointConfig
-from vjepa2_ac.runs.checkpoint import RunState, checkpoint_name, find_damage, read_state, write_checkpoint
-from vjepa2_ac.runs.mirror import upload
-from vjepa2_ac.runs.mirror.background_sync import Mirror
-from vjepa2_ac.runs.mirror.remote_checkpoints import SENDING, RemoteCheckpoints, complete
-from vjepa2_ac.runs.mirror.upload import HELD, RemoteUpdate
-from vjepa2_ac.storage import retries
+from vjepa2_ac.config.loading import parse_config
+from vjepa2_ac.errors import RefusedError, UnreachableError
+from vjepa2_ac.runs.checkpoint import RunState, checkpoint_name, find_damage, write_checkpoint
+from vjepa2_ac.runs.folder import ENVIRONMENT, HELD, open_run_folder
+from vjepa2_ac.runs.mirror import SENDING, Mirror, Remote, RemoteCheckpoints, complete
+from vjepa2_ac.storage import retries, transfer
 
 PLACE = "gs://bucket/run"
 FILES = {"adapter/weights.bin", "optimizer.pt", "state.json"}
@@ -41,22 +44,30 @@ def run(tmp_path: Path) -> Path:
     return folder
 
 
-def write(run: Path, step: int, state: RunState | None = None, keep: int = 3) -> Path:
+def write(run: Path, step: int, state: RunState | None = None, keep: int = 3, words: str = "of step") -> Path:
     def files(folder: Path) -> None:
         (folder / "adapter").mkdir()
-        (folder / "adapter/weights.bin").write_bytes(f"weights {step} ".encode() * 1000)
-        (folder / "optimizer.pt").write_bytes(f"moments {step} ".encode() * 2000)
+        (folder / "adapter/weights.bin").write_bytes(f"{words} {step:04d} ".encode() * 1000)
+        (folder / "optimizer.pt").write_bytes(f"{words} {step:04d} ".encode() * 2000)
 
-    return write_checkpoint(
-        run / "checkpoints", replace(state or RunState(step), step=step, run_id="mine"), files, keep=keep
-    )
+    state = replace(state or RunState(step), step=step)
+    state = state if state.run_id else replace(state, run_id="mine")
+    return write_checkpoint(run / "checkpoints", state, files, keep=keep)
 
 
-def mirror_of(run: Path, place: str = PLACE, run_id: str = "mine", **arguments: object) -> Mirror:
-    minutes, seconds = arguments.pop("minutes", 0.0), arguments.pop("wait_seconds", 30.0)
-    config = CheckpointConfig(keep=3, remote=place, remote_every_minutes=minutes, remote_wait_seconds=seconds)
-    update = RemoteUpdate(RemoteCheckpoints(place), run, run_id, config.keep, arguments.pop("damaged", ()))
-    return Mirror(update, config, **arguments)
+def mirror_of(
+    run: Path, place: str = PLACE, run_id: str = "mine", damaged: Sequence[str] = (), **checkpoint: float
+) -> Mirror:
+    knobs = {"keep": 3, "remote": place, "remote_every_minutes": 0.0, **checkpoint}
+    values = {"run_dir": str(run), "data": {"path": "d"}, "model": {"base": "b"}, "checkpoint": knobs}
+    return Mirror(Remote(place, parse_config(values, where=""), damaged=tuple(damaged)), run_id)
+
+
+def sent(mirror: Mirror) -> None:
+    """Let a pass begin that is due, and wait for its end."""
+    mirror.tick()
+    if mirror._thread is not None:
+        mirror._thread.join()
 
 
 def send(run: Path, **arguments: object) -> Mirror:
@@ -103,12 +114,10 @@ def test_a_run_is_copied_to_any_kind_of_place(run: Path, place: str, caplog: pyt
 
 def test_whose_it_is_comes_first_and_the_manifest_last(run: Path, place: str, monkeypatch: pytest.MonkeyPatch) -> None:
     write(run, 10)
-    order = []
-    for module in ("upload", "remote_checkpoints"):
-        monkeypatch.setattr(
-            f"vjepa2_ac.runs.mirror.{module}.upload",
-            lambda source, target: [order.append(target.rsplit("/", 1)[1]), storage.upload(source, target)],
-        )
+    order, upload = [], storage.upload
+    monkeypatch.setattr(
+        storage, "upload", lambda source, target: [order.append(target.rsplit("/", 1)[1]), upload(source, target)]
+    )
     send(run, place=place)
     assert order == [
         "config.yaml", "metrics.jsonl", SENDING, "state.json", "weights.bin", "optimizer.pt", "manifest.json",
@@ -157,34 +166,9 @@ def test_files_of_another_checkpoint_by_the_same_name_are_not_taken_for_its_own(
     first = write(run, 10)
     send(run)
     shutil.rmtree(first)
-    write_other(run)
+    write(run, 10, words="OF STEP")
     send(run)
     assert_same_files(run, checkpoint_name(10))
-
-
-def write_other(run: Path) -> None:
-    """Write a checkpoint of step 10 with other bytes, and as many."""
-
-    def files(folder: Path) -> None:
-        (folder / "adapter").mkdir()
-        (folder / "adapter/weights.bin").write_bytes(b"WEIGHTS 10 " * 1000)
-        (folder / "optimizer.pt").write_bytes(b"MOMENTS 10 " * 2000)
-
-    write_checkpoint(run / "checkpoints", RunState(10, run_id="mine"), files, keep=3)
-
-
-@pytest.mark.usefixtures("bucket")
-def test_small_files_are_sent_when_they_have_changed(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    sent = []
-    monkeypatch.setattr(upload, "upload", lambda _, target: sent.append(target.rsplit("/", 1)[1]))
-    mirror = mirror_of(run)
-    for step in (10, 20):
-        write(run, step)
-        with (run / "metrics.jsonl").open("a") as metrics:
-            metrics.write("{}\n")
-        mirror.tick()
-        mirror._thread.join()
-    assert sent == ["config.yaml", "metrics.jsonl", "metrics.jsonl"]
 
 
 def test_the_same_are_kept_there_as_here(bucket: Gcs, run: Path) -> None:
@@ -192,8 +176,7 @@ def test_the_same_are_kept_there_as_here(bucket: Gcs, run: Path) -> None:
     for step, error in [(10, 0.9), (20, 0.5), (30, 0.8), (40, 0.7), (50, 0.6), (60, 0.6)]:
         state = replace(state, step=step).measured(error)
         write(run, step, state)
-        mirror.tick()
-        mirror._thread.join()
+        sent(mirror)
     assert there() == names(20, 40, 50, 60) == sorted(path.name for path in (run / "checkpoints").iterdir())
     for name in there():
         assert_same_files(run, name)
@@ -230,8 +213,7 @@ class Gate:
             upload(source, target)
             self.sending -= 1
 
-        for module in ("upload", "remote_checkpoints"):
-            monkeypatch.setattr(f"vjepa2_ac.runs.mirror.{module}.upload", gated)
+        monkeypatch.setattr(storage, "upload", gated)
 
 
 @pytest.fixture
@@ -257,8 +239,7 @@ def test_training_goes_on_while_something_is_sent_and_nothing_is_sent_twice_at_o
     mirror._thread.join()
     assert there() == names(10), "held by links, it came whole"
     assert RemoteCheckpoints(PLACE).fetch(checkpoint_name(10), run.parent / "copy") is None
-    mirror.tick()
-    mirror._thread.join()
+    sent(mirror)
     assert there() == names(10, 20)
     assert held.most == 1
 
@@ -269,7 +250,7 @@ def test_a_copy_that_does_not_end_in_time_is_named_and_left(
 ) -> None:
     held = gate("weights")
     write(run, 10)
-    mirror = mirror_of(run, wait_seconds=0.2)
+    mirror = mirror_of(run, remote_wait_seconds=0.2)
     mirror.finish(lambda: held.waiting.is_set())
     assert f"what {run / 'checkpoints'} has after that is on this machine only: there was no more time" in caplog.text
     assert mirror.is_sending
@@ -284,7 +265,7 @@ def test_in_the_end_the_newest_is_sent_instead_of_the_one_that_was_on_its_way(
 ) -> None:
     held = gate("weights")
     write(run, 10)
-    mirror = mirror_of(run, minutes=30.0)
+    mirror = mirror_of(run, remote_every_minutes=30.0)
     mirror.tick()
     assert held.waiting.wait(120)
     write(run, 20)
@@ -302,8 +283,7 @@ def test_a_place_of_another_run_is_never_written(bucket: Gcs, run: Path, caplog:
     other = write(run, 20)
     mirror = mirror_of(run, run_id="other", damaged=names(10))
     caplog.clear()
-    mirror.tick()
-    mirror._thread.join()
+    sent(mirror)
     mirror.tick()
     mirror.finish(lambda: False)
     assert {name: storage.read_bytes(f"gs://bucket/{name}") for name in bucket.names("bucket")} == before
@@ -332,20 +312,10 @@ def test_without_hard_links_a_checkpoint_is_copied(run: Path, monkeypatch: pytes
     def no_links(*_: object) -> None:
         raise PermissionError(1, "Operation not permitted")
 
-    monkeypatch.setattr(upload.os, "link", no_links)
+    monkeypatch.setattr(os, "link", no_links)
     write(run, 10)
     send(run)
     assert_same_files(run, checkpoint_name(10))
-
-
-def test_a_checkpoint_that_is_fetched_is_the_one_that_was_sent(run: Path, place: str, tmp_path: Path) -> None:
-    written = write(run, 10)
-    send(run, place=place)
-    assert RemoteCheckpoints(place).fetch(checkpoint_name(10), tmp_path / "copy") is None
-    assert read_state(tmp_path / "copy") == read_state(written)
-    assert {path.relative_to(tmp_path / "copy").as_posix() for path in (tmp_path / "copy").rglob("*.*")} == {
-        *FILES, "manifest.json",
-    }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", ["/etc/x", "../x", "a/../../x", ""])
@@ -355,3 +325,175 @@ def test_a_manifest_there_names_no_file_outside_its_folder(bucket: Gcs, tmp_path
     problem = RemoteCheckpoints(PLACE).fetch(checkpoint_name(10), tmp_path / "copy")
     assert problem is not None
     assert "it names" in problem
+
+
+# A place that fills up or is closed during a run: one warning, and up to date when it works again
+
+CHECKPOINT = 40_000  # bytes of one, about
+
+
+def go_on(run: Path, mirror: Mirror, *steps: int) -> None:
+    for step in steps:
+        write(run, step)
+        sent(mirror)
+
+
+@pytest.mark.parametrize(
+    ("status", "match"),
+    [(403, "POST /upload/"), (403, "DELETE"), (401, ""), (507, "POST /upl")],
+)
+def test_a_bucket_that_is_closed_for_a_while_costs_one_warning(
+    bucket: Gcs, run: Path, status: int, match: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    mirror = mirror_of(run)
+    go_on(run, mirror, 10)
+    bucket.fail_next(status, times=10_000, match=match)
+    go_on(run, mirror, 20, 30)
+    assert [record.levelno for record in caplog.records] == [logging.WARNING]
+    assert str(status) in caplog.text
+    assert "Training continues; next attempt in 0 minutes" in caplog.text
+    bucket.forget()
+    go_on(run, mirror, 40)
+    assert there() == (names(20, 30, 40) if match == "DELETE" else names(10, 40))
+    mirror.finish(lambda: False)
+    assert len(caplog.records) == 1
+
+
+class Disk:
+    """The disk of a place, with room for so many bytes, some of which others take."""
+
+    def __init__(self, folder: Path, room: int) -> None:
+        self.folder, self.room, self.of_others = folder, room, 0
+        self.code = errno.ENOSPC
+
+    def copyfileobj(self, source: BinaryIO, target: BinaryIO) -> None:
+        used = sum(path.stat().st_size for path in self.folder.rglob("*") if path.is_file())
+        data = source.read()
+        if used + self.of_others + len(data) > self.room:
+            raise OSError(self.code, "No room")
+        target.write(data)
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT])
+def test_a_place_without_room_may_have_some_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int) -> None:
+    def full(**_: object) -> None:
+        raise OSError(code, "No room")
+
+    monkeypatch.setattr(transfer.tempfile, "TemporaryFile", full)
+    with pytest.raises(UnreachableError) as caught:
+        storage.try_writing(str(tmp_path))
+    assert not isinstance(caught.value, RefusedError), "training begins without it, with a warning"
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT])
+def test_halves_of_a_full_disk_do_not_keep_it_full(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, code: int
+) -> None:
+    place = tmp_path / "disk"
+    disk = Disk(place, room=int(4.2 * CHECKPOINT))  # three that are kept, and one that comes
+    disk.code = code
+    monkeypatch.setattr(transfer, "shutil", SimpleNamespace(copyfileobj=disk.copyfileobj, rmtree=shutil.rmtree))
+    mirror = mirror_of(run, str(place))
+    go_on(run, mirror, 10, 20, 30, 40)
+    disk.of_others = CHECKPOINT // 2
+    go_on(run, mirror, 50, 60, 70)
+    assert there(str(place)) == names(20, 30, 40)
+    assert [record.levelno for record in caplog.records] == [logging.WARNING]
+    assert "No room" in caplog.text
+    disk.of_others = 0
+    go_on(run, mirror, 80)
+    assert there(str(place)) == names(30, 40, 80)
+    assert len(list((place / "checkpoints").iterdir())) == 3
+    assert len(caplog.records) == 1
+
+
+# Two machines with one mirror: the later start keeps it, and the earlier one is warned
+
+
+class Machine:
+    """Trains, and lets each checkpoint be sent."""
+
+    def __init__(self, folder: Path, place: str, run_id: str) -> None:
+        self.folder, self.run_id, self.mirror = folder, run_id, mirror_of(folder, place, run_id)
+
+    def go_on(self, *steps: int) -> None:
+        for step in steps:
+            write(self.folder, step, RunState(step, run_id=self.run_id), words=self.folder.name)
+            sent(self.mirror)
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> str:
+    return str(tmp_path / "disk")
+
+
+@pytest.fixture
+def machine(tmp_path: Path, disk: str, monkeypatch: pytest.MonkeyPatch, make_config):
+    def start(name: str, run_id: str = "mine") -> Machine:
+        monkeypatch.setattr("platform.node", lambda: name)
+        open_run_folder(make_config(run_dir=str(tmp_path / name)), run_id)
+        return Machine(tmp_path / name, disk, run_id)
+
+    return start
+
+
+def content(place: str) -> dict[str, bytes]:
+    return {name: storage.read_bytes(storage.join(place, name)) for name in storage.file_sizes(place)}
+
+
+def test_the_later_start_keeps_the_place_and_the_earlier_one_is_told_once(
+    machine, disk: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    first = machine("one")
+    first.go_on(10, 20)
+    second = machine("two")
+    second.go_on(30)
+    before = content(disk)
+    first.go_on(30, 40)
+    first.mirror.finish(lambda: False)
+    assert content(disk) == before
+    (said,) = [record for record in caplog.records if record.levelno >= logging.WARNING]
+    assert f"{disk} is used by a later start of this run, process {os.getpid()} on two, since 20" in said.getMessage()
+    second.go_on(40)
+    second.mirror.finish(lambda: False)
+    assert there(disk)[-1] == checkpoint_name(40)
+    assert storage.read_bytes(f"{disk}/checkpoints/{checkpoint_name(40)}/optimizer.pt").startswith(b"two")
+    assert len(caplog.records) == 1
+
+
+def test_two_that_begin_at_once_do_not_both_keep_the_place(
+    machine, disk: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each saw an empty place; the runs have different names."""
+    first, second = machine("one", "this"), machine("two", "that")
+    with monkeypatch.context() as at_once:
+        at_once.setattr(RemoteCheckpoints, "listing", lambda _: {})
+        first.go_on(10)
+        second.go_on(10)
+    first.go_on(20)
+    second.go_on(20)
+    assert [record.levelno for record in caplog.records] == [logging.WARNING]
+    assert "continues without it" in caplog.text or "of another run" in caplog.text
+    name = f"{disk}/checkpoints/{checkpoint_name(20)}/state.json"
+    assert json.loads(storage.read_bytes(name))["run_id"] == "that"
+
+
+@pytest.mark.parametrize("starts", [b"?", b"[]", b'[{"host": 7}]'])
+def test_a_list_of_starts_that_tells_nothing_is_another_start_all_the_same(
+    machine, disk: str, caplog: pytest.LogCaptureFixture, starts: bytes
+) -> None:
+    first = machine("one")
+    first.go_on(10)
+    (Path(disk) / ENVIRONMENT).write_bytes(starts)
+    first.go_on(20)
+    assert "used by a later start of this run, " in caplog.text
+
+
+def test_who_removed_the_list_of_starts_took_the_place_from_nobody(machine, disk: str, caplog) -> None:
+    first = machine("one")
+    first.go_on(10)
+    (Path(disk) / ENVIRONMENT).unlink()
+    first.go_on(20)
+    assert not caplog.records
+    assert (Path(disk) / ENVIRONMENT).read_bytes() == (first.folder / ENVIRONMENT).read_bytes()
+    assert there(disk) == names(10, 20)

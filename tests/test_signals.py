@@ -12,18 +12,18 @@ import pytest
 
 from ranks import Rank
 from same_run import assert_same_run
+from vjepa2_ac import process as signals
 from vjepa2_ac.config.loading import config_as_yaml
-from vjepa2_ac.distributed import signals
-from vjepa2_ac.distributed.signals import EXIT_STATUS, SIGNALS, StoppedError, stop_on_signals
+from vjepa2_ac.process import EXIT_STATUS, SIGNALS, StoppedError, stop_on_signals
 from vjepa2_ac.runs.checkpoint import newest_checkpoint, read_state
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.training.loop import train
 
 WAITING = """
 import time
-from vjepa2_ac.distributed import signals
-signals.SAME_WITHIN_S = 0.0
-with signals.stop_on_signals() as stop:
+from vjepa2_ac import process
+process.SAME_WITHIN_S = 0.0
+with process.stop_on_signals() as stop:
     print(stop.reason, flush=True)
     while stop.reason is None:
         time.sleep(0.01)

@@ -1,4 +1,7 @@
-"""Signals: training stops where it can be resumed; other commands remove partial files and end with the signal.
+"""A process and who started it: its terminal never ends the work that it reports, and signals end it tidily.
+
+Output that cannot be written is dropped: the reader has closed the pipe (`| head`), the terminal is gone, the disk of a
+log is full, and a training goes on.
 
 `stop_on_signals`: the first SIGTERM, SIGINT (Ctrl-C), SIGUSR1 or SIGHUP is recorded: the loop finishes its optimizer
 step, and the validation that is due after it, writes a checkpoint and raises `StoppedError`. The command line then
@@ -12,18 +15,89 @@ its terminal, start it with `nohup` or in tmux.
 from __future__ import annotations
 
 import contextlib
+import errno
+import io
 import os
+import select
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 HANG_UP = signal.SIGHUP
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)
 SAME_WITHIN_S = 0.5  # another signal is the same request: `timeout` and launchers signal a process and its group
 EXIT_STATUS = 75  # sysexits.h, EX_TEMPFAIL: the same command resumes
+_LEFT = frozenset({errno.EPIPE, errno.ECONNRESET})  # the reader has closed the stream
+_NAMES = ("stdout", "stderr")
+
+
+# ---- output ----
+
+
+class _Stream(io.FileIO):
+    """A file descriptor, which stays open; writing never raises."""
+
+    problem: OSError | None = None  # the first one
+
+    def write(self, data: Any, /) -> int:
+        """Write all bytes, or drop what cannot be written; return their number."""
+        left = memoryview(data)
+        try:
+            while left:
+                try:
+                    left = left[os.write(self.fileno(), left) :]
+                except BlockingIOError:  # another process that shares this file has made it non-blocking
+                    select.select((), (self,), ())
+        except OSError as error:
+            self.problem = self.problem or error
+        return len(data)
+
+
+@contextlib.contextmanager
+def own_streams() -> Iterator[Callable[[], str]]:
+    """Send all output of this process through streams that never raise, within the context.
+
+    Streams that are not the process's own, such as those of a test or a notebook, are not changed. Yields a function
+    that returns why some of the standard output was lost; empty where none was, or its reader has left.
+    """
+    if None in (sys.stdout, sys.stderr):
+        _occupy_closed_numbers()
+    before, ours = {name: getattr(sys, name) for name in _NAMES}, dict[str, _Stream]()
+    for number, (name, stream) in enumerate(before.items(), start=1):
+        if stream is getattr(sys, f"__{name}__"):  # None: it was closed when the process started
+            if stream is not None:
+                stream.flush()
+            ours[name] = _Stream(number if stream is None else stream.fileno(), "w", closefd=False)
+            encoding = "utf-8" if stream is None else stream.encoding
+            raw: Any = ours[name]  # without a buffer: nothing is left to be written when the process ends
+            setattr(sys, name, io.TextIOWrapper(raw, encoding, "backslashreplace", write_through=True))
+
+    on_terminal = "stdout" in ours and ours["stdout"].isatty()  # which may be gone in the end
+
+    def lost() -> str:
+        problem = ours["stdout"].problem if "stdout" in ours and not on_terminal else None
+        return "" if problem is None or problem.errno in _LEFT else str(problem.strerror)
+
+    try:
+        yield lost
+    finally:
+        for name in ours:
+            setattr(sys, name, before[name])
+
+
+def _occupy_closed_numbers() -> None:
+    """Open /dev/null as 0, 1 and 2 where free: else the next file gets that number, and libraries write into it."""
+    while (handle := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(handle)
+
+
+# ---- signals ----
 
 
 class StoppedError(Exception):

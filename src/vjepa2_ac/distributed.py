@@ -1,0 +1,339 @@
+"""The device of a run, and the processes that share its clips and sum their gradients; the first one writes.
+
+Started by torchrun, by `accelerate launch`, or by anything else that sets RANK, LOCAL_RANK, WORLD_SIZE, MASTER_ADDR and
+MASTER_PORT. Gradients are summed once per optimizer step, after the last micro-batch, and not by a wrapper around the
+model: a process may have no clip in a micro-batch (`data.broken_episodes: skip`), and would leave a wrapper waiting.
+
+What only some processes do may take hours (an index, a checkpoint on a slow disk) or fail: `first_only`,
+`first_of_machine` and `agreed` let the others wait for it without a time-out, and raise its error in all.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from datetime import timedelta
+from functools import cache, lru_cache
+from typing import Any, TypeVar
+
+import torch
+import torch.distributed
+from accelerate import Accelerator
+from accelerate.state import AcceleratorState
+from accelerate.utils import InitProcessGroupKwargs
+from torch import Tensor, nn
+
+from vjepa2_ac.config import Config, ModelConfig, TrainingConfig
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.network.compilation import require_compiler
+
+_log = logging.getLogger(__name__)
+
+PRECISIONS = {"bf16": torch.bfloat16, "fp16": torch.float16, "fp32": torch.float32}
+_BF16_FROM = (8, 0)  # compute capability; PyTorch's is_bf16_supported includes emulation, which is slower than fp32
+_CEILING_S = 0.2
+_CUDA_MATRIX, _CPU_MATRIX = 8192, 512
+_SLOW = 2.0  # times as long as in float32: of a CPU that computes bfloat16 without instructions for it
+
+_T = TypeVar("_T")
+
+_OTHER_LAUNCHES = ("FSDP", "DEEPSPEED", "MEGATRON_LM", "PARALLELISM_CONFIG")
+_LONGEST_STEP = timedelta(hours=2)  # until a process is given up that does not come to a sum: its disk may have stalled
+_AS_LONG_AS_IT_TAKES = timedelta(days=7)
+
+
+# ---- the device, checked before anything is loaded ----
+
+
+def is_on_cpu(training: TrainingConfig) -> bool:
+    """Return whether a config computes on a CPU; else on CUDA.
+
+    Raises:
+        InputError: CUDA was requested and there is none.
+    """
+    has_cuda = torch.cuda.is_available()
+    if training.device == "cuda" and not has_cuda:
+        raise no_cuda(where="training.device", asked="cuda", instead="Set training.device=cpu")
+    return training.device == "cpu" or not has_cuda
+
+
+def no_cuda(*, where: str, asked: str, instead: str) -> InputError:
+    """Return the error of a CUDA device where there is none."""
+    fix = f"{instead}, or install a CUDA build of PyTorch and a driver"
+    return InputError(where=where, found=f"{asked}, but this PyTorch sees no CUDA device", fix=fix)
+
+
+def computing_device(training: TrainingConfig) -> torch.device:
+    """Return the device of this process, after checking that it supports the config.
+
+    On a CPU without instructions for bfloat16 a config that asks for it is warned of.
+
+    Raises:
+        InputError: CUDA was requested and there is none, fp16 without CUDA, bfloat16 on a GPU that has none, or nothing
+            to compile with.
+    """
+    on_cpu = is_on_cpu(training)
+    if training.precision == "fp16" and on_cpu:
+        needed = "a CUDA device: only there are losses scaled so that small gradients do not vanish"
+        fix = "Set training.precision=fp32"
+        raise InputError(where="training.precision", found="fp16 on a CPU", needed=needed, fix=fix)
+    device = torch.device("cpu") if on_cpu else torch.device("cuda", cuda_index())
+    if training.precision == "bf16":  # fp32 is for float32 weights only, and fp16 casts any weights
+        fix = f"Set training.precision={'fp32 with model.dtype=float32' if on_cpu else 'fp16'}"
+        _require_bf16(device, where="training.precision", found="bf16", fix=fix)
+    if training.compile == "blocks":
+        require_compiler(device.type, where="training.compile")
+    return device
+
+
+def require_type_of_weights(model: ModelConfig, device: torch.device) -> None:
+    """Refuse a weight type that the device does not support: planning computes in it, without autocast.
+
+    On a CPU without instructions for bfloat16 it is warned of.
+
+    Raises:
+        InputError: They are bfloat16 on a GPU without it.
+    """
+    if model.dtype == "bfloat16":
+        _require_bf16(device, where="model.dtype", found="bfloat16", fix="Set model.dtype=float32")
+
+
+def slow_bf16() -> str | None:
+    """Return what a product of matrices costs in bfloat16 on this CPU, if that is much slower than in float32.
+
+    Measured here: which instructions a CPU has, and which of them PyTorch uses, no list of names tells.
+    """
+    cpu = torch.device("cpu")
+    bf16, fp32 = (2e3 * _CPU_MATRIX**3 / matmul_speed(cpu, dtype) for dtype in (torch.bfloat16, torch.float32))
+    if bf16 < _SLOW * fp32:
+        return None
+    return f"a product of matrices takes {bf16:.3g} ms on this CPU, {fp32:.3g} ms in float32 ({bf16 / fp32:.0f} times)"
+
+
+@lru_cache(maxsize=8)
+def matmul_speed(device: torch.device, dtype: torch.dtype) -> float:
+    """Return the FLOPs per second of a large matrix product, the best within a fraction of a second.
+
+    Measured once per device and type in a program: load by other programs affects it.
+    """
+    size = _CUDA_MATRIX if device.type == "cuda" else _CPU_MATRIX
+    generator = torch.Generator(device).manual_seed(0)  # its own, so that training's random numbers do not change
+    matrix = torch.randn(size, size, device=device, generator=generator).to(dtype)
+    _product_s(matrix)  # warm-up
+    best, ends = math.inf, time.perf_counter() + _CEILING_S
+    while best == math.inf or time.perf_counter() < ends:
+        best = min(best, _product_s(matrix))
+    return 2 * size**3 / best
+
+
+def has_bf16() -> bool:
+    """Return whether the CUDA device of this process computes in bfloat16."""
+    return torch.cuda.get_device_capability(cuda_index()) >= _BF16_FROM
+
+
+def cuda_index() -> int:
+    """Return the index of this process's CUDA device on its machine."""
+    return int(os.environ.get("LOCAL_RANK", "0")) % torch.cuda.device_count()
+
+
+def autocast(training: TrainingConfig, device: torch.device) -> torch.autocast:
+    """Return the arithmetic of `training.precision`, as Accelerate provides it."""
+    kind = None if training.precision == "fp32" else PRECISIONS[training.precision]
+    return torch.autocast(device.type, dtype=kind, enabled=kind is not None)
+
+
+def _require_bf16(device: torch.device, *, where: str, found: str, fix: str) -> None:
+    """Refuse bfloat16 where a GPU only emulates it; on a CPU that is slow in it, say so."""
+    if device.type == "cpu":
+        _warn(f"{where}: {found}", fix)
+    if device.type != "cuda" or has_bf16():
+        return
+    major, minor = torch.cuda.get_device_capability(cuda_index())
+    found += f", on {torch.cuda.get_device_name(cuda_index())} of compute capability {major}.{minor}"
+    needed = "8.0 or more (Ampere or later): earlier GPUs only emulate bfloat16"
+    raise InputError(where=where, found=found, needed=needed, fix=fix)
+
+
+@cache  # once
+def _warn(found: str, fix: str) -> None:
+    if slow := slow_bf16():
+        _log.warning("%s: %s. %s", found, slow, fix)
+
+
+def _product_s(matrix: Tensor) -> float:
+    _wait_for(matrix.device)
+    started = time.perf_counter()
+    torch.mm(matrix, matrix)
+    _wait_for(matrix.device)
+    return time.perf_counter() - started
+
+
+def _wait_for(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+@contextmanager
+def out_of_memory_explained(where: str, fix: str) -> Iterator[None]:
+    """Turn the error of a GPU whose memory was too small into one that says which knobs to change.
+
+    Raises:
+        InputError: The memory was not enough.
+    """
+    try:
+        yield
+    except torch.OutOfMemoryError as error:
+        found = f"the GPU's memory is not enough ({str(error).splitlines()[0]})"
+        raise InputError(where=where, found=found, fix=fix) from error
+
+
+# ---- processes ----
+
+
+def make_accelerator(config: Config) -> Accelerator:
+    """Return the device and precision of a run. With several processes it joins them.
+
+    Raises:
+        InputError: CUDA was requested and there is none, the device does not compute so (fp16 on a CPU, bf16 on an old
+            GPU), or the launch would share weights.
+    """
+    for name in _OTHER_LAUNCHES:
+        if os.environ.get(f"ACCELERATE_USE_{name}", "false").lower() in {"1", "true", "yes", "on"}:
+            found, needed = f"{name} is asked for", "processes that share the clips, each with the whole model"
+            raise InputError(where="accelerate launch", found=found, needed=needed, fix="Start it without that")
+    training, on_cpu = config.training, computing_device(config.training).type == "cpu"
+    _patient_group.cache_clear()
+    AcceleratorState._reset_state(reset_partial_state=False)  # or a second run keeps the first's precision
+    precision = "no" if training.precision == "fp32" else training.precision
+    waits = InitProcessGroupKwargs(timeout=_LONGEST_STEP)
+    return Accelerator(mixed_precision=precision, cpu=on_cpu, kwargs_handlers=[waits])
+
+
+def first_only(accelerator: Accelerator, work: Callable[[], _T]) -> _T | None:
+    """Let the first process do something that may fail, and take any time; return its result there, None elsewhere.
+
+    Raises:
+        Exception: What it raised; in all processes.
+    """
+    return agreed(accelerator, work if accelerator.is_main_process else lambda: None)
+
+
+def first_of_machine(accelerator: Accelerator, work: Callable[[], _T]) -> _T:
+    """Let all processes do the same, first one of each machine: the others find the files that it has written.
+
+    Raises:
+        Exception: What one of them raised; in all processes.
+    """
+    done: list[_T] = []
+    if accelerator.num_processes > 1:
+        agreed(accelerator, lambda: done.append(work()) if accelerator.is_local_main_process else None)
+    return agreed(accelerator, lambda: done[0] if done else work())
+
+
+def agreed(accelerator: Accelerator, work: Callable[[], _T]) -> _T:
+    """Do something in this process, and wait until all have done their part; return the result.
+
+    Raises:
+        Exception: What the first process that failed raised; in all of them.
+    """
+    if accelerator.num_processes == 1:
+        return work()
+    result, error = None, None
+    try:
+        result = work()
+    except Exception as own:
+        error = own
+    raise_first(accelerator, error)
+    return result  # type: ignore[return-value]  # without an error it is set
+
+
+def raise_first(accelerator: Accelerator, error: Exception | None) -> None:
+    """Raise, in all processes, the error of the first of them that has one. All have to call."""
+    told = error if error is None or isinstance(error, InputError) else RuntimeError(f"{type(error).__name__}: {error}")
+    for rank, first in enumerate(all_gather_object(accelerator, told)):
+        if first is not None and error is not None and rank == accelerator.process_index:
+            raise error
+        if first is not None:
+            if isinstance(first, InputError):
+                first.is_told = True
+            raise first
+
+
+def all_reduce_sum(accelerator: Accelerator, values: Sequence[float | int]) -> list[float]:
+    """Return the sums over all processes, bit-identical in each."""
+    if accelerator.num_processes == 1:
+        return [float(value) for value in values]
+    added = torch.tensor(values, dtype=torch.float64, device=accelerator.device)
+    torch.distributed.all_reduce(added)
+    return [float(value) for value in added.tolist()]
+
+
+def all_reduce_max(accelerator: Accelerator, values: Sequence[int | bool]) -> list[int]:
+    """Return the largest of each value over all processes."""
+    if accelerator.num_processes == 1:
+        return [int(value) for value in values]
+    compared = torch.tensor(values, dtype=torch.int64, device=accelerator.device)
+    torch.distributed.all_reduce(compared, torch.distributed.ReduceOp.MAX)
+    return [int(value) for value in compared.tolist()]
+
+
+def all_reduce_gradients(accelerator: Accelerator, parameters: Iterable[nn.Parameter]) -> None:
+    """Replace the gradient of each parameter by its sum over all processes; no gradient counts as zero."""
+    if accelerator.num_processes == 1:
+        return
+    under_way = []
+    for parameter in parameters:
+        if parameter.grad is None:
+            parameter.grad = torch.zeros_like(parameter)
+        under_way.append(torch.distributed.all_reduce(parameter.grad, async_op=True))
+    for work in under_way:
+        work.wait()
+
+
+def broadcast_object(accelerator: Accelerator, value: _T) -> _T:
+    """Return the value of the first process, however long it takes; the others' values are ignored."""
+    if accelerator.num_processes == 1:
+        return value
+    holder: list[Any] = [value if accelerator.is_main_process else None]
+    torch.distributed.broadcast_object_list(holder, group=_patient_group())
+    return holder[0]  # type: ignore[no-any-return]  # untyped
+
+
+def all_gather_object(accelerator: Accelerator, value: _T) -> list[_T]:
+    """Return the values of all processes, in their order, in each process, however long one takes."""
+    values: list[Any] = [value] * accelerator.num_processes
+    if accelerator.num_processes > 1:
+        torch.distributed.all_gather_object(values, value, group=_patient_group())
+    return values
+
+
+def broadcast_tensors(accelerator: Accelerator, tensors: Iterable[Tensor]) -> None:
+    """Give every process the first one's values, in place."""
+    if accelerator.num_processes == 1:
+        return
+    for tensor in tensors:
+        torch.distributed.broadcast(tensor.detach(), 0)
+
+
+def require_same(accelerator: Accelerator, value: object, *, what: str, fix: str) -> None:
+    """Check that all processes have the same values.
+
+    Raises:
+        InputError: In all processes, if one differs; names the processes.
+    """
+    values = all_gather_object(accelerator, value)
+    differing = [str(rank) for rank, other in enumerate(values) if other != values[0]]
+    if differing:
+        found = f"another one in process {', '.join(differing)} than in process 0"
+        raise InputError(where=what, found=found, needed="the same for all processes of a run", fix=fix)
+
+
+@cache
+def _patient_group() -> torch.distributed.ProcessGroup:
+    """Return a group without a time-out: NCCL's is minutes. A process that dies breaks the others' connections."""
+    group: torch.distributed.ProcessGroup = torch.distributed.new_group(backend="gloo", timeout=_AS_LONG_AS_IT_TAKES)
+    return group

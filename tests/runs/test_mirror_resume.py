@@ -1,0 +1,468 @@
+"""Resuming from the mirror: another machine continues the run without a difference, whenever the first one died."""
+
+import logging
+import os
+import shutil
+import signal
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from gcs import Failure, Gcs
+from run_fixtures import SilentReporter
+from same_run import assert_same_run
+from vjepa2_ac import storage
+from vjepa2_ac.config import Config
+from vjepa2_ac.config.loading import config_as_yaml
+from vjepa2_ac.errors import InputError, UnreachableError
+from vjepa2_ac.process import StoppedError
+from vjepa2_ac.reporter import SILENT
+from vjepa2_ac.runs.checkpoint import RunState, checkpoint_name, newest_checkpoint, read_state, write_checkpoint
+from vjepa2_ac.runs.folder import SMALL_FILES, RunLock, check_run_folder
+from vjepa2_ac.runs.mirror import Mirror, Remote, RemoteCheckpoints, complete, open_remote
+from vjepa2_ac.training.loop import train
+
+PLACE = "gs://bucket/run"
+MakeConfig = Callable[..., Config]
+STEPS = 3
+FILES = 4  # the manifest under another name, state.json and two more come before the manifest
+
+
+class KilledError(BaseException):
+    """Stands for SIGKILL: nobody sees to anything any more."""
+
+
+def there(place: str) -> list[str]:
+    return sorted(complete(RemoteCheckpoints(place).listing()))
+
+
+@pytest.fixture
+def bucket(gcs: Gcs) -> Gcs:
+    gcs.put("bucket/other", b"1")
+    gcs.forget()
+    return gcs
+
+
+@pytest.fixture
+def config(make_config: Callable[..., Config]) -> Config:
+    return make_config(checkpoint__remote=PLACE)
+
+
+def write(run: Path, step: int, run_id: str = "mine", **state: object) -> Path:
+    def files(folder: Path) -> None:
+        (folder / "adapter").mkdir()
+        (folder / "adapter/weights.bin").write_bytes(f"weights {step} ".encode() * 100)
+        (folder / "optimizer.pt").write_bytes(f"moments {step} ".encode() * 200)
+
+    return write_checkpoint(run / "checkpoints", RunState(step, run_id, clips_done=step, **state), files, keep=9)
+
+
+def run_there(gcs: Gcs, config: Config, *steps: int, run_id: str = "mine", **state: object) -> Path:
+    """Put a run with these checkpoints at the place; return the folder it was put from."""
+    folder = Path(config.run_dir).parent / f"elsewhere-{run_id}"
+    for step in steps:
+        write(folder, step, run_id, **state)
+    (folder / "config.yaml").write_text(config_as_yaml(config))
+    (folder / "run_id").write_text(run_id)
+    (folder / "metrics.jsonl").write_text("".join(f'{{"kind": "train", "step": {step}}}\n' for step in steps))
+    gcs.upload(folder, "bucket/run")
+    gcs.forget()
+    return folder
+
+
+def local(config: Config) -> Path:
+    return Path(config.run_dir)
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_an_empty_place_is_tried_and_left_empty(bucket: Gcs, config: Config) -> None:
+    assert open_remote(config, SILENT) == Remote(PLACE, config)
+    assert bucket.names("bucket") == ["other"]
+    assert [r.target.split("/")[0] for r in bucket.requests if "write-check" in r.target] == ["DELETE "]
+    assert len(bucket.uploads()) == 1
+    assert not local(config).exists()
+
+
+def test_a_fresh_machine_gets_the_newest_checkpoint_and_the_small_files(bucket: Gcs, config: Config) -> None:
+    source, reporter = run_there(bucket, config, 5, 10, 20, best_step=10, best_error=0.5), SilentReporter()
+    remote = open_remote(config, reporter)
+    assert remote == Remote(PLACE, config)
+    newest = newest_checkpoint(local(config) / "checkpoints")
+    assert newest is not None
+    assert newest.name == checkpoint_name(20)
+    assert read_state(newest).run_id == "mine"
+    expected = {name: data for name, data in files_of(source).items() if checkpoint_name(5) not in name}
+    assert files_of(local(config)) == expected
+    assert reporter.notes == [
+        f"{PLACE} can be written: it is brought up to date every 30 minutes, and in the end.",
+        f"Fetched {checkpoint_name(20)} from {PLACE}.",
+    ]
+    check_run_folder(config)
+
+
+@pytest.mark.parametrize("failure", [429, 503, "reset", "cut", "short"])
+def test_fetching_survives_what_passes(bucket: Gcs, config: Config, failure: Failure) -> None:
+    source = run_there(bucket, config, 10)
+    bucket.fail_next(failure, times=4, match="/download/.*optimizer")
+    bucket.fail_next(failure, times=4, match="prefix=" if failure != "short" else "never")
+    open_remote(config, SILENT)
+    assert files_of(local(config)) == files_of(source)
+
+
+@pytest.mark.parametrize("damage", ["flip", "remove", "manifest"])
+def test_a_damaged_checkpoint_there_is_passed_over_by_name(
+    bucket: Gcs, config: Config, damage: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    run_there(bucket, config, 10, 20)
+    name = "manifest.json" if damage == "manifest" else "optimizer.pt"
+    victim = f"run/checkpoints/{checkpoint_name(20)}/{name}"
+    data = bytearray(storage.read_bytes(f"gs://bucket/{victim}"))
+    if damage == "remove":
+        storage.remove(f"gs://bucket/{victim}")
+    else:
+        data[5] ^= 1
+        bucket.put(f"bucket/{victim}", bytes(data) if damage == "flip" else b"{")
+    remote = open_remote(config, SILENT)
+    assert [path.name for path in (local(config) / "checkpoints").iterdir()] == [checkpoint_name(10)]
+    assert remote.damaged == (checkpoint_name(20),)
+    assert [record.levelno for record in caplog.records] == [logging.WARNING]
+    assert f"{PLACE}: {checkpoint_name(20)}" in caplog.text
+
+
+@pytest.mark.parametrize(("here", "elsewhere", "taken"), [(10, 20, 20), (20, 10, 20), (20, 20, 20)])
+def test_the_further_one_is_taken(bucket: Gcs, config: Config, here: int, elsewhere: int, taken: int) -> None:
+    run_there(bucket, config, elsewhere)
+    write(local(config), here)
+    (local(config) / "config.yaml").write_text(config_as_yaml(config))
+    open_remote(config, SILENT)
+    assert newest_checkpoint(local(config) / "checkpoints").name == checkpoint_name(taken)
+    assert bool(bucket.bytes_read("optimizer.pt")) == (elsewhere > here)
+
+
+def test_another_config_is_refused_as_if_it_were_on_this_machine(bucket: Gcs, config: Config) -> None:
+    run_there(bucket, config, 10)
+    training = config.training.model_copy(update={"learning_rate": 0.5})
+    other = config.model_copy(update={"training": training})
+    with pytest.raises(InputError, match=rf"{PLACE}: a run of another config; it differs in training.learning_rate"):
+        open_remote(other, SILENT)
+    assert not local(config).exists(), "nothing has come"
+    open_remote(other, SILENT, allow_config_change=True)
+    assert newest_checkpoint(local(config) / "checkpoints") is not None
+
+
+def test_another_runs_place_is_refused(bucket: Gcs, config: Config) -> None:
+    run_there(bucket, config, 10, run_id="other")
+    before = bucket.names("bucket")
+    write(local(config), 20)
+    with pytest.raises(InputError, match=rf"{PLACE} holds a checkpoint of another run, {checkpoint_name(10)}.*Set an"):
+        open_remote(config, SILENT)
+    assert bucket.names("bucket") == before
+
+
+def test_a_place_that_cannot_be_reached_is_a_warning(
+    bucket: Gcs, config: Config, caplog: pytest.LogCaptureFixture
+) -> None:
+    bucket.fail_next(503, times=99)
+    remote = open_remote(config, SILENT)
+    assert remote == Remote(PLACE, config, is_reachable=False)
+    assert len(bucket.requests) == 5, "one call, and no other once it failed"
+    assert [record.levelno for record in caplog.records] == [logging.WARNING]
+    assert "HTTP 503" in caplog.text
+    assert "what is on this machine, without a checkpoint" in caplog.text
+
+
+def test_what_is_seen_there_and_cannot_be_fetched_is_not_done_again_from_the_start(
+    bucket: Gcs, config: Config, caplog: pytest.LogCaptureFixture
+) -> None:
+    run_there(bucket, config, 20)
+    bucket.fail_next(503, times=99, match="/download/.*optimizer")
+    with pytest.raises(UnreachableError, match="optimizer"):
+        open_remote(config, SILENT)
+    caplog.clear()
+    write(local(config), 10)
+    assert open_remote(config, SILENT) == Remote(PLACE, config)
+    assert f"Training goes on after step 10, though {checkpoint_name(20)} is there" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("match", "failure"), [("POST /upload/", 403), ("DELETE", 403), ("prefix=", 403), ("POST /upload/", 401)]
+)
+def test_a_place_without_permission_is_an_error_with_the_way_out(
+    bucket: Gcs, config: Config, match: str, failure: int
+) -> None:
+    bucket.fail_next(failure, times=9, match=match)
+    with pytest.raises(InputError, match=r"^checkpoint.remote: gs://bucket/run: no permission.*Log in.*another place"):
+        open_remote(config, SILENT)
+
+
+def test_a_bucket_that_does_not_exist_is_an_error(bucket: Gcs, make_config: Callable[..., Config]) -> None:
+    assert bucket.names("bucket")
+    with pytest.raises(InputError, match=r"there is no bucket buckett\..*check its name\. Or name another place"):
+        open_remote(make_config(checkpoint__remote="gs://buckett/run"), SILENT)
+
+
+@pytest.mark.parametrize("inner", ["", "mirror"])
+def test_the_runs_own_folder_is_no_mirror(make_config: Callable[..., Config], inner: str) -> None:
+    folder = local(make_config())
+    with pytest.raises(InputError, match="a place outside the run's folder"):
+        open_remote(make_config(checkpoint__remote=str(folder / inner)), SILENT)
+
+
+def test_a_folder_is_claimed_before_anything_is_fetched_into_it(bucket: Gcs, config: Config) -> None:
+    """Two that start at once in a new folder: the second would put older metrics over those of the first."""
+    run_there(bucket, config, 10)
+    with RunLock(local(config)) as first, RunLock(local(config)) as second:
+        first.take()
+        before = files_of(local(config))
+        with pytest.raises(InputError, match="being trained right now"):
+            open_remote(config, SILENT, claim=second.take)
+        assert files_of(local(config)) == before
+    with RunLock(local(config)) as lock:
+        open_remote(config, SILENT, claim=lock.take)
+        with RunLock(local(config)) as other, pytest.raises(InputError, match="being trained right now"):
+            other.take()
+
+
+def test_who_is_killed_while_fetching_fetches_again(
+    bucket: Gcs, config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source, download = run_there(bucket, config, 10), storage.download
+
+    def killed(source: str, target: Path) -> None:
+        if "optimizer" in source:
+            raise KilledError
+        download(source, target)
+
+    with monkeypatch.context() as dying:
+        dying.setattr(storage, "download", killed)
+        with pytest.raises(KilledError):
+            open_remote(config, SILENT)
+    assert newest_checkpoint(local(config) / "checkpoints") is None
+    check_run_folder(config)
+    open_remote(config, SILENT)
+    assert files_of(local(config)) == files_of(source)
+
+
+# A run that goes on elsewhere
+
+
+def mirrored(make_config: MakeConfig, tmp_path: Path, machine: str, **changes: object) -> Config:
+    return make_config(
+        run_dir=str(tmp_path / machine), checkpoint__remote=PLACE, checkpoint__remote_every_minutes=0.0, **changes
+    )
+
+
+def at_step(reporter, step: int, action: Callable[[], None]):
+    """Return another reporter that does something when a step is done, before its checkpoint is written."""
+    other = type(reporter)()
+    stepped = other.stepped
+
+    def then(done: int, metrics: dict) -> None:
+        stepped(done, metrics)
+        if done == step:
+            action()
+
+    other.stepped = then
+    return other
+
+
+def wait_for_mirrors() -> None:
+    """Wait until what is being sent is there, and nothing is being sent."""
+    for thread in threading.enumerate():
+        if thread.name == "mirror":
+            thread.join(120)
+            assert not thread.is_alive()
+
+
+def stop_after(step: int, config: Config, reporter) -> None:
+    with pytest.raises(StoppedError):
+        train(config, at_step(reporter, step, lambda: os.kill(os.getpid(), signal.SIGTERM)))
+
+
+@pytest.mark.usefixtures("bucket", "default_signals")
+def test_after_preemption_a_fresh_machine_goes_on_as_if_nothing_had_happened(
+    make_config: MakeConfig, reporter, tmp_path: Path, whole_run: Path
+) -> None:
+    stop_after(3, mirrored(make_config, tmp_path, "one"), reporter)
+    assert there(PLACE)[-1] == checkpoint_name(3), "sent before the process ends"
+    shutil.rmtree(tmp_path / "one")
+    train(mirrored(make_config, tmp_path, "two"), reporter)
+    assert reporter.steps == [4, 5, 6]
+    assert_same_run(whole_run, tmp_path / "two")
+    assert there(PLACE)[-1] == checkpoint_name(6)
+    train(mirrored(make_config, tmp_path, "three"), reporter)
+    assert reporter.steps == [4, 5, 6], "a run that is done is done everywhere"
+    assert_same_run(whole_run, tmp_path / "three")
+
+
+@pytest.mark.usefixtures("bucket", "default_signals")
+def test_a_machine_killed_while_sending_leaves_the_last_complete_checkpoint_to_the_next(
+    make_config: MakeConfig, reporter, tmp_path: Path, whole_run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fourth_is_on_its_way, dead = threading.Event(), threading.Event()
+
+    real = storage.upload
+
+    def upload(source: Path, target: str) -> None:
+        if f"{checkpoint_name(4)}/optimizer.pt" in target:
+            fourth_is_on_its_way.set()
+            assert dead.wait(120)
+            raise OSError("the process is gone")
+        real(source, target)
+
+    def die() -> None:
+        assert fourth_is_on_its_way.wait(120)
+        raise KilledError
+
+    monkeypatch.setattr(storage, "upload", upload)
+    config = mirrored(make_config, tmp_path, "one", checkpoint__keep_best=False)
+    dying = at_step(reporter, 6, die)
+    stepped = dying.stepped
+    dying.stepped = lambda step, seen: (stepped(step, seen), step == 3 and wait_for_mirrors())
+    with pytest.raises(KilledError):
+        train(config, dying)
+    dead.set()
+    assert there(PLACE) == [checkpoint_name(2)]
+    train(mirrored(make_config, tmp_path, "two", checkpoint__keep_best=False), reporter)
+    assert reporter.steps == [3, 4, 5, 6]
+    assert_same_run(whole_run, tmp_path / "two")
+
+
+@pytest.mark.usefixtures("bucket", "default_signals")
+def test_a_place_that_is_down_for_the_whole_run_costs_warnings_and_no_step(
+    bucket: Gcs, make_config: MakeConfig, reporter, tmp_path: Path, whole_run: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    bucket.fail_next(503, times=10_000)
+    caplog.clear()
+    train(mirrored(make_config, tmp_path, "one"), reporter)
+    assert reporter.steps == [1, 2, 3, 4, 5, 6]
+    assert_same_run(whole_run, tmp_path / "one")
+    warnings = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
+    assert len(warnings) == 2
+    assert "HTTP 503" in warnings[0]
+    assert "is on this machine only" in warnings[1]
+    assert bucket.names("bucket") == ["other"]
+
+
+@pytest.mark.usefixtures("bucket", "default_signals")
+def test_a_check_tries_the_place_and_leaves_nothing_there_or_here(
+    bucket: Gcs, make_config: MakeConfig, reporter, tmp_path: Path
+) -> None:
+    config = mirrored(make_config, tmp_path, "one")
+    train(config, reporter, check_only=True)
+    assert [r.target for r in bucket.requests if r.target.startswith("DELETE") and ".write-check-" in r.target]
+    assert bucket.names("bucket") == ["other"]
+    bucket.fail_next(403, times=99, match="POST /upload/")
+    with pytest.raises(InputError, match="no permission"):
+        train(config, reporter, check_only=True)
+    bucket.forget()
+    stop_after(2, mirrored(make_config, tmp_path, "two"), reporter)
+    before = bucket.names("bucket")
+    train(config, reporter, check_only=True)
+    assert any(note.startswith("Going on from") for note in reporter.notes)
+    assert bucket.names("bucket") == before
+    assert not Path(config.run_dir).exists()
+
+
+@pytest.mark.usefixtures("bucket", "default_signals")
+def test_a_run_that_fails_sends_its_last_checkpoint(make_config: MakeConfig, reporter, tmp_path: Path) -> None:
+    def fail() -> None:
+        raise InputError(where="here", found="a loss that is not finite")
+
+    changes = {"checkpoint__remote_every_minutes": 1e6, "checkpoint__keep_best": False}
+    config = make_config(run_dir=str(tmp_path / "one"), checkpoint__remote=PLACE, **changes)
+    with pytest.raises(InputError, match="not finite"):
+        train(config, at_step(reporter, 5, fail))
+    assert there(PLACE)[-1] == checkpoint_name(4)
+
+
+# A machine killed in its first upload
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> str:
+    return str(tmp_path / "disk/run")
+
+
+@pytest.fixture
+def config_on(make_config, tmp_path: Path, place: str):
+    def config(machine: str, **changes: object):
+        return make_config(
+            run_dir=str(tmp_path / machine), checkpoint__remote=place, checkpoint__remote_every_minutes=0.0,
+            checkpoint__keep_best=False, training__steps=STEPS, **changes,
+        )  # fmt: skip
+
+    return config
+
+
+@pytest.fixture
+def whole(make_config, reporter, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run that nobody killed: the same one for all tests."""
+    if not _whole:
+        folder = tmp_path_factory.mktemp("whole") / "run"
+        _whole.append(
+            train(
+                make_config(run_dir=str(folder), checkpoint__keep_best=False, training__steps=STEPS), type(reporter)()
+            )
+        )
+    return _whole[0]
+
+
+_whole: list[Path] = []
+
+
+def die_in_first_upload(config: object, reporter, monkeypatch: pytest.MonkeyPatch, *, before_file: int) -> None:
+    """Train until so many files of the first checkpoint are at the place; then nothing happens any more."""
+    sent, real = list[str](), storage.upload
+
+    def upload(source: Path, target: str) -> None:
+        if "/checkpoints/" in target:
+            if len(sent) == before_file:
+                raise KilledError
+            sent.append(target)
+        real(source, target)
+
+    with monkeypatch.context() as dying:
+        dying.setattr(storage, "upload", upload)
+        dying.setattr(Mirror, "_begin", Mirror._send)  # at once, and its death is everybody's
+        with pytest.raises(KilledError):
+            train(config, reporter)
+    assert len(sent) == before_file
+
+
+@pytest.mark.parametrize(("before_file", "machine"), [(2, "another"), (FILES, "another"), (2, "this")])
+def test_a_run_killed_in_its_first_upload_is_mirrored_by_the_next_start(
+    config_on, reporter, monkeypatch, tmp_path: Path, place: str, before_file: int, machine: str, caplog, whole: Path
+) -> None:
+    die_in_first_upload(config_on("this"), reporter, monkeypatch, before_file=before_file)
+    assert there(place) == []
+    train(config_on(machine), reporter)
+    assert there(place)[-1] == checkpoint_name(STEPS)
+    assert not [record for record in caplog.records if record.levelno >= logging.WARNING]
+    assert_same_run(whole, tmp_path / machine)
+
+
+def test_half_a_checkpoint_of_another_run_is_refused_before_the_first_step(
+    config_on, reporter, monkeypatch, tmp_path: Path
+) -> None:
+    die_in_first_upload(config_on("this"), reporter, monkeypatch, before_file=2)
+    reporter.steps.clear()
+    with pytest.raises(InputError, match=r"differs in training\.learning_rate.*Set another checkpoint.remote"):
+        train(config_on("other", training__learning_rate=0.5), reporter)
+    assert not (tmp_path / "other").exists()
+    assert reporter.steps == []
+
+
+def test_small_files_alone_keep_nobody_out(config_on, reporter, place: str) -> None:
+    """Who removes the checkpoints of a place starts a run anew there, with another config if need be."""
+    train(config_on("this"), reporter)
+    for name in there(place):
+        RemoteCheckpoints(place).remove(name)
+    assert {"config.yaml", "run_id"} <= {name for name in SMALL_FILES if storage.exists(storage.join(place, name))}
+    train(config_on("other", training__learning_rate=0.5), reporter)
+    assert there(place)[-1] == checkpoint_name(STEPS)
