@@ -28,7 +28,8 @@ def test_intervals_cover_the_truth_at_the_stated_rate(episodes: int) -> None:
     for trial in range(400):
         levels = rng.normal(0.7, 0.1, size=episodes)  # episodes differ; clips within one are alike
         errors = np.repeat(levels, 4) + rng.normal(0, 0.02, size=4 * episodes)
-        found = ratio(errors, np.ones(4 * episodes), ids, resamples=400, seed=trial)
+        columns = np.stack([errors, np.ones(4 * episodes)])[:, :, None]
+        (found,) = bootstrapped(lambda sums: sums[0] / sums[1], columns, ids, resamples=400, seed=trial)
         covered += found.low <= 0.7 <= found.high
     assert covered / 400 == pytest.approx(0.95, abs=0.035)
 
@@ -82,10 +83,13 @@ def test_the_side_of_an_interval_needs_all_of_it() -> None:
 
 
 def test_the_same_seed_gives_the_same_interval() -> None:
-    values = np.random.default_rng(1).normal(size=20)
-    ids = tuple(map(str, range(20)))
-    assert mean_of(values, ids, seed=3) == mean_of(values, ids, seed=3)
-    assert mean_of(values, ids, seed=3) != mean_of(values, ids, seed=4)
+    columns = np.stack([np.random.default_rng(1).normal(size=20), np.ones(20)])[:, :, None]
+
+    def of(seed: int) -> tuple[Estimate, ...]:
+        return bootstrapped(lambda sums: sums[0] / sums[1], columns, list(map(str, range(20))), seed=seed)
+
+    assert of(3) == of(3)
+    assert of(3) != of(4)
 
 
 def test_weights_of_episodes_give_the_interval_of_their_sums() -> None:

@@ -1,6 +1,7 @@
 """`data check --model` measures the data with a model, unchanged and in variants, for every source."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -8,7 +9,8 @@ import pytest
 from adapted_run import write_adapted_run
 from latent_sets import encode_for
 from vector_sets import write_vectors
-from vjepa2_ac.calibration.data import VariantProbe, VariantResult, probe_config
+from vjepa2_ac.calibration.data import VariantProbe, probe_config
+from vjepa2_ac.calibration.variants import VariantResult
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_yaml
@@ -54,8 +56,10 @@ def test_the_probe_prints_a_table_and_a_verdict_after_the_findings(
 def test_a_variant_that_fits_better_is_a_warning_with_what_to_do_and_no_error(
     make_config: MakeConfig, tmp_path: Path, capsys: Printed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    better = VariantResult("y negated", "negate y", Estimate(0.5, 0.4, 0.6), Estimate(-0.4, -0.45, -0.35))
-    probe = VariantProbe(Estimate(0.9, 0.8, 1.0), (better,), clips=64, episodes=12)
+    plain = VariantResult("as they are", Estimate(0.9, 0.8, 1.0), 0.4, 0.5, 1.2, clips=64, episodes=12)
+    less = Estimate(-0.4, -0.45, -0.35)
+    better = replace(plain, name="y negated", ratio=Estimate(0.5, 0.4, 0.6), difference=less, repair="negate y")
+    probe = VariantProbe(plain, (better,))
     monkeypatch.setattr("vjepa2_ac.calibration.data.probe_config", lambda *_, **__: probe)
     assert check(make_config(), tmp_path, "builtin:sim-tiny") == 0
     printed = capsys.readouterr().out.splitlines()
@@ -66,7 +70,7 @@ def test_a_variant_that_fits_better_is_a_warning_with_what_to_do_and_no_error(
 def test_a_run_is_a_model_too(make_config: MakeConfig) -> None:
     config = make_config()
     run = write_adapted_run(config)
-    trained, base = (probed(config, model).ratio.value for model in (str(run), str(config.model.base)))
+    trained, base = (probed(config, model).plain.ratio.value for model in (str(run), str(config.model.base)))
     assert trained != pytest.approx(base, rel=1e-3)
 
 
@@ -74,7 +78,7 @@ def test_without_a_validation_split_training_episodes_are_probed(
     make_config: MakeConfig, tmp_path: Path, capsys: Printed
 ) -> None:
     config = make_config(data__validation_share=0.0, data__test_share=0.0)
-    assert probed(config, str(config.model.base), clips=16).episodes == 8
+    assert probed(config, str(config.model.base), clips=16).plain.episodes == 8
     assert check(config, tmp_path, str(config.model.base)) == 1  # training could not validate
     printed = capsys.readouterr().out
     assert "error    validation" in printed
@@ -111,7 +115,7 @@ def test_a_latent_cache_is_probed_by_the_model_that_encoded_it_without_other_fra
         data__source="latents", data__path=str(cache), data__camera=None, data__frames=10, data__start_every=2
     )
     probe, expected = probed(config, base), probed(of_frames, base)
-    assert probe.ratio.value == pytest.approx(expected.ratio.value, rel=2e-3)  # kept in bfloat16
+    assert probe.plain.ratio.value == pytest.approx(expected.plain.ratio.value, rel=2e-3)  # kept in bfloat16
     assert names(probe) == names(expected) - {"red and blue exchanged", "frames mirrored"}
     differences = {one.name: one.difference.value for one in expected.results}
     for one in probe.results:

@@ -1,13 +1,14 @@
 """The stride of an oracle is found; an uncertain result is reported as uncertain."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from torch import Tensor
 
 from vjepa2_ac.calibration.strides import Calibration, calibrate
-from vjepa2_ac.calibration.variants import is_certainly_better
+from vjepa2_ac.calibration.variants import VariantResult
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.index import EpisodeTable
@@ -82,22 +83,24 @@ def calibrated(model: GoesOn, source: Tracks, progress: Progress = no_progress, 
 @pytest.mark.parametrize("learned", [4, 8, 15])
 def test_the_stride_that_a_model_has_learned_is_found(learned: int) -> None:
     found = calibrated(GoesOn(learned), Tracks([80] * 20, noise=0.1))
-    assert found.best.stride == learned
+    assert found.stride == learned
     assert found.is_certain
     assert "not certain" not in found.verdict()
 
 
 def test_ratios_are_those_computed_by_hand() -> None:
     found = calibrated(GoesOn(8), Tracks([80] * 5), clips=10)
-    assert [one.stride for one in found.results] == [4, 8, 15]
-    assert [one.ratio.value for one in found.results] == [
+    assert list(found.results) == [4, 8, 15]
+    assert [one.ratio.value for one in found.results.values()] == [
         pytest.approx(4 / 4, abs=1e-3), pytest.approx(0.0, abs=1e-3), pytest.approx(7 / 15, abs=1e-3),
     ]  # fmt: skip
-    assert [one.moved_cm for one in found.results] == [pytest.approx(stride / 10, rel=1e-3) for stride in (4, 8, 15)]
-    assert found.results[0].seconds_per_step == pytest.approx(4 / 15)
-    assert found.runner_up == 15
-    assert found.difference is not None
-    assert found.difference.value == pytest.approx(-7 / 15, abs=1e-3)
+    assert [one.moved_cm for one in found.results.values()] == [
+        pytest.approx(stride / 10, rel=1e-3) for stride in (4, 8, 15)
+    ]
+    assert found.as_dict()["strides"][0]["seconds_per_step"] == pytest.approx(4 / 15)
+    assert found.as_dict()["runner_up"] == 15
+    assert found.best.difference is not None
+    assert found.best.difference.value == pytest.approx(-7 / 15, abs=1e-3)
 
 
 def test_every_stride_is_measured_on_the_same_starts() -> None:
@@ -117,7 +120,7 @@ def test_every_stride_is_measured_on_the_same_starts() -> None:
 
 def test_a_model_that_does_nothing_is_certain_of_nothing() -> None:
     found = calibrated(GoesOn(0), Tracks([80] * 6, noise=0.2))
-    assert [one.ratio.value for one in found.results] == [1.0, 1.0, 1.0]
+    assert [one.ratio.value for one in found.results.values()] == [1.0, 1.0, 1.0]
     assert not found.is_certain
     assert "not certain" in found.verdict()
     assert "does it fit this data at all?" in found.verdict()
@@ -125,24 +128,24 @@ def test_a_model_that_does_nothing_is_certain_of_nothing() -> None:
 
 def test_a_handful_of_episodes_gives_an_interval_but_no_certainty() -> None:
     found = calibrated(GoesOn(8), Tracks([80] * 6, noise=0.1))
-    assert found.difference is not None
-    assert found.difference.high < 0
+    assert found.best.difference is not None
+    assert found.best.difference.high < 0
     assert not found.is_certain
     assert "not certain on" in found.verdict()
 
 
 def test_a_stride_that_fits_no_episode_is_named_and_the_others_are_measured() -> None:
     found = calibrated(GoesOn(4), Tracks([30] * 6))
-    assert [one.stride for one in found.results] == [4, 8]
+    assert list(found.results) == [4, 8]
     assert list(found.impossible) == [15]
     assert "46 steps for a clip of 4 frames at stride 15" in found.impossible[15]
 
 
 def test_one_long_episode_does_not_decide_for_all() -> None:
     found = calibrated(GoesOn(4), Tracks([30] * 6 + [80] * 1))
-    assert [one.stride for one in found.results] == [4, 8]
+    assert list(found.results) == [4, 8]
     assert "1 episode only" in found.impossible[15]
-    assert found.results[0].episodes >= 5
+    assert found.best.episodes >= 5
 
 
 def test_clips_are_shortened_to_eight_frames_by_default() -> None:
@@ -165,7 +168,7 @@ def test_clips_that_cannot_be_read_are_left_out_and_all_of_them_are_an_error(mon
     damaged = {int(dataset.windows("validation").episodes[0])}
     found = calibrate(GoesOn(8), encode, dataset, ClipSample(clips=200, batch_size=1))
     assert found.best.episodes == len(dataset.windows("validation").episodes) - 1
-    assert [one.clips for one in found.results] == [found.results[0].clips] * 3
+    assert [one.clips for one in found.results.values()] == [found.best.clips] * 3
     damaged = set(range(20))
     with pytest.raises(InputError, match="none of the clips can be read; broken episodes: track"):
         calibrate(GoesOn(8), encode, dataset, ClipSample(batch_size=4))
@@ -173,7 +176,8 @@ def test_clips_that_cannot_be_read_are_left_out_and_all_of_them_are_an_error(mon
 
 def test_the_best_of_several_is_certain_only_by_twice_its_interval() -> None:
     """Both were chosen on these clips: an interval that just leaves 0 out says little."""
-    narrow, wide = Estimate(-0.1, -0.13, -0.07), Estimate(-0.1, -0.18, -0.02)
-    assert is_certainly_better(narrow, 10, needed=10)
-    assert not is_certainly_better(wide, 10, needed=10)
-    assert not is_certainly_better(narrow, 9, needed=10)
+    result = VariantResult("one", Estimate(0.5, 0.4, 0.6), 0.2, 0.4, None, clips=10, episodes=10)
+    narrow, wide = (replace(result, difference=Estimate(-0.1, -0.1 - half, half - 0.1)) for half in (0.03, 0.08))
+    assert narrow.is_certainly_better(needed=10)
+    assert not wide.is_certainly_better(needed=10)
+    assert not narrow.is_certainly_better(needed=11)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from torch import Tensor
 
-from vjepa2_ac.evaluation.action_use import LandscapeGrid, RolloutStart, grid_axes, measure_landscapes, start_of
+from vjepa2_ac.evaluation.action_use import RolloutStart, grid_axes, measure_landscapes, start_of
 from vjepa2_ac.evaluation.result import Landscapes
 from vjepa2_ac.spaces import POSE_CHANGE
 from worlds import Copier, Oracle, clips_batch
@@ -18,8 +18,8 @@ def starts(**changes: object) -> list[RolloutStart]:
 
 
 def landscapes(model: object, **changes: object) -> Landscapes:
-    grid: dict[str, object] = {"space": POSE_CHANGE, "nodes": 7, "reach": 0.075} | changes
-    return measure_landscapes(model, starts(), LandscapeGrid(**grid), at_once=50)  # type: ignore[arg-type]
+    grid: dict[str, object] = {"nodes": 7, "reach": 0.075} | changes
+    return measure_landscapes(model, starts(), POSE_CHANGE, at_once=50, **grid)  # type: ignore[arg-type]
 
 
 def test_the_minimum_of_an_analytic_energy_is_at_the_true_action() -> None:
@@ -76,11 +76,7 @@ def test_clips_that_hardly_move_along_an_axis_have_no_sign_to_agree_with() -> No
     actions = batch.actions.clone()
     actions[..., 2] = 0.0
     still = clips_batch(CLIPS, actions=actions)
-    found = measure_landscapes(
-        Oracle(),
-        [start_of(still, clip, 0, clip) for clip in range(CLIPS)],
-        LandscapeGrid(POSE_CHANGE, nodes=5, reach=0.075),
-        at_once=99,
-    )
+    begun = [start_of(still, clip, 0, clip) for clip in range(CLIPS)]
+    found = measure_landscapes(Oracle(), begun, POSE_CHANGE, nodes=5, reach=0.075, at_once=99)
     assert found.sign_clips[2] == 0
     assert np.isnan(found.sign_agreement[2].value)

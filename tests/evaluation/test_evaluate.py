@@ -40,7 +40,7 @@ def evaluated(trained: object, base: object | None = None, *, size: int = 4, **c
     contenders.append(Contender("adapter", "trained", trained))  # type: ignore[arg-type]
     batch = clips_batch(actions=changes.pop("actions", None))  # type: ignore[arg-type]
     find_axes = changes.pop("find_axes", None)
-    return evaluate(contenders, again(batch, size), about(**changes), probes=replace(PROBES, find_axes=find_axes))  # type: ignore[arg-type]
+    return evaluate(contenders, again(batch, size), about(**changes), probes=PROBES, find_axes=find_axes)  # type: ignore[arg-type]
 
 
 def pair_of(found: Evaluation) -> tuple[PredictionErrors, PredictionErrors]:
@@ -71,10 +71,9 @@ def test_spread_and_discrepancy_of_the_rollouts_are_those_of_the_predicted_laten
     models = {name: model.distribution for name, model in found.models.items()}
     assert [one.value for one in models["adapter"].spread] == pytest.approx((traces[0] / traces[1]).tolist(), rel=1e-5)
     assert [one.value for one in models["base"].spread] == pytest.approx([1.0] * (TIME - 1))
-    assert [one.squared.value for one in models["base"].mmd] == pytest.approx([0.0] * (TIME - 1), abs=1e-9)
-    copies = found.persistence_distribution
-    assert [one.value for one in copies.copies.spread] == pytest.approx((traces[2] / traces[1]).tolist(), rel=1e-5)
-    assert len(copies.noise_floor) == TIME - 1
+    assert [one.value for one in models["base"].mmd] == pytest.approx([0.0] * (TIME - 1), abs=1e-9)
+    assert [one.value for one in found.copies.spread] == pytest.approx((traces[2] / traces[1]).tolist(), rel=1e-5)
+    assert len(found.noise_floor) == TIME - 1
 
 
 def test_a_model_that_ignores_actions_has_no_sensitivity_and_the_rank_of_chance() -> None:
@@ -110,7 +109,7 @@ def test_a_difference_is_what_is_computed_by_hand() -> None:
     differences = difference_to(errors, base, "teacher_forced")
     nothing = mean_error(errors, "teacher_forced", way="persistence")
     assert [one.value for one in differences] == pytest.approx([-one.value / 2 for one in nothing])
-    last = improvement(found, 4)
+    last = improvement(found)
     assert last is not None
     assert last.value == pytest.approx(0.5)
 

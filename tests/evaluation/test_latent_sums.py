@@ -77,11 +77,11 @@ def test_a_sketch_changes_no_estimate_and_hardly_an_interval(monkeypatch: pytest
 
 def test_discrepancy_is_of_latents_averaged_over_tokens() -> None:
     predicted, true = latents(1, spread=0.5), latents(2)
-    found = distribution_of(summed(predicted), summed(true)).mmd[1]
+    found = distribution_of(summed(predicted), summed(true))
     pooled = [values[:, 1].mean(dim=1).double().numpy() for values in (predicted, true)]
-    expected = discrepancy(pooled[0], pooled[1], IDS)
-    assert found.squared.value == pytest.approx(expected.squared.value, rel=1e-4)
-    assert found.p_value == pytest.approx(expected.p_value, abs=0.01)
+    expected, p_value = discrepancy(pooled[0], pooled[1], IDS)
+    assert found.mmd[1].value == pytest.approx(expected.value, rel=1e-4)
+    assert found.p_values[1] == pytest.approx(p_value, abs=0.01)
     assert all(floor > 0 for floor in latent_noise_floor(summed(true)))
 
 
@@ -90,7 +90,7 @@ def test_one_clip_has_no_spread_and_one_episode_no_interval() -> None:
     alone.add(latents(1)[:1], IDS[:1])
     found = distribution_of(alone, alone)
     assert all(math.isnan(one.value) for one in found.spread)
-    assert all(math.isnan(one.squared.value) for one in found.mmd)
+    assert all(math.isnan(one.value) for one in found.mmd)
     same = LatentSums()
     same.add(latents(1)[:3], ["only"] * 3)
     assert spread_of(same, same)[0].value == pytest.approx(1)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.evaluation.action_use import RolloutStart, moves_of, pool_of, rank_actions
+from vjepa2_ac.evaluation.action_use import ActionPool, RolloutStart, moves_of, rank_actions
 from vjepa2_ac.evaluation.estimates import rank_difference
 from vjepa2_ac.evaluation.measure import Predictor
 from vjepa2_ac.evaluation.result import ActionRanking
@@ -38,10 +38,12 @@ def moves(batch: LatentBatch, space: ActionSpace = POSE_CHANGE, reach: float = R
     return [move for clip in range(CLIPS) for move in moves_of(batch, clip, clip, space, reach)]
 
 
-def ranked(model: Predictor, batch: LatentBatch, samples: int = 40, seed: int = 0) -> ActionRanking:
-    begun = moves(batch)
-    pool = pool_of(begun, POSE_CHANGE, reach=REACH, samples=samples, seed=seed)
-    return rank_actions(model, begun, pool, at_once=16)
+def ranked(model: Predictor, batch: LatentBatch, samples: int = 40) -> ActionRanking:
+    return rank_actions(model, moves(batch), POSE_CHANGE, reach=REACH, samples=samples, seed=0, at_once=16)
+
+
+def pool_of(moves: list[RolloutStart], space: ActionSpace, samples: int) -> ActionPool:
+    return ActionPool(np.stack([move.true for move in moves]), ["an episode"] * len(moves), space, REACH, samples, 0)
 
 
 def test_a_move_is_the_longest_within_reach_there_and_back() -> None:
@@ -123,7 +125,7 @@ def test_the_shell_tells_a_direction_from_a_distance() -> None:
 
 def test_actions_on_the_shell_are_as_long_as_the_true_one_and_go_everywhere() -> None:
     (move, _), samples = moves(line(times=10))[:2], 4000
-    pool = pool_of([move], POSE_CHANGE, reach=REACH, samples=samples, seed=0)
+    pool = pool_of([move], POSE_CHANGE, samples)
     drawn = pool.on_shell(move, np.random.default_rng(0))
     assert np.linalg.norm(drawn[:, :3], axis=1) == pytest.approx(np.full(samples, 0.07))
     assert np.abs(drawn[:, :3].mean(axis=0)).max() < 0.005
@@ -136,7 +138,7 @@ def test_numbers_of_vectors_are_lengths_in_their_largest_change() -> None:
     space = vector_actions(3, "change")
     move = replace(moves(line())[0], action=torch.tensor([0.1, 0.0, 0.0]))
     others = replace(move, action=torch.tensor([0.0, 5.0, 0.0]))
-    drawn = pool_of([move, others], space, reach=0.0, samples=500, seed=0).on_shell(move, np.random.default_rng(0))
+    drawn = pool_of([move, others], space, 500).on_shell(move, np.random.default_rng(0))
     assert np.linalg.norm(drawn[:, :2] / [0.1, 5.0], axis=1) == pytest.approx(np.ones(500))
     assert not drawn[:, 2].any(), "what never changes is not changed"
 
@@ -144,6 +146,6 @@ def test_numbers_of_vectors_are_lengths_in_their_largest_change() -> None:
 def test_what_others_are_drawn_does_not_depend_on_the_moves_beside_it() -> None:
     batch = walked(0.02 * torch.randn(CLIPS, 4, 7, generator=torch.Generator().manual_seed(0)))
     begun = moves(batch)
-    pool = pool_of(begun, POSE_CHANGE, reach=REACH, samples=20, seed=3)
-    whole, last = (rank_actions(Halfway(), some, pool, at_once=7) for some in (begun, begun[-2:]))
+    how = {"reach": REACH, "samples": 20, "seed": 3, "at_once": 7}
+    whole, last = (rank_actions(Halfway(), some, POSE_CHANGE, **how) for some in (begun, begun[-2:]))  # type: ignore[arg-type]
     assert np.array_equal(whole.ranks[-2:], last.ranks)

@@ -190,11 +190,11 @@ def test_one_episode_gives_no_interval_and_no_certainty(tmp_path) -> None:
 
 
 def test_improvement_is_one_minus_the_ratio_of_errors() -> None:
-    gain = improvement(evaluation(model("base", 1.0, noise=0.0), model("adapter", 0.75)), horizon=2)
+    gain = improvement(evaluation(model("base", 1.0, noise=0.0), model("adapter", 0.75)))
     assert gain is not None
     assert gain.value == pytest.approx(0.25, abs=0.02)
     assert gain.low < gain.value < gain.high
-    assert improvement(evaluation(model("model", 0.5)), horizon=2) is None
+    assert improvement(evaluation(model("model", 0.5))) is None
 
 
 def test_the_spread_names_mean_and_range() -> None:

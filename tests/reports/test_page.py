@@ -161,7 +161,7 @@ def test_what_was_not_measured_is_named_with_the_reason() -> None:
     one = evaluation(with_base=False)
     adapter = replace(one.models["adapter"], sensitivity=None, landscapes=None, distribution=None)
     bare = replace(one, models={"adapter": adapter}, examples=(), training=(), strata=(), episodes=())
-    bare = replace(bare, persistence_distribution=None)
+    bare = replace(bare, copies=None)
     page = Page(report_page(bare))
     for what in (
         "Differences to the base", "Energy landscapes", "Example clips", "Training curves", "Other strides",

@@ -115,7 +115,7 @@ def test_what_it_learnt_is_a_base_that_the_same_robot_trains_on(
     evaluation = evaluate_subject(str(folder), QUICK).evaluation
     assert list(evaluation.models) == ["base", "adapter"]
     results = calibrate_config(make_robot(data__stride_candidates=[1, 2], **second), ClipSample(clips=4)).results
-    assert [one.moved_cm for one in results] == [None, None]
+    assert [one.moved_cm for one in results.values()] == [None, None]
 
 
 def test_a_head_that_nothing_trains_is_refused_before_the_model_is_loaded(

@@ -7,7 +7,7 @@ At each candidate stride, the same clips begin at the same control steps of the 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -16,15 +16,7 @@ import numpy as np
 import torch
 from accelerate import Accelerator
 
-from vjepa2_ac.calibration.variants import (
-    SameClips,
-    Variant,
-    VariantErrors,
-    is_certainly_better,
-    load_named,
-    measure_variants,
-    ratios_by_name,
-)
+from vjepa2_ac.calibration.variants import Variant, VariantResult, load_named, measure_variants
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset, open_dataset
@@ -35,61 +27,47 @@ from vjepa2_ac.episode import Batch, LatentBatch, Progress, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.measure import ClipSample, Predictor
 from vjepa2_ac.evaluation.result import Row
-from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
-from vjepa2_ac.spaces import ActionSpace
 
 _EPISODES_NEEDED = 2  # for an interval
 _EPISODES_TO_BE_SURE = 10  # an interval from fewer is too narrow
 
 
 @dataclass(frozen=True)
-class StrideResult:
-    """The one-step, teacher-forced error of a model at one stride."""
-
-    stride: int
-    seconds_per_step: float
-    ratio: Estimate  # of the error to that of copying the frame before
-    error: float  # mean over clips
-    persistence: float
-    moved_cm: float | None  # median distance of the flange per model step; None: the states are no poses
-    clips: int
-    episodes: int
-
-
-@dataclass(frozen=True)
 class Calibration:
     """The results at each stride, and the best one."""
 
-    results: tuple[StrideResult, ...]
-    impossible: dict[int, str]  # stride -> why it could not be measured
+    results: Mapping[int, VariantResult]  # that of the best one is compared with the runner-up
+    impossible: Mapping[int, str]  # stride -> why it could not be measured
     frames: int
     split: Split
-    runner_up: int | None  # the second-best stride
-    difference: Estimate | None  # of the two best ratios, the best's minus the other's, paired by clip
+    rate_hz: float  # control steps per second
 
     @property
-    def best(self) -> StrideResult:
-        """The stride with the lowest ratio."""
-        return min(self.results, key=lambda one: one.ratio.value)
+    def stride(self) -> int:
+        """The stride with the lowest ratio of error and persistence."""
+        return _by_ratio(self.results)[0]
+
+    @property
+    def best(self) -> VariantResult:
+        """Its result."""
+        return self.results[self.stride]
 
     @property
     def is_certain(self) -> bool:
         """Whether the best stride is certainly better than the next, which were both chosen on these clips."""
-        difference, needed = self.difference, _EPISODES_TO_BE_SURE
-        return difference is not None and is_certainly_better(difference, self.best.episodes, needed=needed)
+        return self.best.is_certainly_better(needed=_EPISODES_TO_BE_SURE)
 
     def verdict(self) -> str:
         """Return as text the best stride, and how certain it is."""
-        best, difference = self.best, self.difference
-        words = (
-            f"Best: stride {best.stride} ({best.seconds_per_step:.2f} s per model step), error/persistence {best.ratio}"
-        )
+        best, difference = self.best, self.best.difference
+        seconds = self.stride / self.rate_hz
+        words = f"Best: stride {self.stride} ({seconds:.2f} s per model step), error/persistence {best.ratio}"
         if difference is None:
             words += "; there is no other to compare with"
         else:
-            words += f"; {-difference.value:.3f} below stride {self.runner_up}"
+            words += f"; {-difference.value:.3f} below stride {_by_ratio(self.results)[1]}"
             if difference.has_interval:
                 words += f" (95 % interval {-difference.high:.3f} to {-difference.low:.3f})"
             words += "" if self.is_certain else f": not certain on {best.episodes} episodes, try more"
@@ -100,45 +78,50 @@ class Calibration:
     def lines(self) -> list[str]:
         """Return the results as lines of text, the verdict last."""
         results = [
-            f"  stride {one.stride} ({one.seconds_per_step:.2f} s): error/persistence {one.ratio},"
-            f" {one.clips} clips of {one.episodes} episodes"
-            for one in self.results
+            f"  {one.name}: error/persistence {one.ratio}, {one.clips} clips of {one.episodes} episodes"
+            for one in self.results.values()
         ]
         return [*results, *(f"  stride {n}: not possible: {why}" for n, why in self.impossible.items()), self.verdict()]
 
     def rows(self, model: str) -> list[Row]:
         """Return the error at each stride as rows of an evaluation."""
         group = "One-step L1 error / persistence by stride"
-        impossible = [
+        rows = [
             Row(group, f"stride {stride}", f"strides.{stride}", model, math.nan, note=why, detail=True)
             for stride, why in self.impossible.items()
         ]
-        return impossible + [
-            Row(
-                group, f"stride {one.stride} ({one.seconds_per_step:.2f} s)", f"strides.{one.stride}", model,
-                one.ratio.value, one.ratio.low, one.ratio.high, chance=1.0, detail=True,
-            )
-            for one in self.results
-        ]  # fmt: skip
+        for stride, one in self.results.items():
+            numbers = one.ratio.value, one.ratio.low, one.ratio.high
+            rows.append(Row(group, one.name, f"strides.{stride}", model, *numbers, chance=1.0, detail=True))
+        return rows
 
     def as_dict(self) -> dict[str, Any]:
         """Return all metrics as plain values, for `calibration.json`."""
-        names = ("stride", "seconds_per_step", "error", "persistence", "moved_cm", "clips", "episodes")
-        strides = [
-            {**{name: getattr(one, name) for name in names}, "error_over_persistence": one.ratio.as_dict()}
-            for one in self.results
-        ]
+        names, difference = ("error", "persistence", "moved_cm", "clips", "episodes"), self.best.difference
         return {
-            "stride": self.best.stride,
+            "stride": self.stride,
             "certain": self.is_certain,
             "verdict": self.verdict(),
             "split": self.split,
             "frames": self.frames,
-            "strides": strides,
+            "strides": [
+                {
+                    "stride": stride,
+                    "seconds_per_step": stride / self.rate_hz,
+                    **{name: getattr(one, name) for name in names},
+                    "error_over_persistence": one.ratio.as_dict(),
+                }
+                for stride, one in self.results.items()
+            ],
             "impossible": {str(stride): why for stride, why in self.impossible.items()},
-            "runner_up": self.runner_up,
-            "difference": None if self.difference is None else self.difference.as_dict(),
+            "runner_up": _by_ratio(self.results)[1] if len(self.results) > 1 else None,
+            "difference": None if difference is None else difference.as_dict(),
         }
+
+
+def _by_ratio(results: Mapping[int, VariantResult]) -> list[int]:
+    """Return the strides, the best first."""
+    return sorted(results, key=lambda stride: results[stride].ratio.value)
 
 
 def calibrate_config(
@@ -219,40 +202,21 @@ def calibrate(
     views = {stride: replace(dataset, config=settings.with_stride(stride)) for stride in strides}
     possible, impossible = _possible(views, split)
     windows = validation_windows(views[possible[-1]], split, clips=sample.clips)
-    variants = [Variant(str(stride), partial(_at_stride, views[stride])) for stride in reversed(possible)]
-    clips = SameClips(dataset, windows, sample.batch_size)
-    measured = measure_variants(model, encode, clips, variants, progress)
-    ratios = ratios_by_name(measured)
-    best, *others = sorted(possible, key=lambda stride: ratios[str(stride)])
-    space = dataset.spaces.action
-    return Calibration(
-        tuple(_result(measured[str(stride)], stride, stride / rate, space) for stride in possible),
-        impossible,
-        frames,
-        split,
-        others[0] if others else None,
-        measured[str(best)].minus(measured[str(others[0])]) if others else None,
-    )
+    widest_first = possible[::-1]
+    variants = [Variant(str(stride), partial(_at_stride, views[stride])) for stride in widest_first]
+    found = measure_variants(model, encode, dataset, windows, variants, batch_size=sample.batch_size, progress=progress)
+    measured, space = dict(zip(widest_first, found, strict=True)), dataset.spaces.action
+    results = {
+        stride: measured[stride].result(f"stride {stride} ({stride / rate:.2f} s)", space) for stride in possible
+    }
+    if len(results) > 1:
+        best, second, *_ = _by_ratio(results)
+        results[best] = measured[best].result(results[best].name, space, beside=measured[second])
+    return Calibration(results, impossible, frames, split, rate)
 
 
 def _at_stride(view: Dataset, dataset: Dataset) -> Dataset:
     return replace(view, source=dataset.source)
-
-
-def _result(measured: VariantErrors, stride: int, seconds_per_step: float, space: ActionSpace) -> StrideResult:
-    moved_cm = None
-    if space.position is not None:
-        moved_cm = float(np.median(space.shown_size(measured.actions.reshape(-1, measured.actions.shape[-1]))))
-    return StrideResult(
-        stride=stride,
-        seconds_per_step=seconds_per_step,
-        ratio=measured.ratio,
-        error=float(measured.errors.mean()),
-        persistence=float(measured.persistence.mean()),
-        moved_cm=moved_cm,
-        clips=len(measured.clips),
-        episodes=len(set(measured.episode_ids)),
-    )
 
 
 def _possible(views: dict[int, Dataset], split: Split) -> tuple[list[int], dict[int, str]]:

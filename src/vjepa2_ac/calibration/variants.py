@@ -5,7 +5,7 @@ A model's one-step error over persistence is lowest where frames, states and act
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -18,23 +18,16 @@ from vjepa2_ac.data.loader import batches_of
 from vjepa2_ac.encoding.batch import require_same_encoder, require_widths
 from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, EpisodeSource, LatentBatch, Progress, StepRanges, no_progress
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.measure import Predictor, one_step_errors
+from vjepa2_ac.evaluation.measure import ONE_STEP, Predictor, measured
+from vjepa2_ac.evaluation.result import L1
 from vjepa2_ac.intervals import Estimate, ratio, ratio_difference
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.runs.folder import is_run
 from vjepa2_ac.runs.loading import load_run
+from vjepa2_ac.spaces import ActionSpace
 
 _MARGIN = 2.0  # half-widths of the 95 % interval: the best of several is easily better by chance
-
-
-@dataclass(frozen=True)
-class SameClips:
-    """The clips on which variants are compared."""
-
-    dataset: Dataset
-    windows: Sequence[tuple[int, int]]  # episode and first control step
-    batch_size: int  # clips that are computed together
 
 
 @dataclass(frozen=True)
@@ -44,94 +37,116 @@ class Variant:
     name: str
     view: Callable[[Dataset], Dataset]
     has_frames: bool = True  # False: they are those of the first variant, whose latents are taken
+    repair: str = ""  # the fix, if it fits better
+
+
+@dataclass(frozen=True)
+class VariantResult:
+    """The one-step, teacher-forced error of a model under a variant."""
+
+    name: str
+    ratio: Estimate  # of the error to that of copying the frame before
+    error: float  # mean over clips
+    persistence: float
+    moved_cm: float | None  # median distance of the flange per model step; None: the states are no poses
+    clips: int
+    episodes: int
+    difference: Estimate | None = None  # of the ratio to another variant's on the same clips; below 0: fits better
+    repair: str = ""
+
+    @property
+    def gain(self) -> float:
+        """By how much the ratio is below the other variant's."""
+        return 0.0 if self.difference is None else -self.difference.value
+
+    def is_certainly_better(self, *, needed: int) -> bool:
+        """Return whether the difference is below 0 by twice its interval: the variant was chosen on these clips.
+
+        Args:
+            needed: Episodes; with fewer, an interval is too narrow.
+        """
+        if self.difference is None or not self.difference.has_interval or self.episodes < needed:
+            return False
+        return self.difference.value + _MARGIN * (self.difference.high - self.difference.value) < 0
 
 
 @dataclass(frozen=True)
 class VariantErrors:
     """What was measured of one variant, clip by clip."""
 
-    errors: Float[np.ndarray, " clips"]  # one-step, teacher-forced L1
-    persistence: Float[np.ndarray, " clips"]
+    errors: Float[np.ndarray, "2 clips"]  # one-step, teacher-forced L1 of the model and of persistence
     actions: Float[np.ndarray, "clips steps action_dim"]
     clips: tuple[tuple[str, int], ...]  # episode and first control step
 
-    @classmethod
-    def joined(cls, parts: Sequence[VariantErrors]) -> VariantErrors:
-        """Return all clips of some batches."""
-        return cls(
-            np.concatenate([one.errors for one in parts]),
-            np.concatenate([one.persistence for one in parts]),
-            np.concatenate([one.actions for one in parts]),
-            tuple(clip for one in parts for clip in one.clips),
-        )
+    def result(
+        self, name: str, space: ActionSpace, *, beside: VariantErrors | None = None, repair: str = ""
+    ) -> VariantResult:
+        """Return what it comes to, compared with another variant."""
+        ids, moved_cm = [episode for episode, _ in self.clips], None
+        if space.position is not None:
+            moved_cm = float(np.median(space.shown_size(self.actions.reshape(-1, self.actions.shape[-1]))))
+        error, persistence = (float(one.mean()) for one in self.errors)
+        difference = None if beside is None else self._minus(beside)
+        of_model, of_nothing = self.errors
+        return VariantResult(
+            name, ratio(of_model, of_nothing, ids), error, persistence, moved_cm, len(ids), len(set(ids)), difference,
+            repair,
+        )  # fmt: skip
 
-    @property
-    def episode_ids(self) -> tuple[str, ...]:
-        """The episode of each clip."""
-        return tuple(episode for episode, _ in self.clips)
-
-    @property
-    def ratio(self) -> Estimate:
-        """The error over persistence."""
-        return ratio(self.errors, self.persistence, self.episode_ids)
-
-    def minus(self, other: VariantErrors) -> Estimate:
-        """Return the ratio minus another variant's, paired by clip; below 0 is better."""
+    def _minus(self, other: VariantErrors) -> Estimate:
+        """Return the ratio minus another variant's, paired by clip."""
         places = {clip: place for place, clip in enumerate(other.clips)}
         pairs = [(place, places[clip]) for place, clip in enumerate(self.clips) if clip in places]
         mine, theirs = (np.array(side, dtype=np.int64) for side in zip(*pairs, strict=True))
-        ids = [self.episode_ids[place] for place in mine]
-        return ratio_difference(
-            (self.errors[mine], self.persistence[mine]), (other.errors[theirs], other.persistence[theirs]), ids
-        )
-
-
-def is_certainly_better(difference: Estimate, episodes: int, *, needed: int) -> bool:
-    """Return whether a difference of ratios is below 0 by twice its interval: the variant was chosen on these clips.
-
-    Args:
-        difference: As of `VariantErrors.minus`.
-        episodes: From how many it is.
-        needed: With fewer, an interval is too narrow.
-    """
-    limit = difference.value + _MARGIN * (difference.high - difference.value)
-    return difference.has_interval and episodes >= needed and limit < 0
+        ids = [self.clips[place][0] for place in mine]
+        one, persistence = self.errors[:, mine]
+        return ratio_difference((one, persistence), (other.errors[0, theirs], other.errors[1, theirs]), ids)
 
 
 def measure_variants(
     model: Predictor,
     encode: Callable[[Batch], LatentBatch],
-    clips: SameClips,
+    dataset: Dataset,
+    windows: Sequence[tuple[int, int]],
     variants: Sequence[Variant],
+    *,
+    batch_size: int,
     progress: Progress = no_progress,
-) -> dict[str, VariantErrors]:
+) -> list[VariantErrors]:
     """Measure a model's one-step error on the same clips under each variant; each episode is read once for all.
 
     Args:
         model: The predictor.
         encode: Turns a batch of pixels into latents on the model's device.
-        clips: What to measure on.
+        dataset: The source of clips.
+        windows: Episode and first control step of each.
         variants: The first one decides which clips can be read.
+        batch_size: Clips that are computed together.
         progress: Called with (clips done, clips in total), of all variants.
 
     Raises:
         InputError: A clip cannot be read; or, by `data.broken_episodes`, none of them.
     """
-    first, *others = variants
-    dataset, windows = clips.dataset, clips.windows
-    parts: dict[str, list[VariantErrors]] = {variant.name: [] for variant in variants}
+    first = variants[0]
+    parts: list[list[VariantErrors]] = [[] for _ in variants]
     done = 0
-    for batch in batches_of(first.view(dataset), windows, batch_size=clips.batch_size):
-        latents, here = encode(batch), _windows_of(dataset, batch)
-        read = replace(dataset, source=_RememberingSource(dataset.source))
-        for variant, found in (
-            (first, [latents]),
-            *((one, _read(one, read, here, encode, latents)) for one in others),
-        ):
-            parts[variant.name] += [_measured(model, each) for each in found]
+    for batch in batches_of(first.view(dataset), windows, batch_size=batch_size):
+        latents, read = encode(batch), replace(dataset, source=ReadOnce(dataset.source))
+        places = [dataset.table.find(name) for name in batch.episode_ids]
+        here = [(place, start) for place, start in zip(places, batch.starts, strict=True) if place is not None]
+        for variant, found in zip(variants, parts, strict=True):
+            seen = [latents] if variant is first else _read(variant, read, here, encode, latents)
+            found += [_measured(model, each) for each in seen]
             done += len(batch.starts)
             progress(done, len(windows) * len(variants))
-    return {name: VariantErrors.joined(found) for name, found in parts.items()}
+    return [
+        VariantErrors(
+            np.concatenate([one.errors for one in found], axis=1),
+            np.concatenate([one.actions for one in found]),
+            tuple(clip for one in found for clip in one.clips),
+        )
+        for found in parts
+    ]
 
 
 def _read(
@@ -151,28 +166,34 @@ def _read(
 
 
 def _measured(model: Predictor, latents: LatentBatch) -> VariantErrors:
+    found = measured(model, latents, ONE_STEP, (L1,))
+    errors = np.stack([found.of("teacher_forced", L1, way).mean(axis=1) for way, _ in ONE_STEP])
     clips = tuple(zip(latents.episode_ids, latents.starts, strict=True))
-    return VariantErrors(*one_step_errors(model, latents), latents.actions.cpu().numpy().astype(np.float64), clips)
-
-
-def _windows_of(dataset: Dataset, batch: Batch) -> list[tuple[int, int]]:
-    places = [dataset.table.find(name) for name in batch.episode_ids]
-    return [(place, start) for place, start in zip(places, batch.starts, strict=True) if place is not None]
+    return VariantErrors(errors, latents.actions.cpu().numpy().astype(np.float64), clips)
 
 
 @dataclass(frozen=True)
-class _RememberingSource:
-    """A source that reads each episode once: a remote one, or one in a large record, takes long."""
+class ReadOnce:
+    """A source of which each episode is read once: a remote one, or one in a large record, takes long. It is changed.
+
+    Args:
+        source: The source.
+        change: What is done to each episode.
+        episodes: Those that were read.
+    """
 
     source: EpisodeSource
+    change: Callable[[Episode], Episode] = lambda episode: episode
     episodes: dict[tuple[int, str | None], Episode] = field(default_factory=dict)
 
     def infos(self, progress: Progress | None = None) -> Sequence[EpisodeInfo]:
+        """Return the infos of the source."""
         return self.source.infos(progress)
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:
+        """Return an episode, changed."""
         if (index, camera) not in self.episodes:
-            self.episodes[index, camera] = self.source.read(index, camera, needed)
+            self.episodes[index, camera] = self.change(self.source.read(index, camera, needed))
         return self.episodes[index, camera]
 
 
@@ -206,8 +227,3 @@ def require_learned(model: ModelConfig) -> None:
             needed="one that can say which stride it was trained at",
             fix="Set data.stride to a number, or name another model with model.base (data calibrate: --model)",
         )
-
-
-def ratios_by_name(measured: Mapping[str, VariantErrors]) -> dict[str, float]:
-    """Return the error over persistence of each variant, without intervals."""
-    return {name: float(one.errors.sum() / one.persistence.sum()) for name, one in measured.items()}

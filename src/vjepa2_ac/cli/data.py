@@ -122,7 +122,7 @@ def check_and_print(config: Config, *, clips: int = 32) -> int:
 def _probe(config: Config, model: str, *, clips: int) -> None:
     from vjepa2_ac.calibration.data import probe_config
     from vjepa2_ac.console.progress import ConsoleReporter, show
-    from vjepa2_ac.console.tables import print_finding, probe_table
+    from vjepa2_ac.console.tables import print_finding, variants_table
     from vjepa2_ac.data.dataset import open_dataset
     from vjepa2_ac.inspection.excerpts import Finding
     from vjepa2_ac.inspection.statistics import at_some_stride
@@ -130,7 +130,8 @@ def _probe(config: Config, model: str, *, clips: int) -> None:
     dataset = at_some_stride(open_dataset(config.data))
     with ConsoleReporter() as reporter:
         probe = probe_config(config, dataset, model=model, clips=clips, progress=reporter.task("probing"))
-    show(probe_table(probe))
+    title = "One-step error / persistence of the data, read otherwise"
+    show(variants_table(title, [probe.plain, *probe.results], ["difference"]))
     print_finding(Finding("warning" if probe.better else "ok", "probe", probe.verdict()))
 
 
@@ -185,7 +186,7 @@ def _calibrate(options: argparse.Namespace) -> int:
 
     from vjepa2_ac.calibration.strides import calibrate_config
     from vjepa2_ac.console.progress import ConsoleReporter, show
-    from vjepa2_ac.console.tables import calibration_table
+    from vjepa2_ac.console.tables import variants_table
     from vjepa2_ac.evaluation.measure import ClipSample
     from vjepa2_ac.storage import write_atomically
 
@@ -194,7 +195,11 @@ def _calibrate(options: argparse.Namespace) -> int:
         calibration = calibrate_config(config, sample, model=options.model, reporter=reporter)
     path = options.out / "calibration.json"
     write_atomically(path, json.dumps(calibration.as_dict(), indent=1).encode())
-    show(calibration_table(calibration), calibration.verdict(), files=[path])
+    title = f"One-step error / persistence on {options.split} episodes, {calibration.frames} frames a clip"
+    columns = ["error", "persistence", "moves by", "clips (episodes)"]
+    table = variants_table(title, list(calibration.results.values()), columns, calibration.best)
+    reasons = [f"stride {stride} is not possible: {reason}" for stride, reason in calibration.impossible.items()]
+    show(table, *reasons, calibration.verdict(), files=[path])
     return 0
 
 
@@ -213,12 +218,15 @@ def _calibrate_axes(options: argparse.Namespace, config: Config) -> int:
 
     from vjepa2_ac.calibration.axes import calibrate_axes
     from vjepa2_ac.console.progress import ConsoleReporter, show
-    from vjepa2_ac.console.tables import axes_table
+    from vjepa2_ac.console.tables import row_tables
     from vjepa2_ac.reports.figures.planning import plot_axes
+    from vjepa2_ac.storage import write_atomically
+    from vjepa2_ac.storage.structured import json_text
 
     with ConsoleReporter() as reporter:
         pairs = options.limit or _PAIRS
-        found = calibrate_axes(config, options.axes, pairs=pairs, split=options.split, reporter=reporter)
-    files = [found.write(options.out / AXES_FILE), plot_axes(found.fit, options.out / "axes.png")]
-    show(axes_table({options.axes: found.fit}), found.verdict(), files=files)
-    return int(found.fit.problem is not None)
+        fit, content = calibrate_axes(config, options.axes, pairs=pairs, split=options.split, reporter=reporter)
+    write_atomically(options.out / AXES_FILE, json_text(content))
+    files = [options.out / AXES_FILE, plot_axes(fit, options.out / "axes.png")]
+    show(*row_tables(fit.rows(options.axes), "Yaw of least error, and fit of moves"), fit.words(), files=files)
+    return int(fit.problem is not None)

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from vjepa2_ac.distances import absolute_difference
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.evaluation.measure import Predictor, prediction
 from vjepa2_ac.evaluation.result import L1, Clips, Example, PredictionErrors, Stratum
 from vjepa2_ac.geometry import matrices_from_euler
 from vjepa2_ac.spaces import ActionSpace
@@ -102,12 +101,6 @@ def chosen_clips(errors: PredictionErrors, moved: Float[np.ndarray, " clips"], c
     for why, clip in wanted.items():
         chosen[clip] = f"{chosen[clip]}, {why}" if clip in chosen else why
     return dict(list(chosen.items())[:count])
-
-
-@torch.no_grad()
-def predicted_rollout(model: Predictor, batch: LatentBatch, row: int) -> Float[Tensor, "horizon tokens dim"]:
-    """Return a model's prediction of one clip from its first frame, in float32 on the CPU."""
-    return prediction(model, batch.clip(row))[0].float().cpu()
 
 
 def make_example(

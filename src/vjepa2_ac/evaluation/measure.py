@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, product
-from typing import NamedTuple, Protocol, get_args, runtime_checkable
+from typing import Protocol, get_args, runtime_checkable
 
 import numpy as np
 import torch
@@ -115,19 +115,6 @@ def prediction_errors(
     """
     pairs = with_other_actions(batches)
     return joined([measured(model, batch, VALIDATED, metrics, others) for batch, others in pairs])
-
-
-class OneStepErrors(NamedTuple):
-    """The teacher-forced L1 error of each clip."""
-
-    one_step: Float[np.ndarray, " clips"]
-    persistence: Float[np.ndarray, " clips"]
-
-
-def one_step_errors(model: Predictor, batch: LatentBatch) -> OneStepErrors:
-    """Return the one-step error of a model on each clip, and that of persistence."""
-    found = measured(model, batch, ONE_STEP, (L1,))
-    return OneStepErrors(*(found.of("teacher_forced", L1, way).mean(axis=1) for way, _ in ONE_STEP))
 
 
 def with_other_actions(

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import base64
-import math
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
@@ -22,7 +20,7 @@ from vjepa2_ac.evaluation.result import L1, EpisodeScore, Evaluation, Row, RowTa
 from vjepa2_ac.evaluation.rows import rows_of
 from vjepa2_ac.evaluation.verdict import verdict
 from vjepa2_ac.media.jpeg import encode_jpeg
-from vjepa2_ac.reports.figures import evaluation as figures
+from vjepa2_ac.reports.figures.evaluation import decoded_strip, drawings, example_strip
 from vjepa2_ac.reports.figures.film import draw_strip
 from vjepa2_ac.reports.figures.page import svg_of, visible
 from vjepa2_ac.storage import write_atomically
@@ -33,7 +31,21 @@ _JPEG_QUALITIES = (85, 70, 50, 30)
 _BYTES = 3_000_000  # of all clips together
 _COLOURS = {1: "better", 0: "unclear", -1: "worse"}
 
-Draw = Callable[[Any], None]  # on a figure
+_PARTS = {  # title, and how the keys of the rows begin; what it means stands in the template
+    "errors": ("Error by horizon", r"(rollout|teacher_forced)\.\w+\.(over_pers|error)"),
+    "base": ("Compared with the base", r"(rollout|teacher_forced)\.|one_step_gain"),
+    "spread": ("Is it as varied as the truth?", "spread|latent_mmd"),
+    "steps": ("Where it helps: moving and idle, small and large actions", "one_step"),
+    "actions": ("Does it use the actions?", "cost_of|gap_of|sensitivity|ranking|axes"),
+    "landscapes": ("Energy landscapes", "landscapes"),
+    "planning": ("Plans beside demonstrations", "plans"),
+    "episodes": ("Episodes, best and worst", "$^"),
+    "examples": ("Example clips", "$^"),
+    "decoded": ("What the model imagines, decoded", "decoded"),
+    "training": ("Training", "$^"),
+    "strides": ("Length of a model step", "strides"),
+    "others": ("Further measurements", ""),
+}
 
 
 @dataclass(frozen=True)
@@ -47,23 +59,14 @@ class PageImage:
 
 @dataclass(frozen=True)
 class PagePart:
-    """A part of the page; what it means stands in the template."""
+    """A part of the page."""
 
     id: str
     title: str
-    sections: tuple[RowTable, ...] = ()
-    details: tuple[RowTable, ...] = ()  # folded
-    images: tuple[PageImage, ...] = ()
-    notes: tuple[str, ...] = ()
-
-
-@dataclass
-class _Plan:
-    """What a part is made of, besides the rows whose keys begin so."""
-
-    title: str
-    keys: tuple[str, ...] = ()
-    draw: dict[str, tuple[float, float, Draw]] = field(default_factory=dict)  # description -> inches, and how
+    sections: Sequence[RowTable]
+    details: Sequence[RowTable]  # folded
+    images: Sequence[PageImage]
+    notes: Sequence[str]
 
 
 def write_report(evaluation: Evaluation, path: Path) -> Path:
@@ -102,110 +105,27 @@ def report_page(evaluation: Evaluation) -> str:
 
 
 def _parts(evaluation: Evaluation, rows: Sequence[Row]) -> list[PagePart]:
-    plans = _plans(evaluation)
-    of_part: dict[str, list[Row]] = {name: [] for name in plans}
+    of_part: dict[str, list[Row]] = {name: [] for name in _PARTS}
     for row in rows:
-        place = next((name for name, plan in plans.items() if re.match("|".join(plan.keys) or "$^", row.key)), "others")
-        of_part[place].append(row)
+        of_part[next(name for name, (_, keys) in _PARTS.items() if re.match(keys, row.key))].append(row)
+    images: dict[str, list[PageImage]] = {name: [] for name in _PARTS} | {"examples": _examples(evaluation)}
+    for one in drawings(evaluation):
+        url = svg_of(partial(one.draw, evaluation=evaluation), one.width, one.height)
+        images[one.part].append(PageImage(url, one.described))
+    notes = {
+        "decoded": () if evaluation.decoded is None else evaluation.decoded.notes,
+        "strides": tuple(str(one.as_dict().get("verdict", "")) for one in evaluation.beside.values()),
+    }
     parts = []
-    for name, plan in plans.items():
-        images = [PageImage(svg_of(draw, *size), described) for described, (*size, draw) in plan.draw.items()]
+    for name, (title, _) in _PARTS.items():
         shown = {row.group for row in of_part[name] if not row.detail}
         tables = sections(of_part[name])
-        parts.append(
-            PagePart(
-                name,
-                plan.title,
-                tuple(one for one in tables if one.title in shown or len(tables) == 1),
-                tuple(one for one in tables if one.title not in shown and len(tables) > 1),
-                tuple(images),
-            )
-        )
-    extra: dict[str, dict[str, Any]] = {
-        "episodes": {"sections": _episodes(evaluation.episodes)},
-        "examples": {"images": _examples(evaluation)},
-        "decoded": {"notes": () if evaluation.decoded is None else evaluation.decoded.notes},
-        "strides": {"notes": tuple(str(one.as_dict().get("verdict", "")) for one in evaluation.beside.values())},
-    }
-    return [
-        PagePart(**{**vars(part), **extra.get(part.id, {})})
-        for part in parts
-        if part.id != "others" or of_part["others"]
-    ]
-
-
-def _plans(evaluation: Evaluation) -> dict[str, _Plan]:
-    """Return the parts of the page in their order, with the figures that can be drawn."""
-    e, models = evaluation, evaluation.models.values()
-    plans = {
-        "errors": _Plan("Error by horizon", (r"(rollout|teacher_forced)\.\w+\.(over_pers|error)",)),
-        "base": _Plan("Compared with the base", (r"(rollout|teacher_forced)\.", "one_step_gain")),
-        "spread": _Plan("Is it as varied as the truth?", ("spread", "latent_mmd")),
-        "steps": _Plan("Where it helps: moving and idle, small and large actions", ("one_step",)),
-        "actions": _Plan("Does it use the actions?", ("cost_of", "gap_of", "sensitivity", "ranking", "axes")),
-        "landscapes": _Plan("Energy landscapes", ("landscapes",)),
-        "planning": _Plan("Plans beside demonstrations", ("plans",)),
-        "episodes": _Plan("Episodes, best and worst"),
-        "examples": _Plan("Example clips"),
-        "decoded": _Plan("What the model imagines, decoded", ("decoded",)),
-        "training": _Plan("Training"),
-        "strides": _Plan("Length of a model step", ("strides",)),
-        "others": _Plan("Further measurements"),
-    }
-    forced = partial(figures.draw_errors, mode="teacher_forced")
-    plans["errors"].draw = {
-        "Open-loop L1 error over persistence by horizon": (
-            6.4,
-            3.6,
-            partial(_on_axes, draw=figures.draw_errors, evaluation=e),
-        ),
-        "Teacher-forced L1 error over persistence by horizon": (6.4, 3.6, partial(_on_axes, draw=forced, evaluation=e)),
-    }
-    if e.base is not None:
-        plans["base"].draw = {
-            "Gain over the base by horizon": (6.4, 3.4, partial(_on_axes, draw=figures.draw_gains, evaluation=e))
-        }
-    if any(model.distribution and math.isfinite(model.distribution.spread[-1].value) for model in models):
-        plans["spread"].draw = {
-            "Spread by horizon": (6.4, 3.4, partial(_on_axes, draw=figures.draw_spread, evaluation=e))
-        }
-    plans["actions"].draw = {
-        "One-step error with other actions": (
-            6.4,
-            3.0,
-            partial(_on_axes, draw=figures.draw_use_of_actions, evaluation=e),
-        )
-    }
-    if any(model.sensitivity for model in models):
-        plans["actions"].draw["Ranks of the true action"] = (
-            6.4,
-            3.4,
-            partial(_on_axes, draw=figures.draw_ranks, evaluation=e),
-        )
-    if clips := figures.landscape_clips(e):
-        rows = len(clips) * (2 if e.base and e.models[e.base].landscapes else 1)
-        drawn = partial(figures.draw_landscapes, evaluation=e)
-        plans["landscapes"].draw = {
-            "Energy around the true action: cross; lowest energy: ring": (9.0, 2.6 * rows, drawn)
-        }
-    if e.planning is not None:
-        plans["planning"].draw = {"Ends of plans": (11.0, 3.6, partial(figures.draw_plans, evaluation=e))}
-    if e.episodes:
-        plans["episodes"].draw = {
-            "Error of every episode": (6.4, 3.0, partial(_on_axes, draw=figures.draw_episodes, evaluation=e))
-        }
-    if e.decoded is not None:
-        plans["decoded"].draw = {
-            "PSNR by horizon": (6.4, 3.6, partial(_on_axes, draw=figures.draw_decoded, evaluation=e))
-        }
-    if charts := len(figures.training_charts(e.training)):
-        drawn = partial(figures.draw_training, evaluation=e)
-        plans["training"].draw = {"Metrics over optimizer steps": (11.0, 2.8 * -(-charts // 3), drawn)}
-    return plans
-
-
-def _on_axes(figure: Any, draw: Callable[[Any, Evaluation], None], evaluation: Evaluation) -> None:
-    draw(figure.subplots(), evaluation)
+        open_ones = [one for one in tables if one.title in shown or len(tables) == 1]
+        details = [one for one in tables if one not in open_ones]
+        open_ones += _episodes(evaluation.episodes) if name == "episodes" else []
+        if name != "others" or tables:
+            parts.append(PagePart(name, title, open_ones, details, images[name], notes.get(name, ())))
+    return parts
 
 
 def _tiles(evaluation: Evaluation, rows: Sequence[Row]) -> list[Row]:
@@ -229,18 +149,16 @@ def _outcome(evaluation: Evaluation) -> tuple[str, str]:
     return _COLOURS[min(gain, 0)], f"{words}, and {beside_nothing}."
 
 
-def _episodes(scores: Sequence[EpisodeScore]) -> tuple[RowTable, ...]:
+def _episodes(scores: Sequence[EpisodeScore]) -> list[RowTable]:
     """Return the best and the worst episodes."""
-    if not scores:
-        return ()
-    parts = {f"All {len(scores)} episodes, best first": scores}
+    parts = {f"All {len(scores)} episodes, best first": scores} if scores else {}
     if len(scores) > 2 * _AT_EACH_END:
         parts = {
             f"The {_AT_EACH_END} best of {len(scores)} episodes, best first": scores[:_AT_EACH_END],
             f"The {_AT_EACH_END} worst of {len(scores)} episodes, worst last": scores[-_AT_EACH_END:],
         }
     columns = ("clips", "L1 error / persistence", "gain over the base")
-    return tuple(RowTable(title, columns, tuple(map(_episode, part))) for title, part in parts.items())
+    return [RowTable(title, columns, tuple(map(_episode, part))) for title, part in parts.items()]
 
 
 def _episode(score: EpisodeScore) -> tuple[str, str, tuple[str, ...]]:
@@ -248,20 +166,18 @@ def _episode(score: EpisodeScore) -> tuple[str, str, tuple[str, ...]]:
     return score.episode_id, "", (str(score.clips), f"{score.over_persistence:.3f}", gain)
 
 
-def _examples(evaluation: Evaluation) -> tuple[PageImage, ...]:
+def _examples(evaluation: Evaluation) -> list[PageImage]:
     """Return example clips, and their decoded images, in the best quality in which all of them fit."""
-    strips = [(figures.example_strip(evaluation, one), one) for one in evaluation.examples[:MOST_CLIPS]]
+    examples = evaluation.examples[:MOST_CLIPS]
     decoded = () if evaluation.decoded is None else evaluation.decoded.strips[:MOST_CLIPS]
-    every = [*strips, *((figures.decoded_strip(evaluation, one), one) for one in decoded)]
-    urls = jpeg_urls([draw_strip(strip) for strip, _ in every], at_most=_BYTES)
-    return tuple(
-        PageImage(url, f"{'; '.join(row.label.replace(chr(10), ' ') for row in strip.rows)}: row by row", _named(one))
-        for url, (strip, one) in zip(urls, every, strict=False)
-    )
-
-
-def _named(one: Any) -> str:
-    return f"{one.why}: {one.episode_id}, from control step {one.start}"
+    strips = [example_strip(evaluation, one) for one in examples] + [decoded_strip(evaluation, one) for one in decoded]
+    urls = jpeg_urls([draw_strip(strip) for strip in strips], at_most=_BYTES)
+    images = []
+    for url, one, strip in zip(urls, (*examples, *decoded), strips, strict=False):
+        described = "; ".join(row.label.replace("\n", " ") for row in strip.rows)
+        named = f"{one.why}: {one.episode_id}, from control step {one.start}"
+        images.append(PageImage(url, f"{described}: row by row", named))
+    return images
 
 
 def jpeg_urls(images: Sequence[UInt8[np.ndarray, "height width 3"]], *, at_most: int) -> list[str]:

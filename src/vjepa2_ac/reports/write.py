@@ -8,7 +8,7 @@ from pathlib import Path
 from vjepa2_ac.calibration.axes import infer_axes
 from vjepa2_ac.calibration.strides import calibrate_model
 from vjepa2_ac.evaluation.estimates import Curve, over_persistence
-from vjepa2_ac.evaluation.evaluate_run import Beside, measure_subject
+from vjepa2_ac.evaluation.evaluate_run import measure_subject
 from vjepa2_ac.evaluation.request import EvaluationOptions
 from vjepa2_ac.evaluation.result import Evaluation
 from vjepa2_ac.evaluation.verdict import verdict
@@ -25,7 +25,6 @@ class Evaluated:
     """The result of an evaluation, and its files."""
 
     evaluation: Evaluation
-    checkpoint: str  # which one, as text; "" of a model
     files: tuple[Path, ...]  # written files
 
     @property
@@ -39,21 +38,18 @@ class Evaluated:
         return {name: over_persistence(one.errors, "rollout") for name, one in self.evaluation.models.items()}
 
 
-def evaluate_subject(
-    subject: str,
-    asked: EvaluationOptions | None = None,
-    reporter: Reporter = SILENT,
-) -> Evaluated:
+def evaluate_subject(subject: str, asked: EvaluationOptions | None = None, reporter: Reporter = SILENT) -> Evaluated:
     """Measure as `measure_subject` does, and write metrics.json, report and figure.
 
     Raises:
-        InputError: As `measure_subject`; or the folder cannot be written.
+        InputError: As `measure_subject`.
     """
-    measured = measure_subject(subject, asked, reporter=reporter, beside=Beside(infer_axes, calibrate_model))
-    evaluation, folder = measured.evaluation, measured.folder
+    asked = asked or EvaluationOptions()
+    evaluation = measure_subject(subject, asked, reporter=reporter, find_axes=infer_axes, calibrate=calibrate_model)
+    folder = asked.out or Path(subject)
     files = (
         plot_evaluation(evaluation, folder / PLOT),
         write_metrics(evaluation, folder / METRICS_FILE),
         write_report(evaluation, folder / REPORT),
     )
-    return Evaluated(evaluation, measured.checkpoint, files)
+    return Evaluated(evaluation, files)

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.imagined import Film, with_outcomes
+from vjepa2_ac.evaluation.imagined import Film
 from vjepa2_ac.simulation.counterfactual import resimulate
 from vjepa2_ac.simulation.recording.simulation_file import SIMULATION_FILE
 
@@ -23,4 +23,4 @@ def with_what_happens(film: Film) -> Film:
     except InputError as error:
         note = f"What really happens under other actions is not known: {error}"
         return replace(film, imagination=replace(film.imagination, notes=(*film.imagination.notes, note)))
-    return with_outcomes(film, lambda actions: arm.under(actions, film.stride).frames)
+    return film.with_outcomes(lambda actions: arm.under(actions, config.model_stride).frames)

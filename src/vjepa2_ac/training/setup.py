@@ -136,7 +136,7 @@ def open_data(config: Config, reporter: Reporter = SILENT, accelerator: Accelera
 
         world_model = load_base(config.model, seed=config.seed).to(accelerator.device)
         calibration = broadcast_object(accelerator, choose_stride(world_model, dataset, config, accelerator, reporter))
-        config, dataset = with_stride(config, calibration.best.stride), dataset.with_stride(calibration.best.stride)
+        config, dataset = with_stride(config, calibration.stride), dataset.with_stride(calibration.stride)
     first_clip = _read_one_clip_of_each_split(dataset)
     if replayed is not None:
         _require_fitting_clips(dataset, replayed, first_clip)

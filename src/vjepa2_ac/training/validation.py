@@ -10,7 +10,7 @@ from vjepa2_ac.data.windows import spread
 from vjepa2_ac.distributed.processes import agreed, broadcast_object
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.action_use import RolloutStart, moves_of, pool_of, rank_actions
+from vjepa2_ac.evaluation.action_use import RolloutStart, moves_of, rank_actions
 from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persistence
 from vjepa2_ac.evaluation.measure import prediction_errors
 from vjepa2_ac.evaluation.result import ActionRanking, Validation
@@ -119,8 +119,8 @@ def _moves_kept(
 def _ranking(run: Run, moves: list[RolloutStart]) -> ActionRanking:
     config = run.config.validation
     reach, samples = config.ranking_reach_cm / 100, config.ranking_samples
-    pool = pool_of(moves, run.dataset.spaces.action, reach=reach, samples=samples, seed=0)
-    return rank_actions(run.world_model, moves, pool, at_once=_AT_ONCE)
+    space = run.dataset.spaces.action
+    return rank_actions(run.world_model, moves, space, reach=reach, samples=samples, seed=0, at_once=_AT_ONCE)
 
 
 def validate_base(run: Run, reporter: TrainingReporter) -> Validation | None:
