@@ -82,7 +82,7 @@ ORDERS: dict[str, list[str]] = {
         "imagined_plan",
         "training",
     ],
-    "calibration": ["variants", "strides data axes"],
+    "calibration": ["variants", "data axes"],
     "reports": ["metrics_json", "comparison", "figures", "page", "write imagined"],
     "simulation": [
         "world",
@@ -102,7 +102,7 @@ HOMES = {
         "runs/trackers.py",
         "encoding/encode_dataset.py",
         "evaluation/evaluate_run.py",
-        "calibration/strides.py",
+        "calibration/variants.py",
     ],
     "av": ["media/"],
     "decord": [],

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from torch import Tensor
 
-from vjepa2_ac.calibration.strides import Calibration, calibrate
-from vjepa2_ac.calibration.variants import VariantResult
+from vjepa2_ac.calibration.variants import Calibration, VariantResult, calibrate
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.index import EpisodeTable

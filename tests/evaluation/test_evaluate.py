@@ -262,7 +262,7 @@ def test_the_axes_of_base_and_adapter_are_found_and_those_of_vectors_are_not() -
 def test_nothing_but_errors_is_measured_where_nothing_else_is_asked_for() -> None:
     probes = ProbeOptions(sensitivity_clips=0, landscape_clips=0, examples=0)
     found = evaluate([Contender("model", "trained", Oracle())], again(clips_batch()), about(), probes=probes)
-    assert len(found.notes) == 2
+    assert found.notes == ()
     assert found.models["model"].sensitivity is None
     assert found.models["model"].landscapes is None
     assert found.examples == ()

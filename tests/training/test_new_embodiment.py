@@ -12,7 +12,7 @@ import yaml
 from run_fixtures import KilledError, dying_reporter
 from same_run import assert_same_run
 from vector_sets import write_vectors
-from vjepa2_ac.calibration.strides import calibrate_config
+from vjepa2_ac.calibration.variants import calibrate_config
 from vjepa2_ac.config import Config, ModelConfig
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError

@@ -184,7 +184,7 @@ def _calibrate(options: argparse.Namespace) -> int:
         require_subject(options.model)
     make_folder(options.out)
 
-    from vjepa2_ac.calibration.strides import calibrate_config
+    from vjepa2_ac.calibration.variants import calibrate_config
     from vjepa2_ac.console.progress import ConsoleReporter, show
     from vjepa2_ac.console.tables import variants_table
     from vjepa2_ac.evaluation.measure import ClipSample

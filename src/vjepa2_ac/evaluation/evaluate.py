@@ -47,9 +47,6 @@ from vjepa2_ac.reporter import SILENT, Reporter
 ClipName = tuple[str, int]  # id of the episode, first control step
 FindAxes = Callable[[Predictor, Sequence[RolloutStart], int, Progress], Measurement]  # with the samples per batch
 FramesOfRow = Callable[[int], UInt8[np.ndarray, "time height width 3"] | None]  # of a row of the current batch
-_NOT_ASKED = "{} is 0: no {} were asked for."
-_NO_PLANS = "No plans: they are poses' displacements, and the states here are plain numbers."
-_NO_LANDSCAPES = "No energy landscapes: an action has {} numbers, and a landscape is over three."
 
 
 @dataclass(frozen=True)
@@ -115,30 +112,17 @@ def evaluate(
         copies=distribution_of(seen.copies, seen.true),
         noise_floor=latent_noise_floor(seen.true),
     )
+    notes, width = [], seen.actions.shape[-1]
+    if probes.sensitivity_clips and probes.landscape_clips and width < 3:
+        notes.append(f"No energy landscapes: an action has {width} numbers, and a landscape is over three.")
+    if probes.planning_clips and about.space.position is None:
+        notes.append("No plans: they are poses' displacements, and the states here are plain numbers.")
     return replace(
         evaluation,
         episodes=episode_scores(evaluation.errors, evaluation.base_errors),
         examples=_examples(contenders, clips, evaluation, probes.examples),
-        notes=_left_out(probes, about, action_dim=seen.actions.shape[-1]),
+        notes=tuple(notes),
     )
-
-
-def _left_out(probes: ProbeOptions, about: About, *, action_dim: int) -> tuple[str, ...]:
-    """Return notes on what was not measured: by an option, or because it does not apply."""
-    notes = []
-    if not probes.sensitivity_clips:
-        notes.append(_NOT_ASKED.format("--sensitivity-clips", "other actions and no energy landscapes"))
-    elif not probes.landscape_clips:
-        notes.append(_NOT_ASKED.format("--landscapes", "energy landscapes"))
-    elif action_dim < 3:
-        notes.append(_NO_LANDSCAPES.format(action_dim))
-    if probes.sensitivity_clips and not probes.axis_clips and about.space.is_pose:
-        notes.append(_NOT_ASKED.format("--axes", "calibrated axes"))
-    if probes.planning_clips and about.space.position is None:
-        notes.append(_NO_PLANS)
-    if not probes.examples:
-        notes.append(_NOT_ASKED.format("--examples", "example clips"))
-    return tuple(notes)
 
 
 @dataclass

@@ -157,7 +157,7 @@ def measure_subject(
         asked: The options.
         reporter: Shows the progress of each part of the work.
         find_axes: `calibration.axes.infer_axes`; None: no axes.
-        calibrate: `calibration.strides.calibrate_model`, if the options ask for it; None: no strides.
+        calibrate: `calibration.variants.calibrate_model`, if the options ask for it; None: no strides.
 
     Raises:
         InputError: The subject, the data, the decoder, a file of a metric, or a model to compare with cannot be used;

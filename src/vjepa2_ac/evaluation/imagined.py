@@ -18,7 +18,7 @@ from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import batches_of, validation_windows
 from vjepa2_ac.data.sources.configured_spaces import measured_space
 from vjepa2_ac.data.transforms import frames_as_seen, view
-from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
+from vjepa2_ac.decoding.decoder_folder import load_decoder
 from vjepa2_ac.decoding.imagine import (
     AS_RECORDED,
     Imagination,
@@ -31,9 +31,8 @@ from vjepa2_ac.decoding.imagine import (
 )
 from vjepa2_ac.distributed.processes import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, encode_frames
-from vjepa2_ac.episode import Batch, LatentBatch
+from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.evaluate import Contender
 from vjepa2_ac.evaluation.evaluate_run import load_subject
 from vjepa2_ac.evaluation.request import EvaluationOptions, require_one_process, settle
 from vjepa2_ac.planning.counterfactual import ACTION_NAMES, STEP_M, named_actions, read_actions
@@ -174,9 +173,8 @@ def imagine_clip(subject: str, asked: ImagineOptions, *, reporter: Reporter = SI
     accelerator = make_accelerator(config)
     dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
     if config.data.is_cache:
-        raise InputError(
-            where="data.source", found="latents, without frames", needed="the data set itself, to show what is true"
-        )
+        needed = "the data set itself, to show what is true"
+        raise InputError(where="data.source", found="latents, without frames", needed=needed)
     window = _window(dataset, asked)
     loaded = load_subject(subject, config, asked.evaluation, dataset, decoder)
     loaded.put_on(accelerator.device)
@@ -184,9 +182,20 @@ def imagine_clip(subject: str, asked: ImagineOptions, *, reporter: Reporter = SI
     (batch,) = batches_of(dataset, [window], batch_size=1)
     size = loaded.world_model.image_size
     chosen = _actions_of(asked, batch, dataset, limits=config.planning.limits)
+    rollouts: list[Imagined] = []
     with accelerator.autocast():
         latents = encode_batch(loaded.world_model, batch, device=accelerator.device, chunk=config.model.encode_chunk)
-        rollouts = _rollouts(loaded.contenders, decoder, latents, chosen, dataset.spaces.state)
+        start, states = Start.of(latents, dataset.spaces.state), latents.states[0].double().cpu().numpy()[:-1]
+        for name, actions in chosen.items():
+            for one in loaded.contenders:
+                if name == AS_RECORDED:
+                    with one.switched():
+                        rolled: Tensor = rolled_out(one.model, start, actions, states)
+                elif one.role == "trained":  # others by the one that is looked at
+                    rolled = imagined_latents(one.model, start, actions)
+                else:
+                    continue
+                rollouts.append(Imagined(one.name, name, actions, shown(decoder.decoder, rolled)))
         decoded = shown(decoder.decoder, latents.latents[0])
     assert batch.frames is not None  # noqa: S101  # refused above: a cache
     frames = frames_as_seen(batch.frames[0].numpy(), size)
@@ -203,29 +212,6 @@ def imagine_clip(subject: str, asked: ImagineOptions, *, reporter: Reporter = SI
         notes=worth_knowing(decoder.card, frames[0], decoded[0]),
     )
     return Film(imagination, dataset, window[0], partial(_as_seen, config, size))
-
-
-def _rollouts(
-    contenders: Sequence[Contender],
-    decoder: TrainedDecoder,
-    batch: LatentBatch,
-    chosen: dict[str, Float[np.ndarray, "steps action_dim"]],
-    space: StateSpace,
-) -> list[Imagined]:
-    """Roll out: recorded actions by every model, others by the one that is looked at."""
-    start, states = Start.of(batch, space), batch.states[0].double().cpu().numpy()
-    found = []
-    for name, actions in chosen.items():
-        for contender in contenders:
-            if name != AS_RECORDED and contender.role != "trained":
-                continue
-            with contender.switched():
-                if name == AS_RECORDED:
-                    latents: Tensor = rolled_out(contender.model, start, actions, states[:-1])
-                else:
-                    latents = imagined_latents(contender.model, start, actions)
-            found.append(Imagined(contender.name, name, actions, shown(decoder.decoder, latents)))
-    return found
 
 
 def _actions_of(asked: ImagineOptions, batch: Batch, dataset: Dataset, limits: LimitsConfig) -> dict[str, np.ndarray]:

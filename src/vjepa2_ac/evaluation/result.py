@@ -110,11 +110,6 @@ class Metric:
     of: Callable[[Tensor, Tensor], Tensor]  # predicted and true [batch time tokens dim] -> [batch time]
     smaller_is_better: bool = True
 
-    @property
-    def heading(self) -> str:
-        """The label, and which way is better if that is not the usual one."""
-        return self.label if self.smaller_is_better else f"{self.label} (larger is better)"
-
     def side(self, of_ratio: Estimate) -> int:
         """Return 1 or -1 if the whole interval of a ratio of two results is better or worse than 1, else 0."""
         return of_ratio.side(of=1.0) * (-1 if self.smaller_is_better else 1)

@@ -18,6 +18,7 @@ from vjepa2_ac.evaluation.result import L1, Row
 from vjepa2_ac.intervals import Estimate, bootstrapped
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, Metrics, read_metrics
 
+_SAME = ("split", "frames", "stride", "cameras")
 _SAME_LATENTS = 1e-3  # errors of persistence that differ by a larger share are of other latents
 
 
@@ -69,17 +70,9 @@ def compare(folders: Sequence[Path]) -> Comparison:
 
 
 def _check_same_clips(one: Metrics, other: Metrics, first: Path, second: Path) -> None:
-    differences = [
-        f"{what}: {a} and {b}"
-        for what, a, b in [
-            *(
-                (key, getattr(one.about, key), getattr(other.about, key))
-                for key in ("split", "frames", "stride", "cameras")
-            ),
-            ("clips", one.clips.count, other.clips.count),
-        ]
-        if a != b
-    ]
+    pairs = {key: (getattr(one.about, key), getattr(other.about, key)) for key in _SAME}
+    pairs["clips"] = one.clips.count, other.clips.count
+    differences = [f"{what}: {a} and {b}" for what, (a, b) in pairs.items() if a != b]
     if not differences and one.clips.fingerprint != other.clips.fingerprint:
         differences = [f"other episodes or starts, of {one.about.data} and {other.about.data}"]
     if differences:

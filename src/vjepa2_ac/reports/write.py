@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vjepa2_ac.calibration.axes import infer_axes
-from vjepa2_ac.calibration.strides import calibrate_model
+from vjepa2_ac.calibration.variants import calibrate_model
 from vjepa2_ac.evaluation.estimates import Curve, over_persistence
 from vjepa2_ac.evaluation.evaluate_run import measure_subject
 from vjepa2_ac.evaluation.request import EvaluationOptions

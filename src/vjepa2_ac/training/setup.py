@@ -36,7 +36,7 @@ from vjepa2_ac.training.loss import Objective
 from vjepa2_ac.training.optim import make_optimizer, trained_parameters
 
 if TYPE_CHECKING:
-    from vjepa2_ac.calibration.strides import Calibration
+    from vjepa2_ac.calibration.variants import Calibration
     from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
     from vjepa2_ac.training.imagined_strip import ImaginedStrip
 

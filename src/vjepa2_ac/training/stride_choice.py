@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from accelerate import Accelerator
 
-from vjepa2_ac.calibration.strides import Calibration, calibrate_model
+from vjepa2_ac.calibration.variants import Calibration, calibrate_model
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.errors import InputError
