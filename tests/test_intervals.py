@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from vjepa2_ac.intervals import (
     Estimate,
@@ -12,6 +13,7 @@ from vjepa2_ac.intervals import (
     mean_of,
     ratio,
     ratio_difference,
+    share_of,
 )
 
 
@@ -102,3 +104,20 @@ def test_weights_of_episodes_give_the_interval_of_their_sums() -> None:
     (alone,) = bootstrapped_by_weights(lambda weights: weights, 1)
     assert alone.value == 1
     assert not alone.has_interval
+
+
+def test_published_intervals_come_out() -> None:
+    # Brown, Cai, DasGupta (2001) and any table: Wilson's 95 % intervals.
+    middle, none, all_of_it = share_of(10, 20), share_of(0, 20), share_of(50, 50)
+    assert middle.value == 0.5
+    assert (middle.low, middle.high) == pytest.approx((0.2993, 0.7007), abs=1e-4)
+    assert (none.value, none.low, none.high) == pytest.approx((0.0, 0.0, 0.1611), abs=1e-4)
+    assert (all_of_it.value, all_of_it.low, all_of_it.high) == pytest.approx((1.0, 0.9287, 1.0), abs=1e-4)
+
+
+def test_intervals_of_shares_cover_the_true_share_about_as_often_as_they_say() -> None:
+    for true in (0.1, 0.5, 0.8):
+        found = [share_of(successes, 50) for successes in range(51)]
+        chances = stats.binom.pmf(range(51), 50, true)
+        covered = sum(chance for chance, one in zip(chances, found, strict=True) if one.low <= true <= one.high)
+        assert 0.92 < covered < 0.98

@@ -125,14 +125,6 @@ def test_a_model_that_does_nothing_is_certain_of_nothing() -> None:
     assert "does it fit this data at all?" in found.verdict()
 
 
-def test_a_handful_of_episodes_gives_an_interval_but_no_certainty() -> None:
-    found = calibrated(GoesOn(8), Tracks([80] * 6, noise=0.1))
-    assert found.best.difference is not None
-    assert found.best.difference.high < 0
-    assert not found.is_certain
-    assert "not certain on" in found.verdict()
-
-
 def test_a_stride_that_fits_no_episode_is_named_and_the_others_are_measured() -> None:
     found = calibrated(GoesOn(4), Tracks([30] * 6))
     assert list(found.results) == [4, 8]

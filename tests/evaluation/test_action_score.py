@@ -113,15 +113,6 @@ def test_a_clips_plans_depend_on_neither_the_batch_nor_the_order_nor_on_the_clip
         np.testing.assert_array_equal(random, study_of(starts_of_a_world(), ONE_STEP).random.three_steps[:, order])
 
 
-@pytest.mark.usefixtures("quick")
-def test_how_many_samples_are_computed_at_once_changes_no_plan() -> None:
-    starts = starts_of_a_world()[:2]
-    few = FEW.model_copy(update={"energy": EnergyConfig(samples_at_once=7)})
-    one, other = (measure_plans(Oracle(), starts, config) for config in (FEW, few))
-    np.testing.assert_allclose(one.three_steps, other.three_steps, atol=1e-6)
-    np.testing.assert_allclose(one.one_step, other.one_step, atol=1e-6)
-
-
 class Witness(Oracle):
     """An oracle that records its calls."""
 

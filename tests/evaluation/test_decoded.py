@@ -87,7 +87,7 @@ def test_the_size_of_a_batch_changes_nothing_but_rounding(oracle: DecodedRollout
 
 
 def test_from_a_cache_nothing_is_compared_with_true_frames() -> None:
-    found = measured(Oracle(), has_frames=False)
+    found = measure_decoded(contenders(Oracle()), replace(clips(BATCH, TRAINED), has_frames=False), TRAINED)
     assert not [metric for _, metric in found.curves if metric.endswith(".truth") or ".moving." in metric]
     assert "come from a cache" in found.notes[0]
     assert found.sources == (DECODED_TRUTH, DECODED_PERSISTENCE, "adapter")

@@ -13,7 +13,6 @@ from itertools import pairwise
 from xml.etree import ElementTree as ET
 
 import numpy as np
-import pytest
 from PIL import Image
 
 from evaluation_results import evaluation
@@ -239,11 +238,3 @@ def test_every_colour_can_be_read_on_the_paper_in_light_dark_and_print() -> None
             assert contrast(palette[name], palette["paper"]) >= 4.5, name
         for name in ("ink", "soft", "better", "unclear", "worse"):
             assert contrast(palette[name], palette["raised"]) >= 4.5, name
-
-
-@pytest.mark.parametrize("frames", [3, 16])
-def test_charts_hold_a_point_for_each_horizon(frames: int) -> None:
-    page = Page(report_page(evaluation(frames=frames, size=32)))
-    drawings = [image.decode() for image in page.images() if b"<svg" in image]
-    assert len(drawings) >= 5
-    assert any(f"{(frames - 1) * 4 / 15:.2f}" in drawing for drawing in drawings) or frames > 9

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from vjepa2_ac.calibration.variants import ReadOnce, Variant, VariantResult, load_named, measure_variants
+from vjepa2_ac.calibration.variants import ReadOnce, SameClips, Variant, VariantResult, load_named, measure_variants
 from vjepa2_ac.config import Config, DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset
@@ -121,9 +121,8 @@ def probe_variants(
     dataset = replace(dataset, config=dataset.config.model_copy(update={"frames": frames}))
     windows, shifts = _with_room(dataset, candidates, sample.clips)
     variants = [Variant(AS_THEY_ARE, lambda same: same), *variants_of(dataset.config, shifts)]
-    plain, *measured = measure_variants(
-        model, encode, dataset, windows, variants, batch_size=sample.batch_size, progress=progress
-    )
+    clips = SameClips(dataset, windows, sample.batch_size)
+    plain, *measured = measure_variants(model, encode, clips, variants, progress)
     space = dataset.spaces.action
     results = [
         found.result(one.name, space, beside=plain, repair=one.repair)

@@ -116,14 +116,20 @@ class VariantErrors:
         return ratio_difference((one, persistence), (other.errors[0, theirs], other.errors[1, theirs]), ids)
 
 
+@dataclass(frozen=True)
+class SameClips:
+    """The clips on which variants are compared."""
+
+    dataset: Dataset
+    windows: Sequence[tuple[int, int]]  # episode and first control step of each
+    batch_size: int  # clips that are computed together
+
+
 def measure_variants(
     model: Predictor,
     encode: Callable[[Batch], LatentBatch],
-    dataset: Dataset,
-    windows: Sequence[tuple[int, int]],
+    clips: SameClips,
     variants: Sequence[Variant],
-    *,
-    batch_size: int,
     progress: Progress = no_progress,
 ) -> list[VariantErrors]:
     """Measure a model's one-step error on the same clips under each variant; each episode is read once for all.
@@ -131,19 +137,17 @@ def measure_variants(
     Args:
         model: The predictor.
         encode: Turns a batch of pixels into latents on the model's device.
-        dataset: The source of clips.
-        windows: Episode and first control step of each.
+        clips: What to measure on.
         variants: The first one decides which clips can be read.
-        batch_size: Clips that are computed together.
         progress: Called with (clips done, clips in total), of all variants.
 
     Raises:
         InputError: A clip cannot be read; or, by `data.broken_episodes`, none of them.
     """
-    first = variants[0]
+    first, dataset, windows = variants[0], clips.dataset, clips.windows
     parts: list[list[VariantErrors]] = [[] for _ in variants]
     done = 0
-    for batch in batches_of(first.view(dataset), windows, batch_size=batch_size):
+    for batch in batches_of(first.view(dataset), windows, batch_size=clips.batch_size):
         latents, read = encode(batch), replace(dataset, source=ReadOnce(dataset.source))
         places = [dataset.table.find(name) for name in batch.episode_ids]
         here = [(place, start) for place, start in zip(places, batch.starts, strict=True) if place is not None]
@@ -412,7 +416,8 @@ def calibrate(
     windows = validation_windows(views[possible[-1]], split, clips=sample.clips)
     widest_first = possible[::-1]
     variants = [Variant(str(stride), partial(_at_stride, views[stride])) for stride in widest_first]
-    found = measure_variants(model, encode, dataset, windows, variants, batch_size=sample.batch_size, progress=progress)
+    clips = SameClips(dataset, windows, sample.batch_size)
+    found = measure_variants(model, encode, clips, variants, progress)
     errors, space = dict(zip(widest_first, found, strict=True)), dataset.spaces.action
     results = {stride: errors[stride].result(f"stride {stride} ({stride / rate:.2f} s)", space) for stride in possible}
     if len(results) > 1:

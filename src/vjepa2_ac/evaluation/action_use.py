@@ -15,6 +15,7 @@ from torch import Tensor
 from vjepa2_ac.distances import absolute_difference
 from vjepa2_ac.episode import LatentBatch, Progress, no_progress
 from vjepa2_ac.evaluation.measure import Predictor
+from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import ActionRanking, Landscape, Landscapes, Ranking, Sensitivity
 from vjepa2_ac.intervals import Estimate, mean_of, ratio
 from vjepa2_ac.spaces import POSE, ActionSpace, vector_states
@@ -229,11 +230,9 @@ def rank_actions(
     model: Predictor,
     moves: Sequence[RolloutStart],
     space: ActionSpace,
+    probes: ProbeOptions,
     *,
-    reach: float,
-    samples: int,
     seed: int,
-    at_once: int,
     progress: Progress = no_progress,
 ) -> ActionRanking:
     """Rank the true action of each move among others in the box and on the shell.
@@ -242,15 +241,13 @@ def rank_actions(
         model: The predictor.
         moves: One or more; of vectors, the largest of each number bounds the box.
         space: Of the actions.
-        reach: Half the width of the box, in metres; of poses only.
-        samples: Other actions, of each kind.
-        seed: Of these.
-        at_once: Samples per batch: limits the memory.
+        probes: Their `reach_cm`, half the width of the box (of poses only), `samples` of each kind, and `at_once`.
+        seed: Of the other actions.
         progress: Called with the number of finished moves.
     """
-    ids = tuple(move.episode_id for move in moves)
+    ids, reach, samples = tuple(move.episode_id for move in moves), probes.reach_cm / 100, probes.samples
     pool = ActionPool(np.stack([move.true for move in moves]), ids, space, reach, samples, seed)
-    places, (_, spread, now) = _places(model, moves, pool, (pool.in_box, pool.on_shell), at_once, progress)
+    places, (_, spread, now) = _places(model, moves, pool, (pool.in_box, pool.on_shell), probes.at_once, progress)
     in_box, on_shell = _ranks(places, samples)
     ranks = (in_box + on_shell) / 2
     return ActionRanking(
@@ -305,10 +302,7 @@ def measure_landscapes(
     model: Predictor,
     starts: Sequence[RolloutStart],
     space: ActionSpace,
-    *,
-    nodes: int,
-    reach: float,
-    at_once: int,
+    probes: ProbeOptions,
     progress: Progress = no_progress,
 ) -> Landscapes:
     """Compute the energy over a grid of the first three numbers of the action, the others being the true ones.
@@ -317,16 +311,16 @@ def measure_landscapes(
         model: The predictor.
         starts: One frame of each clip; one or more, with actions of three numbers or more.
         space: Of the actions; positions are reported in cm.
-        nodes: Of the grid along each axis, three or more.
-        reach: It spans at least -reach .. reach (metres; of vectors: in its own numbers).
-        at_once: Samples per batch.
+        probes: Their `nodes` of the grid along each axis, three or more, and `at_once`; of poses the grid spans at
+            least `reach_cm` in both directions.
         progress: Called with the number of finished starts.
     """
     trues = np.stack([start.true[_AXES] for start in starts])
+    nodes, reach = probes.nodes, 0.0 if space.position is None else probes.reach_cm / 100
     half = max(reach, _ROOM * float(np.abs(trues).max())) or 1.0  # vectors that are all zero
     maps = []
     for done, (start, true) in enumerate(zip(starts, trues, strict=True), start=1):
-        maps.append(_landscape(model, start, grid_axes(true, half, nodes), true, space.shown_factor, at_once))
+        maps.append(_landscape(model, start, grid_axes(true, half, nodes), true, space.shown_factor, probes.at_once))
         progress(done, len(starts))
     least = space.shown_factor * half / (nodes - 1)
     chance = np.mean([np.linalg.norm(_places_of(one.axes) - one.true, axis=1).mean() for one in maps])

@@ -53,7 +53,6 @@ def measure_decoded(
     decoder: TrainedDecoder,
     examples: Sequence[Example] = (),
     *,
-    has_frames: bool = True,
     lpips: Lpips | None = None,
     reporter: Reporter = SILENT,
 ) -> DecodedRollouts:
@@ -64,7 +63,6 @@ def measure_decoded(
         clips: What to measure on; they are read once.
         decoder: Makes images of latents.
         examples: Clips whose images are returned, too.
-        has_frames: False: of cached latents there are only small ones.
         lpips: None: no files were named.
         reporter: Shows the progress.
     """
@@ -75,7 +73,7 @@ def measure_decoded(
     values: dict[tuple[str, str], list[Float[np.ndarray, "batch horizon"]]] = {}  # by source and metric
     strips: dict[ClipName, DecodedStrip] = {}
     for batch, frames_of_row in clips.read(None):
-        images = _decoded(batch, contenders, decoder, frames_of_row if has_frames else None)
+        images = _decoded(batch, contenders, decoder, frames_of_row if clips.has_frames else None)
         ids += batch.episode_ids
         for key, found in _measured(images, lpips).items():
             values.setdefault(key, []).append(found.double().cpu().numpy())
@@ -91,7 +89,7 @@ def measure_decoded(
         sources=tuple(one for one in sources if one in {source for source, _ in arrays}),
         curves={key: _means(found, ids) for key, found in arrays.items()},
         strips=tuple(strips[name] for name in wanted if name in strips),
-        notes=_notes(arrays, card.shape.image_size, has_frames=has_frames, has_lpips=lpips is not None),
+        notes=_notes(arrays, card.shape.image_size, has_frames=clips.has_frames, has_lpips=lpips is not None),
     )
 
 

@@ -33,7 +33,6 @@ from vjepa2_ac.evaluation.result import (
     Clips,
     Evaluation,
     Example,
-    Measurement,
     Metric,
     Mode,
     ModelResult,
@@ -45,7 +44,6 @@ from vjepa2_ac.evaluation.result import (
 from vjepa2_ac.reporter import SILENT, Reporter
 
 ClipName = tuple[str, int]  # id of the episode, first control step
-FindAxes = Callable[[Predictor, Sequence[RolloutStart], int, Progress], Measurement]  # with the samples per batch
 FramesOfRow = Callable[[int], UInt8[np.ndarray, "time height width 3"] | None]  # of a row of the current batch
 
 
@@ -66,6 +64,7 @@ class RepeatableClips:
 
     count: int
     read: Callable[[Sequence[ClipName] | None], Iterable[tuple[LatentBatch, FramesOfRow]]]
+    has_frames: bool = True  # False: of cached latents there are only small ones
 
 
 def evaluate(
@@ -75,7 +74,6 @@ def evaluate(
     *,
     metrics: tuple[Metric, ...] | None = None,
     probes: ProbeOptions | None = None,
-    find_axes: FindAxes | None = None,
     reporter: Reporter = SILENT,
 ) -> Evaluation:
     """Measure models on the same clips.
@@ -86,7 +84,6 @@ def evaluate(
         about: Description of the evaluation.
         metrics: Of the errors, L1 first; None: all that are registered.
         probes: Options of the measurements beyond the errors.
-        find_axes: `calibration.axes.infer_axes`; None: no axes.
         reporter: Shows the progress of each part of the work.
 
     Raises:
@@ -99,7 +96,7 @@ def evaluate(
     models: dict[str, ModelResult] = {}
     for contender in contenders:
         with contender.switched():
-            models[contender.name] = _measure(contender, seen, known, probes, about, find_axes, reporter)
+            models[contender.name] = _measure(contender, seen, known, probes, about, reporter)
     evaluation = Evaluation(
         about=about,
         clips=known,
@@ -190,12 +187,10 @@ def _measure(
     clips: Clips,
     probes: ProbeOptions,
     about: About,
-    find_axes: FindAxes | None,
     reporter: Reporter,
 ) -> ModelResult:
     """Measure one model beyond its predictions: what is asked for, and applies."""
     name, model, starts, space = contender.name, contender.model, seen.starts, about.space
-    at_once, reach, samples = probes.at_once, probes.reach_cm / 100, probes.samples
     found = ModelResult(
         name, contender.role, joined(seen.errors[name]), distribution=distribution_of(seen.predicted[name], seen.true)
     )
@@ -205,26 +200,24 @@ def _measure(
 
     if starts:
         count, steps, width = seen.actions.shape
-        ids = [name for name in seen.ids for _ in range(steps)]
-        pool = ActionPool(seen.actions.reshape(count * steps, width), ids, space, reach, samples, about.seed)
+        actions, ids = seen.actions.reshape(count * steps, width), [one for one in seen.ids for _ in range(steps)]
+        pool = ActionPool(actions, ids, space, probes.reach_cm / 100, probes.samples, about.seed)
         task = progress("other actions")
-        sensitivity = measure_sensitivity(model, starts, pool, at_once=at_once, progress=task)
-        how = {"reach": reach, "samples": samples, "seed": about.seed, "at_once": at_once}
-        ranking = rank_actions(model, seen.moves, space, progress=progress("action ranking"), **how)
+        sensitivity = measure_sensitivity(model, starts, pool, at_once=probes.at_once, progress=task)
+        task = progress("action ranking")
+        ranking = rank_actions(model, seen.moves, space, probes, seed=about.seed, progress=task)
         found = replace(found, sensitivity=sensitivity, ranking=ranking)
     moving = [start for start in starts if clips.moving[start.clip].any()] or starts
     if moving and probes.landscape_clips and seen.actions.shape[-1] >= 3:
         chosen = [moving[place] for place in spread(len(moving), probes.landscape_clips)]
-        least = 0.0 if space.position is None else reach
-        task = progress("energy landscapes")
-        maps = measure_landscapes(model, chosen, space, nodes=probes.nodes, reach=least, at_once=at_once, progress=task)
+        maps = measure_landscapes(model, chosen, space, probes, progress("energy landscapes"))
         found = replace(found, landscapes=maps)
     if seen.planned:
         planner = model if contender.to_plan is None else contender.to_plan()
         found = replace(found, plans=measure_plans(planner, seen.planned, probes.planning, progress("planning")))
-    if find_axes is not None and starts and probes.axis_clips and space.is_pose:
+    if probes.find_axes is not None and starts and probes.axis_clips and space.is_pose:
         chosen = [starts[place] for place in spread(len(starts), probes.axis_clips)]
-        found = replace(found, beside={"axes": find_axes(model, chosen, at_once, progress("axes"))})
+        found = replace(found, beside={"axes": probes.find_axes(model, chosen, probes.at_once, progress("axes"))})
     return found
 
 

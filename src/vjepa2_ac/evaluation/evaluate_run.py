@@ -24,7 +24,7 @@ from vjepa2_ac.encoding.encode_dataset import with_latents_if_there
 from vjepa2_ac.episode import Batch, LatentBatch, Progress, Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.decoded import NEIGHBOURS, TRUE_FRAMES, load_lpips, measure_decoded
-from vjepa2_ac.evaluation.evaluate import ClipName, Contender, FindAxes, FramesOfRow, RepeatableClips, evaluate
+from vjepa2_ac.evaluation.evaluate import ClipName, Contender, FramesOfRow, RepeatableClips, evaluate
 from vjepa2_ac.evaluation.measure import ClipSample
 from vjepa2_ac.evaluation.request import EvaluationOptions, settle
 from vjepa2_ac.evaluation.result import PERSISTENCE, About, Evaluation, Measurement, Role, TrainingCurve
@@ -147,7 +147,7 @@ def measure_subject(
     asked: EvaluationOptions,
     *,
     reporter: Reporter = SILENT,
-    find_axes: FindAxes | None = None,
+    find_axes: Callable[..., Measurement] | None = None,
     calibrate: CalibrateStrides | None = None,
 ) -> Evaluation:
     """Measure a run or a model on held-out episodes. Cheap failures first.
@@ -177,8 +177,7 @@ def measure_subject(
     loaded = load_subject(subject, config, asked, dataset, decoder)
     run, world_model, contenders = loaded.run, loaded.world_model, loaded.contenders
     through_cache = with_latents_if_there(config, dataset, world_model)
-    is_cache = through_cache.config.is_cache
-    if is_cache and not asked.calibrate:
+    if through_cache.config.is_cache and not asked.calibrate:
         world_model.set_encoder_aside()
     loaded.put_on(accelerator.device)
     beside: dict[str, Measurement] = {}
@@ -192,18 +191,18 @@ def measure_subject(
             contenders,
             clips,
             _about(subject, run, config, dataset, asked),
-            probes=replace(asked.probes, planning=config.planning),
-            find_axes=find_axes if dataset.spaces.state.is_base_pose else None,
+            probes=replace(
+                asked.probes,
+                planning=config.planning,
+                find_axes=find_axes if dataset.spaces.state.is_base_pose else None,
+            ),
             reporter=reporter,
         )
         decoded = None
         if decoder is not None:
             decoder.to(accelerator.device)
             lpips = None if lpips is None else lpips.to(accelerator.device)
-            examples = evaluation.examples
-            decoded = measure_decoded(
-                contenders, clips, decoder, examples, has_frames=not is_cache, lpips=lpips, reporter=reporter
-            )
+            decoded = measure_decoded(contenders, clips, decoder, evaluation.examples, lpips=lpips, reporter=reporter)
     warned = warnings_of(Path(subject) / METRICS) if run else ()
     return replace(
         evaluation,
@@ -242,7 +241,7 @@ def _clips(
         for batch in batches_of(dataset, wanted, batch_size=batch_size):
             yield encode(batch), lambda row, batch=batch: frames_as_seen(frames_of(dataset, batch, row), image_size)
 
-    return RepeatableClips(len(windows), read)
+    return RepeatableClips(len(windows), read, has_frames=not dataset.config.is_cache)
 
 
 def _about(subject: str, run: TrainedRun | None, config: Config, dataset: Dataset, asked: EvaluationOptions) -> About:

@@ -13,6 +13,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.action_use import RolloutStart, moves_of, rank_actions
 from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persistence
 from vjepa2_ac.evaluation.measure import prediction_errors
+from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import ActionRanking, Validation
 from vjepa2_ac.runs.metrics_log import MetricsLog
 from vjepa2_ac.training.monitoring import NullMetricsLog, TrainingReporter
@@ -118,9 +119,8 @@ def _moves_kept(
 
 def _ranking(run: Run, moves: list[RolloutStart]) -> ActionRanking:
     config = run.config.validation
-    reach, samples = config.ranking_reach_cm / 100, config.ranking_samples
-    space = run.dataset.spaces.action
-    return rank_actions(run.world_model, moves, space, reach=reach, samples=samples, seed=0, at_once=_AT_ONCE)
+    probes = ProbeOptions(samples=config.ranking_samples, reach_cm=config.ranking_reach_cm, at_once=_AT_ONCE)
+    return rank_actions(run.world_model, moves, run.dataset.spaces.action, probes, seed=0)
 
 
 def validate_base(run: Run, reporter: TrainingReporter) -> Validation | None:
