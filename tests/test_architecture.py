@@ -83,7 +83,7 @@ ORDERS: dict[str, list[str]] = {
         "training",
     ],
     "calibration": ["variants", "data axes"],
-    "reports": ["metrics_json", "comparison", "figures", "page", "write imagined"],
+    "reports": ["metrics_json", "comparison", "figures", "write imagined"],
     "simulation": [
         "world",
         "closed_loop",

@@ -1,7 +1,6 @@
 """`data check --model` measures the data with a model, unchanged and in variants, for every source."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,12 +9,10 @@ from adapted_run import write_adapted_run
 from latent_sets import encode_for
 from vector_sets import write_vectors
 from vjepa2_ac.calibration.data import VariantProbe, probe_config
-from vjepa2_ac.calibration.variants import VariantResult
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.model.checkpoints.loading import load_base
 
 MakeConfig = Callable[..., Config]
@@ -51,20 +48,6 @@ def test_the_probe_prints_a_table_and_a_verdict_after_the_findings(
         assert variant in table
     assert table.splitlines()[-1].split()[1] == "probe"
     assert "on 8 clips of 5 episodes: the model predicts none of this" in table.splitlines()[-1]  # it knows no drawings
-
-
-def test_a_variant_that_fits_better_is_a_warning_with_what_to_do_and_no_error(
-    make_config: MakeConfig, tmp_path: Path, capsys: Printed, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    plain = VariantResult("as they are", Estimate(0.9, 0.8, 1.0), 0.4, 0.5, 1.2, clips=64, episodes=12)
-    less = Estimate(-0.4, -0.45, -0.35)
-    better = replace(plain, name="y negated", ratio=Estimate(0.5, 0.4, 0.6), difference=less, repair="negate y")
-    probe = VariantProbe(plain, (better,))
-    monkeypatch.setattr("vjepa2_ac.calibration.data.probe_config", lambda *_, **__: probe)
-    assert check(make_config(), tmp_path, "builtin:sim-tiny") == 0
-    printed = capsys.readouterr().out.splitlines()
-    assert printed[-1].startswith("warning  probe           error / persistence 0.900 [0.800, 1.000] on 64 clips of 12")
-    assert printed[-1].endswith("and 0.400 [0.350, 0.450] less with y negated: negate y")
 
 
 def test_a_run_is_a_model_too(make_config: MakeConfig) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import io
 import re
 from dataclasses import replace
 from functools import cache
@@ -13,13 +12,12 @@ from itertools import pairwise
 from xml.etree import ElementTree as ET
 
 import numpy as np
-from PIL import Image
 
 from evaluation_results import evaluation
 from planned import with_plans
 from vjepa2_ac.evaluation.result import Evaluation, TrainingCurve
 from vjepa2_ac.evaluation.verdict import verdict
-from vjepa2_ac.reports.page import MOST_CLIPS, jpeg_urls, report_page, write_report
+from vjepa2_ac.reports.write import MOST_CLIPS, report_page, write_report
 
 VOID = {"br", "hr", "img", "input", "meta", "wbr"}
 HOSTILE = "\"'><script>alert(1)</script><img src=x onerror=alert(2)>&amp;]]>{}\u202e\x00\ud800é"
@@ -205,16 +203,6 @@ def test_images_are_described_tables_have_captions_and_headings_do_not_jump() ->
     assert all(below <= above + 1 for above, below in pairwise(levels))
     assert all(attributes.get("alt") for tag, attributes in page.elements if tag == "img")
     assert "" not in page.tables
-
-
-def test_photographs_take_the_best_quality_in_which_all_of_them_fit_or_are_left_out() -> None:
-    images = [np.random.default_rng(n).integers(0, 256, size=(120, 240, 3), dtype=np.uint8) for n in range(2)]
-    fine, coarse, none = (sum(map(len, jpeg_urls(images, at_most=most))) for most in (10**6, 50_000, 1000))
-    assert 50_000 < fine <= 10**6
-    assert 0 < coarse <= 50_100
-    assert none == 0
-    first = base64.b64decode(jpeg_urls(images, at_most=10**6)[0].partition("base64,")[2])
-    assert Image.open(io.BytesIO(first)).size == (240, 120)
 
 
 def contrast(one: str, other: str) -> float:

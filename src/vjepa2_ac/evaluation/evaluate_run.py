@@ -8,8 +8,10 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import torch
 from accelerate import Accelerator
+from jaxtyping import UInt8
 
 from vjepa2_ac import __version__
 from vjepa2_ac.config import Config
@@ -236,10 +238,13 @@ def _clips(
     """Return the clips at these windows, with the frames as the encoder sees them; of cached latents, small ones."""
     by_name = {(dataset.table.identity(episode), start): (episode, start) for episode, start in windows}
 
+    def frames(batch: Batch, row: int) -> UInt8[np.ndarray, "time size size 3"]:
+        return frames_as_seen(frames_of(dataset, batch, row), image_size)
+
     def read(names: Sequence[ClipName] | None) -> Iterable[tuple[LatentBatch, FramesOfRow]]:
         wanted = windows if names is None else [by_name[name] for name in names]
         for batch in batches_of(dataset, wanted, batch_size=batch_size):
-            yield encode(batch), lambda row, batch=batch: frames_as_seen(frames_of(dataset, batch, row), image_size)
+            yield encode(batch), partial(frames, batch)
 
     return RepeatableClips(len(windows), read, has_frames=not dataset.config.is_cache)
 

@@ -173,8 +173,10 @@ class _Rows(list[Row]):
             found = {model: gap_of_actions(one, actions) for model, one in self.errors.items()}
             style = {**_GAIN, "form": ".3f"}
             self.line(gap, name, f"gap_of_actions.{actions}", found, detail=True, **style)
-        for part in self.evaluation.strata if self.base is not None else ():
-            found = {name: stratum_gain(one, self.base.errors, part) for name, one in self.others.items()}
+        if (base := self.evaluation.base_errors) is None:
+            return
+        for part in self.evaluation.strata:
+            found = {name: stratum_gain(one, base, part) for name, one in self.others.items()}
             key = f"one_step_gain.{part.kind}.{part.name}"
             self.line("One-step gain over the base", part.name, key, found, detail=True, **_GAIN)
 

@@ -16,7 +16,7 @@ from pydantic_core import to_jsonable_python
 
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.request import SCORED
-from vjepa2_ac.evaluation.result import L1, PERSISTENCE, Evaluation, Row
+from vjepa2_ac.evaluation.result import L1, Evaluation, Row
 from vjepa2_ac.storage import write_atomically
 from vjepa2_ac.storage.structured import json_text
 
@@ -137,7 +137,7 @@ def metrics_as_dict(evaluation: Evaluation) -> dict[str, Any]:
         "rows": rows_of(one),
         "episodes": one.episodes,
         "by_clip": {
-            "persistence": one.errors.of("rollout", L1, PERSISTENCE),
+            "persistence": one.errors.of("rollout", L1, "persistence"),
             "models": {name: model.errors.of("rollout") for name, model in one.models.items()},
         },
         "models": {
