@@ -146,7 +146,7 @@ def test_clips_that_cannot_be_read_are_left_out_and_all_of_them_are_an_error(mon
     assert found.best.episodes == len(dataset.windows("validation").episodes) - 1
     assert len({one.clips for one in found.results.values()}) == 1
     source.unreadable = frozenset(range(20))
-    with pytest.raises(InputError, match="none of the clips can be read; broken episodes: memory: track"):
+    with pytest.raises(InputError, match="none of the clips can be read; broken episodes: track"):
         calibrate(GoesOn(8), encode, dataset, ClipSample(batch_size=4))
 
 

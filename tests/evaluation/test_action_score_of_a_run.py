@@ -26,12 +26,12 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(measure, "SCORED", SCORED.model_copy(update={"samples": 20, "iterations": 2}))
 
 
-def asked(folder: Path, data: Path, base: Path, **changes: object) -> EvaluationOptions:
+def asked(folder: Path, data: Path, base: Path, frames: int = 5) -> EvaluationOptions:
     """Return options with data and planning by a config."""
     config = tiny_config(
         folder / "run", data, base,
-        data__frames=5, data__test_share=0.4, data__cache_dir=str(folder / "caches"), validation__batch_size=3,
-        planning={"samples": 12, "iterations": 2, "limits": {"xyz": [0.0, 0.03, 0.03]}}, **changes,
+        data__frames=frames, data__test_share=0.4, data__cache_dir=str(folder / "caches"), validation__batch_size=3,
+        planning={"samples": 12, "iterations": 2, "limits": {"xyz": [0.0, 0.03, 0.03]}},
     )  # fmt: skip
     probes = ProbeOptions(**QUICK, planning_clips=3)
     return EvaluationOptions(clips=5, data=config, against=("base",), out=folder / "out", probes=probes)
@@ -107,7 +107,7 @@ def test_settings_that_are_none_of_planning_are_refused_before_any_data_are_read
 
 
 def test_clips_too_short_to_plan_on_are_refused_before_any_data_are_read(tmp_path: Path) -> None:
-    options = asked(tmp_path, Path("no such data"), Path("no such model"), data__frames=3)
+    options = asked(tmp_path, Path("no such data"), Path("no such model"), frames=3)
     with pytest.raises(InputError, match=r"--planning: clips of 3 frames \(data\.frames\).*4 or more"):
         evaluate_subject("model", options)
     assert not (tmp_path / "out").exists()

@@ -57,19 +57,6 @@ def test_latents_as_varied_as_the_truth_have_spread_1() -> None:
     assert (one.value, other.value) == pytest.approx((1, 1))
 
 
-def test_its_interval_is_that_of_resampled_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
-    predicted, true = latents(1, spread=0.5), latents(2)
-    sums = [summed(values) for values in (predicted, true)]
-    seen: list[np.ndarray] = []
-    monkeypatch.setattr(
-        latent_sums, "bootstrapped_by_weights", lambda of, count: seen.append(of(np.arange(count)[None] % 3.0))
-    )
-    spread_of(*sums)
-    weight = {name: place % 3 for place, name in enumerate(sorted(set(IDS)))}
-    rows = [clip for clip, name in enumerate(IDS) for _ in range(weight[name])]
-    assert seen[0][0] == pytest.approx(trace(predicted[rows]) / trace(true[rows]))
-
-
 def test_a_sketch_changes_no_estimate_and_hardly_an_interval(monkeypatch: pytest.MonkeyPatch) -> None:
     predicted, true = latents(1, 0.5, 36, 64), latents(2, 1.0, 36, 64)
     predicted *= torch.linspace(0.7, 1.3, EPISODES).repeat(CLIPS // EPISODES)[:, None, None, None]  # unlike episodes

@@ -81,7 +81,6 @@ def test_a_run_that_was_not_evaluated_is_named_with_the_way_out(tmp_path: Path) 
     ("changes", "words"),
     [
         ({"by_clip": {"persistence": 0.5, "models": {}}}, "by_clip.persistence"),
-        ({"by_clip": {"persistence": [[0.5]], "models": {"adapter": [[0.5]]}}}, "not errors of 12 clips"),
         ({"rows": [{"key": 1}]}, "metrics that cannot be used"),
         ({"format": 99}, "format: Input should be 3"),
     ],

@@ -163,12 +163,7 @@ def fit_axes(
         errors: Squared errors at each of `TRIED_DEGREES`.
         episode_ids: Of each pair.
         centre_m: x, y about which states were turned.
-
-    Raises:
-        ValueError: No pairs.
     """
-    if not len(inferred):
-        raise ValueError("no pairs to fit axes to")
     products = np.concatenate(
         [np.einsum("ni,nj->nij", one, executed).reshape(-1, 9) for one in (inferred, executed)], axis=1
     )

@@ -165,12 +165,12 @@ def variants_of(config: DataConfig, shifts: Sequence[int]) -> list[Variant]:
         for shift in (size, -size)
     ]
     if config.actions == "difference":  # a command has no opposite
-        found.append(_variant("the states backwards", "reverse the order of the frames", _backwards))
+        found.append(_variant("the states backwards", "reverse the order of the frames", _of_states(_backwards)))
     if config.states == "pose":
         for axis, name in enumerate("xy"):
             repair = f"negate {name}, with the rotation (as of a mirror)"
-            found.append(_variant(f"{name} negated", repair, partial(_with_mirrored_states, axis=axis)))
-        found.append(_variant("the gripper inverted", config.gripper_fix, _with_gripper_inverted))
+            found.append(_variant(f"{name} negated", repair, _of_states(partial(mirrored, axis=axis))))
+        found.append(_variant("the gripper inverted", config.gripper_fix, _of_states(_with_gripper_inverted)))
     if not config.is_cache:
         exchanged, flipped = (
             partial(_with_changed_frames, change=change)
@@ -219,18 +219,16 @@ def shifted(episode: Episode, *, late: int) -> Episode:
     return replace(episode, states=episode.states[steps], commands=commands)
 
 
-def _backwards(episode: Episode) -> Episode:
-    return replace(episode, states=np.ascontiguousarray(episode.states[::-1]))
+def _of_states(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Episode], Episode]:
+    return lambda episode: replace(episode, states=change(episode.states))
 
 
-def _with_mirrored_states(episode: Episode, *, axis: int) -> Episode:
-    return replace(episode, states=mirrored(episode.states, axis))
+def _backwards(states: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(states[::-1])
 
 
-def _with_gripper_inverted(episode: Episode) -> Episode:
-    states = episode.states.copy()
-    states[:, POSE.gripper] = 1 - states[:, POSE.gripper]
-    return replace(episode, states=states)
+def _with_gripper_inverted(states: np.ndarray) -> np.ndarray:
+    return np.concatenate([states[:, : POSE.gripper], 1 - states[:, POSE.gripper :]], axis=1)
 
 
 def _with_changed_frames(episode: Episode, change: Callable[[np.ndarray], np.ndarray]) -> Episode:

@@ -287,14 +287,6 @@ class Calibration:
             return f"{words}. At no stride is the model better than doing nothing: does it fit this data at all?"
         return f"{words}."
 
-    def lines(self) -> list[str]:
-        """Return the results as lines of text, the verdict last."""
-        results = [
-            f"  {one.name}: error/persistence {one.ratio}, {one.clips} clips of {one.episodes} episodes"
-            for one in self.results.values()
-        ]
-        return [*results, *(f"  stride {n}: not possible: {why}" for n, why in self.impossible.items()), self.verdict()]
-
     def rows(self, model: str) -> list[Row]:
         """Return the error at each stride as rows of an evaluation."""
         group = "One-step L1 error / persistence by stride"

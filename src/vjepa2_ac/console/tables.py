@@ -197,7 +197,7 @@ def variants_table(
     title: str, results: Sequence[VariantResult], columns: Sequence[str], best: VariantResult | None = None
 ) -> Table:
     """Return the table of `data check --model` and of `data calibrate`: a row for each variant of the same clips."""
-    table = MetricsTable(f"{title} (95 % interval over episodes)", ["", "error / persistence", *columns])
+    table = MetricsTable(f"{title} (95 % interval over episodes)", ["variant", "error / persistence", *columns])
     for one in results:
         moved = "" if one.moved_cm is None else f"{one.moved_cm:.1f} cm"
         cells = {

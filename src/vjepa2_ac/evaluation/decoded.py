@@ -19,7 +19,7 @@ from typing import Literal
 import numpy as np
 import torch
 from einops import rearrange
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
@@ -36,7 +36,6 @@ from vjepa2_ac.reporter import SILENT, Reporter
 DECODED_TRUTH, DECODED_PERSISTENCE, RAW_PERSISTENCE = "decoded_truth", "decoded_persistence", "raw_persistence"
 NEIGHBOURS = (DECODED_TRUTH, DECODED_PERSISTENCE, RAW_PERSISTENCE)
 TRUE_FRAMES = "truth"
-LEAST_SSIM, LEAST_LPIPS = 11, 32  # pixels a side: its window; or the pooled images have none
 _LPIPS_AT_ONCE = 8  # images of each source: of VGG, 256 pixels and six sources they take 1.6 GB
 _CACHE = "Nothing is compared with true frames: the latents come from a cache, which holds only small ones."
 _LEFT_OUT = (
@@ -75,13 +74,18 @@ def measure_decoded(
     for batch, frames_of_row in clips.read(None):
         images = _decoded(batch, contenders, decoder, frames_of_row if clips.has_frames else None)
         ids += batch.episode_ids
-        for key, found in _measured(images, lpips).items():
-            values.setdefault(key, []).append(found.double().cpu().numpy())
-        for row, name in enumerate(zip(batch.episode_ids, batch.starts, strict=True)):
-            if name in wanted:
-                strips[name] = images.strip(row, wanted[name], shown)
+        for key, metric in _measured(images, lpips).items():
+            values.setdefault(key, []).append(metric.double().cpu().numpy())
+        for row, clip in enumerate(zip(batch.episode_ids, batch.starts, strict=True)):
+            if clip in wanted:
+                strips[clip] = images.strip(row, wanted[clip], shown)
         progress(len(ids), clips.count)
     arrays = {key: np.concatenate(parts) for key, parts in values.items()}
+    left_out = {}
+    for (source, name), array in arrays.items():
+        count = int((~np.isfinite(array[:, -1])).sum())
+        if count and not (name.endswith(DECODED_TRUTH) and source == DECODED_TRUTH):  # its own reference
+            left_out[name] = _LEFT_OUT.format(metric=name, clips=count)
     card, sources = decoder.card, (*NEIGHBOURS, *(one.name for one in contenders))
     kept = ("encoder", "crop", "data", "cameras", "episodes", "frames", "steps", "held_out")
     return DecodedRollouts(
@@ -89,7 +93,7 @@ def measure_decoded(
         sources=tuple(one for one in sources if one in {source for source, _ in arrays}),
         curves={key: _means(found, ids) for key, found in arrays.items()},
         strips=tuple(strips[name] for name in wanted if name in strips),
-        notes=_notes(arrays, card.shape.image_size, has_frames=clips.has_frames, has_lpips=lpips is not None),
+        notes=(*([] if clips.has_frames else [_CACHE]), *left_out.values()),
     )
 
 
@@ -106,11 +110,6 @@ class _Images:
         """What the sources are compared with."""
         decoded = {DECODED_TRUTH: self.sources[DECODED_TRUTH]}
         return decoded if self.true is None else {TRUE_FRAMES: self.true[:, 1:], **decoded}
-
-    @property
-    def moving(self) -> Bool[Tensor, "batch horizon size size"] | None:
-        """Where something moves, by the true frames."""
-        return None if self.true is None else moving_region(self.true)
 
     def strip(self, row: int, example: Example, models: Sequence[str]) -> DecodedStrip:
         """Return whole clips of one row, the given frame included."""
@@ -149,43 +148,20 @@ def _measured(images: _Images, lpips: Lpips | None) -> dict[tuple[str, str], Flo
 
     PSNR of identical images is infinite; where nothing moves, the region's values are NaN.
     """
-    moving = images.moving
+    moving = None if images.true is None else moving_region(images.true)
     regions = {"whole": None} if moving is None else {"whole": None, "moving": moving}
-    side = images.decoded_first.shape[-1]
     found: dict[tuple[str, str], Tensor] = {}
     for reference, true in images.references.items():
         for source, shown in images.sources.items():
-            similar = ssim_map(shown, true) if side >= LEAST_SSIM else None
+            similar = ssim_map(shown, true)
             for region, where in regions.items():
                 found[source, f"psnr_db.{region}.{reference}"] = psnr(shown, true, where)
-                if similar is not None:
-                    found[source, f"ssim.{region}.{reference}"] = mean_where(similar, where)
+                found[source, f"ssim.{region}.{reference}"] = mean_where(similar, where)
     if moving is not None:
         found[TRUE_FRAMES, "moving_share"] = moving.float().mean(dim=(-2, -1))
-    if lpips is not None and side >= LEAST_LPIPS:
+    if lpips is not None:
         found |= lpips.of_pairs(images.sources, images.references)
     return found
-
-
-def _notes(
-    arrays: Mapping[tuple[str, str], Float[np.ndarray, "clips horizon"]],
-    side: int,
-    *,
-    has_frames: bool,
-    has_lpips: bool,
-) -> tuple[str, ...]:
-    """Return what is absent, and why, and how many clips were left out."""
-    notes = [] if has_frames else [_CACHE]
-    if side < LEAST_SSIM:
-        notes.append(f"No SSIM: images of {side} pixels are too small for its window.")
-    if has_lpips and side < LEAST_LPIPS:
-        notes.append(f"No LPIPS: images of {side} pixels; it needs {LEAST_LPIPS} a side.")
-    left_out = {}
-    for (source, metric), found in arrays.items():
-        clips = int((~np.isfinite(found[:, -1])).sum())
-        if clips and not (metric.endswith(DECODED_TRUTH) and source == DECODED_TRUTH):  # its own reference
-            left_out[metric] = _LEFT_OUT.format(metric=metric, clips=clips)
-    return (*notes, *left_out.values())
 
 
 def _means(values: Float[np.ndarray, "clips horizon"], ids: Sequence[str]) -> tuple[Estimate, ...]:

@@ -94,13 +94,7 @@ def measured(
 
 
 def joined(parts: Sequence[PredictionErrors]) -> PredictionErrors:
-    """Return the errors of all clips of some batches.
-
-    Raises:
-        ValueError: No clips.
-    """
-    if not parts:
-        raise ValueError("no clips to measure on")
+    """Return the errors of all clips of some batches; of one or more."""
     arrays = {key: np.concatenate([part.arrays[key] for part in parts]) for key in parts[0].arrays}
     return PredictionErrors(tuple(name for part in parts for name in part.episode_ids), arrays)
 
@@ -108,11 +102,7 @@ def joined(parts: Sequence[PredictionErrors]) -> PredictionErrors:
 def prediction_errors(
     model: Predictor, batches: Iterable[LatentBatch], metrics: Sequence[Metric] = (L1,)
 ) -> PredictionErrors:
-    """Measure a model as a validation does, batch after batch, so that no latents are stored.
-
-    Raises:
-        ValueError: No clips.
-    """
+    """Measure a model as a validation does, batch after batch, so that no latents are stored."""
     pairs = with_other_actions(batches)
     return joined([measured(model, batch, VALIDATED, metrics, others) for batch, others in pairs])
 

@@ -22,7 +22,6 @@ from vjepa2_ac.storage.structured import json_text
 
 METRICS_FILE = "metrics.json"
 FORMAT = 3  # incremented when a reader of the file would have to change
-_MOST_BYTES = 1 << 28  # landscapes are long
 
 
 @dataclass(frozen=True)
@@ -95,8 +94,6 @@ def read_metrics(folder: Path) -> Metrics:
     """
     path, fix = folder / METRICS_FILE, f"Write it with `vjepa2-ac evaluate {folder}`"
     try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise InputError(where=str(path), found="a file of more than 256 MiB", fix=fix)
         return TypeAdapter(Metrics).validate_json(path.read_bytes())
     except ValidationError as error:
         first = error.errors()[0]

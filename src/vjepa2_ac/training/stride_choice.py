@@ -40,6 +40,7 @@ def choose_stride(
     calibration = calibrate_model(
         world_model, candidates, config, accelerator, ClipSample(clips=config.validation.clips)
     )
-    for line in calibration.lines():
-        reporter.note(line)
+    for row in calibration.rows(""):
+        reporter.note(f"  {row.name}: error/persistence {row}")
+    reporter.note(calibration.verdict())
     return calibration
