@@ -132,7 +132,7 @@ class _Rows(list[Row]):
         gains = {name: gain_over(one, base, mode, metric) for name, one in self.others.items()}
         self.curves(f"Gain over the base by {metric.label}, {_MODES[mode]}", f"{key}.gain_over_base", gains, **_GAIN)
         found = {name: difference_to(one, base, mode, metric) for name, one in self.others.items()}
-        group, better = f"{metric.label} error minus the base's, {_MODES[mode]}", "lower"
+        group = f"{metric.label} error minus the base's, {_MODES[mode]}"
         better = "lower" if metric.smaller_is_better else "higher"
         self.curves(group, f"{key}.difference_to_base", found, form="+.4f", better=better, chance=0.0)
 
@@ -242,9 +242,8 @@ class _Rows(list[Row]):
                     for key, one in differences_of(study, plans, other).items():
                         label, style = _PLAN_DIFFERENCES[key], {"form": "+.1f", "detail": True}
                         style["better"] = "higher" if key == "score" else "lower"
-                        self.line(
-                            f"Plans minus those of {whose}", label, f"plans_minus_{kind}.{key}", {name: one}, **style
-                        )
+                        group, key = f"Plans minus those of {whose}", f"plans_minus_{kind}.{key}"
+                        self.line(group, label, key, {name: one}, **style)
 
     def add_decoded(self) -> None:
         """Add the metrics of decoded rollouts."""
