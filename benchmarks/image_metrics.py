@@ -96,7 +96,7 @@ def _of_features(draws: int) -> Table:
         rng = np.random.default_rng(draw)
         true = _features(rng)
         for name, guess in (("as varied as the truth", _features(rng)), ("smoothed by 20 %", _SMOOTHED * true)):
-            found[name].append((discrepancy(guess, true, ids).squared.value, _v_statistic(guess, true)))
+            found[name].append((discrepancy(guess, true, ids)[0].value, _v_statistic(guess, true)))
     for name, rows in found.items():
         table.add_row(name, *(f"{one:+.4f}" for one in np.mean(rows, axis=0)))
     return table

@@ -157,7 +157,7 @@ def _said(fault: Fault, outcome: Outcome, new: set[tuple[str, str]]) -> Iterator
         yield f"{outcome.refusal}"[:_SAID]
     else:
         better = "" if probe.better is None else f"; {probe.better.ratio.value:.3f} with {probe.better.name}"
-        yield f"{probe.ratio}{better}"
+        yield f"{probe.plain.ratio}{better}"
     for one in outcome.findings:
         is_answer = one.about == "agreement" and fault.name == CLEAN
         if (one.about, one.level) in new or is_answer:

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from vjepa2_ac.intervals import (
     Estimate,
@@ -12,6 +13,7 @@ from vjepa2_ac.intervals import (
     mean_of,
     ratio,
     ratio_difference,
+    share_of,
 )
 
 
@@ -28,7 +30,8 @@ def test_intervals_cover_the_truth_at_the_stated_rate(episodes: int) -> None:
     for trial in range(400):
         levels = rng.normal(0.7, 0.1, size=episodes)  # episodes differ; clips within one are alike
         errors = np.repeat(levels, 4) + rng.normal(0, 0.02, size=4 * episodes)
-        found = ratio(errors, np.ones(4 * episodes), ids, resamples=400, seed=trial)
+        columns = np.stack([errors, np.ones(4 * episodes)])[:, :, None]
+        (found,) = bootstrapped(lambda sums: sums[0] / sums[1], columns, ids, resamples=400, seed=trial)
         covered += found.low <= 0.7 <= found.high
     assert covered / 400 == pytest.approx(0.95, abs=0.035)
 
@@ -82,10 +85,13 @@ def test_the_side_of_an_interval_needs_all_of_it() -> None:
 
 
 def test_the_same_seed_gives_the_same_interval() -> None:
-    values = np.random.default_rng(1).normal(size=20)
-    ids = tuple(map(str, range(20)))
-    assert mean_of(values, ids, seed=3) == mean_of(values, ids, seed=3)
-    assert mean_of(values, ids, seed=3) != mean_of(values, ids, seed=4)
+    columns = np.stack([np.random.default_rng(1).normal(size=20), np.ones(20)])[:, :, None]
+
+    def of(seed: int) -> tuple[Estimate, ...]:
+        return bootstrapped(lambda sums: sums[0] / sums[1], columns, list(map(str, range(20))), seed=seed)
+
+    assert of(3) == of(3)
+    assert of(3) != of(4)
 
 
 def test_weights_of_episodes_give_the_interval_of_their_sums() -> None:
@@ -98,3 +104,20 @@ def test_weights_of_episodes_give_the_interval_of_their_sums() -> None:
     (alone,) = bootstrapped_by_weights(lambda weights: weights, 1)
     assert alone.value == 1
     assert not alone.has_interval
+
+
+def test_published_intervals_come_out() -> None:
+    # Brown, Cai, DasGupta (2001) and any table: Wilson's 95 % intervals.
+    middle, none, all_of_it = share_of(10, 20), share_of(0, 20), share_of(50, 50)
+    assert middle.value == 0.5
+    assert (middle.low, middle.high) == pytest.approx((0.2993, 0.7007), abs=1e-4)
+    assert (none.value, none.low, none.high) == pytest.approx((0.0, 0.0, 0.1611), abs=1e-4)
+    assert (all_of_it.value, all_of_it.low, all_of_it.high) == pytest.approx((1.0, 0.9287, 1.0), abs=1e-4)
+
+
+def test_intervals_of_shares_cover_the_true_share_about_as_often_as_they_say() -> None:
+    for true in (0.1, 0.5, 0.8):
+        found = [share_of(successes, 50) for successes in range(51)]
+        chances = stats.binom.pmf(range(51), 50, true)
+        covered = sum(chance for chance, one in zip(chances, found, strict=True) if one.low <= true <= one.high)
+        assert 0.92 < covered < 0.98

@@ -36,6 +36,8 @@ from vjepa2_ac.runs.checkpoint import NEWEST
 from vjepa2_ac.runs.loading import load_run
 from vjepa2_ac.simulation.closed_loop.policies import Oracle, Planning, Policy, RandomActions, ZeroActions
 from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, run_task
+from vjepa2_ac.storage import write_atomically
+from vjepa2_ac.storage.structured import json_text
 from vjepa2_ac.training.cost.memory import count_parameters
 from vjepa2_ac.training.loop import train
 
@@ -162,12 +164,12 @@ def _turned(batch: LatentBatch, axes: Axes) -> LatentBatch:
 
 def _calibrated(config: Config, model: WorldModel, path: Path) -> tuple[str | None, Axes | None, dict[str, Any]]:
     """Fit a base's axes to the demonstrations; return file and axes if they can be planned by, and what was found."""
-    found = calibrate_axes(config, str(config.model.base), pairs=PAIRS, split="train")
+    fit, found = calibrate_axes(config, str(config.model.base), pairs=PAIRS, split="train")
     path.parent.mkdir(exist_ok=True)
-    found.write(path)
-    if found.fit.problem is not None:
-        return None, None, found.as_dict()
-    return str(path), Axes.read(str(path), Fingerprints.of(model)), found.as_dict()
+    write_atomically(path, json_text(found))
+    if fit.problem is not None:
+        return None, None, found
+    return str(path), Axes.read(str(path), Fingerprints.of(model)), found
 
 
 def _forgetting(model: WorldModel, folder: Path, config: Config) -> dict[str, Any]:

@@ -174,13 +174,12 @@ def measure_alone(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
     rows = [row for row in read_metrics_log(home / "metrics.jsonl") if row["kind"] == "validation"]
     (validated,) = (row for row in rows if row["step"] == cell.step)
     probes = ProbeOptions(sensitivity_clips=24, samples=32, landscape_clips=4, axis_clips=0, nodes=5, examples=0)
-    found = measure_subject(str(home), EvaluationOptions(clips=48, checkpoint=step, against=(), probes=probes))
+    evaluation = measure_subject(str(home), EvaluationOptions(clips=48, checkpoint=step, against=(), probes=probes))
     model = load_run(home, step).world_model
     if model.adaptation is not None:
         merge_adapter(model)
     spec = RolloutSpec("reach", WORLD, goals, GOALS + cell.run.seed)
     result = run_task(spec, Planning(Controller(model.eval(), PLANNING)))
-    evaluation = found.evaluation
     measured = {row.key: row.value for row in rows_of(evaluation) if row.model == evaluation.trained}
     return {
         "cell": asdict(cell.run) | {"step": cell.step, "name": cell.name},

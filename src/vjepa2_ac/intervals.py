@@ -83,62 +83,44 @@ def bootstrapped(
 def bootstrapped_by_weights(
     of_weights: Callable[[Float[np.ndarray, "draws episodes"]], Float[np.ndarray, "draws metrics"]],
     episodes: int,
-    *,
-    resamples: int = RESAMPLES,
-    seed: int = 0,
 ) -> tuple[Estimate, ...]:
     """Return an estimate of each metric that is a function of how often each episode counts, as sums over pairs are.
 
     Args:
         of_weights: Turns weights of the episodes into values; all weights 1 give the estimate itself.
-        episodes: Their number; an interval needs two.
-        resamples: As of `bootstrapped`, with the same samples.
-        seed: Likewise.
+        episodes: Their number; an interval needs two. The samples are those of `bootstrapped`.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         values = of_weights(np.ones((1, episodes)))[0]
         if episodes < 2:
             return tuple(Estimate(float(value), math.nan, math.nan) for value in values)
-        return _estimates(values, of_weights(_draws(episodes, resamples, seed)), episodes)
+        return _estimates(values, of_weights(_draws(episodes, RESAMPLES, 0)), episodes)
 
 
-def mean_of(
-    values: Float[np.ndarray, " clips"], episode_ids: Sequence[str], *, resamples: int = RESAMPLES, seed: int = 0
-) -> Estimate:
+def mean_of(values: Float[np.ndarray, " clips"], episode_ids: Sequence[str]) -> Estimate:
     """Return the mean over clips."""
-    columns = np.stack([values, np.ones_like(values)])[:, :, None]
-    return bootstrapped(lambda sums: sums[0] / sums[1], columns, episode_ids, resamples=resamples, seed=seed)[0]
+    return ratio(values, np.ones_like(values), episode_ids)
 
 
 def ratio(
-    errors: Float[np.ndarray, " clips"],
-    others: Float[np.ndarray, " clips"],
-    episode_ids: Sequence[str],
-    *,
-    resamples: int = RESAMPLES,
-    seed: int = 0,
+    errors: Float[np.ndarray, " clips"], others: Float[np.ndarray, " clips"], episode_ids: Sequence[str]
 ) -> Estimate:
     """Return mean error over mean other error, most often persistence: clips are weighted by the denominator."""
     columns = np.stack([errors, others])[:, :, None]
-    return bootstrapped(lambda sums: sums[0] / sums[1], columns, episode_ids, resamples=resamples, seed=seed)[0]
+    return bootstrapped(lambda sums: sums[0] / sums[1], columns, episode_ids)[0]
 
 
 def ratio_difference(
     one: tuple[Float[np.ndarray, " clips"], Float[np.ndarray, " clips"]],
     other: tuple[Float[np.ndarray, " clips"], Float[np.ndarray, " clips"]],
     episode_ids: Sequence[str],
-    *,
-    resamples: int = RESAMPLES,
-    seed: int = 0,
 ) -> Estimate:
     """Return the `ratio` of one pair of (errors, persistence) minus that of another on the same clips.
 
     Both are resampled together, so what makes an episode hard for both does not widen the interval.
     """
     columns = np.stack([*one, *other])[:, :, None]
-    return bootstrapped(
-        lambda sums: sums[0] / sums[1] - sums[2] / sums[3], columns, episode_ids, resamples=resamples, seed=seed
-    )[0]
+    return bootstrapped(lambda sums: sums[0] / sums[1] - sums[2] / sums[3], columns, episode_ids)[0]
 
 
 @lru_cache(maxsize=4)

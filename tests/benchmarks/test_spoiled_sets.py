@@ -13,7 +13,8 @@ import yaml
 
 from benches import imported
 from moving_arms import RATE_HZ, STEPS, spot_frames, spot_states, write_spots
-from vjepa2_ac.calibration.data import VariantProbe, VariantResult
+from vjepa2_ac.calibration.data import VariantProbe
+from vjepa2_ac.calibration.variants import VariantResult
 from vjepa2_ac.intervals import Estimate
 
 EPISODES = 10
@@ -82,8 +83,9 @@ def outcomes(printed: str) -> dict[str, tuple[str, str]]:
 def test_a_table_says_what_was_refused_warned_and_missed(
     spoiled_sets: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    better = VariantResult("y negated", "negate y", Estimate(0.5, 0.4, 0.6), Estimate(-0.4, -0.5, -0.3))
-    probes = {False: VariantProbe(Estimate(0.5, 0.4, 0.6), (), 16, 8)}
+    plain = VariantResult("as they are", Estimate(0.5, 0.4, 0.6), 0.2, 0.4, 1.2, 16, 8)
+    better = replace(plain, name="y negated", difference=Estimate(-0.4, -0.5, -0.3))
+    probes = {False: VariantProbe(plain, ())}
     probes[True] = replace(probes[False], results=(better,))
     calls: list[object] = []
 

@@ -112,11 +112,3 @@ def test_the_place_that_is_turned_about_is_found(about: str) -> None:
     assert found.centre_m == pytest.approx((0.4, 0.1) if about == "middle" else (0.0, 0.0))
     assert ("about its base" in found.words()) == (about == "base")
     assert found.as_dict()["centre_m"] == list(found.centre_m)
-
-
-def test_what_is_turned_about_stays_where_it_is() -> None:
-    axes, centre = Axes(np.deg2rad(90.0), (0.4, 0.1)), torch.tensor([0.4, 0.1, 0.3, 0.1, 0.2, 0.3, 0.5])
-    assert torch.allclose(axes.poses(centre)[:3], centre[:3])
-    beside = centre + torch.tensor([0.1, 0, 0, 0, 0, 0, 0])
-    assert torch.allclose(axes.poses(beside)[:3], torch.tensor([0.4, 0.2, 0.3]), atol=1e-6)
-    assert torch.equal(axes.actions(beside), Axes(np.deg2rad(90.0)).actions(beside)), "a move has no place"

@@ -10,16 +10,14 @@ import pytest
 import torch
 from rich.table import Table
 
-from vjepa2_ac.calibration.data import VariantProbe, VariantResult
-from vjepa2_ac.calibration.strides import Calibration, StrideResult
+from vjepa2_ac.calibration.variants import VariantResult
 from vjepa2_ac.console.progress import PlainConsole
 from vjepa2_ac.console.tables import (
     benchmark_table,
-    calibration_table,
     motion_table,
     plan_table,
-    probe_table,
     row_tables,
+    variants_table,
 )
 from vjepa2_ac.evaluation.evaluate import Contender, evaluate
 from vjepa2_ac.evaluation.request import ProbeOptions
@@ -35,19 +33,14 @@ from worlds import Copier, Halfway, about, again, clips_batch
 
 SURE = Estimate(-0.123, -0.145, -0.101)
 SHARE = Estimate(0.912, 0.888, 0.934)
-REASON = "no episode of the validation split has the 1,351 steps that a clip of 16 frames has at stride 90; " * 3
 
 
-def calibrations() -> list[Table]:
-    results = tuple(StrideResult(stride, stride / 15, SHARE, 0.4321, 0.5432, 12.3, 1024, 128) for stride in (4, 8, 15))
-    return [calibration_table(Calibration(results, {90: REASON}, 16, "validation", 8, SURE))]
-
-
-def probes() -> list[Table]:
-    results = tuple(
-        VariantResult(f"{name} or some other thing", "mend it", SHARE, SURE) for name in ("late", "mirrored")
-    )
-    return [probe_table(VariantProbe(SHARE, results, 64, 12))]
+def variants() -> list[Table]:
+    results = [
+        VariantResult(f"{name} or some other thing", SHARE, 0.4321, 0.5432, 12.3, 1024, 128, difference)
+        for name, difference in (("late", None), ("mirrored", SURE))
+    ]
+    return [variants_table("variants", results, ["difference", "error", "moves by", "clips (episodes)"], results[1])]
 
 
 def motions() -> list[Table]:
@@ -95,7 +88,7 @@ def benchmarks() -> list[Table]:
 
 
 @pytest.mark.parametrize("width", [80, 120])
-@pytest.mark.parametrize("made", [calibrations, probes, motions, evaluations, comparisons, plans, benchmarks])
+@pytest.mark.parametrize("made", [variants, motions, evaluations, comparisons, plans, benchmarks])
 def test_no_figure_and_no_word_is_cut_off(made: Callable[[], list[Table]], width: int) -> None:
     for table in made():
         console = PlainConsole(width=width)

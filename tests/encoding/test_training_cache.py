@@ -8,7 +8,7 @@ import torch
 
 from latent_sets import encode_for
 from same_run import assert_same_run, metrics, trained_weights
-from vjepa2_ac.calibration.strides import calibrate_config
+from vjepa2_ac.calibration.variants import calibrate_config
 from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.errors import InputError

@@ -7,11 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 
 from adapted_run import write_adapted_run
-from run_fixtures import SilentReporter
-from vjepa2_ac.config.loading import parse_config
+from run_fixtures import SilentReporter, tiny_config
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation import action_score as measure
 from vjepa2_ac.evaluation import evaluate
@@ -28,38 +26,25 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(measure, "SCORED", SCORED.model_copy(update={"samples": 20, "iterations": 2}))
 
 
-def written(folder: Path, data: Path | str, base: Path | str, **changes: object) -> Path:
-    """Write a config of data and planning, and return its path."""
-    values: dict[str, Any] = {
-        "run_dir": str(folder / "run"),
-        "data": {
-            "path": str(data), "frames": 5, "stride": 2, "validation_share": 0.3, "test_share": 0.4, "workers": 0,
-            "cache_dir": str(folder / "caches"), **changes,
-        },
-        "model": {"base": str(base), "dtype": "float32"},
-        "training": {"precision": "fp32", "device": "cpu"},
-        "validation": {"batch_size": 3},
-        "planning": {"samples": 12, "iterations": 2, "limits": {"xyz": [0.0, 0.03, 0.03]}},
-    }  # fmt: skip
-    path = folder / "config.yaml"
-    path.write_text(yaml.safe_dump(values))
-    return path
-
-
-def asked(path: Path, out: Path) -> EvaluationOptions:
-    config = parse_config(yaml.safe_load(path.read_text()), where="test")
-    return EvaluationOptions(
-        clips=5, data=config, against=("base",), out=out, probes=ProbeOptions(**QUICK, planning_clips=3)
-    )
+def asked(folder: Path, data: Path, base: Path, frames: int = 5) -> EvaluationOptions:
+    """Return options with data and planning by a config."""
+    config = tiny_config(
+        folder / "run", data, base,
+        data__frames=frames, data__test_share=0.4, data__cache_dir=str(folder / "caches"), validation__batch_size=3,
+        planning={"samples": 12, "iterations": 2, "limits": {"xyz": [0.0, 0.03, 0.03]}},
+    )  # fmt: skip
+    probes = ProbeOptions(**QUICK, planning_clips=3)
+    return EvaluationOptions(clips=5, data=config, against=("base",), out=folder / "out", probes=probes)
 
 
 @pytest.mark.usefixtures("quick")
 def test_plans_are_measured_on_held_out_clips_with_the_configs_settings(
     tmp_path: Path, data_folder: Path, base_folder: Path
 ) -> None:
-    path = written(tmp_path, data_folder, base_folder)
     reporter = SilentReporter()
-    several = replace(asked(path, tmp_path / "out"), planning=("planning.iterations=2", "planning.cem.elites=3"))
+    several = replace(
+        asked(tmp_path, data_folder, base_folder), planning=("planning.iterations=2", "planning.cem.elites=3")
+    )
     evaluation = evaluate_subject(str(base_folder), several, reporter).evaluation
     assert {"planning, base", "planning, model"} <= set(reporter.tasks)
     metrics = json.loads((tmp_path / "out/metrics.json").read_text())
@@ -116,13 +101,13 @@ def test_a_trained_model_plans_merged_and_its_errors_are_measured_unmerged(
 
 @pytest.mark.parametrize("setting", ["seed=3", "planning.sample=3", "planning.samples=1"])
 def test_settings_that_are_none_of_planning_are_refused_before_any_data_are_read(tmp_path: Path, setting: str) -> None:
-    path = written(tmp_path, "no such data", "no such model")
+    options = replace(asked(tmp_path, Path("no such data"), Path("no such model")), planning=(setting,))
     with pytest.raises(InputError, match=setting.partition("=")[0].replace(".", r"\.")):
-        evaluate_subject("no such model", replace(asked(path, tmp_path / "out"), planning=(setting,)))
+        evaluate_subject("no such model", options)
 
 
 def test_clips_too_short_to_plan_on_are_refused_before_any_data_are_read(tmp_path: Path) -> None:
-    path = written(tmp_path, "no such data", "no such model", frames=3)
+    options = asked(tmp_path, Path("no such data"), Path("no such model"), frames=3)
     with pytest.raises(InputError, match=r"--planning: clips of 3 frames \(data\.frames\).*4 or more"):
-        evaluate_subject("model", asked(path, tmp_path / "out"))
+        evaluate_subject("model", options)
     assert not (tmp_path / "out").exists()

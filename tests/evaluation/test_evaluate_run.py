@@ -1,7 +1,8 @@
-"""Runs and models are evaluated on their own or other data, against others; invalid input is refused early."""
+"""Runs and models are evaluated on their own or other data, against others, with a decoder; wrong input is refused."""
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,21 +10,26 @@ import pytest
 import yaml
 
 from latent_sets import encode_for
-from run_fixtures import one_thread
+from run_fixtures import one_thread, tiny_config
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict, parse_config
 from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.decoding.decoder_folder import DecoderCard, save_decoder
+from vjepa2_ac.decoding.network import Decoder, DecoderShape
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import SILENT
+from vjepa2_ac.reports.metrics_json import read_metrics
 from vjepa2_ac.reports.write import Evaluated, evaluate_subject
 from vjepa2_ac.runs.checkpoint import select_checkpoint
 from vjepa2_ac.training.loop import train
 
 PROBES = ProbeOptions(sensitivity_clips=3, samples=6, landscape_clips=1, nodes=3, examples=1)
+NONE = ProbeOptions(sensitivity_clips=0, examples=0)
+FEW = ["--sensitivity-clips", "0", "--examples", "1", "--clips", "5"]
 QUICK = ["--sensitivity-clips", "3", "--samples", "6", "--landscapes", "1", "--nodes", "3", "--examples", "1"]
 
 
@@ -31,22 +37,12 @@ QUICK = ["--sensitivity-clips", "3", "--samples", "6", "--landscapes", "1", "--n
 def config(tmp_path_factory: pytest.TempPathFactory, data_folder: Path, base_folder: Path) -> Config:
     """Return the config of a tiny run that is trained for two steps."""
     folder = tmp_path_factory.mktemp("evaluation")
-    values = {
-        "run_dir": str(folder / "run"),
-        "data": {
-            "path": str(data_folder), "frames": 4, "stride": 2, "validation_share": 0.3, "test_share": 0.4,
-            "workers": 0, "cache_dir": str(folder / "caches"),
-        },
-        "model": {"base": str(base_folder), "dtype": "float32"},
-        "adapter": {"rank": 4, "alpha": 8},
-        "training": {
-            "steps": 2, "batch_size": 2, "accumulation": 1, "learning_rate": 1e-2, "warmup_steps": 0, "log_every": 1,
-            "precision": "fp32", "device": "cpu", "allow_weak_base": True,
-        },
-        "validation": {"every": 2, "clips": 4, "batch_size": 3},
-        "tracking": {"tensorboard": False},
-    }  # fmt: skip
-    config = parse_config(values, where="test")
+    config = tiny_config(
+        folder / "run", data_folder, base_folder,
+        data__test_share=0.4, data__cache_dir=str(folder / "caches"), data__cache_dtype="fp32",
+        training__steps=2, training__accumulation=1, training__learning_rate=1e-2, training__warmup_steps=0,
+        validation__every=2, validation__batch_size=3,
+    )  # fmt: skip
     train(config, SILENT)
     return config
 
@@ -155,12 +151,8 @@ def test_another_encoder_cannot_be_measured_on_these_latents(run: str, tmp_path:
 def test_a_cache_gives_the_figures_of_the_frames_and_frames_of_its_own(
     config: Config, run: str, tmp_path: Path
 ) -> None:
-    encode_for(
-        changed(config, cache_dtype="fp32"),
-        load_base(config.model, seed=0),
-        open_dataset(config.data),
-    )
-    path = written(config, tmp_path, cache="require", cache_dtype="fp32")
+    encode_for(config, load_base(config.model, seed=0), open_dataset(config.data))
+    path = written(config, tmp_path, cache="require")
     found = main(["evaluate", run, "--data", path, "--out", str(tmp_path / "cached"), "--clips", "5", *QUICK])
     assert found == 0
     fly, cached = figures_of(run), figures_of(tmp_path / "cached")
@@ -224,3 +216,78 @@ def test_a_model_without_data_and_a_file_in_the_way_are_errors(run: str, tmp_pat
     (tmp_path / "file").touch()
     with pytest.raises((InputError, OSError), match="file"):
         evaluate_subject(run, asked(out=tmp_path / "file"))
+
+
+# ---- with a decoder --------------------------------------------------------------------------------------------------
+
+
+def card_of(config: Config) -> DecoderCard:
+    model = load_base(config.model, seed=0)
+    shape = DecoderShape("linear", model.latent_dim, round(model.num_tokens**0.5), model.sizes.patch_size)
+    encoder = model.encoder_fingerprint()
+    return DecoderCard("vjepa2-ac decoder 1", shape, encoder, "released", "fp32", "data", ("camera",), 3, 30, 100)
+
+
+def saved(card: DecoderCard, folder: Path) -> str:
+    weights = Decoder(card.shape).state_dict()
+    save_decoder(folder, card, weights, weights)
+    return str(folder)
+
+
+@pytest.fixture(scope="module")
+def decoder(config: Config, tmp_path_factory: pytest.TempPathFactory) -> str:
+    return saved(card_of(config), tmp_path_factory.mktemp("decoder") / "decoder")
+
+
+def test_a_decoder_adds_rows_and_images_and_changes_nothing_else(
+    run: str, decoder: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["evaluate", run, *FEW, "--out", str(tmp_path)]
+    assert main(arguments) == 0
+    without = read_metrics(tmp_path)
+    assert "Decoded images" not in capsys.readouterr().out
+    assert "Decoded images: not measured." in (tmp_path / "report.html").read_text()
+    assert main([*arguments, "--decoder", decoder]) == 0
+    metrics = read_metrics(tmp_path)
+    added = [row for row in metrics.rows if row.key.startswith("decoded.")]
+    assert tuple(row for row in metrics.rows if row not in added) == without.rows
+    assert {row.model for row in added} >= {"decoded truth", "raw persistence", "base", "adapter"}
+    assert (metrics.of("decoded.psnr_db.whole.truth.3") or added[0]).value > 0  # type: ignore[operator]
+    assert "decoded truth" in capsys.readouterr().out
+    page = (tmp_path / "report.html").read_text()
+    assert "Decoded images against the truth: PSNR (dB), whole image" in page
+
+
+def test_from_a_cache_the_images_are_those_of_the_frames(config: Config, decoder: str, tmp_path: Path) -> None:
+    values = config_as_dict(config)
+    values["data"]["cache"] = "auto"
+    data = parse_config(values, where="test")
+    encode_for(config, load_base(config.model, seed=0), open_dataset(config.data))
+    found = []
+    for name, config_of_data in (("cached", data), ("frames", config)):
+        given = EvaluationOptions(clips=5, data=config_of_data, out=tmp_path / name, decoder=decoder, probes=NONE)
+        evaluate_subject(config.run_dir, given)
+        found.append(read_metrics(tmp_path / name))
+    assert found[0].of("decoded.ssim.whole.truth.3") is None
+    one, other = (each.of("decoded.ssim.whole.decoded_truth.3") for each in found)
+    assert one is not None
+    assert other is not None
+    assert one.value == pytest.approx(other.value, abs=1e-4)
+
+
+@pytest.mark.parametrize("given", [["--lpips", "a.pth"], ["--decoder", "D", "--lpips-heads", "a.pth"]])
+def test_lpips_needs_both_files_and_a_decoder(given: list[str], config: Config, capsys) -> None:
+    assert main(["evaluate", config.run_dir, *given]) == 2
+    assert "one without the others" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [({"encoder": "another"}, "another encoder"), ({"crop": "square"}, "data.crop square")],
+)
+def test_a_decoder_that_does_not_fit_is_refused(
+    changed: dict[str, str], words: str, config: Config, tmp_path: Path
+) -> None:
+    folder = saved(replace(card_of(config), **changed), tmp_path / "decoder")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=words):
+        evaluate_subject(config.run_dir, EvaluationOptions(clips=5, decoder=folder, probes=NONE))

@@ -197,7 +197,6 @@ def test_where_nothing_was_simulated_nothing_is_said_of_what_would_happen(whole_
         ({"actions": ("nowhere.npy",)}, "nowhere.npy: cannot be read"),
         ({"actions": ()}, "--actions"),
         ({"size_m": 0.0}, "--size"),
-        ({"size_m": float("nan")}, "--size"),
         ({"episode": "nobody"}, "--episode: no episode nobody"),
         ({"episode": "first", "start": -1}, r"--start: -1, in an episode of 24 steps.*0 to 17"),
         ({"episode": "first", "start": 18}, r"--start: 18, .*0 to 17: 3 model steps take 7 control steps"),
@@ -214,15 +213,6 @@ def test_what_cannot_be_imagined_is_refused_and_named(
         asked = asked | {"episode": dataset.table.identity(int(dataset.episodes[0]))}
     with pytest.raises(InputError, match=found):
         imagine(**asked)
-
-
-@pytest.mark.parametrize(
-    ("shape", "found"), [((STEPS - 1, 7), "2 actions.*3, one for each model step"), ((STEPS, 6), r"shape \(3, 6\)")]
-)
-def test_a_file_of_the_wrong_length_is_refused(imagine: Imagine, tmp_path: Path, shape: tuple, found: str) -> None:
-    np.save(tmp_path / "file.npy", np.zeros(shape))
-    with pytest.raises(InputError, match=found):
-        imagine(actions=(str(tmp_path / "file.npy"),))
 
 
 def test_under_vector_states_only_recorded_actions_can_be_imagined(make_config: MakeConfig) -> None:

@@ -9,7 +9,6 @@ from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import L1, L2, MODES, Evaluation, Metric
 from vjepa2_ac.evaluation.rows import rows_of
 from vjepa2_ac.evaluation.verdict import verdict
-from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.reports.comparison import compare
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, write_metrics
 from worlds import Copier, Halfway, Oracle, about, again, clips_batch
@@ -51,9 +50,3 @@ def test_more_is_better_where_a_metric_says_so() -> None:
     assert "): NOT better." in mistaken
     both = verdict(evaluated(Oracle(), Halfway(), SMALLER, Metric("h", "twin", "", SMALLER.of)))
     assert "By height and twin it is another matter: " in both
-
-
-def test_a_ratio_is_on_the_side_that_the_metric_says() -> None:
-    low, high, unclear = Estimate(0.5, 0.4, 0.6), Estimate(1.5, 1.4, 1.6), Estimate(1.0, 0.9, 1.1)
-    assert [L1.side(one) for one in (low, high, unclear)] == [1, -1, 0]
-    assert [LARGER.side(one) for one in (low, high, unclear)] == [-1, 1, 0]

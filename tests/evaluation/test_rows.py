@@ -1,6 +1,5 @@
 """Every number is a row, and console, page, metrics.json and comparison show the same rows."""
 
-from dataclasses import replace
 from pathlib import Path
 
 from evaluation_results import evaluation
@@ -8,11 +7,11 @@ from planned import with_plans
 from vjepa2_ac.console.progress import PlainConsole
 from vjepa2_ac.console.tables import row_tables
 from vjepa2_ac.evaluation.estimates import gain_over, over_persistence, rank_difference, stratum_gain
-from vjepa2_ac.evaluation.result import L1, Row, sections
+from vjepa2_ac.evaluation.result import L1
 from vjepa2_ac.evaluation.rows import rows_of
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics, write_metrics
-from vjepa2_ac.reports.page import report_page
+from vjepa2_ac.reports.write import report_page
 
 WHOLE = with_plans(evaluation(others=("runs/other",)))
 
@@ -65,14 +64,3 @@ def test_console_page_and_file_show_the_same_rows(tmp_path: Path) -> None:
     assert found is not None
     row = next(row for row in rows if (row.key, row.model) == (found.key, found.model))
     assert Estimate(found.value or 0, found.low or 0, found.high or 0) == row.estimate
-
-
-def test_lines_join_by_key_and_lack_what_was_not_measured() -> None:
-    one = Row("a group", "a line", "a.key", "one", 0.5, 0.4, 0.6, chance=1.0)
-    other = replace(one, key="another", name="another line", model="two", value=float("nan"), note="why")
-    (section,) = sections([one, other])
-    assert section.columns == ("one", "two")
-    assert section.lines == (
-        ("a line", "1.000", ("0.500 [0.400, 0.600]", "")),
-        ("another line", "1.000", ("", "\N{EN DASH} [0.400, 0.600] (why)")),
-    ) or section.lines[1][2][1].endswith("(why)")

@@ -1,27 +1,22 @@
 """The verdict agrees with the metrics."""
 
-import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from evaluation_results import ranking_of
-from vjepa2_ac.console.tables import row_tables
 from vjepa2_ac.evaluation.clips import clips_of
 from vjepa2_ac.evaluation.result import (
     L1,
     L2,
     MODES,
     Evaluation,
-    Example,
     Metric,
     ModelResult,
     PredictionErrors,
 )
-from vjepa2_ac.evaluation.rows import rows_of
-from vjepa2_ac.evaluation.verdict import improvement, spread, uses_actions, verdict
-from vjepa2_ac.reports.figures.evaluation import plot_evaluation
+from vjepa2_ac.evaluation.verdict import uses_actions, verdict
 from vjepa2_ac.spaces import POSE_CHANGE
 from worlds import about
 
@@ -60,22 +55,13 @@ def model(
 def evaluation(*models: ModelResult, episodes: int = 8) -> Evaluation:
     ids = tuple(f"episode {clip % episodes}" for clip in range(CLIPS))
     actions = np.full((CLIPS, HORIZON, 7), 0.01)
-    example = Example(
-        why="best",
-        episode_id="episode 0",
-        start=0,
-        frames=None,
-        errors={name: np.ones((HORIZON, 2, 2)) for name in ("persistence", *(each.name for each in models))},
-        true_colours=np.zeros((HORIZON + 1, 2, 2, 3), np.uint8),
-        predicted_colours={},
-    )
     return Evaluation(
         about=about(frames=HORIZON + 1, seconds_per_step=0.5),
         clips=clips_of(actions, ids, tuple(range(CLIPS)), space=POSE_CHANGE, seconds_per_step=0.5),
         models={each.name: each for each in models},
         strata=(),
         episodes=(),
-        examples=(example,),
+        examples=(),
     )
 
 
@@ -111,14 +97,6 @@ def ranked(name: str, level: float, rank: float) -> ModelResult:
     return replace(model(name, level), ranking=ranking_of(rank + 0.01 * np.sin(np.arange(CLIPS)), ids))
 
 
-def test_a_model_that_predicts_better_and_plans_worse_is_called_so() -> None:
-    words = verdict(evaluation(ranked("base", 1.0, 0.05), ranked("adapter", 0.7, 0.1)))
-    assert "30% better than the base" in words
-    assert "It predicts better, but PLANS WORSE than the base. For moves as large as plans the true action's" in words
-    assert "mean rank is 0.100" in words
-    assert "that of the base 0.050: WORSE to plan with" in words
-
-
 @pytest.mark.parametrize(
     ("rank", "words"), [(0.02, "better to plan with"), (0.05, "no clear difference"), (0.1, "WORSE")]
 )
@@ -127,6 +105,8 @@ def test_a_ranking_is_compared_with_that_of_the_base(rank: float, words: str) ->
     assert f"that of the base 0.050: {words}" in found
     assert "predicts better, but" not in found
     assert "that of the base" not in verdict(evaluation(ranked("model", 1.0, rank)))
+    better = verdict(evaluation(ranked("base", 1.0, 0.05), ranked("adapter", 0.7, rank)))
+    assert ("It predicts better, but PLANS WORSE than the base." in better) == (words == "WORSE")
 
 
 def test_actions_are_called_used_only_where_wrong_ones_are_clearly_worse() -> None:
@@ -164,41 +144,8 @@ def test_the_words_say_where_l2_contradicts_l1() -> None:
     assert "): NOT better. It does NOT" in denied
 
 
-def test_the_words_say_where_only_l2_or_only_l1_is_sure() -> None:
-    found = evaluation(model("base", 0.8), model("adapter", 0.6))
-    unsure = verdict(with_errors(found, "adapter", by(0.6, 0.79, noise=0.3)))
-    assert "By L2 it is another matter: no clear difference to the base (gain 95 % interval -" in unsure
-    assert "of doing nothing" not in unsure.split("another matter")[1].split(". It")[0], "both are better than that"
-    sure = verdict(
-        with_errors(evaluation(model("base", 0.8, noise=0.3), model("adapter", 0.79)), "adapter", by(0.79, 0.3))
-    )
-    assert sure.startswith("The adapter did not clearly help")
-    assert re.search(r"By L2 it is another matter: \d\d% better than the base \(gain", sure)
-
-
-def test_one_episode_gives_no_interval_and_no_certainty(tmp_path) -> None:
+def test_one_episode_gives_no_interval_and_no_certainty() -> None:
     one = evaluation(*(model(name, level, episodes=1) for name, level in (("base", 1.0), ("adapter", 0.5))), episodes=1)
     words = verdict(one)
     assert "one episode: no interval" in words
     assert "did not clearly help" in words
-    titles = [row_tables(rows_of(found), "")[0].title for found in (one, evaluation(model("model", 0.5)))]
-    assert [str(title).partition("(")[2] for title in titles] == [
-        "one episode: no interval)",
-        "95 % interval over episodes)",
-    ]
-    assert plot_evaluation(one, tmp_path / "picture.png").stat().st_size > 1000
-
-
-def test_improvement_is_one_minus_the_ratio_of_errors() -> None:
-    gain = improvement(evaluation(model("base", 1.0, noise=0.0), model("adapter", 0.75)), horizon=2)
-    assert gain is not None
-    assert gain.value == pytest.approx(0.25, abs=0.02)
-    assert gain.low < gain.value < gain.high
-    assert improvement(evaluation(model("model", 0.5)), horizon=2) is None
-
-
-def test_the_spread_names_mean_and_range() -> None:
-    words = spread([evaluation(model("base", 1.0, noise=0.0), model("adapter", a, noise=0.0)) for a in (0.7, 0.8)])
-    assert words == (
-        "2 runs: error over persistence 0.750 (0.700 to 0.800); better than the base by 25.0% (20.0% to 30.0%)"
-    )

@@ -68,7 +68,7 @@ def test_a_run_of_poses_keeps_what_it_was_taught_and_plans_within_it(make_config
     of_run = Controller.of_run(load_run(folder), taught)
     np.testing.assert_allclose(of_run.space.upper[0, :3], limits, rtol=1e-6)
     asked = EvaluationOptions(planning=("planning.limits.xyz=data",), probes=ProbeOptions(planning_clips=2))
-    assert settle(str(folder), asked)[1].limits.xyz == limits
+    assert settle(str(folder), asked).planning.limits.xyz == limits
 
 
 def test_a_run_that_continues_notes_it_once_and_an_older_one_when_it_goes_on(make_config, reporter) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import io
 import re
 from dataclasses import replace
 from functools import cache
@@ -13,14 +12,12 @@ from itertools import pairwise
 from xml.etree import ElementTree as ET
 
 import numpy as np
-import pytest
-from PIL import Image
 
 from evaluation_results import evaluation
 from planned import with_plans
 from vjepa2_ac.evaluation.result import Evaluation, TrainingCurve
 from vjepa2_ac.evaluation.verdict import verdict
-from vjepa2_ac.reports.page import MOST_CLIPS, jpeg_urls, report_page, write_report
+from vjepa2_ac.reports.write import MOST_CLIPS, report_page, write_report
 
 VOID = {"br", "hr", "img", "input", "meta", "wbr"}
 HOSTILE = "\"'><script>alert(1)</script><img src=x onerror=alert(2)>&amp;]]>{}\u202e\x00\ud800é"
@@ -161,7 +158,7 @@ def test_what_was_not_measured_is_named_with_the_reason() -> None:
     one = evaluation(with_base=False)
     adapter = replace(one.models["adapter"], sensitivity=None, landscapes=None, distribution=None)
     bare = replace(one, models={"adapter": adapter}, examples=(), training=(), strata=(), episodes=())
-    bare = replace(bare, persistence_distribution=None)
+    bare = replace(bare, copies=None)
     page = Page(report_page(bare))
     for what in (
         "Differences to the base", "Energy landscapes", "Example clips", "Training curves", "Other strides",
@@ -208,16 +205,6 @@ def test_images_are_described_tables_have_captions_and_headings_do_not_jump() ->
     assert "" not in page.tables
 
 
-def test_photographs_take_the_best_quality_in_which_all_of_them_fit_or_are_left_out() -> None:
-    images = [np.random.default_rng(n).integers(0, 256, size=(120, 240, 3), dtype=np.uint8) for n in range(2)]
-    fine, coarse, none = (sum(map(len, jpeg_urls(images, at_most=most))) for most in (10**6, 50_000, 1000))
-    assert 50_000 < fine <= 10**6
-    assert 0 < coarse <= 50_100
-    assert none == 0
-    first = base64.b64decode(jpeg_urls(images, at_most=10**6)[0].partition("base64,")[2])
-    assert Image.open(io.BytesIO(first)).size == (240, 120)
-
-
 def contrast(one: str, other: str) -> float:
     """Source: WCAG 2.2, contrast ratio and relative luminance."""
 
@@ -239,11 +226,3 @@ def test_every_colour_can_be_read_on_the_paper_in_light_dark_and_print() -> None
             assert contrast(palette[name], palette["paper"]) >= 4.5, name
         for name in ("ink", "soft", "better", "unclear", "worse"):
             assert contrast(palette[name], palette["raised"]) >= 4.5, name
-
-
-@pytest.mark.parametrize("frames", [3, 16])
-def test_charts_hold_a_point_for_each_horizon(frames: int) -> None:
-    page = Page(report_page(evaluation(frames=frames, size=32)))
-    drawings = [image.decode() for image in page.images() if b"<svg" in image]
-    assert len(drawings) >= 5
-    assert any(f"{(frames - 1) * 4 / 15:.2f}" in drawing for drawing in drawings) or frames > 9

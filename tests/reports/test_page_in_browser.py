@@ -9,7 +9,7 @@ import pytest
 
 from browser import open_page
 from evaluation_results import evaluation
-from vjepa2_ac.reports.page import report_page, write_report
+from vjepa2_ac.reports.write import report_page, write_report
 
 # Put into a copy of the page that may run it: the page itself runs nothing.
 PROBE = """<script>addEventListener("load", () => {

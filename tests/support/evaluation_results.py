@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from vjepa2_ac.calibration.axes import TRIED_DEGREES, AxisFit, fit_axes
-from vjepa2_ac.evaluation.distribution import Discrepancy, LatentDistribution
 from vjepa2_ac.evaluation.estimates import episode_scores
 from vjepa2_ac.evaluation.result import (
     ACTIONS,
@@ -23,9 +22,9 @@ from vjepa2_ac.evaluation.result import (
     Example,
     Landscape,
     Landscapes,
+    LatentDistribution,
     Mode,
     ModelResult,
-    PersistenceDistribution,
     PredictionErrors,
     Ranking,
     Sensitivity,
@@ -73,15 +72,11 @@ def _sensitivity(rng: np.random.Generator, ids: tuple[str, ...], skill: float) -
     rank = rng.beta(1.0, 1.0 + 3 * skill, size=len(ids))
     change = np.abs(rng.normal(0.1 + 0.2 * skill, 0.05, size=len(ids)))
 
-    def ranking(drawn_from: Any, words: str) -> Ranking:
+    def ranking(drawn_from: Any) -> Ranking:
         top = {k: mean_of((rank < k / 65).astype(np.float64), ids) for k in (1, 5)}
-        return Ranking(drawn_from, words, 64, tuple(range(len(ids))), rank, mean_of(rank, ids), top)
+        return Ranking(drawn_from, 64, tuple(range(len(ids))), rank, mean_of(rank, ids), top)
 
-    rankings = (
-        ranking("clips", "actions of other episodes"),
-        ranking("box", "uniform actions of up to 7.5 cm an axis"),
-    )
-    return Sensitivity(mean_of(change, ids), change, rankings)
+    return Sensitivity(mean_of(change, ids), change, (ranking("clips"), ranking("box")))
 
 
 def ranking_of(ranks: np.ndarray, ids: tuple[str, ...]) -> ActionRanking:
@@ -121,7 +116,7 @@ def _axes(ids: tuple[str, ...], degrees: float) -> AxisFit:
 def _distribution(rng: np.random.Generator, ids: tuple[str, ...], spread: float, horizon: int) -> LatentDistribution:
     levels = [spread ** (h / horizon) + 0.1 * rng.standard_normal(len(ids)) for h in range(1, horizon + 1)]
     spreads = tuple(mean_of(level, ids) for level in levels)
-    return LatentDistribution(spreads, tuple(Discrepancy(mean_of(1 - level, ids), 0.04) for level in levels))
+    return LatentDistribution(spreads, tuple(mean_of(1 - level, ids) for level in levels), (0.04,) * horizon)
 
 
 def _example(rng: np.random.Generator, why: str, episode_id: str, times: int, models: list[str], size: int) -> Example:
@@ -192,7 +187,6 @@ def evaluation(
             TrainingCurve("train/data_wait_share", (10, 400, 800), (0.1, 0.02, 0.03)),
             TrainingCurve("train/learning_rate", tuple(range(10, 810, 10)), tuple(np.linspace(3e-3, 0, 80))),
         ),
-        persistence_distribution=PersistenceDistribution(
-            _distribution(np.random.default_rng(9), ids, 1.0, horizon), (0.031,) * horizon
-        ),
+        copies=_distribution(np.random.default_rng(9), ids, 1.0, horizon),
+        noise_floor=(0.031,) * horizon,
     )

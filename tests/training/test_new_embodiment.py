@@ -11,7 +11,7 @@ import yaml
 from run_fixtures import KilledError, dying_reporter
 from same_run import assert_same_run
 from vector_sets import write_vectors
-from vjepa2_ac.calibration.strides import calibrate_config
+from vjepa2_ac.calibration.variants import calibrate_config
 from vjepa2_ac.config import Config, ModelConfig
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
@@ -113,7 +113,7 @@ def test_what_it_learnt_is_a_base_that_the_same_robot_trains_on(
     evaluation = evaluate_subject(str(folder), QUICK).evaluation
     assert list(evaluation.models) == ["base", "adapter"]
     results = calibrate_config(make_robot(data__stride_candidates=[1, 2], **second), ClipSample(clips=4)).results
-    assert [one.moved_cm for one in results] == [None, None]
+    assert [one.moved_cm for one in results.values()] == [None, None]
 
 
 def test_a_head_that_nothing_trains_is_refused_before_the_model_is_loaded(

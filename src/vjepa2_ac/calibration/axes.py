@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,10 +21,10 @@ from torch import Tensor
 
 from vjepa2_ac import __version__
 from vjepa2_ac.calibration.variants import load_named
-from vjepa2_ac.config import Config, DataConfig
+from vjepa2_ac.config import Config
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.planning import CemConfig, LimitsConfig, PlanningConfig
-from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.loader import validation_batches
 from vjepa2_ac.distances import squared_difference
 from vjepa2_ac.distributed import make_accelerator
@@ -35,14 +35,12 @@ from vjepa2_ac.evaluation.measure import Predictor
 from vjepa2_ac.evaluation.result import Row
 from vjepa2_ac.intervals import Estimate, bootstrapped, mean_of, ratio
 from vjepa2_ac.model.adapter.merging import merge_adapter
-from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.axes.axes_file import FORMAT, require_axes_in
 from vjepa2_ac.planning.axes.mapping import Axes
 from vjepa2_ac.planning.model_setup import Fingerprints
 from vjepa2_ac.planning.planner import Planner
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
-from vjepa2_ac.storage import write_atomically
-from vjepa2_ac.storage.structured import json_text, utc_now
+from vjepa2_ac.storage.structured import utc_now
 
 MOST_CONDITION = 10.0  # beyond it, one direction is hardly inferred, or hardly executed
 MOST_YAW_DEGREES = 15.0  # half the width of the interval of an angle that is known
@@ -135,7 +133,7 @@ class AxisFit:
         }
 
 
-def yaw_of_least_error(errors: Float[np.ndarray, "pairs angles"], episode_ids: Sequence[str]) -> Estimate:
+def _yaw_of_least_error(errors: Float[np.ndarray, "pairs angles"], episode_ids: Sequence[str]) -> Estimate:
     """Return the angle of least error in degrees: of a parabola through the least of the tried ones and those beside.
 
     Args:
@@ -165,12 +163,7 @@ def fit_axes(
         errors: Squared errors at each of `TRIED_DEGREES`.
         episode_ids: Of each pair.
         centre_m: x, y about which states were turned.
-
-    Raises:
-        ValueError: No pairs.
     """
-    if not len(inferred):
-        raise ValueError("no pairs to fit axes to")
     products = np.concatenate(
         [np.einsum("ni,nj->nij", one, executed).reshape(-1, 9) for one in (inferred, executed)], axis=1
     )
@@ -183,7 +176,7 @@ def fit_axes(
         return np.stack([nearby + _wrapped(_yaw(fitted) - nearby), flat, _condition(fitted)], axis=-1)
 
     fitted_yaw, gain, condition = bootstrapped(of_sums, products[None], episode_ids)
-    yaw = yaw_of_least_error(errors, episode_ids)
+    yaw = _yaw_of_least_error(errors, episode_ids)
     place = int(np.abs(_wrapped(np.array(TRIED_DEGREES) - yaw.value)).argmin())  # the nearest that was tried
     residuals = np.linalg.norm(inferred - executed @ matrix.T, axis=1)
     return AxisFit(
@@ -234,22 +227,7 @@ def _condition(matrix: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*b
     return np.asarray(sizes[..., 0] / sizes[..., -1])
 
 
-@torch.no_grad()
-def turned_errors(
-    model: Predictor, starts: Sequence[RolloutStart], centre_m: tuple[float, float] = (0.0, 0.0), *, at_once: int
-) -> Float[np.ndarray, "starts angles"]:
-    """Return the mean squared error of the next frame at each angle of `TRIED_DEGREES`, with the executed action.
-
-    Args:
-        model: The predictor.
-        starts: Of poses in the robot's base frame.
-        centre_m: x, y about which is turned.
-        at_once: Samples per batch.
-    """
-    return np.stack([_errors(model, start, centre_m, at_once) for start in starts])
-
-
-def turned(start: RolloutStart, axes: Axes) -> RolloutStart:
+def _turned(start: RolloutStart, axes: Axes) -> RolloutStart:
     """Return a start as a model of these axes sees it."""
     return replace(
         start,
@@ -259,10 +237,11 @@ def turned(start: RolloutStart, axes: Axes) -> RolloutStart:
     )
 
 
-def _errors(
+def _turned_errors(
     model: Predictor, start: RolloutStart, centre_m: tuple[float, float], at_once: int
 ) -> Float[np.ndarray, " angles"]:
-    seen = [turned(start, Axes(math.radians(angle), centre_m)) for angle in TRIED_DEGREES]
+    """Return the mean squared error of the next frame at each angle of `TRIED_DEGREES`, with the executed action."""
+    seen = [_turned(start, Axes(math.radians(angle), centre_m)) for angle in TRIED_DEGREES]
     errors = []
     for first in range(0, len(seen), at_once):
         part = seen[first : first + at_once]
@@ -280,6 +259,7 @@ _MOVE = slice(0, 3)
 _SEARCH = PlanningConfig(samples=48, iterations=6, start_std=0.67, cem=CemConfig(elites=6))
 
 
+@torch.no_grad()
 def infer_axes(
     model: Predictor, starts: Sequence[RolloutStart], at_once: int, progress: Progress = no_progress
 ) -> AxisFit:
@@ -295,8 +275,14 @@ def infer_axes(
         progress: Called with the number of finished starts.
     """
     names = [start.episode_id for start in starts]
-    centre_m, errors = _turn_of_least_error(model, starts, at_once)
-    axes = Axes(math.radians(yaw_of_least_error(errors, names).value), centre_m)
+    # A robot that is mounted turned is turned about its base; a camera, rather about what it looks at: the middle of
+    # the motion.
+    x, y = np.mean([_numbers(start.state)[:2] for start in starts], axis=0)
+    places = ((0.0, 0.0), (float(x), float(y)))
+    tried = {place: np.stack([_turned_errors(model, start, place, at_once) for start in starts]) for place in places}
+    centre_m = min(places, key=lambda place: tried[place].sum(axis=0).min())
+    errors = tried[centre_m]
+    axes = Axes(math.radians(_yaw_of_least_error(errors, names).value), centre_m)
     executed = np.stack([start.true[_MOVE] for start in starts])
     reach = min(1.0, max(_LEAST_M, _ROOM * float(np.linalg.norm(executed, axis=1).max())))
     planner = Planner(
@@ -304,24 +290,9 @@ def infer_axes(
     )
     inferred = []
     for done, start in enumerate(starts, start=1):
-        inferred.append(_inferred(model, turned(start, axes), planner, at_once))
+        inferred.append(_inferred(model, _turned(start, axes), planner, at_once))
         progress(done, len(starts))
     return fit_axes(np.stack(inferred), executed, errors, names, centre_m)
-
-
-def _turn_of_least_error(
-    model: Predictor, starts: Sequence[RolloutStart], at_once: int
-) -> tuple[tuple[float, float], Float[np.ndarray, "starts angles"]]:
-    """Return the better of two places to turn about, and the errors there.
-
-    A robot that is mounted turned is turned about its base; a camera, rather about what it looks at: the middle of the
-    motion.
-    """
-    middle = np.mean([_numbers(start.state)[:2] for start in starts], axis=0)
-    places = ((0.0, 0.0), (float(middle[0]), float(middle[1])))
-    tried = {place: turned_errors(model, starts, place, at_once=at_once) for place in places}
-    best = min(places, key=lambda place: tried[place].sum(axis=0).min())
-    return best, tried[best]
 
 
 def _inferred(model: Predictor, start: RolloutStart, planner: Planner, at_once: int) -> Float[np.ndarray, " 3"]:
@@ -340,46 +311,9 @@ def _numbers(values: Tensor) -> Float[np.ndarray, " numbers"]:
     return values.detach().cpu().double().numpy()
 
 
-@dataclass(frozen=True)
-class AxisCalibration:
-    """The axes of a model on some data."""
-
-    fit: AxisFit
-    subject: str  # the model, as given
-    known: Fingerprints
-    data: DataConfig
-    split: Split
-
-    def verdict(self) -> str:
-        """Return as text where the model's axes lie, and whether they can be planned by."""
-        return self.fit.words()
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the content of axes.json, by the schema in docs/planning.md."""
-        return {
-            "format": FORMAT,
-            "verdict": self.verdict(),
-            **self.fit.as_dict(),
-            "model": {"subject": self.subject, **self.known._asdict()},
-            "data": {
-                "path": self.data.path,
-                "cameras": list(self.data.cameras),
-                "stride": self.data.model_stride,
-                "split": self.split,
-            },
-            "version": __version__,
-            "time": utc_now(),
-        }
-
-    def write(self, path: Path) -> Path:
-        """Write axes.json; the file is written atomically."""
-        write_atomically(path, json_text(self.as_dict()))
-        return path
-
-
 def calibrate_axes(
     config: Config, model: str, *, pairs: int, split: Split = "validation", reporter: Reporter = SILENT
-) -> AxisCalibration:
+) -> tuple[AxisFit, dict[str, Any]]:
     """Fit the axes of a model to recorded pairs of frames, one model step apart.
 
     The model infers moves as it plans: with trained weights merged, in the base's type, without autocast.
@@ -390,6 +324,9 @@ def calibrate_axes(
         pairs: At most, spread over the episodes.
         split: Of the data.
         reporter: Shows the progress of indexing, encoding and inferring.
+
+    Returns:
+        The fit, and the content of axes.json, by the schema in docs/planning.md.
 
     Raises:
         InputError: The data or the model cannot be used; or the states have no axes.
@@ -403,17 +340,25 @@ def calibrate_axes(
     if world_model.adaptation is not None:
         merge_adapter(world_model)
     world_model.to(accelerator.device).eval()
-    starts = _starts(world_model, dataset, config, split, pairs)
-    fit = infer_axes(world_model, starts, config.planning.energy.samples_at_once, reporter.task("inferring moves"))
-    return AxisCalibration(fit, model, known, config.data, split)
-
-
-def _starts(model: WorldModel, dataset: Dataset, config: Config, split: Split, pairs: int) -> list[RolloutStart]:
-    device, size = model.device, config.validation.batch_size
-    batches = validation_batches(dataset, split, clips=pairs, batch_size=size)
-    found: list[RolloutStart] = []
+    starts: list[RolloutStart] = []
+    encode = partial(encode_batch, world_model, device=accelerator.device, chunk=config.model.encode_chunk)
     with torch.no_grad():
-        for batch in batches:
-            latents = encode_batch(model, batch, device=device, chunk=config.model.encode_chunk)
-            found += [start_of(latents, row, 0, len(found) + row) for row in range(len(batch.starts))]
-    return found
+        for batch in validation_batches(dataset, split, clips=pairs, batch_size=config.validation.batch_size):
+            latents = encode(batch)
+            starts += [start_of(latents, row, 0, len(starts) + row) for row in range(len(batch.starts))]
+    fit = infer_axes(world_model, starts, config.planning.energy.samples_at_once, reporter.task("inferring moves"))
+    data = {
+        "path": config.data.path,
+        "cameras": list(config.data.cameras),
+        "stride": config.data.model_stride,
+        "split": split,
+    }
+    return fit, {
+        "format": FORMAT,
+        "verdict": fit.words(),
+        **fit.as_dict(),
+        "model": {"subject": model, **known._asdict()},
+        "data": data,
+        "version": __version__,
+        "time": utc_now(),
+    }

@@ -6,7 +6,7 @@ variant that is certainly better is most likely the true reading of the data.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -14,14 +14,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from vjepa2_ac.calibration.variants import (
-    SameClips,
-    Variant,
-    VariantErrors,
-    is_certainly_better,
-    load_named,
-    measure_variants,
-)
+from vjepa2_ac.calibration.variants import ReadOnce, SameClips, Variant, VariantResult, load_named, measure_variants
 from vjepa2_ac.config import Config, DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset
@@ -29,11 +22,10 @@ from vjepa2_ac.data.loader import validation_windows
 from vjepa2_ac.data.windows import spread
 from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch
-from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, EpisodeSource, LatentBatch, Progress, StepRanges, no_progress
+from vjepa2_ac.episode import Batch, Episode, LatentBatch, Progress, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.measure import ClipSample, Predictor
 from vjepa2_ac.geometry import euler_from_matrices, matrices_from_euler
-from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.spaces import POSE
 
 SHIFTS = (1, 2, 4, 8)  # control steps
@@ -44,62 +36,36 @@ _GAIN = 0.01  # of persistence: smaller gains are irrelevant
 
 
 @dataclass(frozen=True)
-class Reading:
-    """Another reading of the same data."""
-
-    name: str
-    repair: str  # the fix, if it fits better
-    change: Callable[[Episode], Episode]
-    changes_frames: bool = False
-
-
-@dataclass(frozen=True)
-class VariantResult:
-    """The prediction error of a model under a variant."""
-
-    name: str
-    repair: str
-    ratio: Estimate  # one-step error over persistence
-    difference: Estimate  # to the unchanged data, on the same clips; below 0: fits better
-
-
-@dataclass(frozen=True)
 class VariantProbe:
-    """The results of all variants."""
+    """The results of all variants, each compared with the unchanged data."""
 
-    ratio: Estimate  # one-step error over persistence, of the unchanged data
+    plain: VariantResult  # of these
     results: tuple[VariantResult, ...]
-    clips: int
-    episodes: int
 
     @property
     def better(self) -> VariantResult | None:
         """The variant that fits best, if it certainly fits better than the unchanged data."""
-        certain = [one for one in self.results if self._is_certainly_better(one)]
-        return min(certain, key=lambda one: one.difference.value) if certain else None
-
-    def _is_certainly_better(self, one: VariantResult) -> bool:
-        certain = is_certainly_better(one.difference, self.episodes, needed=_EPISODES_TO_BE_SURE)
-        return certain and one.difference.value < -_GAIN and one.ratio.high < 1  # else it only fails less
+        certain = [
+            one
+            for one in self.results
+            if one.is_certainly_better(needed=_EPISODES_TO_BE_SURE)
+            and one.gain > _GAIN
+            and one.ratio.high < 1  # else it only fails less
+        ]
+        return max(certain, key=lambda one: one.gain, default=None)
 
     def verdict(self) -> str:
         """Return as text whether the unchanged data fit the model best."""
-        text = f"error / persistence {self.ratio} on {self.clips} clips of {self.episodes} episodes"
-        if (better := self.better) is not None:
-            less = f"{-better.difference.value:.3f} [{-better.difference.high:.3f}, {-better.difference.low:.3f}]"
+        plain, better = self.plain, self.better
+        text = f"error / persistence {plain.ratio} on {plain.clips} clips of {plain.episodes} episodes"
+        if better is not None and (found := better.difference) is not None:
+            less = f"{-found.value:.3f} [{-found.high:.3f}, {-found.low:.3f}]"
             return f"{text}, and {less} less with {better.name}: {better.repair}"
-        if self.episodes < _EPISODES_TO_BE_SURE:
+        if plain.episodes < _EPISODES_TO_BE_SURE:
             return f"{text}: too few episodes to compare, {_EPISODES_TO_BE_SURE} are needed"
-        if self.ratio.value >= 1:
+        if plain.ratio.value >= 1:
             return f"{text}: the model predicts none of this better than persistence, so the result is unknown"
         return f"{text}; no variant certainly fits better"
-
-
-def rows_of(probe: VariantProbe) -> Iterator[tuple[str, str, str]]:
-    """Yield name, error over persistence, and difference, for a table; the unchanged data first."""
-    yield AS_THEY_ARE, str(probe.ratio), ""
-    for one in probe.results:
-        yield one.name, str(one.ratio), str(one.difference)
 
 
 def probe_config(
@@ -154,22 +120,15 @@ def probe_variants(
     frames = sample.frames_of(dataset.config)
     dataset = replace(dataset, config=dataset.config.model_copy(update={"frames": frames}))
     windows, shifts = _with_room(dataset, candidates, sample.clips)
-    readings = variants_of(dataset.config, shifts)
-    variants = [Variant(AS_THEY_ARE, lambda same: same)]
-    variants += [Variant(one.name, partial(_read_as, one), has_frames=one.changes_frames) for one in readings]
+    variants = [Variant(AS_THEY_ARE, lambda same: same), *variants_of(dataset.config, shifts)]
     clips = SameClips(dataset, windows, sample.batch_size)
-    measured = measure_variants(model, encode, clips, variants, progress)
-    plain = measured[AS_THEY_ARE]
-    results = tuple(_result(one, measured[one.name], plain) for one in readings)
-    return VariantProbe(plain.ratio, results, len(plain.clips), len(set(plain.episode_ids)))
-
-
-def _read_as(reading: Reading, dataset: Dataset) -> Dataset:
-    return replace(dataset, source=ChangedSource(dataset.source, reading))
-
-
-def _result(reading: Reading, measured: VariantErrors, plain: VariantErrors) -> VariantResult:
-    return VariantResult(reading.name, reading.repair, measured.ratio, measured.minus(plain))
+    plain, *measured = measure_variants(model, encode, clips, variants, progress)
+    space = dataset.spaces.action
+    results = [
+        found.result(one.name, space, beside=plain, repair=one.repair)
+        for one, found in zip(variants[1:], measured, strict=True)
+    ]
+    return VariantProbe(plain.result(AS_THEY_ARE, space), tuple(results))
 
 
 def _with_room(
@@ -189,7 +148,7 @@ def _with_room(
     return [fitting[place] for place in spread(len(fitting), clips)], shifts
 
 
-def variants_of(config: DataConfig, shifts: Sequence[int]) -> list[Reading]:
+def variants_of(config: DataConfig, shifts: Sequence[int]) -> list[Variant]:
     """Return the variants that apply to this data.
 
     Args:
@@ -197,27 +156,44 @@ def variants_of(config: DataConfig, shifts: Sequence[int]) -> list[Reading]:
         shifts: Control steps by which to shift frames against states.
     """
     found = [
-        Reading(
+        _variant(
             f"frames {_steps(shift)} {'late' if shift > 0 else 'early'}",
             f"give each frame the state of {_steps(shift)} {'before' if shift > 0 else 'after'}",
-            partial(_shifted, late=shift),
+            partial(shifted, late=shift),
         )
         for size in shifts
         for shift in (size, -size)
     ]
     if config.actions == "difference":  # a command has no opposite
-        found.append(Reading("the states backwards", "reverse the order of the frames", _backwards))
+        found.append(_variant("the states backwards", "reverse the order of the frames", _of_states(_backwards)))
     if config.states == "pose":
         for axis, name in enumerate("xy"):
             repair = f"negate {name}, with the rotation (as of a mirror)"
-            found.append(Reading(f"{name} negated", repair, partial(_with_mirrored_states, axis=axis)))
-        found.append(Reading("the gripper inverted", config.gripper_fix, _with_gripper_inverted))
+            found.append(_variant(f"{name} negated", repair, _of_states(partial(mirrored, axis=axis))))
+        found.append(_variant("the gripper inverted", config.gripper_fix, _of_states(_with_gripper_inverted)))
     if not config.is_cache:
+        exchanged, flipped = (
+            partial(_with_changed_frames, change=change)
+            for change in (lambda frames: frames[..., ::-1], lambda frames: frames[:, :, ::-1])
+        )
         repair = "exchange red and blue (OpenCV reads and writes BGR) where the data is written"
-        found.append(Reading("red and blue exchanged", repair, _with_channels_exchanged, changes_frames=True))
+        found.append(_variant("red and blue exchanged", repair, exchanged, has_frames=True))
         repair = "flip the frames, left to right, where the data is written"
-        found.append(Reading("frames mirrored", repair, _with_mirrored_frames, changes_frames=True))
+        found.append(_variant("frames mirrored", repair, flipped, has_frames=True))
     return found
+
+
+def _variant(name: str, repair: str, change: Callable[[Episode], Episode], *, has_frames: bool = False) -> Variant:
+    """Return a variant of changed episodes; without frames where they are the same."""
+
+    def changed(episode: Episode) -> Episode:
+        found = change(episode)
+        return found if has_frames else replace(found, read_frames=_no_frames, read_latents=None)
+
+    def view(dataset: Dataset) -> Dataset:
+        return replace(dataset, source=ReadOnce(dataset.source, changed))
+
+    return Variant(name, view, has_frames, repair)
 
 
 def mirrored(states: Float[np.ndarray, "steps 7"], axis: int) -> Float[np.ndarray, "steps 7"]:
@@ -228,25 +204,6 @@ def mirrored(states: Float[np.ndarray, "steps 7"], axis: int) -> Float[np.ndarra
     return np.concatenate([states[:, POSE.position] * mirror, euler_from_matrices(rotations), states[:, -1:]], axis=1)
 
 
-@dataclass(frozen=True)
-class ChangedSource:
-    """A source that is read otherwise; without frames where they are the same."""
-
-    source: EpisodeSource
-    reading: Reading
-
-    def infos(self, progress: Progress | None = None) -> Sequence[EpisodeInfo]:
-        """Return the infos of the source."""
-        return self.source.infos(progress)
-
-    def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:
-        """Return an episode, changed."""
-        episode = self.reading.change(self.source.read(index, camera, needed))
-        if self.reading.changes_frames:
-            return episode
-        return replace(episode, read_frames=_no_frames, read_latents=None)
-
-
 def _no_frames(steps: Sequence[int]) -> np.ndarray:
     return np.zeros((len(steps), 1, 1, 3), np.uint8)
 
@@ -255,33 +212,23 @@ def _steps(shift: int) -> str:
     return "1 step" if abs(shift) == 1 else f"{abs(shift)} steps"
 
 
-def _shifted(episode: Episode, *, late: int) -> Episode:
+def shifted(episode: Episode, *, late: int) -> Episode:
     """Give each step the state, and the command, of `late` steps before; beyond the ends, the first or the last."""
     steps = np.clip(np.arange(len(episode.states)) - late, 0, len(episode.states) - 1)
     commands = None if episode.commands is None else episode.commands[steps]
     return replace(episode, states=episode.states[steps], commands=commands)
 
 
-def _backwards(episode: Episode) -> Episode:
-    return replace(episode, states=np.ascontiguousarray(episode.states[::-1]))
+def _of_states(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Episode], Episode]:
+    return lambda episode: replace(episode, states=change(episode.states))
 
 
-def _with_mirrored_states(episode: Episode, *, axis: int) -> Episode:
-    return replace(episode, states=mirrored(episode.states, axis))
+def _backwards(states: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(states[::-1])
 
 
-def _with_gripper_inverted(episode: Episode) -> Episode:
-    states = episode.states.copy()
-    states[:, POSE.gripper] = 1 - states[:, POSE.gripper]
-    return replace(episode, states=states)
-
-
-def _with_channels_exchanged(episode: Episode) -> Episode:
-    return _with_changed_frames(episode, lambda frames: frames[..., ::-1])
-
-
-def _with_mirrored_frames(episode: Episode) -> Episode:
-    return _with_changed_frames(episode, lambda frames: frames[:, :, ::-1])
+def _with_gripper_inverted(states: np.ndarray) -> np.ndarray:
+    return np.concatenate([states[:, : POSE.gripper], 1 - states[:, POSE.gripper :]], axis=1)
 
 
 def _with_changed_frames(episode: Episode, change: Callable[[np.ndarray], np.ndarray]) -> Episode:

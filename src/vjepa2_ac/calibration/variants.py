@@ -1,40 +1,46 @@
 """Variants: the same clips of a data set, read in several ways and measured with a model, compared pair by pair.
 
-A model's one-step error over persistence is lowest where frames, states and actions are those that it knows.
+A model's one-step error over persistence is lowest where frames, states and actions are those that it knows. So strides
+are calibrated: the step length of the released weights is unknown (see IMPLEMENTATION_NOTES), and robots differ in
+their control rate. At each candidate stride, the same clips begin at the same control steps of the same held-out
+episodes. Other readings of the data are in `calibration.data`.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
+from accelerate import Accelerator
 from jaxtyping import Float
 
 from vjepa2_ac.config import Config, ModelConfig
-from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.data.loader import batches_of
-from vjepa2_ac.encoding.batch import require_same_encoder, require_widths
+from vjepa2_ac.config.data import Split
+from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.loader import batches_of, validation_windows
+from vjepa2_ac.distributed import make_accelerator
+from vjepa2_ac.encoding.batch import encode_batch, require_same_encoder, require_widths
 from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, EpisodeSource, LatentBatch, Progress, StepRanges, no_progress
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.measure import Predictor, one_step_errors
+from vjepa2_ac.evaluation.measure import ONE_STEP, ClipSample, Predictor, measured
+from vjepa2_ac.evaluation.result import L1, Row
 from vjepa2_ac.intervals import Estimate, ratio, ratio_difference
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
 from vjepa2_ac.runs.folder import is_run
 from vjepa2_ac.runs.loading import load_run
+from vjepa2_ac.spaces import ActionSpace
 
 _MARGIN = 2.0  # half-widths of the 95 % interval: the best of several is easily better by chance
-
-
-@dataclass(frozen=True)
-class SameClips:
-    """The clips on which variants are compared."""
-
-    dataset: Dataset
-    windows: Sequence[tuple[int, int]]  # episode and first control step
-    batch_size: int  # clips that are computed together
+_EPISODES_NEEDED = 2  # for an interval
+_EPISODES_TO_BE_SURE = 10  # an interval from fewer is too narrow
 
 
 @dataclass(frozen=True)
@@ -44,58 +50,79 @@ class Variant:
     name: str
     view: Callable[[Dataset], Dataset]
     has_frames: bool = True  # False: they are those of the first variant, whose latents are taken
+    repair: str = ""  # the fix, if it fits better
+
+
+@dataclass(frozen=True)
+class VariantResult:
+    """The one-step, teacher-forced error of a model under a variant."""
+
+    name: str
+    ratio: Estimate  # of the error to that of copying the frame before
+    error: float  # mean over clips
+    persistence: float
+    moved_cm: float | None  # median distance of the flange per model step; None: the states are no poses
+    clips: int
+    episodes: int
+    difference: Estimate | None = None  # of the ratio to another variant's on the same clips; below 0: fits better
+    repair: str = ""
+
+    @property
+    def gain(self) -> float:
+        """By how much the ratio is below the other variant's."""
+        return 0.0 if self.difference is None else -self.difference.value
+
+    def is_certainly_better(self, *, needed: int) -> bool:
+        """Return whether the difference is below 0 by twice its interval: the variant was chosen on these clips.
+
+        Args:
+            needed: Episodes; with fewer, an interval is too narrow.
+        """
+        if self.difference is None or not self.difference.has_interval or self.episodes < needed:
+            return False
+        return self.difference.value + _MARGIN * (self.difference.high - self.difference.value) < 0
 
 
 @dataclass(frozen=True)
 class VariantErrors:
     """What was measured of one variant, clip by clip."""
 
-    errors: Float[np.ndarray, " clips"]  # one-step, teacher-forced L1
-    persistence: Float[np.ndarray, " clips"]
+    errors: Float[np.ndarray, "2 clips"]  # one-step, teacher-forced L1 of the model and of persistence
     actions: Float[np.ndarray, "clips steps action_dim"]
     clips: tuple[tuple[str, int], ...]  # episode and first control step
 
-    @classmethod
-    def joined(cls, parts: Sequence[VariantErrors]) -> VariantErrors:
-        """Return all clips of some batches."""
-        return cls(
-            np.concatenate([one.errors for one in parts]),
-            np.concatenate([one.persistence for one in parts]),
-            np.concatenate([one.actions for one in parts]),
-            tuple(clip for one in parts for clip in one.clips),
-        )
+    def result(
+        self, name: str, space: ActionSpace, *, beside: VariantErrors | None = None, repair: str = ""
+    ) -> VariantResult:
+        """Return what it comes to, compared with another variant."""
+        ids, moved_cm = [episode for episode, _ in self.clips], None
+        if space.position is not None:
+            moved_cm = float(np.median(space.shown_size(self.actions.reshape(-1, self.actions.shape[-1]))))
+        error, persistence = (float(one.mean()) for one in self.errors)
+        difference = None if beside is None else self._minus(beside)
+        of_model, of_nothing = self.errors
+        return VariantResult(
+            name, ratio(of_model, of_nothing, ids), error, persistence, moved_cm, len(ids), len(set(ids)), difference,
+            repair,
+        )  # fmt: skip
 
-    @property
-    def episode_ids(self) -> tuple[str, ...]:
-        """The episode of each clip."""
-        return tuple(episode for episode, _ in self.clips)
-
-    @property
-    def ratio(self) -> Estimate:
-        """The error over persistence."""
-        return ratio(self.errors, self.persistence, self.episode_ids)
-
-    def minus(self, other: VariantErrors) -> Estimate:
-        """Return the ratio minus another variant's, paired by clip; below 0 is better."""
+    def _minus(self, other: VariantErrors) -> Estimate:
+        """Return the ratio minus another variant's, paired by clip."""
         places = {clip: place for place, clip in enumerate(other.clips)}
         pairs = [(place, places[clip]) for place, clip in enumerate(self.clips) if clip in places]
         mine, theirs = (np.array(side, dtype=np.int64) for side in zip(*pairs, strict=True))
-        ids = [self.episode_ids[place] for place in mine]
-        return ratio_difference(
-            (self.errors[mine], self.persistence[mine]), (other.errors[theirs], other.persistence[theirs]), ids
-        )
+        ids = [self.clips[place][0] for place in mine]
+        one, persistence = self.errors[:, mine]
+        return ratio_difference((one, persistence), (other.errors[0, theirs], other.errors[1, theirs]), ids)
 
 
-def is_certainly_better(difference: Estimate, episodes: int, *, needed: int) -> bool:
-    """Return whether a difference of ratios is below 0 by twice its interval: the variant was chosen on these clips.
+@dataclass(frozen=True)
+class SameClips:
+    """The clips on which variants are compared."""
 
-    Args:
-        difference: As of `VariantErrors.minus`.
-        episodes: From how many it is.
-        needed: With fewer, an interval is too narrow.
-    """
-    limit = difference.value + _MARGIN * (difference.high - difference.value)
-    return difference.has_interval and episodes >= needed and limit < 0
+    dataset: Dataset
+    windows: Sequence[tuple[int, int]]  # episode and first control step of each
+    batch_size: int  # clips that are computed together
 
 
 def measure_variants(
@@ -104,7 +131,7 @@ def measure_variants(
     clips: SameClips,
     variants: Sequence[Variant],
     progress: Progress = no_progress,
-) -> dict[str, VariantErrors]:
+) -> list[VariantErrors]:
     """Measure a model's one-step error on the same clips under each variant; each episode is read once for all.
 
     Args:
@@ -117,21 +144,26 @@ def measure_variants(
     Raises:
         InputError: A clip cannot be read; or, by `data.broken_episodes`, none of them.
     """
-    first, *others = variants
-    dataset, windows = clips.dataset, clips.windows
-    parts: dict[str, list[VariantErrors]] = {variant.name: [] for variant in variants}
+    first, dataset, windows = variants[0], clips.dataset, clips.windows
+    parts: list[list[VariantErrors]] = [[] for _ in variants]
     done = 0
     for batch in batches_of(first.view(dataset), windows, batch_size=clips.batch_size):
-        latents, here = encode(batch), _windows_of(dataset, batch)
-        read = replace(dataset, source=_RememberingSource(dataset.source))
-        for variant, found in (
-            (first, [latents]),
-            *((one, _read(one, read, here, encode, latents)) for one in others),
-        ):
-            parts[variant.name] += [_measured(model, each) for each in found]
+        latents, read = encode(batch), replace(dataset, source=ReadOnce(dataset.source))
+        places = [dataset.table.find(name) for name in batch.episode_ids]
+        here = [(place, start) for place, start in zip(places, batch.starts, strict=True) if place is not None]
+        for variant, found in zip(variants, parts, strict=True):
+            seen = [latents] if variant is first else _read(variant, read, here, encode, latents)
+            found += [_measured(model, each) for each in seen]
             done += len(batch.starts)
             progress(done, len(windows) * len(variants))
-    return {name: VariantErrors.joined(found) for name, found in parts.items()}
+    return [
+        VariantErrors(
+            np.concatenate([one.errors for one in found], axis=1),
+            np.concatenate([one.actions for one in found]),
+            tuple(clip for one in found for clip in one.clips),
+        )
+        for found in parts
+    ]
 
 
 def _read(
@@ -151,28 +183,34 @@ def _read(
 
 
 def _measured(model: Predictor, latents: LatentBatch) -> VariantErrors:
+    found = measured(model, latents, ONE_STEP, (L1,))
+    errors = np.stack([found.of("teacher_forced", L1, way).mean(axis=1) for way, _ in ONE_STEP])
     clips = tuple(zip(latents.episode_ids, latents.starts, strict=True))
-    return VariantErrors(*one_step_errors(model, latents), latents.actions.cpu().numpy().astype(np.float64), clips)
-
-
-def _windows_of(dataset: Dataset, batch: Batch) -> list[tuple[int, int]]:
-    places = [dataset.table.find(name) for name in batch.episode_ids]
-    return [(place, start) for place, start in zip(places, batch.starts, strict=True) if place is not None]
+    return VariantErrors(errors, latents.actions.cpu().numpy().astype(np.float64), clips)
 
 
 @dataclass(frozen=True)
-class _RememberingSource:
-    """A source that reads each episode once: a remote one, or one in a large record, takes long."""
+class ReadOnce:
+    """A source of which each episode is read once: a remote one, or one in a large record, takes long. It is changed.
+
+    Args:
+        source: The source.
+        change: What is done to each episode.
+        episodes: Those that were read.
+    """
 
     source: EpisodeSource
+    change: Callable[[Episode], Episode] = lambda episode: episode
     episodes: dict[tuple[int, str | None], Episode] = field(default_factory=dict)
 
     def infos(self, progress: Progress | None = None) -> Sequence[EpisodeInfo]:
+        """Return the infos of the source."""
         return self.source.infos(progress)
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:
+        """Return an episode, changed."""
         if (index, camera) not in self.episodes:
-            self.episodes[index, camera] = self.source.read(index, camera, needed)
+            self.episodes[index, camera] = self.change(self.source.read(index, camera, needed))
         return self.episodes[index, camera]
 
 
@@ -208,6 +246,194 @@ def require_learned(model: ModelConfig) -> None:
         )
 
 
-def ratios_by_name(measured: Mapping[str, VariantErrors]) -> dict[str, float]:
-    """Return the error over persistence of each variant, without intervals."""
-    return {name: float(one.errors.sum() / one.persistence.sum()) for name, one in measured.items()}
+@dataclass(frozen=True)
+class Calibration:
+    """The results at each stride, and the best one."""
+
+    results: Mapping[int, VariantResult]  # that of the best one is compared with the runner-up
+    impossible: Mapping[int, str]  # stride -> why it could not be measured
+    frames: int
+    split: Split
+    rate_hz: float  # control steps per second
+
+    @property
+    def stride(self) -> int:
+        """The stride with the lowest ratio of error and persistence."""
+        return _by_ratio(self.results)[0]
+
+    @property
+    def best(self) -> VariantResult:
+        """Its result."""
+        return self.results[self.stride]
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether the best stride is certainly better than the next, which were both chosen on these clips."""
+        return self.best.is_certainly_better(needed=_EPISODES_TO_BE_SURE)
+
+    def verdict(self) -> str:
+        """Return as text the best stride, and how certain it is."""
+        best, difference = self.best, self.best.difference
+        seconds = self.stride / self.rate_hz
+        words = f"Best: stride {self.stride} ({seconds:.2f} s per model step), error/persistence {best.ratio}"
+        if difference is None:
+            words += "; there is no other to compare with"
+        else:
+            words += f"; {-difference.value:.3f} below stride {_by_ratio(self.results)[1]}"
+            if difference.has_interval:
+                words += f" (95 % interval {-difference.high:.3f} to {-difference.low:.3f})"
+            words += "" if self.is_certain else f": not certain on {best.episodes} episodes, try more"
+        if best.ratio.value >= 1:
+            return f"{words}. At no stride is the model better than doing nothing: does it fit this data at all?"
+        return f"{words}."
+
+    def rows(self, model: str) -> list[Row]:
+        """Return the error at each stride as rows of an evaluation."""
+        group = "One-step L1 error / persistence by stride"
+        rows = [
+            Row(group, f"stride {stride}", f"strides.{stride}", model, math.nan, note=why, detail=True)
+            for stride, why in self.impossible.items()
+        ]
+        for stride, one in self.results.items():
+            numbers = one.ratio.value, one.ratio.low, one.ratio.high
+            rows.append(Row(group, one.name, f"strides.{stride}", model, *numbers, chance=1.0, detail=True))
+        return rows
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return all metrics as plain values, for `calibration.json`."""
+        names, difference = ("error", "persistence", "moved_cm", "clips", "episodes"), self.best.difference
+        return {
+            "stride": self.stride,
+            "certain": self.is_certain,
+            "verdict": self.verdict(),
+            "split": self.split,
+            "frames": self.frames,
+            "strides": [
+                {
+                    "stride": stride,
+                    "seconds_per_step": stride / self.rate_hz,
+                    **{name: getattr(one, name) for name in names},
+                    "error_over_persistence": one.ratio.as_dict(),
+                }
+                for stride, one in self.results.items()
+            ],
+            "impossible": {str(stride): why for stride, why in self.impossible.items()},
+            "runner_up": _by_ratio(self.results)[1] if len(self.results) > 1 else None,
+            "difference": None if difference is None else difference.as_dict(),
+        }
+
+
+def _by_ratio(results: Mapping[int, VariantResult]) -> list[int]:
+    """Return the strides, the best first."""
+    return sorted(results, key=lambda stride: results[stride].ratio.value)
+
+
+def calibrate_config(
+    config: Config, sample: ClipSample, *, model: str | None = None, reporter: Reporter = SILENT
+) -> Calibration:
+    """Calibrate the model of a config, or another one, on the config's data.
+
+    A latent cache has the frames of one stride's clips only, so frames are encoded on the fly.
+
+    Args:
+        config: The data, the model, the device and the precision.
+        sample: The clips at each stride.
+        model: Another model: what `model.base` takes, or the folder of a run.
+        reporter: Shows the progress of indexing and measuring.
+
+    Raises:
+        InputError: The data or the model cannot be used.
+    """
+    accelerator = make_accelerator(config)
+    dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
+    world_model = load_named(config, dataset, model).to(accelerator.device)
+    return calibrate_model(world_model, dataset, config, accelerator, sample, reporter.task("measuring clips"))
+
+
+def calibrate_model(
+    world_model: WorldModel,
+    dataset: Dataset,
+    config: Config,
+    accelerator: Accelerator,
+    sample: ClipSample,
+    progress: Progress = no_progress,
+) -> Calibration:
+    """Calibrate a model that is on the accelerator's device, in the run's precision.
+
+    Raises:
+        InputError: As `calibrate`; or the data is a latent cache.
+    """
+    if dataset.config.is_cache:
+        raise InputError(
+            where=f"data.path: {dataset.config.path}",
+            found=f"latents that were encoded for clips at stride {dataset.config.stride}",
+            needed="frames at every candidate stride",
+            fix="Calibrate on the data set itself, with data.cache: off",
+        )
+    world_model.eval()
+    sample = replace(sample, batch_size=config.validation.batch_size)
+    encode = partial(encode_batch, world_model, device=accelerator.device, chunk=config.model.encode_chunk)
+    with accelerator.autocast(), torch.no_grad():
+        return calibrate(world_model, encode, dataset, sample, progress=progress)
+
+
+def calibrate(
+    model: Predictor,
+    encode: Callable[[Batch], LatentBatch],
+    dataset: Dataset,
+    sample: ClipSample,
+    *,
+    progress: Progress = no_progress,
+) -> Calibration:
+    """Measure a model's one-step error over persistence at each stride.
+
+    A stride is possible if clips of it fit into at least two episodes (one, if no stride fits into two). All possible
+    ones are measured on the starts from which a clip of the widest fits.
+
+    Args:
+        model: The predictor.
+        encode: Turns a batch of pixels into latents on the model's device.
+        dataset: The source of clips; its config has the candidates, its own stride does not matter.
+        sample: The clips at each stride.
+        progress: Called with (clips done, clips in total).
+
+    Raises:
+        InputError: The split is empty, no stride fits into any of its episodes, or a clip cannot be read.
+    """
+    frames, split, rate = sample.frames_of(dataset.config), sample.split, dataset.control_rate_hz
+    settings = dataset.config.model_copy(update={"frames": frames, "short_episodes": "skip"})
+    strides = sorted(set(dataset.config.strides_to_try(rate)))
+    views = {stride: replace(dataset, config=settings.with_stride(stride)) for stride in strides}
+    possible, impossible = _possible(views, split)
+    windows = validation_windows(views[possible[-1]], split, clips=sample.clips)
+    widest_first = possible[::-1]
+    variants = [Variant(str(stride), partial(_at_stride, views[stride])) for stride in widest_first]
+    clips = SameClips(dataset, windows, sample.batch_size)
+    found = measure_variants(model, encode, clips, variants, progress)
+    errors, space = dict(zip(widest_first, found, strict=True)), dataset.spaces.action
+    results = {stride: errors[stride].result(f"stride {stride} ({stride / rate:.2f} s)", space) for stride in possible}
+    if len(results) > 1:
+        best, second, *_ = _by_ratio(results)
+        results[best] = errors[best].result(results[best].name, space, beside=errors[second])
+    return Calibration(results, impossible, frames, split, rate)
+
+
+def _at_stride(view: Dataset, dataset: Dataset) -> Dataset:
+    return replace(view, source=dataset.source)
+
+
+def _possible(views: dict[int, Dataset], split: Split) -> tuple[list[int], dict[int, str]]:
+    """Return the strides whose clips fit into enough episodes, and for the others the reason why not."""
+    fitting, reasons = {}, {}
+    for stride, dataset in views.items():
+        try:
+            fitting[stride] = len(np.unique(dataset.windows(split).episodes))
+        except InputError as error:
+            reasons[stride] = f"{error.found}; needed: {error.needed}" if error.needed else error.found
+            if len(reasons) == len(views):
+                raise
+    needed = min(_EPISODES_NEEDED, max(fitting.values()))
+    for stride, episodes in fitting.items():
+        if episodes < needed:
+            reasons[stride] = f"a clip of {views[stride].config.clip_steps} control steps fits into 1 episode only"
+    return [stride for stride in fitting if stride not in reasons], dict(sorted(reasons.items()))

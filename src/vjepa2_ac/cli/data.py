@@ -103,7 +103,7 @@ def check_and_print(config: Config, *, clips: int = 32) -> int:
 
 def _probe(config: Config, model: str, *, clips: int) -> None:
     from vjepa2_ac.calibration.data import probe_config
-    from vjepa2_ac.console.tables import print_finding, probe_table
+    from vjepa2_ac.console.tables import print_finding, variants_table
     from vjepa2_ac.data.dataset import open_dataset
     from vjepa2_ac.inspection.excerpts import Finding
     from vjepa2_ac.inspection.statistics import at_some_stride
@@ -111,7 +111,8 @@ def _probe(config: Config, model: str, *, clips: int) -> None:
     dataset = at_some_stride(open_dataset(config.data))
     with cli.reporter() as reporter:
         probe = probe_config(config, dataset, model=model, clips=clips, progress=reporter.task("probing"))
-    cli.show(probe_table(probe))
+    title = "One-step error / persistence of the data, read otherwise"
+    cli.show(variants_table(title, [probe.plain, *probe.results], ["difference"]))
     print_finding(Finding("warning" if probe.better else "ok", "probe", probe.verdict()))
 
 
@@ -168,8 +169,8 @@ def _calibrate(options: argparse.Namespace) -> int:
         cli.require_subject(options.model)
     cli.make_folder(options.out)
 
-    from vjepa2_ac.calibration.strides import calibrate_config
-    from vjepa2_ac.console.tables import calibration_table
+    from vjepa2_ac.calibration.variants import calibrate_config
+    from vjepa2_ac.console.tables import variants_table
     from vjepa2_ac.evaluation.measure import ClipSample
     from vjepa2_ac.storage import write_atomically
 
@@ -178,7 +179,11 @@ def _calibrate(options: argparse.Namespace) -> int:
         calibration = calibrate_config(config, sample, model=options.model, reporter=reporter)
     path = options.out / "calibration.json"
     write_atomically(path, json.dumps(calibration.as_dict(), indent=1).encode())
-    cli.show(calibration_table(calibration), calibration.verdict(), files=[path])
+    title = f"One-step error / persistence on {options.split} episodes, {calibration.frames} frames a clip"
+    columns = ["error", "persistence", "moves by", "clips (episodes)"]
+    table = variants_table(title, list(calibration.results.values()), columns, calibration.best)
+    reasons = [f"stride {stride} is not possible: {reason}" for stride, reason in calibration.impossible.items()]
+    cli.show(table, *reasons, calibration.verdict(), files=[path])
     return 0
 
 
@@ -196,12 +201,15 @@ def _calibrate_axes(options: argparse.Namespace, config: Config) -> int:
     cli.make_folder(options.out)
 
     from vjepa2_ac.calibration.axes import calibrate_axes
-    from vjepa2_ac.console.tables import axes_table
+    from vjepa2_ac.console.tables import row_tables
     from vjepa2_ac.reports.figures.planning import plot_axes
+    from vjepa2_ac.storage import write_atomically
+    from vjepa2_ac.storage.structured import json_text
 
     with cli.reporter() as reporter:
         pairs = options.limit or _PAIRS
-        found = calibrate_axes(config, options.axes, pairs=pairs, split=options.split, reporter=reporter)
-    files = [found.write(options.out / AXES_FILE), plot_axes(found.fit, options.out / "axes.png")]
-    cli.show(axes_table({options.axes: found.fit}), found.verdict(), files=files)
-    return int(found.fit.problem is not None)
+        fit, content = calibrate_axes(config, options.axes, pairs=pairs, split=options.split, reporter=reporter)
+    write_atomically(options.out / AXES_FILE, json_text(content))
+    files = [options.out / AXES_FILE, plot_axes(fit, options.out / "axes.png")]
+    cli.show(*row_tables(fit.rows(options.axes), "Yaw of least error, and fit of moves"), fit.words(), files=files)
+    return int(fit.problem is not None)

@@ -106,7 +106,8 @@ def _evaluate(options: argparse.Namespace) -> None:
         with cli.reporter() as reporter:
             measured = evaluate_subject(subject, how, reporter)
         evaluations.append(measured.evaluation)
-        name = f"{subject}: checkpoint {measured.checkpoint}" if measured.checkpoint else subject
+        checkpoint = measured.evaluation.about.checkpoint
+        name = f"{subject}: checkpoint {checkpoint}" if checkpoint else subject
         tables = row_tables(rows_of(measured.evaluation), "Held-out episodes")
         cli.show(name, *tables, verdict(measured.evaluation), files=measured.files)
     if len(evaluations) > 1:

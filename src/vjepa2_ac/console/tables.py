@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import groupby
 from typing import TYPE_CHECKING
 
@@ -17,9 +17,7 @@ from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.spaces import POSE
 
 if TYPE_CHECKING:
-    from vjepa2_ac.calibration.axes import AxisFit
-    from vjepa2_ac.calibration.data import VariantProbe
-    from vjepa2_ac.calibration.strides import Calibration
+    from vjepa2_ac.calibration.variants import VariantResult
     from vjepa2_ac.data.index import EpisodeTable, Usage
     from vjepa2_ac.decoding.decoder_folder import DecoderCard
     from vjepa2_ac.demonstrations.make_goals import MadeGoals
@@ -195,43 +193,19 @@ def motion_table(steps: Sequence[StepSizes]) -> Table:
     return table
 
 
-def probe_table(probe: VariantProbe) -> Table:
-    """Return the table of `data check --model`."""
-    from vjepa2_ac.calibration.data import rows_of
-
-    columns = ["variant", "error / persistence", "difference"]
-    table = MetricsTable("One-step error / persistence of the data, read otherwise", columns)
-    for row in rows_of(probe):
-        table.add_row(*row)
-    return table
-
-
-def calibration_table(calibration: Calibration) -> Table:
-    """Return the table of `data calibrate`."""
-    table = MetricsTable(
-        f"One-step error / persistence on {calibration.split} episodes, {calibration.frames} frames a clip"
-        " (95 % interval over episodes)",
-        ["stride", "seconds", "error / persistence", "error", "persistence", "moves by", "clips (episodes)"],
-        labelled=False,
-    )
-    for one in calibration.results:
-        mark = " <" if one is calibration.best else ""
+def variants_table(
+    title: str, results: Sequence[VariantResult], columns: Sequence[str], best: VariantResult | None = None
+) -> Table:
+    """Return the table of `data check --model` and of `data calibrate`: a row for each variant of the same clips."""
+    table = MetricsTable(f"{title} (95 % interval over episodes)", ["variant", "error / persistence", *columns])
+    for one in results:
         moved = "" if one.moved_cm is None else f"{one.moved_cm:.1f} cm"
-        table.add_row(
-            f"{one.stride}{mark}", f"{one.seconds_per_step:.2f}", str(one.ratio), f"{one.error:.4f}",
-            f"{one.persistence:.4f}", moved, f"{one.clips} ({one.episodes})",
-        )  # fmt: skip
-    reasons = [f"stride {stride} is not possible: {reason}" for stride, reason in calibration.impossible.items()]
-    table.caption = "\n".join(reasons) or None
-    return table
-
-
-def axes_table(fits: Mapping[str, AxisFit]) -> Table:
-    """Return the table of `data calibrate --axes`: a row for each model."""
-    title = "Yaw of least error, and fit of inferred to executed moves (95 % interval over episodes)"
-    names = ["yaw, degrees", "error / unturned", "fitted yaw", "gain", "condition", "off by, cm", "pairs (episodes)"]
-    table = MetricsTable(title, ["model", *names])
-    for name, fit in fits.items():
-        yaw, fitted, pairs = f"{fit.yaw_degrees:.1f}", f"{fit.fitted_yaw_degrees:.1f}", f"{fit.pairs} ({fit.episodes})"
-        table.add_row(name, yaw, str(fit.error), fitted, *map(str, (fit.gain, fit.condition, fit.residual_cm)), pairs)
+        cells = {
+            "difference": str(one.difference or ""),
+            "error": f"{one.error:.4f}",
+            "persistence": f"{one.persistence:.4f}",
+            "moves by": moved,
+            "clips (episodes)": f"{one.clips} ({one.episodes})",
+        }
+        table.add_row(f"{one.name}{' <' * (one is best)}", str(one.ratio), *(cells[column] for column in columns))
     return table

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from vjepa2_ac.config.planning import EnergyConfig, PlanningConfig
 from vjepa2_ac.episode import LatentBatch, Progress, no_progress
-from vjepa2_ac.evaluation.action_use import clip_generator
+from vjepa2_ac.evaluation.action_use import RolloutStart, start_of
 from vjepa2_ac.evaluation.measure import Predictor
 from vjepa2_ac.evaluation.request import FRAMES_SEEN, SCORED, STEPS
 from vjepa2_ac.evaluation.result import Evaluation, PlanningStudy, Plans
@@ -33,21 +33,16 @@ _SAME_M = 1e-6
 
 
 @dataclass(frozen=True)
-class PlanningStart:
+class PlanningStart(RolloutStart):
     """A frame of a held-out clip, the following frames, and the demonstrated actions."""
 
-    clip: int  # index into the evaluation's clips
-    episode_id: str
     place: int  # of the frame in the clip
-    frame: Float[Tensor, "tokens dim"]
-    following: Float[Tensor, "tokens dim"]  # one step later
     goal: Float[Tensor, "tokens dim"]  # three steps later
-    state: Float[Tensor, " 7"]
     demonstrated: Float[np.ndarray, "3 7"]
-    extrinsics: Float[Tensor, " 6"] | None
     seeds: tuple[int, int, int]  # of the one-step plan, of the scored one, of random ones
 
 
+@dataclass(frozen=True)
 class WindowCost:
     """The cost of action sequences from one frame: the energy of the last prediction with respect to a goal.
 
@@ -55,18 +50,18 @@ class WindowCost:
     States are integrated with the actions, and the camera does not move.
     """
 
-    def __init__(
-        self, model: Predictor, start: PlanningStart, goal: Float[Tensor, "tokens dim"], config: EnergyConfig
-    ) -> None:
-        self._model, self._start, self._goal, self._config = model, start, goal.float(), config
+    model: Predictor
+    start: PlanningStart
+    goal: Float[Tensor, "tokens dim"]
+    config: EnergyConfig
 
     def __call__(self, actions: Float[Tensor, "samples steps 7"]) -> Float[Tensor, " samples"]:
         """Return energies on the device of the actions."""
-        parts = actions.to(self._start.state).split(self._config.samples_at_once)  # type: ignore[no-untyped-call]  # torch
+        parts = actions.to(self.start.state).split(self.config.samples_at_once)  # type: ignore[no-untyped-call]  # torch
         return torch.cat([self._energies(part) for part in parts]).to(actions.device)
 
     def _energies(self, actions: Float[Tensor, "samples steps 7"]) -> Float[Tensor, " samples"]:
-        start, (samples, steps) = self._start, actions.shape[:2]
+        start, (samples, steps) = self.start, actions.shape[:2]
         states = states_along(start.state, actions)[:, :-1]
         cameras = None if start.extrinsics is None else start.extrinsics.expand(samples, steps, -1)
 
@@ -75,28 +70,23 @@ class WindowCost:
             return actions[:, window], states[:, window], None if cameras is None else cameras[:, window]
 
         frame = start.frame.expand(samples, 1, *start.frame.shape)
-        frames = self._model.rollout(frame, *during(0, FRAMES_SEEN))
+        frames = self.model.rollout(frame, *during(0, FRAMES_SEEN))
         for end in range(FRAMES_SEEN + 1, steps + 1):
-            following = self._model.predict(frames, *during(end - FRAMES_SEEN, end))[:, -1:]
+            following = self.model.predict(frames, *during(end - FRAMES_SEEN, end))[:, -1:]
             frames = torch.cat([frames[:, 1:], following], dim=1)
-        return distance(frames[:, -1].float(), self._goal, self._config)
+        return distance(frames[:, -1].float(), self.goal.float(), self.config)
 
 
 def planning_start(batch: LatentBatch, row: int, clip: int, seed: int) -> PlanningStart:
     """Return a frame of a clip with three steps after it; it is drawn from the seed and the clip's name."""
-    generator = clip_generator(seed, batch.episode_ids[row], batch.starts[row])
+    generator = start_of(batch, row, 0, clip).generator(seed)
     place = int(generator.integers(batch.latents.shape[1] - STEPS))
     one, scored, drawn = generator.integers(2**62, size=3).tolist()
     return PlanningStart(
-        clip=clip,
-        episode_id=batch.episode_ids[row],
+        **vars(start_of(batch, row, place, clip)),
         place=place,
-        frame=batch.latents[row, place].clone(),
-        following=batch.latents[row, place + 1].clone(),
         goal=batch.latents[row, place + STEPS].clone(),
-        state=batch.states[row, place],
         demonstrated=batch.actions[row, place : place + STEPS].cpu().numpy().astype(np.float64),
-        extrinsics=None if batch.extrinsics is None else batch.extrinsics[row, place],
         seeds=(one, scored, drawn),
     )
 
@@ -118,18 +108,19 @@ def measure_plans(
         config: Settings of one-step plans; for three steps, only the number of samples per batch.
         progress: Called with the number of finished plans.
     """
-    one, scored = Planner(one_step_settings(config)), Planner(_as_protocol(config))
-    plans: list[tuple[Plan, Plan]] = []
-    for start in starts:
-        first = _plan(one, model, start, start.following, start.seeds[0])
-        progress(2 * len(plans) + 1, 2 * len(starts))
-        plans.append((first, _plan(scored, model, start, start.goal, start.seeds[1])))
-        progress(2 * len(plans), 2 * len(starts))
-    return Plans(
-        one_step=np.stack([_array(first)[0] for first, _ in plans])[None],
-        three_steps=np.stack([_array(second) for _, second in plans])[None],
-        empty=sum(plan.stopped == "no finite energy" for pair in plans for plan in pair),
+    energy = SCORED.energy.model_copy(update={"samples_at_once": config.energy.samples_at_once})
+    planners = Planner(one_step_settings(config)), Planner(SCORED.model_copy(update={"energy": energy}))
+    plans: tuple[list[Plan], list[Plan]] = [], []
+    for done, start in enumerate(starts):
+        for way, goal in enumerate((start.following, start.goal)):
+            cost = WindowCost(model, start, goal, planners[way].config.energy)
+            plans[way].append(planners[way].plan(cost, torch.Generator().manual_seed(start.seeds[way])))
+            progress(2 * done + way + 1, 2 * len(starts))
+    one_step, three_steps = (
+        np.stack([plan.actions.numpy().astype(np.float64) for plan in found])[None] for found in plans
     )
+    empty = sum(plan.stopped == "no finite energy" for found in plans for plan in found)
+    return Plans(one_step[:, :, 0], three_steps, empty)
 
 
 def study_of(starts: Sequence[PlanningStart], config: PlanningConfig) -> PlanningStudy:
@@ -149,20 +140,6 @@ def study_of(starts: Sequence[PlanningStart], config: PlanningConfig) -> Plannin
         three_steps_beyond=_beyond(within.three_steps[0], demonstrated),
         settings=one_step_settings(config),
     )
-
-
-def _as_protocol(config: PlanningConfig) -> PlanningConfig:
-    at_once = {"samples_at_once": config.energy.samples_at_once}
-    return SCORED.model_copy(update={"energy": SCORED.energy.model_copy(update=at_once)})
-
-
-def _plan(planner: Planner, model: Predictor, start: PlanningStart, goal: Tensor, seed: int) -> Plan:
-    cost = WindowCost(model, start, goal, planner.config.energy)
-    return planner.plan(cost, torch.Generator().manual_seed(seed))
-
-
-def _array(plan: Plan) -> Float[np.ndarray, "steps 7"]:
-    return plan.actions.numpy().astype(np.float64)
 
 
 def _random(starts: Sequence[PlanningStart], one: SearchSpace, scored: SearchSpace) -> Plans:
@@ -190,33 +167,8 @@ def _beyond(allowed: np.ndarray, demonstrated: np.ndarray) -> float:
 AXES = ("x", "y", "z")
 LEAST_CM = 0.5  # a demonstrated step that is shorter has no direction, and along an axis no sign
 _GRIPPER = 6
-_NONE = Estimate(np.nan, np.nan, np.nan)
 _NOWHERE_CM = 1e-7
 _NO_ANGLE = 90.0  # of a plan that goes nowhere: the mean of random directions
-
-
-@dataclass(frozen=True)
-class PlanMetrics:
-    """Metrics of one planning method; cm and degrees."""
-
-    score: Estimate  # 0 to 80
-    missed_cm: Estimate  # basis of the score: sum over x, y, z of the difference of displacements
-    missed_over_zero: Estimate  # over that of doing nothing: 0 perfect, 1 as good
-    step_cm: Estimate  # one step: distance of planned and demonstrated translation
-    step_over_zero: Estimate
-    axes_cm: tuple[Estimate, Estimate, Estimate]  # along x, y, z
-    angle_degrees: Estimate  # between them
-    signs: tuple[Estimate, Estimate, Estimate]  # share of steps whose sign is right, along x, y, z; by chance 0.5
-    gripper: Estimate  # difference in closedness
-
-
-@dataclass(frozen=True)
-class PlanDifferences:
-    """One planning method minus another from the same starts; below 0 is better, except for the score."""
-
-    score: Estimate
-    missed_cm: Estimate
-    step_cm: Estimate
 
 
 def ways_of(evaluation: Evaluation) -> dict[str, Plans]:
@@ -224,32 +176,46 @@ def ways_of(evaluation: Evaluation) -> dict[str, Plans]:
     return {name: model.plans for name, model in evaluation.models.items() if model.plans is not None}
 
 
-def metrics_of(study: PlanningStudy, plans: Plans) -> PlanMetrics:
-    """Return the errors of plans with respect to the demonstrated actions."""
+def metrics_of(study: PlanningStudy, plans: Plans) -> dict[str, Estimate]:
+    """Return the errors of plans with respect to the demonstrated actions, in cm and degrees.
+
+    Returns:
+        `score` (0 to 80); `missed_cm`, of which it is made, and `missed_over_zero` (0 perfect, 1 as good as doing
+        nothing). Of one step: `step_cm`, the distance of the translations, and `step_over_zero`; `axes_cm.x`, y, z;
+        `angle_degrees` between them; `signs.x`, y, z, the share that is right (by chance 0.5); `gripper`, the
+        difference in closedness.
+    """
     ids, missed, step = study.episode_ids, missed_cm(study, plans), _step_cm(study, plans)
     wanted, planned = 100 * study.demonstrated[:, 0, POSE.position], 100 * plans.one_step[..., POSE.position]
-    return PlanMetrics(
-        score=bootstrapped(_score, _sums(missed), ids)[0],
-        missed_cm=mean_of(missed, ids),
-        missed_over_zero=ratio(missed, missed_cm(study, study.zero), ids),
-        step_cm=mean_of(step, ids),
-        step_over_zero=ratio(step, _step_cm(study, study.zero), ids),
-        axes_cm=_each(np.abs(planned - wanted).mean(axis=0), ids),
-        angle_degrees=_mean_where(_angles(planned, wanted).mean(axis=0), directed(study), ids),
-        signs=_signs(study, planned),
-        gripper=mean_of(np.abs(plans.one_step[..., _GRIPPER] - study.demonstrated[:, 0, _GRIPPER]).mean(axis=0), ids),
-    )
+    off = np.abs(planned - wanted).mean(axis=0)
+    right = (0.5 + 0.5 * np.sign(planned) * np.sign(wanted)).mean(axis=0)  # a plan that does not move: half
+    directed = 100 * np.linalg.norm(study.demonstrated[:, 0, POSE.position], axis=-1) >= LEAST_CM
+    gripper = np.abs(plans.one_step[..., _GRIPPER] - study.demonstrated[:, 0, _GRIPPER]).mean(axis=0)
+    return {
+        "score": bootstrapped(_score, _sums(missed), ids)[0],
+        "missed_cm": mean_of(missed, ids),
+        "missed_over_zero": ratio(missed, missed_cm(study, study.zero), ids),
+        "step_cm": mean_of(step, ids),
+        "step_over_zero": ratio(step, _step_cm(study, study.zero), ids),
+        **{f"axes_cm.{name}": mean_of(off[:, axis], ids) for axis, name in enumerate(AXES)},
+        "angle_degrees": _mean_where(_angles(planned, wanted).mean(axis=0), directed, ids),
+        **{
+            f"signs.{name}": _mean_where(right[:, axis], signed_along(study, axis), ids)
+            for axis, name in enumerate(AXES)
+        },
+        "gripper": mean_of(gripper, ids),
+    }
 
 
-def differences_of(study: PlanningStudy, plans: Plans, other: Plans) -> PlanDifferences:
-    """Return the differences of two plans' errors, paired by start."""
+def differences_of(study: PlanningStudy, plans: Plans, other: Plans) -> dict[str, Estimate]:
+    """Return the differences of two plans' metrics, paired by start: below 0 is better, except for the score."""
     ids, missed = study.episode_ids, [missed_cm(study, each) for each in (plans, other)]
     both = np.concatenate([_sums(each) for each in missed])
-    return PlanDifferences(
-        score=bootstrapped(lambda sums: _score(sums[:2]) - _score(sums[2:]), both, ids)[0],
-        missed_cm=mean_of(missed[0] - missed[1], ids),
-        step_cm=mean_of(_step_cm(study, plans) - _step_cm(study, other), ids),
-    )
+    return {
+        "score": bootstrapped(lambda sums: _score(sums[:2]) - _score(sums[2:]), both, ids)[0],
+        "missed_cm": mean_of(missed[0] - missed[1], ids),
+        "step_cm": mean_of(_step_cm(study, plans) - _step_cm(study, other), ids),
+    }
 
 
 def missed_cm(study: PlanningStudy, plans: Plans) -> Float[np.ndarray, " starts"]:
@@ -262,13 +228,8 @@ def missed_cm(study: PlanningStudy, plans: Plans) -> Float[np.ndarray, " starts"
     return np.asarray(100 * np.abs(ends).sum(axis=-1).mean(axis=0))
 
 
-def directed(study: PlanningStudy) -> Bool[np.ndarray, " starts"]:
-    """Return which demonstrated first steps are long enough to have a direction."""
-    return np.asarray(100 * np.linalg.norm(study.demonstrated[:, 0, POSE.position], axis=-1) >= LEAST_CM)
-
-
 def signed_along(study: PlanningStudy, axis: int) -> Bool[np.ndarray, " starts"]:
-    """Return which of them are long enough along an axis to have a sign there."""
+    """Return which demonstrated first steps are long enough along an axis to have a sign there."""
     return np.asarray(100 * np.abs(study.demonstrated[:, 0, axis]) >= LEAST_CM)
 
 
@@ -298,21 +259,7 @@ def _angles(
     return np.where(nowhere, _NO_ANGLE, np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0))))
 
 
-def _signs(study: PlanningStudy, planned: Float[np.ndarray, "draws starts 3"]) -> tuple[Estimate, Estimate, Estimate]:
-    """Return shares of right signs; a plan that does not move counts half."""
-    right = 0.5 + 0.5 * np.sign(planned) * np.sign(study.demonstrated[:, 0, POSE.position])
-    x, y, z = (
-        _mean_where(right[..., axis].mean(axis=0), signed_along(study, axis), study.episode_ids) for axis in range(3)
-    )
-    return x, y, z
-
-
 def _mean_where(values: np.ndarray, chosen: Bool[np.ndarray, " starts"], ids: Sequence[str]) -> Estimate:
     """Return the mean over some starts; NaN if there are none."""
     kept = [name for name, keep in zip(ids, chosen, strict=True) if keep]
-    return mean_of(values[chosen], kept) if kept else _NONE
-
-
-def _each(values: Float[np.ndarray, "starts 3"], ids: Sequence[str]) -> tuple[Estimate, Estimate, Estimate]:
-    x, y, z = (mean_of(values[:, axis], ids) for axis in range(3))
-    return x, y, z
+    return mean_of(values[chosen], kept) if kept else Estimate(np.nan, np.nan, np.nan)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -15,9 +15,15 @@ from torch import Tensor
 from vjepa2_ac.distances import absolute_difference
 from vjepa2_ac.episode import LatentBatch, Progress, no_progress
 from vjepa2_ac.evaluation.measure import Predictor
+from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import ActionRanking, Landscape, Landscapes, Ranking, Sensitivity
 from vjepa2_ac.intervals import Estimate, mean_of, ratio
 from vjepa2_ac.spaces import POSE, ActionSpace, vector_states
+
+TOP = (1, 5, 10)
+_SAME = 1e-6  # relative difference below which energies are equal: rounding decides no rank
+_ROOM = 1.25  # extent of a landscape's grid relative to the largest true action
+_AXES = slice(0, 3)  # of the grid: of poses, the position
 
 
 @dataclass(frozen=True)
@@ -44,8 +50,9 @@ class RolloutStart:
         return float(absolute_difference(self.frame, self.following).mean())
 
     def generator(self, seed: int) -> np.random.Generator:
-        """Return a random generator that depends only on the seed and this clip, not on those before it."""
-        return clip_generator(seed, self.episode_id, self.first_step)
+        """Return a random generator that depends only on the seed and the name of this clip, not on those before it."""
+        digest = hashlib.blake2b(f"{self.episode_id} {self.first_step}".encode(), digest_size=8).digest()
+        return np.random.default_rng([seed, int.from_bytes(digest, "big")])
 
 
 @dataclass(frozen=True)
@@ -56,15 +63,20 @@ class EvaluatedActions:
     change: Float[np.ndarray, " samples"]  # L1 distance of the prediction to that with the true action
 
 
-def clip_generator(seed: int, episode_id: str, first_step: int) -> np.random.Generator:
-    """Return a random generator that depends only on the seed and the name of a clip, not on the clips before it."""
-    digest = hashlib.blake2b(f"{episode_id} {first_step}".encode(), digest_size=8).digest()
-    return np.random.default_rng([seed, int.from_bytes(digest, "big")])
-
-
-def start_of(batch: LatentBatch, row: int, step: int, clip: int) -> RolloutStart:
-    """Return a step of a clip in a batch as a start."""
-    return _start(batch, row, clip, (step, step + 1), batch.actions[row, step])
+def start_of(
+    batch: LatentBatch, row: int, step: int, clip: int, *, end: int | None = None, action: Tensor | None = None
+) -> RolloutStart:
+    """Return a step of a clip in a batch as a start; or two of its frames, and the action that leads to the second."""
+    return RolloutStart(
+        clip=clip,
+        episode_id=batch.episode_ids[row],
+        first_step=batch.starts[row],
+        frame=batch.latents[row, step].clone(),
+        following=batch.latents[row, step + 1 if end is None else end].clone(),
+        state=batch.states[row, step],
+        action=batch.actions[row, step] if action is None else action,
+        extrinsics=None if batch.extrinsics is None else batch.extrinsics[row, step],
+    )
 
 
 def moves_of(batch: LatentBatch, row: int, clip: int, space: ActionSpace, reach: float) -> tuple[RolloutStart, ...]:
@@ -92,9 +104,9 @@ def moves_of(batch: LatentBatch, row: int, clip: int, space: ActionSpace, reach:
     within = lengths <= (np.inf if space.position is None else reach)
     ends = pairs[int(np.where(within, lengths, -1.0).argmax() if within.any() else lengths.argmin())]
     found = []
-    for pair in (ends, ends[::-1]):
-        change = kind.differences(states[list(pair)])[0]
-        found.append(_start(batch, row, clip, pair, torch.from_numpy(change).to(batch.actions)))
+    for first, last in (ends, ends[::-1]):
+        change = torch.from_numpy(kind.differences(states[[first, last]])[0]).to(batch.actions)
+        found.append(start_of(batch, row, first, clip, end=last, action=change))
     return tuple(found)
 
 
@@ -119,21 +131,6 @@ def evaluate_actions(
     return EvaluatedActions(*(torch.cat(parts).cpu().numpy().astype(np.float64) for parts in (energies, changes)))
 
 
-def _start(batch: LatentBatch, row: int, clip: int, ends: tuple[int, int], action: Tensor) -> RolloutStart:
-    """Return two frames of a clip, and the action that leads from the first to the second, as a start."""
-    first, last = ends
-    return RolloutStart(
-        clip=clip,
-        episode_id=batch.episode_ids[row],
-        first_step=batch.starts[row],
-        frame=batch.latents[row, first].clone(),
-        following=batch.latents[row, last].clone(),
-        state=batch.states[row, first],
-        action=action,
-        extrinsics=None if batch.extrinsics is None else batch.extrinsics[row, first],
-    )
-
-
 def _predict(
     model: Predictor, start: RolloutStart, actions: Float[Tensor, "samples action_dim"]
 ) -> Float[Tensor, "samples tokens dim"]:
@@ -144,16 +141,12 @@ def _predict(
     return model.predict(frames, actions[:, None], start.state.expand(count, 1, -1), camera)[:, 0].float()
 
 
-TOP = (1, 5, 10)
-_SAME = 1e-6  # relative difference below which energies are equal: rounding decides no rank
-
-
 @dataclass(frozen=True)
 class ActionPool:
     """Actions of all clips, a pool to draw others from."""
 
     actions: Float[np.ndarray, "count action_dim"]
-    episode_ids: tuple[str, ...]  # of each action
+    episode_ids: Sequence[str]  # of each action
     space: ActionSpace
     reach: float  # half the width of the box along each of x, y, z, in metres; of poses only
     samples: int  # drawn per start, from each of the two sources
@@ -192,14 +185,6 @@ class ActionPool:
         evaluated[:, moved] = drawn * unit * length / np.maximum(np.linalg.norm(drawn, axis=1), 1e-12)[:, None]
         return evaluated
 
-    def words(self, drawn_from: Literal["clips", "box"]) -> str:
-        """Return as text where actions are drawn from."""
-        if drawn_from == "clips":
-            return "actions of other episodes"
-        if self.space.position is not None:
-            return f"(dx, dy, dz) uniform within {self.reach * 100:g} cm along each axis"
-        return "every number uniform within its largest size"
-
 
 def measure_sensitivity(
     model: Predictor,
@@ -218,86 +203,56 @@ def measure_sensitivity(
         at_once: Samples per batch.
         progress: Called with the number of finished starts.
     """
-    changes, persistence, samples = [], [], pool.samples
-    ranks: dict[Literal["clips", "box"], list[tuple[float, float]]] = {"clips": [], "box": []}
-    for done, start in enumerate(starts, start=1):
-        generator = start.generator(pool.seed)
-        drawn = pool.of_others(start, generator), pool.in_box(start, generator)
-        evaluated = evaluate_actions(model, start, np.concatenate([start.true[None], *drawn]), at_once=at_once)
-        own, others, boxed = np.split(evaluated.energy, [1, 1 + samples])
-        ranks["clips"].append(place_of(own[0], others))
-        ranks["box"].append(place_of(own[0], boxed))
-        changes.append(float(evaluated.change[1 : 1 + samples].mean()))
-        persistence.append(start.persistence)
-        progress(done, len(starts))
-    ids = tuple(start.episode_id for start in starts)
-    clips = tuple(start.clip for start in starts)
+    draws = pool.of_others, pool.in_box
+    (clips, box), (changes, _, persistence) = _places(model, starts, pool, draws, at_once, progress)
+    ids = [start.episode_id for start in starts]
+
+    def ranking(drawn_from: Literal["clips", "box"], places: Float[np.ndarray, "clips 2"]) -> Ranking:
+        lower, same = places.T
+        among = {k: np.clip((k - lower) / (same + 1), 0.0, 1.0) for k in TOP if k <= pool.samples}
+        return Ranking(
+            drawn_from=drawn_from,
+            samples=pool.samples,
+            clips=tuple(start.clip for start in starts),
+            rank=_ranks(places, pool.samples),
+            mean_rank=mean_of(_ranks(places, pool.samples), ids),
+            top={k: mean_of(share, ids) for k, share in among.items()},
+        )
+
     return Sensitivity(
-        change=ratio(np.array(changes), np.array(persistence), ids),
-        change_by_clip=np.array(changes) / np.maximum(np.array(persistence), 1e-12),
-        rankings=tuple(_ranking(name, pool.words(name), samples, clips, np.array(ranks[name]), ids) for name in ranks),
-    )
-
-
-def place_of(true: float, others: Float[np.ndarray, " samples"]) -> tuple[float, float]:
-    """Return how many others have a lower energy, and how many an equal one."""
-    same = np.abs(others - true) <= _SAME * max(abs(true), 1e-12)
-    return float(((others < true) & ~same).sum()), float(same.sum())
-
-
-def _ranking(
-    drawn_from: Literal["clips", "box"],
-    words: str,
-    samples: int,
-    clips: tuple[int, ...],
-    places: Float[np.ndarray, "clips 2"],
-    episode_ids: tuple[str, ...],
-) -> Ranking:
-    lower, same = places[:, 0], places[:, 1]
-    rank = (lower + same / 2) / samples
-    among = {k: np.clip((k - lower) / (same + 1), 0.0, 1.0) for k in TOP if k <= samples}
-    return Ranking(
-        drawn_from=drawn_from,
-        words=words,
-        samples=samples,
-        clips=clips,
-        rank=rank,
-        mean_rank=mean_of(rank, episode_ids),
-        top={k: mean_of(share, episode_ids) for k, share in among.items()},
-    )
-
-
-def pool_of(moves: Sequence[RolloutStart], space: ActionSpace, *, reach: float, samples: int, seed: int) -> ActionPool:
-    """Return how other actions are drawn for moves: of vectors, the largest of each number bounds the box."""
-    return ActionPool(
-        np.stack([move.true for move in moves]), tuple(move.episode_id for move in moves), space, reach, samples, seed
+        change=ratio(changes, persistence, ids),
+        change_by_clip=changes / np.maximum(persistence, 1e-12),
+        rankings=(ranking("clips", clips), ranking("box", box)),
     )
 
 
 def rank_actions(
-    model: Predictor, moves: Sequence[RolloutStart], pool: ActionPool, *, at_once: int, progress: Progress = no_progress
+    model: Predictor,
+    moves: Sequence[RolloutStart],
+    space: ActionSpace,
+    probes: ProbeOptions,
+    *,
+    seed: int,
+    progress: Progress = no_progress,
 ) -> ActionRanking:
-    """Rank the true action of each move.
+    """Rank the true action of each move among others in the box and on the shell.
 
     Args:
         model: The predictor.
-        moves: One or more.
-        pool: How other actions are drawn.
-        at_once: Samples per batch: limits the memory.
+        moves: One or more; of vectors, the largest of each number bounds the box.
+        space: Of the actions.
+        probes: Their `reach_cm`, half the width of the box (of poses only), `samples` of each kind, and `at_once`.
+        seed: Of the other actions.
         progress: Called with the number of finished moves.
     """
-    rows = []
-    for done, move in enumerate(moves, start=1):
-        generator = move.generator(pool.seed)
-        drawn = np.concatenate([move.true[None], pool.in_box(move, generator), pool.on_shell(move, generator)])
-        own, box, shell = np.split(evaluate_actions(model, move, drawn, at_once=at_once).energy, [1, 1 + pool.samples])
-        rows.append((_rank(own[0], box), _rank(own[0], shell), float(box.std()), move.persistence))
-        progress(done, len(moves))
-    in_box, on_shell, spread, now = np.array(rows).T
-    ids, ranks = tuple(move.episode_id for move in moves), (in_box + on_shell) / 2
+    ids, reach, samples = tuple(move.episode_id for move in moves), probes.reach_cm / 100, probes.samples
+    pool = ActionPool(np.stack([move.true for move in moves]), ids, space, reach, samples, seed)
+    places, (_, spread, now) = _places(model, moves, pool, (pool.in_box, pool.on_shell), probes.at_once, progress)
+    in_box, on_shell = _ranks(places, samples)
+    ranks = (in_box + on_shell) / 2
     return ActionRanking(
-        samples=pool.samples,
-        reach=pool.reach,
+        samples=samples,
+        reach=reach,
         episode_ids=ids,
         ranks=ranks,
         rank=mean_of(ranks, ids),
@@ -307,31 +262,47 @@ def rank_actions(
     )
 
 
-def _rank(true: float, others: np.ndarray) -> float:
+def _places(
+    model: Predictor,
+    starts: Sequence[RolloutStart],
+    pool: ActionPool,
+    draws: Sequence[Callable[[RolloutStart, np.random.Generator], np.ndarray]],
+    at_once: int,
+    progress: Progress,
+) -> tuple[Float[np.ndarray, "draws starts 2"], Float[np.ndarray, "3 starts"]]:
+    """Evaluate the true action of each start among those of each draw.
+
+    Returns:
+        How many others have a lower energy and how many an equal one; of the first draw the mean change of the
+        prediction and the standard deviation of the energy, and the error of persistence.
+    """
+    places, numbers = [], []
+    for done, start in enumerate(starts, start=1):
+        generator = start.generator(pool.seed)
+        drawn = [start.true[None], *(draw(start, generator) for draw in draws)]
+        found = evaluate_actions(model, start, np.concatenate(drawn), at_once=at_once)
+        own, *others = np.split(found.energy, [1, 1 + pool.samples])
+        places.append([_place(own[0], one) for one in others])
+        numbers.append((found.change[1 : 1 + pool.samples].mean(), others[0].std(), start.persistence))
+        progress(done, len(starts))
+    return np.array(places).swapaxes(0, 1), np.array(numbers).T
+
+
+def _place(true: float, others: Float[np.ndarray, " samples"]) -> tuple[float, float]:
+    same = np.abs(others - true) <= _SAME * max(abs(true), 1e-12)
+    return float(((others < true) & ~same).sum()), float(same.sum())
+
+
+def _ranks(places: Float[np.ndarray, "*draws starts 2"], samples: int) -> Float[np.ndarray, "*draws starts"]:
     """Return the share of the others with a lower energy; equal ones count half."""
-    lower, same = place_of(true, others)
-    return (lower + same / 2) / len(others)
-
-
-_ROOM = 1.25  # extent of the grid relative to the largest true action
-_AXES = slice(0, 3)  # of the grid: of poses, the position
-
-
-@dataclass(frozen=True)
-class LandscapeGrid:
-    """A grid of actions over their first three numbers."""
-
-    space: ActionSpace  # of the actions; positions are reported in cm
-    nodes: int  # along each axis, three or more
-    reach: float  # it spans at least -reach .. reach (metres; of vectors: in its own numbers)
+    return np.asarray((places[..., 0] + places[..., 1] / 2) / samples)
 
 
 def measure_landscapes(
     model: Predictor,
     starts: Sequence[RolloutStart],
-    grid: LandscapeGrid,
-    *,
-    at_once: int,
+    space: ActionSpace,
+    probes: ProbeOptions,
     progress: Progress = no_progress,
 ) -> Landscapes:
     """Compute the energy over a grid of the first three numbers of the action, the others being the true ones.
@@ -339,19 +310,33 @@ def measure_landscapes(
     Args:
         model: The predictor.
         starts: One frame of each clip; one or more, with actions of three numbers or more.
-        grid: The actions.
-        at_once: Samples per batch.
+        space: Of the actions; positions are reported in cm.
+        probes: Their `nodes` of the grid along each axis, three or more, and `at_once`; of poses the grid spans at
+            least `reach_cm` in both directions.
         progress: Called with the number of finished starts.
     """
-    nodes, unit = grid.nodes, grid.space.shown_factor
     trues = np.stack([start.true[_AXES] for start in starts])
-    half = max(grid.reach, _ROOM * float(np.abs(trues).max())) or 1.0  # vectors that are all zero
+    nodes, reach = probes.nodes, 0.0 if space.position is None else probes.reach_cm / 100
+    half = max(reach, _ROOM * float(np.abs(trues).max())) or 1.0  # vectors that are all zero
     maps = []
     for done, (start, true) in enumerate(zip(starts, trues, strict=True), start=1):
-        maps.append(_landscape(model, start, grid_axes(true, half, nodes), true, unit, at_once))
+        maps.append(_landscape(model, start, grid_axes(true, half, nodes), true, space.shown_factor, probes.at_once))
         progress(done, len(starts))
-    first, second, third = grid.space.names[_AXES]
-    return _summary(tuple(maps), (first, second, third), grid.space.shown_unit, least=unit * half / (nodes - 1))
+    least = space.shown_factor * half / (nodes - 1)
+    chance = np.mean([np.linalg.norm(_places_of(one.axes) - one.true, axis=1).mean() for one in maps])
+    agreements, chances, counts = zip(*(_signs(maps, axis, least) for axis in range(3)), strict=True)
+    first, second, third = space.names[_AXES]
+    return Landscapes(
+        axis_names=(first, second, third),
+        unit=space.shown_unit,
+        maps=tuple(maps),
+        distance=mean_of(np.array([one.distance for one in maps]), [one.episode_id for one in maps]),
+        chance_distance=float(chance),
+        sign_agreement=agreements,
+        sign_chance=chances,
+        sign_clips=counts,
+        sign_least=least,
+    )
 
 
 def grid_axes(true: Float[np.ndarray, " 3"], half: float, nodes: int) -> Float[np.ndarray, "3 nodes"]:
@@ -372,7 +357,7 @@ def _landscape(
 ) -> Landscape:
     nodes = axes.shape[1]
     evaluated = np.tile(start.true, (nodes**3, 1))
-    evaluated[:, _AXES] = _places(axes)
+    evaluated[:, _AXES] = _places_of(axes)
     energy = evaluate_actions(model, start, evaluated, at_once=at_once).energy.reshape(nodes, nodes, nodes)
     minimum = evaluated[lowest(energy).ravel(), _AXES].mean(axis=0)
     return Landscape(
@@ -386,23 +371,6 @@ def _landscape(
     )
 
 
-def _summary(maps: tuple[Landscape, ...], names: tuple[str, str, str], unit: str, *, least: float) -> Landscapes:
-    ids = tuple(one.episode_id for one in maps)
-    chance = np.mean([np.linalg.norm(_places(one.axes) - one.true, axis=1).mean() for one in maps])
-    agreements, chances, counts = zip(*(_signs(maps, axis, least) for axis in range(3)), strict=True)
-    return Landscapes(
-        axis_names=names,
-        unit=unit,
-        maps=maps,
-        distance=mean_of(np.array([one.distance for one in maps]), ids),
-        chance_distance=float(chance),
-        sign_agreement=agreements,
-        sign_chance=chances,
-        sign_clips=counts,
-        sign_least=least,
-    )
-
-
 def _signs(maps: Sequence[Landscape], axis: int, least: float) -> tuple[Estimate, float, int]:
     """Return how often the minimum has the true action's sign, the same of any node, and the number of clips.
 
@@ -413,12 +381,12 @@ def _signs(maps: Sequence[Landscape], axis: int, least: float) -> tuple[Estimate
         return Estimate(np.nan, np.nan, np.nan), np.nan, 0
     agreeing, by_chance = [], []
     for one in counted:
-        right = np.sign(_places(one.axes)[:, axis]) == np.sign(one.true[axis])
+        right = np.sign(_places_of(one.axes)[:, axis]) == np.sign(one.true[axis])
         agreeing.append(right[lowest(one.energy).ravel()].mean())
         by_chance.append(right.mean())
     return mean_of(np.array(agreeing), [one.episode_id for one in counted]), float(np.mean(by_chance)), len(counted)
 
 
-def _places(axes: Float[np.ndarray, "3 nodes"]) -> Float[np.ndarray, "places 3"]:
+def _places_of(axes: Float[np.ndarray, "3 nodes"]) -> Float[np.ndarray, "places 3"]:
     """Return every node, the third axis fastest: the order of a flattened energy."""
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from vjepa2_ac.distances import absolute_difference
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.evaluation.measure import Predictor, prediction
 from vjepa2_ac.evaluation.result import L1, Clips, Example, PredictionErrors, Stratum
 from vjepa2_ac.geometry import matrices_from_euler
 from vjepa2_ac.spaces import ActionSpace
@@ -62,16 +61,13 @@ def strata_of(clips: Clips, space: ActionSpace) -> tuple[Stratum, ...]:
     found = [Stratum("moving", "motion", clips.moving), Stratum("idle", "motion", ~clips.moving)]
     edges = np.quantile(clips.action_size, np.arange(1, _PARTS) / _PARTS)
     part = np.searchsorted(edges, clips.action_size, side="right")
+    unit, form = space.shown_unit, ".1f" if space.shown_unit else ".3g"
     for number in range(_PARTS):
-        steps = part == number
-        if steps.any():
-            found.append(Stratum(_range_of(clips.action_size[steps], space.shown_unit), "action size", steps))
+        if (steps := part == number).any():
+            sizes = clips.action_size[steps]
+            name = f"{sizes.min():{form}} to {sizes.max():{form}} {unit}".rstrip()
+            found.append(Stratum(name, "action size", steps))
     return tuple(stratum for stratum in found if stratum.steps.any())
-
-
-def _range_of(sizes: Float[np.ndarray, " steps"], unit: str) -> str:
-    form = ".1f" if unit else ".3g"
-    return f"{sizes.min():{form}} to {sizes.max():{form}} {unit}".rstrip()
 
 
 def _angles(rotations: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
@@ -102,12 +98,6 @@ def chosen_clips(errors: PredictionErrors, moved: Float[np.ndarray, " clips"], c
     for why, clip in wanted.items():
         chosen[clip] = f"{chosen[clip]}, {why}" if clip in chosen else why
     return dict(list(chosen.items())[:count])
-
-
-@torch.no_grad()
-def predicted_rollout(model: Predictor, batch: LatentBatch, row: int) -> Float[Tensor, "horizon tokens dim"]:
-    """Return a model's prediction of one clip from its first frame, in float32 on the CPU."""
-    return prediction(model, batch.clip(row))[0].float().cpu()
 
 
 def make_example(

@@ -14,12 +14,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
 from einops import rearrange
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
@@ -36,32 +36,23 @@ from vjepa2_ac.reporter import SILENT, Reporter
 DECODED_TRUTH, DECODED_PERSISTENCE, RAW_PERSISTENCE = "decoded_truth", "decoded_persistence", "raw_persistence"
 NEIGHBOURS = (DECODED_TRUTH, DECODED_PERSISTENCE, RAW_PERSISTENCE)
 TRUE_FRAMES = "truth"
-LEAST_SSIM, LEAST_LPIPS = 11, 32  # pixels a side: its window; or the pooled images have none
 _LPIPS_AT_ONCE = 8  # images of each source: of VGG, 256 pixels and six sources they take 1.6 GB
 _CACHE = "Nothing is compared with true frames: the latents come from a cache, which holds only small ones."
 _LEFT_OUT = (
-    "{metric}, {ahead}: {clips} clips are left out of the mean, since their images are identical or nothing moves."
+    "{metric}, at the last horizon: {clips} clips are left out of the mean, since their images are identical or nothing"
+    " moves."
 )
 
 Images = Float[Tensor, "batch horizon 3 size size"]
-Values = dict[tuple[str, str], list[Float[np.ndarray, "batch horizon"]]]  # by source and metric
-
-
-@dataclass(frozen=True, eq=False)
-class Decoding:
-    """How latents become images, and what the images are measured by."""
-
-    decoder: TrainedDecoder
-    has_frames: bool = True  # False: of cached latents there are only small ones
-    lpips: Lpips | None = None  # None: no files were named
 
 
 def measure_decoded(
     contenders: Sequence[Contender],
     clips: RepeatableClips,
-    decoding: Decoding,
+    decoder: TrainedDecoder,
     examples: Sequence[Example] = (),
     *,
+    lpips: Lpips | None = None,
     reporter: Reporter = SILENT,
 ) -> DecodedRollouts:
     """Decode the rollouts of all models under the true actions, and measure them beside their neighbours.
@@ -69,26 +60,41 @@ def measure_decoded(
     Args:
         contenders: In the order of the table.
         clips: What to measure on; they are read once.
-        decoding: The decoder and what else is needed.
+        decoder: Makes images of latents.
         examples: Clips whose images are returned, too.
+        lpips: None: no files were named.
         reporter: Shows the progress.
     """
     progress = reporter.task("decoded rollouts")
     wanted = {(one.episode_id, one.start): one for one in examples}
     shown = [one.name for one in contenders if one.role != "other"]
     ids: list[str] = []
-    values: Values = {}
+    values: dict[tuple[str, str], list[Float[np.ndarray, "batch horizon"]]] = {}  # by source and metric
     strips: dict[ClipName, DecodedStrip] = {}
     for batch, frames_of_row in clips.read(None):
-        images = _decoded(batch, contenders, decoding, frames_of_row)
+        images = _decoded(batch, contenders, decoder, frames_of_row if clips.has_frames else None)
         ids += batch.episode_ids
-        for key, found in _measured(images, decoding.lpips).items():
-            values.setdefault(key, []).append(found.double().cpu().numpy())
-        for row, name in enumerate(zip(batch.episode_ids, batch.starts, strict=True)):
-            if name in wanted:
-                strips[name] = images.strip(row, wanted[name], shown)
+        for key, metric in _measured(images, lpips).items():
+            values.setdefault(key, []).append(metric.double().cpu().numpy())
+        for row, clip in enumerate(zip(batch.episode_ids, batch.starts, strict=True)):
+            if clip in wanted:
+                strips[clip] = images.strip(row, wanted[clip], shown)
         progress(len(ids), clips.count)
-    return _result(values, ids, contenders, decoding, tuple(strips[name] for name in wanted if name in strips))
+    arrays = {key: np.concatenate(parts) for key, parts in values.items()}
+    left_out = {}
+    for (source, name), array in arrays.items():
+        count = int((~np.isfinite(array[:, -1])).sum())
+        if count and not (name.endswith(DECODED_TRUTH) and source == DECODED_TRUTH):  # its own reference
+            left_out[name] = _LEFT_OUT.format(metric=name, clips=count)
+    card, sources = decoder.card, (*NEIGHBOURS, *(one.name for one in contenders))
+    kept = ("encoder", "crop", "data", "cameras", "episodes", "frames", "steps", "held_out")
+    return DecodedRollouts(
+        decoder={"folder": decoder.name, "size": card.shape.size} | {name: asdict(card)[name] for name in kept},
+        sources=tuple(one for one in sources if one in {source for source, _ in arrays}),
+        curves={key: _means(found, ids) for key, found in arrays.items()},
+        strips=tuple(strips[name] for name in wanted if name in strips),
+        notes=(*([] if clips.has_frames else [_CACHE]), *left_out.values()),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,11 +111,6 @@ class _Images:
         decoded = {DECODED_TRUTH: self.sources[DECODED_TRUTH]}
         return decoded if self.true is None else {TRUE_FRAMES: self.true[:, 1:], **decoded}
 
-    @property
-    def moving(self) -> Bool[Tensor, "batch horizon size size"] | None:
-        """Where something moves, by the true frames."""
-        return None if self.true is None else moving_region(self.true)
-
     def strip(self, row: int, example: Example, models: Sequence[str]) -> DecodedStrip:
         """Return whole clips of one row, the given frame included."""
         rows = {} if self.true is None else {TRUE_FRAMES: as_pixels(self.true[row])}
@@ -120,9 +121,9 @@ class _Images:
 
 @torch.no_grad()
 def _decoded(
-    batch: LatentBatch, contenders: Sequence[Contender], decoding: Decoding, frames_of_row: FramesOfRow
+    batch: LatentBatch, contenders: Sequence[Contender], trained: TrainedDecoder, frames_of_row: FramesOfRow | None
 ) -> _Images:
-    decoder, latents = decoding.decoder.decoder, batch.latents
+    decoder, latents = trained.decoder, batch.latents
     rollouts = {
         DECODED_TRUTH: latents[:, 1:],
         DECODED_PERSISTENCE: latents[:, :1].expand_as(latents[:, 1:]),
@@ -133,7 +134,7 @@ def _decoded(
     with torch.autocast(latents.device.type, enabled=False):
         sources = {source: decoder.decode(one.float()) for source, one in rollouts.items()}
         first = decoder.decode(latents[:, :1].float())
-    if not decoding.has_frames:
+    if frames_of_row is None:
         return _Images(sources, first, None)
     rows = [frames_of_row(row) for row in range(len(batch.starts))]
     pixels = torch.from_numpy(np.stack([row for row in rows if row is not None])).to(latents.device)
@@ -147,48 +148,20 @@ def _measured(images: _Images, lpips: Lpips | None) -> dict[tuple[str, str], Flo
 
     PSNR of identical images is infinite; where nothing moves, the region's values are NaN.
     """
-    moving = images.moving
+    moving = None if images.true is None else moving_region(images.true)
     regions = {"whole": None} if moving is None else {"whole": None, "moving": moving}
-    side = images.decoded_first.shape[-1]
     found: dict[tuple[str, str], Tensor] = {}
     for reference, true in images.references.items():
         for source, shown in images.sources.items():
-            similar = ssim_map(shown, true) if side >= LEAST_SSIM else None
+            similar = ssim_map(shown, true)
             for region, where in regions.items():
                 found[source, f"psnr_db.{region}.{reference}"] = psnr(shown, true, where)
-                if similar is not None:
-                    found[source, f"ssim.{region}.{reference}"] = mean_where(similar, where)
+                found[source, f"ssim.{region}.{reference}"] = mean_where(similar, where)
     if moving is not None:
         found[TRUE_FRAMES, "moving_share"] = moving.float().mean(dim=(-2, -1))
-    if lpips is not None and side >= LEAST_LPIPS:
+    if lpips is not None:
         found |= lpips.of_pairs(images.sources, images.references)
     return found
-
-
-def _result(
-    values: Values,
-    ids: Sequence[str],
-    contenders: Sequence[Contender],
-    decoding: Decoding,
-    strips: tuple[DecodedStrip, ...],
-) -> DecodedRollouts:
-    arrays = {key: np.concatenate(parts) for key, parts in values.items()}
-    side, notes = decoding.decoder.card.shape.image_size, [] if decoding.has_frames else [_CACHE]
-    notes += [f"No SSIM: images of {side} pixels are too small for its window."] if side < LEAST_SSIM else []
-    if decoding.lpips is not None and side < LEAST_LPIPS:
-        notes.append(f"No LPIPS: images of {side} pixels; it needs {LEAST_LPIPS} a side.")
-    measured, left_out = {source for source, _ in arrays}, dict[str, str]()
-    for (source, metric), found in arrays.items():
-        clips = int((~np.isfinite(found[:, -1])).sum())
-        if clips and not (metric.endswith(DECODED_TRUTH) and source == DECODED_TRUTH):  # its own reference
-            left_out[metric] = _LEFT_OUT.format(metric=metric, ahead="at the last horizon", clips=clips)
-    return DecodedRollouts(
-        decoder=_description(decoding.decoder),
-        sources=tuple(source for source in (*NEIGHBOURS, *(one.name for one in contenders)) if source in measured),
-        curves={key: _means(found, ids) for key, found in arrays.items()},
-        strips=strips,
-        notes=(*notes, *left_out.values()),
-    )
 
 
 def _means(values: Float[np.ndarray, "clips horizon"], ids: Sequence[str]) -> tuple[Estimate, ...]:
@@ -196,12 +169,6 @@ def _means(values: Float[np.ndarray, "clips horizon"], ids: Sequence[str]) -> tu
     finite = np.isfinite(values)
     columns = np.stack([np.where(finite, values, 0.0), finite.astype(np.float64)])
     return bootstrapped(lambda sums: sums[0] / sums[1], columns, ids)
-
-
-def _description(trained: TrainedDecoder) -> dict[str, Any]:
-    card = trained.card
-    kept = ("encoder", "crop", "data", "cameras", "episodes", "frames", "steps", "held_out")
-    return {"folder": trained.name, "size": card.shape.size} | {name: asdict(card)[name] for name in kept}
 
 
 Backbone = Literal["alex", "vgg"]
@@ -279,33 +246,22 @@ def load_lpips(backbone: Path, heads: Path) -> Lpips:
     Raises:
         InputError: A file cannot be read, or is another one.
     """
-    weights = _tensors(backbone, "--lpips")
-    network = Lpips("alex" if "features.10.bias" in weights and "features.28.bias" not in weights else "vgg")
-    convolutions = {name.removeprefix("features."): one for name, one in weights.items() if name.startswith("features")}
-    found = {f"heads.{number}": one.flatten() for number, one in enumerate(_tensors(heads, "--lpips-heads").values())}
     try:
-        network.features.load_state_dict(convolutions)
+        weights, of_heads = (torch.load(path, map_location="cpu", weights_only=True) for path in (backbone, heads))
+        network = Lpips("alex" if "features.10.bias" in weights and "features.28.bias" not in weights else "vgg")
+        network.features.load_state_dict({
+            name.removeprefix("features."): one for name, one in weights.items() if name.startswith("features")
+        })  # fmt: skip
+        found = {f"heads.{number}": one.flatten() for number, one in enumerate(of_heads.values())}
         network.load_state_dict(network.state_dict() | found)
-    except RuntimeError as error:
+    except Exception as error:  # damaged and other files raise errors of many kinds
         raise InputError(
             where=f"--lpips {backbone} --lpips-heads {heads}",
-            found=str(error),
+            found=f"cannot be read ({error})",
             needed="torchvision's AlexNet or VGG16, and the heads of LPIPS for the same one",
             fix="docs/decoding.md says where to get them",
         ) from None
     return network
-
-
-def _tensors(path: Path, option: str) -> dict[str, Tensor]:
-    try:
-        found = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # a damaged file raises errors of many kinds
-        raise InputError(
-            where=f"{option} {path}", found=f"cannot be read ({error})", needed="PyTorch weights"
-        ) from None
-    if not isinstance(found, dict) or not all(isinstance(one, Tensor) for one in found.values()):
-        raise InputError(where=f"{option} {path}", found="no PyTorch weights")
-    return found
 
 
 def _alexnet() -> nn.Sequential:

@@ -26,7 +26,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from vjepa2_ac.evaluation.result import Discrepancy, LatentDistribution
+from vjepa2_ac.evaluation.result import LatentDistribution
 from vjepa2_ac.intervals import Estimate, bootstrapped_by_weights
 
 FLIPS = 2000  # of signs, for a p-value
@@ -84,13 +84,8 @@ class LatentSums:
         return np.stack([np.bincount(episode_of, column, len(names)) for column in by_clip.T])
 
     def products(self) -> Float[np.ndarray, "horizon episodes episodes"]:
-        """Return the inner products of the episodes' sums, scaled so that their total is the exact one.
-
-        Raises:
-            ValueError: There are no clips.
-        """
-        if self._total is None:
-            raise ValueError("no clips to measure on")
+        """Return the inner products of the episodes' sums, scaled so that their total is the exact one."""
+        assert self._total is not None  # noqa: S101  # there are clips
         sketches = np.stack([self._sketches[name] for name in sorted(self._sketches)], axis=1)
         products = sketches @ sketches.swapaxes(1, 2)
         exact = self._total.square().sum(dim=1).cpu().numpy()
@@ -100,8 +95,10 @@ class LatentSums:
 
 
 def distribution_of(predicted: LatentSums, true: LatentSums) -> LatentDistribution:
-    """Return spread and discrepancy of predicted latents against the true ones of the same clips."""
-    return LatentDistribution(spread_of(predicted, true), latent_mmd(predicted, true))
+    """Return spread and, averaged over tokens, discrepancy of predicted latents against the true ones of the clips."""
+    pairs = zip(predicted.pooled.swapaxes(0, 1), true.pooled.swapaxes(0, 1), strict=True)
+    mmd, p_values = zip(*(discrepancy(one, other, true.episode_ids) for one, other in pairs), strict=True)
+    return LatentDistribution(spread_of(predicted, true), mmd, p_values)
 
 
 def spread_of(predicted: LatentSums, true: LatentSums) -> tuple[Estimate, ...]:
@@ -124,14 +121,8 @@ def spread_of(predicted: LatentSums, true: LatentSums) -> tuple[Estimate, ...]:
     return bootstrapped_by_weights(of_weights, len(names))
 
 
-def latent_mmd(predicted: LatentSums, true: LatentSums) -> tuple[Discrepancy, ...]:
-    """Return the discrepancy of latents averaged over tokens, by horizon."""
-    pairs = zip(predicted.pooled.swapaxes(0, 1), true.pooled.swapaxes(0, 1), strict=True)
-    return tuple(discrepancy(one, other, true.episode_ids) for one, other in pairs)
-
-
 def latent_noise_floor(true: LatentSums) -> tuple[float, ...]:
-    """Return the noise floor of `latent_mmd`, by horizon."""
+    """Return the noise floor of the discrepancy, by horizon."""
     return tuple(noise_floor(column, true.episode_ids) for column in true.pooled.swapaxes(0, 1))
 
 
@@ -158,47 +149,38 @@ def _hashes(numbers: int, device: torch.device) -> tuple[Int[Tensor, " numbers"]
 
 @dataclass(frozen=True)
 class EpisodePairs:
-    """Sums of kernels over the clips of each pair of episodes: all that the estimates need."""
+    """Sums of kernels over the clips of each pair of episodes, 0 of an episode with itself: all that estimates need."""
 
     both: Float[np.ndarray, "episodes episodes"]  # k(x, x') + k(y, y') - k(x, y') - k(y, x')
     true: Float[np.ndarray, "episodes episodes"]  # k(y, y')
-    clips: Int[np.ndarray, " episodes"]  # of each episode
-
-    @property
-    def counts(self) -> Float[np.ndarray, "episodes episodes"]:
-        """The number of pairs of clips of each pair of episodes; 0 of an episode with itself."""
-        return _without_diagonal(np.outer(self.clips, self.clips).astype(np.float64))
+    counts: Float[np.ndarray, "episodes episodes"]  # of pairs
 
 
 def discrepancy(
     predicted: Float[np.ndarray, "clips dim"],
     true: Float[np.ndarray, "clips dim"],
     episode_ids: Sequence[str],
-    *,
-    seed: int = 0,
-) -> Discrepancy:
+) -> tuple[Estimate, float]:
     """Return the discrepancy of predicted and true features of the same clips, with its interval over episodes.
 
-    The interval is for its size. Whether it differs from 0 is decided by `p_value` alone: near 0 the estimate is
-    degenerate, and its interval too wide.
+    The interval is for its size. Whether it differs from 0 is decided by the second number alone, the probability of no
+    difference: near 0 the estimate is degenerate, and its interval too wide. Both are NaN of one episode.
 
     Args:
         predicted: Row i is of clip i.
         true: Likewise.
         episode_ids: Of each clip.
-        seed: Of the bootstrap and of the flips.
 
     Source: Gretton et al. (2012), A Kernel Two-Sample Test, lemma 6, with pairs of one episode left out as pairs of one
     sample are there; the kernel: Luo et al. (2410.05203), JEDi.
     """
     pairs = episode_pairs(predicted, true, episode_ids)
-    kernel, counts = _without_diagonal(pairs.both), pairs.counts
 
     def of_weights(weights: np.ndarray) -> np.ndarray:
-        return np.asarray(_SCALE * _quadratic(weights, kernel) / _quadratic(weights, counts))[:, None]
+        return np.asarray(_SCALE * _quadratic(weights, pairs.both) / _quadratic(weights, pairs.counts))[:, None]
 
-    (squared,) = bootstrapped_by_weights(of_weights, len(pairs.clips), seed=seed)
-    return Discrepancy(squared, p_of_no_difference(pairs, seed=seed))
+    (squared,) = bootstrapped_by_weights(of_weights, len(pairs.both))
+    return squared, p_of_no_difference(pairs)
 
 
 def episode_pairs(
@@ -210,9 +192,9 @@ def episode_pairs(
     one, other = predicted.astype(np.float64), true.astype(np.float64)
     of_true, across = _kernel(other, other), _kernel(one, other)
     both = _kernel(one, one) + of_true - across - across.T
-    return EpisodePairs(
-        member.T @ both @ member, member.T @ of_true @ member, np.bincount(episode_of, minlength=len(names))
-    )
+    clips = np.bincount(episode_of, minlength=len(names))
+    sums = member.T @ both @ member, member.T @ of_true @ member, np.outer(clips, clips).astype(np.float64)
+    return EpisodePairs(*(one - np.diag(np.diag(one)) for one in sums))
 
 
 def p_of_no_difference(pairs: EpisodePairs, *, flips: int = FLIPS, seed: int = 0) -> float:
@@ -221,30 +203,27 @@ def p_of_no_difference(pairs: EpisodePairs, *, flips: int = FLIPS, seed: int = 0
     Each flip exchanges prediction and truth of a random half of the episodes. Of few episodes it cannot be small: at
     least 2 / 2^episodes.
     """
-    count = len(pairs.clips)
+    count, kernel = len(pairs.both), pairs.both
     if count < 2:
         return math.nan
-    kernel = _without_diagonal(pairs.both)
     signs = np.random.default_rng(seed).choice([-1.0, 1.0], size=(flips, count))
     least = kernel.sum() - _ROUNDING * np.abs(kernel).sum()
     return float((1 + (_quadratic(signs, kernel) >= least).sum()) / (1 + flips))
 
 
-def noise_floor(
-    true: Float[np.ndarray, "clips dim"], episode_ids: Sequence[str], *, halvings: int = HALVINGS, seed: int = 0
-) -> float:
+def noise_floor(true: Float[np.ndarray, "clips dim"], episode_ids: Sequence[str]) -> float:
     """Return the discrepancy that two halves of the true episodes stay below in 95 % of random halvings.
 
     What is smaller cannot be told from the choice of the episodes. It is cautious: halves are smaller than the whole,
     and unlike predictions they are not of the same clips. NaN of fewer than four episodes.
     """
     pairs = episode_pairs(true, true, episode_ids)
-    count = len(pairs.clips)
+    kernel, counts, count = pairs.true, pairs.counts, len(pairs.true)
     if count < 4:
         return math.nan
-    rng = np.random.default_rng(seed)
-    half = np.stack([rng.permutation(count) < count // 2 for _ in range(halvings)]).astype(np.float64)
-    kernel, counts, rest = _without_diagonal(pairs.true), pairs.counts, 1 - half
+    rng = np.random.default_rng(0)
+    half = np.stack([rng.permutation(count) < count // 2 for _ in range(HALVINGS)]).astype(np.float64)
+    rest = 1 - half
     within = sum(_quadratic(part, kernel) / _quadratic(part, counts) for part in (half, rest))
     across = _quadratic(half, kernel, rest) / _quadratic(half, counts, rest)
     return float(np.quantile(_SCALE * (within - 2 * across), _SHARE))
@@ -254,10 +233,6 @@ def _kernel(
     one: Float[np.ndarray, "clips dim"], other: Float[np.ndarray, "others dim"]
 ) -> Float[np.ndarray, "clips others"]:
     return np.asarray((one @ other.T / one.shape[1]) ** 2)
-
-
-def _without_diagonal(matrix: Float[np.ndarray, "side side"]) -> Float[np.ndarray, "side side"]:
-    return np.asarray(matrix - np.diag(np.diag(matrix)))
 
 
 def _quadratic(

@@ -16,36 +16,28 @@ from vjepa2_ac.episode import LatentBatch, Progress
 from vjepa2_ac.evaluation.action_score import PlanningStart, measure_plans, planning_start, study_of
 from vjepa2_ac.evaluation.action_use import (
     ActionPool,
-    LandscapeGrid,
     RolloutStart,
     measure_landscapes,
     measure_sensitivity,
     moves_of,
-    pool_of,
     rank_actions,
     start_of,
 )
-from vjepa2_ac.evaluation.clips import chosen_clips, clips_of, make_example, predicted_rollout, strata_of
+from vjepa2_ac.evaluation.clips import chosen_clips, clips_of, make_example, strata_of
 from vjepa2_ac.evaluation.distribution import LatentSums, distribution_of, latent_noise_floor
 from vjepa2_ac.evaluation.estimates import episode_scores
-from vjepa2_ac.evaluation.measure import ALL, Predictor, joined, measured, with_other_actions
+from vjepa2_ac.evaluation.measure import ALL, Predictor, joined, measured, prediction, with_other_actions
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import (
     About,
-    ActionRanking,
     Clips,
     Evaluation,
     Example,
-    Landscapes,
-    Measurement,
     Metric,
     Mode,
     ModelResult,
-    PersistenceDistribution,
-    Plans,
     PredictionErrors,
     Role,
-    Sensitivity,
     Way,
     registered_metrics,
 )
@@ -53,9 +45,6 @@ from vjepa2_ac.reporter import SILENT, Reporter
 
 ClipName = tuple[str, int]  # id of the episode, first control step
 FramesOfRow = Callable[[int], UInt8[np.ndarray, "time height width 3"] | None]  # of a row of the current batch
-_NOT_ASKED = "{} is 0: no {} were asked for."
-_NO_PLANS = "No plans: they are poses' displacements, and the states here are plain numbers."
-_NO_LANDSCAPES = "No energy landscapes: an action has {} numbers, and a landscape is over three."
 
 
 @dataclass(frozen=True)
@@ -75,6 +64,7 @@ class RepeatableClips:
 
     count: int
     read: Callable[[Sequence[ClipName] | None], Iterable[tuple[LatentBatch, FramesOfRow]]]
+    has_frames: bool = True  # False: of cached latents there are only small ones
 
 
 def evaluate(
@@ -90,24 +80,23 @@ def evaluate(
 
     Args:
         contenders: In the order of the table; one of them has the role trained.
-        clips: What to measure on.
+        clips: What to measure on; one or more.
         about: Description of the evaluation.
         metrics: Of the errors, L1 first; None: all that are registered.
         probes: Options of the measurements beyond the errors.
         reporter: Shows the progress of each part of the work.
 
     Raises:
-        ValueError: No clips; or too few frames for planning.
+        ValueError: Too few frames for planning.
     """
     probes, metrics = probes or ProbeOptions(), metrics or registered_metrics()
     seen = _collect(contenders, clips, probes, about, metrics, reporter.task("measuring"))
-    ids, seconds = tuple(seen.ids), about.seconds_per_step
-    known = clips_of(seen.actions, ids, tuple(seen.firsts), space=about.space, seconds_per_step=seconds)
-    probe = _Probe(seen, known, _pool(seen, about, probes), probes, about, reporter)
+    ids = tuple(seen.ids)
+    known = clips_of(seen.actions, ids, tuple(seen.firsts), space=about.space, seconds_per_step=about.seconds_per_step)
     models: dict[str, ModelResult] = {}
     for contender in contenders:
         with contender.switched():
-            models[contender.name] = probe.of(contender)
+            models[contender.name] = _measure(contender, seen, known, probes, about, reporter)
     evaluation = Evaluation(
         about=about,
         clips=known,
@@ -117,74 +106,34 @@ def evaluate(
         examples=(),
         planning=study_of(seen.planned, probes.planning) if seen.planned else None,
         metrics=metrics,
-        persistence_distribution=seen.latents.of_persistence(),
+        copies=distribution_of(seen.copies, seen.true),
+        noise_floor=latent_noise_floor(seen.true),
     )
-    scores = episode_scores(evaluation.errors, evaluation.base_errors)
-    examples = _examples(contenders, clips, evaluation, probes)
-    notes = _left_out(probes, about, action_dim=seen.actions.shape[-1])
-    return replace(evaluation, episodes=scores, examples=examples, notes=notes)
-
-
-def _pool(seen: _Seen, about: About, probes: ProbeOptions) -> ActionPool:
-    return ActionPool(
-        actions=seen.actions.reshape(-1, seen.actions.shape[-1]),
-        episode_ids=tuple(np.repeat(np.array(seen.ids), seen.actions.shape[1]).tolist()),
-        space=about.space,
-        reach=probes.reach_cm / 100,
-        samples=probes.samples,
-        seed=about.seed,
-    )
-
-
-def _left_out(probes: ProbeOptions, about: About, *, action_dim: int) -> tuple[str, ...]:
-    """Return notes on what was not measured: by an option, or because it does not apply."""
-    notes = []
-    if not probes.sensitivity_clips:
-        notes.append(_NOT_ASKED.format("--sensitivity-clips", "other actions and no energy landscapes"))
-    elif not probes.landscape_clips:
-        notes.append(_NOT_ASKED.format("--landscapes", "energy landscapes"))
-    elif action_dim < 3:
-        notes.append(_NO_LANDSCAPES.format(action_dim))
-    if probes.sensitivity_clips and not probes.axis_clips and about.space.is_pose:
-        notes.append(_NOT_ASKED.format("--axes", "calibrated axes"))
+    notes, width = [], seen.actions.shape[-1]
+    if probes.sensitivity_clips and probes.landscape_clips and width < 3:
+        notes.append(f"No energy landscapes: an action has {width} numbers, and a landscape is over three.")
     if probes.planning_clips and about.space.position is None:
-        notes.append(_NO_PLANS)
-    if not probes.examples:
-        notes.append(_NOT_ASKED.format("--examples", "example clips"))
-    return tuple(notes)
-
-
-class _Latents:
-    """Sums of the rollouts of every model with the true actions, of copies of frame 0, and of the true latents."""
-
-    def __init__(self, models: Sequence[str]) -> None:
-        self.predicted = {name: LatentSums() for name in models}
-        self.copies = LatentSums()
-        self.true = LatentSums()
-        self._first = models[0]
-
-    def add(self, model: str, ids: Sequence[str], way: Way, mode: Mode, predicted: torch.Tensor) -> None:
-        """Add one model's prediction of a batch; copies are the same for all models."""
-        if (way, mode) == ("true", "rollout"):
-            self.predicted[model].add(predicted, ids)
-        elif (way, mode, model) == ("persistence", "rollout", self._first):
-            self.copies.add(predicted, ids)
-
-    def of_persistence(self) -> PersistenceDistribution:
-        """Return how copies of frame 0 are distributed, and the noise floor."""
-        return PersistenceDistribution(distribution_of(self.copies, self.true), latent_noise_floor(self.true))
+        notes.append("No plans: they are poses' displacements, and the states here are plain numbers.")
+    return replace(
+        evaluation,
+        episodes=episode_scores(evaluation.errors, evaluation.base_errors),
+        examples=_examples(contenders, clips, evaluation, probes.examples),
+        notes=tuple(notes),
+    )
 
 
 @dataclass
 class _Seen:
-    """Data of all clips: errors and actions, and one frame and the next of some."""
+    """What all clips gave: errors, actions, sums of latents, and one frame and the next of some."""
 
-    ids: list[str]
-    firsts: list[int]
-    actions: Float[np.ndarray, "clips horizon action_dim"]
     errors: dict[str, list[PredictionErrors]]  # by model
-    starts: list[RolloutStart]
-    latents: _Latents
+    predicted: dict[str, LatentSums]  # rollouts with the true actions, by model
+    actions: Float[np.ndarray, "clips horizon action_dim"] = field(default_factory=lambda: np.zeros((0, 0, 0)))
+    true: LatentSums = field(default_factory=LatentSums)
+    copies: LatentSums = field(default_factory=LatentSums)  # of frame 0
+    ids: list[str] = field(default_factory=list)
+    firsts: list[int] = field(default_factory=list)
+    starts: list[RolloutStart] = field(default_factory=list)
     moves: list[RolloutStart] = field(default_factory=list)
     planned: list[PlanningStart] = field(default_factory=list)
 
@@ -197,126 +146,95 @@ def _collect(
     metrics: Sequence[Metric],
     progress: Progress,
 ) -> _Seen:
-    names = [contender.name for contender in contenders]
-    seen = _Seen([], [], np.zeros((0, 0, 0)), {name: [] for name in names}, [], _Latents(names))
-    actions = []
+    names, space = [contender.name for contender in contenders], about.space
+    seen, actions = _Seen({name: [] for name in names}, {name: LatentSums() for name in names}), []
     probed = set(spread(clips.count, probes.sensitivity_clips)) if probes.sensitivity_clips else set()
-    planned = (
-        set(spread(clips.count, probes.planning_clips))
-        if probes.planning_clips and about.space.position is not None
-        else set()
-    )
+    plans = probes.planning_clips if space.position is not None else 0
+    planned = set(spread(clips.count, plans)) if plans else set()
+
+    def add(ids: Sequence[str], name: str, way: Way, mode: Mode, predicted: torch.Tensor) -> None:
+        if (way, mode) == ("true", "rollout"):
+            seen.predicted[name].add(predicted, ids)
+        elif (way, mode, name) == ("persistence", "rollout", names[0]):  # copies are the same for all models
+            seen.copies.add(predicted, ids)
+
     for batch, others in with_other_actions(batch for batch, _ in clips.read(None)):
-        seen.latents.true.add(batch.latents[:, 1:], batch.episode_ids)
+        seen.true.add(batch.latents[:, 1:], batch.episode_ids)
         for contender in contenders:
-            watch = partial(seen.latents.add, contender.name, batch.episode_ids)
+            watch = partial(add, batch.episode_ids, contender.name)
             with contender.switched():
                 seen.errors[contender.name].append(measured(contender.model, batch, ALL, metrics, others, watch))
-        first = len(seen.ids)
-        for row in range(len(batch.starts)):
-            if first + row in probed:
-                seen.starts.append(start_of(batch, row, _largest_step(batch.actions[row], about), first + row))
-                seen.moves += moves_of(batch, row, first + row, about.space, probes.reach_cm / 100)
-            if first + row in planned:
-                seen.planned.append(planning_start(batch, row, first + row, about.seed))
+        for row, clip in enumerate(range(len(seen.ids), len(seen.ids) + len(batch.starts))):
+            if clip in probed:
+                largest = int(batch.actions[row][:, space.sized].norm(dim=-1).argmax())
+                seen.starts.append(start_of(batch, row, largest, clip))
+                seen.moves += moves_of(batch, row, clip, space, probes.reach_cm / 100)
+            if clip in planned:
+                seen.planned.append(planning_start(batch, row, clip, about.seed))
         actions.append(batch.actions.cpu().numpy().astype(np.float64))
         seen.ids += batch.episode_ids
         seen.firsts += batch.starts
         progress(len(seen.ids), clips.count)
-    if not seen.ids:
-        raise ValueError("no clips to evaluate on")
     seen.actions = np.concatenate(actions)
     return seen
 
 
-def _largest_step(actions: Float[torch.Tensor, "time action_dim"], about: About) -> int:
-    """Return the step of a clip with the largest action: for poses, by the translation."""
-    return int(actions[:, about.space.sized].norm(dim=-1).argmax())
+def _measure(
+    contender: Contender,
+    seen: _Seen,
+    clips: Clips,
+    probes: ProbeOptions,
+    about: About,
+    reporter: Reporter,
+) -> ModelResult:
+    """Measure one model beyond its predictions: what is asked for, and applies."""
+    name, model, starts, space = contender.name, contender.model, seen.starts, about.space
+    found = ModelResult(
+        name, contender.role, joined(seen.errors[name]), distribution=distribution_of(seen.predicted[name], seen.true)
+    )
+
+    def progress(what: str) -> Progress:
+        return reporter.task(f"{what}, {name}")
+
+    if starts:
+        count, steps, width = seen.actions.shape
+        actions, ids = seen.actions.reshape(count * steps, width), [one for one in seen.ids for _ in range(steps)]
+        pool = ActionPool(actions, ids, space, probes.reach_cm / 100, probes.samples, about.seed)
+        task = progress("other actions")
+        sensitivity = measure_sensitivity(model, starts, pool, at_once=probes.at_once, progress=task)
+        task = progress("action ranking")
+        ranking = rank_actions(model, seen.moves, space, probes, seed=about.seed, progress=task)
+        found = replace(found, sensitivity=sensitivity, ranking=ranking)
+    moving = [start for start in starts if clips.moving[start.clip].any()] or starts
+    if moving and probes.landscape_clips and seen.actions.shape[-1] >= 3:
+        chosen = [moving[place] for place in spread(len(moving), probes.landscape_clips)]
+        maps = measure_landscapes(model, chosen, space, probes, progress("energy landscapes"))
+        found = replace(found, landscapes=maps)
+    if seen.planned:
+        planner = model if contender.to_plan is None else contender.to_plan()
+        found = replace(found, plans=measure_plans(planner, seen.planned, probes.planning, progress("planning")))
+    if probes.find_axes is not None and starts and probes.axis_clips and space.is_pose:
+        chosen = [starts[place] for place in spread(len(starts), probes.axis_clips)]
+        found = replace(found, beside={"axes": probes.find_axes(model, chosen, probes.at_once, progress("axes"))})
+    return found
 
 
-@dataclass(frozen=True)
-class _Probe:
-    """The measurements of one model beyond its predictions; each gives None where nothing was asked for."""
-
-    seen: _Seen
-    clips: Clips
-    pool: ActionPool
-    options: ProbeOptions
-    about: About
-    reporter: Reporter
-
-    def of(self, contender: Contender) -> ModelResult:
-        """Return all results of a model."""
-        name, seen = contender.name, self.seen
-        return ModelResult(
-            name,
-            contender.role,
-            joined(seen.errors[name]),
-            sensitivity=self._sensitivity(contender),
-            ranking=self._ranking(contender),
-            landscapes=self._landscapes(contender),
-            plans=self._plans(contender),
-            beside=self._axes(contender),
-            distribution=distribution_of(seen.latents.predicted[name], seen.latents.true),
-        )
-
-    def _sensitivity(self, contender: Contender) -> Sensitivity | None:
-        if not self.seen.starts:
-            return None
-        progress = self.reporter.task(f"other actions, {contender.name}")
-        at_once = self.options.at_once
-        return measure_sensitivity(contender.model, self.seen.starts, self.pool, at_once=at_once, progress=progress)
-
-    def _ranking(self, contender: Contender) -> ActionRanking | None:
-        if not (moves := self.seen.moves):
-            return None
-        options, about = self.options, self.about
-        pool = pool_of(moves, about.space, reach=options.reach_cm / 100, samples=options.samples, seed=about.seed)
-        progress = self.reporter.task(f"action ranking, {contender.name}")
-        return rank_actions(contender.model, moves, pool, at_once=options.at_once, progress=progress)
-
-    def _landscapes(self, contender: Contender) -> Landscapes | None:
-        starts, options, pool = self.seen.starts, self.options, self.pool
-        moving = [start for start in starts if self.clips.moving[start.clip].any()] or starts
-        if not options.landscape_clips or not moving or pool.actions.shape[-1] < 3:
-            return None
-        chosen = [moving[place] for place in spread(len(moving), options.landscape_clips)]
-        grid = LandscapeGrid(pool.space, options.nodes, reach=0.0 if pool.space.position is None else pool.reach)
-        progress = self.reporter.task(f"energy landscapes, {contender.name}")
-        return measure_landscapes(contender.model, chosen, grid, at_once=options.at_once, progress=progress)
-
-    def _plans(self, contender: Contender) -> Plans | None:
-        if not self.seen.planned:
-            return None
-        model = contender.model if contender.to_plan is None else contender.to_plan()
-        progress = self.reporter.task(f"planning, {contender.name}")
-        return measure_plans(model, self.seen.planned, self.options.planning, progress)
-
-    def _axes(self, contender: Contender) -> dict[str, Measurement]:
-        starts, clips = self.seen.starts, self.options.axis_clips
-        if self.options.find_axes is None or not starts or not clips or not self.about.space.is_pose:
-            return {}
-        chosen = [starts[place] for place in spread(len(starts), clips)]
-        progress = self.reporter.task(f"axes, {contender.name}")
-        return {"axes": self.options.find_axes(contender.model, chosen, self.options.at_once, progress)}
-
-
+@torch.no_grad()
 def _examples(
-    contenders: Sequence[Contender], clips: RepeatableClips, evaluation: Evaluation, probes: ProbeOptions
+    contenders: Sequence[Contender], clips: RepeatableClips, evaluation: Evaluation, count: int
 ) -> tuple[Example, ...]:
     """Read the clips of the examples again: which ones these are is known only now."""
     known = evaluation.clips
-    chosen = chosen_clips(evaluation.errors, known.action_size.sum(axis=1), probes.examples)
+    chosen = chosen_clips(evaluation.errors, known.action_size.sum(axis=1), count)
     if not chosen:
         return ()
-    names = [(known.episode_ids[clip], known.starts[clip]) for clip in chosen]
-    reasons = dict(zip(names, chosen.values(), strict=True))
+    reasons = {(known.episode_ids[clip], known.starts[clip]): why for clip, why in chosen.items()}
     found = {}
-    for batch, frames_of_row in clips.read(names):
+    for batch, frames_of_row in clips.read(list(reasons)):
         for row, name in enumerate(zip(batch.episode_ids, batch.starts, strict=True)):
             predicted = {}
             for contender in contenders:
                 with contender.switched():
-                    predicted[contender.name] = predicted_rollout(contender.model, batch, row)
+                    predicted[contender.name] = prediction(contender.model, batch.clip(row))[0].float().cpu()
             found[name] = make_example(reasons[name], batch, row, predicted, frames_of_row(row))
-    return tuple(found[name] for name in names if name in found)
+    return tuple(found[name] for name in reasons if name in found)

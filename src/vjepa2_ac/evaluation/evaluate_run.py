@@ -25,11 +25,11 @@ from vjepa2_ac.encoding.batch import encode_batch, require_widths
 from vjepa2_ac.encoding.encode_dataset import with_latents_if_there
 from vjepa2_ac.episode import Batch, LatentBatch, Progress, Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.decoded import NEIGHBOURS, TRUE_FRAMES, Decoding, load_lpips, measure_decoded
+from vjepa2_ac.evaluation.decoded import NEIGHBOURS, TRUE_FRAMES, load_lpips, measure_decoded
 from vjepa2_ac.evaluation.evaluate import ClipName, Contender, FramesOfRow, RepeatableClips, evaluate
 from vjepa2_ac.evaluation.measure import ClipSample
 from vjepa2_ac.evaluation.request import EvaluationOptions, settle
-from vjepa2_ac.evaluation.result import About, Evaluation, Measurement, Role, TrainingCurve
+from vjepa2_ac.evaluation.result import PERSISTENCE, About, Evaluation, Measurement, Role, TrainingCurve
 from vjepa2_ac.model.adapter.merging import base_only, unadapted_copy
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.input_heads import heads_to_replace, widths_as_text
@@ -80,49 +80,30 @@ def load_subject(
         InputError: One of the models cannot be loaded; it does not fit the data, the decoder, or the others.
     """
     run = load_run(Path(name), asked.checkpoint) if is_run(name) else None
-    world_model = run.world_model if run else load_model(name, config)
+    world_model = run.world_model if run else load_base(config.model.with_base(name), seed=config.seed)
     require_widths(world_model, dataset.widths, where=name)
     if decoder is not None:
         decoder.require_fit(world_model, config.data.crop, subject=name)
-    contenders, notes = _contenders_of(name, config, run, world_model, asked, dataset.widths)
-    return Subject(run, world_model, tuple(contenders), notes)
-
-
-def load_model(name: str, config: Config) -> WorldModel:
-    """Load a model by its name, with the config's other settings of a model."""
-    return load_base(config.model.with_base(name), seed=config.seed)
-
-
-def _contenders_of(
-    subject: str,
-    config: Config,
-    run: TrainedRun | None,
-    world_model: WorldModel,
-    asked: EvaluationOptions,
-    widths: Widths,
-) -> tuple[list[Contender], tuple[str, ...]]:
-    """Return the models to measure, the base first and the subject last; and notes on them."""
     against = asked.against if asked.against is not None else (BASE,) * (run is not None)
     found: list[Contender] = []
     notes: tuple[str, ...] = ()
-    if BASE in against and run is not None and config.model.base is not None:
-        if world_model.fresh_heads is not None:
-            notes = (_NO_BASE,)
-        else:
-            found.append(_contender(BASE, "base", world_model, partial(base_only, world_model)))
+    if BASE in against and config.model.base is None:
+        if run is None:
+            needed = "a base to compare with"
+            raise InputError(where="--against base", found="a config without model.base", needed=needed)
     elif BASE in against and run is None:
-        if config.model.base is None:
-            raise InputError(
-                where="--against base", found="a config without model.base", needed="a base to compare with"
-            )
-        found.append(Contender(BASE, "base", _like(world_model, config.model.base, config, subject, widths)))
-    name = "adapter" if world_model.adaptation is not None and world_model.adaptation.kind == "lora" else "model"
+        found.append(_contender(BASE, "base", _like(name, world_model, str(config.model.base), config, dataset.widths)))
+    elif BASE in against and world_model.fresh_heads is not None:
+        notes = (_NO_BASE,)
+    elif BASE in against:
+        found.append(_contender(BASE, "base", world_model, partial(base_only, world_model)))
+    own = "adapter" if world_model.adaptation is not None and world_model.adaptation.kind == "lora" else "model"
     for other in against:
         if other != BASE:
-            taken = {each.name for each in found} | {name, BASE, "persistence", TRUE_FRAMES, *NEIGHBOURS}
+            taken = {each.name for each in found} | {own, BASE, PERSISTENCE, TRUE_FRAMES, *NEIGHBOURS}
             called = Path(other).name if Path(other).name not in taken else other
-            found.append(_contender(called, "other", _like(world_model, other, config, subject, widths)))
-    return [*found, _contender(name, "trained", world_model)], notes
+            found.append(_contender(called, "other", _like(name, world_model, other, config, dataset.widths)))
+    return Subject(run, world_model, (*found, _contender(own, "trained", world_model)), notes)
 
 
 def _contender(
@@ -134,77 +115,57 @@ def _contender(
     return Contender(name, role, model, switched, None if plans_as_it_is else partial(unadapted_copy, model))
 
 
-def _like(world_model: WorldModel, other: str, config: Config, subject: str, widths: Widths) -> WorldModel:
+def _like(subject: str, world_model: WorldModel, other: str, config: Config, widths: Widths) -> WorldModel:
     """Load another run or model that can be measured on the same latents, and states and actions of these widths.
 
     Raises:
         InputError: It has another encoder, or takes other states or actions.
     """
+    where = f"--against {other}"
     if not (other.startswith(BUILTIN) or Path(other).exists()):
-        raise InputError(
-            where=f"--against {other}",
-            found="no such file or folder",
-            needed="base, the folder of a run, or a model: what model.base takes",
-        )
-    loaded = load_run(Path(other)).world_model if is_run(other) else load_model(other, config)
+        needed = "base, the folder of a run, or a model: what model.base takes"
+        raise InputError(where=where, found="no such file or folder", needed=needed)
+    is_other_run, model = is_run(other), config.model.with_base(other)
+    loaded = load_run(Path(other)).world_model if is_other_run else load_base(model, seed=config.seed)
     same = loaded.image_size == world_model.image_size
     if not same or loaded.encoder_fingerprint() != world_model.encoder_fingerprint():
         raise InputError(
-            where=f"--against {other}",
+            where=where,
             found=f"another encoder than that of {subject}",
             needed="the same one: errors are compared on the same latents",
             fix="Evaluate each by itself, and put their ratios to persistence side by side with `vjepa2-ac compare`",
         )
     if heads_to_replace(loaded.sizes, widths):
-        raise InputError(
-            where=f"--against {other}",
-            found=f"a model of {widths_as_text(loaded.sizes)}",
-            needed=f"{widths.state} and {widths.action}, as the data of {subject} has",
-        )
+        needed = f"{widths.state} and {widths.action}, as the data of {subject} has"
+        raise InputError(where=where, found=f"a model of {widths_as_text(loaded.sizes)}", needed=needed)
     return loaded
 
 
 CalibrateStrides = Callable[[WorldModel, Dataset, Config, Accelerator, ClipSample, Progress], Measurement]
 
 
-@dataclass(frozen=True)
-class Beside:
-    """What is measured beside the core (`calibration`); None: it is not."""
-
-    axes: Callable[..., Measurement] | None = None
-    strides: CalibrateStrides | None = None
-
-
-@dataclass(frozen=True)
-class Measured:
-    """The result of an evaluation."""
-
-    evaluation: Evaluation
-    checkpoint: str  # which one, as text; "" of a model
-    folder: Path  # of the output
-
-
 def measure_subject(
     subject: str,
-    asked: EvaluationOptions | None = None,
+    asked: EvaluationOptions,
     *,
     reporter: Reporter = SILENT,
-    beside: Beside | None = None,
-) -> Measured:
+    find_axes: Callable[..., Measurement] | None = None,
+    calibrate: CalibrateStrides | None = None,
+) -> Evaluation:
     """Measure a run or a model on held-out episodes. Cheap failures first.
 
     Args:
         subject: The folder of a run; or a model, as in `model.base`.
         asked: The options.
         reporter: Shows the progress of each part of the work.
-        beside: What else is measured, if the options ask for it.
+        find_axes: `calibration.axes.infer_axes`; None: no axes.
+        calibrate: `calibration.variants.calibrate_model`, if the options ask for it; None: no strides.
 
     Raises:
         InputError: The subject, the data, the decoder, a file of a metric, or a model to compare with cannot be used;
-            the split is empty.
+            the split is empty; the folder of the output cannot be written.
     """
-    asked, beside = asked or EvaluationOptions(), beside or Beside()
-    config, planning, folder = settle(subject, asked)
+    config, folder = settle(subject, asked), asked.out or Path(subject)
     if is_run(subject):
         select_checkpoint(Path(subject), asked.checkpoint)
     with user_can_write(folder):
@@ -221,38 +182,40 @@ def measure_subject(
     if through_cache.config.is_cache and not asked.calibrate:
         world_model.set_encoder_aside()
     loaded.put_on(accelerator.device)
-    found: dict[str, Measurement] = {}
-    if asked.calibrate and beside.strides is not None:
+    beside: dict[str, Measurement] = {}
+    if asked.calibrate and calibrate is not None:
         sample, progress = ClipSample(asked.split, asked.clips), reporter.task("calibrating strides")
-        found["strides"] = beside.strides(world_model, dataset, config, accelerator, sample, progress)
+        beside["strides"] = calibrate(world_model, dataset, config, accelerator, sample, progress)
     encode = partial(encode_batch, world_model, device=accelerator.device, chunk=config.model.encode_chunk)
     clips = _clips(through_cache, chosen, config.validation.batch_size, encode, world_model.image_size)
-    find_axes = beside.axes if dataset.spaces.state.is_base_pose else None
     with accelerator.autocast():
         evaluation = evaluate(
             contenders,
             clips,
             _about(subject, run, config, dataset, asked),
-            probes=replace(asked.probes, planning=planning, find_axes=find_axes),
+            probes=replace(
+                asked.probes,
+                planning=config.planning,
+                find_axes=find_axes if dataset.spaces.state.is_base_pose else None,
+            ),
             reporter=reporter,
         )
         decoded = None
         if decoder is not None:
+            decoder.to(accelerator.device)
             lpips = None if lpips is None else lpips.to(accelerator.device)
-            decoding = Decoding(decoder.to(accelerator.device), not through_cache.config.is_cache, lpips)
-            decoded = measure_decoded(contenders, clips, decoding, evaluation.examples, reporter=reporter)
+            decoded = measure_decoded(contenders, clips, decoder, evaluation.examples, lpips=lpips, reporter=reporter)
     warned = warnings_of(Path(subject) / METRICS) if run else ()
-    evaluation = replace(
+    return replace(
         evaluation,
         decoded=decoded,
-        training=training_curves(Path(subject)) if run else (),
-        beside=found,
+        training=_training_curves(Path(subject)) if run else (),
+        beside=beside,
         notes=(*loaded.notes, *(f"In training, {text}." for text in warned), *evaluation.notes),
     )
-    return Measured(evaluation, run.chosen if run else "", folder)
 
 
-def training_curves(folder: Path) -> tuple[TrainingCurve, ...]:
+def _training_curves(folder: Path) -> tuple[TrainingCurve, ...]:
     """Return all scalar metrics of a run's metrics.jsonl, over optimizer steps."""
     points: dict[str, list[tuple[int, float]]] = {}
     for row in read_metrics_log(folder / METRICS):
@@ -272,20 +235,18 @@ def _clips(
     encode: Callable[[Batch], LatentBatch],
     image_size: int,
 ) -> RepeatableClips:
-    """Return the clips at these windows, which can be read repeatedly."""
+    """Return the clips at these windows, with the frames as the encoder sees them; of cached latents, small ones."""
     by_name = {(dataset.table.identity(episode), start): (episode, start) for episode, start in windows}
+
+    def frames(batch: Batch, row: int) -> UInt8[np.ndarray, "time size size 3"]:
+        return frames_as_seen(frames_of(dataset, batch, row), image_size)
 
     def read(names: Sequence[ClipName] | None) -> Iterable[tuple[LatentBatch, FramesOfRow]]:
         wanted = windows if names is None else [by_name[name] for name in names]
         for batch in batches_of(dataset, wanted, batch_size=batch_size):
-            yield encode(batch), partial(_frames_of_row, dataset, batch, image_size)
+            yield encode(batch), partial(frames, batch)
 
-    return RepeatableClips(len(windows), read)
-
-
-def _frames_of_row(dataset: Dataset, batch: Batch, size: int, row: int) -> UInt8[np.ndarray, "time size size 3"]:
-    """Return the frames of a clip as the encoder sees them; of cached latents, enlarged small frames."""
-    return frames_as_seen(frames_of(dataset, batch, row), size)
+    return RepeatableClips(len(windows), read, has_frames=not dataset.config.is_cache)
 
 
 def _about(subject: str, run: TrainedRun | None, config: Config, dataset: Dataset, asked: EvaluationOptions) -> About:

@@ -18,7 +18,7 @@ from vjepa2_ac.data.loader import batches_of, validation_windows
 from vjepa2_ac.data.sources.configured_spaces import measured_space
 from vjepa2_ac.data.transforms import frames_as_seen, view
 from vjepa2_ac.data.windows import require_frames
-from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
+from vjepa2_ac.decoding.decoder_folder import load_decoder
 from vjepa2_ac.decoding.imagine import (
     AS_RECORDED,
     Imagination,
@@ -30,9 +30,8 @@ from vjepa2_ac.decoding.imagine import (
 )
 from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, encode_frames
-from vjepa2_ac.episode import Batch, LatentBatch
+from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.evaluate import Contender
 from vjepa2_ac.evaluation.evaluate_run import load_subject
 from vjepa2_ac.evaluation.request import EvaluationOptions, require_one_process, settle
 from vjepa2_ac.planning.counterfactual import ACTION_NAMES, STEP_M, named_actions, read_actions
@@ -41,6 +40,8 @@ from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
 from vjepa2_ac.spaces import StateSpace
 
 _RATE_HZ = 15.0  # of a robot, where nobody says: DROID's
+_SEARCHED = 64  # clips, among which the one with the most motion is shown
+TRUE = "true"  # the word for the recorded actions
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,8 +81,8 @@ def imagine_image(
     decoder.require_fit(model, config.data.crop, subject=session.subject)
     decoder.to(model.device)
     space = measured_space(config.data, len(seen.state))
-    require_directions(space, where="--state")
-    chosen = {name: actions_by_name(name, steps, size_m, config.planning.limits) for name in actions}
+    _require_directions(space, where="--state")
+    chosen = {name: _actions_by_name(name, steps, size_m, config.planning.limits) for name in actions}
     camera = None if seen.extrinsics is None else torch.as_tensor(seen.extrinsics, dtype=torch.float32).to(model.device)
     latents = encode_frames(model, seen.image[None], config.data.crop)[0]
     start = Start(latents, np.asarray(seen.state, dtype=np.float64), space, camera)
@@ -105,38 +106,20 @@ def imagine_image(
     )
 
 
-def require_directions(space: StateSpace, *, where: str, fix: str = "") -> None:
-    """Refuse states in which actions by name, which are directions in the robot base frame, mean nothing.
-
-    Raises:
-        InputError: They are no poses, or poses in the camera's frame.
-    """
+def _require_directions(space: StateSpace, *, where: str, fix: str = "") -> None:
+    """Refuse states in which actions by name mean nothing: no poses, or poses in the camera's frame."""
     if not space.is_base_pose:
-        raise InputError(
-            where=where,
-            found="states that are no poses in the robot base frame",
-            needed="poses: actions by name are directions in that frame",
-            fix=fix,
-        )
+        found, needed = "states that are no poses in the robot base frame", "poses: names are directions in that frame"
+        raise InputError(where=where, found=found, needed=needed, fix=fix)
 
 
-def actions_by_name(word: str, steps: int, size_m: float, limits: LimitsConfig) -> Float[np.ndarray, "steps 7"]:
-    """Return actions by their name or from a file.
-
-    Raises:
-        InputError: No such name, or a file of other actions than one for each step.
-    """
+def _actions_by_name(word: str, steps: int, size_m: float, limits: LimitsConfig) -> Float[np.ndarray, "steps 7"]:
     if word in ACTION_NAMES:
         return named_actions(word, steps, size_m=size_m, limits=limits)
     if word.lower().endswith((".npy", ".csv")):
         return read_actions(word, steps=steps)
     needed = f"true (of a recorded clip), {', '.join(ACTION_NAMES)}, or a file"
     raise InputError(where=f"--actions {word}", found="no such actions", needed=needed)
-
-
-_SEARCHED = 64  # clips, among which the one with the most motion is shown
-TRUE = "true"
-"""The word for the recorded actions."""
 
 
 @dataclass(frozen=True)
@@ -160,9 +143,16 @@ class Film:
     imagination: Imagination
     dataset: Dataset
     episode: int
-    stride: int
-    size: int
-    outcome: Callable[[UInt8[np.ndarray, "time h w 3"]], UInt8[np.ndarray, "time size size 3"]]
+    as_seen: Callable[[UInt8[np.ndarray, "time h w 3"]], UInt8[np.ndarray, "time size size 3"]]  # by the encoder
+
+    def with_outcomes(self, outcomes: Callable[[np.ndarray], UInt8[np.ndarray, "time h w 3"]]) -> Film:
+        """Return the film with what really happens under actions that were not recorded, by their outcome."""
+        told = self.imagination
+        rollouts = tuple(
+            replace(one, truth=told.truth if one.name == AS_RECORDED else self.as_seen(outcomes(one.actions))[1:])
+            for one in told.rollouts
+        )
+        return replace(self, imagination=replace(told, rollouts=rollouts))
 
 
 def imagine_clip(subject: str, asked: ImagineOptions, *, reporter: Reporter = SILENT) -> Film:
@@ -177,7 +167,8 @@ def imagine_clip(subject: str, asked: ImagineOptions, *, reporter: Reporter = SI
         InputError: Subject, data, decoder, clip or actions cannot be used.
     """
     decoder = load_decoder(asked.decoder)
-    config, planning, _ = settle(subject, asked.evaluation, frames=asked.steps + 1)
+    config = settle(subject, asked.evaluation)
+    config = config.model_copy(update={"data": config.data.model_copy(update={"frames": asked.steps + 1})})
     accelerator = make_accelerator(config)
     dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
     require_frames(config.data, to="show what is true")
@@ -187,10 +178,18 @@ def imagine_clip(subject: str, asked: ImagineOptions, *, reporter: Reporter = SI
     decoder.to(accelerator.device)
     (batch,) = batches_of(dataset, [window], batch_size=1)
     size = loaded.world_model.image_size
-    chosen = _actions_of(asked, batch, dataset, limits=planning.limits)
+    chosen = _actions_of(asked, batch, dataset, limits=config.planning.limits)
+    rollouts: list[Imagined] = []
     with accelerator.autocast():
         latents = encode_batch(loaded.world_model, batch, device=accelerator.device, chunk=config.model.encode_chunk)
-        rollouts = _rollouts(loaded.contenders, decoder, latents, chosen, dataset.spaces.state)
+        start, states = Start.of(latents, dataset.spaces.state), latents.states[0].double().cpu().numpy()[:-1]
+        for name, actions in chosen.items():
+            for one in loaded.contenders:
+                if name != AS_RECORDED and one.role != "trained":
+                    continue  # others by the one that is looked at
+                with one.switched():
+                    rolled = rolled_out(one.model, start, actions, states if name == AS_RECORDED else None)
+                rollouts.append(Imagined(one.name, name, actions, shown(decoder.decoder, rolled)))
         decoded = shown(decoder.decoder, latents.latents[0])
     assert batch.frames is not None  # noqa: S101  # refused above: a cache
     frames = frames_as_seen(batch.frames[0].numpy(), size)
@@ -206,41 +205,7 @@ def imagine_clip(subject: str, asked: ImagineOptions, *, reporter: Reporter = SI
         decoded_truth=decoded[1:],
         notes=worth_knowing(decoder.card, frames[0], decoded[0]),
     )
-    return Film(imagination, dataset, window[0], config.data.model_stride, size, partial(_as_seen, config, size))
-
-
-def with_outcomes(
-    film: Film, outcomes: Callable[[Float[np.ndarray, "steps 7"]], UInt8[np.ndarray, "time h w 3"]]
-) -> Film:
-    """Return the film with what really happens under each sequence of actions, of those that were not recorded."""
-    told = film.imagination
-
-    def truth(one: Imagined) -> UInt8[np.ndarray, "steps size size 3"] | None:
-        return told.truth if one.name == AS_RECORDED else film.outcome(outcomes(one.actions))[1:]
-
-    rollouts = tuple(replace(one, truth=truth(one)) for one in told.rollouts)
-    return replace(film, imagination=replace(told, rollouts=rollouts))
-
-
-def _rollouts(
-    contenders: Sequence[Contender],
-    decoder: TrainedDecoder,
-    batch: LatentBatch,
-    chosen: dict[str, Float[np.ndarray, "steps action_dim"]],
-    space: StateSpace,
-) -> list[Imagined]:
-    """Roll out: recorded actions by every model, others by the one that is looked at."""
-    start, states = Start.of(batch, space), batch.states[0].double().cpu().numpy()
-    found = []
-    for name, actions in chosen.items():
-        for contender in contenders:
-            if name != AS_RECORDED and contender.role != "trained":
-                continue
-            with contender.switched():
-                known = states[:-1] if name == AS_RECORDED else None
-                latents = rolled_out(contender.model, start, actions, known)
-            found.append(Imagined(contender.name, name, actions, shown(decoder.decoder, latents)))
-    return found
+    return Film(imagination, dataset, window[0], partial(_as_seen, config, size))
 
 
 def _actions_of(asked: ImagineOptions, batch: Batch, dataset: Dataset, limits: LimitsConfig) -> dict[str, np.ndarray]:
@@ -253,38 +218,36 @@ def _actions_of(asked: ImagineOptions, batch: Batch, dataset: Dataset, limits: L
         if word == TRUE:
             chosen[AS_RECORDED] = recorded
             continue
-        require_directions(dataset.spaces.state, where=f"--actions {word}", fix="Give --actions true")
+        _require_directions(dataset.spaces.state, where=f"--actions {word}", fix="Give --actions true")
         name = word if word in ACTION_NAMES else Path(word).name  # with its ending: never one of the other names
-        chosen[word if name in chosen else name] = actions_by_name(word, len(recorded), asked.size_m, limits)
+        chosen[word if name in chosen else name] = _actions_by_name(word, len(recorded), asked.size_m, limits)
     return chosen
 
 
 def _window(dataset: Dataset, asked: ImagineOptions) -> tuple[int, int]:
     """Return episode and first control step of the clip."""
-    if asked.episode is not None:
-        episode = dataset.table.find(asked.episode)
-        if episode is None:
-            example = dataset.table.identity(int(dataset.episodes[0]))
-            raise InputError(where="--episode", found=f"no episode {asked.episode}", needed=f"one such as {example}")
-        start, last = asked.start or 0, int(dataset.table.num_steps[episode]) - dataset.config.clip_steps
-        if not 0 <= start <= last:
-            raise InputError(
-                where="--start",
-                found=f"{start}, in an episode of {dataset.table.num_steps[episode]} steps",
-                needed=f"0 to {last}: {asked.steps} model steps take {dataset.config.clip_steps} control steps"
-                if last >= 0
-                else "a longer episode",
-                fix="Lower --steps or --start",
-            )
-        return episode, start
-    members = dataset.members(asked.split)[dataset.episodes]
-    longest = int(dataset.table.num_steps[dataset.episodes[members]].max(initial=0))
-    if 0 < longest < dataset.config.clip_steps:
-        most = (longest - 1) // dataset.config.model_stride
-        found = f"{asked.steps} model steps, and the longest {asked.split} episode has {most}"
-        raise InputError(where="--steps", found=found, needed=f"{most} at most")
-    windows = validation_windows(dataset, asked.split, clips=_SEARCHED)
-    return max(windows, key=lambda window: _motion(dataset, *window))
+    lengths, clip = dataset.table.num_steps, dataset.config.clip_steps
+    if asked.episode is None:
+        members = dataset.members(asked.split)[dataset.episodes]
+        longest = int(lengths[dataset.episodes[members]].max(initial=0))
+        if 0 < longest < clip:
+            most = (longest - 1) // dataset.config.model_stride
+            found = f"{asked.steps} model steps, and the longest {asked.split} episode has {most}"
+            raise InputError(where="--steps", found=found, needed=f"{most} at most")
+        windows = validation_windows(dataset, asked.split, clips=_SEARCHED)
+        return max(windows, key=lambda window: _motion(dataset, *window))
+    episode = dataset.table.find(asked.episode)
+    if episode is None:
+        example = dataset.table.identity(int(dataset.episodes[0]))
+        raise InputError(where="--episode", found=f"no episode {asked.episode}", needed=f"one such as {example}")
+    start, last = asked.start or 0, int(lengths[episode]) - clip
+    if not 0 <= start <= last:
+        needed = (
+            f"0 to {last}: {asked.steps} model steps take {clip} control steps" if last >= 0 else "a longer episode"
+        )
+        found, fix = f"{start}, in an episode of {lengths[episode]} steps", "Lower --steps or --start"
+        raise InputError(where="--start", found=found, needed=needed, fix=fix)
+    return episode, start
 
 
 def _motion(dataset: Dataset, episode: int, start: int) -> float:

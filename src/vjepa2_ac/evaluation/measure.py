@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, product
-from typing import NamedTuple, Protocol, get_args, runtime_checkable
+from typing import Protocol, get_args, runtime_checkable
 
 import numpy as np
 import torch
@@ -94,13 +94,7 @@ def measured(
 
 
 def joined(parts: Sequence[PredictionErrors]) -> PredictionErrors:
-    """Return the errors of all clips of some batches.
-
-    Raises:
-        ValueError: No clips.
-    """
-    if not parts:
-        raise ValueError("no clips to measure on")
+    """Return the errors of all clips of some batches; of one or more."""
     arrays = {key: np.concatenate([part.arrays[key] for part in parts]) for key in parts[0].arrays}
     return PredictionErrors(tuple(name for part in parts for name in part.episode_ids), arrays)
 
@@ -108,26 +102,9 @@ def joined(parts: Sequence[PredictionErrors]) -> PredictionErrors:
 def prediction_errors(
     model: Predictor, batches: Iterable[LatentBatch], metrics: Sequence[Metric] = (L1,)
 ) -> PredictionErrors:
-    """Measure a model as a validation does, batch after batch, so that no latents are stored.
-
-    Raises:
-        ValueError: No clips.
-    """
+    """Measure a model as a validation does, batch after batch, so that no latents are stored."""
     pairs = with_other_actions(batches)
     return joined([measured(model, batch, VALIDATED, metrics, others) for batch, others in pairs])
-
-
-class OneStepErrors(NamedTuple):
-    """The teacher-forced L1 error of each clip."""
-
-    one_step: Float[np.ndarray, " clips"]
-    persistence: Float[np.ndarray, " clips"]
-
-
-def one_step_errors(model: Predictor, batch: LatentBatch) -> OneStepErrors:
-    """Return the one-step error of a model on each clip, and that of persistence."""
-    found = measured(model, batch, ONE_STEP, (L1,))
-    return OneStepErrors(*(found.of("teacher_forced", L1, way).mean(axis=1) for way, _ in ONE_STEP))
 
 
 def with_other_actions(

@@ -84,32 +84,44 @@ class EvaluationOptions:
     planning: tuple[str, ...] = ()  # settings in place of the config's, such as planning.samples=200
 
 
-def settle(subject: str, asked: EvaluationOptions, *, frames: int | None = None) -> tuple[Config, PlanningConfig, Path]:
-    """Return the config to measure with, how one step is planned, and the folder for what is written.
+def settle(subject: str, asked: EvaluationOptions) -> Config:
+    """Return the config to measure with; its `planning` says how one step is planned.
 
     Args:
         subject: The folder of a run; or a model, as in `model.base`.
         asked: The options.
-        frames: Of a clip; None: as `data.frames` says.
 
     Raises:
         InputError: Several processes; the subject is no run and no data are named, a setting is wrong, a folder is
-            missing, or files of LPIPS are named without a decoder or incompletely.
+            missing, limits are those of data that nobody knows, or files of LPIPS are named without a decoder or
+            incompletely.
     """
     require_one_process()
-    files = [asked.decoder, asked.lpips, asked.lpips_heads]
-    if any(files[1:]) and not all(files):
+    if (asked.lpips or asked.lpips_heads) and not (asked.decoder and asked.lpips and asked.lpips_heads):
         raise InputError(
             where="--lpips, --lpips-heads",
             found="one without the others",
             needed="a backbone (--lpips), its heads (--lpips-heads) and a --decoder, whose images LPIPS compares",
             fix="docs/decoding.md says where to get the files",
         )
-    config, folder = _config_of(subject, asked)
-    if frames is not None:
-        config = config.model_copy(update={"data": config.data.model_copy(update={"frames": frames})})
-    _check_long_enough(config, asked.probes)
-    return config, _planning_of(subject, config, asked), folder
+    config = _config_of(subject, asked)
+    for setting in asked.planning:
+        if not setting.startswith("planning."):
+            needed = "settings of planning, such as planning.samples=200"
+            raise InputError(where="--planning", found=setting, needed=needed)
+    config = config_from(config_as_dict(config), asked.planning, where="--planning")
+    if is_run(subject):
+        config = with_taught_limits(config, Path(subject))
+    if asked.probes.planning_clips:
+        require_limits(config)
+        if config.data.states == "pose" and config.data.frames < FRAMES:
+            raise InputError(
+                where="--planning",
+                found=f"clips of {config.data.frames} frames (data.frames)",
+                needed=f"{FRAMES} or more: plans are held against {FRAMES - 1} steps that were demonstrated",
+                fix=f"Give --data a config with data.frames of {FRAMES} or more, and --out",
+            )
+    return config
 
 
 def require_one_process(environment: Mapping[str, str] = os.environ) -> None:
@@ -119,65 +131,25 @@ def require_one_process(environment: Mapping[str, str] = os.environ) -> None:
         InputError: torchrun or `accelerate launch` started several.
     """
     if (processes := environment.get("WORLD_SIZE", "1")) != "1":
-        raise InputError(
-            where="torchrun",
-            found=f"{processes} processes",
-            needed="one: only training shares its work among processes",
-            fix="Start the command without torchrun or accelerate launch",
-        )
+        needed = "one: only training shares its work among processes"
+        fix = "Start the command without torchrun or accelerate launch"
+        raise InputError(where="torchrun", found=f"{processes} processes", needed=needed, fix=fix)
 
 
-def _config_of(subject: str, asked: EvaluationOptions) -> tuple[Config, Path]:
-    """Return the config to measure with, and the output folder."""
-    if is_run(subject):
-        config = read_run_config(Path(subject))
-        if asked.data is None:
-            return config, asked.out or Path(subject)
-        config = config.model_copy(update={"data": asked.data.data})
-    elif asked.data is None:
-        raise InputError(
-            where=subject,
-            found="no config.yaml: not the folder of a run" if Path(subject).exists() else "no such folder",
-            needed="the folder of a run, which `vjepa2-ac train CONFIG` makes",
-            fix="To measure a model, name the data with --data CONFIG and a folder with --out",
-        )
-    else:
-        config = asked.data
-    if asked.out is None:
-        raise InputError(
-            where="--data without --out",
-            found="metrics.json of a run's own folder is for its own data",
-            needed="a folder for what is found on these data",
-            fix="Add --out FOLDER",
-        )
-    require_stride(config.data, to="evaluate")
-    return config, asked.out
-
-
-def _planning_of(subject: str, config: Config, asked: EvaluationOptions) -> PlanningConfig:
-    """Return the settings of one-step plans: the config's, some of them replaced.
-
-    Raises:
-        InputError: A setting is wrong, or does not belong to planning, or limits are those of data that nobody knows.
-    """
-    for setting in asked.planning:
-        if not setting.startswith("planning."):
+def _config_of(subject: str, asked: EvaluationOptions) -> Config:
+    """Return the config of a run, on other data if some are named, or of the data."""
+    own = read_run_config(Path(subject)) if is_run(subject) else None
+    if asked.data is None:
+        if own is None:
             raise InputError(
-                where="--planning", found=setting, needed="settings of planning, such as planning.samples=200"
+                where=subject,
+                found="no config.yaml: not the folder of a run" if Path(subject).exists() else "no such folder",
+                needed="the folder of a run, which `vjepa2-ac train CONFIG` makes",
+                fix="To measure a model, name the data with --data CONFIG and a folder with --out",
             )
-    config = config_from(config_as_dict(config), asked.planning, where="--planning")
-    if is_run(subject):
-        config = with_taught_limits(config, Path(subject))
-    if asked.probes.planning_clips:
-        require_limits(config)
-    return config.planning
-
-
-def _check_long_enough(config: Config, probes: ProbeOptions) -> None:
-    if probes.planning_clips and config.data.states == "pose" and config.data.frames < FRAMES:
-        raise InputError(
-            where="--planning",
-            found=f"clips of {config.data.frames} frames (data.frames)",
-            needed=f"{FRAMES} or more: plans are held against {FRAMES - 1} steps that were demonstrated",
-            fix=f"Give --data a config with data.frames of {FRAMES} or more, and --out",
-        )
+        return own
+    if asked.out is None:
+        found, needed = "metrics.json of a run's own folder is for its own data", "a folder for what is found on these"
+        raise InputError(where="--data without --out", found=found, needed=needed, fix="Add --out FOLDER")
+    require_stride(asked.data.data, to="evaluate")
+    return asked.data if own is None else own.model_copy(update={"data": asked.data.data})

@@ -110,11 +110,6 @@ class Metric:
     of: Callable[[Tensor, Tensor], Tensor]  # predicted and true [batch time tokens dim] -> [batch time]
     smaller_is_better: bool = True
 
-    @property
-    def heading(self) -> str:
-        """The label, and which way is better if that is not the usual one."""
-        return self.label if self.smaller_is_better else f"{self.label} (larger is better)"
-
     def side(self, of_ratio: Estimate) -> int:
         """Return 1 or -1 if the whole interval of a ratio of two results is better or worse than 1, else 0."""
         return of_ratio.side(of=1.0) * (-1 if self.smaller_is_better else 1)
@@ -209,7 +204,6 @@ class Ranking:
     """
 
     drawn_from: Literal["clips", "box"]  # the others: actions of other episodes, or uniform in a box
-    words: str  # the same as text, with the size of the box
     samples: int  # others per clip
     clips: tuple[int, ...]  # the measured ones, as indices into Clips
     rank: Float[np.ndarray, " ranked"]  # share of the others with lower energy: 0 best, 1 worst
@@ -318,19 +312,12 @@ class PlanningStudy:
 
 
 @dataclass(frozen=True)
-class Discrepancy:
-    """The squared MMD of two sets of features, times 100, and whether the sets differ."""
-
-    squared: Estimate  # NaN of one episode
-    p_value: float  # of no difference, by sign flips; NaN of one episode
-
-
-@dataclass(frozen=True)
 class LatentDistribution:
     """How the latents of one kind of prediction are distributed, by horizon (index h - 1), against the truth."""
 
     spread: tuple[Estimate, ...]  # 1: as varied as the truth
-    mmd: tuple[Discrepancy, ...]  # of latents averaged over tokens
+    mmd: tuple[Estimate, ...]  # squared, times 100, of latents averaged over tokens; NaN of one episode
+    p_values: tuple[float, ...]  # of no difference, by sign flips; NaN of one episode
 
 
 @dataclass(frozen=True, eq=False)
@@ -372,14 +359,6 @@ class ModelResult:
     ranking: ActionRanking | None = None
     distribution: LatentDistribution | None = None  # of the rollout with the true actions
     beside: Mapping[str, Measurement] = field(default_factory=dict)  # by measurements that the core does not know
-
-
-@dataclass(frozen=True)
-class PersistenceDistribution:
-    """The neighbours of the models' distributions: that of copies of frame 0, and what chance makes of the truth."""
-
-    copies: LatentDistribution
-    noise_floor: tuple[float, ...]  # of the discrepancy, by horizon
 
 
 @dataclass(frozen=True)
@@ -438,7 +417,8 @@ class Evaluation:
     notes: tuple[str, ...] = ()  # for the reader: why there is no base, no landscape ...
     planning: PlanningStudy | None = None
     metrics: tuple[Metric, ...] = (L1, L2)  # of the errors
-    persistence_distribution: PersistenceDistribution | None = None
+    copies: LatentDistribution | None = None  # of frame 0
+    noise_floor: tuple[float, ...] = ()  # of the MMD: what chance makes of the truth, by horizon
     decoded: DecodedRollouts | None = None  # None: no decoder was given
 
     @property

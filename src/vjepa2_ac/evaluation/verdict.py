@@ -15,7 +15,7 @@ from vjepa2_ac.evaluation.estimates import (
     rank_difference,
 )
 from vjepa2_ac.evaluation.request import BEST_SCORE, STEPS
-from vjepa2_ac.evaluation.result import L1, Evaluation, Metric, Ranking
+from vjepa2_ac.evaluation.result import L1, Evaluation, Metric
 from vjepa2_ac.intervals import Estimate
 
 _SIDES = {1: "better", 0: "no clear difference", -1: "NOT better"}  # of an error over persistence
@@ -33,10 +33,10 @@ def verdict(evaluation: Evaluation) -> str:
     return " ".join(part for part in (*parts, _planned(evaluation), *evaluation.notes) if part)
 
 
-def improvement(evaluation: Evaluation, horizon: int) -> Estimate | None:
-    """Return the share by which the trained model's error is below the base's at a horizon, paired; None: no base."""
+def improvement(evaluation: Evaluation) -> Estimate | None:
+    """Return the share by which the trained error is below the base's at the last horizon, paired; None: no base."""
     base = evaluation.base_errors
-    return None if base is None else gain_over(evaluation.errors, base)[horizon - 1]
+    return None if base is None else gain_over(evaluation.errors, base)[-1]
 
 
 def uses_actions(evaluation: Evaluation) -> bool:
@@ -50,7 +50,7 @@ def uses_actions(evaluation: Evaluation) -> bool:
 def spread(evaluations: Sequence[Evaluation]) -> str:
     """Return as text how much the results of several runs differ, at the longest horizon."""
     errors = [over_persistence(one.errors, "rollout")[-1].value for one in evaluations]
-    gains = [gain.value for one in evaluations if (gain := improvement(one, one.horizon)) is not None]
+    gains = [gain.value for one in evaluations if (gain := improvement(one)) is not None]
     words = f"{len(evaluations)} runs: error over persistence {_mean_and_range(errors, '.3f')}"
     return words + (f"; better than the base by {_mean_and_range(gains, '.1%')}" if gains else "")
 
@@ -65,7 +65,7 @@ def interval(value: Estimate, form: str) -> str:
 def _compared(evaluation: Evaluation, ahead: str) -> str:
     episodes = evaluation.clips.episodes
     where = f"on {len(evaluation.clips)} clips of {episodes} held-out episode{'s' * (episodes > 1)}"
-    gain = improvement(evaluation, evaluation.horizon)
+    gain = improvement(evaluation)
     if gain is None:
         return f"The {evaluation.trained} was measured {where}"
     if gain.value == gain.low == gain.high == 0 or (gain.value == 0 and not gain.has_interval):
@@ -85,25 +85,22 @@ def _digits(gain: Estimate) -> str:
 def _disagreements(evaluation: Evaluation) -> tuple[str, ...]:
     """Return sentences on how other metrics differ from L1: better, worse, or uncertain."""
     found: dict[str, list[str]] = {}
+    errors, base = evaluation.errors, evaluation.base_errors
     for metric in evaluation.metrics[1:]:
-        if words := _disagreement(evaluation, metric):
+        words = []
+        if base is not None:
+            by_l1, by_other = (gain_over(errors, base, metric=each)[-1] for each in (L1, metric))
+            if (side := by_other.side(of=0.0)) != by_l1.side(of=0.0):
+                form = _digits(by_other)
+                share = f"{abs(by_other.value):{form}}"
+                how = {-1: f"{share} WORSE than", 0: "no clear difference to", 1: f"{share} better than"}[side]
+                words.append(f"{how} the base (gain {interval(by_other, form)})")
+        by_l1, by_other = (over_persistence(errors, "rollout", each)[-1] for each in (L1, metric))
+        if metric.side(by_other) != L1.side(by_l1):
+            words.append(_over_nothing(by_other, metric))
+        if words:
             found.setdefault(" and ".join(words), []).append(metric.label)
     return tuple(f"By {' and '.join(metrics)} it is another matter: {words}." for words, metrics in found.items())
-
-
-def _disagreement(evaluation: Evaluation, metric: Metric) -> list[str]:
-    words, errors, base = [], evaluation.errors, evaluation.base_errors
-    if base is not None:
-        by_l1, by_other = (gain_over(errors, base, metric=each)[-1] for each in (L1, metric))
-        if by_other.side(of=0.0) != by_l1.side(of=0.0):
-            form = _digits(by_other)
-            share = f"{abs(by_other.value):{form}}"
-            how = {-1: f"{share} WORSE than", 0: "no clear difference to", 1: f"{share} better than"}
-            words.append(f"{how[by_other.side(of=0.0)]} the base (gain {interval(by_other, form)})")
-    by_l1, by_other = (over_persistence(errors, "rollout", each)[-1] for each in (L1, metric))
-    if metric.side(by_other) != L1.side(by_l1):
-        words.append(_over_nothing(by_other, metric))
-    return words
 
 
 def _over_nothing(error: Estimate, metric: Metric) -> str:
@@ -120,7 +117,7 @@ def _ranking(evaluation: Evaluation) -> str:
     words += f" ({interval(found.rank, '.3f')}; 0 is best, chance 0.5)"
     if base is None:
         return f"{words}."
-    beside, gain = rank_difference(found, base), improvement(evaluation, evaluation.horizon)
+    beside, gain = rank_difference(found, base), improvement(evaluation)
     words += f", that of the base {base.rank.value:.3f}: {_PLANS[beside.side(of=0.0)]}"
     if beside.side(of=0.0) == 1 and gain is not None and gain.side(of=0.0) == 1:
         return f"It predicts better, but PLANS WORSE than the base. {words}."
@@ -134,28 +131,26 @@ def _actions(evaluation: Evaluation) -> str:
     words = "It uses the actions" if uses_actions(evaluation) else "It does NOT clearly use the actions"
     words += f": with another clip's its one-step error is {others:.2f} of doing nothing, with its own {own:.2f}"
     words += f" (difference: {interval(gap, '.2f')})"
-    sensitivity = evaluation.models[evaluation.trained].sensitivity
-    return words + ("" if sensitivity is None else f", and {_ranked(sensitivity.rankings[0])}") + "."
-
-
-def _ranked(ranking: Ranking) -> str:
-    rank = ranking.mean_rank
-    return f"{rank.value:.0%} of other actions fit better than the true one ({interval(rank, '.0%')}; chance 50%)"
+    if (sensitivity := evaluation.models[evaluation.trained].sensitivity) is None:
+        return f"{words}."
+    rank = sensitivity.rankings[0].mean_rank
+    beside = f"{rank.value:.0%} of other actions fit better than the true one ({interval(rank, '.0%')}; chance 50%)"
+    return f"{words}, and {beside}."
 
 
 def _planned(evaluation: Evaluation) -> str:
     study, plans = evaluation.planning, evaluation.models[evaluation.trained].plans
     if study is None or plans is None:
         return ""
-    found, nothing = metrics_of(study, plans), metrics_of(study, study.zero).missed_cm.value
-    side = _NEARER[found.missed_over_zero.side(of=1.0)]
-    words = f"Its plans of {STEPS} steps end {found.missed_cm.value:.1f} cm from where the demonstrations do"
-    words += f" ({interval(found.missed_cm, '.1f')}): {side} doing nothing ({nothing:.1f} cm)"
+    found, nothing = metrics_of(study, plans), metrics_of(study, study.zero)["missed_cm"].value
+    side = _NEARER[found["missed_over_zero"].side(of=1.0)]
+    words = f"Its plans of {STEPS} steps end {found['missed_cm'].value:.1f} cm from where the demonstrations do"
+    words += f" ({interval(found['missed_cm'], '.1f')}): {side} doing nothing ({nothing:.1f} cm)"
     base = None if evaluation.base is None else evaluation.models[evaluation.base].plans
     if base is not None:
-        beside = differences_of(study, plans, base).missed_cm
-        words += f", {_NEARER[beside.side(of=0.0)]} the base ({metrics_of(study, base).missed_cm.value:.1f} cm)"
-    return f"{words}; the Action Score is {found.score.value:.0f} of {BEST_SCORE:.0f}."
+        beside, its = differences_of(study, plans, base)["missed_cm"], metrics_of(study, base)["missed_cm"].value
+        words += f", {_NEARER[beside.side(of=0.0)]} the base ({its:.1f} cm)"
+    return f"{words}; the Action Score is {found['score'].value:.0f} of {BEST_SCORE:.0f}."
 
 
 def _mean_and_range(values: list[float], form: str) -> str:

@@ -16,8 +16,9 @@ from jaxtyping import Float
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.result import L1, Row
 from vjepa2_ac.intervals import Estimate, bootstrapped
-from vjepa2_ac.reports.metrics_json import METRICS_FILE, Metrics, read_metrics
+from vjepa2_ac.reports.metrics_json import Metrics, read_metrics
 
+_SAME = ("split", "frames", "stride", "cameras")
 _SAME_LATENTS = 1e-3  # errors of persistence that differ by a larger share are of other latents
 
 
@@ -69,17 +70,9 @@ def compare(folders: Sequence[Path]) -> Comparison:
 
 
 def _check_same_clips(one: Metrics, other: Metrics, first: Path, second: Path) -> None:
-    differences = [
-        f"{what}: {a} and {b}"
-        for what, a, b in [
-            *(
-                (key, getattr(one.about, key), getattr(other.about, key))
-                for key in ("split", "frames", "stride", "cameras")
-            ),
-            ("clips", one.clips.count, other.clips.count),
-        ]
-        if a != b
-    ]
+    pairs = {key: (getattr(one.about, key), getattr(other.about, key)) for key in _SAME}
+    pairs["clips"] = one.clips.count, other.clips.count
+    differences = [f"{what}: {a} and {b}" for what, (a, b) in pairs.items() if a != b]
     if not differences and one.clips.fingerprint != other.clips.fingerprint:
         differences = [f"other episodes or starts, of {one.about.data} and {other.about.data}"]
     if differences:
@@ -97,7 +90,7 @@ def _gains(measured: Mapping[str, Metrics]) -> list[Row]:
     ids = [episode for episode, _ in first.clips.named]
     found = []
     for other, metrics in others:
-        columns = np.stack([*_last(metrics, len(ids), other), *_last(first, len(ids), name)])[:, :, None]
+        columns = np.stack([*_last(metrics), *_last(first)])[:, :, None]
         (gain,) = bootstrapped(lambda sums: 1 - (sums[0] / sums[1]) / (sums[2] / sums[3]), columns, ids)
         group, line = f"Gain over {name}", f"{(first.about.frames - 1) * first.about.seconds_per_step:.2f} s ahead"
         numbers = (gain.value, gain.low, gain.high)
@@ -105,17 +98,10 @@ def _gains(measured: Mapping[str, Metrics]) -> list[Row]:
     return found
 
 
-def _last(metrics: Metrics, clips: int, run: str) -> tuple[np.ndarray, np.ndarray]:
+def _last(metrics: Metrics) -> tuple[np.ndarray, np.ndarray]:
     """Return the errors of each clip at the last horizon: of what was evaluated, and of persistence."""
-    sides = metrics.by_clip.models.get(metrics.trained, []), metrics.by_clip.persistence
-    if any(len(side) != clips or not all(side) for side in sides):
-        raise InputError(
-            where=f"{METRICS_FILE} of {run}",
-            found=f"metrics that cannot be used (by_clip: not errors of {clips} clips)",
-            fix="Write them again with `vjepa2-ac evaluate`",
-        )
-    errors, persistence = (np.array([clip[-1] for clip in side]) for side in sides)
-    return errors, persistence
+    errors, persistence = metrics.by_clip.models[metrics.trained], metrics.by_clip.persistence
+    return np.array(errors)[:, -1], np.array(persistence)[:, -1]
 
 
 def _curve(metrics: Metrics) -> tuple[Estimate, ...]:
@@ -124,7 +110,7 @@ def _curve(metrics: Metrics) -> tuple[Estimate, ...]:
 
 
 def _notes(measured: Mapping[str, Metrics]) -> tuple[str, ...]:
-    nothing = {name: _last(one, one.clips.count, name)[1].mean() for name, one in measured.items()}
+    nothing = {name: _last(one)[1].mean() for name, one in measured.items()}
     first, *names = measured
     others = [name for name in names if abs(nothing[name] / nothing[first] - 1) > _SAME_LATENTS]
     notes = []

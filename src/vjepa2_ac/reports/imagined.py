@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from vjepa2_ac.decoding.imagine import AS_RECORDED, Imagination, Imagined
+from vjepa2_ac.decoding.imagine import AS_RECORDED, Imagination
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.image_file import encode_png
 from vjepa2_ac.media.video_writer import write_gif, write_video
 from vjepa2_ac.reporter import SILENT, Reporter
-from vjepa2_ac.reports.figures.film import FilmStrip, Kind, StripRow, draw_strip, durations, film_frames, held
+from vjepa2_ac.reports.figures.film import FilmStrip, StripRow, draw_strip, durations, film_frames, held
 from vjepa2_ac.storage import user_can_write, write_atomically
 from vjepa2_ac.storage.structured import json_text
 
@@ -28,27 +27,31 @@ _WAYS = (("forward", "back"), ("left", "right"), ("up", "down"))  # of x, y, z i
 
 def strip_of(imagination: Imagination) -> FilmStrip:
     """Return the rows: truth, decoded truth, recorded actions as each model imagines them, then other actions."""
-    recorded = [one for one in imagination.rollouts if one.name == AS_RECORDED]
-    others = [one for one in imagination.rollouts if one.name != AS_RECORDED]
+    told, first, decoded_first = imagination, imagination.first[None], imagination.decoded_first[None]
+    recorded = [one for one in told.rollouts if one.name == AS_RECORDED]
     rows = []
-    if imagination.truth is not None:
-        captions = ("", *map(short_action, recorded[0].actions)) if recorded else ()
-        rows.append(_row("what happened", "recorded", imagination.first, imagination.truth, captions))
-    if imagination.decoded_truth is not None:
-        label = "what happened,\nencoded and decoded"
-        rows.append(_row(label, "decoded", imagination.decoded_first, imagination.decoded_truth))
-    for one in recorded:
+    if told.truth is not None:
+        captions = ("", *map(_short_action, recorded[0].actions)) if recorded else ()
+        rows.append(StripRow("what happened", "recorded", np.concatenate([first, told.truth]), captions))
+    if told.decoded_truth is not None:
+        frames = np.concatenate([decoded_first, told.decoded_truth])
+        rows.append(StripRow("what happened,\nencoded and decoded", "decoded", frames))
+    for one in sorted(told.rollouts, key=lambda one: one.name != AS_RECORDED):
         label = f"{one.model} imagines,\nsame actions"
-        rows.append(_row(label, "imagined", imagination.decoded_first, one.frames))
-    for one in others:
-        rows += _rows_of_other(imagination, one)
-    clip = f"{_short(imagination.episode_id)} from control step {imagination.start}"
-    place = f"{imagination.subject}, {clip if imagination.episode_id else 'from an image'}"
+        if one.name != AS_RECORDED:
+            length = 100 * float(np.linalg.norm(one.actions[0, :3])) if one.actions.shape[1] == _POSE else 0.0
+            label = f"{one.model} imagines:\n{one.name}" + (f", {length:.1f} cm a step" if length >= _LEAST_CM else "")
+        rows.append(StripRow(label, "imagined", np.concatenate([decoded_first, one.frames])))
+        if one.truth is not None and one.name != AS_RECORDED:
+            frames = np.concatenate([first, one.truth])
+            rows.append(StripRow(f"what really happens:\n{one.name}", "simulated", frames))
+    clip = f"{_short(told.episode_id)} from control step {told.start}"
+    title = f"{told.subject}, {clip if told.episode_id else 'from an image'}"
     times = range(len(rows[0].frames)) if rows else range(0)
-    return FilmStrip(place, tuple(rows), tuple(time * imagination.seconds_per_step for time in times))
+    return FilmStrip(title, tuple(rows), tuple(time * told.seconds_per_step for time in times))
 
 
-def short_action(action: Float[np.ndarray, " action_dim"]) -> str:
+def _short_action(action: Float[np.ndarray, " action_dim"]) -> str:
     """Return a pose's action in a few words, in the robot's directions; of a vector nothing."""
     if len(action) != _POSE:
         return ""
@@ -88,19 +91,6 @@ def _short(name: str) -> str:
     """Return the end of an episode's name; of DROID's, which name several files, that of the first folder."""
     own = name.split("--", maxsplit=1)[0].removesuffix("/recordings/MP4").rstrip("/")
     return own if len(own) <= _LONGEST_NAME else f"...{own[-_LONGEST_NAME:]}"
-
-
-def _rows_of_other(imagination: Imagination, one: Imagined) -> list[StripRow]:
-    length = 100 * float(np.linalg.norm(one.actions[0, :3])) if one.actions.shape[1] == _POSE else 0.0
-    label = f"{one.model} imagines:\n{one.name}" + (f", {length:.1f} cm a step" if length >= _LEAST_CM else "")
-    rows = [_row(label, "imagined", imagination.decoded_first, one.frames)]
-    if one.truth is not None:
-        rows.append(_row(f"what really happens:\n{one.name}", "simulated", imagination.first, one.truth))
-    return rows
-
-
-def _row(label: str, kind: Kind, first: np.ndarray, frames: np.ndarray, captions: Sequence[str] = ()) -> StripRow:
-    return StripRow(label, kind, np.concatenate([first[None], frames]), tuple(captions))
 
 
 def _as_dict(imagination: Imagination) -> dict[str, object]:

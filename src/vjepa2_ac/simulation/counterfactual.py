@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from vjepa2_ac.episode import Episode
 from vjepa2_ac.errors import InputError, UserError
-from vjepa2_ac.evaluation.imagined import Film, with_outcomes
+from vjepa2_ac.evaluation.imagined import Film
 from vjepa2_ac.media.jpeg import decode_jpegs, encode_jpeg
 from vjepa2_ac.simulation.closed_loop.rollout import send_action
 from vjepa2_ac.simulation.recording.record import (
@@ -127,4 +127,4 @@ def with_what_happens(film: Film) -> Film:
     except UserError as error:
         note = f"What really happens under other actions is not known: {error}"
         return replace(film, imagination=replace(film.imagination, notes=(*film.imagination.notes, note)))
-    return with_outcomes(film, lambda actions: arm.under(actions, film.stride).frames)
+    return film.with_outcomes(lambda actions: arm.under(actions, film.dataset.config.model_stride).frames)

@@ -37,7 +37,7 @@ from vjepa2_ac.training.loss import Objective
 from vjepa2_ac.training.optim import make_optimizer, trained_parameters
 
 if TYPE_CHECKING:
-    from vjepa2_ac.calibration.strides import Calibration
+    from vjepa2_ac.calibration.variants import Calibration
     from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
     from vjepa2_ac.training.imagined_strip import ImaginedStrip
 
@@ -134,7 +134,7 @@ def set_up(
     if is_auto:
         chooser = load_base(config.model, seed=config.seed).to(accelerator.device)
         calibration = broadcast_object(accelerator, choose_stride(chooser, dataset, config, accelerator, reporter))
-        config, dataset = with_stride(config, calibration.best.stride), dataset.with_stride(calibration.best.stride)
+        config, dataset = with_stride(config, calibration.stride), dataset.with_stride(calibration.stride)
     splits: tuple[Split, ...] = ("train", "validation", "test") if config.data.test_share else ("train", "validation")
     clip, *_ = [_first_of(dataset, split) for split in splits]  # fails early: an empty split, a broken clip
     _require_fitting_clips(dataset, others, clip)
@@ -264,7 +264,7 @@ def choose_stride(
     Raises:
         InputError: There is none, or as `calibrate_model`.
     """
-    from vjepa2_ac.calibration.strides import calibrate_model
+    from vjepa2_ac.calibration.variants import calibrate_model
     from vjepa2_ac.evaluation.measure import ClipSample
 
     reporter.note("data.stride is auto: measuring the model at each candidate stride")
@@ -284,8 +284,9 @@ def choose_stride(
     calibration = calibrate_model(
         world_model, candidates, config, accelerator, ClipSample(clips=config.validation.clips)
     )
-    for line in calibration.lines():
-        reporter.note(line)
+    for row in calibration.rows(""):
+        reporter.note(f"  {row.name}: error/persistence {row}")
+    reporter.note(calibration.verdict())
     return calibration
 
 

@@ -10,9 +10,10 @@ from vjepa2_ac.data.windows import spread
 from vjepa2_ac.distributed import agreed, broadcast_object
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.action_use import RolloutStart, moves_of, pool_of, rank_actions
+from vjepa2_ac.evaluation.action_use import RolloutStart, moves_of, rank_actions
 from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persistence
 from vjepa2_ac.evaluation.measure import prediction_errors
+from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import ActionRanking, Validation
 from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.metrics_log import MetricsLog
@@ -119,9 +120,8 @@ def _moves_kept(
 
 def _ranking(run: Run, moves: list[RolloutStart]) -> ActionRanking:
     config = run.config.validation
-    reach, samples = config.ranking_reach_cm / 100, config.ranking_samples
-    pool = pool_of(moves, run.dataset.spaces.action, reach=reach, samples=samples, seed=0)
-    return rank_actions(run.world_model, moves, pool, at_once=_AT_ONCE)
+    probes = ProbeOptions(samples=config.ranking_samples, reach_cm=config.ranking_reach_cm, at_once=_AT_ONCE)
+    return rank_actions(run.world_model, moves, run.dataset.spaces.action, probes, seed=0)
 
 
 def validate_base(run: Run, reporter: Reporter) -> Validation | None:

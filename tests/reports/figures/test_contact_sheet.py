@@ -7,7 +7,6 @@ import pytest
 from matplotlib.image import imread
 
 from vjepa2_ac.data.transforms import crop_box
-from vjepa2_ac.inspection.sheet import _short_names
 from vjepa2_ac.reports.figures.contact_sheet import ContactSheet, Strip, pictures_per_row, plot_contact_sheet
 
 
@@ -61,9 +60,3 @@ def test_episodes_stand_below_one_another_in_their_order(tmp_path: Path) -> None
     three = pixels(plot_contact_sheet(sheet(*map(strip, colours)), tmp_path / "three.png"))
     centres = [np.argwhere(abs(three - colour).max(axis=-1) <= 2)[:, 0].mean() for colour in colours]
     assert centres == sorted(centres)
-
-
-def test_names_lose_their_common_part() -> None:
-    assert _short_names(["/a/b/c/one--x", "/a/b/d/two--x"]) == ["c/one", "d/two"]
-    assert _short_names(["/a/out--1", "/a/out--2"]) == ["out--1", "out--2"]
-    assert _short_names(["/a/b"]) == ["/a/b"]

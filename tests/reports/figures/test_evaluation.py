@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from evaluation_results import evaluation
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.reports.comparison import Comparison
-from vjepa2_ac.reports.figures.evaluation import plot_comparison, plot_evaluation
+from vjepa2_ac.reports.figures.evaluation import draw_training, plot_comparison, plot_evaluation
 
 NAMES = ("runs/lora", "_hidden", r"$\frac$", *(f"run {number}" for number in range(10)))
 
@@ -34,3 +34,9 @@ def test_names_that_look_like_formulas_and_missing_images_do_not_stop_the_image_
     bare = replace(one, examples=tuple(replace(example, frames=None) for example in one.examples))
     assert plot_evaluation(bare, tmp_path / "bare.png").stat().st_size > 1000
     assert plot_evaluation(replace(one, examples=()), tmp_path / "none.png").stat().st_size > 1000
+
+
+def test_no_empty_chart_stands_beside_those_of_training() -> None:
+    figure = Figure()
+    draw_training(figure, evaluation())
+    assert [bool(axes.lines) for axes in figure.axes] == [axes.axison for axes in figure.axes]

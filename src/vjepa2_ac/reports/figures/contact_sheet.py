@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -74,7 +74,8 @@ def plot_contact_sheet(sheet: ContactSheet, path: Path) -> Path:
         words.text(_EDGE, 1 - 0.16 / heights[0], sheet.title, size=13, weight="bold", va="top")
         words.text(_EDGE, 1 - 0.5 / heights[0], "\n".join(facts), size=9, va="top", linespacing=1.4)
         _panels(panels, sheet)
-        fastest = _fastest(sheet.strips)
+        speeds = np.concatenate([strip.speed for strip in sheet.strips]) if sheet.strips else np.zeros(1)
+        fastest = max(float(np.percentile(speeds, 99.5)) * 1.15, 1.0)
         for part, strip in zip(rows, sheet.strips, strict=True):
             _strip(part, strip, sheet.control_rate_hz, fastest)
     return path
@@ -88,22 +89,28 @@ def _panels(part: Any, sheet: ContactSheet) -> None:
     lengths.set_title("Length of episodes (s)")
     lengths.locator_params(axis="y", nbins=4, integer=True)
     _motion(part.add_subplot(grid[1]), sheet)
-    if sheet.places_m is not None:
-        _places(part, part.add_subplot(grid[2]), sheet.places_m)
+    if (places := sheet.places_m) is not None:
+        axes = part.add_subplot(grid[2])
+        shown = axes.scatter(-places[:, 1], places[:, 0], c=places[:, 2], s=2, cmap="viridis", linewidths=0)
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.set(title="Where the flange was, from above (m; colour: height)")
+        axes.set(xlabel="-y: to the robot's right", ylabel="x: forward")
+        axes.locator_params(nbins=5)
+        part.colorbar(shown, ax=axes, fraction=0.04, pad=0.02)
     if sheet.directions is not None:
         _directions(part, part.add_subplot(grid[3]), sheet.directions)
-    if sheet.ranges is not None:
-        _ranges(part.add_subplot(grid[2:]), sheet.ranges)
-    part.legend(handles=_meanings(sheet), loc="lower right", ncols=4, fontsize=9, handlelength=1)
-
-
-def _places(part: Any, axes: Any, places_m: Float[np.ndarray, "points 3"]) -> None:
-    shown = axes.scatter(-places_m[:, 1], places_m[:, 0], c=places_m[:, 2], s=2, cmap="viridis", linewidths=0)
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.set(title="Where the flange was, from above (m; colour: height)")
-    axes.set(xlabel="-y: to the robot's right", ylabel="x: forward")
-    axes.locator_params(nbins=5)
-    part.colorbar(shown, ax=axes, fraction=0.04, pad=0.02)
+    if (ranges := sheet.ranges) is not None:
+        axes = part.add_subplot(grid[2:])
+        axes.bar(np.arange(len(ranges)), ranges[:, 1] - ranges[:, 0], bottom=ranges[:, 0], color=BLUE)
+        axes.set(title="Range of each number of the state", xlabel="number, from 0")
+        axes.locator_params(axis="x", integer=True)
+    has_poses = sheet.places_m is not None
+    speed = "speed (cm/s)" if has_poses else "fastest number (% of its range per second)"
+    meanings = {speed: BLUE} | ({"gripper: 0 open, 1 closed": ORANGE} if has_poses else {})
+    meanings |= {sheet.shaded_means: _IDLE} if sheet.shaded_means else {}
+    meanings["bright part of a picture: what the model sees"] = "none"
+    handles = [Patch(color=colour, label=label) for label, colour in meanings.items()]
+    part.legend(handles=handles, loc="lower right", ncols=4, fontsize=9, handlelength=1)
 
 
 def _directions(part: Any, axes: Any, directions: Float[np.ndarray, "rows columns"]) -> None:
@@ -117,12 +124,6 @@ def _directions(part: Any, axes: Any, directions: Float[np.ndarray, "rows column
     axes.set_xticks([-180, -90, 0, 90, 180], ["-x", "-y", "+x", "+y", "-x"])
     axes.set_yticks([-1, 0, 1], ["-z", "", "+z"])
     part.colorbar(shown, ax=axes, fraction=0.04, pad=0.02, ticks=[0, ENOUGH_NEAR, 1, 2])
-
-
-def _ranges(axes: Any, ranges: Float[np.ndarray, "state_dim 2"]) -> None:
-    axes.bar(np.arange(len(ranges)), ranges[:, 1] - ranges[:, 0], bottom=ranges[:, 0], color=BLUE)
-    axes.set(title="Range of each number of the state", xlabel="number, from 0")
-    axes.locator_params(axis="x", integer=True)
 
 
 def _motion(axes: Any, sheet: ContactSheet) -> None:
@@ -144,20 +145,6 @@ def _motion(axes: Any, sheet: ContactSheet) -> None:
     axes.legend(frameon=True, framealpha=0.85, edgecolor="none", fontsize=8, loc="lower right")
 
 
-def _meanings(sheet: ContactSheet) -> list[Patch]:
-    has_poses = sheet.places_m is not None
-    speed = "speed (cm/s)" if has_poses else "fastest number (% of its range per second)"
-    found = [Patch(color=BLUE, label=speed)]
-    found += [Patch(color=ORANGE, label="gripper: 0 open, 1 closed")] * has_poses
-    found += [Patch(color=_IDLE, label=sheet.shaded_means)] * bool(sheet.shaded_means)
-    return [*found, Patch(color="none", label="bright part of a picture: what the model sees")]
-
-
-def _fastest(strips: Sequence[Strip]) -> float:
-    speeds = np.concatenate([strip.speed for strip in strips]) if strips else np.zeros(1)
-    return max(float(np.percentile(speeds, 99.5)) * 1.15, 1.0)
-
-
 def _strip(part: Any, strip: Strip, control_rate_hz: float, fastest: float) -> None:
     outcome, colour = _OUTCOME[strip.success]
     steps = len(strip.speed)
@@ -168,7 +155,7 @@ def _strip(part: Any, strip: Strip, control_rate_hz: float, fastest: float) -> N
     label = part.add_subplot(grid[:, 0])
     label.set_axis_off()
     label.add_patch(Rectangle((0, 0), 0.03, 1, color=colour))
-    label.text(0.08, 1.0, _wrapped(strip.name), va="top")
+    label.text(0.08, 1.0, textwrap.fill(strip.name, 22, max_lines=5, placeholder="…"), va="top")
     label.text(0.08, 0.47, outcome, color=colour, size=9, weight="bold", va="top")
     label.text(0.08, 0.37, f"{steps} steps, {steps / control_rate_hz:.1f} s", color=GREY, va="top")
     film = grid[0, 1].subgridspec(1, len(strip.frames), wspace=0.03)
@@ -177,14 +164,6 @@ def _strip(part: Any, strip: Strip, control_rate_hz: float, fastest: float) -> N
         axes.set_axis_off()
         axes.imshow(_paler(frame, strip.seen), interpolation="nearest" if len(frame) < 100 else "antialiased")
     _motion_of(part.add_subplot(grid[1, 1]), strip, control_rate_hz, fastest)
-
-
-def _wrapped(name: str, across: int = 22, down: int = 5) -> str:
-    """Break a name, which has no spaces, into lines; the first of them where it is too long."""
-    lines = [name[start : start + across] for start in range(0, len(name), across)]
-    if len(lines) > down:
-        lines = [*lines[: down - 1], lines[down - 1][: across - 1] + "…"]
-    return "\n".join(lines)
 
 
 def _paler(frame: UInt8[np.ndarray, "height width 3"], seen: CropBox) -> UInt8[np.ndarray, "height width 3"]:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import itertools
 import math
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -36,12 +37,12 @@ def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
     """Write the figure of an evaluation as PNG; it is written atomically."""
     with written_figure(path, 13.0, 6.2, dpi=110, size=9) as figure:
         headline(figure, verdict(evaluation))
-        halves = figure.subfigures(1, 2, width_ratios=[5, 6], wspace=0.02)
-        upper, lower = halves[0].subplots(2, 1, height_ratios=[3, 2])
+        left, right = figure.subfigures(1, 2, width_ratios=[5, 6], wspace=0.02)
+        upper, lower = left.subfigures(2, 1, height_ratios=[3, 2])
         draw_errors(upper, evaluation)
         draw_use_of_actions(lower, evaluation)
         if evaluation.examples:
-            axes = halves[1].subplots()
+            axes = right.subplots()
             strip = example_strip(evaluation, evaluation.examples[0], most=4)
             rows = tuple(row for row in strip.rows if row.kind != "latents") or strip.rows
             axes.imshow(draw_strip(replace(strip, rows=rows)))
@@ -62,54 +63,87 @@ def plot_comparison(comparison: Comparison, path: Path) -> Path:
     return path
 
 
-def draw_errors(axes: Any, evaluation: Evaluation, mode: Mode = "rollout") -> None:
+class Drawing(NamedTuple):
+    """A figure of a part of the page."""
+
+    part: str
+    described: str
+    width: float  # inches
+    height: float
+    draw: Callable[[Any, Evaluation], None]  # on a figure
+
+
+def drawings(evaluation: Evaluation) -> Iterator[Drawing]:
+    """Yield the figures of an evaluation that can be drawn, by the part of the page."""
+    models = evaluation.models.values()
+    forced = partial(draw_errors, mode="teacher_forced")
+    yield Drawing("errors", "Open-loop L1 error over persistence by horizon", 6.4, 3.6, draw_errors)
+    yield Drawing("errors", "Teacher-forced L1 error over persistence by horizon", 6.4, 3.6, forced)
+    if evaluation.base is not None:
+        yield Drawing("base", "Gain over the base by horizon", 6.4, 3.4, draw_gains)
+    if any(model.distribution and math.isfinite(model.distribution.spread[-1].value) for model in models):
+        yield Drawing("spread", "Spread by horizon", 6.4, 3.4, draw_spread)
+    yield Drawing("actions", "One-step error with other actions", 6.4, 3.0, draw_use_of_actions)
+    if any(model.sensitivity for model in models):
+        yield Drawing("actions", "Ranks of the true action", 6.4, 3.4, draw_ranks)
+    if clips := landscape_clips(evaluation):
+        rows = len(clips) * (2 if evaluation.base and evaluation.models[evaluation.base].landscapes else 1)
+        described = "Energy around the true action: cross; lowest energy: ring"
+        yield Drawing("landscapes", described, 9.0, 2.6 * rows, draw_landscapes)
+    if evaluation.planning is not None:
+        yield Drawing("planning", "Ends of plans", 11.0, 3.6, draw_plans)
+    if evaluation.episodes:
+        yield Drawing("episodes", "Error of every episode", 6.4, 3.0, draw_episodes)
+    if evaluation.decoded is not None:
+        yield Drawing("decoded", "PSNR by horizon", 6.4, 3.6, draw_decoded)
+    if charts := len(training_charts(evaluation.training)):
+        yield Drawing("training", "Metrics over optimizer steps", 11.0, 2.8 * -(-charts // 3), draw_training)
+
+
+def draw_errors(figure: Any, evaluation: Evaluation, mode: Mode = "rollout") -> None:
     """Draw the error over persistence of every model by horizon."""
     curves = {name: over_persistence(model.errors, mode) for name, model in evaluation.models.items()}
-    _by_horizon(axes, evaluation, curves, level=(1.0, _NOTHING))
+    axes = _by_horizon(figure, evaluation, curves, level=(1.0, _NOTHING))
     how = {"rollout": "open loop", "teacher_forced": "teacher-forced"}[mode]
     axes.set(title=f"L1 error by horizon, {how} (band: 95 % over episodes)", ylabel="latent error / persistence")
     axes.set_ylim(0, None)
 
 
-def draw_gains(axes: Any, evaluation: Evaluation) -> None:
+def draw_gains(figure: Any, evaluation: Evaluation) -> None:
     """Draw the gain of the models over the base by horizon."""
     base, models = evaluation.base_errors, evaluation.models
     if base is not None:
         gains = {name: gain_over(model.errors, base) for name, model in models.items() if model.errors is not base}
-        _by_horizon(axes, evaluation, gains, level=(0.0, "the base"))
+        axes = _by_horizon(figure, evaluation, gains, level=(0.0, "the base"))
         axes.set(title="Gain over the base, open loop, L1 (above 0: better)", ylabel="gain over the base")
         axes.yaxis.set_major_formatter("{x:.0%}")
 
 
-def draw_spread(axes: Any, evaluation: Evaluation) -> None:
+def draw_spread(figure: Any, evaluation: Evaluation) -> None:
     """Draw the spread of predictions over that of the truth by horizon."""
-    found = {name: model.distribution for name, model in evaluation.models.items()}
-    _by_horizon(
-        axes, evaluation, {name: one.spread for name, one in found.items() if one is not None}, level=(1.0, "the truth")
-    )
+    curves = {name: one.distribution.spread for name, one in evaluation.models.items() if one.distribution is not None}
+    axes = _by_horizon(figure, evaluation, curves, level=(1.0, "the truth"))
     axes.set(title="Spread of predicted latents, open loop (1: as varied as the truth)", ylabel="spread / the truth's")
     axes.set_ylim(0, None)
 
 
-def draw_decoded(axes: Any, evaluation: Evaluation) -> None:
+def draw_decoded(figure: Any, evaluation: Evaluation) -> None:
     """Draw the PSNR of decoded rollouts by horizon, where something moves if the true frames say so."""
     found = evaluation.decoded
     if found is not None:
+        finite = {name for (_, name), curve in found.curves.items() if any(math.isfinite(one.value) for one in curve)}
         names = ("psnr_db.moving.truth", "psnr_db.whole.truth", "psnr_db.whole.decoded_truth")
-        metric = next(name for name in names if any(math.isfinite(one.value) for one in _any_curve(found.curves, name)))
+        metric = next(name for name in names if name in finite)
         curves = {source.replace("_", " "): found.curves[source, metric] for source in found.sources}
-        _by_horizon(axes, evaluation, curves, level=None)
+        axes = _by_horizon(figure, evaluation, curves, level=None)
         _, region, reference = metric.split(".")
         where = "where something moves" if region == "moving" else "of the whole image"
         axes.set(title=f"PSNR {where}, against the {reference.replace('_', ' ')}", ylabel="dB")
 
 
-def _any_curve(curves: Mapping[tuple[str, str], Curve], metric: str) -> list[Any]:
-    return [one for (_, name), curve in curves.items() if name == metric for one in curve]
-
-
-def draw_use_of_actions(axes: Any, evaluation: Evaluation) -> None:
+def draw_use_of_actions(figure: Any, evaluation: Evaluation) -> None:
     """Draw the one-step error of every model with true and wrong actions."""
+    axes = figure.subplots()
     width = 0.8 / len(evaluation.models)
     for i, (name, colour) in enumerate(_colours(evaluation.models).items()):
         ratios = [one_step_over_persistence(evaluation.models[name].errors, actions) for actions in ACTIONS]
@@ -122,8 +156,9 @@ def draw_use_of_actions(axes: Any, evaluation: Evaluation) -> None:
     axes.set(title="Does it use the actions?", xlabel="actions given", ylabel="one-step error / persistence")
 
 
-def draw_ranks(axes: Any, evaluation: Evaluation) -> None:
+def draw_ranks(figure: Any, evaluation: Evaluation) -> None:
     """Draw how often the true action is among the best share of others, by model; dashed: among those in a box."""
+    axes = figure.subplots()
     axes.plot([0, 1], [0, 100], color=GREY, linestyle=":", label="chance")
     for name, colour in _colours(evaluation.models).items():
         sensitivity = evaluation.models[name].sensitivity
@@ -136,8 +171,9 @@ def draw_ranks(axes: Any, evaluation: Evaluation) -> None:
     axes.legend()
 
 
-def draw_episodes(axes: Any, evaluation: Evaluation) -> None:
+def draw_episodes(figure: Any, evaluation: Evaluation) -> None:
     """Draw the error over persistence of every episode, best first."""
+    axes = figure.subplots()
     values = [score.over_persistence for score in evaluation.episodes]
     axes.plot(range(1, len(values) + 1), values, "o-", color=BLUE, markersize=3)
     axes.axhline(1.0, color=GREY, linestyle="--")
@@ -202,7 +238,7 @@ def draw_training(figure: Any, evaluation: Evaluation) -> None:
     charts = training_charts(evaluation.training)
     columns = min(3, len(charts))
     grid = figure.subplots(-(-len(charts) // columns), columns, squeeze=False).flat
-    for axes, (kind, curves) in zip(grid, charts.items(), strict=False):
+    for (kind, curves), axes in zip(charts.items(), grid, strict=False):
         for curve in curves:
             every = -(-len(curve.steps) // _MOST_POINTS)
             kept = sorted({*range(0, len(curve.steps), every), len(curve.steps) - 1})
@@ -282,18 +318,18 @@ def _overlay(
 
 
 def _by_horizon(
-    axes: Any, evaluation: Evaluation, curves: Mapping[str, Curve], *, level: tuple[float, str] | None
-) -> None:
-    """Draw curves with their intervals, and a level that is none of a model, with its name."""
+    figure: Any, evaluation: Evaluation, curves: Mapping[str, Curve], *, level: tuple[float, str] | None
+) -> Any:
+    """Draw curves with their intervals, and a level that is none of a model, with its name; return the axes."""
+    axes = figure.subplots()
     seconds = evaluation.about.seconds_per_step * np.arange(1, evaluation.horizon + 1)
-    colours = _colours(curves)
-    drawn = _curves(
-        axes, seconds, ((curve, {"color": colours[name]}) for name, curve in curves.items()), level and level[0]
-    )
+    styled = ((curves[name], {"color": colour}) for name, colour in _colours(curves).items())
+    drawn = _curves(axes, seconds, styled, level and level[0])
     shown = seconds[:: -(-len(seconds) // 8)]
     axes.set_xticks(shown, [f"{value:.2f}" for value in shown])
     labels = [] if level is None else [level[1]]
     axes.legend(drawn, [*labels, *map(_short, curves)], loc="best")
+    return axes
 
 
 def _curves(

@@ -78,14 +78,14 @@ def new_figure(width: float, height: float, **options: Any) -> Figure:
     return figure
 
 
-def svg_of(draw: Callable[[Any], None], width: float, height: float) -> str:
-    """Return a figure of so many inches as SVG in a data: URL, in which nothing can run; always the same bytes."""
+def svg_of(draw: Callable[..., None], width: float, height: float, *given: Any) -> str:
+    """Return what is drawn of what is given, so many inches large, as SVG in a data: URL; always the same bytes."""
     style = {"font.size": 9, "legend.fontsize": 8, "svg.fonttype": "none", "svg.hashsalt": "vjepa2-ac"}
     text = io.StringIO()
     with in_our_style(style), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing", category=UserWarning)  # a reader's fonts have it
         figure = new_figure(width, height, layout="constrained")
-        draw(figure)
+        draw(figure, *given)
         figure.draw_without_rendering()
         figure.set_layout_engine("none")  # it has been laid out: once is enough
         figure.savefig(text, format="svg", metadata={"Date": None})

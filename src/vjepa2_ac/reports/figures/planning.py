@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
 import numpy as np
-from jaxtyping import Float
 from matplotlib.patches import Rectangle
 
 from vjepa2_ac.data.transforms import crop_box
@@ -22,8 +21,6 @@ if TYPE_CHECKING:  # of other rooms, which the figure of one need not load
     from vjepa2_ac.calibration.axes import AxisFit
     from vjepa2_ac.decoding.imagine import ImaginedPlan
     from vjepa2_ac.demonstrations.make_goals import EnergyCourse, MadeGoals
-    from vjepa2_ac.planning.energy import EnergySlice
-    from vjepa2_ac.planning.goals import SubGoal
     from vjepa2_ac.planning.interfaces import Plan
 
 PLAN_IMAGE, GOALS_IMAGE = "plan.png", "goals.png"
@@ -31,6 +28,8 @@ PLAN_IMAGE, GOALS_IMAGE = "plan.png", "goals.png"
 _FRAME = "#e8b10c"
 _ROW, _ROW_OF_IMAGINED = 3.4, 2.3  # inches
 _MOST_NUMBERS = 8  # of a vector
+_ACROSS = 6  # images of goals in a row
+_NAME = 70  # characters of a recording's name, its end
 _MOST_GOALS = 3  # that are shown: the first ones, and the last
 _STAR: dict[str, Any] = {"marker": "*", "s": 150, "color": RED, "edgecolors": "white", "zorder": 5}
 
@@ -43,20 +42,19 @@ def plot_plan(answer: PlanResult, path: Path, imagined: ImaginedPlan | None = No
         path: The file.
         imagined: What the planner imagined; None: nobody has decoded it.
     """
-    plan = answer.decision.plan
-    rows: list[tuple[float, Callable[[Any], None]]] = [(_ROW, partial(_pictures, answer=answer))]
+    rows: list[tuple[float, Callable[[Any, PlanResult], None]]] = [(_ROW, _pictures)]
     if imagined is not None:
-        rows.append((_ROW_OF_IMAGINED, partial(_imagined, answer=answer, imagined=imagined)))
-    if plan is not None:
-        rows.append((_ROW, partial(_search, answer=answer, plan=plan)))
+        rows.append((_ROW_OF_IMAGINED, partial(_imagined, imagined=imagined)))
+    if (plan := answer.decision.plan) is not None:
+        rows.append((_ROW, partial(_search, plan=plan)))
         if answer.slices:
-            rows.append((_ROW, partial(_slices, answer=answer)))
+            rows.append((_ROW, _slices))
     heights = [height for height, _ in rows]
     with written_figure(path, 13.0, 0.9 + sum(heights), size=9) as figure:
         headline(figure, summarize(answer))
         parts = figure.subfigures(len(rows), 1, squeeze=False, height_ratios=heights)[:, 0]
         for part, (_, draw) in zip(parts, rows, strict=True):
-            draw(part)
+            draw(part, answer)
     return path
 
 
@@ -71,20 +69,18 @@ def _pictures(part: Any, answer: PlanResult) -> None:
             hidden = np.where(answer.question.mask > 0, np.nan, 1.0)
             axes.imshow(hidden, cmap="gray", vmin=0, vmax=2, alpha=0.6)
         box = crop_box(picture.shape[0], picture.shape[1], answer.controller.crop)
-        axes.add_patch(
-            Rectangle((box.left - 0.5, box.top - 0.5), box.width, box.height, fill=False, color=_FRAME, linewidth=1.2)
-        )
+        corner = box.left - 0.5, box.top - 0.5
+        axes.add_patch(Rectangle(corner, box.width, box.height, fill=False, color=_FRAME, linewidth=1.2))
         axes.set_title(f"{name} (frame: what the model sees)")
         axes.set_axis_off()
 
 
 def _imagined(part: Any, answer: PlanResult, imagined: ImaginedPlan) -> None:
     """Draw the start, the imagined steps and the goal, time from left to right; frames have the colours of films."""
-    last = answer.space.steps
     panels: list[tuple[str, Kind, np.ndarray]] = [("start, decoded", "decoded", imagined.start)]
     for step, image in imagined.steps.items():
-        name = f"imagined end\n(step {step})" if step == last else f"imagined,\nstep {step}"
-        panels.append((name, "imagined", image))
+        is_last = step == answer.space.steps
+        panels.append((f"imagined end\n(step {step})" if is_last else f"imagined,\nstep {step}", "imagined", image))
     panels += [("goal, decoded", "decoded", imagined.decoded_goal), ("goal", "recorded", imagined.goal)]
     for axes, (title, kind, image) in zip(part.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
         show_framed(axes, image, kind)
@@ -94,18 +90,17 @@ def _imagined(part: Any, answer: PlanResult, imagined: ImaginedPlan) -> None:
 
 
 def _search(part: Any, answer: PlanResult, plan: Plan) -> None:
-    elites, heights, energies, path = part.subplots(1, 4, width_ratios=[3, 3, 3, 3])
+    elites, heights, energies, path = part.subplots(1, 4)
     colours = mpl.colormaps["viridis"](np.linspace(0.9, 0.0, len(plan.iterations)))
     factor = answer.state_space.shown_factor
     first, upper = answer.actions[0] * factor, answer.space.upper[0].double().numpy() * factor
-    across, up, third = _three(answer)
+    shown = answer.shown_axes  # one again where there are fewer than three numbers
+    across, up, third = shown[0], shown[min(1, len(shown) - 1)], shown[-1]
     for number, (one, colour) in enumerate(zip(plan.iterations, colours, strict=True), start=1):
         tried = one.elites[:, 0].double().numpy() * factor
         elites.scatter(tried[:, across], tried[:, up], s=9, color=colour, alpha=0.8)
         heights.scatter(np.full(len(tried), number), tried[:, third], s=9, color=colour, alpha=0.8)
-    _limits(elites, upper[across], upper[up])
-    elites.scatter(first[across], first[up], **_STAR)
-    elites.set(xlabel=_label(answer, across), ylabel=_label(answer, up), aspect="equal")
+    _plane(elites, answer, across, up)
     elites.set(title="Best of each iteration,\nfirst action (dark: last)")
     heights.axhspan(-upper[third], upper[third], color=GREY, alpha=0.12, linewidth=0)
     heights.scatter(len(plan.iterations) + 1, first[third], **_STAR)
@@ -117,10 +112,15 @@ def _search(part: Any, answer: PlanResult, plan: Plan) -> None:
     _path(path, answer)
 
 
-def _three(answer: PlanResult) -> tuple[int, int, int]:
-    """Return the numbers of an action that are shown; one again where there are fewer."""
-    shown = answer.shown_axes
-    return shown[0], shown[min(1, len(shown) - 1)], shown[-1]
+def _plane(axes: Any, answer: PlanResult, across: int, up: int) -> None:
+    """Draw the limits of two numbers of the first action, and the chosen one."""
+    factor = answer.state_space.shown_factor
+    width, height = (answer.space.upper[0, axis].item() * factor for axis in (across, up))
+    corner = -width, -height
+    axes.add_patch(Rectangle(corner, 2 * width, 2 * height, fill=False, color=GREY, linewidth=1))
+    axes.margins(0.08)
+    axes.scatter(answer.actions[0, across] * factor, answer.actions[0, up] * factor, **_STAR)
+    axes.set(xlabel=_label(answer, across), ylabel=_label(answer, up), aspect="equal")
 
 
 def _label(answer: PlanResult, axis: int) -> str:
@@ -170,88 +170,61 @@ def _path(axes: Any, answer: PlanResult) -> None:
 def _slices(part: Any, answer: PlanResult) -> None:
     lowest = min(np.nanmin(one.energy) for one in answer.slices)
     highest = max(np.nanmax(one.energy) for one in answer.slices)
-    all_axes = part.subplots(1, len(answer.slices))
+    factor, all_axes = answer.state_space.shown_factor, part.subplots(1, len(answer.slices))
     for axes, one in zip(all_axes, answer.slices, strict=True):
-        image = _slice(axes, one, answer, lowest, highest)
+        colours = {"shading": "nearest", "cmap": "viridis", "vmin": lowest, "vmax": highest}
+        image = axes.pcolormesh(one.across * factor, one.up * factor, one.energy, **colours)
+        axes.plot(0, 0, "+", color="white", markersize=9)
+        _plane(axes, answer, *one.axes)
+        axes.set_title("\n")
+    all_axes[0].set_title("Energy around the first action\n(star; +: no motion; box: limits)")
     part.colorbar(image, ax=list(all_axes), label="energy", shrink=0.85)
-
-
-def _slice(axes: Any, one: EnergySlice, answer: PlanResult, lowest: float, highest: float) -> Any:
-    first, second = one.axes
-    factor = answer.state_space.shown_factor
-    across, up = one.across * factor, one.up * factor
-    image = axes.pcolormesh(across, up, one.energy, shading="nearest", cmap="viridis", vmin=lowest, vmax=highest)
-    upper = answer.space.upper[0].double().numpy() * factor
-    _limits(axes, upper[first], upper[second])
-    axes.plot(0, 0, "+", color="white", markersize=9)
-    axes.scatter(answer.actions[0, first] * factor, answer.actions[0, second] * factor, **_STAR)
-    axes.set(xlabel=_label(answer, first), ylabel=_label(answer, second), aspect="equal")
-    title = "Energy around the first action\n(star; +: no motion; box: limits)" if one is answer.slices[0] else "\n"
-    axes.set_title(title)
-    return image
-
-
-def _limits(axes: Any, across: float, up: float) -> None:
-    axes.add_patch(Rectangle((-across, -up), 2 * across, 2 * up, fill=False, color=GREY, linewidth=1))
-    axes.margins(0.08)
-
-
-_ACROSS = 6  # images in a row
-_NAME = 70  # characters of a recording's name, its end
 
 
 def plot_goals(made: MadeGoals, path: Path) -> Path:
     """Write the contact sheet of goals as PNG; it is written atomically."""
     images = [made.first, *(goal.image for goal in made.goals)]
     rows = -(-len(images) // _ACROSS)
-    drawn: list[tuple[Callable[..., None], Any]] = [(_gripper, made.recording.states), (_energy, made.course)]
-    plots = [(draw, given) for draw, given in drawn if given is not None]
-    heights = [2.8 * rows, *(1.8 for _ in plots)]
+    states, course = made.recording.states, made.course
+    heights = [2.8 * rows, *(1.8 for given in (states, course) if given is not None)]
+    options, name = made.options, made.recording.name
+    how = f"every {options.every} frames" if options.by == "every" else f"by {options.by}"
+    count = f"{len(made.goals)} goal{'s' * (len(made.goals) > 1)}"
+    name = name if len(name) <= _NAME else f"…{name[-_NAME:]}"
     with written_figure(path, 13.0, 0.5 + sum(heights)) as figure:
-        headline(figure, _title(made))
+        headline(figure, f"{count}, {how}; {options.stride} frames are a model step. Of {name}")
         sheet, *parts = figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
         for place, axes in enumerate(sheet.subplots(rows, _ACROSS, squeeze=False).flat):
             axes.set_axis_off()
             if place < len(images):
                 axes.imshow(images[place])
                 axes.set_title(_caption(made, place), fontsize=8)
-        for part, (draw, given) in zip(parts, plots, strict=True):
-            axes = part.subplots()
-            draw(axes, made, given)
+        plots = [part.subplots() for part in parts]
+        for axes in plots:
             for key in made.keys:
                 axes.axvline(key.frame, color=GREY, linewidth=0.8, linestyle=":")
             axes.set_xlim(0, made.recording.frames - 1)
             axes.locator_params(axis="x", integer=True)
+        if states is not None:
+            plots[0].plot(states[:, POSE.gripper], color=ORANGE, linewidth=1.3)
+            plots[0].set(title="Gripper: 0 open, 1 closed", ylim=(-0.05, 1.05))
+        if course is not None:
+            _energy(plots[-1], made, course)
     return path
-
-
-def _title(made: MadeGoals) -> str:
-    how = f"every {made.options.every} frames" if made.options.by == "every" else f"by {made.options.by}"
-    count = f"{len(made.goals)} goal{'s' * (len(made.goals) > 1)}"
-    name = made.recording.name if len(made.recording.name) <= _NAME else f"…{made.recording.name[-_NAME:]}"
-    return f"{count}, {how}; {made.options.stride} frames are a model step. Of {name}"
 
 
 def _caption(made: MadeGoals, place: int) -> str:
     if not place:
         return "the start, frame 0"
     goal, key = made.goals[place - 1], made.keys[place - 1]
-    lines = [f"goal {place}: {goal.name}" if goal.name else f"goal {place}", f"frame {key.frame}, {_bounds(goal)}"]
+    steps = f"{goal.at_least} model steps or more"
+    if goal.at_most is not None:
+        steps = f"{goal.at_least} to {goal.at_most} model steps"
+    lines = [f"goal {place}: {goal.name}" if goal.name else f"goal {place}", f"frame {key.frame}, {steps}"]
     lines.append(f"gripper {goal.gripper or 'as planning.limits say'}")
     if made.course is not None:
         lines.append(f"energy {made.course.began[place - 1]:.3g} at its beginning")
     return "\n".join(lines)
-
-
-def _bounds(goal: SubGoal) -> str:
-    if goal.at_most is None:
-        return f"{goal.at_least} model steps or more"
-    return f"{goal.at_least} to {goal.at_most} model steps"
-
-
-def _gripper(axes: Any, _: MadeGoals, states: Float[np.ndarray, "frames 7"]) -> None:
-    axes.plot(states[:, POSE.gripper], color=ORANGE, linewidth=1.3)
-    axes.set(title="Gripper: 0 open, 1 closed", ylim=(-0.05, 1.05))
 
 
 def _energy(axes: Any, made: MadeGoals, course: EnergyCourse) -> None:
@@ -267,25 +240,19 @@ def _energy(axes: Any, made: MadeGoals, course: EnergyCourse) -> None:
     axes.legend(fontsize=7, loc="upper right", ncols=3)
 
 
-_EXECUTED, _INFERRED, _FITTED = "#8a8a8a", "#1f6fb4", "#d1762a"
-
-
 def plot_axes(fit: AxisFit, path: Path) -> Path:
     """Write moves in the horizontal plane, and the robot's x and y as the model takes them, as PNG, atomically."""
     with written_figure(path, 9.0, 4.6, dpi=110, size=9) as figure:
-        found = {
-            "yaw": fit.yaw_degrees,
-            "fitted yaw": fit.fitted_yaw_degrees,
-            "gain": fit.gain,
-            "condition": fit.condition,
-        }
-        headline(figure, ", ".join(f"{name} {number}" for name, number in found.items()), across=110)
+        words = (
+            f"yaw {fit.yaw_degrees}, fitted yaw {fit.fitted_yaw_degrees}, gain {fit.gain}, condition {fit.condition}"
+        )
+        headline(figure, words, across=110)
         left, right = figure.subplots(1, 2, sharex=True, sharey=True)
         reach = 105 * max(float(np.abs(moves[:, :2]).max()) for moves in (fit.executed, fit.inferred)) or 1.0
-        left.scatter(*(100 * fit.executed[:, :2].T), s=9, color=_EXECUTED, label="executed")
-        left.scatter(*(100 * fit.inferred[:, :2].T), s=9, color=_INFERRED, label="inferred by the model")
+        left.scatter(*(100 * fit.executed[:, :2].T), s=9, color=GREY, label="executed")
+        left.scatter(*(100 * fit.inferred[:, :2].T), s=9, color=BLUE, label="inferred by the model")
         for axis, name in enumerate("xy"):
-            for moved, colour in ((np.eye(3)[:2, axis], _EXECUTED), (fit.matrix[:2, axis], _FITTED)):
+            for moved, colour in ((np.eye(3)[:2, axis], GREY), (fit.matrix[:2, axis], ORANGE)):
                 along = 0.8 * reach * moved
                 right.annotate("", along, (0, 0), arrowprops={"arrowstyle": "->", "color": colour, "lw": 2})
                 right.annotate(name, along, color=colour)

@@ -1,0 +1,300 @@
+"""The true action among others: ranks are counted, ties are shared, an energy that is known is lowest there."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from vjepa2_ac.episode import LatentBatch
+from vjepa2_ac.evaluation.action_use import (
+    ActionPool,
+    RolloutStart,
+    evaluate_actions,
+    grid_axes,
+    measure_landscapes,
+    measure_sensitivity,
+    moves_of,
+    rank_actions,
+    start_of,
+)
+from vjepa2_ac.evaluation.estimates import rank_difference
+from vjepa2_ac.evaluation.measure import Predictor
+from vjepa2_ac.evaluation.request import ProbeOptions
+from vjepa2_ac.evaluation.result import ActionRanking, Landscapes
+from vjepa2_ac.spaces import POSE_CHANGE, ActionSpace, vector_actions
+from worlds import DIM, TIME, Copier, Halfway, Oracle, clips_batch, moved
+
+CLIPS, REACH, FEW, SAMPLES = 12, 0.075, 8, 40
+
+
+def line(step_m: float = 0.01, times: int = 6) -> LatentBatch:
+    """Return clips of a robot that only ever moves to the front, by the same distance a step."""
+    actions = torch.zeros(CLIPS, times - 1, 7)
+    actions[:, :, 0] = step_m
+    return walked(actions)
+
+
+def walked(actions: Tensor) -> LatentBatch:
+    """Return clips of these actions, with states that agree with them."""
+    batch = clips_batch(CLIPS)
+    states = torch.cat([torch.zeros(CLIPS, 1, 7), actions.cumsum(dim=1)], dim=1)
+    first = batch.latents[:, :1]
+    latents = torch.cat([first, moved(first.expand(-1, actions.shape[1], -1, -1), actions.cumsum(dim=1))], dim=1)
+    return replace(batch, latents=latents, states=states, actions=actions)
+
+
+def moves(batch: LatentBatch, space: ActionSpace = POSE_CHANGE, reach: float = REACH) -> list[RolloutStart]:
+    return [move for clip in range(CLIPS) for move in moves_of(batch, clip, clip, space, reach)]
+
+
+def ranked(model: Predictor, batch: LatentBatch, samples: int = 40) -> ActionRanking:
+    probes = ProbeOptions(samples=samples, at_once=16)
+    return rank_actions(model, moves(batch), POSE_CHANGE, probes, seed=0)
+
+
+def pool_of(moves: list[RolloutStart], space: ActionSpace, samples: int) -> ActionPool:
+    return ActionPool(np.stack([move.true for move in moves]), ["an episode"] * len(moves), space, REACH, samples, 0)
+
+
+def test_a_move_is_the_longest_within_reach_there_and_back() -> None:
+    there, back = moves(line(times=10))[:2]
+    assert float(there.action[0]) == pytest.approx(0.07), "7 of its 9 steps: 8 are beyond 7.5 cm"
+    assert torch.equal(there.action, -back.action)
+    assert torch.equal(there.frame, back.following)
+    assert torch.equal(there.following, back.frame)
+    assert float(back.state[0] - there.state[0]) == pytest.approx(0.07)
+    assert there.episode_id == back.episode_id
+
+
+def test_a_robot_that_is_faster_than_the_reach_moves_by_one_step() -> None:
+    there, back = moves(line(step_m=0.2))[:2]
+    assert (float(there.action[0]), float(back.action[0])) == pytest.approx((0.2, -0.2))
+
+
+def test_commands_that_are_no_changes_are_taken_as_they_are() -> None:
+    batch = line()
+    batch.actions[:, 2] *= 3
+    found = moves(batch, vector_actions(7, "target"))
+    assert len(found) == CLIPS
+    assert all(torch.equal(one.action, batch.actions[one.clip, 2]) for one in found)
+
+
+def test_any_move_of_vectors_is_within_reach() -> None:
+    there, _ = moves(line(step_m=2.0), vector_actions(7, "change"))[:2]
+    assert float(there.action[0]) == pytest.approx(10.0), "all five steps"
+
+
+def test_who_knows_the_world_ranks_the_true_action_first() -> None:
+    found = ranked(Oracle(), walked(0.02 * torch.randn(CLIPS, 4, 7, generator=torch.Generator().manual_seed(0))))
+    assert (found.rank.value, found.box.value, found.shell.value) == (0.0, 0.0, 0.0)
+    assert found.spread.value > 0.1
+    assert len(found.ranks) == 2 * CLIPS
+
+
+def test_who_ignores_actions_ranks_by_chance_and_spreads_nothing() -> None:
+    found = ranked(Copier(), line())
+    assert set(found.ranks) == {0.5}
+    assert found.spread.value == 0.0
+
+
+class _Taught(Oracle):
+    """Knows what it was taught, steps to the front of 1 cm, and takes every action for one that is as short."""
+
+    def predict(self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
+        return super().predict(latents, actions.clamp(0.0, 0.01), states, extrinsics)
+
+
+def test_who_knows_only_short_steps_to_the_front_is_right_of_each_step_and_found_out() -> None:
+    """The trap: on the steps of the data the model is perfect, and a planner has nothing to go by beyond them."""
+    batch = line()
+    own_steps = batch.latents[:, :-1], batch.actions, batch.states
+    assert torch.equal(_Taught().predict(*own_steps), Oracle().predict(*own_steps))
+    taught, oracle = ranked(_Taught(), batch), ranked(Oracle(), batch)
+    assert oracle.rank.value == 0.0
+    assert taught.rank.low > 0.03
+    assert taught.spread.value < 0.5 * oracle.spread.value
+    worse = rank_difference(taught, oracle)
+    assert worse.low > 0.0
+    assert rank_difference(oracle, taught).value == pytest.approx(-worse.value)
+
+
+class _Length(Oracle):
+    """Sees how far an action goes, and believes that it goes to the front."""
+
+    def predict(self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
+        seen = torch.zeros_like(actions)
+        seen[..., 0] = actions[..., :3].norm(dim=-1)
+        return super().predict(latents, seen, states, extrinsics)
+
+
+def test_the_shell_tells_a_direction_from_a_distance() -> None:
+    found = ranked(_Length(), line(), samples=200)
+    assert found.shell.value == pytest.approx(0.5, abs=0.1), "all of one length are alike"
+    assert found.box.value < 0.5
+
+
+def test_actions_on_the_shell_are_as_long_as_the_true_one_and_go_everywhere() -> None:
+    (move, _), samples = moves(line(times=10))[:2], 4000
+    pool = pool_of([move], POSE_CHANGE, samples)
+    drawn = pool.on_shell(move, np.random.default_rng(0))
+    assert np.linalg.norm(drawn[:, :3], axis=1) == pytest.approx(np.full(samples, 0.07))
+    assert np.abs(drawn[:, :3].mean(axis=0)).max() < 0.005
+    assert np.array_equal(drawn[:, 3:], np.zeros((samples, 4)))
+    still = replace(move, action=torch.zeros(7))
+    assert not pool.on_shell(still, np.random.default_rng(0)).any()
+
+
+def test_numbers_of_vectors_are_lengths_in_their_largest_change() -> None:
+    space = vector_actions(3, "change")
+    move = replace(moves(line())[0], action=torch.tensor([0.1, 0.0, 0.0]))
+    others = replace(move, action=torch.tensor([0.0, 5.0, 0.0]))
+    drawn = pool_of([move, others], space, 500).on_shell(move, np.random.default_rng(0))
+    assert np.linalg.norm(drawn[:, :2] / [0.1, 5.0], axis=1) == pytest.approx(np.ones(500))
+    assert not drawn[:, 2].any(), "what never changes is not changed"
+
+
+def test_what_others_are_drawn_does_not_depend_on_the_moves_beside_it() -> None:
+    batch = walked(0.02 * torch.randn(CLIPS, 4, 7, generator=torch.Generator().manual_seed(0)))
+    begun = moves(batch)
+    probes = ProbeOptions(samples=20, at_once=7)
+    whole, last = (rank_actions(Halfway(), some, POSE_CHANGE, probes, seed=3) for some in (begun, begun[-2:]))
+    assert np.array_equal(whole.ranks[-2:], last.ranks)
+
+
+# ---- sensitivity -----------------------------------------------------------------------------------------------------
+
+
+def starts(step: int = 0) -> list[RolloutStart]:
+    batch = clips_batch(FEW)
+    return [start_of(batch, clip, step, clip) for clip in range(FEW)]
+
+
+def pool(
+    *, space: ActionSpace = POSE_CHANGE, reach: float = 0.075, samples: int = SAMPLES, seed: int = 0
+) -> ActionPool:
+    batch = clips_batch(FEW)
+    ids = tuple(name for name in batch.episode_ids for _ in range(TIME - 1))
+    return ActionPool(batch.actions.flatten(0, 1).double().numpy(), ids, space, reach, samples, seed)
+
+
+def test_energy_and_change_are_the_distances_of_the_world() -> None:
+    start = starts()[0]
+    true = start.action.double().numpy()
+    other = true + np.array([0.03, 0, 0, 0, 0, 0, 0])
+    tried = evaluate_actions(Oracle(), start, np.stack([true, other]), at_once=1)
+    assert tried.energy == pytest.approx([0.0, 3.0 / DIM], abs=1e-5), "3 cm in one of the numbers"
+    assert tried.change == pytest.approx([0.0, 3.0 / DIM], abs=1e-5)
+    half = evaluate_actions(Halfway(), start, np.stack([2 * true, other]), at_once=7)
+    assert half.energy[0] == pytest.approx(0.0, abs=1e-5)
+    assert half.change[1] == pytest.approx(1.5 / DIM, abs=1e-5)
+
+
+def test_ranks_are_counted_by_hand() -> None:
+    """A model that sees the third of what an action does prefers others that are larger: as many as are drawn there."""
+
+    class Third(Oracle):
+        def predict(self, latents, actions, states, extrinsics=None):  # type: ignore[no-untyped-def]
+            return super().predict(latents, actions / 3, states, extrinsics)
+
+    begun = starts()
+    found = measure_sensitivity(Third(), begun, pool(seed=4), at_once=16)
+    for number, start in enumerate(begun):
+        generator = start.generator(4)
+        drawn = [pool().of_others(start, generator), pool().in_box(start, generator)]
+        for ranking, others in zip(found.rankings, drawn, strict=True):
+            true = start.action[:DIM].double().numpy()
+            energies = np.abs(others[:, :DIM] / 3 - true).mean(axis=1)
+            if ranking is found.rankings[0]:  # what the box holds may be nothing that a robot does
+                changes = np.abs(others[:, :DIM] / 3 - true / 3).mean(axis=1) * 100
+                assert found.change_by_clip[number] * start.persistence == pytest.approx(changes.mean(), rel=1e-4)
+            assert ranking.rank[number] == pytest.approx((energies < np.abs(true / 3 - true).mean()).mean())
+    assert found.rankings[0].samples == SAMPLES
+    assert found.rankings[0].clips == tuple(range(FEW))
+
+
+def test_equal_energies_share_their_places() -> None:
+    found = measure_sensitivity(Copier(), starts(), pool(), at_once=16)
+    for ranking in found.rankings:
+        assert set(ranking.rank) == {0.5}
+        assert ranking.top[1].value == pytest.approx(1 / (SAMPLES + 1))
+        assert ranking.top[10].value == pytest.approx(10 / (SAMPLES + 1))
+
+
+def test_others_are_of_other_episodes_and_the_box_moves_only_the_hand() -> None:
+    start, drawing = starts()[0], pool(samples=500)
+    others = drawing.of_others(start, np.random.default_rng(0))
+    own = drawing.actions[np.array(drawing.episode_ids) == start.episode_id]
+    assert not (others[:, None] == own[None]).all(axis=2).any()
+    boxed = drawing.in_box(start, np.random.default_rng(0))
+    assert np.array_equal(boxed[:, 3:], np.tile(start.action[3:].double().numpy(), (500, 1)))
+    assert 0.07 < np.abs(boxed[:, :3]).max() <= 0.075
+    assert abs(boxed[:, :3].mean()) < 0.005
+    vectors = pool(space=vector_actions(7, "change"), samples=500).in_box(start, np.random.default_rng(0))
+    assert (np.abs(vectors).max(axis=0) <= np.abs(drawing.actions).max(axis=0)).all()
+    assert np.abs(vectors[:, 3:]).max() > 0.05
+
+
+def landscapes(model: Predictor, nodes: int = 7) -> Landscapes:
+    return measure_landscapes(model, starts(1), POSE_CHANGE, ProbeOptions(nodes=nodes, at_once=50))
+
+
+def test_the_minimum_of_an_analytic_energy_is_at_the_true_action() -> None:
+    found = landscapes(Oracle())
+    assert (found.unit, found.axis_names) == ("cm", ("dx", "dy", "dz"))
+    for one, start in zip(found.maps, starts(1), strict=True):
+        np.testing.assert_allclose(one.true, start.action[:3] * 100, rtol=1e-5)
+        np.testing.assert_allclose(one.minimum, one.true, rtol=1e-6)
+        assert one.energy.min() == pytest.approx(0.0, abs=1e-4)
+        assert one.distance == 0.0
+    assert found.distance.value == 0.0
+    assert found.chance_distance > 5.0
+    assert all(agreement.value == 1.0 for agreement, n in zip(found.sign_agreement, found.sign_clips, strict=True) if n)
+
+
+def test_the_energy_at_a_node_is_that_of_its_action() -> None:
+    one = landscapes(Oracle()).maps[0]
+    i, j, k = 2, 5, 1
+    tried = np.array([one.axes[0, i], one.axes[1, j], one.axes[2, k]])
+    assert one.energy[i, j, k] == pytest.approx(np.abs(tried - one.true).sum() / 6, rel=1e-4), "3 of 6 numbers differ"
+
+
+def test_a_mirrored_model_has_no_sign_right() -> None:
+    class Mirrored(Oracle):
+        def predict(self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
+            return super().predict(latents, -actions, states, extrinsics)
+
+    found = landscapes(Mirrored(), nodes=21)
+    assert all(agreement.value == 0.0 for agreement, n in zip(found.sign_agreement, found.sign_clips, strict=True) if n)
+    assert found.distance.value > 3.0
+
+
+def test_a_model_that_ignores_actions_agrees_as_often_as_chance_and_is_as_far_as_the_middle() -> None:
+    found = landscapes(Copier())
+    for agreement, chance, clips in zip(found.sign_agreement, found.sign_chance, found.sign_clips, strict=True):
+        if clips:
+            assert agreement.value == pytest.approx(chance)
+            assert 0.35 < chance < 0.65
+    assert found.distance.value > 1.0
+
+
+@pytest.mark.parametrize("true", [[0.0, 0.07, -0.07], [0.031, -0.002, 0.05]])
+def test_the_true_action_is_a_node_and_the_grid_spans_zero_whatever_it_is(true: list[float]) -> None:
+    axes = grid_axes(np.array(true), 0.075, 9)
+    assert axes.shape == (3, 9)
+    for value, axis in zip(true, axes, strict=True):
+        assert value in axis
+        np.testing.assert_allclose(np.diff(axis), 0.15 / 8)
+        assert abs(axis[0] + axis[-1]) / 2 <= 0.15 / 16 + 1e-12, "centred on zero to half a node"
+
+
+def test_clips_that_hardly_move_along_an_axis_have_no_sign_to_agree_with() -> None:
+    batch = clips_batch(FEW)
+    actions = batch.actions.clone()
+    actions[..., 2] = 0.0
+    still = clips_batch(FEW, actions=actions)
+    begun = [start_of(still, clip, 0, clip) for clip in range(FEW)]
+    found = measure_landscapes(Oracle(), begun, POSE_CHANGE, ProbeOptions(nodes=5, at_once=99))
+    assert found.sign_clips[2] == 0
+    assert np.isnan(found.sign_agreement[2].value)
