@@ -17,10 +17,9 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.config.planning import CemConfig, EnergyConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.planning.axes.mapping import Axes
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.energy import WorldModelCost
-from vjepa2_ac.planning.model_setup import Fingerprints
+from vjepa2_ac.planning.model_setup import Axes, Fingerprints
 from vjepa2_ac.planning.session import load_to_plan
 from vjepa2_ac.planning.state_integration import apply_actions
 from vjepa2_ac.runs.loading import load_run
@@ -113,7 +112,6 @@ def test_limits_hold_for_what_the_robot_executes(tmp_path: Path) -> None:
         ({"problem": "ill-conditioned: condition 30"}, "ill-conditioned: condition 30"),
         ({"format": 7}, "format 7"),
         ({"yaw_degrees": {"value": "north", "low": None, "high": None}}, r"yaw_degrees\.value"),
-        ({"matrix": [[1.0, 0.0]]}, "matrix"),
     ],
 )
 def test_a_file_that_nothing_can_be_planned_by_is_refused(tmp_path: Path, changes: dict, complaint: str) -> None:

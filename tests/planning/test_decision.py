@@ -28,7 +28,6 @@ def test_an_answer_is_what_the_controller_decides() -> None:
     controller = Controller(tiny_model(), QUICK, seed=5)
     controller.reset(image(100))
     np.testing.assert_array_equal(controller.act(image(0), STATE), found.actions[0])
-    assert found.decision.cost is not None
     assert found.doing_nothing == pytest.approx(float(found.decision.cost(torch.zeros(1, 2, 7))[0]))
     assert found.states.shape == (3, 7)
     assert len(found.slices) == 3
@@ -67,7 +66,6 @@ def test_the_file_holds_the_decision(tmp_path: Path) -> None:
     found = asked()
     file = read(found, tmp_path)
     plan = found.decision.plan
-    assert plan is not None
     assert file["format"] == 1
     assert file["model"] == {"subject": "a model"}
     assert (file["why"], file["seed"], file["crop"]) == ("planned", 5, "released")
@@ -75,7 +73,7 @@ def test_the_file_holds_the_decision(tmp_path: Path) -> None:
     np.testing.assert_allclose(file["states"], found.states)
     np.testing.assert_allclose(file["state"], STATE)
     assert file["energy"] == {
-        "now": found.decision.energy_now, "began": found.decision.began, "doing_nothing": found.doing_nothing,
+        "now": found.decision.energy_now, "began": found.decision.progress.began, "doing_nothing": found.doing_nothing,
         "plan": plan.energy,
     }  # fmt: skip
     assert [one["lowest"] for one in file["iterations"]] == [one.lowest for one in plan.iterations]
@@ -94,7 +92,6 @@ def test_words_say_how_far_it_goes_and_what_it_is_worth() -> None:
     words, way = summarize(found), (found.states[2] - found.states[0])[:3] * 100
     assert words.startswith(f"Goes {np.linalg.norm(way):.1f} cm in 2 model steps (dx {way[0]:+.1f}, dy {way[1]:+.1f}")
     plan = found.decision.plan
-    assert plan is not None
     assert f"Energy {found.decision.energy_now:.4f} now, {plan.energy:.4f} predicted" in words
     assert f"{found.doing_nothing:.4f} predicted when doing nothing" in words
     assert f"Planner cem, seed 5: {plan.evaluations} action sequences in 3 iterations" in words

@@ -11,8 +11,7 @@ from vjepa2_ac.episode import Widths
 from vjepa2_ac.geometry import apply_action
 from vjepa2_ac.model.network.predictor_network import KeyValueCache
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.planning.energy import Scene, WorldModelCost, distance
-from vjepa2_ac.planning.goals import Goal, patch_weights
+from vjepa2_ac.planning.energy import Goal, Scene, WorldModelCost, distance, patch_weights
 from vjepa2_ac.planning.planner import Planner
 from vjepa2_ac.spaces import Spaces
 
@@ -166,25 +165,6 @@ def test_the_goal_that_counts_depends_on_what_was_done() -> None:
         torch.testing.assert_close(found, expected)
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"durations": (1,)},
-        {"goals": 2, "durations": (0,)},
-        {"goals": 2},
-        {"goals": 0},
-        {"weights": torch.zeros(TOKENS)},
-        {"weights": -torch.ones(TOKENS)},
-        {"weights": torch.full((TOKENS,), torch.inf)},
-        {"weights": torch.full((TOKENS,), torch.nan)},
-        {"weights": torch.arange(TOKENS) - 1.0},
-    ],
-)
-def test_a_goal_that_cannot_be_is_refused(wrong) -> None:
-    with pytest.raises(ValueError, match=r"durations|weight"):
-        goal(**wrong)
-
-
 @pytest.mark.parametrize("context", [1, 3])
 def test_gradients_flow_to_the_actions_the_same_for_every_cut(context: int) -> None:
     model, found = tiny_model(), []
@@ -229,20 +209,10 @@ def test_planning_leaves_no_gradient_in_the_model() -> None:
     assert all(value.grad is None for value in model.parameters())
 
 
-def test_a_model_that_says_nothing_leads_to_no_motion() -> None:
-    model = tiny_model()
-    with torch.no_grad():
-        model.base_predictor.predictor_proj.weight.fill_(float("nan"))
-    plan = Planner(PlanningConfig(samples=8, cem={"elites": 2}, iterations=2)).plan(cost(model), torch.Generator())
-    assert plan.stopped == "no finite energy"
-    assert not plan.actions.any()
-
-
 def test_what_all_samples_share_keeps_no_graph_of_an_adapters_weights() -> None:
     model = tiny_model(adapted=True)
     assert any(value.requires_grad for value in model.parameters())
     shared = cost(model, context=3)._cache
-    assert shared is not None
     assert not any(piece.requires_grad for piece in shared.layer(0) + shared.layer(1))
 
 

@@ -15,8 +15,7 @@ from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.image_file import read_image
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.goal_folder import GOALS_FILE, GoalFolder, read_goal_folder
-from vjepa2_ac.planning.goals import SubGoal
+from vjepa2_ac.planning.goals import GOALS_FILE, GoalFolder, SubGoal, read_goal_folder
 from vjepa2_ac.planning.input_checks import require_image
 from vjepa2_ac.planning.session import PlanningSession
 from vjepa2_ac.serving.session import Session

@@ -95,7 +95,7 @@ class Recorder:
             return None  # it depends on the clock, or on decisions before it
         present = self._goals[decision.goal]
         ahead, durations = [present], []
-        left = number - decision.since
+        left = number - decision.progress.since
         for goal in self._goals[decision.goal + 1 :]:
             most = ahead[-1].at_most
             if most is None:

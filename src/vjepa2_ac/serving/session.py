@@ -18,7 +18,7 @@ from jaxtyping import Float
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.controller import Controller, Decision
 from vjepa2_ac.planning.goals import SubGoal
-from vjepa2_ac.planning.interfaces import SearchCancelledError
+from vjepa2_ac.planning.planner import SearchCancelledError
 from vjepa2_ac.serving.motion import waypoints, why_not_sent
 from vjepa2_ac.serving.recording import Recorder
 from vjepa2_ac.serving.request import IMAGE_KEYS, GivenGoal, NamedGoal, Request, read_request
@@ -189,8 +189,8 @@ class Session:
             "goal": {
                 "index": decision.goal,
                 "name": self._names[decision.goal],
-                "since": decision.since,
-                "changed": decision.changed,
+                "since": decision.progress.since,
+                "changed": decision.progress.changed,
             },
             "done": decision.done,
             "energy": {
