@@ -24,7 +24,7 @@ if TYPE_CHECKING:  # of other rooms, which the figure of one need not load
     from vjepa2_ac.demonstrations.make_goals import EnergyCourse, MadeGoals
     from vjepa2_ac.planning.energy import EnergySlice
     from vjepa2_ac.planning.goals import SubGoal
-    from vjepa2_ac.planning.interfaces import Plan
+    from vjepa2_ac.planning.planner import Plan
 
 PLAN_IMAGE, GOALS_IMAGE = "plan.png", "goals.png"
 
