@@ -178,7 +178,7 @@ def test_schema_documents_every_knob() -> None:
 def test_every_knob_is_read_somewhere() -> None:
     source = "\n".join(path.read_text() for path in (ROOT / "src").rglob("*.py"))
     read = {(owner.removeprefix("_"), name) for owner, name in re.findall(r"(\w+)(?=\.(\w+))", source)}
-    for key in all_keys():
+    for key in set(all_keys()) - {"plugins"}:  # these are read before the config is checked
         *sections, name = key.split(".")
         owners = ["config", "sizes", "knobs", "self", *sections[-1:]]
         assert any((owner, name) in read for owner in owners), f"nobody reads {key}"

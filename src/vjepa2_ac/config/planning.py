@@ -55,26 +55,22 @@ class LimitsConfig(Section):
         """
         if isinstance(self.xyz, tuple):
             return self.xyz
-        raise InputError(
-            where="planning.limits.xyz",
-            found="data, of a model or an older run, which does not say what it was taught",
-            needed="the largest dx, dy, dz in metres, such as planning.limits.xyz=[0.05,0.05,0.05]",
-            fix="`vjepa2-ac data inspect CONFIG` shows how far 99 % of the steps in your data go (line `axes`)",
-        )
+        found = "data, of a model or an older run, which does not say what it was taught"
+        needed = "the largest dx, dy, dz in metres, such as planning.limits.xyz=[0.05,0.05,0.05]"
+        fix = "`vjepa2-ac data inspect CONFIG` shows how far 99 % of the steps in your data go (line `axes`)"
+        raise InputError(where="planning.limits.xyz", found=found, needed=needed, fix=fix)
 
     @model_validator(mode="after")
     def _workspace_has_room(self) -> LimitsConfig:
-        if self.workspace is not None and any(low >= high for low, high in zip(*self.workspace, strict=True)):
-            low, high = self.workspace
-            raise ValueError(f"workspace: the corner {low} is not below {high} on every axis")
-        return self
+        low, high = self.workspace or ((0, 0, 0), (1, 1, 1))
+        is_broken = any(one >= other for one, other in zip(low, high, strict=True))
+        return self.refused((is_broken, f"workspace: the corner {low} is not below {high} on every axis"))
 
     @model_validator(mode="after")
     def _something_is_free(self) -> LimitsConfig:
         held = self.gripper_mode in {"held", "open", "close"} or not self.gripper
-        if not any(self.xyz) and not self.rotation and held:
-            raise ValueError("nothing is left to plan: xyz, rotation and gripper are all held")
-        return self
+        is_broken = not any(self.xyz) and not self.rotation and held
+        return self.refused((is_broken, "nothing is left to plan: xyz, rotation and gripper are all held"))
 
 
 class EnergyConfig(Section):
@@ -214,11 +210,6 @@ class PlanningConfig(Section):
     gradient: GradientConfig = GradientConfig()
     """Of planner gradient only."""
 
-    @model_validator(mode="after")
-    def _options_fit(self) -> PlanningConfig:
-        PLANNERS.options(self.planner, self.planner_options)
-        return self
-
     @property
     def sequences(self) -> tuple[int, ...]:
         """The action sequences that each iteration evaluates; without those that icem reuses."""
@@ -228,14 +219,11 @@ class PlanningConfig(Section):
 
     @model_validator(mode="after")
     def _numbers_fit(self) -> PlanningConfig:
-        if self.horizon % self.action_repeat:
-            raise ValueError(f"horizon {self.horizon} is not a multiple of action_repeat {self.action_repeat}")
-        if self.limits.gripper_from % self.action_repeat:
-            raise ValueError(
-                f"limits.gripper_from {self.limits.gripper_from} is not a multiple of action_repeat"
-                f" {self.action_repeat}"
-            )
+        PLANNERS.options(self.planner, self.planner_options)
         elites = {"cem": self.cem.elites, "icem": self.icem.elites}.get(self.planner, 0)
-        if elites > self.samples:
-            raise ValueError(f"{self.planner}.elites {elites} are more than {self.samples} samples")
-        return self
+        repeat, first = self.action_repeat, self.limits.gripper_from
+        return self.refused(
+            (self.horizon % repeat, f"horizon {self.horizon} is not a multiple of action_repeat {repeat}"),
+            (first % repeat, f"limits.gripper_from {first} is not a multiple of action_repeat {repeat}"),
+            (elites > self.samples, f"{self.planner}.elites {elites} are more than {self.samples} samples"),
+        )

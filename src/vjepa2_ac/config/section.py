@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from enum import Flag, auto
 from functools import cache, reduce
 from operator import or_
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any, Self, get_args
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 from pydantic.fields import FieldInfo
@@ -37,6 +37,17 @@ class Section(BaseModel):
     model_config = ConfigDict(
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
     )
+
+    def refused(self, *rules: tuple[object, str]) -> Self:
+        """Return the section, for a validator; each rule says when it is broken, and what is wrong then.
+
+        Raises:
+            ValueError: With what is wrong by the first rule that is broken.
+        """
+        for is_broken, why in rules:
+            if is_broken:
+                raise ValueError(why)
+        return self
 
 
 class Affects(Flag):

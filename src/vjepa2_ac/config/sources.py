@@ -90,9 +90,8 @@ class LeRobotFields(Section):
 
     @model_validator(mode="after")
     def _gripper_moves(self) -> LeRobotFields:
-        if self.gripper_open == self.gripper_closed:
-            raise ValueError("gripper_open and gripper_closed are the same number")
-        return self
+        is_broken = self.gripper_open == self.gripper_closed
+        return self.refused((is_broken, "gripper_open and gripper_closed are the same number"))
 
 
 class RldsData(DataConfig):
@@ -156,12 +155,8 @@ class LeRobotData(DataConfig):
     @property
     def own_knobs_of_poses(self) -> list[str]:
         """Conventions of rotation and gripper."""
-        gripper = (self.lerobot.gripper_open, self.lerobot.gripper_closed)
-        asked = {
-            "lerobot.rotation": self.lerobot.rotation != "euler_xyz",
-            "lerobot.gripper_open and gripper_closed": gripper != (0, 1),
-        }
-        return [name for name, is_asked in asked.items() if is_asked]
+        turned, gripper = self.lerobot.rotation != "euler_xyz", (self.lerobot.gripper_open, self.lerobot.gripper_closed)
+        return ["lerobot.rotation"] * turned + ["lerobot.gripper_open and gripper_closed"] * (gripper != (0, 1))
 
 
 class NpzData(DataConfig):
