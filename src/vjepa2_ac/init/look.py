@@ -11,8 +11,7 @@ import numpy as np
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.config.loading import config_from
-from vjepa2_ac.config.plugins import admit_forms_of_data
+from vjepa2_ac.config.loading import admit_forms_of_data, config_from
 from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.data.sources.droid_raw.episode_folders import find_episodes
 from vjepa2_ac.data.sources.lerobot.info import INFO

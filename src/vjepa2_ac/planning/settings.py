@@ -13,7 +13,7 @@ from typing import Annotated
 from pydantic import Field
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.config.loading import config_from, load_config_of_run
+from vjepa2_ac.config.loading import config_from, load_config
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.config.section import Affects, mark_of, names_that_affect
 from vjepa2_ac.errors import InputError
@@ -49,13 +49,15 @@ def planning_settings(
             found, fix = f"{subject}, a run, which has a config of its own", "Change single settings by key=value"
             raise InputError(where=f"--config {config}", found=found, fix=fix)
         folder = Path(subject)
-        its = load_config_of_run(folder / CONFIG, [*overrides, f"run_dir={json.dumps(literal(folder))}", _ANY_TYPE])
+        its = load_config(
+            folder / CONFIG, [*overrides, f"run_dir={json.dumps(literal(folder))}", _ANY_TYPE], of_run=True
+        )
         its = with_taught_limits(its, folder)
     elif config is None:
         plain = {"run_dir": "none", "data": {"path": "none"}, "model": {"base": subject, "dtype": dtype}}
         its = config_from(plain, overrides, where="overrides")
     else:
-        its = load_config_of_run(Path(config), [*overrides, _ANY_TYPE])
+        its = load_config(config, [*overrides, _ANY_TYPE], of_run=True)
         its = its.model_copy(update={"model": its.model.with_base(subject)})
     require_limits(its)
     require_axes(its)
