@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from adapted_run import write_adapted_run
+from decisions import STATE, image
 from tiny_models import actions, goal, scene, tiny_model
 from vjepa2_ac.calibration.axes import TRIED_DEGREES, fit_axes
 from vjepa2_ac.config import Config
@@ -27,7 +28,6 @@ from vjepa2_ac.spaces import CAMERA_POSE, POSE_CHANGE, Spaces
 
 TURN = Axes(math.radians(43.0))
 QUICK = PlanningConfig(samples=24, iterations=3, horizon=2, cem=CemConfig(elites=4))
-STATE = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2])
 
 
 def some(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -51,10 +51,6 @@ def write(path: Path, model: WorldModel, degrees: float = 43.0, **changes: Any) 
 
 def controller(model: WorldModel, **changes: Any) -> Controller:
     return Controller(model, QUICK.model_copy(update=changes))
-
-
-def image(seed: int) -> np.ndarray:
-    return np.random.default_rng(seed).integers(0, 256, (60, 48, 3), dtype=np.uint8)
 
 
 def test_turned_states_follow_from_turned_actions() -> None:

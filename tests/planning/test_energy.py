@@ -9,7 +9,6 @@ from tiny_models import DIM, TOKENS, actions, cost, draw, goal, scene, tiny_mode
 from vjepa2_ac.config.planning import EnergyConfig, GradientConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.geometry import apply_action
-from vjepa2_ac.model.network.predictor_network import KeyValueCache
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.energy import Goal, Scene, WorldModelCost, distance, patch_weights
 from vjepa2_ac.planning.planner import Planner
@@ -219,21 +218,3 @@ def test_what_all_samples_share_keeps_no_graph_of_an_adapters_weights() -> None:
 def test_a_model_in_training_mode_is_refused() -> None:
     with pytest.raises(ValueError, match="eval"):
         cost(tiny_model(adapted=True).train())
-
-
-@torch.no_grad()
-def test_what_a_patch_knows_depends_on_the_action_beside_it_from_the_second_layer_on() -> None:
-    """So keys and values of the present frame cannot be shared over samples, but those of earlier frames can."""
-    model, start, tried = tiny_model(), scene(2), actions(2, 1)
-    found, layers = [], model.base_predictor.config.num_hidden_layers
-    for action in tried:
-        cache = KeyValueCache()
-        given = torch.cat([start.actions, action])[None]
-        model.predict(start.latents[None], given, start.states[None], cache=cache)
-        found.append([cache.layer(layer)[0][:, 0] for layer in range(layers)])
-    (first, second), (other_first, other_second) = found
-    for one, other in ((first, other_first), (second, other_second)):
-        past, present = one.tensor_split([TOKENS + 2], dim=2)
-        other_past, other_present = other.tensor_split([TOKENS + 2], dim=2)
-        assert torch.equal(past, other_past)
-        assert torch.equal(present[:, :, 2:], other_present[:, :, 2:]) == (one is first)

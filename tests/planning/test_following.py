@@ -73,20 +73,6 @@ def test_an_equal_image_is_the_goal_without_any_rule() -> None:
     assert decided(run, image(101)) == (1, 1, True, True)
 
 
-def test_a_mask_decides_which_energies_count() -> None:
-    mask = np.zeros((60, 48), bool)
-    mask[:, :16] = True
-    seen = image(0)
-    seen[:, :24] = image(100)[:, :24]  # near the goal where it counts
-    found = []
-    for counted in (None, mask):
-        run = controller()
-        run.follow([SubGoal(image(100), at_most=9, share=0.3), SubGoal(image(101))], mask=counted)
-        run.act(image(0), STATE)
-        found.append(decided(run, seen)[0])
-    assert found == [0, 1]
-
-
 def test_each_goal_has_its_own_gripper_mode() -> None:
     run = controller(gripper_start_std=2.0)
     modes: list[GripperMode] = ["close", "held", "open"]

@@ -68,22 +68,6 @@ def test_a_goal_that_gave_way_early_was_below_its_share(course: tuple) -> None:
             assert after.done == reached
 
 
-@given(courses(), st.floats(0.01, 100.0))
-def test_only_relative_energies_count(course: tuple, factor: float) -> None:
-    rules, energies = course
-    if any(0 < one < 1e-3 for row in energies for one in row):  # near the energy of an equal image
-        return
-    scaled = [[one * factor for one in row] for row in energies]
-    plain, other = progress_over(rules, energies), progress_over(rules, scaled)
-    close = any(
-        goal.share is not None and abs(row[place] - goal.share * one.began) < 1e-9
-        for one in plain
-        for row in energies
-        for place, goal in enumerate(rules)
-    )
-    assert close or [one.place for one in plain] == [one.place for one in other]
-
-
 def test_the_next_goal_begins_with_its_own_first_energy() -> None:
     rules = [rule("grasp", 1, 9, 0.5), rule(share=0.5)]
     found = progress_over(rules, [[1.0, 5.0], [0.6, 4.0], [0.4, 3.0], [9.0, 2.0], [9.0, 1.4], [9.0, 9.0]])

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from adapted_run import write_adapted_run
+from decisions import STATE, image
 from vjepa2_ac.config.loading import config_as_dict, config_as_yaml
 from vjepa2_ac.data.sources.registry import open_source
 from vjepa2_ac.episode import Episode
@@ -21,7 +22,6 @@ from vjepa2_ac.runs.loading import load_run
 from vjepa2_ac.training.loop import train
 
 PLANNING = {"horizon": 2, "samples": 12, "iterations": 2, "cem": {"elites": 4}}
-STATE = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2])
 
 
 @pytest.fixture
@@ -124,10 +124,6 @@ VECTORS = {
     "adapter__modules_to_save": ["state_encoder", "action_encoder"],
     "planning": {"samples": 8, "iterations": 2, "cem": {"elites": 3}, "horizon": 2},
 }
-
-
-def image(seed: int) -> np.ndarray:
-    return np.random.default_rng(seed).integers(0, 255, (36, 64, 3), dtype=np.uint8)
 
 
 def test_a_run_of_vectors_plans_within_what_it_was_taught(make_config, reporter) -> None:

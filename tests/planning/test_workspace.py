@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from decisions import image
 from tiny_models import tiny_model
 from vjepa2_ac.config.planning import CemConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.errors import InputError
@@ -27,10 +28,6 @@ def limits_of(ball: str = "none") -> LimitsConfig:
 
 def box() -> Workspace:
     return Workspace.of(limits_of(), POSE)
-
-
-def image(seed: int) -> np.ndarray:
-    return np.random.default_rng(seed).integers(0, 256, (48, 48, 3), dtype=np.uint8)
 
 
 def position(*numbers: float) -> np.ndarray:

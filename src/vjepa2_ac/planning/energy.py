@@ -270,14 +270,9 @@ def energy_slices(
         actions: The plan.
         space: Its limits say how far the slices reach.
         axes: The numbers.
-        nodes: Along each axis.
+        nodes: Along each axis, three or more.
         progress: Called with the number of evaluated action sequences.
-
-    Raises:
-        ValueError: Fewer than three nodes.
     """
-    if nodes < 3:
-        raise ValueError(f"{nodes} nodes")
     total, slices = sequences_of_slices(nodes, len(axes)), []
     progress(0, total)
     for number, pair in enumerate(combinations(axes, 2)):

@@ -177,11 +177,9 @@ class Planner:
 
         Raises:
             SearchCancelledError: It was cancelled.
-            ValueError: The cost does not return one number per sample, or `start` is of another shape.
+            ValueError: The cost does not return one number per sample.
         """
         began, config, space = self.clock(), self.config, space or self.space
-        if start is not None and start.mean.shape != space.lower.shape:
-            raise ValueError(f"a start of {tuple(start.mean.shape)} for {tuple(space.lower.shape)} decisions")
         options = PLANNERS.options(config.planner, config.planner_options)
         search: Solver = PLANNERS.find(config.planner)(space, config, generator, start, **options)
         record: list[Iteration] = []

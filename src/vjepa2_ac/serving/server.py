@@ -204,11 +204,11 @@ class PlanningServer:
     def collect(self) -> Iterator[Any]:
         """Yield the metrics that are read when the page is made: Prometheus' collector."""
         families, counts = self._metrics.metrics_core, self._counts
-        for name, about, value in (
+        for name, about, holds in (
             ("ready", "1 once requests are answered.", self._ready.is_set()),
             ("robots", "Robots that are connected.", self._robot is not None),
         ):
-            yield families.GaugeMetricFamily(f"vjepa2_ac_{name}", about, value=float(value))
+            yield families.GaugeMetricFamily(f"vjepa2_ac_{name}", about, value=float(holds))
         for name, about, number in (
             ("requests_refused", "Requests that could not be used.", counts.refused),
             ("requests_failed", "Requests at which the server failed.", counts.failed),
