@@ -11,7 +11,7 @@ from same_run import assert_same_run
 from synthetic import write_synthetic_droid
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict, config_as_yaml, parse_config
-from vjepa2_ac.config.section import Affects, knobs_that_affect, marks_of, names_that_affect
+from vjepa2_ac.config.section import Affects, knobs_that_affect, marks_of
 from vjepa2_ac.data import loader
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.loader import Mixed, ProcessShare, training_loader
@@ -226,5 +226,5 @@ def test_replay_is_part_of_what_decides_a_run_and_of_nothing_else(replaying, mak
             assert (mark == Affects.RUN) == (Affects.RUN in marks_of(Config)[key.removeprefix("replay.")]), key
     for what in (Affects.PLAN, Affects.MEASURED, Affects.LATENTS, Affects.INDEX):
         assert "replay" not in knobs_that_affect(what, config)
-        assert not [name for name in names_that_affect(what, Config) if name.startswith("replay")]
+        assert not [key for key, mark in marks_of(Config).items() if what in mark and key.startswith("replay")]
     assert knobs_that_affect(Affects.LATENTS, config.for_replay().data)["frames"] == 4

@@ -51,8 +51,7 @@ class IdleConfig(Section):
     """none: keep all. published: ranges from a file. commands: openpi's rule on commanded joint velocities. motion: the
     same runs, found in the measured poses, for data sets without joint velocities."""
     ranges: Place | None = None
-    """For published: a JSON file, local or a URL, of {"recording_folderpath--file_path": [[start, end), ...]}. Episodes
-    that it does not name count as idle."""
+    """For published: a JSON file or URL of {"recording_folderpath--file_path": [[start, end), ...]}; others: idle."""
     velocity_change_rad_s: Positive = 1e-3
     """For commands: a step is idle if no commanded joint velocity changes by this much."""
     translation_m: Positive = 1e-3
@@ -144,8 +143,7 @@ class DataConfig(Section):
     """Kind of state. pose: 7 numbers, position, rotation and gripper, which the released weights know. vector: the
     source's own numbers, unchanged, of any width, for other robots: two arms, joints, a mobile base."""
     actions: Annotated[Literal["difference", "recorded"], Affects.INDEX | Affects.CLIPS] = "difference"
-    """difference: the change from a state to the next one; of vectors, the plain difference. recorded: the commands in
-    the source, of any width; for vectors only."""
+    """difference: the change from a state to the next. recorded: the source's commands, of any width; for vectors."""
     join_actions: Annotated[Literal["sum", "mean", "last"] | None, Affects.MEASURED | Affects.RUN] = None
     """How the recorded commands of a model step's control steps become one action. sum: deltas. mean: velocities. last:
     absolute targets. Must be given unless `stride` is 1."""
@@ -158,11 +156,9 @@ class DataConfig(Section):
     """Clips start at multiples of this many control steps, counted from the first step of their episode that
     `data.idle` keeps. With the stride's own number, only every stride-th frame is ever needed: a small latent cache."""
     stride_candidates: Annotated[Annotated[tuple[PositiveInt, ...], Field(min_length=1)] | None, Affects.RUN] = None
-    """Strides that `auto` and `data calibrate` evaluate; null: 4, 8, 15 at 15 control steps per second, scaled to
-    others."""
+    """Strides that `auto` and `data calibrate` evaluate; null: 4, 8, 15 at 15 control steps per second, or scaled."""
     validation_share: Annotated[Share, Affects.RUN] = 0.05
-    """Share of the episodes held out for validation, chosen by a hash of the episode's identity; at least one of three
-    or more, unless this is 0."""
+    """Share of the episodes held out for validation, by a hash of their identity; at least one of three, unless 0."""
     test_share: Annotated[Share, Affects.RUN] = 0.05
     """Share of the episodes held out for `evaluate`, likewise; never seen in training nor in validation."""
     split_by: Annotated[Annotated[str, Field(max_length=500), AfterValidator(_split_by)] | None, Affects.RUN] = None

@@ -28,9 +28,8 @@ class LimitsConfig(Section):
     radius: Positive = 0.05
     """Of the ball, in metres."""
     workspace: tuple[Corner, Corner] | None = None
-    """Corners (lowest and highest x, y, z, in metres, base frame) of the box in which every target of the flange lies.
-    An action that would leave it is cut; a robot that is outside by more than one step does not move. Of poses in the
-    base frame."""
+    """Corners (lowest and highest x, y, z, in metres) of the box in which every target of the flange lies: an action is
+    cut; a robot that is outside by more than one step does not move. Of poses in the base frame."""
     rotation: Annotated[float, Field(ge=0.0, le=math.pi)] = 0.0
     """Largest turn about each axis, in radians; 0: the rotation is held, as upstream does."""
     axes: Literal["data"] | Annotated[tuple[NonNegative, ...], Field(min_length=1)] = "data"
@@ -145,8 +144,7 @@ class MppiConfig(Section):
     """Model predictive path integral control."""
 
     temperature: Positive = 0.1
-    """Of the weights exp(-energy / temperature), in standard deviations of the samples' energies, hence without a
-    unit."""
+    """Of the weights exp(-energy / temperature), in standard deviations of the samples' energies."""
     std_decay: Annotated[float, Field(gt=0.0, le=1.0)] = 0.8
     """Factor of the standard deviation after each iteration; 1: constant."""
 
@@ -155,8 +153,7 @@ class GradientConfig(Section):
     """Gradient descent through the model."""
 
     starts: PositiveInt = 8
-    """Sequences that are optimised at once: the first from the previous plan (or no motion), the others from random
-    ones."""
+    """Sequences that are optimised at once: the first from the previous plan (or none), the others from random ones."""
     learning_rate: Positive = 0.1
     """Of Adam at the first iteration, as a share of the limits; it decays linearly to zero."""
 
@@ -171,8 +168,7 @@ class PlanningConfig(Section):
     horizon: PositiveInt = 1
     """Model steps that a plan spans."""
     action_repeat: PositiveInt = 1
-    """Model steps for which one action is repeated; the horizon is a multiple of it. A controller still decides anew at
-    each of them."""
+    """Model steps for which a plan repeats an action; the horizon is a multiple of it. Each step is decided anew."""
     samples: Annotated[int, Field(ge=2)] = 800
     """Action sequences an iteration; gradient has `gradient.starts`."""
     iterations: PositiveInt = 10

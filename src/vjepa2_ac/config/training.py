@@ -74,8 +74,7 @@ class TrainingConfig(Section):
     max_grad_norm: Positive | None = 1.0
     """Gradients are clipped to this norm; null: never (the released recipe)."""
     precision: Annotated[Literal["bf16", "fp16", "fp32"], Affects.LATENTS | Affects.RUN] = "bf16"
-    """Arithmetic of the networks (autocast). bf16 needs compute capability 8.0 on CUDA (Ampere). fp16 scales the loss,
-    and needs CUDA."""
+    """Arithmetic of the networks (autocast). bf16 needs compute capability 8.0 on CUDA; fp16 needs CUDA, too."""
     gradient_checkpointing: bool = False
     """Compute each predictor block again in the backward pass instead of keeping its activations."""
     compile: Annotated[Literal["off", "blocks"], OFF] = "off"
@@ -145,8 +144,7 @@ class CheckpointConfig(Section):
     rollout error over persistence at the last horizon. off: the newest counts."""
     remote: Place | None = None
     """Where the run is copied to during training: gs://bucket/folder, another URL of fsspec that can be written, or a
-    folder (a mounted disk). A start with an empty run_dir resumes from there; null: nowhere. Same keep and best as
-    here."""
+    folder. A start with an empty run_dir resumes from there; null: nowhere. Same keep and best as here."""
     remote_every_minutes: NonNegative = 30.0
     """Minutes between uploads to remote; there is also one at the end and on preemption."""
     remote_wait_seconds: NonNegative = 120.0

@@ -116,12 +116,9 @@ class Controller:
         _require_spaces(world_model, spaces)
         if extrinsics is not None:
             require_numbers(extrinsics, EXTRINSICS, where="extrinsics")
-        if world_model.sizes.predictor.use_extrinsics != (extrinsics is not None):
-            raise InputError(
-                where="model: predictor.use_extrinsics",
-                found=f"{world_model.sizes.predictor.use_extrinsics}, camera pose given: {extrinsics is not None}",
-                needed="a camera pose exactly where the model uses it",
-            )
+        if (uses := world_model.sizes.predictor.use_extrinsics) != (extrinsics is not None):
+            found, needed = f"{uses}, camera pose given: {not uses}", "a camera pose exactly where the model uses it"
+            raise InputError(where="model: predictor.use_extrinsics", found=found, needed=needed)
         self.config = config or PlanningConfig()
         self._model, self.seed, self.crop = prepare_for_planning(world_model, self.config), seed, crop
         self._camera = None if extrinsics is None else torch.from_numpy(extrinsics.astype(np.float32))
@@ -337,7 +334,7 @@ class Controller:
         where, fix = f"gripper mode {gripper!r} of a goal", "Leave the goal's gripper mode out"
         if not self.spaces.state.is_pose:
             found = "a model whose states are vectors, in which no number is known to be the gripper"
-            raise InputError(where=where, found=found, needed="a pose and gripper", fix=fix)
+            raise InputError(where=where, found=found, fix=fix)
         limits = self.config.limits.model_copy(update={"gripper_mode": gripper})
         space = search_space(self.config.model_copy(update={"limits": limits}), self.spaces.state)
         if not len(space.free):
@@ -376,15 +373,9 @@ class Controller:
 
 def _require_spaces(model: WorldModel, spaces: Spaces) -> None:
     if heads_to_replace(model.sizes, spaces.widths):
-        raise InputError(
-            where="model",
-            found=widths_as_text(model.sizes),
-            needed=f"{spaces.widths.state} and {spaces.widths.action}, as the spaces say",
-            fix="Give the spaces of the data that it was trained on",
-        )
+        needed = f"{spaces.widths.state} and {spaces.widths.action}, as the spaces of the data that it was trained on"
+        raise InputError(where="model", found=widths_as_text(model.sizes), needed=needed)
     if spaces.action.follows == "unknown":
-        raise InputError(
-            where="data.actions: recorded",
-            found="commands of which nobody knows what they do to the state",
-            fix="To plan, train with data.actions: difference, or with join_actions: sum or last",
-        )
+        found = "commands of which nobody knows what they do to the state"
+        fix = "To plan, train with data.actions: difference, or with join_actions: sum or last"
+        raise InputError(where="data.actions: recorded", found=found, fix=fix)

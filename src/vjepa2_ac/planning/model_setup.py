@@ -82,11 +82,9 @@ class Axes:
         """
         axes = read_axes(path)
         if (axes.model.encoder, axes.model.predictor) != (known.encoder, known.predictor):
-            raise InputError(
-                where=f"planning.axes: {path}",
-                found=f"axes that were fitted for another model, {axes.model.subject}",
-                fix="Fit them anew: `vjepa2-ac data calibrate CONFIG --axes MODEL`",
-            )
+            found = f"axes that were fitted for another model, {axes.model.subject}"
+            fix = "Fit them anew: `vjepa2-ac data calibrate CONFIG --axes MODEL`"
+            raise InputError(where=f"planning.axes: {path}", found=found, fix=fix)
         return cls(math.radians(axes.yaw_degrees.value), axes.centre_m)
 
     def poses(self, poses: Float[Tensor, "*batch numbers"]) -> Float[Tensor, "*batch numbers"]:

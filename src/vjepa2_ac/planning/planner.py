@@ -134,6 +134,7 @@ def _later(
     return reduce(at_steps, "samples (decisions repeat) dim -> samples decisions dim", "mean", repeat=repeat)
 
 
+@dataclass
 class Planner:
     """Searches the action sequence of lowest cost, and knows nothing else about the model.
 
@@ -147,16 +148,10 @@ class Planner:
             cost reports, and after each iteration.
     """
 
-    def __init__(
-        self,
-        config: PlanningConfig,
-        space: SearchSpace | None = None,
-        clock: Clock = time.perf_counter,
-        progress: Progress = no_progress,
-    ) -> None:
-        self.config = config
-        self.space = pose_space(config) if space is None else space
-        self.clock, self.progress = clock, progress
+    config: PlanningConfig
+    space: SearchSpace | None = None
+    clock: Clock = time.perf_counter
+    progress: Progress = no_progress
 
     def plan(
         self,
@@ -179,7 +174,7 @@ class Planner:
             SearchCancelledError: It was cancelled.
             ValueError: The cost does not return one number per sample.
         """
-        began, config, space = self.clock(), self.config, space or self.space
+        began, config, space = self.clock(), self.config, space or self.space or pose_space(self.config)
         options = PLANNERS.options(config.planner, config.planner_options)
         search: Solver = PLANNERS.find(config.planner)(space, config, generator, start, **options)
         record: list[Iteration] = []

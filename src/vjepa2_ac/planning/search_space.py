@@ -106,12 +106,9 @@ def search_space(config: PlanningConfig, space: StateSpace) -> SearchSpace:
         return pose_space(config)
     limits, width = config.limits.axes, len(space)
     if not isinstance(limits, tuple) or len(limits) not in {1, width}:
-        raise InputError(
-            where="planning.limits.axes",
-            found="data, of a model that does not say what it was taught" if limits == "data" else f"{limits}",
-            needed=f"the largest change of each of the {width} numbers in a model step; or one number for all",
-            fix="Such as planning.limits.axes=[0.05]; a run keeps what it was taught, and then data means that",
-        )
+        found = "data, of a model that does not say what it was taught" if limits == "data" else f"{limits}"
+        needed = f"the largest change of each of the {width} numbers in a model step, or one for all, such as [0.05]"
+        raise InputError(where="planning.limits.axes", found=found, needed=needed)
     upper = _towards_zero(list(limits) * (width // len(limits))).repeat(config.horizon // config.action_repeat, 1)
     return SearchSpace(-upper, upper, config.start_std * upper, config.action_repeat)
 

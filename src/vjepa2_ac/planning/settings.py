@@ -15,7 +15,7 @@ from pydantic import Field
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_from, load_config
 from vjepa2_ac.config.planning import LimitsConfig
-from vjepa2_ac.config.section import Affects, mark_of, names_that_affect
+from vjepa2_ac.config.section import Affects, mark_of
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.places import literal
 from vjepa2_ac.planning.axes import require_axes
@@ -25,6 +25,7 @@ from vjepa2_ac.storage.structured import read_json_object, record_of
 
 logger = logging.getLogger(__name__)
 
+USED = ("planning.…", "seed", "data.stride", "data.crop", "model.sizes.…", "model.dtype", "training.device")
 _ANY_TYPE = "training.precision=bf16"  # of autocast, which planning does without: weights may be of any type beside it
 _SLACK = 1.1  # uniform motion has its 99th percentile below its limit, and that of some episodes is not exact
 
@@ -71,8 +72,8 @@ def _require_relevant(overrides: Sequence[str]) -> None:
         except KeyError:  # the config says what is wrong
             continue
         if not is_relevant:
-            needed = f"one of {', '.join(names_that_affect(Affects.PLAN, Config))}"
-            raise InputError(where=f"override {override}", found="a setting that planning does not use", needed=needed)
+            found = "a setting that planning does not use"
+            raise InputError(where=f"override {override}", found=found, needed=f"one of {', '.join(USED)}")
 
 
 def require_limits(config: Config) -> None:
