@@ -18,7 +18,7 @@ def rule(*given: object, **named: object) -> SubGoal:
 
 def progress_over(rules: Sequence[SubGoal], energies: Sequence[Sequence[float]]) -> list[GoalProgress]:
     """Return the progress at each decision, from the energy of each image to each goal."""
-    found = [GoalProgress.first(energies[0].__getitem__)]
+    found = [GoalProgress(0, 0, energies[0][0])]
     for step, row in enumerate(energies[1:], start=1):
         found.append(found[-1].after(rules, step, row.__getitem__))
     return found

@@ -44,8 +44,8 @@ def load_config(
         >>> config = load_config({"run_dir": "run", "data": {"path": "data"}, "model": {"base": "builtin:sim-tiny"}})
     """
     if isinstance(config, Mapping):
-        return config_from(config, overrides, where="load_config")
-    return parse_config(_overridden(_read_yaml(config_path(config)), overrides), where=str(config), here=not of_run)
+        return parse_config(config, overrides, where="load_config")
+    return parse_config(_read_yaml(config_path(config)), overrides, where=str(config), here=not of_run)
 
 
 def packaged_configs() -> dict[str, str]:
@@ -68,28 +68,26 @@ def config_path(name: str | Path) -> Path:
     return _PACKAGED / f"{known}.yaml"
 
 
-def config_from(values: Mapping[str, Any], overrides: Iterable[str] = (), *, where: str) -> Config:
-    """Return a config of plain values with `key.sub=value` overrides, without a file.
-
-    Raises:
-        InputError: Names every key that is wrong.
-    """
-    return parse_config(_overridden(json.loads(_as_json(values, where)), overrides), where=where)
-
-
-def parse_config(values: Mapping[str, Any], *, where: str, here: bool = True) -> Config:
-    """Validate plain values, as YAML or JSON gives them.
+def parse_config(values: Mapping[str, Any], overrides: Iterable[str] = (), *, where: str, here: bool = True) -> Config:
+    """Validate plain values, as YAML or JSON gives them, with `key.sub=value` overrides.
 
     Args:
-        values: The values.
+        values: The values; a Path is text.
+        overrides: Such as training.steps=100.
         where: Their file, for messages.
         here: Whether plug-ins may lie in the working directory: not those of a run, which may be a stranger's.
 
     Raises:
         InputError: Names every key that is wrong, all at once.
     """
+    given = json.loads(_as_json(values, where))
+    for override in overrides:
+        key, separator, text = override.partition("=")
+        if not separator or not key:
+            raise InputError(where="overrides", found=f"{override!r}", needed="key=value, such as training.steps=100")
+        _set(given, key.split("."), parse_yaml(text, where=f"override {key}"), override)
     try:
-        return Config.model_validate_json(_as_json(with_plugins(values, where=where, here=here), where))
+        return Config.model_validate_json(_as_json(with_plugins(given, where=where, here=here), where))
     except ValidationError as error:
         lines = _wrong_values(error)
     found = "\n  ".join([f"{len(lines)} value{'s are' if len(lines) > 1 else ' is'} wrong", *lines]) + "\n"
@@ -166,15 +164,6 @@ def _as_json(values: Mapping[str, Any], where: str) -> str:
         return json.dumps(dict(values), default=os.fspath)
     except (TypeError, ValueError) as error:
         raise InputError(where=where, found=f"a value that a config cannot hold ({error})") from None
-
-
-def _overridden(values: dict[str, Any], overrides: Iterable[str]) -> dict[str, Any]:
-    for override in overrides:
-        key, separator, text = override.partition("=")
-        if not separator or not key:
-            raise InputError(where="overrides", found=f"{override!r}", needed="key=value, such as training.steps=100")
-        _set(values, key.split("."), parse_yaml(text, where=f"override {key}"), override)
-    return values
 
 
 def _set(values: dict[str, Any], keys: list[str], value: Any, override: str) -> None:

@@ -279,7 +279,7 @@ class Controller:
             return float(distance(latents, goal.latents[place], self.config.energy, goal.weights))
 
         if self.decision is None:
-            return GoalProgress.first(energy)
+            return GoalProgress(0, 0, energy(0))
         return self.decision.progress.after(goal.goals, self._done, energy)
 
     def _decided(self, goals: _Goals, seen: Sequence[Seen], cancelled: Cancelled) -> Decision:

@@ -118,15 +118,6 @@ class GoalProgress:
     changed: str = ""  # why it is another one than before, or why the last one is reached; empty: nothing changed
     done: bool = False  # the last goal is reached; it stays so
 
-    @classmethod
-    def first(cls, energy: Callable[[int], float]) -> GoalProgress:
-        """Return the progress at the first decision.
-
-        Args:
-            energy: Of the current image to the goal of an index.
-        """
-        return cls(0, 0, energy(0))
-
     def after(self, goals: Sequence[SubGoal], step: int, energy: Callable[[int], float]) -> GoalProgress:
         """Return the progress at a later decision: the same goal, or the next one.
 

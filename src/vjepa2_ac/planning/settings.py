@@ -13,7 +13,7 @@ from typing import Annotated
 from pydantic import Field
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.config.loading import config_from, load_config
+from vjepa2_ac.config.loading import load_config, parse_config
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.config.section import Affects, mark_of
 from vjepa2_ac.errors import InputError
@@ -56,7 +56,7 @@ def planning_settings(
         its = with_taught_limits(its, folder)
     elif config is None:
         plain = {"run_dir": "none", "data": {"path": "none"}, "model": {"base": subject, "dtype": dtype}}
-        its = config_from(plain, overrides, where="overrides")
+        its = parse_config(plain, overrides, where="overrides")
     else:
         its = load_config(config, [*overrides, _ANY_TYPE], of_run=True)
         its = its.model_copy(update={"model": its.model.with_base(subject)})

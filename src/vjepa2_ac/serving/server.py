@@ -204,25 +204,20 @@ class PlanningServer:
     def collect(self) -> Iterator[Any]:
         """Yield the metrics that are read when the page is made: Prometheus' collector."""
         families, counts = self._metrics.metrics_core, self._counts
-        for name, about, holds in (
-            ("ready", "1 once requests are answered.", self._ready.is_set()),
-            ("robots", "Robots that are connected.", self._robot is not None),
+        robots, gauge, counter = int(self._robot is not None), families.GaugeMetricFamily, families.CounterMetricFamily
+        for family, name, about, label, values in (
+            (gauge, "ready", "1 once requests are answered.", "", {"": int(self._ready.is_set())}),
+            (gauge, "robots", "Robots that are connected.", "", {"": robots}),
+            (counter, "requests_refused", "Requests that could not be used.", "", {"": counts.refused}),
+            (counter, "requests_failed", "Requests at which the server failed.", "", {"": counts.failed}),
+            (counter, "episodes", "Episodes that were begun.", "", {"": counts.episodes}),
+            (counter, "decisions", "Decisions, by their reason.", "why", counts.decisions),
+            (counter, "connections_refused", "Connections, by HTTP status.", "status", self._turned_away),
         ):
-            yield families.GaugeMetricFamily(f"vjepa2_ac_{name}", about, value=float(holds))
-        for name, about, number in (
-            ("requests_refused", "Requests that could not be used.", counts.refused),
-            ("requests_failed", "Requests at which the server failed.", counts.failed),
-            ("episodes", "Episodes that were begun.", counts.episodes),
-        ):
-            yield families.CounterMetricFamily(f"vjepa2_ac_{name}", about, value=number)
-        for name, about, label, values in (
-            ("decisions", "Decisions, by their reason.", "why", counts.decisions),
-            ("connections_refused", "Connections, by HTTP status.", "status", self._turned_away),
-        ):
-            family = families.CounterMetricFamily(f"vjepa2_ac_{name}", about, labels=[label])
+            found = family(f"vjepa2_ac_{name}", about, labels=[label] if label else [])
             for key, value in sorted(dict(values).items()):
-                family.add_metric([key], value)
-            yield family
+                found.add_metric([key] if label else [], value)
+            yield found
 
 
 def serve(load: Callable[[], Served], options: ServerOptions, tell: Callable[[str], None]) -> bool:
