@@ -135,10 +135,10 @@ def read_config(path: str | Path, overrides: Sequence[str] = (), *, base: bool =
     Raises:
         InputError: The config is wrong, or one of them is not there.
     """
-    from vjepa2_ac.config.loading import load_config
+    from vjepa2_ac.config.loading import load_config, load_config_of_run
     from vjepa2_ac.model.base_model import require_model
 
-    config = load_config(path, overrides, of_run=of_run)
+    config = load_config_of_run(Path(path), overrides) if of_run else load_config(path, overrides)
     data = config.data.path
     if not places.is_url(data) and not Path(data).exists():
         found = f"no such file or folder, seen from {Path.cwd()}"

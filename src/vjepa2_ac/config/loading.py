@@ -26,15 +26,12 @@ from vjepa2_ac.storage.structured import message_of, parse_yaml
 _PACKAGED = Path(str(importlib.resources.files("vjepa2_ac"))) / "assets" / "configs"
 
 
-def load_config(
-    config: str | Path | Mapping[str, Any], overrides: Iterable[str] = (), *, of_run: bool = False
-) -> Config:
+def load_config(config: str | Path | Mapping[str, Any], overrides: Iterable[str] = ()) -> Config:
     """Read a config, from a file or from plain values, and apply `key.sub=value` overrides.
 
     Args:
         config: A file, `builtin:NAME` of the package, or plain values.
         overrides: Such as training.steps=100.
-        of_run: Of a run, which may be a stranger's: its plug-ins are not looked for in the working directory.
 
     Raises:
         InputError: The file cannot be read or is not a valid config; names every key that is wrong.
@@ -45,7 +42,12 @@ def load_config(
     """
     if isinstance(config, Mapping):
         return parse_config(config, overrides, where="load_config")
-    return parse_config(_read_yaml(config_path(config)), overrides, where=str(config), here=not of_run)
+    return parse_config(_read_yaml(config_path(config)), overrides, where=str(config))
+
+
+def load_config_of_run(path: str | Path, overrides: Iterable[str] = ()) -> Config:
+    """Read the config of a run, which may be a stranger's: its plug-ins are not looked for in the working directory."""
+    return parse_config(_read_yaml(config_path(path)), overrides, where=str(path), here=False)
 
 
 def packaged_configs() -> dict[str, str]:

@@ -13,7 +13,7 @@ from typing import Annotated
 from pydantic import Field
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.config.loading import load_config, parse_config
+from vjepa2_ac.config.loading import load_config_of_run, parse_config
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.config.section import Affects, mark_of
 from vjepa2_ac.errors import InputError
@@ -50,15 +50,14 @@ def planning_settings(
             found, fix = f"{subject}, a run, which has a config of its own", "Change single settings by key=value"
             raise InputError(where=f"--config {config}", found=found, fix=fix)
         folder = Path(subject)
-        its = load_config(
-            folder / CONFIG, [*overrides, f"run_dir={json.dumps(literal(folder))}", _ANY_TYPE], of_run=True
-        )
+        moved = f"run_dir={json.dumps(literal(folder))}"
+        its = load_config_of_run(folder / CONFIG, [*overrides, moved, _ANY_TYPE])
         its = with_taught_limits(its, folder)
     elif config is None:
         plain = {"run_dir": "none", "data": {"path": "none"}, "model": {"base": subject, "dtype": dtype}}
         its = parse_config(plain, overrides, where="overrides")
     else:
-        its = load_config(config, [*overrides, _ANY_TYPE], of_run=True)
+        its = load_config_of_run(config, [*overrides, _ANY_TYPE])
         its = its.model_copy(update={"model": its.model.with_base(subject)})
     require_limits(its)
     require_axes(its)

@@ -34,7 +34,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.config.loading import changed_keys, config_as_flat_dict, config_as_yaml, load_config
+from vjepa2_ac.config.loading import changed_keys, config_as_flat_dict, config_as_yaml, load_config_of_run
 from vjepa2_ac.config.section import Affects, mark_of
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.places import BUILTIN, is_url, literal
@@ -161,9 +161,9 @@ def read_run_config(folder: Path) -> Config:
         needed = "the folder of a run, which `vjepa2-ac train CONFIG` makes"
         raise InputError(where=str(folder), found=found, needed=needed)
     overrides = [f"run_dir={json.dumps(literal(folder))}"]
-    config = load_config(folder / CONFIG, overrides, of_run=True)
+    config = load_config_of_run(folder / CONFIG, overrides)
     moved = [f"{key}={json.dumps(path)}" for key, path in _seen_from_start(config, folder)]
-    return load_config(folder / CONFIG, [*overrides, *moved], of_run=True) if moved else config
+    return load_config_of_run(folder / CONFIG, [*overrides, *moved]) if moved else config
 
 
 def _seen_from_start(config: Config, folder: Path) -> Iterator[tuple[str, str]]:
