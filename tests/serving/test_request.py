@@ -127,6 +127,7 @@ WRONG = {
     "goal/durations: None. needed: 1 whole numbers": {**OURS, "goal/images": GOALS},
     "goal/durations: \\[1, 2\\]": {**OURS, "goal/images": GOALS, "goal/durations": [1, 2]},
     "goal/durations: \\[0\\]": {**OURS, "goal/images": GOALS, "goal/durations": [0]},
+    "goal/durations: \\[\\[1\\], \\[1, 2\\]\\]": {**OURS, "goal/images": GOALS, "goal/durations": [[1], [1, 2]]},
     "goal/durations: \\[1.5\\]": {**OURS, "goal/images": GOALS, "goal/durations": [1.5]},
     "goal/durations: \\[inf\\]": {**OURS, "goal/images": GOALS, "goal/durations": [np.inf]},
     "goal/durations: \\[nan\\]": {**OURS, "goal/images": GOALS, "goal/durations": [np.nan]},
