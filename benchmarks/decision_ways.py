@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from vjepa2_ac.planning.interfaces import Plan
+from vjepa2_ac.planning.planner import Plan
 
 PLAIN, OFFICIAL, COMPILED, ADAPTER = "plain", "official", "+compiled", "+adapter"
 _OURS = "ours/"

@@ -20,8 +20,7 @@ from torch import Tensor
 
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.config.planning import PlanningConfig
-from vjepa2_ac.planning.energy import Scene
-from vjepa2_ac.planning.goals import Goal
+from vjepa2_ac.planning.energy import Goal, Scene
 
 PLANNER = Path("notebooks/utils/world_model_wrapper.py")  # of a checkout
 

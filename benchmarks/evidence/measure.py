@@ -28,9 +28,8 @@ from vjepa2_ac.evaluation.result import PredictionErrors, Way
 from vjepa2_ac.model.adapter.merging import base_only, merge_adapter
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.planning.axes.mapping import Axes
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.model_setup import Fingerprints
+from vjepa2_ac.planning.model_setup import Axes, Fingerprints
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.checkpoint import NEWEST
 from vjepa2_ac.runs.loading import load_run

@@ -32,8 +32,7 @@ from vjepa2_ac.decoding.steps import DecoderSteps
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.model.adapter.lora import add_adapter
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.planning.interfaces import Cost, Plan
-from vjepa2_ac.planning.planner import Planner
+from vjepa2_ac.planning.planner import Cost, Plan, Planner
 from vjepa2_ac.training.cost.flops import frame_flops
 from vjepa2_ac.training.cost.memory import ALLOWANCE, estimate_memory
 

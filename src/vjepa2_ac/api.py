@@ -18,7 +18,7 @@ from torch import Tensor
 
 from vjepa2_ac.config import Config, EncoderConfig, ModelConfig, ModelSizes
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.config.loading import config_as_dict, config_from
+from vjepa2_ac.config.loading import config_as_dict, parse_config
 from vjepa2_ac.data import dataset as datasets
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.loader import validation_batches
@@ -70,12 +70,12 @@ def open_dataset(data: str | Path | Config, **knobs: Any) -> Dataset:
     """
     if isinstance(data, Config):
         values = config_as_dict(data)
-        config = config_from(values | {"data": values["data"] | knobs}, where="open_dataset") if knobs else data
+        config = parse_config(values | {"data": values["data"] | knobs}, where="open_dataset") if knobs else data
         return datasets.open_dataset(config.data)
     if str(data).endswith((".yaml", ".yml")):
         fix = "Read it first: open_dataset(load_config(PATH))"
         raise InputError(where=str(data), found="a config", needed="the folder of a data set", fix=fix)
-    return datasets.open_dataset(config_from(_REST | {"data": {"path": str(data)} | knobs}, where="open_dataset").data)
+    return datasets.open_dataset(parse_config(_REST | {"data": {"path": str(data)} | knobs}, where="open_dataset").data)
 
 
 def read_clips(dataset: Dataset, split: Split = "train", *, clips: int = 16, batch_size: int = 8) -> Iterator[Batch]:

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from vjepa2_ac.config.loading import _ALSO_CALLED, all_keys, config_from
+from vjepa2_ac.config.loading import _ALSO_CALLED, all_keys, parse_config
 from vjepa2_ac.errors import InputError
 
 MINIMAL = {"run_dir": "runs/x", "data": {"path": "d"}, "model": {"base": "b.pt"}}
@@ -14,7 +14,7 @@ MINIMAL = {"run_dir": "runs/x", "data": {"path": "d"}, "model": {"base": "b.pt"}
 def complaints(*overrides: str, values: dict[str, Any] | None = None) -> list[str]:
     """Return the lines of what is wrong."""
     with pytest.raises(InputError) as caught:
-        config_from(MINIMAL if values is None else values, overrides, where="here")
+        parse_config(MINIMAL if values is None else values, overrides, where="here")
     return [line.strip() for line in str(caught.value).splitlines() if line.startswith("  ")]
 
 
@@ -90,5 +90,5 @@ def test_what_is_wrong_is_said_once_without_the_inner_names_of_pydantic(wrong: s
 
 def test_a_flood_of_mistakes_does_not_flood_the_terminal() -> None:
     with pytest.raises(InputError) as caught:
-        config_from(MINIMAL | {f"{'x' * 1000}{n}": n for n in range(5000)}, where="here")
+        parse_config(MINIMAL | {f"{'x' * 1000}{n}": n for n in range(5000)}, where="here")
     assert len(str(caught.value)) < 20_000

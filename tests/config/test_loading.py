@@ -34,42 +34,21 @@ def write(folder: Path, text: str) -> Path:
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "configs").glob("*.yaml")), ids=lambda p: p.name)
-def test_every_config_of_the_project_loads(path: Path) -> None:
-    load_config(path)
+def test_every_config_of_the_project_loads_and_is_in_line(path: Path) -> None:
+    assert load_config(path).adapter.out_of_line is None
 
 
-def test_default_config_holds_the_mission() -> None:
-    config = load_config(ROOT / "configs/default.yaml")
-    assert (config.adapter.rank, config.adapter.alpha, config.adapter.rslora) == (16, 32, True)
-    assert (config.training.batch_size, config.training.accumulation, config.training.steps) == (4, 8, 100_000)
-    assert (config.training.learning_rate, config.training.precision) == (1e-4, "bf16")
-    assert (config.data.frames, config.model.sizes.image_size) == (16, 256)
-    assert (config.checkpoint.every, config.checkpoint.keep) == (1_000, 5)
-
-
-@pytest.mark.parametrize(
-    ("knobs", "warned"),
-    [
-        ({"rank": 64, "alpha": 128}, True),
-        ({"rank": 32, "alpha": 64}, True),
-        ({"rank": 64, "alpha": 32}, False),
-        ({"rank": 4, "alpha": 32}, False),
-        ({"rank": 4, "alpha": 8}, False),
-        ({"rank": 64, "alpha": 128, "rslora": False}, False),
-        ({"kind": "none", "alpha": 128}, False),
-    ],
-)
-def test_an_alpha_that_grows_with_the_rank_under_rslora_is_out_of_line(knobs: dict[str, object], warned: bool) -> None:
-    found = AdapterConfig.model_validate(knobs).out_of_line
-    assert (found is not None) == warned
-    if found is not None:
-        assert f"a scale of {knobs['alpha'] / knobs['rank'] ** 0.5:.3g}, alpha 32 one of" in found
-        assert "Take adapter.alpha=32" in found
-
-
-def test_no_config_of_the_project_is_out_of_line() -> None:
-    for path in (ROOT / "configs").glob("*.yaml"):
-        assert load_config(path).adapter.out_of_line is None, path
+def test_an_alpha_that_grows_with_the_rank_under_rslora_is_out_of_line() -> None:
+    found = AdapterConfig(rank=64, alpha=128).out_of_line
+    assert "a scale of 16, alpha 32 one of" in found
+    assert "Take adapter.alpha=32" in found
+    for usual in (
+        {"rank": 64},
+        {"rank": 4, "alpha": 8},
+        {"alpha": 128, "rslora": False},
+        {"kind": "none", "alpha": 128},
+    ):
+        assert AdapterConfig.model_validate(usual).out_of_line is None
 
 
 def test_the_config_for_a_few_demonstrations_holds_its_recipe(tmp_path: Path) -> None:
@@ -178,7 +157,7 @@ def test_schema_documents_every_knob() -> None:
 def test_every_knob_is_read_somewhere() -> None:
     source = "\n".join(path.read_text() for path in (ROOT / "src").rglob("*.py"))
     read = {(owner.removeprefix("_"), name) for owner, name in re.findall(r"(\w+)(?=\.(\w+))", source)}
-    for key in all_keys():
+    for key in set(all_keys()) - {"plugins"}:  # these are read before the config is checked
         *sections, name = key.split(".")
         owners = ["config", "sizes", "knobs", "self", *sections[-1:]]
         assert any((owner, name) in read for owner in owners), f"nobody reads {key}"

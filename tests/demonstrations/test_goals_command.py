@@ -16,7 +16,7 @@ from vjepa2_ac.cli import main
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.registry import open_source
 from vjepa2_ac.media.video_writer import write_video
-from vjepa2_ac.planning.goal_folder import read_goal_folder
+from vjepa2_ac.planning.goals import read_goal_folder
 from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
 
 QUICK = ["planning.samples=8", "planning.iterations=2", "planning.cem.elites=4"]

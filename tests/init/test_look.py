@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from copied_sets import WRITERS, write_lerobot, write_npz
-from vjepa2_ac.config.loading import config_from
+from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.init.draft import choose_model, make_draft
@@ -226,4 +226,4 @@ def test_droid_needs_no_look() -> None:
     assert found.episodes == 95_658
     values = {"run_dir": "run", "model": {"base": "builtin:sim-tiny"}}
     data = {"path": found.path, **plain(found.knobs), "idle": plain(found.idle or {})}
-    assert config_from({**values, "data": data}, where="here").data.idle.rule == "published"
+    assert parse_config({**values, "data": data}, where="here").data.idle.rule == "published"

@@ -5,6 +5,7 @@ import pytest
 import torch
 from torch._dynamo.utils import counters
 
+from decisions import STATE
 from tiny_models import actions, cost, tiny_model
 from tracing import tracing
 from vjepa2_ac.config import AdapterConfig
@@ -18,7 +19,6 @@ from vjepa2_ac.planning.model_setup import prepare_for_planning
 
 pytestmark = tracing
 
-STATE = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2])
 PLAIN = PlanningConfig(
     samples=11, iterations=2, horizon=3, cem=CemConfig(elites=4), energy=EnergyConfig(samples_at_once=4)
 )

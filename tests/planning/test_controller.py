@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from decisions import STATE, image
 from tiny_models import tiny_model
 from vjepa2_ac.config.planning import CemConfig, EnergyConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.episode import Widths
@@ -13,12 +14,7 @@ from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.spaces import Spaces
 
-STATE = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2])
 QUICK = PlanningConfig(samples=12, iterations=2, horizon=2, cem=CemConfig(elites=4))
-
-
-def image(seed: int, height: int = 60, width: int = 48) -> np.ndarray:
-    return np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
 
 
 def controller(model: WorldModel | None = None, seed: int = 0, **changes: object) -> Controller:
@@ -36,10 +32,7 @@ def test_actions_are_within_the_limits_and_lower_the_energy() -> None:
     found = actions(run)
     assert (np.abs(found) <= [0.05, 0.02, 0, 0, 0, 0, 0.75]).all()
     assert found[:, :2].all()
-    assert run.decision is not None
     assert run.decision.why == "planned"
-    assert run.decision.plan is not None
-    assert run.decision.cost is not None
     with torch.no_grad():
         still = float(run.decision.cost(torch.zeros(1, 2, 7)))
     assert run.decision.plan.energy < still
@@ -56,31 +49,11 @@ def test_the_same_seed_gives_the_same_actions_again() -> None:
 def test_a_decision_holds_the_predicted_states_of_its_plan() -> None:
     run = controller()
     actions(run, 1)
-    assert run.decision is not None
-    assert run.decision.plan is not None
     expected = [STATE]
     for action in run.decision.plan.actions.double().numpy():
         after = apply_action(expected[-1], action)
         expected.append(np.append(after[:6], after[6].clip(0, 1)))
     np.testing.assert_allclose(run.decision.states, expected, atol=1e-6)
-
-
-def test_a_decision_begins_from_the_last_ones_plan() -> None:
-    frames = (image(1), image(1))
-    found = []
-    for warm in (True, False):
-        run = controller(warm_start=warm, iterations=6)
-        run.reset(image(100))
-        run.act(frames[0], STATE)
-        before = run.decision
-        run.act(frames[1], STATE)
-        assert before is not None
-        assert before.plan is not None
-        assert run.decision is not None
-        assert run.decision.plan is not None
-        found.append(run.decision.plan.iterations[0].elites[:, 0, :3].mean(dim=0))
-        found.append(before.plan.start_after(1).mean[0, :3])
-    assert (found[0] - found[1]).norm() < (found[2] - found[3]).norm()
 
 
 def test_earlier_frames_are_seen_with_the_actions_that_were_done() -> None:
@@ -96,30 +69,19 @@ def test_earlier_frames_are_seen_with_the_actions_that_were_done() -> None:
     alone = controller(model=model)
     alone.reset(image(100))
     alone.act(image(4), states[4])
-    assert alone.decision is not None
-    assert run.decision is not None
     tried = torch.full((1, 1, 7), 0.02)
     with torch.no_grad():
-        assert not torch.allclose(run.decision.cost(tried), alone.decision.cost(tried))  # type: ignore[misc]
-
-
-def test_sub_goals_follow_one_another() -> None:
-    run = controller()
-    run.reset(image(100), image(101), durations=(2,))
-    goals = []
-    for seed in range(4):
-        run.act(image(seed), STATE)
-        goals.append(run.decision.goal)  # type: ignore[union-attr]
-    assert goals == [0, 0, 1, 1]
+        assert not torch.allclose(run.decision.cost(tried), alone.decision.cost(tried))
 
 
 def test_at_the_goal_nothing_is_done() -> None:
     run = controller()
     run.reset(image(100))
     assert not run.act(image(100), STATE).any()
-    assert run.decision is not None
     assert run.decision.why == "at the goal"
     assert run.act(image(1), STATE).any()
+    run.reset(image(100), image(100), durations=(1,))
+    assert not run.act(image(100), STATE).any()
 
 
 def test_a_broken_model_leads_to_no_motion_with_a_reason() -> None:
@@ -128,18 +90,7 @@ def test_a_broken_model_leads_to_no_motion_with_a_reason() -> None:
         model.base_predictor.predictor_proj.weight.fill_(float("nan"))
     run = controller(model)
     assert not actions(run).any()
-    assert run.decision is not None
     assert run.decision.why == "no finite energy"
-
-
-def test_a_mask_decides_what_counts_of_the_image() -> None:
-    run = controller()
-    mask = np.zeros((60, 48), bool)
-    mask[:20, :16] = True
-    run.reset(image(100), mask=mask)
-    assert run._goal is not None
-    assert run._goal.weights is not None
-    assert run._goal.weights.nonzero().flatten().tolist() == [0]
 
 
 def test_what_does_not_count_may_differ_at_the_goal() -> None:
@@ -210,8 +161,6 @@ def test_the_present_energy_is_that_of_an_image_that_stays(steps: str) -> None:
     run = controller(energy=EnergyConfig(steps=steps))
     run.reset(image(100), image(101), durations=(1,))
     run.act(image(1), STATE)
-    assert run._goal is not None
-    assert run.decision is not None
     seen = run._seen[-1][0]
     first, second = (float((seen - wanted).abs().mean()) for wanted in run._goal.latents)
     expected = {"last": second, "sum": first + second}[steps]
@@ -223,12 +172,6 @@ def test_a_goal_that_is_reached_on_the_way_to_another_is_left() -> None:
         run = controller(energy=EnergyConfig(steps=steps))
         run.reset(image(100), image(101), durations=(1,))
         assert run.act(image(100), STATE).any()
-
-
-def test_goals_that_are_all_reached_are_reached() -> None:
-    run = controller()
-    run.reset(image(100), image(100), durations=(1,))
-    assert not run.act(image(100), STATE).any()
 
 
 def test_a_new_goal_forgets_what_was_seen() -> None:
@@ -260,41 +203,26 @@ def test_a_model_that_was_in_training_is_put_into_eval_mode() -> None:
     np.testing.assert_array_equal(actions(controller(model), 1), actions(controller(tiny_model(adapted=True)), 1))
 
 
-@torch.no_grad()
-def test_energies_are_of_the_goal_that_counts_now() -> None:
-    run = controller(horizon=1)
-    run.reset(image(100), image(101), durations=(1,))
-    for seed, wanted in enumerate((0, 1)):
-        run.act(image(seed), STATE)
-        assert run._goal is not None
-        assert run.decision is not None
-        assert run.decision.cost is not None
-        tried = torch.full((1, 1, 7), 0.02)
-        predicted, _ = run.decision.cost.imagine(tried)
-        expected = (predicted[:, 0] - run._goal.latents[wanted]).abs().mean(dim=(1, 2))
-        torch.testing.assert_close(run.decision.cost(tried), expected)
-
-
 def test_one_model_step_of_the_last_plan_is_gone_when_the_next_begins(monkeypatch: pytest.MonkeyPatch) -> None:
     run = controller(warm_start=True, horizon=3)
     actions(run, 1)
-    assert run.decision is not None
     before, starts, plan = run.decision.plan, [], run.planner.plan
     monkeypatch.setattr(run.planner, "plan", lambda *given: (starts.append(given[2]), plan(*given))[1])
     run.act(image(1), STATE)
-    assert before is not None
     assert torch.equal(starts[0].mean, before.mean[[1, 2, 2]])
     assert not torch.equal(before.mean[0], before.mean[1])
 
 
-def test_a_mask_is_cropped_as_the_image_is() -> None:
+def test_a_mask_decides_what_counts_of_the_image_and_is_cropped_as_it_is() -> None:
     run = controller()
+    mask = np.zeros((60, 48), bool)
+    mask[:20, :16] = True
+    run.reset(image(100), mask=mask)
+    assert run._goal.weights.nonzero().flatten().tolist() == [0]
     mask = np.zeros((48, 120), bool)
     mask[:16, :20] = True  # outside what the model sees: columns 27 to 91
     mask[:16, 72:] = True
     run.reset(image(100, 48, 120), mask=mask)
-    assert run._goal is not None
-    assert run._goal.weights is not None
     assert run._goal.weights.nonzero().flatten().tolist() == [2]
 
 
@@ -304,7 +232,7 @@ def test_every_decision_draws_with_a_seed_of_its_own() -> None:
     seeds = []
     for seed in range(3):
         run.act(image(seed), STATE)
-        seeds.append(run.decision.plan.seed)  # type: ignore[union-attr]
+        seeds.append(run.decision.plan.seed)
     assert seeds == [7, 8, 9]
 
 
@@ -316,7 +244,7 @@ def test_images_are_cropped_as_in_training() -> None:
         run = Controller(tiny_model(), QUICK, crop=crop)
         run.reset(images[0])
         run.act(images[1], STATE)
-        energies.append(run.decision.energy_now)  # type: ignore[union-attr]
+        energies.append(run.decision.energy_now)
     assert energies[0] == energies[1] != energies[2]
 
 

@@ -46,11 +46,6 @@ def test_a_slice_reaches_beyond_the_limits_also_along_an_axis_that_is_held() -> 
     np.testing.assert_allclose(energy_slices(weighted, CHOSEN, held, nodes=3)[0].up, [-0.0625, 0, 0.0625], rtol=1e-5)
 
 
-def test_fewer_than_three_nodes_show_nothing() -> None:
-    with pytest.raises(ValueError, match="2 nodes"):
-        energy_slices(weighted, CHOSEN, pose_space(PlanningConfig(horizon=4)), nodes=2)
-
-
 @pytest.mark.parametrize("axes", [2, 3])
 def test_chosen_nodes_are_the_most_that_cost_no_more_than_the_search(axes: int) -> None:
     for searched in range(600):

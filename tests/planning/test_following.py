@@ -15,8 +15,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.decision import PlanRequest, decide, plan_as_dict
-from vjepa2_ac.planning.goal_folder import write_goals
-from vjepa2_ac.planning.goals import GripperMode, SubGoal
+from vjepa2_ac.planning.goals import GripperMode, SubGoal, write_goals
 from vjepa2_ac.spaces import Spaces
 
 
@@ -33,8 +32,7 @@ def noisy(seed: int, most: int = 6) -> np.ndarray:
 def decided(run: Controller, seen: np.ndarray) -> tuple[int, int, bool, bool]:
     """Return which goal applies, since when, whether it changed, and whether all is done."""
     run.act(seen, STATE)
-    assert run.decision is not None
-    return run.decision.goal, run.decision.since, bool(run.decision.changed), run.decision.done
+    return run.decision.goal, run.decision.progress.since, bool(run.decision.progress.changed), run.decision.done
 
 
 def test_the_next_goal_follows_once_an_image_is_near_the_present_one() -> None:
@@ -45,8 +43,7 @@ def test_the_next_goal_follows_once_an_image_is_near_the_present_one() -> None:
     assert decided(run, image(1)) == (0, 0, False, False)
     assert decided(run, noisy(100)) == (1, 3, True, False)
     assert decided(run, image(2)) == (1, 3, False, False)
-    assert run.decision is not None
-    assert run.decision.began == pytest.approx(begun(run, noisy(100), 101), rel=1e-5)
+    assert run.decision.progress.began == pytest.approx(begun(run, noisy(100), 101), rel=1e-5)
 
 
 def begun(run: Controller, seen: np.ndarray, goal: int) -> float:
@@ -58,9 +55,8 @@ def test_a_noisy_image_of_the_goal_ends_it_and_what_is_done_stays_done() -> None
     run.reset(image(100))
     assert decided(run, image(0)) == (0, 0, False, False)
     assert not run.act(noisy(100), STATE).any()
-    assert run.decision is not None
     assert (run.decision.why, run.decision.done, run.decision.plan) == ("at the goal", True, None)
-    assert "below 50%" in run.decision.changed
+    assert "below 50%" in run.decision.progress.changed
     assert not run.act(image(1), STATE).any(), "only a reset begins again"
     run.reset(image(100))
     assert run.act(image(1), STATE).any()
@@ -75,20 +71,6 @@ def test_an_equal_image_is_the_goal_without_any_rule() -> None:
     run.reset(image(100), image(101), durations=(1,))
     assert decided(run, image(100)) == (0, 0, False, False), "not the last goal"
     assert decided(run, image(101)) == (1, 1, True, True)
-
-
-def test_a_mask_decides_which_energies_count() -> None:
-    mask = np.zeros((60, 48), bool)
-    mask[:, :16] = True
-    seen = image(0)
-    seen[:, :24] = image(100)[:, :24]  # near the goal where it counts
-    found = []
-    for counted in (None, mask):
-        run = controller()
-        run.follow([SubGoal(image(100), at_most=9, share=0.3), SubGoal(image(101))], mask=counted)
-        run.act(image(0), STATE)
-        found.append(decided(run, seen)[0])
-    assert found == [0, 1]
 
 
 def test_each_goal_has_its_own_gripper_mode() -> None:
@@ -132,16 +114,8 @@ def test_a_plan_looks_ahead_to_what_follows_at_the_latest() -> None:
     found = []
     for seed in range(3):
         run.act(image(seed), STATE)
-        assert run.decision is not None
         found.append(run.decision.goals)
     assert found == [(0, 0, 1, 1, 1, 1), (0, 1, 1, 1, 1, 1), (1,) * 6], "nobody knows when the second one ends"
-
-
-def test_a_share_in_the_config_stands_for_that_of_every_goal_but_the_last() -> None:
-    run = controller(goals=GoalsConfig(share=0.5))
-    run.follow([SubGoal(image(100), at_most=9), SubGoal(image(101))])
-    run.act(image(0), STATE)
-    assert decided(run, noisy(100)) == (1, 1, True, False)
 
 
 @pytest.mark.parametrize(

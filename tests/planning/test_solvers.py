@@ -13,10 +13,15 @@ from solver_problems import PLANNERS, config, parabola, rosenbrock, solve, space
 from vjepa2_ac.config.planning import CemConfig, GradientConfig, IcemConfig, LimitsConfig, MppiConfig, PlanningConfig
 from vjepa2_ac.episode import no_progress
 from vjepa2_ac.evaluation.request import SCORED
-from vjepa2_ac.planning.interfaces import Plan, PlanStart
-from vjepa2_ac.planning.planner import Planner
-from vjepa2_ac.planning.search_space import Ball, SearchSpace
-from vjepa2_ac.planning.solvers import EvaluatedPlans, GradientSolver, MppiSolver, coloured_noise, white_noise
+from vjepa2_ac.planning.planner import Plan, Planner
+from vjepa2_ac.planning.search_space import Ball
+from vjepa2_ac.planning.solvers import (
+    EvaluatedPlans,
+    GradientSolver,
+    MppiSolver,
+    PlanStart,
+    coloured_noise,
+)
 
 
 @pytest.mark.parametrize("planner", PLANNERS)
@@ -25,16 +30,6 @@ def test_the_lowest_place_of_a_parabola_is_found(planner: str) -> None:
     plan = solve(planner, parabola(target), space(3), iterations=40)
     torch.testing.assert_close(plan.actions, target, atol=0.03, rtol=0)
     assert plan.energy == pytest.approx(float((plan.actions - target).square().sum()), abs=1e-6)
-
-
-@pytest.mark.parametrize("planner", PLANNERS)
-def test_the_end_of_a_bent_valley_is_found(planner: str) -> None:
-    patient = {
-        "cem": CemConfig(momentum_std=0.8), "icem": IcemConfig(momentum=0.8, shrink=1.0),
-        "mppi": MppiConfig(temperature=0.003, std_decay=0.95),
-    }  # fmt: skip
-    plan = solve(planner, rosenbrock, space(), iterations=100, **patient)
-    torch.testing.assert_close(plan.actions, torch.tensor([[0.5, 0.5]]), atol=0.03, rtol=0)
 
 
 @pytest.mark.parametrize("planner", PLANNERS)
@@ -55,7 +50,7 @@ def test_an_optimum_beyond_the_limits_is_sought_at_their_edge(planner: str) -> N
 @pytest.mark.parametrize(("norm", "optimum"), [("l2", (0.6, 0.8, 0.1)), ("l1", (0.0, 1.0, 0.1))])
 def test_an_optimum_beyond_a_ball_is_sought_on_it(planner: str, norm: str, optimum: tuple[float, ...]) -> None:
     target = torch.tensor([[1.2, 1.6, 0.1]]) if norm == "l2" else torch.tensor([[0.0, 2.0, 0.1]])
-    ball = Ball(norm, 1.0, axes=2)  # type: ignore[arg-type]
+    ball = Ball(norm, 1.0, axes=2)
     plan = solve(planner, parabola(target), space(dim=3, reach=5.0, ball=ball), iterations=60)
     torch.testing.assert_close(plan.actions, torch.tensor([optimum]), atol=0.05, rtol=0)
     assert torch.linalg.vector_norm(plan.actions[:, :2], ord=int(norm[1])) <= 1.0
@@ -74,7 +69,7 @@ def upstream_cost(actions: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("case", json.loads((GOLDEN / "cem.json").read_text()), ids=lambda case: str(case["seed"]))
-def test_cem_gives_upstreams_plan_for_upstreams_seed(case: dict) -> None:  # type: ignore[type-arg]
+def test_cem_gives_upstreams_plan_for_upstreams_seed(case: dict) -> None:
     given = case["arguments"]
     closing = given.get("close_gripper")
     limits = LimitsConfig(
@@ -107,7 +102,7 @@ def jepa_wms_cost(actions: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("case", json.loads((GOLDEN / "cem_jepa_wms.json").read_text()), ids=lambda c: str(c["seed"]))
-def test_cem_with_the_action_scores_settings_gives_jepa_wms_plan(case: dict) -> None:  # type: ignore[type-arg]
+def test_cem_with_the_action_scores_settings_gives_jepa_wms_plan(case: dict) -> None:
     settings = SCORED.model_copy(update={"samples": 304})  # then their one draw and our three give the same numbers
     plan = Planner(settings).plan(jepa_wms_cost, torch.Generator().manual_seed(case["seed"]))
     torch.testing.assert_close([one.lowest for one in plan.iterations], case["losses"], rtol=1e-3, atol=1e-7)
@@ -273,8 +268,6 @@ def test_what_was_done_of_a_plan_is_gone_and_its_end_is_repeated(done: int, plac
     start = plan.start_after(done)
     assert torch.equal(start.mean, plan.mean[places])
     assert torch.equal(start.elites, plan.iterations[-1].elites[:, places])
-    with pytest.raises(ValueError, match="-1 steps"):
-        plan.start_after(-1)
 
 
 def test_within_a_repeated_action_the_next_plan_begins_with_what_is_left_of_it() -> None:
@@ -373,19 +366,6 @@ def test_coloured_noise_has_the_spectrum_that_was_asked_for() -> None:
     torch.testing.assert_close(power / power.mean(), torch.ones(9), rtol=0, atol=0.1)
 
 
-def test_held_axes_get_no_noise() -> None:
-    upper = torch.tensor([[1.0, 0.0, 1.0]])
-    noise = white_noise(SearchSpace(-upper, upper, upper), 5, torch.Generator())
-    assert not noise[..., 1].any()
-    assert noise[..., [0, 2]].all()
-
-
 def test_a_cost_of_another_shape_is_refused() -> None:
     with pytest.raises(ValueError, match="energies of shape"):
         Planner(config("cem"), space()).plan(lambda actions: actions.sum(), torch.Generator())
-
-
-def test_a_start_of_another_shape_is_refused() -> None:
-    start = PlanStart(torch.zeros(2, 2), torch.zeros(0, 2, 2))
-    with pytest.raises(ValueError, match="start of"):
-        Planner(config("cem"), space()).plan(rosenbrock, torch.Generator(), start)

@@ -56,7 +56,6 @@ def test_at_gimbal_lock_the_yaw_is_zero_and_gradients_are_finite() -> None:
     assert not angles[2].detach()
     torch.testing.assert_close(matrices_from_euler(angles), up)
     angles.sum().backward()
-    assert up.grad is not None
     assert torch.isfinite(up.grad).all()
 
 
@@ -65,7 +64,6 @@ def test_gradients_are_finite_everywhere(pitch: float) -> None:
     state = torch.tensor([0.4, 0.0, 0.3, np.pi, pitch, 0.2, 0.5], dtype=torch.float64)
     actions = torch.zeros(1, 3, 7, dtype=torch.float64, requires_grad=True)
     states_along(state, actions).sum().backward()
-    assert actions.grad is not None
     assert torch.isfinite(actions.grad).all()
 
 

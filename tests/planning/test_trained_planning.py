@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from decisions import STATE
 from tiny_models import actions, cost, tiny_model
 from vjepa2_ac.config import AdapterConfig
 from vjepa2_ac.config.planning import CemConfig, PlanningConfig
@@ -23,7 +24,6 @@ from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.model_setup import prepare_for_planning
 
 PLAIN = PlanningConfig(samples=16, iterations=2, horizon=2, cem=CemConfig(elites=4))
-STATE = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2])
 ADAPTERS = {
     "lora": AdapterConfig(rank=4, alpha=8.0, dropout=0.1),
     "heads": AdapterConfig(rank=4, alpha=8.0, modules_to_save=("predictor_embed", "predictor_proj", "action_encoder")),

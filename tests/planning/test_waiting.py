@@ -46,10 +46,3 @@ def test_energies_are_computed_without_asking_the_device(context: int, steps: st
     assert reported == 2 * [(4, 10), (8, 10), (10, 10)]
     assert "addmm" in seen
     assert not seen & ASKING
-
-
-@pytest.mark.parametrize(
-    "work", [lambda x: x[[0, 1]], lambda x: float(x[0]), lambda x: x[x > 0], lambda x: x.bfloat16()]
-)
-def test_asking_would_be_noticed(work: Callable[[torch.Tensor], object]) -> None:
-    assert operations_of(lambda: work(torch.ones(3))) & ASKING

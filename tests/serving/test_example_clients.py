@@ -224,10 +224,3 @@ def test_nobody_moves_after_an_error_or_in_a_dry_run(name: str) -> None:
     ways, gripper = driven(name, Policy(dry_run=True))
     np.testing.assert_allclose(ways, np.tile([0.45, 0.0, 0.3], (4, 1)), atol=1e-9)
     assert not gripper.calls
-
-
-@pytest.mark.parametrize("name", CLIENTS)
-def test_a_loop_has_fifteen_lines_at_most(name: str) -> None:
-    text = (ROOT / f"examples/serve/{name}_client.py").read_text()
-    body = text.split("def drive(")[1].split("\ndef ")[0].splitlines()[1:]
-    assert len([line for line in body if line.strip() and not line.strip().startswith('"""')]) <= 15

@@ -8,8 +8,7 @@ from PIL import Image
 
 from served import image
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.planning.goal_folder import write_goals
-from vjepa2_ac.planning.goals import SubGoal
+from vjepa2_ac.planning.goals import SubGoal, write_goals
 from vjepa2_ac.serving.about import read_kept_goals
 
 

@@ -7,10 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
-from served import STATE, controller, ended, image, serving, session, started
-from tiny_models import tiny_model
+from served import STATE, controller, image, serving, session
 from vjepa2_ac.geometry import apply_action
 from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.serving.about import roboarena_metadata
@@ -67,23 +65,6 @@ def test_it_gets_the_controllers_actions_errors_and_a_new_episode(robot: Path) -
     own.reset(image(50))
     own.act(image(3), STATE)
     assert found["one_by_one"] == own.decision.plan.actions.double().tolist()
-
-
-def test_it_drives_the_command(robot: Path, tmp_path: Path) -> None:
-    tiny_model().save_pretrained(tmp_path / "model")
-    (tmp_path / "goals").mkdir()
-    Image.fromarray(image(50)).save(tmp_path / "goals/cup.png")
-    quick = ["planning.samples=12", "planning.iterations=2", "planning.horizon=2", "planning.cem.elites=4"]
-    process, url = started(str(tmp_path / "model"), "--goals", str(tmp_path / "goals"), *quick)
-    found = driven(robot, "openpi", url)
-    assert "has left" in ended(process)
-    own = controller()
-    own.reset(image(100))
-    own.act(image(0), STATE)
-    first = own.decision.plan.actions.double().numpy()
-    np.testing.assert_allclose(found["actions"][0], first, rtol=0, atol=1e-6)  # its threads are its own
-    assert found["actions"][3] == found["actions"][0]
-    assert found["error"].startswith("Error in inference server:\nstate: 3 numbers")
 
 
 def test_roboarenas_dialect(robot: Path) -> None:

@@ -129,9 +129,6 @@ GOOD = pack({
 })  # fmt: skip
 
 
-CHANGES = st.lists(st.tuples(st.integers(0, len(GOOD) - 1), st.integers(0, 255)), min_size=1, max_size=6)
-
-
 @settings(max_examples=2000)
 @given(
     st.lists(st.tuples(st.integers(0, len(GOOD) - 1), st.integers(0, 255)), min_size=1, max_size=6),

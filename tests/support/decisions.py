@@ -12,8 +12,8 @@ STATE = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2])
 QUICK = PlanningConfig(samples=12, iterations=3, horizon=2, cem=CemConfig(elites=4))
 
 
-def image(seed: int) -> np.ndarray:
-    return np.random.default_rng(seed).integers(0, 256, (60, 48, 3), dtype=np.uint8)
+def image(seed: int, height: int = 60, width: int = 48) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
 
 
 def asked(*goals: int, nodes: int | None = 3, broken: bool = False, start: int = 0, **changes: object) -> PlanResult:

@@ -7,8 +7,7 @@ import torch
 from torch import Tensor
 
 from vjepa2_ac.config.planning import GradientConfig, MppiConfig, PlanningConfig
-from vjepa2_ac.planning.interfaces import Plan
-from vjepa2_ac.planning.planner import Planner
+from vjepa2_ac.planning.planner import Plan, Planner
 from vjepa2_ac.planning.search_space import Ball, SearchSpace
 
 PLANNERS = ("cem", "icem", "mppi", "gradient")

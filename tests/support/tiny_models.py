@@ -7,8 +7,7 @@ from vjepa2_ac.config import AdapterConfig, EncoderSizes, ModelSizes, PredictorS
 from vjepa2_ac.config.planning import EnergyConfig
 from vjepa2_ac.model.adapter.lora import add_adapter
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.planning.energy import Scene, WorldModelCost
-from vjepa2_ac.planning.goals import Goal
+from vjepa2_ac.planning.energy import Goal, Scene, WorldModelCost
 
 TOKENS, DIM = 9, 24
 

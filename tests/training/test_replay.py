@@ -142,8 +142,8 @@ def test_a_clip_that_cannot_be_read_counts_for_its_own_data_set(replaying, monke
     [
         ({"replay__data__frames": 5}, r"replay.data.frames 5 is not data.frames 4"),
         ({"replay__data__states": "vector"}, r"replay.data.states vector is not data.states pose"),
-        ({"replay__data__cache": "auto"}, r"replay.data takes latents from a cache and data does not"),
-        ({"data__cache": "auto"}, r"data takes latents from a cache and replay.data does not"),
+        ({"replay__data__cache": "auto"}, r"latents from a cache, and the other does not"),
+        ({"data__cache": "auto"}, r"latents from a cache, and the other does not"),
         ({"replay__data__stride": "auto"}, r"stride auto: give its number"),
         ({"data__stride": "auto"}, r"data.stride auto with replay"),
         ({"replay__share": 1.0}, r"replay.share: .*less than 1"),

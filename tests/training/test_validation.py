@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from same_run import assert_same_run
-from vjepa2_ac.config.loading import config_from
+from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.runs.checkpoint import checkpoint_name, newest_checkpoint, read_state, select_checkpoint
 from vjepa2_ac.runs.metrics_log import read_metrics_log
@@ -106,4 +106,4 @@ def test_a_run_without_a_better_one_ends_when_patience_does(make_config, reporte
 )
 def test_what_does_not_fit_together_is_refused(overrides: list[str], words: str) -> None:
     with pytest.raises(InputError, match=words):
-        config_from({"run_dir": "r", "data": {"path": "d"}, "model": {"base": "b"}}, overrides, where="here")
+        parse_config({"run_dir": "r", "data": {"path": "d"}, "model": {"base": "b"}}, overrides, where="here")

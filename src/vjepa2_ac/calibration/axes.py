@@ -35,9 +35,8 @@ from vjepa2_ac.evaluation.measure import Predictor
 from vjepa2_ac.evaluation.result import Row
 from vjepa2_ac.intervals import Estimate, bootstrapped, mean_of, ratio
 from vjepa2_ac.model.adapter.merging import merge_adapter
-from vjepa2_ac.planning.axes.axes_file import FORMAT, require_axes_in
-from vjepa2_ac.planning.axes.mapping import Axes
-from vjepa2_ac.planning.model_setup import Fingerprints
+from vjepa2_ac.planning.axes import FORMAT, require_axes_in
+from vjepa2_ac.planning.model_setup import Axes, Fingerprints
 from vjepa2_ac.planning.planner import Planner
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
 from vjepa2_ac.storage.structured import utc_now

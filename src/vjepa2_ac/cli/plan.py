@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from vjepa2_ac.config import Config
     from vjepa2_ac.config.planning import PlanningConfig
     from vjepa2_ac.demonstrations.make_goals import Recording
-    from vjepa2_ac.planning.goal_folder import GoalFolder
+    from vjepa2_ac.planning.goals import GoalFolder
     from vjepa2_ac.planning.session import PlanningSession
 
 _QUICK, _QUICK_SEQUENCES = "planning.samples=64 planning.iterations=4", 256  # docs/planning.md says how good it is
@@ -149,7 +149,7 @@ def _images(
 
     folder = None
     if options.goals is not None:
-        from vjepa2_ac.planning.goal_folder import read_goal_folder
+        from vjepa2_ac.planning.goals import read_goal_folder
 
         folder = read_goal_folder(options.goals)
         images = tuple(goal.image for goal in folder.goals)

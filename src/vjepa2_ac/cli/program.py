@@ -39,7 +39,7 @@ def _run(arguments: Sequence[str] | None) -> int:
     try:
         _require_working_directory()
         if options.plugin:
-            from vjepa2_ac.config.plugins import name_plugins
+            from vjepa2_ac.config.loading import name_plugins
 
             name_plugins(options.plugin)
         return handler(options) or 0

@@ -28,6 +28,7 @@ _CameraName = Annotated[str, BeforeValidator(lambda name: str(name) if type(name
 _PartOfAFrame = Annotated[float, Field(gt=0.0, le=1.0)]
 Split = Literal["train", "validation", "test"]
 _STRIDES_AT_15_HZ = (4, 8, 15)
+_JOINED = "to sum (deltas), mean (velocities) or last (absolute targets)"
 
 
 def _split_by(text: str) -> str:
@@ -39,10 +40,7 @@ def _split_by(text: str) -> str:
     except (re.error, OverflowError, RecursionError) as error:
         raise ValueError(f"{text!r} is no regular expression ({error})") from None
     if groups != 1:
-        raise ValueError(
-            f"{text!r} has {groups} groups; name a field, or put the part of the identity that episodes share in the"
-            " one group of a regular expression: (...)"
-        )
+        raise ValueError(f"{text!r} has {groups} groups; name a field, or put what episodes share in one group: (...)")
     return text
 
 
@@ -53,8 +51,7 @@ class IdleConfig(Section):
     """none: keep all. published: ranges from a file. commands: openpi's rule on commanded joint velocities. motion: the
     same runs, found in the measured poses, for data sets without joint velocities."""
     ranges: Place | None = None
-    """For published: a JSON file, local or a URL, of {"recording_folderpath--file_path": [[start, end), ...]}. Episodes
-    that it does not name count as idle."""
+    """For published: a JSON file or URL of {"recording_folderpath--file_path": [[start, end), ...]}; others: idle."""
     velocity_change_rad_s: Positive = 1e-3
     """For commands: a step is idle if no commanded joint velocity changes by this much."""
     translation_m: Positive = 1e-3
@@ -72,9 +69,8 @@ class IdleConfig(Section):
 
     @model_validator(mode="after")
     def _published_ranges_are_named(self) -> IdleConfig:
-        if (self.rule == "published") != (self.ranges is not None):
-            raise ValueError("rule published and ranges (a file or URL) belong together")
-        return self
+        is_broken = (self.rule == "published") != (self.ranges is not None)
+        return self.refused((is_broken, "rule published and ranges (a file or URL) belong together"))
 
 
 class AugmentConfig(Section):
@@ -98,10 +94,11 @@ class AugmentConfig(Section):
 
     @model_validator(mode="after")
     def _pairs_are_ordered(self) -> AugmentConfig:
-        for name, pair in (("crop_scale", self.crop_scale), ("crop_aspect", self.crop_aspect)):
-            if pair is not None and pair[0] > pair[1]:
-                raise ValueError(f"{name}: {pair[0]} is more than {pair[1]}")
-        return self
+        least, most = self.crop_scale or (0, 1)
+        return self.refused(
+            (least > most, f"crop_scale: {least} is more than {most}"),
+            (self.crop_aspect[0] > self.crop_aspect[1], "crop_aspect: {} is more than {}".format(*self.crop_aspect)),
+        )
 
 
 class DiskCacheConfig(Section):
@@ -146,8 +143,7 @@ class DataConfig(Section):
     """Kind of state. pose: 7 numbers, position, rotation and gripper, which the released weights know. vector: the
     source's own numbers, unchanged, of any width, for other robots: two arms, joints, a mobile base."""
     actions: Annotated[Literal["difference", "recorded"], Affects.INDEX | Affects.CLIPS] = "difference"
-    """difference: the change from a state to the next one; of vectors, the plain difference. recorded: the commands in
-    the source, of any width; for vectors only."""
+    """difference: the change from a state to the next. recorded: the source's commands, of any width; for vectors."""
     join_actions: Annotated[Literal["sum", "mean", "last"] | None, Affects.MEASURED | Affects.RUN] = None
     """How the recorded commands of a model step's control steps become one action. sum: deltas. mean: velocities. last:
     absolute targets. Must be given unless `stride` is 1."""
@@ -160,11 +156,9 @@ class DataConfig(Section):
     """Clips start at multiples of this many control steps, counted from the first step of their episode that
     `data.idle` keeps. With the stride's own number, only every stride-th frame is ever needed: a small latent cache."""
     stride_candidates: Annotated[Annotated[tuple[PositiveInt, ...], Field(min_length=1)] | None, Affects.RUN] = None
-    """Strides that `auto` and `data calibrate` evaluate; null: 4, 8, 15 at 15 control steps per second, scaled to
-    others."""
+    """Strides that `auto` and `data calibrate` evaluate; null: 4, 8, 15 at 15 control steps per second, or scaled."""
     validation_share: Annotated[Share, Affects.RUN] = 0.05
-    """Share of the episodes held out for validation, chosen by a hash of the episode's identity; at least one of three
-    or more, unless this is 0."""
+    """Share of the episodes held out for validation, by a hash of their identity; at least one of three, unless 0."""
     test_share: Annotated[Share, Affects.RUN] = 0.05
     """Share of the episodes held out for `evaluate`, likewise; never seen in training nor in validation."""
     split_by: Annotated[Annotated[str, Field(max_length=500), AfterValidator(_split_by)] | None, Affects.RUN] = None
@@ -227,25 +221,25 @@ class DataConfig(Section):
 
     @model_validator(mode="after")
     def _parts_fit(self) -> DataConfig:
-        known = self.known_cameras
-        if not self.cameras:
-            raise ValueError("camera: an empty list; name one or more, or null for the source's first")
-        for camera in self.cameras:
-            if known is not None and camera not in known:
-                raise ValueError(
-                    f"camera {camera!r} is not one of the cameras of source {self.source}: {', '.join(known)}"
-                )
-        if self.is_cache and isinstance(self.stride, str):
-            raise ValueError("stride auto: a latent cache has one stride; give its number")
-        if self.is_cache and (self.cache != "off" or is_url(self.path)):
-            raise ValueError(f"source {self.source} is itself a cache, in a folder on this machine: set cache: off")
-        if self.augment.is_on and self.takes_latents:
-            raise ValueError("augment changes frames, and latents that are cached are of unchanged ones: choose one")
-        if self.validation_share + self.test_share >= 1.0:
-            raise ValueError("validation_share and test_share leave nothing to train on")
-        if self.pose_frame == "camera" and not self.has_camera_poses:
-            raise ValueError(f"pose_frame camera needs camera poses, which a source of {self.source} does not have")
-        return self
+        known, cameras = self.known_cameras, self.cameras
+        unknown = [camera for camera in cameras if known is not None and camera not in known]
+        splits, of_camera = self.validation_share + self.test_share, self.pose_frame == "camera"
+        return self.refused(
+            (not cameras, "camera: an empty list; name one or more, or null for the source's first"),
+            (unknown, f"camera {unknown[:1]} is none of source {self.source}: {', '.join(known or ())}"),
+            (self.is_cache and self.stride == "auto", "stride auto: a latent cache has one stride; give its number"),
+            (self.is_cache and is_url(self.path), "path: a latent cache is a folder on this machine"),
+            (self.is_cache and self.cache != "off", f"source {self.source} is itself a cache: set cache: off"),
+            (
+                self.augment.is_on and self.takes_latents,
+                "augment changes frames, and latents in a cache stay: choose one",
+            ),
+            (splits >= 1.0, "validation_share and test_share leave nothing to train on"),
+            (
+                of_camera and not self.has_camera_poses,
+                f"pose_frame camera: a source of {self.source} has no camera poses",
+            ),
+        )
 
     @model_validator(mode="after")
     def _vectors_fit(self) -> DataConfig:
@@ -255,18 +249,14 @@ class DataConfig(Section):
             "idle.rule motion": self.idle.rule == "motion",
         }
         asked = [*(name for name, is_asked in of_poses.items() if is_asked), *self.own_knobs_of_poses]
-        if self.states == "vector" and asked:
-            raise ValueError(f"{', '.join(asked)}: a matter of poses, and states is vector")
-        if self.actions == "recorded" and self.states == "pose":
-            raise ValueError("actions recorded needs states vector: the action of a pose is its difference to the next")
-        if self.actions == "recorded" and self.stride != 1 and self.join_actions is None:
-            raise ValueError(
-                f"actions recorded at stride {self.stride}: a model step has a command for each of its control steps;"
-                " set join_actions to sum (deltas), mean (velocities) or last (absolute targets)"
-            )
-        if self.actions != "recorded" and self.join_actions is not None:
-            raise ValueError("join_actions belongs to actions recorded")
-        return self
+        is_vector, is_recorded = self.states == "vector", self.actions == "recorded"
+        has_many = is_recorded and self.stride != 1 and self.join_actions is None
+        return self.refused(
+            (is_vector and asked, f"{', '.join(asked)}: a matter of poses, and states is vector"),
+            (is_recorded and not is_vector, "actions recorded needs states vector: that of a pose is its difference"),
+            (has_many, f"actions recorded at stride {self.stride}: set join_actions {_JOINED}"),
+            (not is_recorded and self.join_actions is not None, "join_actions belongs to actions recorded"),
+        )
 
     @classmethod
     def look(cls, path: str) -> dict[str, Any] | None:  # noqa: ARG003 - of a form that is looked for

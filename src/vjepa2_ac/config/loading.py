@@ -15,10 +15,12 @@ import yaml  # to write: `storage.structured` reads
 from pydantic import ValidationError
 
 from vjepa2_ac.config import Config, DataConfig
-from vjepa2_ac.config.plugins import admit_forms_of_data, with_plugins
+from vjepa2_ac.config.data import source_of
+from vjepa2_ac.config.run import ReplayConfig
 from vjepa2_ac.config.section import marks_of
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.places import BUILTIN
+from vjepa2_ac.registry import SOURCES, import_plugins
 from vjepa2_ac.storage.structured import message_of, parse_yaml
 
 _PACKAGED = Path(str(importlib.resources.files("vjepa2_ac"))) / "assets" / "configs"
@@ -39,19 +41,13 @@ def load_config(config: str | Path | Mapping[str, Any], overrides: Iterable[str]
         >>> config = load_config({"run_dir": "run", "data": {"path": "data"}, "model": {"base": "builtin:sim-tiny"}})
     """
     if isinstance(config, Mapping):
-        return config_from(config, overrides, where="load_config")
-    return parse_config(_overridden(_read_yaml(config_path(config)), overrides), where=str(config))
+        return parse_config(config, overrides, where="load_config")
+    return parse_config(_read_yaml(config_path(config)), overrides, where=str(config))
 
 
-def load_config_of_run(path: Path, overrides: Iterable[str] = ()) -> Config:
-    """Read the config of a run, which may be a stranger's: its plug-ins are not looked for in the working directory.
-
-    It may be one of the package, as for `load_config`.
-
-    Raises:
-        InputError: As `load_config`.
-    """
-    return parse_config(_overridden(_read_yaml(config_path(path)), overrides), where=str(path), here=False)
+def load_config_of_run(path: str | Path, overrides: Iterable[str] = ()) -> Config:
+    """Read the config of a run, which may be a stranger's: its plug-ins are not looked for in the working directory."""
+    return parse_config(_read_yaml(config_path(path)), overrides, where=str(path), here=False)
 
 
 def packaged_configs() -> dict[str, str]:
@@ -74,31 +70,29 @@ def config_path(name: str | Path) -> Path:
     return _PACKAGED / f"{known}.yaml"
 
 
-def config_from(values: Mapping[str, Any], overrides: Iterable[str] = (), *, where: str) -> Config:
-    """Return a config of plain values with `key.sub=value` overrides, without a file.
-
-    Raises:
-        InputError: Names every key that is wrong.
-    """
-    return parse_config(_overridden(json.loads(_as_json(values, where)), overrides), where=where)
-
-
-def parse_config(values: Mapping[str, Any], *, where: str, here: bool = True) -> Config:
-    """Validate plain values, as YAML or JSON gives them.
+def parse_config(values: Mapping[str, Any], overrides: Iterable[str] = (), *, where: str, here: bool = True) -> Config:
+    """Validate plain values, as YAML or JSON gives them, with `key.sub=value` overrides.
 
     Args:
-        values: The values.
+        values: The values; a Path is text.
+        overrides: Such as training.steps=100.
         where: Their file, for messages.
         here: Whether plug-ins may lie in the working directory: not those of a run, which may be a stranger's.
 
     Raises:
         InputError: Names every key that is wrong, all at once.
     """
+    given = json.loads(_as_json(values, where))
+    for override in overrides:
+        key, separator, text = override.partition("=")
+        if not separator or not key:
+            raise InputError(where="overrides", found=f"{override!r}", needed="key=value, such as training.steps=100")
+        _set(given, key.split("."), parse_yaml(text, where=f"override {key}"), override)
     try:
-        return Config.model_validate_json(_as_json(with_plugins(values, where=where, here=here), where))
+        return Config.model_validate_json(_as_json(with_plugins(given, where=where, here=here), where))
     except ValidationError as error:
         lines = _wrong_values(error)
-    found = f"{len(lines)} value{'s are' if len(lines) > 1 else ' is'} wrong\n  " + "\n  ".join(lines) + "\n"
+    found = "\n  ".join([f"{len(lines)} value{'s are' if len(lines) > 1 else ' is'} wrong", *lines]) + "\n"
     raise InputError(where=where, found=found, fix="`vjepa2-ac config schema` lists every key with its range")
 
 
@@ -174,15 +168,6 @@ def _as_json(values: Mapping[str, Any], where: str) -> str:
         raise InputError(where=where, found=f"a value that a config cannot hold ({error})") from None
 
 
-def _overridden(values: dict[str, Any], overrides: Iterable[str]) -> dict[str, Any]:
-    for override in overrides:
-        key, separator, text = override.partition("=")
-        if not separator or not key:
-            raise InputError(where="overrides", found=f"{override!r}", needed="key=value, such as training.steps=100")
-        _set(values, key.split("."), parse_yaml(text, where=f"override {key}"), override)
-    return values
-
-
 def _set(values: dict[str, Any], keys: list[str], value: Any, override: str) -> None:
     for depth, key in enumerate(keys[:-1]):
         if values.get(key) is None:
@@ -197,6 +182,62 @@ def _set(values: dict[str, Any], keys: list[str], value: Any, override: str) -> 
         for section in {section for kind in others for section in kind.own_sections()}:
             values.pop(section, None)  # of the form of data that it replaces
     values[keys[-1]] = value
+
+
+# ---- plug-ins: modules that are imported before a config is checked; what they register may be named in it ----
+
+_named: list[str] = []  # by `--plugin`
+
+
+def name_plugins(modules: list[str]) -> None:
+    """Import the modules of `--plugin`; every config that is read from now on names them, too.
+
+    Raises:
+        InputError: One is not there.
+    """
+    import_plugins(modules, where="--plugin")
+    _named.extend(modules)
+
+
+def with_plugins(values: Mapping[str, Any], *, where: str, here: bool) -> dict[str, Any]:
+    """Import the plug-ins of a config, and the installed form of data that it names; return it with all plug-ins.
+
+    Args:
+        values: The plain values, which may be wrong.
+        where: Its file.
+        here: As for `registry.import_plugins`.
+
+    Raises:
+        InputError: One is not there.
+    """
+    given = values.get("plugins")
+    if given is not None and not (isinstance(given, list) and all(isinstance(one, str) for one in given)):
+        return dict(values)  # an error, which the check names
+    plugins = list(dict.fromkeys([*(given or ()), *_named]))
+    import_plugins([one for one in plugins if one not in _named], where=f"{where}: plugins", here=here)
+    replay = values.get("replay")
+    for data in (values.get("data"), replay.get("data") if isinstance(replay, dict) else None):
+        if (source := source_of(data)) not in DataConfig.kinds and source in SOURCES.names():
+            SOURCES.find(source)
+    admit_forms_of_data()
+    return {**values, "plugins": plugins} if plugins else dict(values)
+
+
+def admit_forms_of_data(*, all_installed: bool = False) -> None:
+    """Let configs hold the forms of data that were defined since the last time.
+
+    Args:
+        all_installed: Import those of all installed packages first.
+    """
+    for name in SOURCES.names() if all_installed else ():
+        SOURCES.find(name)
+    if (count := len(DataConfig.kinds)) != _admitted[0]:
+        for section in (DataConfig, ReplayConfig, Config):
+            section.model_rebuild(force=True)
+        _admitted[0] = count
+
+
+_admitted = [len(DataConfig.kinds)]
 
 
 # ---- what is wrong ----
@@ -235,8 +276,9 @@ def _wrong_values(error: ValidationError) -> list[str]:
     for detail in error.errors(include_url=False):
         if detail["type"] != "default_factory_not_called":  # a default that follows from another value, which is wrong
             key = _key_of(detail["loc"]) + ".source" * (detail["type"] == "union_tag_invalid")
-            found.setdefault(key, []).append(_explain(key, detail))
-    return [f"{key}: {_joined(lines)}".removeprefix(": ") for key, lines in found.items()]
+            *others, last = dict.fromkeys([*found.get(key, ()), _explain(key, detail)])
+            found[key] = [*(line.split(" (found ")[0] for line in others), last]  # all of the same value
+    return [f"{key}: {', or '.join(lines)}".removeprefix(": ") for key, lines in found.items()]
 
 
 def all_keys() -> list[str]:
@@ -250,16 +292,9 @@ def _key_of(location: Sequence[Any]) -> str:
     parts: list[str] = []
     for before, part in zip(["", *location], map(str, location), strict=False):
         is_form = before == "data" and part in DataConfig.kinds
-        is_type = ".".join(parts) in all_keys() and _TYPE_OF_A_UNION.fullmatch(part)
-        if not is_form and not is_type:
+        if not is_form and not (_TYPE_OF_A_UNION.fullmatch(part) and ".".join(parts) in all_keys()):
             parts.append(part)
     return ".".join(parts)
-
-
-def _joined(lines: list[str]) -> str:
-    """Return the messages of the types of a union, which are about the same value, as one."""
-    *others, last = dict.fromkeys(lines)
-    return ", or ".join([*(line.split(" (found ")[0] for line in others), last])
 
 
 def _explain(key: str, detail: Any) -> str:
@@ -269,15 +304,15 @@ def _explain(key: str, detail: Any) -> str:
         return f"Input should be {' or '.join(map(repr, DataConfig.kinds))} (found {detail['ctx']['tag']!r})"
     if detail["type"] != "extra_forbidden":
         return message_of(detail)
-    section, _, name = key.rpartition(".")
+    section, dot, name = key.rpartition(".")
     if key in all_keys():
         owners = [source for source, kind in DataConfig.kinds.items() if name in kind.model_fields]
         return f"a section of source {' or '.join(owners)}, and this is source {detail['loc'][-2]}"
-    siblings = [one.rpartition(".")[2] for one in all_keys() if one.rpartition(".")[0] == section]
-    prefix = f"{section}." if section else ""
-    close = [prefix + one for one in difflib.get_close_matches(name, siblings, n=1)]
+    prefix = section + dot
+    siblings = [one for one in all_keys() if one.rpartition(".")[0] == section]
+    close = difflib.get_close_matches(name, [one.removeprefix(prefix) for one in siblings], n=1)
     elsewhere = [one for one in all_keys() if one.endswith(f".{name}")]
-    also = [_ALSO_CALLED[name]] if name in _ALSO_CALLED else []
-    meant = next(iter([*also, *close, *elsewhere]), None)
-    hint = f"known here: {', '.join(siblings)}" if meant is None else f"did you mean {meant.removeprefix(prefix)}?"
-    return f"unknown key; {hint}"
+    for meant in (_ALSO_CALLED.get(name), *(prefix + one for one in close), *elsewhere):
+        if meant is not None:
+            return f"unknown key; did you mean {meant.removeprefix(prefix)}?"
+    return f"unknown key; known here: {', '.join(one.removeprefix(prefix) for one in siblings)}"

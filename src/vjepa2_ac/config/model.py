@@ -68,9 +68,10 @@ class PredictorSizes(Section):
 
     @model_validator(mode="after")
     def _widths_are_used(self) -> PredictorSizes:
-        if not self.use_states and self.state_dim != _STATE_DIM:
-            raise ValueError(f"state_dim {self.state_dim} with use_states false: leave it out, states of any width fit")
-        return self
+        is_broken = not self.use_states and self.state_dim != _STATE_DIM
+        return self.refused(
+            (is_broken, f"state_dim {self.state_dim} with use_states false: any width fits, leave it out")
+        )
 
 
 class ModelSizes(Section):
@@ -97,46 +98,42 @@ class ModelSizes(Section):
             return None
         return (
             f"model.random_start persistence: a predictor of width {self.predictor.width} cannot copy latents of width"
-            f" {self.encoder.width}; it starts from a random part of them and learns the rest. With predictor.width"
-            f" {self.encoder.width} or more it starts near copying"
+            f" {self.encoder.width}; it starts from a random part of them. A predictor as wide starts near copying"
         )
 
     @model_validator(mode="after")
     def _sizes_divide(self) -> ModelSizes:
-        if self.image_size % self.patch_size:
-            raise ValueError(f"image_size {self.image_size} is not a multiple of patch_size {self.patch_size}")
+        image, patch = self.image_size, self.patch_size
+        old, as_image = self.encoder.family == "v2", self.encoder.frame == "image"
+        self.refused(
+            (image % patch, f"image_size {image} is not a multiple of patch_size {patch}"),
+            (old and as_image, "encoder.frame image: V-JEPA 2 has no path for images, only 2.1 has; take tubelet"),
+            (not old and image == patch, "image_size of one patch: V-JEPA 2.1 needs a grid of two patches or more"),
+        )
         for name, part in (("encoder", self.encoder), ("predictor", self.predictor)):
-            if part.width % part.heads:
-                raise ValueError(f"{name}.width {part.width} is not a multiple of {name}.heads {part.heads}")
-            if part.width // part.heads < 6 or (part.width // part.heads) % 2:
-                raise ValueError(
-                    f"{name}: heads of width / heads = {part.width // part.heads} do not fit 3D RoPE (even, at least 6)"
-                )
-            if not int(part.width * part.mlp_ratio):
-                raise ValueError(f"{name}.mlp_ratio {part.mlp_ratio} leaves nothing of {name}.width {part.width}")
-        if self.encoder.frame == "image" and self.encoder.family == "v2":
-            raise ValueError("encoder.frame image: V-JEPA 2 has no path for images, only 2.1 has; take tubelet")
-        if self.encoder.family == "v2.1" and self.image_size == self.patch_size:
-            raise ValueError("image_size of one patch: V-JEPA 2.1 scales positions to a grid of two patches or more")
+            head, rest = divmod(part.width, part.heads)
+            self.refused(
+                (rest, f"{name}.width {part.width} is not a multiple of {name}.heads {part.heads}"),
+                (
+                    head < 6 or head % 2,
+                    f"{name}: heads of width / heads = {head} do not fit 3D RoPE (even, at least 6)",
+                ),
+                (part.width * part.mlp_ratio < 1, f"{name}.mlp_ratio {part.mlp_ratio} leaves nothing of {name}.width"),
+            )
         return self
 
     @model_validator(mode="after")
     def _sizes_are_of_this_world(self) -> ModelSizes:
-        tokens = self.tokens_per_frame
-        if tokens > _MOST_TOKENS:
-            raise ValueError(
-                f"image_size {self.image_size} and patch_size {self.patch_size} make {tokens:,} tokens a frame, more"
-                f" than {_MOST_TOKENS:,}"
-            )
-        parts = (self.encoder, self.predictor)
+        parts, tokens = (self.encoder, self.predictor), self.tokens_per_frame
         weights = sum(part.depth * part.width**2 * (4 + 2 * part.mlp_ratio) for part in parts)
         weights += 6 * self.patch_size**2 * self.encoder.width  # of patches: 3 colours, 2 frames
-        if weights > _MOST_WEIGHTS:
-            raise ValueError(
-                f"encoder and predictor of these widths and depths have {weights:.2g} weights, more than"
-                f" {_MOST_WEIGHTS:.0e}"
-            )
-        return self
+        return self.refused(
+            (tokens > _MOST_TOKENS, f"image_size: {tokens:,} tokens a frame, more than {_MOST_TOKENS:,}"),
+            (
+                weights > _MOST_WEIGHTS,
+                f"encoder and predictor have {weights:.2g} weights, more than {_MOST_WEIGHTS:.0e}",
+            ),
+        )
 
 
 class EncoderConfig(Section):
@@ -178,9 +175,8 @@ class ModelConfig(Section):
 
     @model_validator(mode="after")
     def _one_start(self) -> ModelConfig:
-        if (self.base is None) == (self.random is None):
-            raise ValueError("give either base (a model to adapt) or random (sizes of a fresh one)")
-        return self
+        is_broken = (self.base is None) == (self.random is None)
+        return self.refused((is_broken, "give either base (a model to adapt) or random (sizes of a fresh one)"))
 
     def with_base(self, name: str) -> ModelConfig:
         """Return the config of another model that is there, with the other settings of this one."""
@@ -226,16 +222,11 @@ class AdapterConfig(Section):
 
     @model_validator(mode="after")
     def _is_an_adapter_of_this_base(self) -> AdapterConfig:
-        for name in self.peft:
-            if name in PEFT_NAMES:
-                raise ValueError(f"peft.{name} is adapter.{PEFT_NAMES[name]} here")
         start = self.peft.get("init_lora_weights", True)
-        if start not in (True, False, "gaussian", "orthogonal"):
-            raise ValueError(
-                f"peft.init_lora_weights {start!r} changes the base, or needs data: the adapter would belong to weights"
-                " that nobody has; take true, false, gaussian or orthogonal"
-            )
-        return self
+        ours = [(True, f"peft.{name} is adapter.{PEFT_NAMES[name]} here") for name in self.peft if name in PEFT_NAMES]
+        changes_base = start not in (True, False, "gaussian", "orthogonal")
+        why = "changes the base to weights that nobody has; take true, false, gaussian or orthogonal"
+        return self.refused(*ours, (changes_base, f"peft.init_lora_weights {start!r} {why}"))
 
     @property
     def out_of_line(self) -> str | None:
@@ -245,6 +236,6 @@ class AdapterConfig(Section):
         scale, usual = (alpha / math.sqrt(self.rank) for alpha in (self.alpha, _USUAL_ALPHA))
         return (
             f"adapter.alpha {self.alpha:g} gives rank {self.rank} a scale of {scale:.3g}, alpha {_USUAL_ALPHA:g} one of"
-            f" {usual:.3g}. With adapter.rslora alpha is meant to stay the same at every rank: raised with the rank, it"
-            f" asks for a lower training.learning_rate. Take adapter.alpha={_USUAL_ALPHA:g}, or compare both"
+            f" {usual:.3g}. With adapter.rslora alpha stays the same at every rank: raised with it, it asks for a lower"
+            f" training.learning_rate. Take adapter.alpha={_USUAL_ALPHA:g}, or compare both"
         )

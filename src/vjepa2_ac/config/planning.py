@@ -28,9 +28,8 @@ class LimitsConfig(Section):
     radius: Positive = 0.05
     """Of the ball, in metres."""
     workspace: tuple[Corner, Corner] | None = None
-    """Corners (lowest and highest x, y, z, in metres, base frame) of the box in which every target of the flange lies.
-    An action that would leave it is cut; a robot that is outside by more than one step does not move. Of poses in the
-    base frame."""
+    """Corners (lowest and highest x, y, z, in metres) of the box in which every target of the flange lies: an action is
+    cut; a robot that is outside by more than one step does not move. Of poses in the base frame."""
     rotation: Annotated[float, Field(ge=0.0, le=math.pi)] = 0.0
     """Largest turn about each axis, in radians; 0: the rotation is held, as upstream does."""
     axes: Literal["data"] | Annotated[tuple[NonNegative, ...], Field(min_length=1)] = "data"
@@ -55,26 +54,22 @@ class LimitsConfig(Section):
         """
         if isinstance(self.xyz, tuple):
             return self.xyz
-        raise InputError(
-            where="planning.limits.xyz",
-            found="data, of a model or an older run, which does not say what it was taught",
-            needed="the largest dx, dy, dz in metres, such as planning.limits.xyz=[0.05,0.05,0.05]",
-            fix="`vjepa2-ac data inspect CONFIG` shows how far 99 % of the steps in your data go (line `axes`)",
-        )
+        found = "data, of a model or an older run, which does not say what it was taught"
+        needed = "the largest dx, dy, dz in metres, such as planning.limits.xyz=[0.05,0.05,0.05]"
+        fix = "`vjepa2-ac data inspect CONFIG` shows how far 99 % of the steps in your data go (line `axes`)"
+        raise InputError(where="planning.limits.xyz", found=found, needed=needed, fix=fix)
 
     @model_validator(mode="after")
     def _workspace_has_room(self) -> LimitsConfig:
-        if self.workspace is not None and any(low >= high for low, high in zip(*self.workspace, strict=True)):
-            low, high = self.workspace
-            raise ValueError(f"workspace: the corner {low} is not below {high} on every axis")
-        return self
+        low, high = self.workspace or ((0, 0, 0), (1, 1, 1))
+        is_broken = any(one >= other for one, other in zip(low, high, strict=True))
+        return self.refused((is_broken, f"workspace: the corner {low} is not below {high} on every axis"))
 
     @model_validator(mode="after")
     def _something_is_free(self) -> LimitsConfig:
         held = self.gripper_mode in {"held", "open", "close"} or not self.gripper
-        if not any(self.xyz) and not self.rotation and held:
-            raise ValueError("nothing is left to plan: xyz, rotation and gripper are all held")
-        return self
+        is_broken = not any(self.xyz) and not self.rotation and held
+        return self.refused((is_broken, "nothing is left to plan: xyz, rotation and gripper are all held"))
 
 
 class EnergyConfig(Section):
@@ -149,8 +144,7 @@ class MppiConfig(Section):
     """Model predictive path integral control."""
 
     temperature: Positive = 0.1
-    """Of the weights exp(-energy / temperature), in standard deviations of the samples' energies, hence without a
-    unit."""
+    """Of the weights exp(-energy / temperature), in standard deviations of the samples' energies."""
     std_decay: Annotated[float, Field(gt=0.0, le=1.0)] = 0.8
     """Factor of the standard deviation after each iteration; 1: constant."""
 
@@ -159,8 +153,7 @@ class GradientConfig(Section):
     """Gradient descent through the model."""
 
     starts: PositiveInt = 8
-    """Sequences that are optimised at once: the first from the previous plan (or no motion), the others from random
-    ones."""
+    """Sequences that are optimised at once: the first from the previous plan (or none), the others from random ones."""
     learning_rate: Positive = 0.1
     """Of Adam at the first iteration, as a share of the limits; it decays linearly to zero."""
 
@@ -175,8 +168,7 @@ class PlanningConfig(Section):
     horizon: PositiveInt = 1
     """Model steps that a plan spans."""
     action_repeat: PositiveInt = 1
-    """Model steps for which one action is repeated; the horizon is a multiple of it. A controller still decides anew at
-    each of them."""
+    """Model steps for which a plan repeats an action; the horizon is a multiple of it. Each step is decided anew."""
     samples: Annotated[int, Field(ge=2)] = 800
     """Action sequences an iteration; gradient has `gradient.starts`."""
     iterations: PositiveInt = 10
@@ -214,11 +206,6 @@ class PlanningConfig(Section):
     gradient: GradientConfig = GradientConfig()
     """Of planner gradient only."""
 
-    @model_validator(mode="after")
-    def _options_fit(self) -> PlanningConfig:
-        PLANNERS.options(self.planner, self.planner_options)
-        return self
-
     @property
     def sequences(self) -> tuple[int, ...]:
         """The action sequences that each iteration evaluates; without those that icem reuses."""
@@ -228,14 +215,11 @@ class PlanningConfig(Section):
 
     @model_validator(mode="after")
     def _numbers_fit(self) -> PlanningConfig:
-        if self.horizon % self.action_repeat:
-            raise ValueError(f"horizon {self.horizon} is not a multiple of action_repeat {self.action_repeat}")
-        if self.limits.gripper_from % self.action_repeat:
-            raise ValueError(
-                f"limits.gripper_from {self.limits.gripper_from} is not a multiple of action_repeat"
-                f" {self.action_repeat}"
-            )
+        PLANNERS.options(self.planner, self.planner_options)
         elites = {"cem": self.cem.elites, "icem": self.icem.elites}.get(self.planner, 0)
-        if elites > self.samples:
-            raise ValueError(f"{self.planner}.elites {elites} are more than {self.samples} samples")
-        return self
+        repeat, first = self.action_repeat, self.limits.gripper_from
+        return self.refused(
+            (self.horizon % repeat, f"horizon {self.horizon} is not a multiple of action_repeat {repeat}"),
+            (first % repeat, f"limits.gripper_from {first} is not a multiple of action_repeat {repeat}"),
+            (elites > self.samples, f"{self.planner}.elites {elites} are more than {self.samples} samples"),
+        )

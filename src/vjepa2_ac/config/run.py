@@ -8,13 +8,11 @@ from pydantic import AfterValidator, Field, model_validator
 
 from vjepa2_ac import places
 from vjepa2_ac.config.data import DataConfig
-from vjepa2_ac.config.decoder import DecoderConfig
 from vjepa2_ac.config.model import AdapterConfig, ModelConfig
 from vjepa2_ac.config.planning import PlanningConfig
-from vjepa2_ac.config.replay import ReplayConfig
-from vjepa2_ac.config.section import Affects, Section
+from vjepa2_ac.config.section import Affects, AtMost, Section
 from vjepa2_ac.config.sources import RldsData  # noqa: F401 - all forms of data
-from vjepa2_ac.config.training import CheckpointConfig, TrackingConfig, TrainingConfig, ValidationConfig
+from vjepa2_ac.config.training import CheckpointConfig, DecoderConfig, TrackingConfig, TrainingConfig, ValidationConfig
 
 
 def _run_folder(path: str) -> str:
@@ -24,6 +22,37 @@ def _run_folder(path: str) -> str:
         if not places.is_url(path):
             raise
         raise ValueError(f"{error}; to keep a copy there as the run goes, set checkpoint.remote to it") from None
+
+
+class ReplayConfig(Section):
+    """Clips of a second data set, mixed into training against forgetting: those of the base, or of varied motion.
+
+    Validation, evaluation and planning know the first data set only.
+    """
+
+    share: Annotated[float, Field(gt=0.0, lt=1.0), Affects.RUN] = 0.25
+    """Share of the training clips that come from it, evenly spread over the run."""
+    data: Annotated[DataConfig, AtMost(Affects.RUN)]
+    """The second data set, with the knobs of `data`: as many frames, the same kind of states and actions, and latents
+    of a cache if the first one's clips are. Only its training split is used; `workers` and `prefetch` are not."""
+
+    @model_validator(mode="after")
+    def _stride_is_known(self) -> ReplayConfig:
+        is_auto = self.data.stride == "auto"
+        return self.refused(
+            (is_auto, "data.stride auto: give its number; the model chooses for the first data set only")
+        )
+
+    def misfits(self, first: DataConfig) -> list[str]:
+        """Return why clips of both cannot be in one micro-batch, as far as their configs say."""
+        same = ("frames", "states", "actions", "join_actions", "pose_frame")
+        pairs = [(name, getattr(self.data, name), getattr(first, name)) for name in same]
+        lines = [f"replay.data.{name} {one} is not data.{name} {other}" for name, one, other in pairs if one != other]
+        if self.data.takes_latents != first.takes_latents:
+            lines.append("replay.data or data takes latents from a cache, and the other does not: set cache alike")
+        if first.stride == "auto":
+            lines.append("data.stride auto with replay: give its number, so that steps of both last equally long")
+        return lines
 
 
 class Config(Section):
@@ -59,42 +88,25 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _parts_fit(self) -> Config:
-        if self.training.rollout_steps >= self.data.frames:
-            raise ValueError(
-                f"training.rollout_steps {self.training.rollout_steps} needs data.frames of at least"
-                f" {self.training.rollout_steps + 1}, not {self.data.frames}"
-            )
-        if self.model.random is not None and self.adapter.kind == "lora":
-            raise ValueError("model.random with adapter.kind lora would adapt noise; set adapter.kind: none")
-        if self.training.precision == "fp32" and self.model.dtype != "float32":
-            raise ValueError("training.precision fp32 needs model.dtype float32: bfloat16 weights compute in bfloat16")
-        if self.training.compile != "off" and self.adapter.kind == "lora" and self.adapter.dora:
-            raise ValueError("training.compile blocks cannot trace adapter.dora; set one of them off")
-        if self.checkpoint.keep_best == "ranking" and not self.validation.ranking_clips:
-            raise ValueError("checkpoint.keep_best ranking needs validation.ranking_clips of 1 or more")
-        if self.training.patience is not None and self.checkpoint.keep_best == "off":
-            raise ValueError("training.patience waits for a better checkpoint, and checkpoint.keep_best is off")
-        sizes = self.model.random or self.model.sizes
-        for data in self.data_sets:
-            if sizes.predictor.use_extrinsics and not data.has_camera_poses:
-                raise ValueError(
-                    f"predictor.use_extrinsics needs camera poses, which a data.source of {data.source} does not have"
-                )
-        return self
-
-    @model_validator(mode="after")
-    def _adapter_fits_the_predictor(self) -> Config:
-        if self.adapter.kind == "lora" and not (self.model.random or self.model.sizes).predictor.use_states:
-            for knob in ("targets", "modules_to_save"):
-                if "state_encoder" in getattr(self.adapter, knob):
-                    raise ValueError(f"adapter.{knob}: no state_encoder where predictor.use_states is false")
-        return self
-
-    @model_validator(mode="after")
-    def _replay_fits(self) -> Config:
-        if self.replay is not None and (misfits := self.replay.misfits(self.data)):
-            raise ValueError("; ".join(misfits))
-        return self
+        training, adapter, model, best = self.training, self.adapter, self.model, self.checkpoint.keep_best
+        predictor, steps, lora = (model.random or model.sizes).predictor, training.rollout_steps, adapter.kind == "lora"
+        fp32, compiled = training.precision == "fp32", training.compile != "off" and lora
+        patient, ranked = training.patience is not None, self.validation.ranking_clips > 0
+        stray = [name for name in ("targets", "modules_to_save") if "state_encoder" in getattr(adapter, name)]
+        stray = stray if lora and not predictor.use_states else []
+        blind = [data.source for data in self.data_sets if not data.has_camera_poses]
+        misfits = [] if self.replay is None else self.replay.misfits(self.data)
+        return self.refused(
+            (steps >= self.data.frames, f"training.rollout_steps {steps} needs data.frames of at least {steps + 1}"),
+            (model.random and lora, "model.random with adapter.kind lora would adapt noise; set adapter.kind: none"),
+            (fp32 and model.dtype != "float32", "training.precision fp32 needs model.dtype float32"),
+            (compiled and adapter.dora, "training.compile blocks cannot trace adapter.dora; set one of them off"),
+            (best == "ranking" and not ranked, "checkpoint.keep_best ranking needs validation.ranking_clips"),
+            (best == "off" and patient, "training.patience waits for a better one, and checkpoint.keep_best is off"),
+            (predictor.use_extrinsics and blind, f"predictor.use_extrinsics needs camera poses, not in source {blind}"),
+            (stray, f"adapter.{' and '.join(stray)}: no state_encoder where predictor.use_states is false"),
+            (misfits, "; ".join(misfits)),
+        )
 
     @property
     def data_sets(self) -> tuple[DataConfig, ...]:

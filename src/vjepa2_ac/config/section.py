@@ -6,13 +6,12 @@ holds for the knobs in it that have none of their own. `AtMost` limits those tha
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import Flag, auto
 from functools import cache, reduce
 from operator import or_
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any, Self, get_args
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 from pydantic.fields import FieldInfo
@@ -37,6 +36,17 @@ class Section(BaseModel):
     model_config = ConfigDict(
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
     )
+
+    def refused(self, *rules: tuple[object, str]) -> Self:
+        """Return the section, for a validator; each rule says when it is broken, and what is wrong then.
+
+        Raises:
+            ValueError: With what is wrong by the first rule that is broken.
+        """
+        for is_broken, why in rules:
+            if is_broken:
+                raise ValueError(why)
+        return self
 
 
 class Affects(Flag):
@@ -88,16 +98,6 @@ def mark_of(key: str, knobs: type[BaseModel]) -> Affects:
     if not found:
         raise KeyError(key)
     return reduce(or_, found)
-
-
-def names_that_affect(what: Affects, knobs: type[BaseModel]) -> list[str]:
-    """Return the keys of the knobs that affect something; for a section that does as a whole, its name and dots."""
-    marks, names = marks_of(knobs), []
-    for key in (key for key, mark in marks.items() if what in mark):
-        outer = [key[: dot.end()] for dot in re.finditer(r"\.", key)]
-        whole = (f"{one}…" for one in outer if all(what in marks[k] for k in marks if k.startswith(one)))
-        names.append(next(whole, key))
-    return list(dict.fromkeys(names))
 
 
 def knobs_that_affect(

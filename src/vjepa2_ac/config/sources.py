@@ -21,8 +21,7 @@ class RldsFields(Section):
         "steps/observation/cartesian_position",
         "steps/observation/gripper_position",
     )
-    """Features that form, concatenated, the 7 numbers of the *measured* state (legend: episode.py); for `states:
-    vector` any numbers."""
+    """Features that are, concatenated, the 7 numbers of the *measured* state (episode.py); for `states: vector` any."""
     action: Annotated[_Names, Affects.INDEX | Affects.CLIPS] = ("steps/action",)
     """For `actions: recorded`: features that form, concatenated, the *commanded* action of each control step."""
     gripper: Annotated[Literal["closedness", "openness"], Affects.IDLE | Affects.CLIPS] = "closedness"
@@ -62,13 +61,11 @@ class LeRobotFields(Section):
         "observation.state.cartesian_position",
         "observation.state.gripper_position",
     )
-    """Columns whose values, concatenated, hold position, rotation and gripper of the *measured* state; for `states:
-    vector` any numbers."""
+    """Columns that hold position, rotation and gripper of the *measured* state; for `states: vector` any numbers."""
     action: Annotated[_Names, Affects.INDEX | Affects.CLIPS] = ("action",)
     """For `actions: recorded`: columns that form, concatenated, the *commanded* action of each control step."""
     select: Annotated[tuple[Count, ...] | None, Affects.EPISODES] = None
-    """Which of the concatenated numbers, in this order, are x, y, z, the rotation's 3 or 4, the gripper; for `states:
-    vector` which are the state; null: all."""
+    """Which of these numbers, in this order, are x, y, z, rotation (3 or 4), gripper; or are the vector; null: all."""
     rotation: Annotated[Literal["euler_xyz", "quaternion_wxyz", "quaternion_xyzw"], Affects.EPISODES] = "euler_xyz"
     """How the rotation is written: extrinsic xyz Euler angles in radians, or a unit quaternion, w first or last."""
     gripper_open: Annotated[float, Affects.EPISODES] = 0.0
@@ -90,9 +87,8 @@ class LeRobotFields(Section):
 
     @model_validator(mode="after")
     def _gripper_moves(self) -> LeRobotFields:
-        if self.gripper_open == self.gripper_closed:
-            raise ValueError("gripper_open and gripper_closed are the same number")
-        return self
+        is_broken = self.gripper_open == self.gripper_closed
+        return self.refused((is_broken, "gripper_open and gripper_closed are the same number"))
 
 
 class RldsData(DataConfig):
@@ -156,12 +152,8 @@ class LeRobotData(DataConfig):
     @property
     def own_knobs_of_poses(self) -> list[str]:
         """Conventions of rotation and gripper."""
-        gripper = (self.lerobot.gripper_open, self.lerobot.gripper_closed)
-        asked = {
-            "lerobot.rotation": self.lerobot.rotation != "euler_xyz",
-            "lerobot.gripper_open and gripper_closed": gripper != (0, 1),
-        }
-        return [name for name, is_asked in asked.items() if is_asked]
+        turned, gripper = self.lerobot.rotation != "euler_xyz", (self.lerobot.gripper_open, self.lerobot.gripper_closed)
+        return ["lerobot.rotation"] * turned + ["lerobot.gripper_open and gripper_closed"] * (gripper != (0, 1))
 
 
 class NpzData(DataConfig):

@@ -1,4 +1,4 @@
-"""Training knobs: optimisation, validation, checkpoints and logging."""
+"""Training knobs: optimisation, validation, checkpoints and logging; and those of the decoder's training."""
 
 from __future__ import annotations
 
@@ -10,15 +10,19 @@ from vjepa2_ac.config.section import (
     OFF,
     Affects,
     Count,
+    Local,
     LocalOrBuiltin,
     NonNegative,
     Place,
     Positive,
     PositiveInt,
     Section,
+    Share,
     ZeroToOne,
 )
 from vjepa2_ac.registry import LOSSES, TRACKERS
+
+DecoderSize = Literal["tiny", "small", "medium"]
 
 
 def _usual_warmup(values: dict[str, Any]) -> int:
@@ -70,8 +74,7 @@ class TrainingConfig(Section):
     max_grad_norm: Positive | None = 1.0
     """Gradients are clipped to this norm; null: never (the released recipe)."""
     precision: Annotated[Literal["bf16", "fp16", "fp32"], Affects.LATENTS | Affects.RUN] = "bf16"
-    """Arithmetic of the networks (autocast). bf16 needs compute capability 8.0 on CUDA (Ampere). fp16 scales the loss,
-    and needs CUDA."""
+    """Arithmetic of the networks (autocast). bf16 needs compute capability 8.0 on CUDA; fp16 needs CUDA, too."""
     gradient_checkpointing: bool = False
     """Compute each predictor block again in the backward pass instead of keeping its activations."""
     compile: Annotated[Literal["off", "blocks"], OFF] = "off"
@@ -90,25 +93,18 @@ class TrainingConfig(Section):
     """Optimizer steps between lines in metrics.jsonl."""
 
     @model_validator(mode="after")
-    def _schedule_fits(self) -> TrainingConfig:
-        if self.warmup_steps + self.decay_steps > self.steps:
-            raise ValueError(
-                f"warmup_steps {self.warmup_steps} and decay_steps {self.decay_steps} exceed steps {self.steps}"
-            )
-        if self.decay_steps and self.schedule != "warmup_stable_decay":
-            raise ValueError(f"decay_steps belongs to schedule warmup_stable_decay, not {self.schedule}")
-        if self.schedule == "constant" and self.final_learning_rate:
-            raise ValueError("schedule constant stays at learning_rate: leave final_learning_rate out")
-        return self
-
-    @model_validator(mode="after")
-    def _loss_fits(self) -> TrainingConfig:
+    def _parts_fit(self) -> TrainingConfig:
+        warmup, decay, schedule = self.warmup_steps, self.decay_steps, self.schedule
+        decays, constant = schedule == "warmup_stable_decay", schedule == "constant"
         LOSSES.options(self.loss, self.loss_options)
-        if not self.teacher_forcing_weight + self.rollout_weight:
-            raise ValueError("teacher_forcing_weight and rollout_weight are both 0: nothing would be learned")
-        if self.loss != "smooth_l1" and self.smooth_l1_beta != 1.0:
-            raise ValueError(f"smooth_l1_beta belongs to loss smooth_l1, not {self.loss}")
-        return self
+        weights, has_beta = self.teacher_forcing_weight + self.rollout_weight, self.smooth_l1_beta != 1.0
+        return self.refused(
+            (warmup + decay > self.steps, f"warmup_steps {warmup} and decay_steps {decay} exceed steps {self.steps}"),
+            (decay and not decays, f"decay_steps belongs to schedule warmup_stable_decay, not {schedule}"),
+            (constant and self.final_learning_rate, "schedule constant has no final_learning_rate: leave it out"),
+            (not weights, "teacher_forcing_weight and rollout_weight are both 0: nothing would be learned"),
+            (has_beta and self.loss != "smooth_l1", f"smooth_l1_beta belongs to loss smooth_l1, not {self.loss}"),
+        )
 
 
 class ValidationConfig(Section):
@@ -148,8 +144,7 @@ class CheckpointConfig(Section):
     rollout error over persistence at the last horizon. off: the newest counts."""
     remote: Place | None = None
     """Where the run is copied to during training: gs://bucket/folder, another URL of fsspec that can be written, or a
-    folder (a mounted disk). A start with an empty run_dir resumes from there; null: nowhere. Same keep and best as
-    here."""
+    folder. A start with an empty run_dir resumes from there; null: nowhere. Same keep and best as here."""
     remote_every_minutes: NonNegative = 30.0
     """Minutes between uploads to remote; there is also one at the end and on preemption."""
     remote_wait_seconds: NonNegative = 120.0
@@ -175,3 +170,35 @@ class TrackingConfig(Section):
         for name, options in self.others.items():
             TRACKERS.options(TRACKERS.known(name), options)
         return self
+
+
+class DecoderConfig(Section):
+    """The decoder that `vjepa2-ac decoder` trains: it shows what the encoder's latents hold."""
+
+    folder: Annotated[Local | None, Affects.NOTHING] = None
+    """Folder of the decoder; null: `decoder`, beside run_dir. It is made for an encoder and a camera, not for a run."""
+    size: DecoderSize = "small"
+    """Parameters at the released sizes: tiny 2 M, for small encoders; small 27 M; medium 96 M."""
+    frames: PositiveInt = 40_000
+    """Frames to learn from, at most, spread over the training episodes; each is encoded once. They take 0.9 MB of disk
+    each at the released sizes with data.cache_dtype bf16, 0.6 MB with int8, until training ends."""
+    held_out_frames: PositiveInt = 1_000
+    """Frames of test episodes, at most, on which the decoder is measured in the end."""
+    steps: PositiveInt = 20_000
+    """Optimizer steps."""
+    batch_size: PositiveInt = 64
+    """Frames of a step."""
+    learning_rate: Annotated[float, Field(gt=0.0, le=1.0)] = 5e-4
+    """Peak learning rate; it falls to none by half a cosine."""
+    warmup_steps: Count = 500
+    """Optimizer steps of the linear warm-up."""
+    weight_decay: ZeroToOne = 0.05
+    """AdamW's decay; biases and norms are exempt."""
+    max_grad_norm: Positive = 1.0
+    """Gradients are clipped to this norm."""
+    average: Share = 0.999
+    """Decay of the moving average of the weights, which is the decoder in the end; 0: the last weights."""
+    noise: Annotated[float, Field(ge=0.0, le=2.0)] = 0.0
+    """Noise on latents in training, up to this standard deviation. It hides what distinguishes latents; 0: none."""
+    checkpoint_every: PositiveInt = 500
+    """Steps between checkpoints."""

@@ -35,8 +35,7 @@ from vjepa2_ac.episode import FrameReader, Progress, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.video_reader import count_frames, read_frames
 from vjepa2_ac.planning.energy import distance
-from vjepa2_ac.planning.goal_folder import NoiseFloor, write_goals
-from vjepa2_ac.planning.goals import SubGoal
+from vjepa2_ac.planning.goals import NoiseFloor, SubGoal, write_goals
 from vjepa2_ac.planning.session import PlanningSession
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.storage import unreadable

@@ -18,7 +18,7 @@ from typing import Any
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.config.loading import config_as_dict, config_from
+from vjepa2_ac.config.loading import config_as_dict, parse_config
 from vjepa2_ac.config.planning import CemConfig, EnergyConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.errors import InputError
@@ -109,7 +109,7 @@ def settle(subject: str, asked: EvaluationOptions) -> Config:
         if not setting.startswith("planning."):
             needed = "settings of planning, such as planning.samples=200"
             raise InputError(where="--planning", found=setting, needed=needed)
-    config = config_from(config_as_dict(config), asked.planning, where="--planning")
+    config = parse_config(config_as_dict(config), asked.planning, where="--planning")
     if is_run(subject):
         config = with_taught_limits(config, Path(subject))
     if asked.probes.planning_clips:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from vjepa2_ac.config import Config, EncoderConfig, ModelConfig
-from vjepa2_ac.config.loading import config_from
+from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.config.model import ModelSizes
 from vjepa2_ac.init.choices import (
     CLIPS_A_STEP,
@@ -142,7 +142,7 @@ def make_draft(found: FoundData, machine: Machine, model: ModelChoice, *, run_di
 
 
 def _config_of(knobs: Knobs) -> Config:
-    return config_from(plain(knobs), where="vjepa2-ac init")
+    return parse_config(plain(knobs), where="vjepa2-ac init")
 
 
 def _fit(config: Config, sizes: ModelSizes, machine: Machine) -> tuple[int, bool, int]:

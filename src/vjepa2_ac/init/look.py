@@ -11,8 +11,7 @@ import numpy as np
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.config.loading import config_from
-from vjepa2_ac.config.plugins import admit_forms_of_data
+from vjepa2_ac.config.loading import admit_forms_of_data, parse_config
 from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.data.sources.droid_raw.episode_folders import find_episodes
 from vjepa2_ac.data.sources.lerobot.info import INFO
@@ -224,7 +223,7 @@ def measured(found: FoundData, progress: Progress | None = None) -> FoundData:
     data = {"source": found.source, "path": found.path, "states": found.states, **plain(found.knobs)}
     values = {"run_dir": "none", "data": data, "model": {"base": f"{BUILTIN}sim-tiny"}}
     try:
-        source = open_source(config_from(values, where="vjepa2-ac init").data)
+        source = open_source(parse_config(values, where="vjepa2-ac init").data)
         lengths = EpisodeTable.of(source.infos(progress)).num_steps
     except UserError:
         return found

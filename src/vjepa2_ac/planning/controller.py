@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from vjepa2_ac.config import Config, ModelSizes
+from vjepa2_ac.config import Config
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.sources.configured_spaces import spaces_of
 from vjepa2_ac.data.transforms import Crop, view
@@ -20,22 +20,12 @@ from vjepa2_ac.encoding.batch import encode_frames
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.input_heads import heads_to_replace, widths_as_text, widths_of_model
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.planning.axes.axes_file import no_vertical_axis
-from vjepa2_ac.planning.axes.mapping import Axes
-from vjepa2_ac.planning.energy import Scene, WorldModelCost, distance
-from vjepa2_ac.planning.goals import (
-    REACHED,
-    AdvanceRule,
-    GoalProgress,
-    GoalSequence,
-    GripperMode,
-    SubGoal,
-    patch_weights,
-)
+from vjepa2_ac.planning.axes import require_base_frame
+from vjepa2_ac.planning.energy import Goal, Scene, WorldModelCost, distance, patch_weights
+from vjepa2_ac.planning.goals import REACHED, GoalProgress, GripperMode, SubGoal, timed, with_shares
 from vjepa2_ac.planning.input_checks import require_image, require_mask, require_numbers
-from vjepa2_ac.planning.interfaces import Plan
-from vjepa2_ac.planning.model_setup import Fingerprints, prepare_for_planning
-from vjepa2_ac.planning.planner import Cancelled, Planner
+from vjepa2_ac.planning.model_setup import Axes, Fingerprints, prepare_for_planning
+from vjepa2_ac.planning.planner import Cancelled, Plan, Planner
 from vjepa2_ac.planning.search_space import SearchSpace, Workspace, search_space
 from vjepa2_ac.planning.settings import warn_beyond_taught, with_taught_limits
 from vjepa2_ac.planning.state_integration import states_along
@@ -53,15 +43,35 @@ class Decision:
     action: Float[np.ndarray, " dim"]  # for the next model step; nothing changes for some values of `why`
     why: Why  # out of time: the best plan so far. at the goal, no finite energy, outside the workspace: do nothing
     energy_now: float  # of the current image, if nothing changed: to compare with the plan's
-    goal: int  # index of the goal that applies now
-    goals: tuple[int, ...]  # and after each model step of a plan
-    plan: Plan | None  # None if the goal is reached, or the robot is outside the workspace
-    states: Float[np.ndarray, "time dim"] | None  # states predicted along the plan, the current state first
-    cost: WorldModelCost | None  # to evaluate other actions
-    since: int = 0  # model step, counted from the reset, at which the present goal began
-    began: float = np.nan  # energy of the image to it at that time
-    changed: str = ""  # why the goal changed just before this decision, a sentence; empty: it did not
+    goals: tuple[int, ...]  # index of the goal that applies now, and after each model step of a plan
+    progress: GoalProgress  # which goal that is, since when, and why it changed
+    plan: Plan | None = None  # None if the goal is reached, or the robot is outside the workspace
+    states: Float[np.ndarray, "time dim"] | None = None  # states predicted along the plan, the current state first
+    cost: WorldModelCost | None = None  # to evaluate other actions
     done: bool = False  # the last goal is reached: no motion
+
+    @property
+    def goal(self) -> int:
+        """The index of the goal that applies now."""
+        return self.progress.place
+
+
+@dataclass(frozen=True)
+class _Goals:
+    """Goals in order, as they are compared with."""
+
+    goals: tuple[SubGoal, ...]
+    latents: Float[Tensor, "goals tokens dim"]
+    weights: Float[Tensor, " tokens"] | None = None  # as of `Goal`
+
+    def rest(self, place: int) -> Goal:
+        """Return a goal and what follows it by count at the latest, for plans of several steps."""
+        durations: list[int] = []
+        for goal in self.goals[place:-1]:
+            if goal.at_most is None:
+                break
+            durations.append(goal.at_most)
+        return Goal(self.latents[place : place + len(durations) + 1], tuple(durations), self.weights)
 
 
 class Controller:
@@ -103,25 +113,24 @@ class Controller:
                 compiled; or vectors have no limits, or a workspace; or `planning.axes` are not
                 this model's.
         """
-        _require_spaces(world_model.sizes, spaces)
+        _require_spaces(world_model, spaces)
         if extrinsics is not None:
             require_numbers(extrinsics, EXTRINSICS, where="extrinsics")
-        if world_model.sizes.predictor.use_extrinsics != (extrinsics is not None):
-            raise InputError(
-                where="model: predictor.use_extrinsics",
-                found=f"{world_model.sizes.predictor.use_extrinsics}, camera pose given: {extrinsics is not None}",
-                needed="a camera pose exactly where the model uses it",
-            )
+        if (uses := world_model.sizes.predictor.use_extrinsics) != (extrinsics is not None):
+            found, needed = f"{uses}, camera pose given: {not uses}", "a camera pose exactly where the model uses it"
+            raise InputError(where="model: predictor.use_extrinsics", found=found, needed=needed)
         self.config = config or PlanningConfig()
         self._model, self.seed, self.crop = prepare_for_planning(world_model, self.config), seed, crop
         self._camera = None if extrinsics is None else torch.from_numpy(extrinsics.astype(np.float32))
-        self.spaces, self._axes = spaces, _axes_of(world_model, self.config, spaces)
-        self.planner = Planner(self.config, search_space(self.config, spaces.state))
+        self.spaces, self._axes = spaces, None
+        if self.config.axes is not None:
+            require_base_frame(f"planning.axes: {self.config.axes}", is_base=spaces.state.is_base_pose)
+            self._axes = Axes.read(self.config.axes, Fingerprints.of(world_model))
+        self.space = search_space(self.config, spaces.state)  # the allowed changes of the state, of the last decision
+        self.planner = Planner(self.config, self.space)
         self._workspace = Workspace.of(self.config.limits, spaces.state)
-        self._searched: dict[GripperMode | None, SearchSpace] = {None: self.planner.space}
-        self._goal: GoalSequence | None = None
-        self._progress: GoalProgress | None = None  # at the last decision
-        self._like = np.zeros(0)
+        self._searched: dict[GripperMode | None, SearchSpace] = {None: self.space}
+        self._goal: _Goals | None = None
         self._seen: list[Seen] = []  # the newest `planning.context`
         self._done = 0
         self.decision: Decision | None = None  # the last one
@@ -176,11 +185,6 @@ class Controller:
         return self._model.device
 
     @property
-    def space(self) -> SearchSpace:
-        """The allowed changes of the state."""
-        return self.planner.space
-
-    @property
     def shown_axes(self) -> tuple[int, ...]:
         """The numbers to show, three at most: of a pose the position, else the first that may change."""
         return (0, 1, 2) if self.spaces.state.is_pose else tuple(self.space.free[:3].tolist())
@@ -197,12 +201,7 @@ class Controller:
             InputError: An image is invalid, sizes differ, or the mask is empty.
             ValueError: No goals, or the number of durations is not the number of goals minus one, or one is below 1.
         """
-        if not goals:
-            raise ValueError("no goal")
-        if len(durations) != len(goals) - 1 or min(durations, default=1) < 1:
-            raise ValueError(f"{len(goals)} goals with durations {durations}: one for each but the last")
-        timed = [SubGoal(one, at_least=steps, at_most=steps) for one, steps in zip(goals, durations, strict=False)]
-        self.follow([*timed, SubGoal(goals[-1])], mask=mask)
+        self.follow(timed(goals, durations), mask=mask)
 
     def follow(self, goals: Sequence[SubGoal], *, mask: np.ndarray | None = None) -> None:
         """Set goals that take their turns by their own rules, and forget all observations.
@@ -225,15 +224,12 @@ class Controller:
             raise ValueError("no goal")
         for place, goal in enumerate(goals):
             require_image(goal.image, where=f"goal {place}", like=goals[0].image if place else None)
-        rules = rules_of(goals, self.config)
+        ruled = with_shares(goals, self.config.goals)
         searched = {goal.gripper: self._space_with(goal.gripper) for goal in goals} | {None: self._searched[None]}
         latents = torch.stack([self.encoded(goal.image) for goal in goals])
-        weights = self._weights(mask, goals[0].image)
-        self._goal = GoalSequence(latents, rules, tuple(goal.gripper for goal in goals), weights)
-        self._searched, self._progress = searched, None
-        self._use(None)
-        self._like, self._done, self.decision = goals[0].image, 0, None
-        self._seen = []
+        self._goal = _Goals(ruled, latents, self._weights(mask, goals[0].image))
+        self._searched, self.space = searched, searched[None]
+        self._seen, self._done, self.decision = [], 0, None
 
     def act(
         self, frame: np.ndarray, state: np.ndarray, *, cancelled: Cancelled = lambda: False
@@ -258,22 +254,12 @@ class Controller:
         """
         if self._goal is None:
             raise ValueError("no goal: call reset first")
-        require_image(frame, where="frame", like=self._like)
+        require_image(frame, where="frame", like=self._goal.goals[0].image)
         state = self._known(np.asarray(state, dtype=np.float64))
         require_numbers(state, self.spaces.state, where="state")
         seen = [*self._seen, (self.encoded(frame), state)][-self.config.context :]
-        progress = self._progressed(self._goal, seen[-1][0])
-        decision = self._decided(self._goal, seen, progress, cancelled)
-        is_last = progress.place == len(self._goal.rules) - 1
-        decision = replace(
-            decision,
-            since=progress.since,
-            began=progress.began,
-            changed=progress.changed,
-            done=is_last and decision.why == "at the goal",
-        )
+        decision = self._decided(self._goal, seen, cancelled)
         self._seen, self._done, self.decision = seen, self._done + 1, decision  # after an error nothing has changed
-        self._progress = progress
         return decision.action
 
     def _known(self, state: np.ndarray) -> np.ndarray:
@@ -286,49 +272,49 @@ class Controller:
         """Return the latents of what the model sees of an image, on its device."""
         return encode_frames(self._model, image[None], self.crop)[0]
 
-    def _progressed(self, goal: GoalSequence, latents: Float[Tensor, "tokens dim"]) -> GoalProgress:
+    def _progressed(self, goal: _Goals, latents: Float[Tensor, "tokens dim"]) -> GoalProgress:
         """Return which goal applies to the current image."""
 
         def energy(place: int) -> float:
             return float(distance(latents, goal.latents[place], self.config.energy, goal.weights))
 
-        if self._progress is None:
-            return GoalProgress.first(energy)
-        return self._progress.after(goal.rules, self._done, energy)
+        if self.decision is None:
+            return GoalProgress(0, 0, energy(0))
+        return self.decision.progress.after(goal.goals, self._done, energy)
 
-    def _decided(
-        self, goals: GoalSequence, seen: Sequence[Seen], progress: GoalProgress, cancelled: Cancelled
-    ) -> Decision:
+    def _decided(self, goals: _Goals, seen: Sequence[Seen], cancelled: Cancelled) -> Decision:
         latents, state = seen[-1]
+        progress = self._progressed(goals, latents)
         goal, done = goals.rest(progress.place), self._done - progress.since
         places = tuple(progress.place + goal.place(done + step) for step in range(self.config.horizon))
         wanted = goal.ahead(done, self.config.horizon)
         still = distance(latents.expand_as(wanted), wanted, self.config.energy, goal.weights)
         energy = float(still[-1] if self.config.energy.steps == "last" else still.sum())
-        reason: Why | None = "at the goal" if progress.done or float(still.max()) <= REACHED else None
-        if reason is None and self._workspace is not None and not self._workspace.is_near(state, self.config.limits):
-            reason = "outside the workspace"
-        if reason is not None:
-            still_here = self._command(state, np.zeros(len(state)))
-            return Decision(still_here, reason, energy, places[0], places, None, None, None)
-        self._use(goals.grippers[progress.place])
+        nothing = Decision(self._command(state, np.zeros(len(state))), "at the goal", energy, places, progress)
+        if progress.done or float(still.max()) <= REACHED:
+            return replace(nothing, done=progress.place == len(goals.goals) - 1)
+        if self._workspace is not None and not self._workspace.is_near(state, self.config.limits):
+            return replace(nothing, why="outside the workspace")
+        self.space = self._searched[goals.goals[progress.place].gripper]
         cost = WorldModelCost(self._model, self._scene(seen), goal, self.config.energy, done=done, spaces=self.spaces)
-        generator = torch.Generator().manual_seed(self.seed + self._done)
+        plan = self._planned(state, cost, cancelled)
+        return replace(
+            nothing,
+            action=self._command(state, plan.actions[0].double().numpy()),
+            why="planned" if plan.stopped == "finished" else plan.stopped,
+            plan=plan,
+            states=states_along(torch.from_numpy(state), plan.actions.double()[None], self.spaces.state)[0].numpy(),
+            cost=cost,
+        )
+
+    def _planned(self, state: np.ndarray, cost: WorldModelCost, cancelled: Cancelled) -> Plan:
+        """Return what a search finds, inside the workspace if there is one; the energy is of what is sent."""
+        generator, box = torch.Generator().manual_seed(self.seed + self._done), self._workspace
         before = None if self.decision is None else self.decision.plan
         start = before.start_after(1) if before is not None and self.config.warm_start else None
-        plan = self._planned(state, cost, lambda planner: planner.plan(cost, generator, start, cancelled))
-        why: Why = "planned" if plan.stopped == "finished" else plan.stopped
-        states = states_along(torch.from_numpy(state), plan.actions.double()[None], self.spaces.state)[0]
-        action = self._command(state, plan.actions[0].double().numpy())
-        return Decision(action, why, energy, places[0], places, plan, states.numpy(), cost)
-
-    def _planned(self, state: np.ndarray, cost: WorldModelCost, search: Callable[[Planner], Plan]) -> Plan:
-        """Return what a search finds, inside the workspace if there is one; the energy is of what is sent."""
-        planner, box = self.planner, self._workspace
-        if box is None:
-            return search(planner)
-        plan = search(Planner(planner.config, box.narrowed(planner.space, state), planner.clock, planner.progress))
-        if plan.stopped == "no finite energy":
+        space = self.space if box is None else box.narrowed(self.space, state)
+        plan = self.planner.plan(cost, generator, start, cancelled, space)
+        if box is None or plan.stopped == "no finite energy":
             return plan
         kept = torch.from_numpy(box.kept(state, plan.actions.double().numpy(), self.config.limits)).to(plan.actions)
         if torch.equal(kept, plan.actions):
@@ -336,12 +322,6 @@ class Controller:
         with torch.no_grad():
             energy = float(cost(kept[None])[0])
         return replace(plan, actions=kept, energy=energy, evaluations=plan.evaluations + 1)
-
-    def _use(self, gripper: GripperMode | None) -> None:
-        """Let the planner search what a gripper mode allows."""
-        space = self._searched[gripper]
-        if self.planner.space is not space:
-            self.planner = Planner(self.config, space, self.planner.clock, self.planner.progress)
 
     def _space_with(self, gripper: GripperMode | None) -> SearchSpace:
         """Return what a gripper mode allows.
@@ -354,7 +334,7 @@ class Controller:
         where, fix = f"gripper mode {gripper!r} of a goal", "Leave the goal's gripper mode out"
         if not self.spaces.state.is_pose:
             found = "a model whose states are vectors, in which no number is known to be the gripper"
-            raise InputError(where=where, found=found, needed="a pose and gripper", fix=fix)
+            raise InputError(where=where, found=found, fix=fix)
         limits = self.config.limits.model_copy(update={"gripper_mode": gripper})
         space = search_space(self.config.model_copy(update={"limits": limits}), self.spaces.state)
         if not len(space.free):
@@ -391,53 +371,11 @@ class Controller:
             raise InputError(where="mask", found="nothing of what the model sees counts") from None
 
 
-def rules_of(goals: Sequence[SubGoal], config: PlanningConfig, *, first: int = 0) -> tuple[AdvanceRule, ...]:
-    """Return the rule of each goal, with the shares of `planning.goals` where they are given.
-
-    Args:
-        goals: In order.
-        config: Whose `goals` count.
-        first: Number of the first goal in messages.
-
-    Raises:
-        InputError: One would never end, or the last one has a bound.
-    """
-    rules = []
-    for place, goal in enumerate(goals):
-        is_last = place == len(goals) - 1
-        share = (config.goals.stop_share if is_last else config.goals.share) or goal.share
-        rule = AdvanceRule(goal.name, goal.at_least, goal.at_most, share, goal.floor)
-        if is_last and rule.at_most is not None:
-            found = f"at_most {rule.at_most} of the last goal, after which there is none"
-            raise InputError(where=f"goal {place + first}", found=found, needed="null: no bound")
-        if not is_last and rule.at_most is None and share is None:
-            found, needed = "a goal that would never end", "at_most or share, or planning.goals.share"
-            raise InputError(where=f"goal {place + first}", found=found, needed=needed)
-        rules.append(rule)
-    return tuple(rules)
-
-
-def _axes_of(world_model: WorldModel, config: PlanningConfig, spaces: Spaces) -> Axes | None:
-    """Return the model's axes where they are calibrated."""
-    if config.axes is None:
-        return None
-    if not spaces.state.is_base_pose:
-        raise no_vertical_axis(f"planning.axes: {config.axes}")
-    return Axes.read(config.axes, Fingerprints.of(world_model))
-
-
-def _require_spaces(sizes: ModelSizes, spaces: Spaces) -> None:
-    if heads_to_replace(sizes, spaces.widths):
-        raise InputError(
-            where="model",
-            found=widths_as_text(sizes),
-            needed=f"{spaces.widths.state} and {spaces.widths.action}, as the spaces say",
-            fix="Give the spaces of the data that it was trained on",
-        )
+def _require_spaces(model: WorldModel, spaces: Spaces) -> None:
+    if heads_to_replace(model.sizes, spaces.widths):
+        needed = f"{spaces.widths.state} and {spaces.widths.action}, as the spaces of the data that it was trained on"
+        raise InputError(where="model", found=widths_as_text(model.sizes), needed=needed)
     if spaces.action.follows == "unknown":
-        raise InputError(
-            where="data.actions: recorded",
-            found="commands of which nobody knows what they do to the state",
-            needed="to plan: differences of states; or recorded deltas or targets, as many numbers as a state has",
-            fix="Train with data.actions: difference, or with join_actions: sum or last",
-        )
+        found = "commands of which nobody knows what they do to the state"
+        fix = "To plan, train with data.actions: difference, or with join_actions: sum or last"
+        raise InputError(where="data.actions: recorded", found=found, fix=fix)

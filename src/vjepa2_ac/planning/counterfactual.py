@@ -5,6 +5,7 @@ They need no simulator: a model can predict under them from any start of recorde
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -84,28 +85,27 @@ def read_actions(path: str | Path, *, steps: int | None = None) -> Float[np.ndar
         InputError: It cannot be read, a row has not 7 finite numbers in metres, radians and closedness, or there are
             too few rows.
     """
-    where, needed = str(path), f"one line of {ACTION_DIM} numbers for each model step: {', '.join(POSE_CHANGE.names)}"
+    needed = f"one line of {ACTION_DIM} numbers for each model step: {', '.join(POSE_CHANGE.names)}"
     fix = "In metres, radians, and closedness from -1 to 1; a .npy of NumPy, or a .csv with commas"
+    refused = partial(InputError, where=str(path), needed=needed, fix=fix)
     try:
-        if where.lower().endswith(".npy"):
+        if str(path).lower().endswith(".npy"):
             with Path(path).open("rb") as file:
                 actions = np.asarray(np.lib.format.read_array(file, allow_pickle=False), dtype=np.float64)
         else:
-            text = Path(path).read_text(encoding="utf-8-sig")
-            lines = [line for line in text.splitlines() if line.strip()]
+            lines = [line for line in Path(path).read_text(encoding="utf-8-sig").splitlines() if line.strip()]
             names = bool(lines) and lines[0].replace(" ", "") == ",".join(POSE_CHANGE.names)
             actions = np.loadtxt(lines[names:], delimiter=",", ndmin=2)
     except (OSError, ValueError, TypeError) as error:
-        raise InputError(where=where, found=f"cannot be read ({error})", needed=needed, fix=fix) from None
+        raise refused(found=f"cannot be read ({error})") from None
     if actions.ndim != 2 or actions.shape[1] != ACTION_DIM or not len(actions):
-        raise InputError(where=where, found=f"an array of shape {actions.shape}", needed=needed, fix=fix)
+        raise refused(found=f"an array of shape {actions.shape}")
     wrong = ~(np.abs(actions) <= _LARGEST).all(axis=1)  # NaN is wrong, too
     if wrong.any():
         step = int(wrong.argmax())
-        found = f"action {step} is {np.array2string(actions[step], precision=4, max_line_width=200)}"
-        raise InputError(where=where, found=found, needed=needed, fix=fix)
+        raise refused(found=f"action {step} is {np.array2string(actions[step], precision=4, max_line_width=200)}")
     if steps is not None and len(actions) < steps:
-        raise InputError(where=where, found=f"{len(actions)} actions", needed=f"{steps}, one for each model step")
+        raise InputError(where=str(path), found=f"{len(actions)} actions", needed=f"{steps}, one for each model step")
     return actions[:steps]
 
 

@@ -14,13 +14,13 @@ from jaxtyping import Float, UInt8
 
 from vjepa2_ac.planning.controller import Controller, Decision
 from vjepa2_ac.planning.energy import FEWEST_NODES, EnergySlice, energy_slices, fitting_nodes, sequences_of_slices
-from vjepa2_ac.planning.goals import SubGoal
-from vjepa2_ac.planning.interfaces import Cost, Iteration, Plan
+from vjepa2_ac.planning.goals import SubGoal, timed
+from vjepa2_ac.planning.planner import Cost, Iteration, Plan
 from vjepa2_ac.planning.search_space import SearchSpace
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.spaces import StateSpace
 from vjepa2_ac.storage import write_atomically
-from vjepa2_ac.storage.structured import finite_or_none, json_text
+from vjepa2_ac.storage.structured import json_text, plain
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,15 +46,6 @@ class PlanRequest:
         return replace(self, durations=(max(1, horizon // len(self.goals)),) * (len(self.goals) - 1))
 
 
-@dataclass(frozen=True)
-class Seconds:
-    """Durations in seconds."""
-
-    goals: float  # encoding them
-    decision: float  # encoding the start, and planning
-    slices: float
-
-
 @dataclass(frozen=True, eq=False)
 class PlanResult:
     """A decision, with its alternatives."""
@@ -66,7 +57,7 @@ class PlanResult:
     states: Float[np.ndarray, "steps+1 dim"]  # predicted states along them
     doing_nothing: float  # predicted energy of no motion; NaN if it was not computed
     slices: tuple[EnergySlice, ...]  # empty if there is no plan, or none were requested
-    seconds: Seconds
+    seconds: dict[str, float]  # of encoding the goals, of the decision with encoding the start, of the slices
 
     @property
     def space(self) -> SearchSpace:
@@ -107,34 +98,31 @@ def decide(
         InputError: An image, the state or the mask is invalid.
         ValueError: The number of durations is not the number of goals minus one.
     """
-    began = time.perf_counter()
-    if question.sub_goals:
-        controller.follow(question.sub_goals, mask=question.mask)
-    else:
-        controller.reset(*question.goals, durations=question.durations, mask=question.mask)
-    ready = time.perf_counter()
+    times = [time.perf_counter()]
+    controller.follow(question.sub_goals or timed(question.goals, question.durations), mask=question.mask)
+    times.append(time.perf_counter())
     controller.act(question.start, question.state)
-    decided = time.perf_counter()
+    times.append(time.perf_counter())
     decision = controller.decision
     if decision is None:
         raise ValueError("a controller that acted has decided")
-    still = np.nan
+    plan, space, still = decision.plan, controller.space, np.nan
     slices: tuple[EnergySlice, ...] = ()
-    if decision.plan is not None and decision.cost is not None:
+    if plan is not None and decision.cost is not None:
         with torch.no_grad():
-            still = float(decision.cost(torch.zeros_like(decision.plan.actions)[None])[0])
+            still = float(decision.cost(torch.zeros_like(plan.actions)[None])[0])
         if decision.why != "no finite energy":
-            slices = _slices(controller, decision.plan, decision.cost, nodes, reporter)
-    steps, dim = controller.space.steps, controller.space.dim
+            slices = _slices(controller, plan, decision.cost, nodes, reporter)
+    times.append(time.perf_counter())
     return PlanResult(
         question=question,
         controller=controller,
         decision=decision,
-        actions=np.zeros((steps, dim)) if decision.plan is None else decision.plan.actions.double().numpy(),
-        states=np.tile(question.state, (steps + 1, 1)) if decision.states is None else decision.states,
+        actions=np.zeros((space.steps, space.dim)) if plan is None else plan.actions.double().numpy(),
+        states=np.tile(question.state, (space.steps + 1, 1)) if decision.states is None else decision.states,
         doing_nothing=still,
         slices=slices,
-        seconds=Seconds(ready - began, decided - ready, time.perf_counter() - decided),
+        seconds=dict(zip(("goals", "decision", "slices"), np.diff(times).tolist(), strict=True)),
     )
 
 
@@ -173,70 +161,59 @@ def write_plan(answer: PlanResult, about: Mapping[str, Any], path: Path) -> Path
 
 def plan_as_dict(answer: PlanResult, about: Mapping[str, Any]) -> dict[str, Any]:
     """Return the content of the file; numbers that are not finite are null."""
-    decision, plan, config = answer.decision, answer.decision.plan, answer.controller.config
-    return {
+    decision, question, controller = answer.decision, answer.question, answer.controller
+    plan, progress, names = decision.plan, decision.progress, answer.state_space.change_names
+    rules = ("name", "at_least", "at_most", "share", "gripper", "floor")
+    found = {
         "format": FORMAT,
         "in_words": summarize(answer),
         **about,
-        "state": _plain(answer.question.state),
-        "durations": list(answer.question.durations),
-        "settings": config.model_dump(mode="json"),
-        "seed": answer.controller.seed,
-        "crop": answer.controller.crop,
+        "state": question.state,
+        "durations": question.durations,
+        "settings": controller.config.model_dump(mode="json"),
+        "seed": controller.seed,
+        "crop": controller.crop,
         "why": decision.why,
-        "actions": _plain(answer.actions),
-        "states": _plain(answer.states),
-        "goal_of_each_step": list(decision.goals),
-        "sub_goals": [_sub_goal(one) for one in answer.question.sub_goals],
-        "since": decision.since,
-        "changed": decision.changed,
+        "actions": answer.actions,
+        "states": answer.states,
+        "goal_of_each_step": decision.goals,
+        "sub_goals": [{name: getattr(one, name) for name in rules} for one in question.sub_goals],
+        "since": progress.since,
+        "changed": progress.changed,
         "done": decision.done,
         "energy": {
-            "now": finite_or_none(decision.energy_now),
-            "began": finite_or_none(decision.began),
-            "doing_nothing": finite_or_none(answer.doing_nothing),
-            "plan": None if plan is None else finite_or_none(plan.energy),
+            "now": decision.energy_now,
+            "began": progress.began,
+            "doing_nothing": answer.doing_nothing,
+            "plan": None if plan is None else plan.energy,
         },
         "evaluations": 0 if plan is None else plan.evaluations,
-        "iterations": [] if plan is None else [_iteration(one) for one in plan.iterations],
-        "slices": [_slice(one, answer.state_space.change_names) for one in answer.slices],
-        "seconds": {
-            "goals": answer.seconds.goals,
-            "decision": answer.seconds.decision,
-            "search": 0.0 if plan is None else plan.seconds,
-            "slices": answer.seconds.slices,
-        },
+        "iterations": [_iteration(one) for one in (() if plan is None else plan.iterations)],
+        "slices": [_slice(one, names[one.axes[0]], names[one.axes[1]]) for one in answer.slices],
+        "seconds": {**answer.seconds, "search": 0.0 if plan is None else plan.seconds},
     }
-
-
-def _sub_goal(one: SubGoal) -> dict[str, Any]:
-    return {name: getattr(one, name) for name in ("name", "at_least", "at_most", "share", "gripper", "floor")}
+    return {name: plain(value) for name, value in found.items()}
 
 
 def _iteration(one: Iteration) -> dict[str, Any]:
     return {
         "samples": one.samples,
         "finite": one.finite,
-        "lowest": finite_or_none(one.lowest),
-        "elites_mean": finite_or_none(one.elite_energy),
-        "mean": _plain(one.mean.double().numpy()),
-        "std": _plain(one.std.double().numpy()),
+        "lowest": one.lowest,
+        "elites_mean": one.elite_energy,
+        "mean": one.mean,
+        "std": one.std,
         "seconds": one.seconds,
     }
 
 
-def _slice(one: EnergySlice, names: Sequence[str]) -> dict[str, Any]:
-    across, up = (names[axis] for axis in one.axes)
-    return {"across": across, "up": up, across: _plain(one.across), up: _plain(one.up), "energy": _plain(one.energy)}
-
-
-def _plain(values: np.ndarray) -> Any:
-    return [_plain(row) if row.ndim else finite_or_none(float(row)) for row in np.asarray(values, dtype=np.float64)]
+def _slice(one: EnergySlice, across: str, up: str) -> dict[str, Any]:
+    return {"across": across, "up": up, across: one.across, up: one.up, "energy": one.energy}
 
 
 def summarize(answer: PlanResult) -> str:
     """Return the decision as one or more sentences."""
-    plan, why = answer.decision.plan, answer.decision.why
+    plan, why, now = answer.decision.plan, answer.decision.why, answer.decision.energy_now
     if why == "outside the workspace":
         return (
             "Does nothing: the robot is farther outside planning.limits.workspace than an action leads. Move it back by"
@@ -249,7 +226,27 @@ def summarize(answer: PlanResult) -> str:
             "Does nothing: the model gives no finite energy for any of"
             f" {plan.evaluations:,} action sequences. It is broken; another checkpoint may not be."
         )
-    return " ".join([_motion(answer), _energy(answer, plan), _effort(answer, plan), *_warnings(answer, plan)])
+    change, rounds = f" ({plan.energy / now - 1:+.0%})" if now else "", len(plan.iterations)
+    searched = f"{plan.evaluations:,} action sequences in {rounds} iteration{'s' * (rounds > 1)}"
+    found = [
+        _motion(answer),
+        f"Energy {now:.4f} now, {plan.energy:.4f} predicted{change};",
+        f"{answer.doing_nothing:.4f} predicted when doing nothing.",
+        f"Planner {plan.planner}, seed {plan.seed}: {searched}, {answer.seconds['decision']:.2f} s.",
+    ]
+    if plan.stopped == "out of time":
+        found.append(
+            f"Time was up after {rounds} of {answer.controller.config.iterations} iterations: the best so far."
+        )
+    if not plan.energy < answer.doing_nothing:
+        found.append("None of the evaluated actions is predicted to be better than doing nothing.")
+    if at_limit := axes_at_limit(answer):
+        knob = f"planning.limits.{'xyz' if answer.state_space.is_pose else 'axes'}"
+        found.append(f"The first action is at its limit along {', '.join(at_limit)} ({knob}).")
+    if answer.unused_goals and not answer.question.sub_goals:  # of these everybody knows that the others come later
+        unused = ", ".join(str(place + 1) for place in answer.unused_goals)
+        found.append(f"No part in this plan has goal {unused}: see durations, planning.horizon, planning.energy.steps.")
+    return " ".join(found)
 
 
 def _motion(answer: PlanResult) -> str:
@@ -265,39 +262,6 @@ def _motion(answer: PlanResult) -> str:
     gripper = 0.0 if space.gripper is None else change[space.gripper]
     grips = f", gripper {gripper:+.2f}" if gripper else ""
     return f"Goes {np.linalg.norm(shown):.1f} {space.shown_unit} {lasting} ({parts} {space.shown_unit}{grips})."
-
-
-def _energy(answer: PlanResult, plan: Plan) -> str:
-    now = answer.decision.energy_now
-    change = f" ({plan.energy / now - 1:+.0%})" if now else ""
-    return (
-        f"Energy {now:.4f} now, {plan.energy:.4f} predicted{change};"
-        f" {answer.doing_nothing:.4f} predicted when doing nothing."
-    )
-
-
-def _effort(answer: PlanResult, plan: Plan) -> str:
-    rounds = len(plan.iterations)
-    return (
-        f"Planner {plan.planner}, seed {plan.seed}: {plan.evaluations:,} action sequences in {rounds}"
-        f" iteration{'s' * (rounds > 1)}, {answer.seconds.decision:.2f} s."
-    )
-
-
-def _warnings(answer: PlanResult, plan: Plan) -> list[str]:
-    found = []
-    if plan.stopped == "out of time":
-        most = answer.controller.config.iterations
-        found.append(f"Time was up after {len(plan.iterations)} of {most} iterations: the best so far.")
-    if not plan.energy < answer.doing_nothing:
-        found.append("None of the evaluated actions is predicted to be better than doing nothing.")
-    if at_limit := axes_at_limit(answer):
-        knob = f"planning.limits.{'xyz' if answer.state_space.is_pose else 'axes'}"
-        found.append(f"The first action is at its limit along {', '.join(at_limit)} ({knob}).")
-    if answer.unused_goals and not answer.question.sub_goals:  # of these everybody knows that the others come later
-        unused = ", ".join(str(place + 1) for place in answer.unused_goals)
-        found.append(f"No part in this plan has goal {unused}: see durations, planning.horizon, planning.energy.steps.")
-    return found
 
 
 def axes_at_limit(answer: PlanResult) -> list[str]:

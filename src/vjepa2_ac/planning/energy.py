@@ -9,9 +9,9 @@ from math import comb
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import cosine_similarity
+from torch.nn.functional import adaptive_avg_pool2d, cosine_similarity
 from torch.utils.checkpoint import checkpoint
 
 from vjepa2_ac.config.planning import EnergyConfig
@@ -19,13 +19,55 @@ from vjepa2_ac.distances import absolute_difference, squared_difference
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.model.network.predictor_network import KeyValueCache
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.planning.axes.mapping import Axes
-from vjepa2_ac.planning.goals import Goal
-from vjepa2_ac.planning.interfaces import Cost, reporting
+from vjepa2_ac.planning.model_setup import Axes
+from vjepa2_ac.planning.planner import Cost, reporting
 from vjepa2_ac.planning.search_space import SearchSpace
 from vjepa2_ac.planning.state_integration import states_along
 from vjepa2_ac.registry import ENERGIES
 from vjepa2_ac.spaces import POSES, Spaces
+
+
+@dataclass(frozen=True)
+class Goal:
+    """Goal latents in order: each applies for its number of model steps, the last one without end."""
+
+    latents: Float[Tensor, "goals tokens dim"]
+    durations: tuple[int, ...] = ()  # model steps of each goal but the last
+    weights: Float[Tensor, " tokens"] | None = None  # weight of each patch; None: equal weights
+
+    def place(self, step: int) -> int:
+        """Return the index of the goal that applies after this many model steps since the start."""
+        for place, duration in enumerate(self.durations):
+            step -= duration
+            if step < 0:
+                return place
+        return len(self.latents) - 1
+
+    def ahead(self, done: int, steps: int) -> Float[Tensor, "steps tokens dim"]:
+        """Return the goal latents after each of the next steps, when some are done.
+
+        The frame after a goal's last step is still compared with that goal.
+        """
+        places = [self.place(done + step) for step in range(steps)]
+        return torch.stack([self.latents[place] for place in places])  # a list as an index would wait for the device
+
+
+def patch_weights(
+    mask: Bool[Tensor, "height width"] | Float[Tensor, "height width"], grid: int
+) -> Float[Tensor, " tokens"]:
+    """Return the weight of each patch: the mean of a mask over the patch, patches row by row.
+
+    Args:
+        mask: Over the image as the model sees it (cropped), of any resolution; 1 counts, 0 does not.
+        grid: Patches along one side.
+
+    Raises:
+        ValueError: The mask is empty.
+    """
+    weights = adaptive_avg_pool2d(mask.float()[None], grid).flatten()
+    if weights.sum() <= 1e-12:
+        raise ValueError("the mask leaves nothing of the image")
+    return weights
 
 
 @dataclass(frozen=True)
@@ -228,14 +270,9 @@ def energy_slices(
         actions: The plan.
         space: Its limits say how far the slices reach.
         axes: The numbers.
-        nodes: Along each axis.
+        nodes: Along each axis, three or more.
         progress: Called with the number of evaluated action sequences.
-
-    Raises:
-        ValueError: Fewer than three nodes.
     """
-    if nodes < 3:
-        raise ValueError(f"{nodes} nodes")
     total, slices = sequences_of_slices(nodes, len(axes)), []
     progress(0, total)
     for number, pair in enumerate(combinations(axes, 2)):

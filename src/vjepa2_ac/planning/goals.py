@@ -1,20 +1,34 @@
-"""Goals: images that a plan aims at, when each takes its turn, and the latents that energies compare with."""
+"""Goals: images that a plan aims at, when each takes its turn, and folders of them: goals.json and an image for each.
+
+Such a folder is written by `vjepa2-ac goals`, or by a person. PyTorch is not imported.
+"""
 
 from __future__ import annotations
 
+import logging
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Literal
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import numpy as np
-import torch
-from jaxtyping import Bool, Float
-from torch import Tensor
-from torch.nn.functional import adaptive_avg_pool2d
+from pydantic import ConfigDict, Field
 
+from vjepa2_ac.config.planning import GoalsConfig
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.media.image_file import encode_png, read_image
+from vjepa2_ac.planning.input_checks import require_image
+from vjepa2_ac.storage import unreadable
+from vjepa2_ac.storage.files import folder_writer
+from vjepa2_ac.storage.structured import json_text, read_json_object, record_of
 
+logger = logging.getLogger(__name__)
+
+GOALS_FILE = "goals.json"
+REACHED = 1e-6  # the energy of an image equal to the goal image, up to rounding
+
+Energy = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 GripperMode = Literal["rounded", "free", "held", "open", "close"]
 
 
@@ -35,41 +49,59 @@ class SubGoal:
     floor: float = 0.0  # noise of camera and encoder: no threshold is below this energy
 
     def __post_init__(self) -> None:
+        where = f"goal {self.name!r}" if self.name else "goal"
         if self.at_least < 1 or (self.at_most is not None and self.at_most < self.at_least):
             found = f"at least {self.at_least} and at most {self.at_most} steps"
-            raise InputError(where=self._where, found=found, needed="1 <= at_least <= at_most")
+            raise InputError(where=where, found=found, needed="1 <= at_least <= at_most")
         if self.share is not None and not 0.0 < self.share < 1.0:
-            raise InputError(where=self._where, found=f"share {self.share}", needed="a number between 0 and 1, or none")
+            raise InputError(where=where, found=f"share {self.share}", needed="a number between 0 and 1, or none")
         if not 0.0 <= self.floor < np.inf:
-            raise InputError(where=self._where, found=f"a noise floor of {self.floor}", needed="an energy of 0 or more")
+            raise InputError(where=where, found=f"a noise floor of {self.floor}", needed="an energy of 0 or more")
 
-    @property
-    def _where(self) -> str:
-        return f"goal {self.name!r}" if self.name else "goal"
-
-
-REACHED = 1e-6  # the energy of an image equal to the goal image, up to rounding
-
-
-@dataclass(frozen=True)
-class AdvanceRule:
-    """How long a goal applies: as `SubGoal`, in model steps."""
-
-    name: str = ""
-    at_least: int = 1
-    at_most: int | None = None
-    share: float | None = None
-    floor: float = 0.0
-
-    def is_reached(self, energy: float, began: float) -> bool:
-        """Return whether an energy is low enough, by what it was when the goal began; false for NaN."""
+    def why_reached(self, energy: float, began: float) -> str:
+        """Return why an energy is low enough, by what it was when the goal began; empty: it is not, as for NaN."""
         if self.share is None:
-            return False
-        return energy < max(self.share * began, self.floor) or energy <= REACHED
+            return ""
+        if energy < self.share * began:
+            return f"energy {energy:.4g} is below {self.share:.0%} of {began:.4g}"
+        if energy < self.floor:
+            return f"energy {energy:.4g} is within the noise of {self.floor:.4g}"
+        return "the image equals the goal's" if energy <= REACHED else ""
 
-    def is_used_up(self, steps: int) -> bool:
-        """Return whether the goal has had all its steps."""
-        return self.at_most is not None and steps >= self.at_most
+
+def timed(images: Sequence[np.ndarray], durations: Sequence[int]) -> tuple[SubGoal, ...]:
+    """Return images as goals that apply for so many model steps each, the last one without end.
+
+    Raises:
+        ValueError: No images, or the number of durations is not theirs minus one, or one is below 1.
+    """
+    if not images or len(durations) != len(images) - 1 or min(durations, default=1) < 1:
+        raise ValueError(f"no goal, or {len(images)} goals with durations {durations}: one for each but the last")
+    first = [SubGoal(image, at_least=steps, at_most=steps) for image, steps in zip(images, durations, strict=False)]
+    return (*first, SubGoal(images[-1]))
+
+
+def with_shares(goals: Sequence[SubGoal], config: GoalsConfig, *, first: int = 0) -> tuple[SubGoal, ...]:
+    """Return goals with the shares of `planning.goals` where they are given.
+
+    Args:
+        goals: In order.
+        config: Whose shares stand for theirs.
+        first: Number of the first goal in messages.
+
+    Raises:
+        InputError: One would never end, or the last one has a bound.
+    """
+    *before, last = goals
+    ruled = [replace(goal, share=config.share or goal.share) for goal in before]
+    for place, goal in enumerate(ruled, start=first):
+        if goal.at_most is None and goal.share is None:
+            needed = "at_most or share, or planning.goals.share"
+            raise InputError(where=f"goal {place}", found="a goal that would never end", needed=needed)
+    if last.at_most is not None:
+        found = f"at_most {last.at_most} of the last goal, after which there is none"
+        raise InputError(where=f"goal {len(before) + first}", found=found, needed="null: no bound")
+    return (*ruled, replace(last, share=config.stop_share or last.share))
 
 
 @dataclass(frozen=True)
@@ -86,124 +118,161 @@ class GoalProgress:
     changed: str = ""  # why it is another one than before, or why the last one is reached; empty: nothing changed
     done: bool = False  # the last goal is reached; it stays so
 
-    @classmethod
-    def first(cls, energy: Callable[[int], float]) -> GoalProgress:
-        """Return the progress at the first decision.
-
-        Args:
-            energy: Of the current image to the goal of an index.
-        """
-        return cls(0, 0, energy(0))
-
-    def after(self, rules: Sequence[AdvanceRule], step: int, energy: Callable[[int], float]) -> GoalProgress:
+    def after(self, goals: Sequence[SubGoal], step: int, energy: Callable[[int], float]) -> GoalProgress:
         """Return the progress at a later decision: the same goal, or the next one.
 
         Args:
-            rules: Of all goals, in order. That of the last one says when it is reached, by energy only.
+            goals: In order. The rule of the last one says when it is reached, by energy only.
             step: Model steps done since the reset.
             energy: Of the current image to the goal of an index.
         """
-        rule, steps, stays = rules[self.place], step - self.since, replace(self, changed="")
-        if self.done or steps < rule.at_least:
+        goal, steps, stays = goals[self.place], step - self.since, replace(self, changed="")
+        if self.done or steps < goal.at_least:
             return stays
-        now, is_last = energy(self.place), self.place == len(rules) - 1
-        if rule.is_reached(now, self.began):
-            why = _reached(rule, now, self.began)
-        elif rule.is_used_up(steps) and not is_last:
-            why = f"its {rule.at_most} steps are over at energy {now:.4g}{_share_of(now, self.began)}"
-        else:
+        now, is_last = energy(self.place), self.place == len(goals) - 1
+        why = goal.why_reached(now, self.began)
+        if not why and goal.at_most is not None and steps >= goal.at_most and not is_last:
+            why = f"its {goal.at_most} steps are over at energy {now:.4g}"
+            if self.began > 0 and math.isfinite(now):
+                why += f", {now / self.began:.0%} of {self.began:.4g}"
+        if not why:
             return stays
-        text = f"{self._called(rule)}, after {steps} step{'s' * (steps > 1)}: {why}."
+        name = f"Goal {self.place + 1} ({goal.name})" if goal.name else f"Goal {self.place + 1}"
+        text = f"{name}, after {steps} step{'s' * (steps > 1)}: {why}."
         if is_last:
             return replace(self, changed=text, done=True)
         return GoalProgress(self.place + 1, step, energy(self.place + 1), text)
 
-    def _called(self, rule: AdvanceRule) -> str:
-        return f"Goal {self.place + 1} ({rule.name})" if rule.name else f"Goal {self.place + 1}"
 
+@dataclass(frozen=True)
+class GoalEntry:
+    """What goals.json says of one goal; all but its file may be left out."""
 
-def _reached(rule: AdvanceRule, now: float, began: float) -> str:
-    if rule.share is not None and now < rule.share * began:
-        return f"energy {now:.4g} is below {rule.share:.0%} of {began:.4g}"
-    if now < rule.floor:
-        return f"energy {now:.4g} is within the noise of {rule.floor:.4g}"
-    return "the image equals the goal's"
+    __pydantic_config__ = ConfigDict(extra="forbid")
 
-
-def _share_of(now: float, began: float) -> str:
-    return f", {now / began:.0%} of {began:.4g}" if began > 0 and math.isfinite(now / began) else ""
+    file: str  # PNG or JPEG, in the folder
+    name: str = ""
+    at_least: int = 1
+    at_most: int | None = None
+    share: float | None = None
+    gripper: GripperMode | None = None
+    frame: int | None = None  # of the demonstration
+    began: Energy | None = None  # energy of the key frame before, or of the first frame, to this one
 
 
 @dataclass(frozen=True)
-class Goal:
-    """Goal latents in order: each applies for its number of model steps, the last one without end.
+class NoiseFloor:
+    """The energy between frames of a resting arm: what camera and encoder cannot tell apart."""
+
+    energy: Energy
+    pairs: int  # of frames
+    encoder: str  # SHA-256 of its weights: energies of another one mean something else
+    distance: str  # as planning.energy.distance
+
+
+@dataclass(frozen=True)
+class _GoalsFile:
+    format: Literal[1]  # goes up when a reader of the file would have to change
+    goals: Annotated[list[GoalEntry], Field(min_length=1, max_length=256)]
+    noise: NoiseFloor | None = None
+    origin: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class GoalFolder:
+    """Goals as they were written, with what is known of their demonstration."""
+
+    goals: tuple[SubGoal, ...]
+    noise: NoiseFloor | None = None
+    began: tuple[float | None, ...] = ()  # energy of each goal at its beginning, in the demonstration
+
+    def for_model(self, encoder: str, distance: str) -> tuple[SubGoal, ...]:
+        """Return the goals with the noise floor, below which no threshold lies, if it was measured with this encoder.
+
+        What is changed or cannot be known is logged as a warning.
+
+        Args:
+            encoder: SHA-256 of its weights.
+            distance: As planning.energy.distance.
+        """
+        noise = self.noise
+        if noise is None:
+            return self.goals
+        if (noise.encoder, noise.distance) != (encoder, distance):
+            if any(goal.share is not None for goal in self.goals):
+                found = f"{noise.distance} and encoder {noise.encoder[:8]}, not {distance} and encoder {encoder[:8]}"
+                logger.warning("the noise floor of these goals is of %s: it does not guard their thresholds", found)
+            return self.goals
+        for place, (goal, began) in enumerate(zip(self.goals, self.began, strict=True), start=1):
+            if goal.share is not None and began is not None and goal.share * began < noise.energy:
+                logger.warning(
+                    "goal %d: %.0f%% of energy %.4g is below the noise of a resting arm, %.4g: that is its threshold",
+                    place, 100 * goal.share, began, noise.energy,
+                )  # fmt: skip
+        return tuple(replace(goal, floor=noise.energy) for goal in self.goals)
+
+
+def read_goals(folder: Path) -> tuple[SubGoal, ...]:
+    """Return the goals of a folder, in order; errors as of `read_goal_folder`."""
+    return read_goal_folder(folder).goals
+
+
+def read_goal_folder(folder: Path) -> GoalFolder:
+    """Return the goals of a folder, and what it says about them.
 
     Raises:
-        ValueError: No goals, another number of durations than there are goals before the last, a duration below 1, or
-            weights that are negative, not finite, or all zero.
+        InputError: There is no goals.json, it says something else, or a file is no image of the first one's size.
     """
-
-    latents: Float[Tensor, "goals tokens dim"]
-    durations: tuple[int, ...] = ()  # model steps of each goal but the last
-    weights: Float[Tensor, " tokens"] | None = None  # weight of each patch; None: equal weights
-
-    def __post_init__(self) -> None:
-        if not len(self.latents) or len(self.durations) != len(self.latents) - 1 or min(self.durations, default=1) < 1:
-            raise ValueError(f"{len(self.latents)} goals with durations {self.durations}: one for each but the last")
-        if self.weights is not None:
-            usable = torch.isfinite(self.weights).all() and (self.weights >= 0).all() and self.weights.any()
-            if self.weights.shape != self.latents.shape[1:2] or not usable:
-                raise ValueError("one weight for each patch, none negative, and not all zero")
-
-    def place(self, step: int) -> int:
-        """Return the index of the goal that applies after this many model steps since the start."""
-        for place, duration in enumerate(self.durations):
-            step -= duration
-            if step < 0:
-                return place
-        return len(self.latents) - 1
-
-    def ahead(self, done: int, steps: int) -> Float[Tensor, "steps tokens dim"]:
-        """Return the goal latents after each of the next steps, when some are done.
-
-        The frame after a goal's last step is still compared with that goal.
-        """
-        places = [self.place(done + step) for step in range(steps)]
-        return torch.stack([self.latents[place] for place in places])  # a list as an index would wait for the device
+    path, needed = folder / GOALS_FILE, f"the {GOALS_FILE} that `vjepa2-ac goals` writes"
+    try:
+        values = read_json_object(path, needed=needed)
+    except OSError as error:
+        raise unreadable(str(path), error, needed=needed) from None
+    found = record_of(_GoalsFile, values, where=str(path), needed=needed)
+    goals: list[SubGoal] = []
+    for place, entry in enumerate(found.goals, start=1):
+        image = read_image(folder / entry.file)
+        require_image(image, where=str(folder / entry.file), like=goals[0].image if goals else None)
+        try:
+            goals.append(SubGoal(image, entry.name, entry.at_least, entry.at_most, entry.share, entry.gripper))
+        except InputError as error:
+            raise InputError(where=f"{path}: goal {place}", found=error.found, needed=error.needed) from None
+    return GoalFolder(tuple(goals), found.noise, tuple(entry.began for entry in found.goals))
 
 
-@dataclass(frozen=True)
-class GoalSequence:
-    """Latents of goals in order, with the rule of each."""
-
-    latents: Float[Tensor, "goals tokens dim"]
-    rules: tuple[AdvanceRule, ...]
-    grippers: tuple[GripperMode | None, ...]  # None: planning.limits.gripper_mode
-    weights: Float[Tensor, " tokens"] | None = None  # as of `Goal`
-
-    def rest(self, place: int) -> Goal:
-        """Return a goal and what follows it by count at the latest, for plans of several steps."""
-        durations: list[int] = []
-        for rule in self.rules[place:-1]:
-            if rule.at_most is None:
-                break
-            durations.append(rule.at_most)
-        return Goal(self.latents[place : place + len(durations) + 1], tuple(durations), self.weights)
-
-
-def patch_weights(
-    mask: Bool[Tensor, "height width"] | Float[Tensor, "height width"], grid: int
-) -> Float[Tensor, " tokens"]:
-    """Return the weight of each patch: the mean of a mask over the patch, patches row by row.
+def write_goals(
+    folder: Path,
+    goals: Sequence[SubGoal],
+    *,
+    frames: Sequence[int | None] = (),
+    began: Sequence[float | None] = (),
+    noise: NoiseFloor | None = None,
+    origin: Mapping[str, Any] | None = None,
+) -> Path:
+    """Write goals into a folder, whole or not at all, and return the path of its goals.json.
 
     Args:
-        mask: Over the image as the model sees it (cropped), of any resolution; 1 counts, 0 does not.
-        grid: Patches along one side.
+        folder: A new or empty one; other files in it stay.
+        goals: In order. Their noise floor is not written: it is that of `noise`.
+        frames: Of the demonstration, of each goal; empty: not known.
+        began: Energy of each goal at its beginning; empty: not known.
+        noise: Energy between frames of a resting arm.
+        origin: Where they come from, as plain values.
 
     Raises:
-        ValueError: The mask is empty.
+        InputError: The folder cannot be written.
+        ValueError: No goals.
     """
-    weights = adaptive_avg_pool2d(mask.float()[None], grid).flatten()
-    if weights.sum() <= 1e-12:
-        raise ValueError("the mask leaves nothing of the image")
-    return weights
+    if not goals:
+        raise ValueError("no goals")
+    none = [None] * len(goals)
+    with folder_writer(folder, GOALS_FILE) as filling:
+        entries = []
+        for place, (goal, frame, energy) in enumerate(zip(goals, frames or none, began or none, strict=True), start=1):
+            name = f"goal_{place}.png"
+            (filling / name).write_bytes(encode_png(goal.image))
+            bounds = (goal.name, goal.at_least, goal.at_most, goal.share, goal.gripper)
+            entries.append(GoalEntry(name, *bounds, frame, energy))
+        content = _GoalsFile(1, entries, noise, dict(origin or {}))
+        (filling / GOALS_FILE).write_text(json_text(asdict(content)))
+    return folder / GOALS_FILE

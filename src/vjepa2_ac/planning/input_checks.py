@@ -23,16 +23,12 @@ def require_image(image: np.ndarray, *, where: str, like: np.ndarray | None = No
     """
     found = f"an array of shape {image.shape} and type {image.dtype}"
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or min(image.shape[:2]) < _LEAST_SIDE:
-        raise InputError(
-            where=where, found=found, needed=f"an RGB image: height x width x 3, uint8, {_LEAST_SIDE} pixels or more"
-        )
+        needed = f"an RGB image: height x width x 3, uint8, {_LEAST_SIDE} pixels or more"
+        raise InputError(where=where, found=found, needed=needed)
     if like is not None and image.shape != like.shape:
-        raise InputError(
-            where=where,
-            found=f"{image.shape[1]} x {image.shape[0]} pixels (width x height)",
-            needed=f"{like.shape[1]} x {like.shape[0]}, as the goal image",
-            fix="Take both with the same camera, at the same place and resolution",
-        )
+        found = f"{image.shape[1]} x {image.shape[0]} pixels (width x height)"
+        needed = f"{like.shape[1]} x {like.shape[0]}, as the goal image: same camera, place and resolution"
+        raise InputError(where=where, found=found, needed=needed)
 
 
 def require_mask(mask: np.ndarray, *, where: str, like: np.ndarray) -> None:
@@ -42,11 +38,8 @@ def require_mask(mask: np.ndarray, *, where: str, like: np.ndarray) -> None:
         InputError: Says what was found.
     """
     if mask.shape != like.shape[:2]:
-        raise InputError(
-            where=where,
-            found=f"shape {mask.shape} (height, width)",
-            needed=f"{like.shape[:2]}, as the goal image",
-        )
+        found, needed = f"shape {mask.shape} (height, width)", f"{like.shape[:2]}, as the goal image"
+        raise InputError(where=where, found=found, needed=needed)
 
 
 def require_numbers(numbers: np.ndarray, space: StateSpace, *, where: str) -> None:
@@ -56,13 +49,7 @@ def require_numbers(numbers: np.ndarray, space: StateSpace, *, where: str) -> No
         InputError: Says what was found.
     """
     if numbers.shape != (len(space),):
-        raise InputError(
-            where=where,
-            found=f"{numbers.size} numbers in the shape {numbers.shape}",
-            needed=f"{len(space)}: {', '.join(map(_with_unit, space.names, space.units))}",
-        )
+        names = (f"{name} ({unit})" if unit else name for name, unit in zip(space.names, space.units, strict=True))
+        found = f"{numbers.size} numbers in the shape {numbers.shape}"
+        raise InputError(where=where, found=found, needed=f"{len(space)}: {', '.join(names)}")
     space.require_plausible(numbers[None], where)
-
-
-def _with_unit(name: str, unit: str) -> str:
-    return f"{name} ({unit})" if unit else name

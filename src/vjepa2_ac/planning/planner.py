@@ -1,55 +1,165 @@
-"""The planner: the loop around each solver, with a time budget, limits, bad energies and a record of all steps."""
+"""The planner: a cost function in, a plan out. The loop around each solver: time, limits, bad energies, a record.
+
+Axes: samples (action sequences), decisions (chosen actions), steps (of the model; a decision is repeated for
+`SearchSpace.repeat` of them), dim (components of an action). All on the CPU.
+"""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Literal, Protocol, runtime_checkable
 
 import torch
+from einops import reduce
 from jaxtyping import Float
 from torch import Generator, Tensor
 
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.episode import Progress, no_progress
-from vjepa2_ac.planning.interfaces import Cost, Iteration, Plan, PlanStart, SearchCancelledError, Stopped, reporting
 from vjepa2_ac.planning.search_space import SearchSpace, pose_space
-from vjepa2_ac.planning.solvers import EvaluatedPlans, Solver
+from vjepa2_ac.planning.solvers import EvaluatedPlans, PlanStart, Solver
 from vjepa2_ac.registry import PLANNERS
 
 Clock = Callable[[], float]  # seconds, from anywhere
 Cancelled = Callable[[], bool]  # whether nobody waits for the plan any more
+Stopped = Literal["finished", "out of time", "no finite energy"]
 
 
+class SearchCancelledError(Exception):
+    """A search was ended from outside before it was done; there is no plan."""
+
+
+@runtime_checkable
+class Cost(Protocol):
+    """A planner's only view of a model: the cost of action sequences. Lower is better; NaN is not allowed."""
+
+    def __call__(self, actions: Float[Tensor, "samples steps dim"]) -> Float[Tensor, " samples"]:
+        """Return the energy of each action sequence; for `gradient`, as a differentiable function of it."""
+        ...
+
+
+@runtime_checkable
+class ReportingCost(Cost, Protocol):
+    """A cost that evaluates in parts, and says how far it is."""
+
+    progress: Progress  # called after each part with the action sequences so far, and all of the call
+
+
+@contextmanager
+def reporting(cost: Cost, progress: Progress, *, done: int, share: int, total: int) -> Iterator[None]:
+    """Report the progress of the one evaluation within a `with` block: its parts, if the cost says so, and its end.
+
+    Args:
+        cost: What is evaluated.
+        progress: Called with what is done, and the total.
+        done: Before the evaluation.
+        share: Of the evaluation in the total, however many action sequences it has.
+        total: Of all evaluations.
+    """
+
+    def evaluated(part: int, of: int) -> None:
+        if part < of:  # the last part is done when its energies are there
+            progress(done + share * part // of, total)
+
+    if isinstance(cost, ReportingCost):
+        before, cost.progress = cost.progress, evaluated
+        try:
+            yield
+        finally:
+            cost.progress = before
+    else:
+        yield
+    progress(done + share, total)
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """The record of one iteration, for figures."""
+
+    samples: int
+    finite: int  # of these, how many have an energy
+    elites: Float[Tensor, "elites decisions dim"]  # best first
+    elite_energies: Float[Tensor, " elites"]
+    mean: Float[Tensor, "decisions dim"]  # of the distribution after it
+    std: Float[Tensor, "decisions dim"]
+    seconds: float
+
+    @property
+    def lowest(self) -> float:
+        """The energy of this iteration's best; infinite where there is none."""
+        return float(self.elite_energies[0]) if len(self.elite_energies) else math.inf
+
+    @property
+    def elite_energy(self) -> float:
+        """The mean of the elites' energies; infinite where there are none."""
+        return float(self.elite_energies.mean()) if len(self.elite_energies) else math.inf
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The planned actions, and how they were found."""
+
+    actions: Float[Tensor, "steps dim"]  # within the limits, always
+    energy: float  # of these actions; NaN where the plan is to do nothing
+    stopped: Stopped  # with "no finite energy" the actions are zero
+    iterations: tuple[Iteration, ...]
+    mean: Float[Tensor, "decisions dim"]  # where the search ended, before the gripper is rounded
+    repeat: int  # model steps of a decision
+    planner: str
+    seed: int
+    evaluations: int  # number of evaluated action sequences
+    seconds: float
+
+    def start_after(self, done: int) -> PlanStart:
+        """Return the start of the next search after some model steps of this plan were done.
+
+        A decision of the next plan begins at the mean of what this plan would have done in its model steps: if an
+        action is repeated, a decision begins between two of this plan's. The last decision is repeated for the steps
+        that this plan did not reach.
+        """
+        elites = self.iterations[-1].elites if self.iterations else self.mean[None][:0]
+        return PlanStart(_later(self.mean[None], done, self.repeat)[0], _later(elites, done, self.repeat))
+
+
+def _later(
+    decisions: Float[Tensor, "samples decisions dim"], by: int, repeat: int
+) -> Float[Tensor, "samples decisions dim"]:
+    steps = decisions.shape[1] * repeat
+    places = (torch.arange(steps) + by).clamp(max=steps - 1) // repeat
+    at_steps = decisions[:, places]
+    return reduce(at_steps, "samples (decisions repeat) dim -> samples decisions dim", "mean", repeat=repeat)
+
+
+@dataclass
 class Planner:
     """Searches the action sequence of lowest cost, and knows nothing else about the model.
 
     Whatever the cost returns, the actions of a plan are within the limits; if no cost is finite, they are zero.
+
+    Args:
+        config: The solver, and how long it searches.
+        space: The allowed actions; None: an arm's actions within `planning.limits`.
+        clock: Measures the time budget.
+        progress: Called with the number of evaluated action sequences of a plan: at its start, after each part that the
+            cost reports, and after each iteration.
     """
 
-    def __init__(
-        self,
-        config: PlanningConfig,
-        space: SearchSpace | None = None,
-        clock: Clock = time.perf_counter,
-        progress: Progress = no_progress,
-    ) -> None:
-        """Select a planner.
-
-        Args:
-            config: The solver, and how long it searches.
-            space: The allowed actions; None: an arm's actions within `planning.limits`.
-            clock: Measures the time budget.
-            progress: Called with the number of evaluated action sequences of a plan: at its start, after each part that
-                the cost reports, and after each iteration.
-        """
-        self.config = config
-        self.space = pose_space(config) if space is None else space
-        self.clock, self.progress = clock, progress
+    config: PlanningConfig
+    space: SearchSpace | None = None
+    clock: Clock = time.perf_counter
+    progress: Progress = no_progress
 
     def plan(
-        self, cost: Cost, generator: Generator, start: PlanStart | None = None, cancelled: Cancelled = lambda: False
+        self,
+        cost: Cost,
+        generator: Generator,
+        start: PlanStart | None = None,
+        cancelled: Cancelled = lambda: False,
+        space: SearchSpace | None = None,
     ) -> Plan:
         """Return the best plan found.
 
@@ -58,38 +168,36 @@ class Planner:
             generator: On the CPU; the same seed gives the same plan. Its initial seed is recorded.
             start: Left by an earlier plan (`Plan.start_after`).
             cancelled: Asked before every iteration.
+            space: The allowed actions, as many as usual; None: those of the planner.
 
         Raises:
             SearchCancelledError: It was cancelled.
-            ValueError: The cost does not return one number per sample, or `start` is of another shape.
+            ValueError: The cost does not return one number per sample.
         """
-        began = self.clock()
-        if start is not None and start.mean.shape != self.space.lower.shape:
-            raise ValueError(f"a start of {tuple(start.mean.shape)} for {tuple(self.space.lower.shape)} decisions")
-        options = PLANNERS.options(self.config.planner, self.config.planner_options)
-        search: Solver = PLANNERS.find(self.config.planner)(self.space, self.config, generator, start, **options)
+        began, config, space = self.clock(), self.config, space or self.space or pose_space(self.config)
+        options = PLANNERS.options(config.planner, config.planner_options)
+        search: Solver = PLANNERS.find(config.planner)(space, config, generator, start, **options)
         record: list[Iteration] = []
-        best = _Best()
-        shares, total = self.config.sequences, sum(self.config.sequences)
+        shares, total = config.sequences, sum(config.sequences)
         self.progress(0, total)
-        while len(record) < self.config.iterations and self._has_time(began, record):
+        while len(record) < config.iterations and self._has_time(began, record):
             if cancelled():
                 raise SearchCancelledError
             done, share = sum(shares[: len(record)]), shares[len(record)]
             with reporting(cost, self.progress, done=done, share=share, total=total):
-                record.append(self._iterate(search, cost, best))
-        stopped: Stopped = "finished" if len(record) == self.config.iterations else "out of time"
-        actions, energy, evaluated = self._chosen(search.result(), best, cost, lowest=stopped == "out of time")
+                record.append(self._iterate(search, cost, space))
+        stopped: Stopped = "finished" if len(record) == config.iterations else "out of time"
+        actions, energy, evaluated = _chosen(search.result(), record, cost, space, lowest=stopped == "out of time")
         if actions is None:
-            actions, stopped = torch.zeros(self.space.steps, self.space.dim), "no finite energy"
+            actions, stopped = torch.zeros(space.steps, space.dim), "no finite energy"
         return Plan(
             actions=actions,
             energy=energy,
             stopped=stopped,
             iterations=tuple(record),
             mean=search.mean,
-            repeat=self.space.repeat,
-            planner=self.config.planner,
+            repeat=space.repeat,
+            planner=config.planner,
             seed=generator.initial_seed(),
             evaluations=sum(one.samples for one in record) + evaluated,
             seconds=self.clock() - began,
@@ -101,64 +209,50 @@ class Planner:
             return True
         return self.clock() - began + max(one.seconds for one in record) <= self.config.budget_s
 
-    def _iterate(self, search: Solver, cost: Cost, best: _Best) -> Iteration:
+    def _iterate(self, search: Solver, cost: Cost, space: SearchSpace) -> Iteration:
         began = self.clock()
         decisions = search.sample()
-        evaluated = self._try(cost, decisions, gradients=search.uses_gradients)
-        elites = evaluated.best(search.elites)
-        if len(elites.energies) and float(elites.energies[0]) < best.energy:
-            best.decisions, best.energy = elites.decisions[0], float(elites.energies[0])
-        search.update(evaluated)
-        found = bool(len(elites.energies))
-        return Iteration(
-            samples=len(decisions),
-            finite=len(evaluated.energies),
-            lowest=float(elites.energies[0]) if found else math.inf,
-            elite_energy=float(elites.energies.mean()) if found else math.inf,
-            elites=elites.decisions,
-            elite_energies=elites.energies,
-            mean=search.mean,
-            std=search.std,
-            seconds=self.clock() - began,
-        )
-
-    def _try(self, cost: Cost, decisions: Float[Tensor, "samples decisions dim"], *, gradients: bool) -> EvaluatedPlans:
-        decisions = decisions.detach().requires_grad_(gradients)
-        with torch.set_grad_enabled(gradients):
-            energies = cost(self.space.over_steps(decisions))
-            if energies.shape != (len(decisions),):
-                raise ValueError(f"energies of shape {tuple(energies.shape)} for {len(decisions)} action sequences")
-            finite = torch.isfinite(energies)
-            downhill = None
-            if gradients:
-                (downhill,) = torch.autograd.grad(energies.where(finite, 0.0).sum(), decisions)
-                downhill = torch.nan_to_num(downhill, nan=0.0, posinf=0.0, neginf=0.0)
-        finite = finite.cpu()
-        return EvaluatedPlans(decisions.detach()[finite], energies.detach().float().cpu()[finite], downhill)
-
-    def _chosen(
-        self, answer: Tensor | None, best: _Best, cost: Cost, *, lowest: bool
-    ) -> tuple[Float[Tensor, "steps dim"] | None, float, int]:
-        """Return actions, their energy, and the number of extra evaluations: the result, or else the best sample.
-
-        With `lowest`, the one of lower cost: a mean that has hardly moved may lead nowhere.
-        """
-        chosen, lowest_energy, evaluated = None, math.nan, 0
-        for decisions in (answer, best.decisions):
-            if decisions is None or (chosen is not None and not lowest):
-                continue
-            done, energies = self.space.finished(decisions), [best.energy]
-            if decisions is not best.decisions or not torch.equal(done, decisions):
-                energies = self._try(cost, done[None], gradients=False).energies.tolist()
-                evaluated += 1
-            if energies and not energies[0] >= lowest_energy:
-                chosen, lowest_energy = self.space.over_steps(done), energies[0]
-        return chosen, lowest_energy, evaluated
+        found = _evaluated(cost, decisions, space, gradients=search.uses_gradients)
+        best = found.best(search.elites)
+        search.update(found)
+        counts = len(decisions), len(found.energies)
+        return Iteration(*counts, best.decisions, best.energies, search.mean, search.std, self.clock() - began)
 
 
-@dataclass
-class _Best:
-    """The best decisions evaluated so far."""
+def _evaluated(
+    cost: Cost, decisions: Float[Tensor, "samples decisions dim"], space: SearchSpace, *, gradients: bool
+) -> EvaluatedPlans:
+    decisions = decisions.detach().requires_grad_(gradients)
+    with torch.set_grad_enabled(gradients):
+        energies = cost(space.over_steps(decisions))
+        if energies.shape != (len(decisions),):
+            raise ValueError(f"energies of shape {tuple(energies.shape)} for {len(decisions)} action sequences")
+        finite = torch.isfinite(energies)
+        downhill = None
+        if gradients:
+            (downhill,) = torch.autograd.grad(energies.where(finite, 0.0).sum(), decisions)
+            downhill = torch.nan_to_num(downhill, nan=0.0, posinf=0.0, neginf=0.0)
+    finite = finite.cpu()
+    return EvaluatedPlans(decisions.detach()[finite], energies.detach().float().cpu()[finite], downhill)
 
-    decisions: Tensor | None = None
-    energy: float = math.inf
+
+def _chosen(
+    answer: Tensor | None, record: list[Iteration], cost: Cost, space: SearchSpace, *, lowest: bool
+) -> tuple[Float[Tensor, "steps dim"] | None, float, int]:
+    """Return actions, their energy, and the number of extra evaluations: the result, or else the best sample.
+
+    With `lowest`, the one of lower cost: a mean that has hardly moved may lead nowhere.
+    """
+    found = min(record, key=lambda one: one.lowest)
+    best = found.elites[0] if len(found.elites) else None
+    chosen, lowest_energy, evaluated = None, math.nan, 0
+    for decisions in (answer, best):
+        if decisions is None or (chosen is not None and not lowest):
+            continue
+        done, energies = space.finished(decisions), [found.lowest]
+        if decisions is not best or not torch.equal(done, decisions):
+            energies = _evaluated(cost, done[None], space, gradients=False).energies.tolist()
+            evaluated += 1
+        if energies and not energies[0] >= lowest_energy:
+            chosen, lowest_energy = space.over_steps(done), energies[0]
+    return chosen, lowest_energy, evaluated

@@ -31,8 +31,7 @@ class Ball:
 class SearchSpace:
     """Limits of each component of each decision; where both limits are equal, it is fixed.
 
-    Raises:
-        ValueError: Limits cross or are not finite, or there is a ball and zero motion is not allowed.
+    They are finite, the lower ones not above the upper ones; where there is a ball, they allow zero motion.
     """
 
     lower: Float[Tensor, "decisions dim"]
@@ -42,14 +41,6 @@ class SearchSpace:
     ball: Ball | None = None
     gripper: int | None = None  # which number, where one is
     gripper_rounding: float = 0.0  # changes below this are set to zero in a finished plan
-
-    def __post_init__(self) -> None:
-        if not (torch.isfinite(self.lower) & torch.isfinite(self.upper) & (self.lower <= self.upper)).all():
-            raise ValueError("limits must be finite, the lower ones not above the upper ones")
-        if self.ball is not None:
-            inside = (self.lower <= 0) & (self.upper >= 0)
-            if not inside[:, : self.ball.axes].all():
-                raise ValueError("a ball is around no motion, which the limits do not allow")
 
     @property
     def decisions(self) -> int:
@@ -105,6 +96,23 @@ class SearchSpace:
         return decisions.repeat_interleave(self.repeat, dim=-2)
 
 
+def search_space(config: PlanningConfig, space: StateSpace) -> SearchSpace:
+    """Return the allowed changes of a state: of a pose within the limits of an arm, of a vector within `limits.axes`.
+
+    Raises:
+        InputError: There are no limits for vectors, or not one for each number.
+    """
+    if space.is_pose:
+        return pose_space(config)
+    limits, width = config.limits.axes, len(space)
+    if not isinstance(limits, tuple) or len(limits) not in {1, width}:
+        found = "data, of a model that does not say what it was taught" if limits == "data" else f"{limits}"
+        needed = f"the largest change of each of the {width} numbers in a model step, or one for all, such as [0.05]"
+        raise InputError(where="planning.limits.axes", found=found, needed=needed)
+    upper = _towards_zero(list(limits) * (width // len(limits))).repeat(config.horizon // config.action_repeat, 1)
+    return SearchSpace(-upper, upper, config.start_std * upper, config.action_repeat)
+
+
 def pose_space(config: PlanningConfig) -> SearchSpace:
     """Return the allowed actions of an arm: dx, dy, dz, three rotations, gripper (legend: `vjepa2_ac.episode`)."""
     limits, decisions = config.limits, config.horizon // config.action_repeat
@@ -124,35 +132,8 @@ def pose_space(config: PlanningConfig) -> SearchSpace:
         repeat=config.action_repeat,
         ball=None if limits.ball == "none" else Ball(limits.ball, limits.radius),
         gripper=GRIPPER,
-        gripper_rounding=_rounding(limits),
+        gripper_rounding=0.0 if limits.gripper_mode == "free" else limits.gripper_rounding,
     )
-
-
-def search_space(config: PlanningConfig, space: StateSpace) -> SearchSpace:
-    """Return the allowed changes of a state: of a pose within the limits of an arm, of a vector within `limits.axes`.
-
-    Raises:
-        InputError: There are no limits for vectors, or not one for each number.
-    """
-    return pose_space(config) if space.is_pose else vector_space(config, len(space))
-
-
-def vector_space(config: PlanningConfig, width: int) -> SearchSpace:
-    """Return the allowed changes of a vector: each number by `limits.axes` at most, up and down."""
-    limits, decisions = config.limits.axes, config.horizon // config.action_repeat
-    if not isinstance(limits, tuple) or len(limits) not in {1, width}:
-        raise InputError(
-            where="planning.limits.axes",
-            found="data, of a model that does not say what it was taught" if limits == "data" else f"{limits}",
-            needed=f"the largest change of each of the {width} numbers in a model step; or one number for all",
-            fix="Such as planning.limits.axes=[0.05]; a run keeps what it was taught, and then data means that",
-        )
-    upper = _towards_zero(list(limits) * (width // len(limits))).repeat(decisions, 1)
-    return SearchSpace(lower=-upper, upper=upper, std=config.start_std * upper, repeat=config.action_repeat)
-
-
-def _rounding(limits: LimitsConfig) -> float:
-    return 0.0 if limits.gripper_mode == "free" else limits.gripper_rounding
 
 
 def _towards_zero(values: list[float]) -> Float[Tensor, " dim"]:
@@ -188,10 +169,6 @@ class Workspace:
             raise InputError(where="planning.limits.workspace", found=found, needed="no box", fix=fix)
         return cls(*(np.array(corner, dtype=np.float64) for corner in limits.workspace))
 
-    def contains(self, position: Float[np.ndarray, " 3"]) -> bool:
-        """Return whether a position is inside, to rounding."""
-        return bool((position >= self.low - _NEAR_M).all() and (position <= self.high + _ROUNDING).all())
-
     def narrowed(self, space: SearchSpace, state: Float[np.ndarray, " 7"]) -> SearchSpace:
         """Return the search space whose first decision stays inside, for each of the model steps it is repeated.
 
@@ -206,12 +183,12 @@ class Workspace:
 
     def is_near(self, state: Float[np.ndarray, " 7"], limits: LimitsConfig) -> bool:
         """Return whether one action leads back inside; true of a robot that is inside."""
-        return _is_allowed(self._way_back(state[:3]), limits)
+        return is_allowed(self.way_back(state[:3]), limits)
 
     def kept(
         self, state: Float[np.ndarray, " 7"], actions: Float[np.ndarray, "steps 7"], limits: LimitsConfig
     ) -> Float[np.ndarray, "steps 7"]:
-        """Return actions whose targets are all inside.
+        """Return actions whose targets are all inside, of a robot that is near.
 
         A target is moved to the nearest place inside; where that is more than an action may be, towards the way back.
 
@@ -219,21 +196,16 @@ class Workspace:
             state: Where the robot is.
             actions: Changes of each model step, within the limits.
             limits: Of an action.
-
-        Raises:
-            ValueError: The robot is not near the box: nothing should be done at all.
         """
-        if not self.is_near(state, limits):
-            raise ValueError(f"{state[:3]} is farther from the workspace than an action leads")
         kept, position = np.array(actions, dtype=np.float64), np.array(state[:3], dtype=np.float64)
         for action in kept:
             way = np.clip(position + action[:3], self.low, self.high) - position
             if abs(way - action[:3]).max() > _NEAR_M:
-                action[:3] = _within(limits, self._way_back(position), way)
+                action[:3] = _within(limits, self.way_back(position), way)
             position = position + action[:3]
         return kept
 
-    def _way_back(self, position: Float[np.ndarray, " 3"]) -> Float[np.ndarray, " 3"]:
+    def way_back(self, position: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
         """Return the shortest way inside; zeros from there."""
         return np.asarray(np.clip(position, self.low, self.high) - position)
 
@@ -242,17 +214,18 @@ def _within(
     limits: LimitsConfig, sure: Float[np.ndarray, " 3"], wanted: Float[np.ndarray, " 3"]
 ) -> Float[np.ndarray, " 3"]:
     """Return the last way from an allowed one to a wanted one that is allowed, too: limits are convex."""
-    if _is_allowed(wanted, limits):
+    if is_allowed(wanted, limits):
         return wanted
     low, high = 0.0, 1.0
     for _ in range(_HALVINGS):
         middle = (low + high) / 2
-        low, high = (middle, high) if _is_allowed(sure + middle * (wanted - sure), limits) else (low, middle)
+        low, high = (middle, high) if is_allowed(sure + middle * (wanted - sure), limits) else (low, middle)
     return np.asarray(sure + low * (wanted - sure))
 
 
-def _is_allowed(way: Float[np.ndarray, " 3"], limits: LimitsConfig) -> bool:
-    if (abs(way) > np.array(limits.xyz_m) + _NEAR_M).any():
+def is_allowed(way: Float[np.ndarray, " 3"], limits: LimitsConfig, slack_m: float = _NEAR_M) -> bool:
+    """Return whether a motion is within the limits of each axis and of the ball."""
+    if (abs(way) > np.array(limits.xyz_m) + slack_m).any():
         return False
     order = 1 if limits.ball == "l1" else 2
-    return limits.ball == "none" or bool(np.linalg.norm(way, ord=order) <= limits.radius + _NEAR_M)
+    return limits.ball == "none" or bool(np.linalg.norm(way, ord=order) <= limits.radius + slack_m)

@@ -19,9 +19,8 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.merging import merge_adapter
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.planning.controller import Controller, rules_of
-from vjepa2_ac.planning.goal_folder import GoalFolder
-from vjepa2_ac.planning.goals import SubGoal
+from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.planning.goals import GoalFolder, SubGoal, with_shares
 from vjepa2_ac.planning.model_setup import Fingerprints
 from vjepa2_ac.planning.settings import planning_settings, warn_beyond_taught
 from vjepa2_ac.runs.checkpoint import SELECTED
@@ -39,7 +38,6 @@ class PlanningSession:
     subject: str  # the run or model as given
     checkpoint: str  # which one, as text; "" of a model
     warnings: tuple[str, ...] = ()  # why its plans may leave what the run was taught
-    fingerprints: Fingerprints | None = None  # of a run's weights before they were merged; None: of the world model
 
     def controller(
         self,
@@ -65,7 +63,7 @@ class PlanningSession:
     @property
     def encoder(self) -> str:
         """The hash of the encoder's weights."""
-        return (self.fingerprints or Fingerprints.of(self.world_model)).encoder
+        return Fingerprints.of(self.world_model).encoder
 
     def goals_of(self, folder: GoalFolder) -> tuple[SubGoal, ...]:
         """Return the goals of a folder for this model, with their noise floor; what is changed is logged as a warning.
@@ -74,7 +72,7 @@ class PlanningSession:
             InputError: A goal would never end, or the last one has a bound.
         """
         goals = folder.for_model(self.encoder, self.config.planning.energy.distance)
-        rules_of(goals, self.config.planning, first=1)
+        with_shares(goals, self.config.planning.goals, first=1)
         return goals
 
     def as_dict(self) -> dict[str, Any]:
@@ -87,7 +85,7 @@ class PlanningSession:
             "model": {
                 "subject": self.subject,
                 "checkpoint": self.checkpoint or None,
-                **(self.fingerprints or Fingerprints.of(model))._asdict(),
+                **Fingerprints.of(model)._asdict(),
                 "dtype": str(dtype).removeprefix("torch."),
                 "device": model.device.type,
                 "image_size": model.image_size,
@@ -119,29 +117,17 @@ def load_to_plan(
     """
     dtype = "bfloat16" if torch.cuda.is_available() and has_bf16() else "float32"
     its = planning_settings(subject, config=config, overrides=overrides, dtype=dtype)
-    device = _device_to_plan_on(its)
+    device = torch.device("cpu" if is_on_cpu(its.training) else "cuda")
+    require_type_of_weights(its.model, device)  # without autocast
     if is_run(subject):
         run = load_run(Path(subject), checkpoint, its)
-        known = Fingerprints.of(run.world_model)
-        merge_adapter(run.world_model)
-        run.world_model.merged_from = known
-        warnings = warn_beyond_taught(its, Path(subject))
-        return PlanningSession(run.world_model.to(device).eval(), its, subject, run.chosen, warnings, known)
-    if checkpoint != SELECTED:
-        raise InputError(
-            where=f"--checkpoint {checkpoint}",
-            found=f"{subject}, which is not the folder of a run",
-            needed="a run: a model has no checkpoints to choose from",
-        )
-    return PlanningSession(load_base(its.model, seed=its.seed).to(device).eval(), its, subject, "")
-
-
-def _device_to_plan_on(config: Config) -> torch.device:
-    """Return the device, after checking that it supports the type used in planning, without autocast.
-
-    Raises:
-        InputError: It does not.
-    """
-    device = torch.device("cpu" if is_on_cpu(config.training) else "cuda")
-    require_type_of_weights(config.model, device)
-    return device
+        model, chosen, warnings = run.world_model, run.chosen, warn_beyond_taught(its, Path(subject))
+        known = Fingerprints.of(model)
+        merge_adapter(model)
+        model.merged_from = known
+    elif checkpoint == SELECTED:
+        model, chosen, warnings = load_base(its.model, seed=its.seed), "", ()
+    else:
+        found, needed = f"{subject}, which is not the folder of a run", "a run: a model has no checkpoints"
+        raise InputError(where=f"--checkpoint {checkpoint}", found=found, needed=needed)
+    return PlanningSession(model.to(device).eval(), its, subject, chosen, warnings)

@@ -8,24 +8,26 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.config.loading import config_from, load_config_of_run
+from vjepa2_ac.config.loading import load_config_of_run, parse_config
 from vjepa2_ac.config.planning import LimitsConfig
-from vjepa2_ac.config.section import Affects, mark_of, names_that_affect
+from vjepa2_ac.config.section import Affects, mark_of
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.places import literal
-from vjepa2_ac.planning.axes.axes_file import require_axes
+from vjepa2_ac.planning.axes import require_axes
 from vjepa2_ac.runs.folder import CHANGES, CONFIG, is_run
 from vjepa2_ac.spaces import POSE, REACH_M, vector_states
-from vjepa2_ac.storage.structured import read_json_object, shown
+from vjepa2_ac.storage.structured import read_json_object, record_of
 
 logger = logging.getLogger(__name__)
 
+USED = ("planning.…", "seed", "data.stride", "data.crop", "model.sizes.…", "model.dtype", "training.device")
 _ANY_TYPE = "training.precision=bf16"  # of autocast, which planning does without: weights may be of any type beside it
 _SLACK = 1.1  # uniform motion has its 99th percentile below its limit, and that of some episodes is not exact
-
-_Compared = tuple[str, str, tuple[str, ...], Sequence[float], Sequence[float]]
 
 
 def planning_settings(
@@ -44,12 +46,33 @@ def planning_settings(
     """
     _require_relevant(overrides)
     if is_run(subject):
-        its = with_taught_limits(_of_run(subject, config, overrides), Path(subject))
+        if config is not None:
+            found, fix = f"{subject}, a run, which has a config of its own", "Change single settings by key=value"
+            raise InputError(where=f"--config {config}", found=found, fix=fix)
+        folder = Path(subject)
+        moved = f"run_dir={json.dumps(literal(folder))}"
+        its = load_config_of_run(folder / CONFIG, [*overrides, moved, _ANY_TYPE])
+        its = with_taught_limits(its, folder)
+    elif config is None:
+        plain = {"run_dir": "none", "data": {"path": "none"}, "model": {"base": subject, "dtype": dtype}}
+        its = parse_config(plain, overrides, where="overrides")
     else:
-        its = _of_model(subject, config, overrides, dtype)
+        its = load_config_of_run(config, [*overrides, _ANY_TYPE])
+        its = its.model_copy(update={"model": its.model.with_base(subject)})
     require_limits(its)
     require_axes(its)
     return its
+
+
+def _require_relevant(overrides: Sequence[str]) -> None:
+    for override in overrides:
+        try:
+            is_relevant = Affects.PLAN in mark_of(override.partition("=")[0], Config)
+        except KeyError:  # the config says what is wrong
+            continue
+        if not is_relevant:
+            found = "a setting that planning does not use"
+            raise InputError(where=f"override {override}", found=found, needed=f"one of {', '.join(USED)}")
 
 
 def require_limits(config: Config) -> None:
@@ -66,8 +89,9 @@ def require_limits(config: Config) -> None:
 class Taught:
     """What a run noted of the actions in its data."""
 
-    changes: tuple[float, ...]  # 99th percentile of the size of each number's change in a model step
-    narrow: str  # why the data are narrow; empty: they are not, or that is not known
+    # 99th percentile of the size of each number's change in a model step
+    changes: tuple[Annotated[float, Field(ge=0.0, allow_inf_nan=False)], ...]
+    narrow: str = ""  # why the data are narrow; empty: they are not, or that is not known
 
 
 def taught_in(folder: Path, *, poses: bool) -> Taught | None:
@@ -79,14 +103,12 @@ def taught_in(folder: Path, *, poses: bool) -> Taught | None:
     path = folder / CHANGES
     if not path.is_file():
         return None
-    noted = read_json_object(path)
-    changes, narrow = noted.get("changes"), noted.get("narrow", "")
-    if not isinstance(changes, list) or not all(isinstance(one, float) and 0 <= one < math.inf for one in changes):
-        raise InputError(where=str(path), found=shown(changes), needed="a number of 0 or more for each of the state's")
-    if poses and (len(changes) != len(POSE) or max(changes[:3]) > REACH_M):
+    noted = {name: one for name, one in read_json_object(path).items() if name in {"changes", "narrow"}}
+    taught = record_of(Taught, noted, where=str(path), needed="a number of 0 or more for each of the state's")
+    if poses and (len(taught.changes) != len(POSE) or max(taught.changes[:3]) > REACH_M):
         needed = f"{len(POSE)} numbers: {', '.join(POSE.change_names)}, positions in metres"
-        raise InputError(where=str(path), found=shown(changes), needed=needed)
-    return Taught(tuple(changes), narrow if isinstance(narrow, str) else "")
+        raise InputError(where=str(path), found=str(taught.changes), needed=needed)
+    return taught
 
 
 def with_taught_limits(config: Config, folder: Path) -> Config:
@@ -121,10 +143,12 @@ def beyond_taught(config: Config, folder: Path) -> tuple[str, ...]:
     if (taught := taught_in(folder, poses=poses)) is None:
         return ()
     found = [f"{folder} learned from narrow data: {taught.narrow}"] if taught.narrow else []
-    for knob, unit, names, reach, usual in _compared(config.planning.limits, taught.changes, poses=poses):
+    names = POSE.change_names if poses else vector_states(len(taught.changes)).names
+    reach = _reach(config.planning.limits, taught, poses=poses)
+    for knob, (unit, factor, numbers) in (_OF_POSES if poses else _OF_VECTORS).items():
         beyond = [
-            f"{name} {most:.3g} ({far:.3g}){unit}"
-            for name, most, far in zip(names, reach, usual, strict=True)
+            f"{name} {factor * most:.3g} ({factor * far:.3g}){unit}"
+            for name, most, far in list(zip(names, reach, taught.changes, strict=False))[numbers]
             if most > _SLACK * far
         ]
         if beyond:
@@ -137,61 +161,28 @@ def beyond_taught(config: Config, folder: Path) -> tuple[str, ...]:
     return tuple(found)
 
 
+_OF_POSES = {  # which numbers a knob limits, and in which unit people read them
+    "xyz": (" cm", 100.0, slice(0, 3)),
+    "rotation": (" degrees", 180 / math.pi, slice(3, 6)),
+    "gripper": ("", 1.0, slice(6, 7)),
+}
+_OF_VECTORS = {"axes": ("", 1.0, slice(None))}
+
+
+def _reach(limits: LimitsConfig, taught: Taught, *, poses: bool) -> Sequence[float]:
+    """Return how far limits let each number go in a model step; nothing where they do not say it for each."""
+    if not poses:
+        axes = limits.axes if isinstance(limits.axes, tuple) else taught.changes
+        axes = axes * len(taught.changes) if len(axes) == 1 else axes
+        return axes if len(axes) == len(taught.changes) else ()
+    ball = math.inf if limits.ball == "none" else limits.radius
+    gripper = limits.gripper if limits.gripper_mode in {"rounded", "free"} else 0.0
+    return [*(min(one, ball) for one in limits.xyz_m), *[limits.rotation] * 3, gripper]
+
+
 def warn_beyond_taught(config: Config, folder: Path) -> tuple[str, ...]:
     """Log what `beyond_taught` returns as warnings, and return it."""
     found = beyond_taught(config, folder)
     for text in found:
         logger.warning(text)
     return found
-
-
-def _compared(limits: LimitsConfig, taught: tuple[float, ...], *, poses: bool) -> list[_Compared]:
-    """Return what is compared: a knob, a unit, the numbers it limits, how far it lets them go, how far they went."""
-    if not poses:
-        axes = limits.axes if isinstance(limits.axes, tuple) else taught
-        reach = axes * len(taught) if len(axes) == 1 else axes
-        return [("axes", "", vector_states(len(taught)).names, reach, taught)] if len(reach) == len(taught) else []
-    names, ball = POSE.change_names, math.inf if limits.ball == "none" else limits.radius
-    gripper = limits.gripper if limits.gripper_mode in {"rounded", "free"} else 0.0
-    moved, moved_data = ([100 * one for one in metres] for metres in (limits.xyz_m, taught[:3]))
-    turned, turned_data = (list(map(math.degrees, radians)) for radians in ([limits.rotation] * 3, taught[3:6]))
-    return [
-        ("xyz", " cm", names[:3], [min(one, 100 * ball) for one in moved], moved_data),
-        ("rotation", " degrees", names[3:6], turned, turned_data),
-        ("gripper", "", names[6:], (gripper,), taught[6:]),
-    ]
-
-
-def _of_run(subject: str, config: str | Path | None, overrides: Sequence[str]) -> Config:
-    if config is not None:
-        raise InputError(
-            where=f"--config {config}",
-            found=f"{subject}, a run, which has a config of its own",
-            needed="one config",
-            fix="Change single settings behind the run's name, such as planning.horizon=2",
-        )
-    return load_config_of_run(
-        Path(subject) / CONFIG, [*overrides, f"run_dir={json.dumps(literal(Path(subject)))}", _ANY_TYPE]
-    )
-
-
-def _of_model(subject: str, config: str | Path | None, overrides: Sequence[str], dtype: str) -> Config:
-    if config is None:
-        plain = {"run_dir": "none", "data": {"path": "none"}, "model": {"base": subject, "dtype": dtype}}
-        return config_from(plain, overrides, where="overrides")
-    its = load_config_of_run(Path(config), [*overrides, _ANY_TYPE])
-    return its.model_copy(update={"model": its.model.with_base(subject)})
-
-
-def _require_relevant(overrides: Sequence[str]) -> None:
-    for override in overrides:
-        try:
-            is_relevant = Affects.PLAN in mark_of(override.partition("=")[0], Config)
-        except KeyError:  # the config says what is wrong
-            continue
-        if not is_relevant:
-            raise InputError(
-                where=f"override {override}",
-                found="a setting that planning does not use",
-                needed=f"one of {', '.join(names_that_affect(Affects.PLAN, Config))}",
-            )

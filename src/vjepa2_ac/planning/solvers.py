@@ -1,21 +1,29 @@
 """Solvers: how the action sequence of lowest cost is searched. CEM, iCEM, MPPI, gradient descent.
 
 A solver samples decisions, is told their energies, and has a result; `planning.planner` has the loop around it. One of
-your own has the same constructor (docs/extending.md).
+your own has the constructor, the attributes and the methods of `Solver`, which it need not inherit (docs/extending.md).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
 from vjepa2_ac.config.planning import PlanningConfig
-from vjepa2_ac.planning.interfaces import PlanStart
 from vjepa2_ac.planning.search_space import SearchSpace
+
+Momentum = float | Float[Tensor, " dim"]  # share of the old mean or standard deviation in the new one
+
+
+@dataclass(frozen=True)
+class PlanStart:
+    """The start of a search: what the last decision left."""
+
+    mean: Float[Tensor, "decisions dim"]
+    elites: Float[Tensor, "elites decisions dim"]
 
 
 @dataclass(frozen=True)
@@ -32,34 +40,46 @@ class EvaluatedPlans:
         return EvaluatedPlans(self.decisions[order], self.energies[order])
 
 
-@runtime_checkable
-class Solver(Protocol):
-    """The search of one decision, from its first samples to its result."""
+class Solver:
+    """The search of one decision, from its first samples to its result.
 
+    Args:
+        space: The allowed decisions.
+        config: Its settings.
+        generator: Of its samples.
+        start: What the last decision left.
+    """
+
+    uses_gradients = False
     elites: int  # how many of the best are recorded
-    uses_gradients: bool
+    mean: Float[Tensor, "decisions dim"]  # of the distribution
+    std: Float[Tensor, "decisions dim"]
 
-    @property
-    def mean(self) -> Float[Tensor, "decisions dim"]:
-        """The mean of the distribution."""
-        ...
-
-    @property
-    def std(self) -> Float[Tensor, "decisions dim"]:
-        """The standard deviation of the distribution."""
-        ...
+    def __init__(
+        self, space: SearchSpace, config: PlanningConfig, generator: Generator, start: PlanStart | None = None
+    ) -> None:
+        self._space, self._config, self._generator = space, config, generator
+        self.mean = space.allowed(torch.zeros_like(space.lower) if start is None else start.mean)
+        self.std = space.first_std
 
     def sample(self) -> Float[Tensor, "samples decisions dim"]:
         """Return the next decisions to evaluate, all allowed."""
-        ...
+        raise NotImplementedError
 
     def update(self, evaluated: EvaluatedPlans) -> None:
         """Update the distribution. Without any finite energy, nothing changes."""
-        ...
+        raise NotImplementedError
 
     def result(self) -> Float[Tensor, "decisions dim"] | None:
         """Return the current result; None: the best evaluated decisions."""
-        ...
+        return None
+
+    def _fit(self, best: Float[Tensor, "elites decisions dim"], keep_mean: Momentum, keep_std: Momentum) -> None:
+        """Move the distribution to its elites; a single one does not change the standard deviation."""
+        if len(best):
+            self.mean = keep_mean * self.mean + (1 - keep_mean) * best.mean(dim=0)
+        if len(best) > 1:
+            self.std = keep_std * self.std + (1 - keep_std) * best.std(dim=0)
 
 
 def white_noise(space: SearchSpace, samples: int, generator: Generator) -> Float[Tensor, "samples decisions dim"]:
@@ -73,7 +93,7 @@ def white_noise(space: SearchSpace, samples: int, generator: Generator) -> Float
     return noise
 
 
-class CemSolver:
+class CemSolver(Solver):
     """As upstream: samples are clipped, mean and standard deviation keep a share of their old values.
 
     Differs from upstream: a warm start is possible, samples without a finite energy are no elites, and a fixed gripper
@@ -82,38 +102,29 @@ class CemSolver:
     Source: facebookresearch/vjepa2 @ c2963a4, notebooks/utils/mpc_utils.py, cem.
     """
 
-    uses_gradients = False
-
     def __init__(
         self, space: SearchSpace, config: PlanningConfig, generator: Generator, start: PlanStart | None = None
     ) -> None:
+        super().__init__(space, config, generator, start)
         cem = config.cem
         self.elites = cem.elites
-        self.mean = space.allowed(torch.zeros_like(space.lower) if start is None else start.mean)
-        self.std = space.first_std
-        self._space, self._samples, self._generator = space, config.samples, generator
-        self._answers_mean, self._tries_mean = cem.answer == "mean", cem.try_mean
         self._keep_mean = _momentum(space, cem.momentum_mean, cem.momentum_mean_gripper)
         self._keep_std = _momentum(space, cem.momentum_std, cem.momentum_std_gripper)
 
     def sample(self) -> Float[Tensor, "samples decisions dim"]:
         """Return samples of the distribution, clipped to the allowed set."""
-        noise = white_noise(self._space, self._samples, self._generator)
-        if self._tries_mean:
+        noise = white_noise(self._space, self._config.samples, self._generator)
+        if self._config.cem.try_mean:
             noise[0] = 0.0
         return self._space.allowed(self.mean + self.std * noise)
 
     def update(self, evaluated: EvaluatedPlans) -> None:
-        """Fit the distribution to the elites; a single one does not change the standard deviation."""
-        best = evaluated.best(self.elites).decisions
-        if len(best):
-            self.mean = self._keep_mean * self.mean + (1 - self._keep_mean) * best.mean(dim=0)
-        if len(best) > 1:
-            self.std = self._keep_std * self.std + (1 - self._keep_std) * best.std(dim=0)
+        """Fit the distribution to the elites."""
+        self._fit(evaluated.best(self.elites).decisions, self._keep_mean, self._keep_std)
 
     def result(self) -> Float[Tensor, "decisions dim"] | None:
         """Return the mean, or None to request the best."""
-        return self.mean if self._answers_mean else None
+        return self.mean if self._config.cem.answer == "mean" else None
 
 
 def _momentum(space: SearchSpace, others: float, gripper: float) -> Float[Tensor, " dim"]:
@@ -123,7 +134,7 @@ def _momentum(space: SearchSpace, others: float, gripper: float) -> Float[Tensor
     return momentum
 
 
-class IcemSolver:
+class IcemSolver(Solver):
     """Fewer samples per iteration; elites are reused and shifted into the next decision; the result is the best sample.
 
     The last iteration also evaluates the mean. Components of a sample are independent, decisions are correlated.
@@ -131,46 +142,33 @@ class IcemSolver:
     Source: Pinneri et al., Sample-efficient Cross-Entropy Method for Real-time Planning, arXiv 2008.06389, algorithm 1.
     """
 
-    uses_gradients = False
-
     def __init__(
         self, space: SearchSpace, config: PlanningConfig, generator: Generator, start: PlanStart | None = None
     ) -> None:
-        self.elites = config.icem.elites
-        self.mean = space.allowed(torch.zeros_like(space.lower) if start is None else start.mean)
-        self.std = space.first_std
-        self._space, self._config, self._generator = space, config.icem, generator
-        self._samples, self._iterations, self._iteration = config.samples, config.iterations, 0
+        super().__init__(space, config, generator, start)
+        self.elites, self._iteration = config.icem.elites, 0
         self._kept = self.mean[None][:0] if start is None else self._few(start.elites)
 
     def sample(self) -> Float[Tensor, "samples decisions dim"]:
         """Return new samples, the reused elites, and in the last iteration the mean."""
-        count = self._config.new_samples(self._samples, self._iteration)
-        noise = coloured_noise(
-            count, self._space.decisions, self._space.dim, self._config.noise_exponent, self._generator
-        )
+        icem, space = self._config.icem, self._space
+        count = icem.new_samples(self._config.samples, self._iteration)
+        noise = coloured_noise(count, space.decisions, space.dim, icem.noise_exponent, self._generator)
         evaluated = [self.mean + self.std * noise, self._kept]
         self._iteration += 1
-        if self._iteration == self._iterations:
+        if self._iteration == self._config.iterations:
             evaluated.append(self.mean[None])
-        return self._space.allowed(torch.cat(evaluated))
+        return space.allowed(torch.cat(evaluated))
 
     def update(self, evaluated: EvaluatedPlans) -> None:
         """Fit the distribution to the elites, and keep some of them."""
-        best = evaluated.best(self.elites).decisions
-        keep = self._config.momentum
+        best, keep = evaluated.best(self.elites).decisions, self._config.icem.momentum
+        self._fit(best, keep, keep)
         if len(best):
-            self.mean = keep * self.mean + (1 - keep) * best.mean(dim=0)
             self._kept = self._few(best)
-        if len(best) > 1:
-            self.std = keep * self.std + (1 - keep) * best.std(dim=0)
-
-    def result(self) -> Float[Tensor, "decisions dim"] | None:
-        """Return None to request the best evaluated decisions."""
-        return None
 
     def _few(self, elites: Float[Tensor, "elites decisions dim"]) -> Float[Tensor, "kept decisions dim"]:
-        return elites[: round(self._config.kept * self.elites)]
+        return elites[: round(self._config.icem.kept * self.elites)]
 
 
 def coloured_noise(
@@ -195,7 +193,7 @@ def coloured_noise(
     return noise / power.sqrt()
 
 
-class MppiSolver:
+class MppiSolver(Solver):
     """Weights exp(-energy / temperature); the noise decays by a fixed factor, and the mean is evaluated itself.
 
     The control cost of the original is left out: the limits define the allowed actions.
@@ -203,42 +201,34 @@ class MppiSolver:
     Source: Williams et al., Information Theoretic MPC for Model-Based Reinforcement Learning, ICRA 2017, algorithm 2.
     """
 
-    uses_gradients = False
     elites = 10  # recorded; all samples decide
-
-    def __init__(
-        self, space: SearchSpace, config: PlanningConfig, generator: Generator, start: PlanStart | None = None
-    ) -> None:
-        self.mean = space.allowed(torch.zeros_like(space.lower) if start is None else start.mean)
-        self.std = space.first_std
-        self._space, self._config, self._samples, self._generator = space, config.mppi, config.samples, generator
 
     def sample(self) -> Float[Tensor, "samples decisions dim"]:
         """Return the mean and samples around it."""
-        noise = white_noise(self._space, self._samples, self._generator)
+        noise = white_noise(self._space, self._config.samples, self._generator)
         noise[0] = 0.0
         return self._space.allowed(self.mean + self.std * noise)
 
     def update(self, evaluated: EvaluatedPlans) -> None:
         """Move the mean to the weighted mean of the samples."""
-        if not len(evaluated.energies):
+        energies, mppi = evaluated.energies, self._config.mppi
+        if not len(energies):
             return
-        spread = evaluated.energies.std(correction=0).clamp(min=torch.finfo(torch.float32).tiny)
-        weights = torch.softmax(
-            (evaluated.energies.min() - evaluated.energies) / (self._config.temperature * spread), dim=0
-        )
+        spread = energies.std(correction=0).clamp(min=torch.finfo(torch.float32).tiny)
+        weights = torch.softmax((energies.min() - energies) / (mppi.temperature * spread), dim=0)
         self.mean = torch.einsum("s,sdn->dn", weights, evaluated.decisions)
-        self.std = self.std * self._config.std_decay
+        self.std = self.std * mppi.std_decay
 
     def result(self) -> Float[Tensor, "decisions dim"] | None:
         """Return the mean."""
         return self.mean
 
 
-class GradientSolver:
+class GradientSolver(Solver):
     """Adam on decisions in units of their limits, projected onto the allowed set after every step.
 
-    Each start descends independently. The result is the best of all evaluated decisions.
+    Each start descends independently: the first from the best current descent of the last decision, since the mean of
+    several that lead to different places leads nowhere. The result is the best of all evaluated decisions.
     """
 
     uses_gradients = True
@@ -246,27 +236,18 @@ class GradientSolver:
     def __init__(
         self, space: SearchSpace, config: PlanningConfig, generator: Generator, start: PlanStart | None = None
     ) -> None:
-        gradient = config.gradient
-        self.elites = gradient.starts
-        noise = white_noise(space, gradient.starts, generator)
+        super().__init__(space, config, generator, start)
+        self.elites = config.gradient.starts
+        noise = white_noise(space, self.elites, generator)
         noise[0] = 0.0
-        origin = torch.zeros_like(space.lower) if start is None else _best_of(start)
-        self._space = space
+        origin = torch.zeros_like(space.lower)
+        if start is not None:
+            origin = start.elites[0] if len(start.elites) else start.mean
         half = (space.upper - space.lower) / 2
         self._unit = torch.where(half > 0, half, 1.0)
         self._place = space.allowed(origin + space.first_std * noise) / self._unit
-        self._adam = torch.optim.Adam([self._place], lr=gradient.learning_rate)
+        self._adam = torch.optim.Adam([self._place], lr=config.gradient.learning_rate)
         self._fall = torch.optim.lr_scheduler.LambdaLR(self._adam, lambda step: max(0.0, 1 - step / config.iterations))
-
-    @property
-    def mean(self) -> Float[Tensor, "decisions dim"]:
-        """The mean of all descents."""
-        return self.sample().mean(dim=0)
-
-    @property
-    def std(self) -> Float[Tensor, "decisions dim"]:
-        """The standard deviation over the descents."""
-        return self.sample().std(dim=0, correction=0)
 
     def sample(self) -> Float[Tensor, "samples decisions dim"]:
         """Return the current decisions of each descent."""
@@ -285,12 +266,5 @@ class GradientSolver:
         self._fall.step()
         with torch.no_grad():
             self._place.copy_(self.sample() / self._unit)
-
-    def result(self) -> Float[Tensor, "decisions dim"] | None:
-        """Return None to request the best evaluated decisions."""
-        return None
-
-
-def _best_of(start: PlanStart) -> Float[Tensor, "decisions dim"]:
-    """Return the best current descent: the mean of several that lead to different places leads nowhere."""
-    return start.elites[0] if len(start.elites) else start.mean
+            descents = self.sample()
+            self.mean, self.std = descents.mean(dim=0), descents.std(dim=0, correction=0)

@@ -15,8 +15,7 @@ from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.image_file import read_image
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.goal_folder import GOALS_FILE, GoalFolder, read_goal_folder
-from vjepa2_ac.planning.goals import SubGoal
+from vjepa2_ac.planning.goals import GOALS_FILE, GoalFolder, SubGoal, read_goal_folder
 from vjepa2_ac.planning.input_checks import require_image
 from vjepa2_ac.planning.session import PlanningSession
 from vjepa2_ac.serving.session import Session
@@ -38,43 +37,44 @@ def require_steps(config: Config) -> int:
 
 def metadata_of(loaded: PlanningSession, session: Session) -> dict[str, Any]:
     """Return what a client may know of the server: plain values, without a path of this machine."""
-    planning, limits, model = loaded.config.planning, loaded.config.planning.limits, loaded.as_dict()["model"]
-    steps, rate = session.options.control_steps, _control_rate(loaded.config)
-    space = session.controller.spaces.state
+    planning, options, model = loaded.config.planning, session.options, loaded.as_dict()["model"]
+    rate = _control_rate(loaded.config)
     return {
         "policy": "vjepa2-ac",
         "protocol": PROTOCOL,
         "version": __version__,
         "predictor": model["predictor"],
         "encoder": model["encoder"],
-        "state": list(space.names),
+        "state": list(session.controller.spaces.state.names),
         "frame_of_states": loaded.config.data.pose_frame,
-        "control_steps": steps,
-        "seconds_per_step": None if rate is None else steps / rate,
+        "control_steps": options.control_steps,
+        "seconds_per_step": None if rate is None else options.control_steps / rate,
         "horizon": planning.horizon,
-        "limits": limits.model_dump(mode="json"),
+        "limits": planning.limits.model_dump(mode="json"),
         "planning": planning.model_dump(mode="json"),
         "seed": session.controller.seed,
         "checkpoint": loaded.checkpoint,
         "use_extrinsics": loaded.world_model.sizes.predictor.use_extrinsics,
-        "deadline_s": session.options.deadline_s,
-        "image_keys": list(session.options.image_keys),
+        "deadline_s": options.deadline_s,
+        "image_keys": list(options.image_keys),
         "goals": sorted(session.goals)[:_MOST_NAMES],
         "warnings": list(loaded.warnings),
-        "dry_run": session.options.dry_run,
+        "dry_run": options.dry_run,
         **roboarena_metadata(session),
     }
 
 
 def roboarena_metadata(session: Session) -> dict[str, Any]:
     """Return the six keys of RoboArena's clients, which take no others."""
+    space = session.controller.spaces
+    change = "cartesian_delta" if space.state.is_pose else f"vector_{space.action.follows}"
     return {
         "image_resolution": None,
         "needs_wrist_camera": False,
         "n_external_cameras": 1,
         "needs_stereo_camera": False,
         "needs_session_id": True,
-        "action_space": _action_space(session),
+        "action_space": "cartesian_position" if session.options.actions == "pose" else change,
     }
 
 
@@ -109,16 +109,8 @@ def warm_up(controller: Controller) -> float:
 
 def _control_rate(config: Config) -> float | None:
     """Return the control steps a second; None: only the data set knows."""
-    sections = (getattr(config.data, name) for name in type(config.data).own_sections())
-    found = [getattr(one, "control_rate_hz", None) for one in sections]
-    return next((rate for rate in found if rate is not None), None)
-
-
-def _action_space(session: Session) -> str:
-    space = session.controller.spaces
-    if session.options.actions == "pose":
-        return "cartesian_position"
-    return "cartesian_delta" if space.state.is_pose else f"vector_{space.action.follows}"
+    rates = (getattr(one, "control_rate_hz", None) for one in config.data.own_section.values())
+    return next((rate for rate in rates if rate is not None), None)
 
 
 KeptGoals = Mapping[str, GoalFolder]
@@ -141,26 +133,19 @@ def read_kept_goals(folder: Path) -> KeptGoals:
         return {folder.resolve().name: read_goal_folder(folder)}
     kept: dict[str, GoalFolder] = {}
     for path in sorted(folder.iterdir()):
-        goals = _goals_at(path)
-        if goals is not None and path.stem in kept:
-            found = f"two goals named {path.stem!r}"
-            raise InputError(where=str(path), found=found, needed="another name for one of them")
-        kept |= {} if goals is None else {path.stem: goals}
+        is_order, is_picture = (path / GOALS_FILE).is_file(), path.suffix.lower() in _PICTURES and path.is_file()
+        if not is_order and not is_picture:
+            continue
+        if path.stem in kept:
+            raise InputError(where=str(path), found=f"two goals named {path.stem!r}", fix="Rename one of them")
+        kept[path.stem] = read_goal_folder(path) if is_order else _picture(path)
     if not kept:
-        found, needed = (
-            "no goal",
-            f"pictures (PNG or JPEG), or folders with a {GOALS_FILE} (`vjepa2-ac goals` makes them)",
-        )
-        raise InputError(where=f"--goals {folder}", found=found, needed=needed)
+        needed = f"pictures (PNG or JPEG), or folders with a {GOALS_FILE} (`vjepa2-ac goals` makes them)"
+        raise InputError(where=f"--goals {folder}", found="no goal", needed=needed)
     return kept
 
 
-def _goals_at(path: Path) -> GoalFolder | None:
-    """Return the goals that a file or folder is; None: it is something else."""
-    if path.is_dir():
-        return read_goal_folder(path) if (path / GOALS_FILE).is_file() else None
-    if path.suffix.lower() not in _PICTURES:
-        return None
+def _picture(path: Path) -> GoalFolder:
     image = read_image(path)
     require_image(image, where=str(path))
-    return GoalFolder((SubGoal(image, name=path.stem),), (None,), (None,))
+    return GoalFolder((SubGoal(image, name=path.stem),))

@@ -57,8 +57,13 @@ class Access:
         """Return whether a request names this server by an address, or by a name that is its own."""
         if host is None:
             return False
-        name = _without_port(host)
-        return _is_address(name) or name in {"localhost", self.host.lower(), *(one.lower() for one in self.names)}
+        name = host.strip().lower()
+        if name.startswith("["):
+            name = name[1:].partition("]")[0]
+        elif name.count(":") == 1:
+            name = name.partition(":")[0]
+        own = {"localhost", self.host.lower(), *(one.lower() for one in self.names)}
+        return name in own or _address(name) is not None
 
     def _has_key(self, authorization: str | None) -> bool:
         scheme, _, given = (authorization or "").partition(" ")
@@ -92,24 +97,12 @@ def read_key(path: Path) -> str:
 
 def is_loopback(host: str) -> bool:
     """Return whether only this machine reaches an address; a name but `localhost` may be any machine's."""
-    if host == "localhost":
-        return True
+    address = _address(host)
+    return host == "localhost" or (address is not None and address.is_loopback)
+
+
+def _address(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
     try:
-        return ipaddress.ip_address(host).is_loopback
+        return ipaddress.ip_address(name)
     except ValueError:
-        return False
-
-
-def _without_port(host: str) -> str:
-    name = host.strip().lower()
-    if name.startswith("["):
-        return name[1:].partition("]")[0]
-    return name.partition(":")[0] if name.count(":") == 1 else name
-
-
-def _is_address(name: str) -> bool:
-    try:
-        ipaddress.ip_address(name)
-    except ValueError:
-        return False
-    return True
+        return None

@@ -44,7 +44,9 @@ class PlanningClient:
             self.metadata = unpack(self._connection.recv())
         except Exception as error:
             self._open.close()
-            raise UnreachableError(where=url, found=_reason(error), needed="a server (`vjepa2-ac serve`)") from None
+            body = getattr(getattr(error, "response", None), "body", None)  # the server's words, where it refuses
+            found = f"{_reason(error)}: {body.decode(errors='replace').strip()}" if body else _reason(error)
+            raise UnreachableError(where=url, found=found, needed="a server (`vjepa2-ac serve`)") from None
 
     def infer(self, request: dict[str, Any]) -> dict[str, Any]:
         """Return the answer to a request (docs/serving.md).
@@ -93,7 +95,4 @@ def goal_keys(goals: Sequence[SubGoal]) -> dict[str, Any]:
 
 
 def _reason(error: Exception) -> str:
-    """Return why, with the server's own words where it refused the connection."""
-    response = getattr(error, "response", None)
-    body = getattr(response, "body", None)
-    return f"{error}: {body.decode(errors='replace').strip()}" if body else f"{error or type(error).__name__}"
+    return str(error) or type(error).__name__

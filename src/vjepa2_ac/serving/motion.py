@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.geometry import apply_action, euler_from_matrices, matrices_from_euler
-from vjepa2_ac.planning.search_space import Workspace
+from vjepa2_ac.planning.search_space import Workspace, is_allowed
 from vjepa2_ac.spaces import StateSpace
 
 
@@ -61,20 +61,12 @@ def why_not_sent(
     if not space.is_pose:
         largest = np.array(limits.axes if isinstance(limits.axes, tuple) else (0.0,))
         return "more than planning.limits.axes" if (abs(changes) > largest + _ROUNDING).any() else ""
-    if (abs(changes[:, :3]) > np.array(limits.xyz_m) + _ROUNDING).any():
-        return "more than planning.limits.xyz"
-    order = 1 if limits.ball == "l1" else 2
-    if limits.ball != "none" and np.linalg.norm(changes[:, :3], ord=order, axis=1).max() > limits.radius + _ROUNDING:
-        return "more than planning.limits.radius"
+    if not all(is_allowed(change, limits, _ROUNDING) for change in changes[:, :3]):
+        return "more than planning.limits.xyz or its ball"
     if (abs(changes[:, 3:6]) > min(limits.rotation + _ROUNDING, math.pi)).any():
         return "more than planning.limits.rotation"
     if abs(changes[:, 6]).max() > 1.0:  # open and close are changes of 1, whatever the limit
         return "more than a gripper can change"
-    box = Workspace.of(limits, space)
-    return _outside(box, state, changes) if box is not None and changes[:, :3].any() else ""
-
-
-def _outside(box: Workspace, state: Float[np.ndarray, " 7"], changes: Float[np.ndarray, "steps 7"]) -> str:
-    targets = state[:3] + np.cumsum(changes[:, :3], axis=0)
-    nearest = np.clip(targets, box.low, box.high)
-    return "out of planning.limits.workspace" if (abs(targets - nearest) > _ROUNDING).any() else ""
+    box, targets = Workspace.of(limits, space), state[:3] + np.cumsum(changes[:, :3], axis=0)
+    is_out = box is not None and changes[:, :3].any() and (abs(box.way_back(targets)) > _ROUNDING).any()
+    return "out of planning.limits.workspace" if is_out else ""

@@ -15,7 +15,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.image_file import encode_png
 from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.storage import user_can_write, write_atomically
-from vjepa2_ac.storage.structured import finite_or_none, json_text, utc_now
+from vjepa2_ac.storage.structured import json_text, plain, utc_now
 
 if TYPE_CHECKING:
     from vjepa2_ac.planning.controller import Controller
@@ -77,10 +77,13 @@ class Recorder:
                 "time": utc_now(),
                 "episode": self._episode,
                 "decision": number,
-                "answer": _plain(answer),
+                "answer": plain(answer),
                 "plan": self._words(controller, frame, state, number),
             }
-            self._append(json.dumps(line, allow_nan=False) + "\n")
+            text = json.dumps(line, allow_nan=False) + "\n"
+            self._take(len(text.encode()))
+            with (self.folder / DECISIONS).open("a") as file:
+                file.write(text)
         except _FullError:
             self._end("has reached its size (--record-gb)")
         except OSError as error:
@@ -93,42 +96,30 @@ class Recorder:
             raise ValueError("nothing was decided")
         if decision.why == "out of time" or (number and (config.context > 1 or config.warm_start)):
             return None  # it depends on the clock, or on decisions before it
-        present = self._goals[decision.goal]
-        ahead, durations = [present], []
-        left = number - decision.since
-        for goal in self._goals[decision.goal + 1 :]:
-            most = ahead[-1].at_most
-            if most is None:
-                break
-            durations.append(max(1, most - left))
-            ahead, left = [*ahead, goal], 0
+        goals, durations, left = self._goals[decision.goal :], [], number - decision.progress.since
         words = ["--start", self._image(frame), "--state=" + ",".join(repr(float(one)) for one in state)]
-        for goal in ahead:
+        for goal in goals:
             words += ["--goal", self._image(goal.image)]
+            if goal is goals[-1] or goal.at_most is None:
+                break
+            durations.append(max(1, goal.at_most - left))
+            left = 0
         words += ["--durations", ",".join(map(str, durations))] if durations else []
         if self._mask is not None:
             seen = (self._mask > 0).astype(np.uint8)[..., None] * np.uint8(255)
             words += ["--mask", self._image(np.repeat(seen, 3, axis=-1))]
         words += ["--seed", str(controller.seed + number)]
-        return words + ([f"planning.limits.gripper_mode={present.gripper}"] if present.gripper else [])
+        return words + ([f"planning.limits.gripper_mode={goals[0].gripper}"] if goals[0].gripper else [])
 
     def _image(self, pixels: np.ndarray) -> str:
         """Write an image, once however often it comes; return its name in the folder."""
         digest = hashlib.sha256(repr(pixels.shape).encode() + np.ascontiguousarray(pixels).tobytes()).hexdigest()[:24]
         name = f"{IMAGES}/{digest}.png"
         if not (self.folder / name).exists():
-            self._write(self.folder / name, encode_png(pixels))
+            data = encode_png(pixels)
+            self._take(len(data))
+            write_atomically(self.folder / name, data)
         return name
-
-    def _append(self, line: str) -> None:
-        self._take(len(line.encode()))
-        with (self.folder / DECISIONS).open("a") as file:
-            file.write(line)
-
-    def _write(self, path: Path, data: str | bytes) -> None:
-        data = data.encode() if isinstance(data, str) else data
-        self._take(len(data))
-        write_atomically(path, data)
 
     def _take(self, size: int) -> None:
         if size > self._left:
@@ -148,13 +139,3 @@ def require_new_record(folder: Path) -> None:
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(where=f"--record {folder}", found="something that is there already", needed="a new folder")
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, Mapping):
-        return {key: _plain(one) for key, one in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(one) for one in value]
-    return finite_or_none(value) if isinstance(value, float) else value

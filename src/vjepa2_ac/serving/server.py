@@ -8,6 +8,7 @@ import http
 import signal
 import ssl
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -47,12 +48,7 @@ class Served:
 class PlanningServer:
     """Serves a planner to one robot at a time."""
 
-    def __init__(
-        self,
-        load: Callable[[], Served],
-        options: ServerOptions,
-        tell: Callable[[str], None],
-    ) -> None:
+    def __init__(self, load: Callable[[], Served], options: ServerOptions, tell: Callable[[str], None]) -> None:
         """Prepare; nothing is loaded yet.
 
         Args:
@@ -63,10 +59,16 @@ class PlanningServer:
         self._load, self._options, self._tell = load, options, tell
         self._planning = ThreadPoolExecutor(1, "planning")
         self._served: Served | None = None
-        self._ready: asyncio.Event = asyncio.Event()
+        self._ready = asyncio.Event()
         self._robot: str | None = None  # the address of the one that is served
-        self._turned_away: dict[str, int] = {}
-        self._metrics = _Metrics(self)
+        self._turned_away: Counter[str] = Counter()  # by HTTP status
+        self._metrics = require_library(
+            "prometheus_client", where="serve", called="prometheus-client, which writes /metrics", extra="serve"
+        )
+        self._registry = self._metrics.CollectorRegistry()
+        self._registry.register(self)
+        about = {"registry": self._registry, "buckets": (0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30, 60)}
+        self._seconds = self._metrics.Histogram("vjepa2_ac_decision_seconds", "Duration of a decision.", **about)
 
     async def run(self, stop: asyncio.Event) -> bool:
         """Listen until `stop`; return whether the planning thread has ended, too.
@@ -102,14 +104,9 @@ class PlanningServer:
         finally:
             server.close()
             await server.wait_closed()
-            ended = await self._end_planning()
-        return ended
-
-    async def _end_planning(self) -> bool:
-        """Let the planning thread end; return whether it did in time."""
-        last = asyncio.wrap_future(self._planning.submit(int))
-        self._planning.shutdown(wait=False)
-        done, _ = await asyncio.wait([last], timeout=_END_S)
+            last = asyncio.wrap_future(self._planning.submit(int))
+            self._planning.shutdown(wait=False)
+            done, _ = await asyncio.wait([last], timeout=_END_S)
         return bool(done)
 
     async def _serve(self, stop: asyncio.Event) -> None:
@@ -125,26 +122,26 @@ class PlanningServer:
 
     def _asked(self, connection: Any, request: Any) -> Any:
         """Answer what comes over HTTP, and refuse who may not come in; None: a robot may begin."""
-        path = request.path.partition("?")[0]
+        path, status = request.path.partition("?")[0], http.HTTPStatus
         host, authorization = (_only(request.headers.get_all(name)) for name in ("Host", "Authorization"))
         if path == "/healthz":
-            return connection.respond(http.HTTPStatus.OK, "OK\n")
+            return connection.respond(status.OK, "OK\n")
         if path == "/readyz":
             is_ready = self._ready.is_set()
-            ready = http.HTTPStatus.OK if is_ready else http.HTTPStatus.SERVICE_UNAVAILABLE
-            return connection.respond(ready, "ready\n" if is_ready else "loading\n")
-        refused: tuple[int, str] | None = self._options.access.why_not(host, authorization)
+            return connection.respond(
+                status.OK if is_ready else status.SERVICE_UNAVAILABLE, "ready\n" if is_ready else "loading\n"
+            )
+        refused = self._options.access.why_not(host, authorization)
         if refused is None and path == "/metrics":
-            return connection.respond(http.HTTPStatus.OK, self._metrics.text())
+            return connection.respond(status.OK, self._page())
         if refused is None and path != "/":
-            return connection.respond(http.HTTPStatus.NOT_FOUND, "no such page\n")
+            return connection.respond(status.NOT_FOUND, "no such page\n")
         if refused is None and self._robot is not None and request.headers.get_all("Upgrade"):
-            refused = http.HTTPStatus.SERVICE_UNAVAILABLE.value, _busy(self._robot)
+            refused = status.SERVICE_UNAVAILABLE.value, _busy(self._robot)
         if refused is None:
             return None
-        status, reason = refused
-        self._turned_away[str(status)] = self._turned_away.get(str(status), 0) + 1
-        return connection.respond(http.HTTPStatus(status), f"{reason}\n")
+        self._turned_away[str(refused[0])] += 1
+        return connection.respond(status(refused[0]), f"{refused[1]}\n")
 
     async def _robot_came(self, connection: Any) -> None:
         """Serve a robot until it leaves; one that comes before the model is loaded waits."""
@@ -193,64 +190,34 @@ class PlanningServer:
             return None
 
     @property
-    def counts(self) -> Counts:
-        """What was answered since the start."""
+    def _counts(self) -> Counts:
         return Counts() if self._served is None else self._served.session.counts
 
-    @property
-    def state(self) -> dict[str, bool]:
-        """Whether requests are answered, and whether a robot is connected."""
-        return {"ready": self._ready.is_set(), "robots": self._robot is not None}
-
-    @property
-    def turned_away(self) -> dict[str, int]:
-        """Connections that were refused, by HTTP status."""
-        return self._turned_away
-
-
-class _Metrics:
-    """The metrics of a server in Prometheus' text format."""
-
-    def __init__(self, server: PlanningServer) -> None:
-        self._server = server
-        self._library = require_library(
-            "prometheus_client", where="serve", called="prometheus-client, which writes /metrics", extra="serve"
-        )
-        self._registry = self._library.CollectorRegistry()
-        self._registry.register(self)
-        about = {"registry": self._registry, "buckets": (0.1, 0.25, 0.5, 1, 2.5, 5, 10, 30, 60)}
-        self._seconds = self._library.Histogram("vjepa2_ac_decision_seconds", "Duration of a decision.", **about)
-
-    def text(self) -> str:
-        """Return the page."""
-        counts = self._server.counts
+    def _page(self) -> str:
+        """Return the metrics in Prometheus' text format."""
+        counts = self._counts
         seconds, counts.seconds = counts.seconds, []
         for one in seconds:
             self._seconds.observe(one)
-        return str(self._library.generate_latest(self._registry).decode())
+        return str(self._metrics.generate_latest(self._registry).decode())
 
     def collect(self) -> Iterator[Any]:
-        """Yield the metrics that are read when the page is made."""
-        families, counts = self._library.metrics_core, self._server.counts
-        abouts = {"ready": "1 once requests are answered.", "robots": "Robots that are connected."}
-        for name, holds in self._server.state.items():
-            yield families.GaugeMetricFamily(f"vjepa2_ac_{name}", abouts[name], value=float(holds))
-        numbers = {
-            "requests_refused": ("Requests that could not be used.", counts.refused),
-            "requests_failed": ("Requests at which the server failed.", counts.failed),
-            "episodes": ("Episodes that were begun.", counts.episodes),
-        }
-        for name, (about, value) in numbers.items():
-            yield families.CounterMetricFamily(f"vjepa2_ac_{name}", about, value=value)
-        labelled = {
-            "decisions": ("Decisions, by their reason.", "why", counts.decisions),
-            "connections_refused": ("Connections, by HTTP status.", "status", self._server.turned_away),
-        }
-        for name, (about, label, values) in labelled.items():
-            family = families.CounterMetricFamily(f"vjepa2_ac_{name}", about, labels=[label])
+        """Yield the metrics that are read when the page is made: Prometheus' collector."""
+        families, counts = self._metrics.metrics_core, self._counts
+        robots, gauge, counter = int(self._robot is not None), families.GaugeMetricFamily, families.CounterMetricFamily
+        for family, name, about, label, values in (
+            (gauge, "ready", "1 once requests are answered.", "", {"": int(self._ready.is_set())}),
+            (gauge, "robots", "Robots that are connected.", "", {"": robots}),
+            (counter, "requests_refused", "Requests that could not be used.", "", {"": counts.refused}),
+            (counter, "requests_failed", "Requests at which the server failed.", "", {"": counts.failed}),
+            (counter, "episodes", "Episodes that were begun.", "", {"": counts.episodes}),
+            (counter, "decisions", "Decisions, by their reason.", "why", counts.decisions),
+            (counter, "connections_refused", "Connections, by HTTP status.", "status", self._turned_away),
+        ):
+            found = family(f"vjepa2_ac_{name}", about, labels=[label] if label else [])
             for key, value in sorted(dict(values).items()):
-                family.add_metric([key], value)
-            yield family
+                found.add_metric([key] if label else [], value)
+            yield found
 
 
 def serve(load: Callable[[], Served], options: ServerOptions, tell: Callable[[str], None]) -> bool:

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import logging
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -18,19 +19,18 @@ from jaxtyping import Float
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.controller import Controller, Decision
 from vjepa2_ac.planning.goals import SubGoal
-from vjepa2_ac.planning.interfaces import SearchCancelledError
+from vjepa2_ac.planning.planner import SearchCancelledError
 from vjepa2_ac.serving.motion import waypoints, why_not_sent
 from vjepa2_ac.serving.recording import Recorder
-from vjepa2_ac.serving.request import IMAGE_KEYS, GivenGoal, NamedGoal, Request, read_request
+from vjepa2_ac.serving.request import IMAGE_KEYS, GivenGoal, Request, read_request
 from vjepa2_ac.serving.wire import WireError, pack, unpack
-from vjepa2_ac.storage.structured import finite_or_none
+from vjepa2_ac.storage.structured import plain
 
 logger = logging.getLogger(__name__)
 
 ActionForm = Literal["delta", "pose"]
 Clock = Callable[[], float]  # seconds, from anywhere
 
-_NOT_SENT = "not sent"
 _MOST_NAMES = 20  # of goals in a message
 _BAR = 0.05  # share of an image's height, black at the top and at the bottom: a padded image
 
@@ -50,7 +50,7 @@ class SessionOptions:
 class Counts:
     """What a session has done, for whoever watches it."""
 
-    decisions: dict[str, int] = field(default_factory=dict)  # by their reason
+    decisions: Counter[str] = field(default_factory=Counter)  # by their reason
     refused: int = 0
     failed: int = 0
     episodes: int = 0
@@ -131,9 +131,11 @@ class Session:
     def _answered(self, request: Request, began: float, is_gone: Callable[[], bool]) -> dict[str, Any]:
         if request.begins or request.episode not in (None, self._episode):
             self._forget(request.episode or self._episode)
-        if request.goal is not None and request.goal.fingerprint != self._goal:
+        if request.goal is not None and (fingerprint := request.goal.fingerprint) != self._goal:
+            self._goal, self._notes = None, []  # a goal that cannot be used leaves none
             self._set(request.goal)
-        if request.is_reset_only or request.frame is None or request.state is None:
+            self._goal = fingerprint
+        if request.frame is None or request.state is None:
             return {"status": "reset"}
         if self._goal is None:
             needed = f"a goal first: goal/image, goal/images or goal/name{self._known_names()}"
@@ -143,87 +145,72 @@ class Session:
     def _decided(
         self, frame: np.ndarray, state: np.ndarray, began: float, is_gone: Callable[[], bool]
     ) -> dict[str, Any]:
-        planning_began = self._clock()
-        until = began + self.options.deadline_s
+        planning_began, until = self._clock(), began + self.options.deadline_s
         try:
             self.controller.act(frame, state, cancelled=lambda: is_gone() or self._clock() > until)
         except SearchCancelledError:
             if is_gone():
                 raise GoneError from None
-            return self._nothing(state, "past the deadline", began, planning_began)
-        decision = self.controller.decision
-        if decision is None:
-            raise ValueError("a controller that acted has decided")
-        changes, why = self._checked(decision, state)
-        self._note(frame)
-        found = self._message(decision, state, changes, why)
-        found["policy_timing"] = {"infer_ms": 1e3 * (self._clock() - planning_began)}
-        found = self._finished(found, why, began)
-        if self.recorder is not None:
+            decision, why = None, "past the deadline"
+        else:
+            decision, why = self._checked(state)
+            self._note(frame)
+        found = self._message(decision, state, why)
+        now = self._clock()
+        found["policy_timing"] = {"infer_ms": 1e3 * (now - planning_began)}
+        found["server_timing"] = {"infer_ms": 1e3 * (now - began)}
+        if self._last_ms is not None:
+            found["server_timing"]["prev_total_ms"] = self._last_ms
+        self.counts.decisions[why] += 1
+        self.counts.seconds.append(now - began)
+        if self.recorder is not None and why != "past the deadline":
             self.recorder.decision(self.controller, frame, state, found)
         return found
 
-    def _checked(self, decision: Decision, state: np.ndarray) -> tuple[Float[np.ndarray, "steps dim"], str]:
-        """Return the changes of each model step, and why they are so; zeros where they must not be sent."""
-        steps, dim = self.controller.space.steps, self.controller.space.dim
-        zeros = np.zeros((steps, dim))
-        changes = zeros if decision.plan is None else decision.plan.actions.double().numpy()
-        wrong = why_not_sent(state, changes, self.controller.config.limits, self.controller.spaces.state)
-        if wrong:
-            logger.error("a planned action is not sent: %s", wrong)
-            return zeros, f"{_NOT_SENT}: {wrong}"
-        return changes, decision.why
+    def _checked(self, state: np.ndarray) -> tuple[Decision, str]:
+        """Return the decision, and why it is so; without a plan where that must not be sent."""
+        decision, controller = self.controller.decision, self.controller
+        if decision is None:
+            raise ValueError("a controller that acted has decided")
+        if decision.plan is None:
+            return decision, decision.why
+        changes = decision.plan.actions.double().numpy()
+        wrong = why_not_sent(state, changes, controller.config.limits, controller.spaces.state)
+        if not wrong:
+            return decision, decision.why
+        logger.error("a planned action is not sent: %s", wrong)
+        return replace(decision, plan=None, states=None), f"not sent: {wrong}"
 
-    def _message(
-        self, decision: Decision, state: np.ndarray, changes: Float[np.ndarray, "steps dim"], why: str
-    ) -> dict[str, Any]:
-        """Return an answer. Its arrays have one row an action, and all else is plain: clients take rows of arrays."""
-        sent = np.zeros_like(changes) if self.options.dry_run else changes
-        actions = self._actions(state, sent)
-        states = None if why.startswith(_NOT_SENT) else decision.states
-        planned = _rows(state if states is None else states[1:])
-        found: dict[str, Any] = {
-            "actions": actions,
-            "target": _rows(state) if self.options.dry_run else planned,
+    def _message(self, decision: Decision | None, state: np.ndarray, why: str) -> dict[str, Any]:
+        """Return an answer. Its arrays have one row an action, and all else is plain: clients take rows of arrays.
+
+        Without a decision, or a plan in it, nobody moves.
+        """
+        still, space = np.atleast_2d(state), self.controller.space
+        plan = None if decision is None else decision.plan
+        planned = still if decision is None or decision.states is None else decision.states[1:]
+        changes = np.zeros((space.steps, space.dim))
+        if plan is not None and not self.options.dry_run:
+            changes = plan.actions.double().numpy()
+        goal = None
+        if decision is not None:
+            progress = decision.progress
+            name = self._names[progress.place]
+            goal = {"index": progress.place, "name": name, "since": progress.since, "changed": progress.changed}
+        found = {
+            "target": still if self.options.dry_run else planned,
             "why": why,
-            "goal": {
-                "index": decision.goal,
-                "name": self._names[decision.goal],
-                "since": decision.since,
-                "changed": decision.changed,
-            },
-            "done": decision.done,
+            "goal": goal,
+            "done": decision is not None and decision.done,
             "energy": {
-                "now": finite_or_none(decision.energy_now),
-                "plan": None if decision.plan is None else finite_or_none(decision.plan.energy),
+                "now": None if decision is None else decision.energy_now,
+                "plan": None if plan is None else plan.energy,
             },
-            "notes": list(self._notes),
+            "notes": self._notes,
         }
-        return found | ({"dry_run": True, "planned": planned} if self.options.dry_run else {})
-
-    def _nothing(self, state: np.ndarray, why: str, began: float, planning_began: float) -> dict[str, Any]:
-        """Return the answer of no decision: nobody moves."""
-        zeros = np.zeros((self.controller.space.steps, self.controller.space.dim))
-        found: dict[str, Any] = {
-            "actions": self._actions(state, zeros),
-            "target": _rows(state),
-            "why": why,
-            "goal": None,
-            "done": False,
-            "energy": {"now": None, "plan": None},
-            "notes": list(self._notes),
-            "policy_timing": {"infer_ms": 1e3 * (self._clock() - planning_began)},
-        }
-        return self._finished(found, why, began)
-
-    def _finished(self, found: dict[str, Any], why: str, began: float) -> dict[str, Any]:
-        seconds = self._clock() - began
-        found["server_timing"] = {"infer_ms": 1e3 * seconds}
-        if self._last_ms is not None:
-            found["server_timing"]["prev_total_ms"] = self._last_ms
-        self.counts.decisions[why] = self.counts.decisions.get(why, 0) + 1
-        self.counts.seconds.append(seconds)
-        return found
+        if self.options.dry_run:
+            found |= {"dry_run": True, "planned": planned}
+        return {"actions": self._actions(state, changes), **plain(found)}
 
     def _actions(self, state: np.ndarray, changes: Float[np.ndarray, "steps dim"]) -> Float[np.ndarray, "rows dim"]:
         """Return changes as the robot wants them: waypoints to the first target, or what each model step does."""
@@ -237,22 +224,15 @@ class Session:
         self._episode, self._goal, self._notes = episode, None, []
         self.counts.episodes += 1
 
-    def _set(self, goal: GivenGoal | NamedGoal) -> None:
-        self._goal, self._notes = None, []  # a goal that cannot be used leaves none
-        goals, mask = self._sub_goals(goal)
-        self.controller.follow(goals, mask=mask)
+    def _set(self, goal: GivenGoal) -> None:
+        if goal.name is not None and goal.name not in self.goals:
+            needed = f"the name of one{self._known_names()}"
+            raise InputError(where="goal", found=f"{goal.name!r}, which names no goal", needed=needed)
+        goals = goal.goals if goal.name is None else self.goals[goal.name]
+        self.controller.follow(goals, mask=goal.mask)
         self._names = tuple(one.name for one in goals)
         if self.recorder is not None:
-            self.recorder.goal(goals, mask)
-        self._goal = goal.fingerprint
-
-    def _sub_goals(self, goal: GivenGoal | NamedGoal) -> tuple[tuple[SubGoal, ...], np.ndarray | None]:
-        if isinstance(goal, GivenGoal):
-            return goal.goals, goal.mask
-        if goal.name not in self.goals:
-            found = f"{goal.name!r}, which names no goal"
-            raise InputError(where="goal", found=found, needed=f"the name of one{self._known_names()}")
-        return self.goals[goal.name], None
+            self.recorder.goal(goals, goal.mask)
 
     def _known_names(self) -> str:
         names = list(self.goals)
@@ -264,11 +244,6 @@ class Session:
         if has_black_bars(frame) and text not in self._notes:
             self._notes.append(text)
             logger.warning(text)
-
-
-def _rows(states: np.ndarray) -> list[list[float]]:
-    found: list[list[float]] = np.atleast_2d(states).tolist()
-    return found
 
 
 def has_black_bars(frame: np.ndarray) -> bool:

@@ -55,7 +55,7 @@ def unpack(message: bytes) -> dict[str, Any]:
     except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException) as error:
         raise WireError(f"not a msgpack message that is read here ({type(error).__name__})") from None
     if not isinstance(found, dict):
-        raise WireError(f"a message is a map; this one is {_kind(found)}")
+        raise WireError(f"a message is a map; this one is a {type(found).__name__}")
     _require_plain(found, MOST_DEPTH)
     return found
 
@@ -128,7 +128,7 @@ def _scalar(found: dict[Any, Any]) -> bool | int | float:
     _type(found[_DTYPE])
     value = found[_DATA]
     if not isinstance(value, bool | int | float):
-        raise WireError(f"a NumPy number that is {_kind(value)}")
+        raise WireError(f"a NumPy number that is a {type(value).__name__}")
     return value
 
 
@@ -146,19 +146,7 @@ def _require_plain(found: Any, deep: int) -> None:
         for one in found.values() if isinstance(found, dict) else found:
             _require_plain(one, deep - 1)
     elif not isinstance(found, np.ndarray | str | bytes | bool | int | float | None):
-        raise WireError(f"{_kind(found)} in a message")
-
-
-def _kind(found: Any) -> str:
-    names = {
-        dict: "a map",
-        list: "a list",
-        str: "a text",
-        bytes: "bytes",
-        type(None): "nothing",
-        np.ndarray: "an array",
-    }
-    return names.get(type(found), f"a {type(found).__name__}")
+        raise WireError(f"a {type(found).__name__} in a message")
 
 
 def _packed(value: Any) -> Any:

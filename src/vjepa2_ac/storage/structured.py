@@ -100,6 +100,17 @@ def finite_or_none(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
+def plain(value: Any) -> Any:
+    """Return values with arrays and tensors in them as plain ones: numbers that are not finite are None."""
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())
+    if isinstance(value, Mapping):
+        return {key: plain(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(one) for one in value]
+    return finite_or_none(value) if isinstance(value, float) else value
+
+
 def utc_now() -> str:
     """Return the time in UTC, to the second, as ISO 8601."""
     return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())

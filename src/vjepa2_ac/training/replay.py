@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from vjepa2_ac.config.replay import ReplayConfig
+from vjepa2_ac.config.run import ReplayConfig
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.selection import named
 from vjepa2_ac.episode import Batch

@@ -7,7 +7,7 @@ import pytest
 
 from vjepa2_ac.config import Config, DataConfig
 from vjepa2_ac.config.loading import config_as_yaml, load_config, parse_config
-from vjepa2_ac.config.replay import ReplayConfig
+from vjepa2_ac.config.run import ReplayConfig
 from vjepa2_ac.config.section import Affects, mark_of, marks_of
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.loader import training_loader

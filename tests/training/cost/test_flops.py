@@ -14,8 +14,7 @@ from vjepa2_ac.config.planning import EnergyConfig
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.model.adapter.lora import add_adapter
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.planning.energy import Scene, WorldModelCost
-from vjepa2_ac.planning.goals import Goal
+from vjepa2_ac.planning.energy import Goal, Scene, WorldModelCost
 from vjepa2_ac.training.cost.flops import clip_flops, frame_flops, plan_flops
 from vjepa2_ac.training.loss import Objective
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:  # of other rooms, which the figure of one need not load
     from vjepa2_ac.calibration.axes import AxisFit
     from vjepa2_ac.decoding.imagine import ImaginedPlan
     from vjepa2_ac.demonstrations.make_goals import EnergyCourse, MadeGoals
-    from vjepa2_ac.planning.interfaces import Plan
+    from vjepa2_ac.planning.planner import Plan
 
 PLAN_IMAGE, GOALS_IMAGE = "plan.png", "goals.png"
 

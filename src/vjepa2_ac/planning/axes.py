@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated
 
@@ -18,16 +18,13 @@ FORMAT = 1  # incremented when a reader of the file would have to change
 _FIX = "Fit them with `vjepa2-ac data calibrate CONFIG --axes MODEL`, and name the axes.json that it writes"
 
 _Number = Annotated[float, Field(allow_inf_nan=False)]
-_Row = tuple[_Number, _Number, _Number]
 
 
 @dataclass(frozen=True)
 class FittedNumber:
-    """A number with its 95 % interval."""
+    """A number; its interval is there for people."""
 
     value: _Number
-    low: _Number | None
-    high: _Number | None
 
 
 @dataclass(frozen=True)
@@ -36,17 +33,14 @@ class FittedModel:
 
     subject: str
     encoder: str
-    base: str
     predictor: str
 
 
 @dataclass(frozen=True)
 class AxesFile:
-    """The content of the file, but for what is there for people only."""
+    """What is planned by, of the content of the file."""
 
     yaw_degrees: FittedNumber  # about z, counterclockwise from above: what the model infers, from what was executed
-    gain: FittedNumber
-    matrix: tuple[_Row, _Row, _Row]
     model: FittedModel
     problem: str | None  # why nothing can be planned by it
     centre_m: tuple[_Number, _Number] = (0.0, 0.0)  # x, y about which is turned
@@ -58,25 +52,18 @@ def read_axes(path: str | Path) -> AxesFile:
     Raises:
         InputError: There is no such file, it is none of calibrated axes, or the fit is not good enough.
     """
-    where = f"planning.axes: {path}"
+    where, needed = f"planning.axes: {path}", f"calibrated axes of format {FORMAT}"
     try:
-        values = read_json_object(Path(path), needed="calibrated axes", fix=_FIX)
+        values = read_json_object(Path(path), needed=needed, fix=_FIX)
     except OSError as error:
-        raise InputError(
-            where=where, found=f"cannot be read ({error.strerror})", needed="calibrated axes", fix=_FIX
-        ) from None
+        raise InputError(where=where, found=f"cannot be read ({error.strerror})", needed=needed, fix=_FIX) from None
     if values.get("format") != FORMAT:
-        found = f"format {values.get('format')!r}"
-        raise InputError(where=where, found=found, needed=f"calibrated axes of format {FORMAT}", fix=_FIX)
-    known = {name: values[name] for name in AxesFile.__dataclass_fields__ if name in values}
-    axes = record_of(AxesFile, known, where=where, needed="calibrated axes", fix=_FIX)
+        raise InputError(where=where, found=f"format {values.get('format')!r}", needed=needed, fix=_FIX)
+    known = {one.name: values[one.name] for one in fields(AxesFile) if one.name in values}
+    axes = record_of(AxesFile, known, where=where, needed=needed, fix=_FIX)
     if axes.problem is not None:
-        raise InputError(
-            where=where,
-            found=f"axes that are {axes.problem}",
-            needed="a fit whose angle is known",
-            fix="Record varied moves and fit to more pairs (--limit); or the model does not see the actions: adapt it",
-        )
+        fix = "Record varied moves and fit to more pairs (--limit); or the model does not see the actions: adapt it"
+        raise InputError(where=where, found=f"axes that are {axes.problem}", fix=fix)
     return axes
 
 
@@ -86,29 +73,22 @@ def require_axes(config: Config) -> None:
     Raises:
         InputError: As `read_axes`; or the states are no poses in the robot's base frame.
     """
-    if config.planning.axes is None:
-        return
-    read_axes(config.planning.axes)
-    require_base_frame(config.data, f"planning.axes: {config.planning.axes}")
+    if config.planning.axes is not None:
+        read_axes(config.planning.axes)
+        is_base = config.data.states == "pose" and config.data.pose_frame == "base"
+        require_base_frame(f"planning.axes: {config.planning.axes}", is_base=is_base)
 
 
-def require_base_frame(data: DataConfig, where: str) -> None:
+def require_base_frame(where: str, *, is_base: bool) -> None:
     """Refuse states that have no vertical axis to turn about.
 
     Raises:
         InputError: They are no poses in the robot's base frame.
     """
-    if data.states != "pose" or data.pose_frame != "base":
-        raise no_vertical_axis(where)
-
-
-def no_vertical_axis(where: str) -> InputError:
-    """Return the error of states that are no poses in the robot's base frame."""
-    return InputError(
-        where=where,
-        found="states that are no poses in the robot's base frame",
-        needed="data.states: pose and data.pose_frame: base, whose vertical axis moves are turned about",
-    )
+    if not is_base:
+        found = "states that are no poses in the robot's base frame"
+        needed = "data.states: pose and data.pose_frame: base, whose vertical axis moves are turned about"
+        raise InputError(where=where, found=found, needed=needed)
 
 
 def require_axes_in(data: DataConfig) -> None:
@@ -117,5 +97,5 @@ def require_axes_in(data: DataConfig) -> None:
     Raises:
         InputError: The states are no poses in the base frame, or the stride is still to be chosen.
     """
-    require_base_frame(data, "data calibrate --axes")
+    require_base_frame("data calibrate --axes", is_base=data.states == "pose" and data.pose_frame == "base")
     require_stride(data, to="calibrate axes, for axes are those of a model step")
