@@ -19,13 +19,13 @@ import torch
 
 from clips import clip_at, open_in_memory
 from memory_source import MemorySource
-from recording_cuda import Pinning, RecordingCuda, recorded_copies
+from recording_cuda import Pinning, RecordingCuda
 from synthetic import write_synthetic_droid
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data import loader
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import ProcessShare, collate, training_loader, validation_batches
-from vjepa2_ac.data.streams import NO_COPIES, copies_for
+from vjepa2_ac.data.streams import ToDevice, copies_for
 from vjepa2_ac.episode import Batch, Episode
 from vjepa2_ac.errors import InputError, UnreachableError
 from vjepa2_ac.geometry import actions_from_states, states_in_camera_frame
@@ -132,7 +132,7 @@ def test_an_error_in_a_worker_is_the_error_the_user_reads(
         features["steps/observation/exterior_image_1_left"][1][:] = [b"GIF89a"] * 12
 
     config = config_of(spoiled(spoil), workers=workers, validation_share=0.0)
-    copies = recorded_copies(RecordingCuda()) if pinned else NO_COPIES
+    copies = ToDevice(RecordingCuda()) if pinned else None
     with monkeypatch.context() as patch:
         _ = Pinning(patch) if pinned else None
         with pytest.raises(InputError, match="not a JPEG") as caught:
@@ -188,9 +188,7 @@ def test_batches_for_a_device_are_pinned_by_the_loader(
     expected = take(2, config_of(droid))
     pinning, cuda = Pinning(monkeypatch), RecordingCuda()
     with closing(
-        training_loader(
-            open_dataset(config_of(droid, workers=workers)), seed=1, batch_size=2, copies=recorded_copies(cuda)
-        )
+        training_loader(open_dataset(config_of(droid, workers=workers)), seed=1, batch_size=2, copies=ToDevice(cuda))
     ) as batches:
         found = [next(batches), next(batches)]
     assert_same(found, expected)

@@ -17,7 +17,7 @@ from vector_sets import vectors, write_vectors
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.data.sources.registry import open_source
+from vjepa2_ac.data.sources.indexed_source import open_source
 from vjepa2_ac.episode import Batch, Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.inspection.check import check_data, findings_in

@@ -13,7 +13,7 @@ from torch import Tensor
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import Dataset, require_widths
 from vjepa2_ac.data.selection import with_way_out
-from vjepa2_ac.data.sources.configured_spaces import measured_space
+from vjepa2_ac.data.sources.indexed_source import measured_space
 from vjepa2_ac.data.transforms import view
 from vjepa2_ac.episode import Augmentation, Batch, Clip, StoredLatents, Widths
 from vjepa2_ac.errors import InputError

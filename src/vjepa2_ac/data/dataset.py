@@ -25,8 +25,7 @@ from vjepa2_ac.data.selection import (
     require_distinct,
     with_way_out,
 )
-from vjepa2_ac.data.sources.configured_spaces import spaces_of
-from vjepa2_ac.data.sources.registry import open_source
+from vjepa2_ac.data.sources.indexed_source import open_source, spaces_of
 from vjepa2_ac.data.windows import Windows, clip_starts, in_split, windows_of
 from vjepa2_ac.episode import POSE_WIDTHS, Episode, EpisodeSource, Progress, StepRanges, Widths
 from vjepa2_ac.errors import InputError

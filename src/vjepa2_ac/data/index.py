@@ -36,7 +36,7 @@ _COLUMNS = ("num_steps", "success", "ids", "id_hash", "id_rank")
 _HASH, _LOCATOR, _LABEL = "state_hash", "locator.", "label."
 _HASH_BYTES = 8
 _CACHE = "VJEPA2_AC_CACHE"
-_VERSION = 4  # of the cache: another number makes all of it be rebuilt
+_VERSION = 5  # of the cache: another number makes all of it be rebuilt
 
 
 class NotATableError(ValueError):

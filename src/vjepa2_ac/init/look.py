@@ -13,12 +13,12 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.loading import config_from
 from vjepa2_ac.config.plugins import admit_forms_of_data
+from vjepa2_ac.data.files import walk, within
 from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.data.sources.droid_raw.episode_folders import find_episodes
+from vjepa2_ac.data.sources.indexed_source import open_source
 from vjepa2_ac.data.sources.lerobot.info import INFO
-from vjepa2_ac.data.sources.listing import walk, within
 from vjepa2_ac.data.sources.npz import FORMAT_HELP, opened_npz
-from vjepa2_ac.data.sources.registry import open_source
 from vjepa2_ac.episode import STATE_DIM, Progress
 from vjepa2_ac.errors import InputError, UserError
 from vjepa2_ac.init.converters import way_by

@@ -130,7 +130,7 @@ def test_what_was_found_out_is_kept_until_a_file_changes(tmp_path: Path, monkeyp
     folder = write(tmp_path)
     assert len(source(tmp_path).infos()) == 1
     with monkeypatch.context() as patch:
-        patch.setattr(RawDroidSource, "_scan_all", None)
+        patch.setattr(RawDroidSource, "_scan", None)
         assert len(source(tmp_path).infos()) == 1
     write_mp4(folder / f"recordings/MP4/{LEFT}.mp4", FRAMES[LEFT][:-1])
     assert source(tmp_path).infos()[0].num_steps == STEPS - 1

@@ -31,12 +31,12 @@ from lerobot_sets import (
 from recordings import write_mp4
 from synthetic import synthetic_states
 from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.files import EpisodeFiles
 from vjepa2_ac.data.sources.lerobot.parquet import ParquetRows
 from vjepa2_ac.data.sources.lerobot.source import LeRobotSource
 from vjepa2_ac.episode import Episode, EpisodeSource
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.geometry import euler_from_matrices, matrices_from_euler
-from vjepa2_ac.storage.block_file import DiskCache
 
 LENGTHS = (12, 13, 14, 15, 16)
 KEY = "observation.images.exterior_1_left"
@@ -157,7 +157,9 @@ def test_only_row_groups_and_columns_of_the_episode_are_read(
         return original(self, number, columns=columns, **options)
 
     monkeypatch.setattr(pq.ParquetFile, "read_row_group", noted)
-    rows = ParquetRows(str, [STATE[1]], DiskCache(tmp_path / "cache", 0), "")
+    rows = ParquetRows(
+        EpisodeFiles(config_of(root, disk_cache={"dir": str(tmp_path), "limit_gb": 0.0})), [STATE[1]], ""
+    )
     assert len(rows.rows(str(first_rows(root)), 1)[STATE[1]]) == LENGTHS[1]  # rows 12 to 24
     assert read == [(1, ("episode_index", STATE[1])), (2, ("episode_index", STATE[1]))]
     rows.rows(str(first_rows(root)), 2)

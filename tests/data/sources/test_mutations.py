@@ -12,7 +12,7 @@ from lerobot_sets import recorded, write_v21, write_v30
 from recordings import write_raw_droid
 from synthetic import draw_frame, synthetic_states
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.sources.registry import open_source
+from vjepa2_ac.data.sources.indexed_source import open_source
 from vjepa2_ac.errors import InputError
 
 MUTATIONS = int(os.environ.get("VJEPA2_AC_MUTATIONS", "40"))  # of each kind of file; more in a longer run

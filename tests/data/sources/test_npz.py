@@ -88,7 +88,7 @@ def test_what_was_found_out_is_kept_until_a_file_changes(tmp_path: Path, monkeyp
     write(tmp_path / "one.npz")
     assert len(source(tmp_path).infos()) == 1
     with monkeypatch.context() as patch:
-        patch.setattr(NpzSource, "_scan_all", lambda *_: pytest.fail("read again"))
+        patch.setattr(NpzSource, "_scan", lambda *_: pytest.fail("read again"))
         assert len(source(tmp_path).infos()) == 1
     write(tmp_path / "two.npz")
     assert [info.id for info in source(tmp_path).infos()] == ["one", "two"]

@@ -81,7 +81,7 @@ def test_an_index_reads_a_part_of_the_records_and_is_made_once(
     assert list(source.infos(lambda *counts: told.append(counts))) == list(
         RldsSource(DataConfig(path=str(folder))).infos()
     )
-    assert told == [(4, 4)]
+    assert told[-1] == (4, 4)
     assert gcs.bytes_read("-of-00001") < next(folder.glob("*.tfrecord-*")).stat().st_size / 2
     gcs.forget()
     far(folder).infos()

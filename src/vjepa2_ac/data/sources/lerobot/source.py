@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Sequence, Set
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
@@ -13,32 +12,20 @@ from jaxtyping import UInt8
 from vjepa2_ac import storage
 from vjepa2_ac.config import LeRobotData
 from vjepa2_ac.config.section import Affects, knobs_that_affect
-from vjepa2_ac.data.cache import fetched_data
+from vjepa2_ac.data.files import connections_to, in_parallel
 from vjepa2_ac.data.index import EpisodeTable, get_or_build, hash_of_states, index_key
-from vjepa2_ac.data.sources.indexed_source import FramesByStep, IndexedSource, Opened
-from vjepa2_ac.data.sources.lerobot.episodes import (
-    TABLES,
-    EpisodeRow,
-    data_file,
-    problem_of,
-    read_episodes,
-    row_of,
-    table_of,
-    video_file,
-)
+from vjepa2_ac.data.selection import as_problem
+from vjepa2_ac.data.sources.indexed_source import Found, FramesByStep, IndexedSource, Opened, Scanned, table_of
+from vjepa2_ac.data.sources.lerobot.episodes import TABLES, EpisodeRow, read_episodes, require_files, row_of
 from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, list_by_template, read_info
 from vjepa2_ac.data.sources.lerobot.parquet import ParquetRows
 from vjepa2_ac.data.sources.lerobot.states import EpisodeContent, content_of, wanted_columns
-from vjepa2_ac.data.sources.listing import in_parallel
-from vjepa2_ac.episode import Episode, Progress, StepRanges
+from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.image_file import decode_image
 from vjepa2_ac.media.jpeg import require_bounded
 from vjepa2_ac.media.video_reader import Clock, read_frames, require_decoder
 from vjepa2_ac.storage.block_file import BlockCachedFile
-from vjepa2_ac.storage.structured import json_list
-
-logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -64,7 +51,8 @@ class LeRobotSource(IndexedSource[LeRobotData, _Opened]):
         table = self.infos()
         info, row = table[index], row_of(table, index)
         content = self._content(row)
-        task = self._tasks[table.locators["task"][index]]
+        tasks = table.labels.get("task")
+        task = None if tasks is None else tasks.of_episode(index)
         key = self._info.camera_key(self._config.lerobot, camera or self._config.cameras[0])
         return Episode(
             info=info,
@@ -85,22 +73,13 @@ class LeRobotSource(IndexedSource[LeRobotData, _Opened]):
         return self._config.lerobot.fps or self._info.fps
 
     @cached_property
-    def _tasks(self) -> list[str]:
-        return json_list(self.infos().texts["tasks"], where="the tasks of the index")
-
-    @cached_property
     def _parquet(self) -> ParquetRows:
-        cache = fetched_data(self._config.disk_cache)
-        return ParquetRows(self._open_file, wanted_columns(self._config), cache, self._data_version)
-
-    @property
-    def _is_far(self) -> bool:
-        return storage.is_url(self._config.path)
+        return ParquetRows(self._files, wanted_columns(self._config), self._data_version)
 
     @property
     def _data_version(self) -> str:
         """A version that changes with the data set's files and the wanted columns."""
-        return self._version if self._known is None else self._known.table.texts["version"]
+        return self._version if self._known is None else self._known.table.texts["index"]
 
     def _open_file(self, path: str) -> str | BlockCachedFile:
         return self._files.open(path, version=self._data_version)
@@ -111,11 +90,11 @@ class LeRobotSource(IndexedSource[LeRobotData, _Opened]):
         keys = [info.camera_key(config.lerobot, camera) for camera in config.cameras]
         if any(info.features[key].dtype == "video" for key in keys):
             require_decoder(info.where)
-        tables = list_by_template(info.root, TABLES[info.version], connections=self._connections)
-        files = list_by_template(info.root, info.data_path, connections=self._connections)
+        listed = partial(list_by_template, info.root, connections=connections_to(config))
+        tables, files = listed(TABLES[info.version]), listed(info.data_path)
         for key in keys:
             if info.features[key].dtype == "video":
-                files |= list_by_template(info.root, info.video_path or "", key, connections=self._connections)
+                files |= listed(info.video_path or "", key)
         fields = knobs_that_affect(Affects.INDEX, config.lerobot)
         fields.pop("action")  # where it matters, it is among the columns
         parts = {
@@ -123,7 +102,7 @@ class LeRobotSource(IndexedSource[LeRobotData, _Opened]):
             "source": "lerobot",
             "fields": fields,
             "keys": keys,
-            "outcome": self._is_far and config.outcome != "all",
+            "outcome": storage.is_url(config.path) and config.outcome != "all",
             "info": repr(replace(info, root="")),
             "files": [(path, file.size, file.version) for path, file in [*tables.items(), *files.items()]],
         }
@@ -132,61 +111,54 @@ class LeRobotSource(IndexedSource[LeRobotData, _Opened]):
         return _Opened(get_or_build(config.disk_cache, self._version, config.path, build), info)
 
     def _built(self, tables: list[str], files: Set[str], keys: list[str], progress: Progress) -> EpisodeTable:
-        info, fields = self._info, self._config.lerobot
+        info, config, fields = self._info, self._config, self._config.lerobot
+        is_far = storage.is_url(config.path)
         of_config = [key for key in dict.fromkeys(fields.cameras.values()) if key in info.features]
         videos = [key for key in of_config if info.features[key].dtype == "video"]
-        states = fields.state if self._is_far else ()  # of local rows the states themselves are hashed
+        states = fields.state if is_far else ()  # of local rows the states themselves are hashed
         rows = read_episodes(info, tables, videos, states, fields.success, self._open_file)
-        found = {row.index: problem_of(info, row, files, keys) for row in rows}
-        problems = {index: problem for index, problem in found.items() if problem is not None}
-        outcome_unknown = any(row.success is None for row in rows) and fields.success in info.features
-        if not self._is_far or (self._config.outcome != "all" and outcome_unknown):
-            rows = self._with_content(rows, problems, progress)
         if not rows:
             raise InputError(where=info.where, found="no episodes", needed="a data set with episodes")
-        texts = {"version": self._version, "control_rate_hz": str(self._control_rate_hz)}
-        table = table_of(rows, problems, texts)
-        logger.info("%s: %d episodes, %d steps", info.root, len(table), int(table.num_steps.sum()))
-        return table
+        outcome_unknown = any(row.success is None for row in rows) and fields.success in info.features
+        reads_rows = not is_far or (config.outcome != "all" and outcome_unknown)
 
-    def _with_content(
-        self, rows: list[EpisodeRow], problems: dict[int, InputError], progress: Progress
-    ) -> list[EpisodeRow]:
-        """Return the episodes with the facts in their rows; those that turn out unusable are added to `problems`."""
-        by_file: dict[str, list[EpisodeRow]] = {}
-        for row in rows:
-            if row.index not in problems:
-                by_file.setdefault(data_file(self._info, row), []).append(row)
-
-        def checked(row: EpisodeRow) -> EpisodeRow:
+        def look(row: EpisodeRow) -> Found:
+            success, state_hash = row.success, row.state_hash
             try:
-                content = self._content(row)
+                require_files(info, row, files, keys)
+                if reads_rows:
+                    content = self._content(row)
+                    success = success if content.success is None else content.success
+                    state_hash = hash_of_states(content.states)
             except InputError as error:
-                problems[row.index] = error
-                return row
-            success = row.success if content.success is None else content.success
-            return replace(row, success=success, state_hash=hash_of_states(content.states))
+                return as_problem(error, row.id)
+            facts, labels = EpisodeInfo(row.id, row.length, success), {"task": row.task}
+            return Scanned(facts, self._where(row), row.place, state_hash, labels, self._control_rate_hz)
 
-        read, done = [row for row in rows if row.index in problems], 0
-        for of_file in in_parallel(lambda some: [checked(row) for row in some], [*by_file.values()], self._connections):
-            read += of_file
-            done += len(of_file)
-            progress(done, len(rows))
-        return sorted(read, key=lambda row: row.index)
+        def look_at_all(some: list[EpisodeRow]) -> dict[str, Found]:
+            return {row.id: look(row) for row in some}
+
+        by_file: dict[str, list[EpisodeRow]] = {}  # so that a row group is decoded once
+        for row in rows:
+            by_file.setdefault(row.data_file(info), []).append(row)
+        found: dict[str, Found] = {}
+        for some in in_parallel(look_at_all, [*by_file.values()], connections_to(config)):
+            found |= some
+            progress(len(found), len(rows))
+        return table_of([found[row.id] for row in rows], config, len(rows))
 
     def _content(self, row: EpisodeRow) -> EpisodeContent:
-        rows = self._parquet.rows(storage.join(self._info.root, data_file(self._info, row)), row.index)
+        rows = self._parquet.rows(storage.join(self._info.root, row.data_file(self._info)), row.index)
         return content_of(rows, row.length, self._info, self._config, self._where(row))
 
     def _frames(self, row: EpisodeRow, key: str) -> FramesByStep:
         info = self._info
         if info.features[key].dtype == "image":
-            path, where = storage.join(info.root, data_file(info, row)), f"{self._where(row)}: {key}"
+            path, where = storage.join(info.root, row.data_file(info)), f"{self._where(row)}: {key}"
             read = cache(partial(self._parquet.images, path, key, row.index))
             return FramesByStep(row.length, where, partial(_stored_images, read, row.length, where))
-        place = row.videos[key]
-        path = storage.join(info.root, video_file(info, place, key))
-        clock, where = Clock(start_s=place.start_s, rate_hz=info.fps), f"{path}: {row.id}"
+        path = storage.join(info.root, row.video_file(info, key))
+        clock, where = Clock(start_s=row.place[f"{key}.start_s"], rate_hz=info.fps), f"{path}: {row.id}"
         return FramesByStep(row.length, where, partial(self._video_frames, path, clock, where))
 
     def _video_frames(
@@ -196,7 +168,7 @@ class LeRobotSource(IndexedSource[LeRobotData, _Opened]):
         return read_frames(self._open_file(path), steps, where=where, clock=clock)
 
     def _where(self, row: EpisodeRow) -> str:
-        return f"{storage.join(self._info.root, data_file(self._info, row))}: {row.id}"
+        return f"{storage.join(self._info.root, row.data_file(self._info))}: {row.id}"
 
 
 def _stored_images(
