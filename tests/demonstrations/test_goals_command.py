@@ -84,7 +84,7 @@ def test_a_model_adds_energies_and_the_noise_of_a_resting_arm(
 
 
 def test_the_arm_of_an_episode_may_rest_itself(workshop: Path, tmp_path: Path) -> None:
-    from vjepa2_ac.data.sources.registry import open_source
+    from vjepa2_ac.data.sources.indexed_source import open_source
 
     states = open_source_of(workshop, open_source)
     rests = (np.abs(np.diff(states, axis=0)) < 5e-4).all(axis=1)
