@@ -129,9 +129,8 @@ def test_no_copies_and_episodes_that_were_not_looked_at_are_none() -> None:
 
 def test_what_is_left_out_is_no_copy() -> None:
     dataset = in_memory([7, 7, 8])
-    without = dataset.kept.taking_part.copy()
-    without[1] = False
-    assert find_duplicates(replace(dataset, kept=dataset.kept.only(without))).episodes == 0
+    without = dataset.config.model_copy(update={"exclude": (dataset.table.identity(1),)})
+    assert find_duplicates(replace(dataset, config=without)).episodes == 0
 
 
 def test_check_and_inspect_warn_of_copies_and_are_calm_without(tmp_path: Path) -> None:

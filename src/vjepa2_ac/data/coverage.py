@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.data.idle import in_order
+from vjepa2_ac.data.files import connections_to, in_parallel
 from vjepa2_ac.data.windows import spread
 from vjepa2_ac.episode import Episode, Progress, no_progress
 from vjepa2_ac.errors import InputError
@@ -86,7 +86,7 @@ def read_sample(dataset: Dataset, count: int, progress: Progress = no_progress) 
             return error
 
     chosen = sample_of(dataset, count)
-    found = in_order(look, chosen, dataset.config)
+    found = in_parallel(look, chosen, connections_to(dataset.config))
     for done, (index, episode) in enumerate(zip(chosen, found, strict=True), start=1):
         progress(done, len(chosen))
         if isinstance(episode, InputError):

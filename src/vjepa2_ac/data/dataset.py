@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -14,8 +13,8 @@ from jaxtyping import Bool, Int, UInt64
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.idle import FoundRanges, find_ranges
-from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable
+from vjepa2_ac.data.idle import find_ranges
+from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.data.selection import (
     BrokenEpisodes,
     StepSelection,
@@ -54,7 +53,7 @@ class Removed:
 class EncodedSource(EpisodeSource, Protocol):
     """A source of encoded episodes: its steps were selected when they were encoded."""
 
-    def kept_ranges(self) -> FoundRanges:
+    def kept_ranges(self) -> StepSelection:
         """Return the ranges that `data.idle` keeps."""
         ...
 
@@ -78,6 +77,13 @@ class Dataset:
     broken: BrokenEpisodes  # grows in the process that opened the set
     groups: UInt64[np.ndarray, " episodes"] | None = None  # hash of each one's group; None: `data.split_by` names none
 
+    @cached_property
+    def taking_part(self) -> Bool[np.ndarray, " episodes"]:
+        """Which episodes are used, although none of their steps may be kept."""
+        chosen = included(self.table, self.config) & of_outcome(self.table, self.config)
+        chosen[[place for place, _ in self.kept.problems]] = False
+        return chosen
+
     @property
     def split_hash(self) -> UInt64[np.ndarray, " episodes"]:
         """The hashes that determine the split of each episode."""
@@ -86,7 +92,7 @@ class Dataset:
     def members(self, split: Split) -> Bool[np.ndarray, " episodes"]:
         """Return which episodes are used and belong to a split."""
         among = of_outcome(self.table, self.config)
-        return np.asarray(self.kept.taking_part & in_split(self.split_hash, self.config, split, among))
+        return np.asarray(self.taking_part & in_split(self.split_hash, self.config, split, among))
 
     def windows(self, split: Split) -> Windows:
         """Return the clips of a split.
@@ -100,7 +106,7 @@ class Dataset:
         return windows_of(self.table, members, self.starts, self.config, split)
 
     def _empty_split(self, split: Split) -> InputError:
-        config, taking_part = self.config, self.kept.taking_part
+        config, taking_part = self.config, self.taking_part
         groups = None if config.split_by is None else len(np.unique(self.split_hash[taking_part]))
         together = "" if groups is None else f" in {groups} groups (data.split_by)"
         shares = f"validation_share {config.validation_share:g}, test_share {config.test_share:g}"
@@ -136,7 +142,7 @@ class Dataset:
         """What each filter removed, in their order."""
         included_ones = included(self.table, self.config)
         chosen = included_ones & of_outcome(self.table, self.config)
-        masks = np.ones(len(self.table), bool), included_ones, chosen, self.kept.taking_part
+        masks = np.ones(len(self.table), bool), included_ones, chosen, self.taking_part
         left = [self._count(StepSelection.whole(self.table, mask)) for mask in masks]
         gone = -np.diff([*left, self._count(self.kept)], axis=0)
         excluded = sum(problem.name in self.config.exclude for problem in self.table.problems)
@@ -227,24 +233,21 @@ def open_dataset(config: DataConfig, *, progress: Progress | None = None) -> Dat
     source = open_source(config)
     table = EpisodeTable.of(source.infos(progress))
     broken = BrokenEpisodes(config, len(table) + len(table.problems))
-    taking_part = included(table, config)
-    require_distinct(table, taking_part, config)
-    broken.found(_not_excluded(table.problems, config))
-    taking_part &= of_outcome(table, config)
-    kept = StepSelection.whole(table, taking_part)
+    chosen = included(table, config)
+    require_distinct(table, chosen, config)
+    broken.found([problem for problem in table.problems if problem.name not in config.exclude])
+    chosen &= of_outcome(table, config)
+    kept = StepSelection.whole(table, chosen)
     if config.idle.rule != "none":
-        if isinstance(source, EncodedSource):
-            found = source.kept_ranges()
-        else:
-            found = find_ranges(source, table, config, progress)
-        met = [(place, problem) for place, problem in found.problems if taking_part[place]]
-        broken.found([problem for _, problem in met])
-        taking_part[[place for place, _ in met]] = False
-        kept = StepSelection(found.episode, found.start, found.end, taking_part).only(taking_part)
-    dataset = Dataset(config, source, table, kept, broken, groups_of(table, kept.taking_part, config))
+        found = None if not isinstance(source, EncodedSource) else source.kept_ranges()
+        found = found or find_ranges(source, table, config, progress)
+        broken.found([problem for place, problem in found.problems if chosen[place]])
+        kept = found.only(chosen)
+    dataset = Dataset(config, source, table, kept, broken)
+    dataset = replace(dataset, groups=groups_of(table, dataset.taking_part, config))
     if not len(dataset.episodes):
         raise _nothing_left(dataset)
-    logger.info("%s: %d episodes take part, %d steps of them", config.path, kept.taking_part.sum(), kept.steps)
+    logger.info("%s: %d episodes take part, %d steps of them", config.path, dataset.taking_part.sum(), kept.steps)
     return _settled(dataset)
 
 
@@ -264,11 +267,6 @@ def _settled(dataset: Dataset) -> Dataset:
     if not isinstance(dataset.source, EncodedSource):
         return dataset
     return replace(dataset, config=dataset.source.settle(dataset.starts.episode))
-
-
-def _not_excluded(problems: Sequence[EpisodeProblem], config: DataConfig) -> list[EpisodeProblem]:
-    excluded = frozenset(config.exclude)
-    return [problem for problem in problems if problem.name not in excluded]
 
 
 def _nothing_left(dataset: Dataset) -> InputError:

@@ -12,9 +12,10 @@ import numpy as np
 from jaxtyping import Bool, Int32, UInt64
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable, identity_hash
+from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable, NotATableError, identity_hash
 from vjepa2_ac.episode import StepRanges
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage.npz_reader import arrays_as_bytes, read_arrays
 
 logger = logging.getLogger(__name__)
 
@@ -36,19 +37,26 @@ class StepSelection:
     episode: Int32[np.ndarray, " ranges"]  # index into the table
     start: Int32[np.ndarray, " ranges"]
     end: Int32[np.ndarray, " ranges"]
-    taking_part: Bool[np.ndarray, " episodes"]  # an episode may be used although none of its steps is kept
+    problems: tuple[tuple[int, EpisodeProblem], ...] = ()  # the episodes that could not be read, by the same index
 
     @classmethod
     def whole(cls, table: EpisodeTable, taking_part: Bool[np.ndarray, " episodes"]) -> StepSelection:
         """Keep every step of the used episodes."""
         episode = np.flatnonzero(taking_part).astype(np.int32)
-        return cls(episode, np.zeros(len(episode), np.int32), table.num_steps[episode], taking_part)
+        return cls(episode, np.zeros(len(episode), np.int32), table.num_steps[episode])
+
+    @classmethod
+    def of_each(cls, found: Sequence[list[tuple[int, int]] | EpisodeProblem]) -> StepSelection:
+        """Join the ranges of all episodes."""
+        problems = tuple((place, one) for place, one in enumerate(found) if isinstance(one, EpisodeProblem))
+        ranges = [(place, *pair) for place, one in enumerate(found) if isinstance(one, list) for pair in one]
+        episode, start, end = np.ascontiguousarray(np.array(ranges, np.int32).reshape(-1, 3).T)
+        return cls(episode, start, end, problems)
 
     def only(self, episodes: Bool[np.ndarray, " episodes"]) -> StepSelection:
         """Return the selection with these episodes only."""
         stays = episodes[self.episode]
-        ranges = replace(self, episode=self.episode[stays], start=self.start[stays], end=self.end[stays])
-        return replace(ranges, taking_part=self.taking_part & episodes)
+        return replace(self, episode=self.episode[stays], start=self.start[stays], end=self.end[stays])
 
     def of(self, episode: int) -> StepRanges:
         """Return the ranges of one episode."""
@@ -59,6 +67,26 @@ class StepSelection:
     def steps(self) -> int:
         """The total number of kept steps."""
         return int((self.end.astype(np.int64) - self.start).sum())
+
+    def to_bytes(self) -> bytes:
+        """Return this as a file's content."""
+        text = json.dumps([[place, vars(problem)] for place, problem in self.problems]).encode()
+        columns = {"episode": self.episode, "start": self.start, "end": self.end}
+        return arrays_as_bytes({"problems": np.frombuffer(text, np.uint8), **columns})
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> StepSelection:
+        """Read the result of `to_bytes`.
+
+        Raises:
+            NotATableError: It is another kind of file, or damaged.
+        """
+        try:
+            arrays = read_arrays(data)
+            problems = json.loads(arrays.pop("problems").tobytes())
+            return cls(**arrays, problems=tuple((place, EpisodeProblem(**values)) for place, values in problems))
+        except (InputError, LookupError, TypeError, ValueError) as error:
+            raise NotATableError(f"no ranges of steps ({error})") from None
 
 
 def included(table: EpisodeTable, config: DataConfig) -> Bool[np.ndarray, " episodes"]:

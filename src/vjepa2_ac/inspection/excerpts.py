@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from vjepa2_ac import storage
 from vjepa2_ac.data.coverage import sample_of
 from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.data.idle import in_order
+from vjepa2_ac.data.files import connections_to, in_parallel
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.inspection.agreement import FEWEST_EPISODES, Agreement, agreement_of
 from vjepa2_ac.spaces import POSE, StateSpace
@@ -80,7 +80,7 @@ def excerpts_of(dataset: Dataset, *, episodes: int = EPISODES, steps: int = STEP
             return error
 
     chosen = sample_of(dataset, episodes)
-    for index, found in zip(chosen, in_order(look, chosen, dataset.config), strict=True):
+    for index, found in zip(chosen, in_parallel(look, chosen, connections_to(dataset.config)), strict=True):
         if isinstance(found, InputError):
             dataset.leave_out(index, found)
         else:

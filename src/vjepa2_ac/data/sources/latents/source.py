@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Int
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.idle import FoundRanges
+from vjepa2_ac.data.selection import StepSelection
 from vjepa2_ac.data.sources.indexed_source import IndexedSource, Opened
 from vjepa2_ac.data.sources.latents.cache_files import OPTIONAL, LatentFiles, read_key, read_tables
 from vjepa2_ac.data.sources.latents.cache_key import CacheKey, clip_parts
@@ -22,7 +22,7 @@ from vjepa2_ac.errors import InputError
 class _Opened(Opened):
     key: CacheKey
     files: LatentFiles
-    kept: FoundRanges | None
+    kept: StepSelection | None
 
 
 class LatentSource(IndexedSource[DataConfig, _Opened]):
@@ -47,7 +47,7 @@ class LatentSource(IndexedSource[DataConfig, _Opened]):
         """The config with the names of the cameras."""
         return self._config.model_copy(update={"camera": self.cameras})
 
-    def kept_ranges(self) -> FoundRanges:
+    def kept_ranges(self) -> StepSelection:
         """Return the ranges that `data.idle` keeps, from the cache.
 
         Raises:
