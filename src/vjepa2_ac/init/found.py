@@ -81,4 +81,3 @@ class FoundData:
     idle: Knobs | None = None  # of `data.idle`; None: no rule
     about: tuple[str, ...] = ()  # what a person should know of it
     extra: str = ""  # of this package, that reads it
-    sample: str = ""  # one of its large files

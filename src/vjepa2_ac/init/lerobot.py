@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from vjepa2_ac import storage
-from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, filled, read_info
+from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, read_info
 from vjepa2_ac.errors import InputError, UserError
 from vjepa2_ac.init.found import FoundData, Knob, Knobs
 from vjepa2_ac.init.names import Column, Pose, find_pose, pick_camera, short_name
@@ -67,7 +67,6 @@ def look_at_lerobot(path: str) -> FoundData:
         about=(f"LeRobot {info.version}, {info.episodes:,} episodes at {info.fps:g} a second",)
         + ((f"depth maps are not used: {', '.join(depth)}",) if depth else ()),
         extra="lerobot",
-        sample=storage.join(path, filled(info.data_path, 0, 0)),
     )
 
 

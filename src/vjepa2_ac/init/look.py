@@ -60,7 +60,6 @@ def look_at_npz(path: str) -> FoundData:
         states="pose" if is_pose else "vector",
         episodes=len(files),
         idle={"rule": Knob("commands" if velocities else "motion", "pauses teach nothing")} if is_pose else None,
-        sample=where,
         about=(f".npz, {len(files):,} episodes at {rate:g} a second, the first of {steps:,} steps",),
     )
 

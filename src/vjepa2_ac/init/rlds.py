@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import prod
 from typing import Any
 
@@ -48,7 +48,6 @@ def droid() -> FoundData:
         },
         about=(f"DROID 1.0.1, {_DROID_EPISODES:,} episodes, 1.7 TB, fetched from Google Cloud as they are needed",),
         extra="gcs",
-        sample=f"{DROID}/droid_101-train.tfrecord-00000-of-02048",
     )
 
 
@@ -64,7 +63,7 @@ def look_at_rlds(path: str) -> FoundData:
     name = dataset_name(path)
     if name in _DROID_NAMES and _DROID_FEATURE in features:
         is_simulated = storage.exists(storage.join(path, _SIMULATION))
-        return replace(like_droid(path, episodes, is_simulated=is_simulated), sample=shards[0].path)
+        return like_droid(path, episodes, is_simulated=is_simulated)
     images = [name for name, one in features.items() if one.kind == "image" and name.startswith("steps/")]
     if not images:
         where = storage.join(path, "features.json")
@@ -92,7 +91,6 @@ def look_at_rlds(path: str) -> FoundData:
         idle={"rule": Knob("commands" if has_velocities else "motion", "pauses teach nothing")},
         about=(f"RLDS {name}, {episodes:,} episodes, {rate.value:g} steps a second{' (guessed)' * rate.is_guess}",),
         extra="gcs" if path.startswith("gs://") else "",
-        sample=shards[0].path,
     )
 
 
