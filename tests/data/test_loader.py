@@ -79,24 +79,6 @@ def test_another_layout_goes_on_where_the_run_stopped(droid: Path) -> None:
     assert names([ranks[rank][step] for step in range(2) for rank in range(2)]) == alone[5:17]
 
 
-def test_an_epoch_holds_every_training_window_once_and_no_other(droid: Path) -> None:
-    config = config_of(droid)
-    held_out = set(names(list(validation_batches(open_dataset(config), "validation", clips=1000, batch_size=1))))
-    everything = {
-        (info.id, start)
-        for info in open_dataset(config).table
-        for start in range(info.num_steps - config.clip_steps + 1)
-    }
-    epoch = names(take(len(everything - held_out), config, batch_size=1))
-    assert held_out
-    assert len(epoch) == len(set(epoch))
-    assert set(epoch) == everything - held_out
-
-
-def test_seeds_change_the_order(droid: Path) -> None:
-    assert names(take(5, config_of(droid), seed=1)) != names(take(5, config_of(droid), seed=2))
-
-
 def test_the_shards_change_neither_training_nor_validation(droid: Path, tmp_path: Path) -> None:
     other = config_of(write_synthetic_droid(tmp_path / "set", steps=range(12, 18), size=(48, 96), shards=5))
     config = config_of(droid)

@@ -67,7 +67,7 @@ def test_figures_of_a_whole_set(droid: Path) -> None:
         *(len(dataset.windows(split)) for split in ("train", "validation")), 0,
     ]  # fmt: skip
     by_hand = np.concatenate([dataset.source.read(index).states for index in range(6)])
-    assert found.range_of(6) == (pytest.approx(by_hand[:, 6].min()), pytest.approx(by_hand[:, 6].max()))
+    assert found.ranges[6].tolist() == pytest.approx([by_hand[:, 6].min(), by_hand[:, 6].max()])
 
 
 def test_a_sample_is_drawn_from_those_that_take_part_and_is_always_the_same(droid: Path) -> None:

@@ -22,11 +22,13 @@ from vjepa2_ac.data.sources.npz import FORMAT_HELP, opened_npz
 from vjepa2_ac.episode import STATE_DIM, Progress
 from vjepa2_ac.errors import InputError, UserError
 from vjepa2_ac.init.converters import way_by
-from vjepa2_ac.init.found import FoundData, Knob, plain
+from vjepa2_ac.init.found import FoundData, Knob, idle_rule, plain
 from vjepa2_ac.init.lerobot import look_at_lerobot
 from vjepa2_ac.init.names import pick_camera
 from vjepa2_ac.init.rlds import droid, like_droid, look_at_rlds
 from vjepa2_ac.places import BUILTIN
+
+_CONNECTIONS = 16  # reads at once
 
 
 def look_at_npz(path: str) -> FoundData:
@@ -50,7 +52,6 @@ def look_at_npz(path: str) -> FoundData:
         rate = float(np.asarray(file.array("fps_hz")).reshape(-1)[0])
     steps, width = headers["states"].shape
     first = "frames" if "frames" in cameras else pick_camera(cameras)
-    velocities = "joint_velocities" in headers
     is_pose = width == STATE_DIM
     return FoundData(
         source="npz",
@@ -59,13 +60,9 @@ def look_at_npz(path: str) -> FoundData:
         rate_hz=Knob(rate, f"of {files[0]}"),
         states="pose" if is_pose else "vector",
         episodes=len(files),
-        idle={"rule": Knob("commands" if velocities else "motion", "pauses teach nothing")} if is_pose else None,
+        idle=idle_rule(has_velocities="joint_velocities" in headers) if is_pose else None,
         about=(f".npz, {len(files):,} episodes at {rate:g} a second, the first of {steps:,} steps",),
     )
-
-
-RAW_DROID = "gs://gresearch/robotics/droid_raw/1.0.1"
-_CONNECTIONS = 16  # reads at once
 
 
 def look_at_raw(path: str) -> FoundData:
@@ -210,9 +207,6 @@ def _names_below(path: str) -> list[str]:
     return names
 
 
-_MOST_ARE_LONGER = 0.1  # quantile
-
-
 def measured(found: FoundData, progress: Progress | None = None) -> FoundData:
     """Return what was found with the numbers of the index; unchanged behind a URL, or where it cannot be built.
 
@@ -234,5 +228,5 @@ def measured(found: FoundData, progress: Progress | None = None) -> FoundData:
         episodes=len(lengths),
         steps=int(lengths.sum()),
         usual_steps=int(np.median(lengths)),
-        short_steps=int(np.quantile(lengths, _MOST_ARE_LONGER)),
+        short_steps=int(np.quantile(lengths, 0.1)),
     )

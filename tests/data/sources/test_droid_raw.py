@@ -16,7 +16,7 @@ from recordings import write_mp4, write_raw_droid
 from synthetic import draw_frame, synthetic_states
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.droid_raw.source import RawDroidSource
-from vjepa2_ac.errors import InputError, UnreachableError
+from vjepa2_ac.errors import InputError
 from vjepa2_ac.media import video_reader
 
 STEPS, SIZE = 24, (72, 128)
@@ -87,12 +87,6 @@ def test_an_episode_has_as_many_steps_as_frames(tmp_path: Path, frames: int) -> 
     assert len(raw.read(0).states) == steps
     with pytest.raises(ValueError, match="steps"):
         raw.read(0).read_frames([steps])
-
-
-def test_the_camera_with_the_fewest_frames_sets_the_steps(tmp_path: Path) -> None:
-    write(tmp_path, pictures={LEFT: FRAMES[LEFT], RIGHT: FRAMES[RIGHT][:-1]})
-    raw = source(tmp_path, camera=("left", "right"))
-    assert [raw.infos()[0].num_steps, len(raw.read(0, "left").states)] == [STEPS - 1, STEPS - 1]
 
 
 @pytest.mark.parametrize("right", [STEPS - 2, STEPS + 2])
@@ -277,24 +271,3 @@ def test_a_clip_of_a_video_in_the_cloud_fetches_much_less_than_the_video(noisy: 
     frames = raw.read(0).read_frames([40, 44, 48])
     assert 0 < gcs.bytes_read(".mp4") < whole / 3
     np.testing.assert_array_equal(frames, source(noisy).read(0).read_frames([40, 44, 48]))
-
-
-@pytest.mark.parametrize("kept", [0.0, 1.0])
-def test_a_network_that_fails_within_a_video_is_neither_damage_nor_silence(
-    noisy: Path, gcs: Gcs, tmp_path: Path, kept: float
-) -> None:
-    raw = source(gcs.upload(noisy, "bucket/raw"), disk_cache={"dir": str(tmp_path), "limit_gb": kept})
-    frames = raw.read(0).read_frames
-    gcs.fail_next(503, times=5, match="download.*mp4")
-    with pytest.raises(UnreachableError, match="not reached in 5 attempts"):
-        frames([40, 44])
-    np.testing.assert_array_equal(frames([40, 44]), source(noisy).read(0).read_frames([40, 44]))
-
-
-def test_a_video_in_the_cloud_that_became_shorter_is_no_frame(noisy: Path, gcs: Gcs, tmp_path: Path) -> None:
-    raw = source(gcs.upload(noisy, "bucket/raw"), disk_cache={"dir": str(tmp_path)})
-    frames = raw.read(0).read_frames
-    frames([0])
-    gcs.put(f"bucket/raw/{PLACE}/{MP4}", (noisy / PLACE / MP4).read_bytes()[:900_000])
-    with pytest.raises((InputError, OSError), match=f"{LEFT}.mp4"):
-        frames([80])

@@ -174,14 +174,6 @@ def test_a_name_that_is_no_text_is_refused(tmp_path: Path, name: str) -> None:
         source(tmp_path).infos()
 
 
-def test_an_identity_may_be_long_and_of_any_letters(tmp_path: Path) -> None:
-    name = "/".join(["ü字é" * 20] * 3)
-    write(tmp_path / f"{name}.npz")
-    made, kept = source(tmp_path).infos(), source(tmp_path).infos()
-    assert [info.id for info in made] == [info.id for info in kept] == [name]
-    assert kept.find(name) == 0
-
-
 def test_of_a_file_in_the_cloud_nothing_is_fetched_twice(tmp_path: Path, gcs: Gcs) -> None:
     write(tmp_path / "set" / "one.npz")
     plain = source(gcs.upload(tmp_path / "set", "bucket/own"), disk_cache={"dir": str(tmp_path / "cache")})

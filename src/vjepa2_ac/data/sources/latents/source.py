@@ -42,11 +42,6 @@ class LatentSource(IndexedSource[DataConfig, _Opened]):
         """The cameras that clips are drawn from: the config's, or all of the cache."""
         return self.key.cameras if self._config.camera is None else self._config.cameras
 
-    @property
-    def settled_config(self) -> DataConfig:
-        """The config with the names of the cameras."""
-        return self._config.model_copy(update={"camera": self.cameras})
-
     def kept_ranges(self) -> StepSelection:
         """Return the ranges that `data.idle` keeps, from the cache.
 
@@ -81,19 +76,11 @@ class LatentSource(IndexedSource[DataConfig, _Opened]):
         )
 
     def settle(self, episodes: Int[np.ndarray, " episodes"]) -> DataConfig:
-        """Return the config with the cameras that there are.
+        """Return the config with the names of the cameras.
 
         Raises:
-            InputError: As `require_encoded`.
-        """
-        self.require_encoded(episodes)
-        return self.settled_config
-
-    def require_encoded(self, episodes: Int[np.ndarray, " episodes"]) -> None:
-        """Refuse a cache without whole files of these episodes: it is unfinished, damaged, or was made of others.
-
-        Raises:
-            InputError: Some are missing.
+            InputError: Some of these episodes have no whole files: the cache is unfinished, damaged, or was made of
+                others.
         """
         opened, wanted = self._open(), np.unique(episodes).tolist()
         lacking = [one for one in wanted if not all(opened.files.is_done(one, camera) for camera in self.cameras)]
@@ -106,6 +93,7 @@ class LatentSource(IndexedSource[DataConfig, _Opened]):
                 fix="Run `vjepa2-ac encode` again, as the cache was made: it encodes what is missing; or leave these"
                 " episodes out (data.outcome, data.exclude)",
             )
+        return self._config.model_copy(update={"camera": self.cameras})
 
     def _look(self, progress: Progress) -> _Opened:  # noqa: ARG002 - at once
         folder = Path(self._config.path)

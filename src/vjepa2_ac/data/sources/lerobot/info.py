@@ -65,6 +65,7 @@ class DatasetInfo:
     version: str
     fps: float
     episodes: int
+    frames: int | None  # of all episodes; None: not said
     chunk_episodes: int  # v2.1: episodes per chunk folder
     data_path: str
     video_path: str | None
@@ -171,6 +172,7 @@ def read_info(root: str) -> DatasetInfo:
 def _parsed(root: str, content: Mapping[str, Any]) -> DatasetInfo:
     video_path = content.get("video_path")
     fps, episodes, chunk = float(content["fps"]), content["total_episodes"], content.get("chunks_size", 1000)
+    frames = content.get("total_frames")
     if not 0 < fps <= 1000 or type(episodes) is not int or type(chunk) is not int or episodes < 0 or chunk < 1:
         raise ValueError(f"fps {fps}, total_episodes {episodes}, chunks_size {chunk}")
     return DatasetInfo(
@@ -178,6 +180,7 @@ def _parsed(root: str, content: Mapping[str, Any]) -> DatasetInfo:
         version=content["codebase_version"],
         fps=fps,
         episodes=episodes,
+        frames=frames if type(frames) is int else None,
         chunk_episodes=chunk,
         data_path=_template(content["data_path"]),
         video_path=None if video_path is None else _template(video_path),
