@@ -80,7 +80,7 @@ class Dataset:
     @cached_property
     def taking_part(self) -> Bool[np.ndarray, " episodes"]:
         """Which episodes are used, although none of their steps may be kept."""
-        chosen = included(self.table, self.config) & of_outcome(self.table, self.config)
+        chosen = np.asarray(included(self.table, self.config) & of_outcome(self.table, self.config))
         chosen[[place for place, _ in self.kept.problems]] = False
         return chosen
 

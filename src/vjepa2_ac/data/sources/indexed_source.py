@@ -105,26 +105,20 @@ def table_of(found: Iterable[Found], config: DataConfig, total: int, progress: P
     )
 
 
-@dataclass(frozen=True)
-class Opened:
-    """The state of an indexed data set; sources add what else they need to read an episode."""
-
-    table: EpisodeTable
-
-
 Config = TypeVar("Config", bound=DataConfig)
-State = TypeVar("State", bound=Opened)
+More = TypeVar("More")
 
 
-class IndexedSource(ABC, Generic[Config, State]):
+class IndexedSource(ABC, Generic[Config, More]):
     """A source that is opened with the first call; pickled to a loader worker, it takes the index along.
 
-    Nothing is read before that call. Any number of threads may use it.
+    Nothing is read before that call. Any number of threads may use it. Besides the table it keeps what else is needed
+    to read an episode.
     """
 
     def __init__(self, config: Config) -> None:
         self._config = config
-        self._known: State | None = None
+        self._known: tuple[EpisodeTable, More] | None = None
         self._opening = threading.Lock()
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -138,13 +132,13 @@ class IndexedSource(ABC, Generic[Config, State]):
             InputError: No data set, one that does not fit the config, or no episode that can be used.
             OSError: Data behind a URL cannot be read.
         """
-        return self._open(progress or no_progress).table
+        return self._open(progress or no_progress)[0]
 
     @cached_property
     def _files(self) -> EpisodeFiles:
         return EpisodeFiles(self._config)
 
-    def _open(self, progress: Progress = no_progress) -> State:
+    def _open(self, progress: Progress = no_progress) -> tuple[EpisodeTable, More]:
         with self._opening:
             if self._known is None:
                 self._known = self._look(progress)
@@ -175,11 +169,13 @@ class IndexedSource(ABC, Generic[Config, State]):
         return table_of(found, self._config, len(identities), progress)
 
     @abstractmethod
-    def _look(self, progress: Progress) -> State:
+    def _look(self, progress: Progress) -> tuple[EpisodeTable, More]:
         """Open the data set: read its index from the cache, or scan it."""
 
 
-def _reopened(kind: type[IndexedSource[Any, Any]], config: DataConfig, known: Opened | None) -> object:
+def _reopened(
+    kind: type[IndexedSource[Any, Any]], config: DataConfig, known: tuple[EpisodeTable, Any] | None
+) -> object:
     source = kind(config)
     source._known = known
     return source

@@ -37,11 +37,10 @@ from jaxtyping import Float64, UInt8
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.files import walk, within
-from vjepa2_ac.data.index import get_or_build, hash_of_states, index_key
+from vjepa2_ac.data.index import EpisodeTable, get_or_build, hash_of_states, index_key
 from vjepa2_ac.data.sources.indexed_source import (
     FramesByStep,
     IndexedSource,
-    Opened,
     Scanned,
     measured_space,
     require_as_indexed,
@@ -60,7 +59,7 @@ _MOST_TEXT_BYTES = 1 << 18
 _LABELS = ("scene", "building", "operator", "day")
 
 
-class NpzSource(IndexedSource[DataConfig, Opened]):
+class NpzSource(IndexedSource[DataConfig, None]):
     """The episodes of a folder of .npz files, in the order of their paths; a path without .npz is the identity.
 
     `infos` reads every file except the frames. Data from URLs is cached on this machine.
@@ -121,7 +120,7 @@ class NpzSource(IndexedSource[DataConfig, Opened]):
             _Arrays(file, path).require_frames(camera, num_steps, count=len(set(steps)))
             return np.asarray(file.rows(camera, steps))
 
-    def _look(self, progress: Progress) -> Opened:
+    def _look(self, progress: Progress) -> tuple[EpisodeTable, None]:
         """Return the cached table, or read every episode; a changed file changes the key."""
         config, root = self._config, self._config.path
         listed = sorted(
@@ -138,7 +137,7 @@ class NpzSource(IndexedSource[DataConfig, Opened]):
         key = index_key({"source": "npz", **knobs, "listed": listed}, root)
         ids = [path.removesuffix(_SUFFIX) for path, _, _ in listed]
         build = partial(self._scanned, partial(self._scan, key), dict(zip(ids, ids, strict=True)), progress)
-        return Opened(get_or_build(config.disk_cache, key, root, build))
+        return get_or_build(config.disk_cache, key, root, build), None
 
     def _scan(self, version: str, identity: str) -> Scanned:
         episode, labels = self._episode(identity, version, self._config.cameras)

@@ -16,7 +16,7 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import RawDroidData
 from vjepa2_ac.config.section import Affects, knobs_that_affect
 from vjepa2_ac.config.sources import RAW_CAMERAS
-from vjepa2_ac.data.index import get_or_build, hash_of_states, index_key, key_of
+from vjepa2_ac.data.index import EpisodeTable, get_or_build, hash_of_states, index_key, key_of
 from vjepa2_ac.data.sources.droid_raw.episode_folders import (
     TRAJECTORY,
     VIDEOS,
@@ -29,7 +29,6 @@ from vjepa2_ac.data.sources.droid_raw.episode_folders import (
 from vjepa2_ac.data.sources.indexed_source import (
     FramesByStep,
     IndexedSource,
-    Opened,
     Scanned,
     require_as_indexed,
 )
@@ -63,7 +62,7 @@ class _Place:
     frames: dict[str, int]  # how many the MP4 of each of the config's cameras has, by serial number
 
 
-class RawDroidSource(IndexedSource[RawDroidData, Opened]):
+class RawDroidSource(IndexedSource[RawDroidData, None]):
     """The episodes of a raw DROID tree, or of a part of it, in the order of their paths.
 
     `infos` reads every trajectory and the headers of the MP4s of the config's cameras, once; data behind a URL is not
@@ -116,7 +115,7 @@ class RawDroidSource(IndexedSource[RawDroidData, Opened]):
         times = self._parsed(f"times {video} {version}", walk)["times"].tolist()
         return read_frames(opened(), [frames[step] for step in steps], where=video, times=times)
 
-    def _look(self, progress: Progress) -> Opened:
+    def _look(self, progress: Progress) -> tuple[EpisodeTable, None]:
         """Return the cached table, or scan every episode; a changed local file changes the key."""
         config, root = self._config, self._config.path
         folders = find_episodes(root, config.connections)
@@ -140,7 +139,7 @@ class RawDroidSource(IndexedSource[RawDroidData, Opened]):
         key = index_key(parts, root, named=identity_of(root, folders[0]))
         identities = {folder: identity_of(root, folder) for folder in folders}
         build = partial(self._scanned, self._scan, identities, progress)
-        return Opened(get_or_build(config.disk_cache, key, root, build))
+        return get_or_build(config.disk_cache, key, root, build), None
 
     def _scan(self, folder: str) -> Scanned:
         identity = identity_of(self._config.path, folder)

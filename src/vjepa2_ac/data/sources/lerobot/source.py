@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence, Set
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, cached_property, partial
 
 import numpy as np
@@ -15,7 +15,7 @@ from vjepa2_ac.config.section import Affects, knobs_that_affect
 from vjepa2_ac.data.files import connections_to, in_parallel
 from vjepa2_ac.data.index import EpisodeTable, get_or_build, hash_of_states, index_key
 from vjepa2_ac.data.selection import as_problem
-from vjepa2_ac.data.sources.indexed_source import Found, FramesByStep, IndexedSource, Opened, Scanned, table_of
+from vjepa2_ac.data.sources.indexed_source import Found, FramesByStep, IndexedSource, Scanned, table_of
 from vjepa2_ac.data.sources.lerobot.episodes import TABLES, EpisodeRow, read_episodes, require_files, row_of
 from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, list_by_template, read_info
 from vjepa2_ac.data.sources.lerobot.parquet import ParquetRows
@@ -28,12 +28,7 @@ from vjepa2_ac.media.video_reader import Clock, read_frames, require_decoder
 from vjepa2_ac.storage.block_file import BlockCachedFile
 
 
-@dataclass(frozen=True)
-class _Opened(Opened):
-    info: DatasetInfo
-
-
-class LeRobotSource(IndexedSource[LeRobotData, _Opened]):
+class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
     """The episodes of a LeRobot data set, v3.0 or v2.1, in the order of their numbers.
 
     Of a local data set `infos` checks the states of every episode; of a remote one it reads the files in meta, and
@@ -66,7 +61,7 @@ class LeRobotSource(IndexedSource[LeRobotData, _Opened]):
 
     @cached_property
     def _info(self) -> DatasetInfo:
-        return read_info(self._config.path) if self._known is None else self._known.info
+        return read_info(self._config.path) if self._known is None else self._known[1]
 
     @property
     def _control_rate_hz(self) -> float:
@@ -79,12 +74,12 @@ class LeRobotSource(IndexedSource[LeRobotData, _Opened]):
     @property
     def _data_version(self) -> str:
         """A version that changes with the data set's files and the wanted columns."""
-        return self._version if self._known is None else self._known.table.texts["index"]
+        return self._version if self._known is None else self._known[0].texts["index"]
 
     def _open_file(self, path: str) -> str | BlockCachedFile:
         return self._files.open(path, version=self._data_version)
 
-    def _look(self, progress: Progress) -> _Opened:
+    def _look(self, progress: Progress) -> tuple[EpisodeTable, DatasetInfo]:
         info, config = self._info, self._config
         info.require_mapping(config)
         keys = [info.camera_key(config.lerobot, camera) for camera in config.cameras]
@@ -108,7 +103,7 @@ class LeRobotSource(IndexedSource[LeRobotData, _Opened]):
         }
         self._version = index_key(parts, config.path)
         build = partial(self._built, list(tables), files.keys(), keys, progress)
-        return _Opened(get_or_build(config.disk_cache, self._version, config.path, build), info)
+        return get_or_build(config.disk_cache, self._version, config.path, build), info
 
     def _built(self, tables: list[str], files: Set[str], keys: list[str], progress: Progress) -> EpisodeTable:
         info, config, fields = self._info, self._config, self._config.lerobot

@@ -23,8 +23,8 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import DiskCacheConfig, RldsData
 from vjepa2_ac.config.section import Affects, knobs_that_affect
 from vjepa2_ac.data.files import fetched_data
-from vjepa2_ac.data.index import cache_folder, get_or_build, index_key
-from vjepa2_ac.data.sources.indexed_source import FramesByStep, IndexedSource, Opened
+from vjepa2_ac.data.index import EpisodeTable, cache_folder, get_or_build, index_key
+from vjepa2_ac.data.sources.indexed_source import FramesByStep, IndexedSource
 from vjepa2_ac.data.sources.rlds.episode import STEP_FLAG, Record, episode_of, step_features
 from vjepa2_ac.data.sources.rlds.index import build_index, position_of
 from vjepa2_ac.data.sources.rlds.shards import Shard, find_shards, naming, open_shard
@@ -48,13 +48,7 @@ _CHUNK_BYTES = 1 << 20  # all of a camera's images are fetched in parallel chunk
 _NO_LIMIT = 1 << 62
 
 
-@dataclass(frozen=True)
-class _Opened(Opened):
-    shards: tuple[Shard, ...]
-    checked: Path  # a byte for each record whose CRC was checked on this machine, shared by all processes
-
-
-class RldsSource(IndexedSource[RldsData, _Opened]):
+class RldsSource(IndexedSource[RldsData, tuple[Shard, ...]]):
     """The episodes of an RLDS data set, in the order of its shards.
 
     `infos` scans every record once and caches the result; `read` reads the states only, and images are read and decoded
@@ -73,12 +67,13 @@ class RldsSource(IndexedSource[RldsData, _Opened]):
             UnreachableError: The network fails.
             ValueError: A camera that the config does not know.
         """
-        opened, config, fields = self._open(), self._config, self._config.fields
+        table, shards = self._open()
+        config, fields = self._config, self._config.fields
         camera = camera or config.cameras[0]
         if camera not in fields.cameras:
             raise ValueError(f"camera {camera!r} is not one of {', '.join(fields.cameras)}")
-        feature, info = fields.cameras[camera], opened.table[index]
-        shard, span = position_of(opened.table, opened.shards, index)
+        feature, info = fields.cameras[camera], table[index]
+        shard, span = position_of(table, shards, index)
         where = f"{span} ({info.id})"
         of_images = f"{where}: {feature}"
         if storage.is_url(shard.path):
@@ -89,16 +84,16 @@ class RldsSource(IndexedSource[RldsData, _Opened]):
             images = remote.images(feature, place, info.num_steps, needed, of_images)
             return episode_of(record, config, info, images, where)
         with open_shard(shard) as read:
-            if config.check_crc == "always":
+            checked = cache_folder(config.disk_cache) / "index" / f"{table.texts['index']}.checked"
+            is_checked = config.check_crc == "once" and _is_marked(checked, index)
+            if config.check_crc != "never" and not is_checked:
                 require_intact(read, span)
-            elif config.check_crc == "once" and not _is_marked(opened.checked, index):
-                require_intact(read, span)
-                _mark(opened.checked, index)
+                _mark(checked, index)
             record = Record(read, span)
             images = images_here(shard, record.place_of(feature), info.num_steps, of_images)
             return episode_of(record, config, info, images, where)
 
-    def _look(self, progress: Progress) -> _Opened:
+    def _look(self, progress: Progress) -> tuple[EpisodeTable, tuple[Shard, ...]]:
         config, fields = self._config, self._config.fields
         shards = tuple(find_shards(config.path))
         cameras = [fields.cameras[camera] for camera in config.cameras]
@@ -112,8 +107,7 @@ class RldsSource(IndexedSource[RldsData, _Opened]):
         key = index_key(parts, config.path)
         build = partial(build_index, shards, config, cameras, progress)
         table = get_or_build(config.disk_cache, key, config.path, build)
-        table = replace(table, texts={**table.texts, "control_rate_hz": str(fields.control_rate_hz)})
-        return _Opened(table, shards, cache_folder(config.disk_cache) / "index" / f"{key}.checked")
+        return replace(table, texts={**table.texts, "control_rate_hz": str(fields.control_rate_hz)}), shards
 
 
 def _is_marked(file: Path, number: int) -> bool:
