@@ -20,7 +20,7 @@ from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.sources.indexed_source import open_source
 from vjepa2_ac.episode import Batch, Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.inspection.check import check_data, findings_in
+from vjepa2_ac.inspection.check import findings_in
 from vjepa2_ac.inspection.sheet import plot_dataset
 from vjepa2_ac.inspection.statistics import CHANGED, inspect_dataset
 from vjepa2_ac.spaces import Spaces
@@ -193,16 +193,6 @@ def test_what_needs_poses_or_says_too_little_is_refused_with_the_config(
     values = {"path": "d", "source": "npz", "states": "vector"} | changes
     with pytest.raises(InputError, match=complaint):
         parse_config({"run_dir": "r", "model": {"base": "b"}, "data": values}, where="here")
-
-
-def test_the_check_says_how_wide_and_that_all_is_well(tmp_path: Path) -> None:
-    config = knobs(write_vectors(tmp_path, width=14, action_width=3), **recorded_by("sum"))
-    found = {one.about: one for one in check_data(config, clips=8)}
-    assert {one.level for one in found.values()} == {"ok"}
-    assert found["states"].text.startswith("14 numbers, -1")
-    assert found["actions"].text.startswith("3 numbers")
-    assert "states (2, 3, 14), actions (2, 2, 3)" in found["batch"].text
-    assert found["pictures"].text.startswith("0 of 16")
 
 
 FIVE = Spaces.of_vectors(Widths(5, 5), "difference")
