@@ -113,14 +113,11 @@ class Dataset:
         share = {"train": 1.0, "validation": config.validation_share, "test": config.test_share}[split]
         always = f"above 0, three {'episodes' if groups is None else 'groups'} or more always have one"
         always += ", unless it is broken or in data.exclude" if share else ""
-        return InputError(
-            where=f"data.path: {config.path}",
-            found=f"no {split} episodes among {taking_part.sum()}{together} ({shares})",
-            needed="one or more",
-            fix="Lower data.validation_share or data.test_share"
-            if split == "train"
-            else f"Raise data.{split}_share: {always}",
-        )
+        fix = f"Raise data.{split}_share: {always}"
+        if split == "train":
+            fix = "Lower data.validation_share or data.test_share"
+        found = f"no {split} episodes among {taking_part.sum()}{together} ({shares})"
+        return InputError(where=f"data.path: {config.path}", found=found, fix=fix)
 
     def with_stride(self, stride: int) -> Dataset:
         """Return the data set with another stride.
@@ -129,12 +126,9 @@ class Dataset:
             InputError: The data is a latent cache, which has the frames of one stride only.
         """
         if self.config.is_cache and stride != self.config.stride:
-            raise InputError(
-                where=self.config.path,
-                found=f"latents that were encoded for clips at stride {self.config.stride}",
-                needed=f"stride {stride}",
-                fix="Use the data set itself, with data.cache: off",
-            )
+            found = f"latents that were encoded for clips at stride {self.config.stride}, not {stride}"
+            fix = "Use the data set itself, with data.cache: off"
+            raise InputError(where=self.config.path, found=found, fix=fix)
         return replace(self, config=self.config.with_stride(stride))
 
     @cached_property
@@ -271,13 +265,10 @@ def _settled(dataset: Dataset) -> Dataset:
 
 def _nothing_left(dataset: Dataset) -> InputError:
     filters = ", ".join(f"{one.name} {one.episodes}" for one in dataset.removed if one.episodes)
-    return InputError(
-        where=f"data.path: {dataset.config.path}",
-        found=f"none of {len(dataset.table) + len(dataset.table.problems)} episodes is left"
-        + (f" (left out: {filters})" if filters else ""),
-        needed="at least one",
-        fix="Look at data.exclude, data.outcome and data.idle" if filters else "",
-    )
+    found = f"none of {len(dataset.table) + len(dataset.table.problems)} episodes is left"
+    found += f" (left out: {filters})" if filters else ""
+    fix = "Look at data.exclude, data.outcome and data.idle" if filters else ""
+    return InputError(where=f"data.path: {dataset.config.path}", found=found, fix=fix)
 
 
 def widths_of(episode: Episode) -> Widths:
@@ -294,9 +285,7 @@ def require_widths(episode: Episode, widths: Widths) -> None:
     """
     found = widths_of(episode)
     if found != widths:
-        raise InputError(
-            where=f"episode {episode.info.id}",
-            found=f"states of {found.state} and actions of {found.action} numbers",
-            needed=f"{widths.state} and {widths.action}, as in the others",
-            fix="Keep the recordings of different robots in different data sets",
-        )
+        wrong = f"states of {found.state} and actions of {found.action} numbers"
+        needed = f"{widths.state} and {widths.action}, as in the others"
+        fix = "Keep the recordings of different robots in different data sets"
+        raise InputError(where=f"episode {episode.info.id}", found=wrong, needed=needed, fix=fix)

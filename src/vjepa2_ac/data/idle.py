@@ -90,12 +90,9 @@ def published_ranges(path: str, table: EpisodeTable) -> StepSelection:
     listed = sum(name in lists for name in names)
     if not listed:
         first = next(iter(lists), "none at all")
-        raise InputError(
-            where=where,
-            found=f"none of the {len(table)} episodes; its first is {first}",
-            needed="the identities of the episodes" + (f", such as {names[0]}" if names else ""),
-            fix=another,
-        )
+        found_there = f"none of the {len(table)} episodes; its first is {first}"
+        needed = "the identities of the episodes" + (f", such as {names[0]}" if names else "")
+        raise InputError(where=where, found=found_there, needed=needed, fix=another)
     found: list[Found] = []
     for name, steps in zip(names, table.num_steps.tolist(), strict=True):
         pairs = _pairs(lists.get(name, []), steps)
@@ -131,12 +128,8 @@ def kept_ranges(episode: Episode, config: IdleConfig) -> list[tuple[int, int]]:
         return moving_ranges(idle_by_motion(episode.states, config), config)
     where, velocities = f"episode {episode.info.id}", episode.joint_velocities
     if velocities is None:
-        raise InputError(
-            where=where,
-            found="no commanded joint velocities",
-            needed="them, for data.idle.rule commands",
-            fix="Set data.idle.rule: motion, which needs only poses, or name the feature with the velocities",
-        )
+        fix = "Set data.idle.rule: motion, which needs only poses, or name the feature with the velocities"
+        raise InputError(where=where, found="no commanded joint velocities", fix=fix)
     if not np.isfinite(velocities).all():
         raise InputError(where=where, found="a joint velocity that is not finite", needed="finite numbers")
     return moving_ranges(idle_by_commands(velocities, config), config)

@@ -145,12 +145,9 @@ def batches_of(dataset: Dataset, windows: Sequence[tuple[int, int]], *, batch_si
             empty = False
             yield batch
     if empty:
-        raise InputError(
-            where=f"data.path: {dataset.config.path}",
-            found=f"none of the clips can be read; broken episodes: {named(tuple(dataset.broken.reasons))}",
-            needed="at least one",
-            fix="Repair or fetch these episodes again, or add them to data.exclude",
-        )
+        found = f"none of the clips can be read; broken episodes: {named(tuple(dataset.broken.reasons))}"
+        fix = "Repair or fetch these episodes again, or add them to data.exclude"
+        raise InputError(where=f"data.path: {dataset.config.path}", found=found, fix=fix)
 
 
 def _chosen_clip(dataset: Dataset, windows: Sequence[tuple[int, int]], position: int) -> ClipRequest:

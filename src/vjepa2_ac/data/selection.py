@@ -101,11 +101,9 @@ def included(table: EpisodeTable, config: DataConfig) -> Bool[np.ndarray, " epis
     found = {place: name for place in candidates if (name := table.identity(place)) in excluded}
     unknown = excluded.difference(found.values(), (problem.name for problem in table.problems))
     if unknown:
-        raise InputError(
-            where="data.exclude",
-            found=f"not the identity of any episode: {named(sorted(unknown))}",
-            needed="identities as errors name them" + (f", such as {table.identity(0)}" if len(table) else ""),
-        )
+        wrong = f"not the identity of any episode: {named(sorted(unknown))}"
+        needed = "identities as errors name them" + (f", such as {table.identity(0)}" if len(table) else "")
+        raise InputError(where="data.exclude", found=wrong, needed=needed)
     taking_part = np.ones(len(table), bool)
     taking_part[list(found)] = False
     return taking_part
@@ -120,12 +118,8 @@ def of_outcome(table: EpisodeTable, config: DataConfig) -> Bool[np.ndarray, " ep
     if config.outcome == "all":
         return np.ones(len(table), bool)
     if len(table) and (table.success < 0).all():
-        raise InputError(
-            where=f"data.outcome: {config.outcome}",
-            found=f"no episode of {config.path} says whether it succeeded",
-            needed="at least some that do",
-            fix="Set data.outcome: all",
-        )
+        found = f"no episode of {config.path} says whether it succeeded"
+        raise InputError(where=f"data.outcome: {config.outcome}", found=found, fix="Set data.outcome: all")
     return np.asarray(table.success == (config.outcome == "success"))
 
 
@@ -141,12 +135,8 @@ def require_distinct(table: EpisodeTable, taking_part: Bool[np.ndarray, " episod
     for place in members[np.isin(table.id_hash[members], hashes[counts > 1])].tolist():
         name = table.identity(place)
         if name in places:
-            error = InputError(
-                where=f"data.path: {config.path}",
-                found=f"episodes {places[name]} and {place} have the same identity: {name}",
-                needed="episodes that can be told apart: the split is a hash of the identity",
-                fix=config.same_identity_fix,
-            )
+            found, fix = f"episodes {places[name]} and {place} have the same identity: {name}", config.same_identity_fix
+            error = InputError(where=f"data.path: {config.path}", found=found, fix=fix)
             raise with_way_out(error, [name], skippable=False)
         places[name] = place
 
@@ -211,13 +201,11 @@ class BrokenEpisodes:
         if len(self) <= MOST_BROKEN * self._episodes:
             return
         name, reason = next(iter(self._reasons.items()))
-        raise InputError(
-            where=f"data.path: {self._config.path}",
-            found=f"{len(self)} of {self._episodes} episodes are broken: {named(tuple(self._reasons))}."
-            f" The first, {name}: {reason.rstrip('.')}",
-            needed=f"{MOST_BROKEN:.0%} at most: data.broken_episodes is skip",
-            fix="Repair or fetch them again, or add them to data.exclude",
-        )
+        found = f"{len(self)} of {self._episodes} episodes are broken: {named(tuple(self._reasons))}."
+        found += f" The first, {name}: {reason.rstrip('.')}"
+        needed = f"{MOST_BROKEN:.0%} at most: data.broken_episodes is skip"
+        fix = "Repair or fetch them again, or add them to data.exclude"
+        raise InputError(where=f"data.path: {self._config.path}", found=found, needed=needed, fix=fix)
 
 
 def as_error(problem: EpisodeProblem) -> InputError:
@@ -243,12 +231,8 @@ def with_way_out(error: InputError, names: Sequence[str], *, skippable: bool = T
     listed = json.dumps(list(names[:NAMED]), ensure_ascii=False)
     of_all = f" (the first {NAMED} of {len(names)})" if len(names) > NAMED else ""
     skip = "set data.broken_episodes: skip, or " if skippable else ""
-    return InputError(
-        where=error.where,
-        found=error.found,
-        needed=error.needed,
-        fix=f"{others}{fix}To go on without, {skip}add{of_all} to data.exclude: {listed}",
-    )
+    fix = f"{others}{fix}To go on without, {skip}add{of_all} to data.exclude: {listed}"
+    return InputError(where=error.where, found=error.found, needed=error.needed, fix=fix)
 
 
 def named(ids: Sequence[str], count: int | None = None) -> str:
@@ -279,12 +263,9 @@ def groups_of(
         from_source = split_by in table.labels
         reason = "the data set does not say it of" if from_source else "found nothing in the identities of"
         another = "choose another field" if from_source else "choose a pattern that fits every identity"
-        raise InputError(
-            where=f"data.split_by: {split_by}",
-            found=f"{reason} {len(lacking)} of {taking_part.sum()} episodes: {named(lacking)}",
-            needed="a group for every episode that takes part",
-            fix=f"Leave these out with data.exclude, or {another}",
-        )
+        found = f"{reason} {len(lacking)} of {taking_part.sum()} episodes: {named(lacking)}"
+        fix = f"Leave these out with data.exclude, or {another}"
+        raise InputError(where=f"data.split_by: {split_by}", found=found, fix=fix)
     hashes = {group: identity_hash(group) for group in groups if group}
     any_hash = next(iter(hashes.values()), 0)
     return np.array([hashes[group] if group else any_hash for group in groups], np.uint64)
@@ -295,12 +276,9 @@ def _groups(table: EpisodeTable, split_by: str) -> list[str | None]:
         return [labels.of_episode(place) for place in range(len(table))]
     identities = [table.identity(place) for place in range(len(table))]
     if split_by not in IN_IDENTITY and re.fullmatch(r"[A-Za-z_]+", split_by):
-        raise InputError(
-            where=f"data.split_by: {split_by}",
-            found=f"no such field; this data set has {', '.join(table.labels) or 'none of its own'}, and its identities"
-            f" may have {', '.join(IN_IDENTITY)}",
-            needed="a field, or a regular expression with one group for the identity"
-            + (f", such as {identities[0]}" if identities else ""),
-        )
+        own, such = ", ".join(table.labels) or "none of its own", f", such as {identities[0]}" if identities else ""
+        found = f"no such field; this data set has {own}, and its identities may have {', '.join(IN_IDENTITY)}"
+        needed = f"a field, or a regular expression with one group for the identity{such}"
+        raise InputError(where=f"data.split_by: {split_by}", found=found, needed=needed)
     search = re.compile(IN_IDENTITY.get(split_by, split_by)).search
     return [found.group(1) if (found := search(identity)) else None for identity in identities]

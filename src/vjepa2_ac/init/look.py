@@ -185,13 +185,10 @@ def _recognized(path: str) -> tuple[str, str]:
     if any(name == "trajectory.h5" or name.startswith("metadata_") for name in names):
         return "raw", path
     way = next((text for end, text in _WAYS.items() for name in names if name.lower().endswith(end)), "")
-    shown = ", ".join(names[:5]) + (", …" if len(names) > 5 else "")
-    raise InputError(
-        where=path,
-        found=f"nothing that is read ({shown or 'an empty folder'})",
-        needed="LeRobot (meta/info.json), RLDS (dataset_info.json), .npz files, or raw DROID (trajectory.h5)",
-        fix=f"This looks like {way}" if way else "docs/data.md says how other data become one of these",
-    )
+    shown = ", ".join(names[:5]) + (", …" if len(names) > 5 else "") or "an empty folder"
+    needed = "LeRobot (meta/info.json), RLDS (dataset_info.json), .npz files, or raw DROID (trajectory.h5)"
+    fix = f"This looks like {way}" if way else "docs/data.md says how other data become one of these"
+    raise InputError(where=path, found=f"nothing that is read ({shown})", needed=needed, fix=fix)
 
 
 def _names_below(path: str) -> list[str]:

@@ -120,12 +120,9 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
         config, root = self._config, self._config.path
         folders = find_episodes(root, config.connections)
         if not folders:
-            raise InputError(
-                where="data.path",
-                found=f"no episodes under {root}",
-                needed=f"folders LAB/success|failure/DATE/TIME with a {TRAJECTORY}",
-                fix="DROID's are in gs://gresearch/robotics/droid_raw/1.0.1",
-            )
+            needed = f"folders LAB/success|failure/DATE/TIME with a {TRAJECTORY}"
+            fix = "DROID's are in gs://gresearch/robotics/droid_raw/1.0.1"
+            raise InputError(where="data.path", found=f"no episodes under {root}", needed=needed, fix=fix)
         listed: Sequence[EpisodeFolder | str] = folders
         if not storage.is_url(root):
             listed = [list_episode(root, folder) for folder in folders]

@@ -88,14 +88,10 @@ class LatentSource(IndexedSource[DataConfig, _Cache]):
         wanted = np.unique(episodes).tolist()
         lacking = [one for one in wanted if not all(opened.files.is_done(one, camera) for camera in self.cameras)]
         if lacking:
-            first = table.identity(lacking[0])
-            raise InputError(
-                where=self._config.path,
-                found=f"no whole latents of {len(lacking)} of {len(wanted)} episodes, such as {first}",
-                needed="those of every episode that takes part",
-                fix="Run `vjepa2-ac encode` again, as the cache was made: it encodes what is missing; or leave these"
-                " episodes out (data.outcome, data.exclude)",
-            )
+            such = f"{len(lacking)} of {len(wanted)} episodes, such as {table.identity(lacking[0])}"
+            fix = "Run `vjepa2-ac encode` again, as the cache was made: it encodes what is missing; or leave these"
+            fix += " episodes out (data.outcome, data.exclude)"
+            raise InputError(where=self._config.path, found=f"no whole latents of {such}", fix=fix)
         return self._config.model_copy(update={"camera": self.cameras})
 
     def _look(self, progress: Progress) -> tuple[EpisodeTable, _Cache]:  # noqa: ARG002 - at once
@@ -114,9 +110,7 @@ class LatentSource(IndexedSource[DataConfig, _Cache]):
 
 def another_cache(folder: Path, differing: Sequence[str]) -> InputError:
     """Return the error of a cache with other settings than those in use."""
-    return InputError(
-        where=str(folder),
-        found=f"a latent cache that was made otherwise: {'; '.join(differing)}",
-        needed="one that was made with this model and these settings",
-        fix="Change the settings to those, or encode the data set again",
-    )
+    found = f"a latent cache that was made otherwise: {'; '.join(differing)}"
+    needed = "one that was made with this model and these settings"
+    fix = "Change the settings to those, or encode the data set again"
+    return InputError(where=str(folder), found=found, needed=needed, fix=fix)

@@ -123,12 +123,10 @@ class DatasetInfo:
                 raise InputError(where=where, found=found, needed=f"0 to {width - 1}")
         needed, rotation = (7, "3 Euler angles") if fields.rotation == "euler_xyz" else (8, "a quaternion's 4")
         if config.states == "pose" and count != needed:
-            raise InputError(
-                where=where,
-                found=f"{count} numbers a step from {source}",
-                needed=f"{needed}: x, y, z, {rotation} (data.lerobot.rotation: {fields.rotation}), the gripper",
-                fix="Name other columns in data.lerobot.state, or choose among their numbers with data.lerobot.select",
-            )
+            found = f"{count} numbers a step from {source}"
+            wanted = f"{needed}: x, y, z, {rotation} (data.lerobot.rotation: {fields.rotation}), the gripper"
+            fix = "Name other columns in data.lerobot.state, or choose among their numbers with data.lerobot.select"
+            raise InputError(where=where, found=found, needed=wanted, fix=fix)
 
 
 def missing(where: str, kind: str, name: str, place: str, known: Iterable[str]) -> InputError:

@@ -75,12 +75,9 @@ class Record:
         if name not in self.located:
             known = sorted(self.located)
             close = difflib.get_close_matches(name, known, n=1)
-            raise InputError(
-                where=str(self._span),
-                found=f"no feature {name}; the record has {', '.join(known) or 'none'}",
-                needed="the features that data.fields names",
-                fix=f"Did you mean {close[0]}? Set data.fields" if close else "Set data.fields",
-            )
+            found = f"no feature {name}; the record has {', '.join(known) or 'none'}"
+            fix = f"Did you mean {close[0]}? Set data.fields" if close else "Set data.fields"
+            raise InputError(where=str(self._span), found=found, fix=fix)
         return self.located[name]
 
     def floats(self, name: str) -> Float32[np.ndarray, " values"]:
