@@ -79,11 +79,6 @@ def test_an_identity_without_a_group_is_named_and_refused() -> None:
     opened(names, split_by="day", exclude=("elsewhere/one", "elsewhere/two"))
 
 
-def test_a_field_that_is_not_there_is_refused_with_those_that_are() -> None:
-    with pytest.raises(InputError, match=r"no such field; this data set has none of its own.*lab, day, folder"):
-        opened(split_by="kitchen")
-
-
 @pytest.mark.parametrize("pattern", ["(", "(a)(b)", r"\d+-\d+", "(?:a)", "", "(?P<a>", "a" * 501])
 def test_a_pattern_without_one_group_is_refused_with_the_config(pattern: str) -> None:
     with pytest.raises(ValidationError, match="split_by"):

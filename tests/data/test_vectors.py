@@ -62,12 +62,6 @@ def test_commands_of_a_model_step_are_those_of_its_control_steps_joined(
     np.testing.assert_array_equal(clip.actions, join(written[4:8].reshape(2, 2, 5), axis=1).astype(np.float32))
 
 
-def test_at_stride_one_there_is_nothing_to_join(tmp_path: Path) -> None:
-    config = knobs(write_vectors(tmp_path, width=8, action_width=8), stride=1, actions="recorded")
-    clip = clip_at(open_dataset(config), 0, 0)
-    np.testing.assert_array_equal(clip.actions, vectors(24, 8, seed=1000)[:2].astype(np.float32))
-
-
 def test_a_pose_that_is_read_as_a_vector_is_not_turned_into_rotations(droid: Path) -> None:
     states = ["steps/observation/cartesian_position", "steps/observation/gripper_position"]
     plain = open_dataset(knobs(droid, source="rlds", states="pose"))
