@@ -277,8 +277,8 @@ def _groups(table: EpisodeTable, split_by: str) -> list[str | None]:
     identities = [table.identity(place) for place in range(len(table))]
     if split_by not in IN_IDENTITY and re.fullmatch(r"[A-Za-z_]+", split_by):
         own, such = ", ".join(table.labels) or "none of its own", f", such as {identities[0]}" if identities else ""
-        found = f"no such field; this data set has {own}, and its identities may have {', '.join(IN_IDENTITY)}"
+        wrong = f"no such field; this data set has {own}, and its identities may have {', '.join(IN_IDENTITY)}"
         needed = f"a field, or a regular expression with one group for the identity{such}"
-        raise InputError(where=f"data.split_by: {split_by}", found=found, needed=needed)
+        raise InputError(where=f"data.split_by: {split_by}", found=wrong, needed=needed)
     search = re.compile(IN_IDENTITY.get(split_by, split_by)).search
     return [found.group(1) if (found := search(identity)) else None for identity in identities]
