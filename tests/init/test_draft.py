@@ -9,7 +9,8 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.init import draft
 from vjepa2_ac.init.draft import choose_model, make_draft
-from vjepa2_ac.init.found import FoundData, Knob, Machine, duration, plain
+from vjepa2_ac.init.found import FoundData, Knob, plain
+from vjepa2_ac.init.machine import Machine, duration
 from vjepa2_ac.storage.structured import parse_yaml
 
 GB = 10**9

@@ -12,8 +12,9 @@ from vjepa2_ac.config.loading import config_from
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.init.draft import choose_model, make_draft
-from vjepa2_ac.init.found import Machine, guesses, plain
+from vjepa2_ac.init.found import guesses, plain
 from vjepa2_ac.init.look import look_at, measured
+from vjepa2_ac.init.machine import Machine
 from vjepa2_ac.simulation.recording.simulation_file import SIMULATION_FILE
 
 LAPTOP = Machine(None, 24 * 10**9, has_bf16=False, cores=2, free_bytes=10**11)

@@ -116,8 +116,9 @@ def _init(options: argparse.Namespace) -> int:
 
     from vjepa2_ac.console.progress import ConsoleReporter, show
     from vjepa2_ac.init.draft import TINY, choose_model, make_draft
-    from vjepa2_ac.init.found import guesses, this_machine
+    from vjepa2_ac.init.found import guesses
     from vjepa2_ac.init.look import measured
+    from vjepa2_ac.init.machine import this_machine
     from vjepa2_ac.reporter import INDEXING
 
     with ConsoleReporter() as reporter:

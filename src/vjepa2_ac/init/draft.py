@@ -10,7 +10,8 @@ from pathlib import Path
 from vjepa2_ac.config import Config, EncoderConfig, ModelConfig
 from vjepa2_ac.config.loading import config_from
 from vjepa2_ac.config.model import ModelSizes
-from vjepa2_ac.init.found import FoundData, Knob, Knobs, Machine, as_yaml, duration, guesses, plain
+from vjepa2_ac.init.found import FoundData, Knob, Knobs, as_yaml, guesses, plain
+from vjepa2_ac.init.machine import Machine, duration
 from vjepa2_ac.model.checkpoints.loading import base_sizes
 from vjepa2_ac.model.checkpoints.published import OFFICIAL, PUBLISHED
 from vjepa2_ac.places import BUILTIN
