@@ -35,7 +35,7 @@ def main(data: str | None = None) -> None:
 
     inspection = inspect_dataset(dataset)
     SHEET.parent.mkdir(parents=True, exist_ok=True)
-    x, y, z = (inspection.range_of(axis) for axis in range(3))
+    x, y, z, *_ = inspection.ranges
     print(f"The hand was at x {x[0]:.2f} to {x[1]:.2f}, y {y[0]:.2f} to {y[1]:.2f}, z {z[0]:.2f} to {z[1]:.2f} m.")
     print(f"Look at {plot_dataset(inspection, SHEET, rows=4)}")
 

@@ -43,7 +43,7 @@ ORDERS: dict[str, list[str]] = {
     "data": [
         "streams",
         "index",
-        "selection cache transforms",
+        "selection files transforms",
         "idle windows",
         "sources",
         "dataset",
@@ -51,7 +51,7 @@ ORDERS: dict[str, list[str]] = {
         "loader duplicates",
         "coverage",
     ],
-    "data.sources": ["listing configured_spaces", "indexed_source", "rlds droid_raw lerobot npz latents", "registry"],
+    "data.sources": ["indexed_source", "rlds droid_raw lerobot npz latents"],
     "serving": [
         "wire access motion",
         "client request recording",

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.sources.configured_spaces import measured_space, spaces_of
+from vjepa2_ac.data.sources.indexed_source import measured_space, spaces_of
 from vjepa2_ac.episode import POSE_WIDTHS, Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.geometry import actions_from_states

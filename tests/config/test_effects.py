@@ -16,8 +16,8 @@ from vjepa2_ac.config.loading import changed_keys, config_as_yaml, parse_config
 from vjepa2_ac.config.section import Affects, Section, knobs_that_affect, mark_of, marks_of
 from vjepa2_ac.data import idle as idle_ranges
 from vjepa2_ac.data.index import EpisodeInfo, EpisodeTable
+from vjepa2_ac.data.sources.indexed_source import open_source
 from vjepa2_ac.data.sources.latents.cache_key import key_of_cache
-from vjepa2_ac.data.sources.registry import open_source
 from vjepa2_ac.encoding.batch import encoding_of
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.world_model import WorldModel

@@ -1,6 +1,5 @@
 """Coverage of actions: what is varied is fit to plan with, what is not is narrow, whichever way the axes point."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -112,19 +111,6 @@ def test_random_reaching_of_the_simulator_is_fit_and_one_way_reaching_is_narrow(
     assert recorded(None).verdict == "fit to plan with"
     one_way = recorded(MotionRecipe(drift_m=(0.01, 0.0, 0.0)))
     assert "steps go to 7% of all directions; nearly all go one way" in one_way.narrow
-
-
-def test_what_is_said_of_each_axis_and_of_the_gripper_is_what_the_steps_do() -> None:
-    changes = np.zeros((200, 7))
-    changes[:, 0] = np.where(np.arange(200) % 4 == 0, -0.02, 0.03)
-    changes[:20, 6] = 0.5
-    found = poses(changes)
-    assert "dx 3.0 cm (25% back, 75% forth), dy 0.0 cm (0% back, 0% forth)" in found.lines["axes"]
-    assert "the gripper changes in 10%" in found.lines["axes"]
-    values = json.loads(json.dumps(found.metrics))
-    assert values["length_cm_10_50_90_99"] == pytest.approx([2, 3, 3, 3])
-    assert values["back_share_xyz"] == [0.25, 0, 0]
-    assert values["gripper_share"] == 0.1
 
 
 def test_changes_are_those_over_a_stride_within_kept_ranges_in_the_frame_of_the_model() -> None:

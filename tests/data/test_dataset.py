@@ -14,9 +14,8 @@ from memory_source import MemorySource
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data import dataset as opening
 from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.data.idle import FoundRanges
 from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable
-from vjepa2_ac.data.selection import BrokenEpisodes
+from vjepa2_ac.data.selection import BrokenEpisodes, StepSelection
 from vjepa2_ac.errors import InputError
 
 
@@ -151,12 +150,12 @@ def droid_sized() -> EpisodeTable:
     )
 
 
-def two_ranges_each(table: EpisodeTable) -> FoundRanges:
+def two_ranges_each(table: EpisodeTable) -> StepSelection:
     """Return ranges with rests between them: a quarter of the steps, as in DROID."""
     count, steps = len(table), table.num_steps
     start, end = (np.zeros(2 * count, np.int32) for _ in range(2))
     start[1::2], end[0::2], end[1::2] = steps * 0.4, steps * 0.3, steps * 0.85
-    return FoundRanges(np.repeat(np.arange(count, dtype=np.int32), 2), start, end)
+    return StepSelection(np.repeat(np.arange(count, dtype=np.int32), 2), start, end)
 
 
 @pytest.mark.parametrize("idle", [{}, {"rule": "motion"}])
@@ -167,7 +166,7 @@ def test_a_set_of_droids_size_is_opened_without_a_call_for_each_episode_and_in_f
     table = droid_sized()
     kept.write_bytes(table.to_bytes())
     ranges.write_bytes(two_ranges_each(table).to_bytes())
-    monkeypatch.setattr(opening, "find_ranges", lambda *_: FoundRanges.from_bytes(ranges.read_bytes()))
+    monkeypatch.setattr(opening, "find_ranges", lambda *_: StepSelection.from_bytes(ranges.read_bytes()))
     del table
 
     class Kept:

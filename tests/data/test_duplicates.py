@@ -17,8 +17,7 @@ from synthetic import synthetic_states
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.duplicates import Duplicates, find_duplicates
-from vjepa2_ac.data.index import UNKNOWN, EpisodeTable, hash_of_states
-from vjepa2_ac.data.sources.latents.cache_files import EPISODES
+from vjepa2_ac.data.index import UNKNOWN, hash_of_states
 from vjepa2_ac.inspection.check import check_data
 from vjepa2_ac.inspection.statistics import inspect_dataset
 
@@ -93,15 +92,11 @@ def test_a_far_set_of_which_nothing_tells_the_states_is_said_to_be_not_known(gcs
     assert "not known" in str(found)
 
 
-def test_a_latent_cache_passes_the_hashes_on_and_an_older_one_is_read_without(tmp_path: Path) -> None:
+def test_a_latent_cache_passes_the_hashes_on(tmp_path: Path) -> None:
     dataset = open_dataset(config_of("npz", write_npz(tmp_path / "set", RECORDINGS), tmp_path))
     folder = write_cache(dataset)
     cached = open_dataset(config_of("latents", folder, tmp_path, stride=2))
     assert find_duplicates(cached) == find_duplicates(dataset)
-    data = (folder / EPISODES).read_bytes()
-    assert (
-        EpisodeTable.from_bytes(replace(EpisodeTable.from_bytes(data), state_hash=None).to_bytes()).state_hash is None
-    )
 
 
 def test_those_across_splits_are_counted_and_two_of_them_are_named() -> None:
@@ -129,9 +124,8 @@ def test_no_copies_and_episodes_that_were_not_looked_at_are_none() -> None:
 
 def test_what_is_left_out_is_no_copy() -> None:
     dataset = in_memory([7, 7, 8])
-    without = dataset.kept.taking_part.copy()
-    without[1] = False
-    assert find_duplicates(replace(dataset, kept=dataset.kept.only(without))).episodes == 0
+    without = dataset.config.model_copy(update={"exclude": (dataset.table.identity(1),)})
+    assert find_duplicates(replace(dataset, config=without)).episodes == 0
 
 
 def test_check_and_inspect_warn_of_copies_and_are_calm_without(tmp_path: Path) -> None:

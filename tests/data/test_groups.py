@@ -14,12 +14,7 @@ from latent_sets import write_cache
 from memory_source import MemorySource
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.data.index import EpisodeTable
-from vjepa2_ac.data.selection import groups_of
-from vjepa2_ac.episode import EpisodeInfo
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.inspection.check import check_data
-from vjepa2_ac.inspection.statistics import inspect_dataset
 
 DROID = "gs://xembodiment_data/r2d2/r2d2-data-full/{lab}/{outcome}/{day}/Fri_Jul__7_09:42:23_2023/{number}--{number}.h5"
 NAMES = [
@@ -84,27 +79,10 @@ def test_an_identity_without_a_group_is_named_and_refused() -> None:
     opened(names, split_by="day", exclude=("elsewhere/one", "elsewhere/two"))
 
 
-def test_a_group_of_nothing_is_none() -> None:
-    with pytest.raises(InputError, match="60 of 60 episodes"):
-        opened(split_by=r"LAB(x*)")
-
-
-def test_a_field_that_is_not_there_is_refused_with_those_that_are() -> None:
-    with pytest.raises(InputError, match=r"no such field; this data set has none of its own.*lab, day, folder"):
-        opened(split_by="kitchen")
-
-
 @pytest.mark.parametrize("pattern", ["(", "(a)(b)", r"\d+-\d+", "(?:a)", "", "(?P<a>", "a" * 501])
 def test_a_pattern_without_one_group_is_refused_with_the_config(pattern: str) -> None:
     with pytest.raises(ValidationError, match="split_by"):
         config_of(split_by=pattern)
-
-
-def test_a_split_without_groups_says_that_groups_are_drawn() -> None:
-    two_days = [name for number, name in enumerate(NAMES) if number % 7 < 2]
-    dataset = opened(two_days, split_by="day", validation_share=0.001, test_share=0.0)
-    with pytest.raises(InputError, match=r"among 18 in 2 groups \(data.split_by\).*three groups or more always have"):
-        dataset.windows("validation")
 
 
 @pytest.mark.parametrize(
@@ -141,24 +119,3 @@ def test_a_latent_cache_knows_the_groups_and_serves_any_grouping(tmp_path: Path)
     plain = config_of(source="npz", path=str(tmp_path / "set"), disk_cache={"dir": str(tmp_path / "cache")})
     folder = write_cache(open_dataset(plain))
     assert count_of_groups(open_dataset(plain.as_kind("latents", path=str(folder), split_by="scene"))) == 3
-
-
-def test_check_says_how_many_groups_there_are_and_inspect_counts_the_splits_of_the_clips(tmp_path: Path) -> None:
-    write_npz(tmp_path / "set", range(8), scene=lambda place: f"room {place % 4}")
-    config = config_of(source="npz", path=str(tmp_path / "set"), split_by="scene", test_share=0.0)
-    findings = {one.about: one for one in check_data(config, clips=2)}
-    assert findings["groups"].text == "4 by scene, each in one split"
-    dataset = open_dataset(config)
-    found = inspect_dataset(dataset).values["splits"]
-    for split in ("train", "validation"):
-        assert found[split]["episodes"] == len(dataset.windows(split).episodes)
-
-
-def test_labels_come_back_from_a_file() -> None:
-    from vjepa2_ac.data.index import Labels
-
-    infos = [EpisodeInfo(name, 20) for name in "abc"]
-    table = EpisodeTable.of(infos, labels={"scene": Labels.of(["x", None, "y"])}, state_hashes=[1, 0, 2])
-    back = EpisodeTable.from_bytes(table.to_bytes())
-    assert [back.labels["scene"].of_episode(place) for place in range(3)] == ["x", None, "y"]
-    assert groups_of(back, np.array([True, False, True]), config_of(split_by="scene")) is not None

@@ -19,13 +19,13 @@ import torch
 
 from clips import clip_at, open_in_memory
 from memory_source import MemorySource
-from recording_cuda import Pinning, RecordingCuda, recorded_copies
+from recording_cuda import Pinning, RecordingCuda
 from synthetic import write_synthetic_droid
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data import loader
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import ProcessShare, collate, training_loader, validation_batches
-from vjepa2_ac.data.streams import NO_COPIES, copies_for
+from vjepa2_ac.data.streams import ToDevice, copies_for
 from vjepa2_ac.episode import Batch, Episode
 from vjepa2_ac.errors import InputError, UnreachableError
 from vjepa2_ac.geometry import actions_from_states, states_in_camera_frame
@@ -79,24 +79,6 @@ def test_another_layout_goes_on_where_the_run_stopped(droid: Path) -> None:
     assert names([ranks[rank][step] for step in range(2) for rank in range(2)]) == alone[5:17]
 
 
-def test_an_epoch_holds_every_training_window_once_and_no_other(droid: Path) -> None:
-    config = config_of(droid)
-    held_out = set(names(list(validation_batches(open_dataset(config), "validation", clips=1000, batch_size=1))))
-    everything = {
-        (info.id, start)
-        for info in open_dataset(config).table
-        for start in range(info.num_steps - config.clip_steps + 1)
-    }
-    epoch = names(take(len(everything - held_out), config, batch_size=1))
-    assert held_out
-    assert len(epoch) == len(set(epoch))
-    assert set(epoch) == everything - held_out
-
-
-def test_seeds_change_the_order(droid: Path) -> None:
-    assert names(take(5, config_of(droid), seed=1)) != names(take(5, config_of(droid), seed=2))
-
-
 def test_the_shards_change_neither_training_nor_validation(droid: Path, tmp_path: Path) -> None:
     other = config_of(write_synthetic_droid(tmp_path / "set", steps=range(12, 18), size=(48, 96), shards=5))
     config = config_of(droid)
@@ -132,7 +114,7 @@ def test_an_error_in_a_worker_is_the_error_the_user_reads(
         features["steps/observation/exterior_image_1_left"][1][:] = [b"GIF89a"] * 12
 
     config = config_of(spoiled(spoil), workers=workers, validation_share=0.0)
-    copies = recorded_copies(RecordingCuda()) if pinned else NO_COPIES
+    copies = ToDevice(RecordingCuda()) if pinned else None
     with monkeypatch.context() as patch:
         _ = Pinning(patch) if pinned else None
         with pytest.raises(InputError, match="not a JPEG") as caught:
@@ -188,9 +170,7 @@ def test_batches_for_a_device_are_pinned_by_the_loader(
     expected = take(2, config_of(droid))
     pinning, cuda = Pinning(monkeypatch), RecordingCuda()
     with closing(
-        training_loader(
-            open_dataset(config_of(droid, workers=workers)), seed=1, batch_size=2, copies=recorded_copies(cuda)
-        )
+        training_loader(open_dataset(config_of(droid, workers=workers)), seed=1, batch_size=2, copies=ToDevice(cuda))
     ) as batches:
         found = [next(batches), next(batches)]
     assert_same(found, expected)

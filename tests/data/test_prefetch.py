@@ -5,11 +5,11 @@ from collections.abc import Generator
 import pytest
 import torch
 
-from recording_cuda import RecordingCuda, recorded_copies
+from recording_cuda import RecordingCuda
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.loader import Batches, MicroBatch, prefetch_next
 from vjepa2_ac.data.selection import BrokenEpisodes
-from vjepa2_ac.data.streams import NO_COPIES, Copies
+from vjepa2_ac.data.streams import ToDevice
 from vjepa2_ac.episode import Batch, Skipped
 from vjepa2_ac.errors import InputError
 
@@ -45,13 +45,13 @@ def cuda() -> RecordingCuda:
     return RecordingCuda()
 
 
-def batches_of(rows: Rows, copies: Copies) -> Batches:
+def batches_of(rows: Rows, copies: ToDevice | None) -> Batches:
     return Batches(rows(), BrokenEpisodes(DataConfig(path="x", broken_episodes="skip"), 1000), copies)
 
 
 def test_a_batch_fetched_ahead_is_copied_at_once_and_comes_in_its_turn(cuda: RecordingCuda) -> None:
     rows = Rows(3)
-    batches = batches_of(rows, recorded_copies(cuda))
+    batches = batches_of(rows, ToDevice(cuda))
     first = next(batches)
     assert rows.fetched == 1
     cuda.calls.clear()
@@ -65,7 +65,7 @@ def test_a_batch_fetched_ahead_is_copied_at_once_and_comes_in_its_turn(cuda: Rec
 
 
 def test_the_copy_on_the_device_is_given_once_and_the_batch_stays(cuda: RecordingCuda) -> None:
-    given = next(batches_of(Rows(3), recorded_copies(cuda)))
+    given = next(batches_of(Rows(3), ToDevice(cuda)))
     cuda.calls.clear()
     there = given.on_device()
     assert cuda.calls == ["computing: waits for event 1", *["memory in use by computing"] * 2]
@@ -78,7 +78,7 @@ def test_the_copy_on_the_device_is_given_once_and_the_batch_stays(cuda: Recordin
 @pytest.mark.parametrize("error", [InputError(where="x", found="damaged"), RuntimeError("a worker died"), None])
 def test_what_goes_wrong_ahead_is_raised_when_its_turn_has_come(cuda: RecordingCuda, error: Exception | None) -> None:
     rows = Rows(2, error=error)
-    batches = batches_of(rows, recorded_copies(cuda))
+    batches = batches_of(rows, ToDevice(cuda))
     for number in range(2):
         assert next(batches).starts == (number,)
         prefetch_next(batches)
@@ -92,7 +92,7 @@ def test_what_goes_wrong_ahead_is_raised_when_its_turn_has_come(cuda: RecordingC
 
 def test_clips_left_out_ahead_are_noted_when_their_turn_has_come(cuda: RecordingCuda) -> None:
     broken = BrokenEpisodes(DataConfig(path="x", broken_episodes="skip"), 1000)
-    batches = Batches(Rows(2, skipped=(1,))(), broken, recorded_copies(cuda))
+    batches = Batches(Rows(2, skipped=(1,))(), broken, ToDevice(cuda))
     next(batches)
     prefetch_next(batches)
     assert broken.reasons == {}
@@ -102,7 +102,7 @@ def test_clips_left_out_ahead_are_noted_when_their_turn_has_come(cuda: Recording
 
 def test_on_a_cpu_nothing_is_fetched_ahead_and_batches_are_as_they_were() -> None:
     rows = Rows(2)
-    batches = batches_of(rows, NO_COPIES)
+    batches = batches_of(rows, None)
     assert next(batches).on_device is None
     prefetch_next(batches)
     assert rows.fetched == 1
@@ -112,7 +112,7 @@ def test_on_a_cpu_nothing_is_fetched_ahead_and_batches_are_as_they_were() -> Non
 
 def test_closing_ends_the_rows_and_lets_go_of_what_was_fetched_ahead(cuda: RecordingCuda) -> None:
     rows = Rows(3)
-    batches = batches_of(rows, recorded_copies(cuda))
+    batches = batches_of(rows, ToDevice(cuda))
     next(batches)
     prefetch_next(batches)
     batches.close()

@@ -3,11 +3,9 @@
 import pytest
 import torch
 
-from recording_cuda import COMPUTING, RecordingCuda, recorded_copies
-from vjepa2_ac.data.streams import Change, copies_for
+from recording_cuda import COMPUTING, RecordingCuda
+from vjepa2_ac.data.streams import ToDevice, copies_for
 from vjepa2_ac.episode import Batch, StoredLatents
-
-CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 
 
 def batch(count: int = 2) -> Batch:
@@ -46,7 +44,7 @@ def pinned(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_copy_to_the_device_is_on_its_way_at_once_and_only_computing_waits_for_it() -> None:
     cuda = RecordingCuda()
     given = batch()
-    taken = recorded_copies(cuda).to_device.start(given.mapped)
+    taken = ToDevice(cuda).start(given.mapped)
     assert cuda.calls == ["side 1: to device"] * 6 + ["side 1: event 1"]
     cuda.calls.clear()
     assert_equal(taken(), given)
@@ -55,47 +53,25 @@ def test_a_copy_to_the_device_is_on_its_way_at_once_and_only_computing_waits_for
 
 def test_what_is_not_pinned_is_pinned_first() -> None:
     cuda, tensor = RecordingCuda(), torch.ones(2)
-    recorded_copies(cuda).to_device.start(lambda copy: copy(tensor))
+    ToDevice(cuda).start(lambda copy: copy(tensor))
     assert cuda.calls[:2] == ["side 1: to pinned memory", "side 1: to device"]
 
 
-def test_a_copy_from_the_device_starts_when_it_is_computed_and_is_waited_for_alone() -> None:
-    cuda = RecordingCuda()
-    given = StoredLatents(torch.ones(2, 3, 4), torch.ones(2, 3))
-    taken = recorded_copies(cuda).to_host.start(given.mapped)
-    assert cuda.calls == [
-        f"{COMPUTING}: event 1", "side 2: waits for event 1",
-        *["memory in use by side 2", "side 2: to pinned memory"] * 2, "side 2: event 2",
-    ]  # fmt: skip
-    cuda.calls.clear()
-    assert_equal(taken(), given)
-    assert cuda.calls == ["host: waits for event 2"]
-
-
 def test_on_a_cpu_nothing_is_copied() -> None:
-    copies, given = copies_for(torch.device("cpu")), batch()
-    assert not copies.overlap
-    for way in (copies.to_device, copies.to_host):
-        found = way.start(given.mapped)()
-        assert all(one is other for one, other in zip(tensors(found), tensors(given), strict=True))
+    assert copies_for(torch.device("cpu")) is None
 
 
 def test_a_batch_is_as_large_as_its_tensors() -> None:
     assert batch(3).nbytes == 3 * (2 * 6 + 4 * (2 * 7 + 7 + 2 * 6) + 2 * 3 * 4 + 4 * 2 * 3)
 
 
-@CUDA
-def test_tensors_cross_to_cuda_and_back_unharmed() -> None:
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_tensors_reach_cuda_unharmed() -> None:
     device, given = torch.device("cuda"), batch()
     copies = copies_for(device)
-    assert copies.overlap
+    assert copies is not None
     assert copies_for(device) is copies
-    started = [copies.to_device.start(given.mapped) for _ in range(3)]
-    there = [taken() for taken in started]
-    assert all(tensor.is_cuda for one in there for tensor in tensors(one))
-    twice: Change = lambda tensor: tensor + tensor  # noqa: E731
-    back = [copies.to_host.start(one.mapped(twice).mapped) for one in there]
-    for taken in back:
+    for taken in [copies.start(given.mapped) for _ in range(3)]:
         found = taken()
-        assert all(tensor.is_pinned() for tensor in tensors(found))
-        assert_equal(found, given.mapped(twice))
+        assert all(tensor.is_cuda for tensor in tensors(found))
+        assert_equal(found.mapped(torch.Tensor.cpu), given)

@@ -18,7 +18,6 @@ from vjepa2_ac.data.transforms import (
     draw,
     frame_of_seen,
     frames_as_seen,
-    images_to_input,
     input_to_pixels,
     jittered,
     per_channel,
@@ -61,13 +60,6 @@ def test_tall_frames_are_cut_too_and_cropped_ones_are_left(height: int, width: i
     assert crop_box(height, width) == CropBox(*expected)
 
 
-def test_the_crop_is_a_slice_of_the_same_pixels() -> None:
-    frames = np.random.default_rng(0).integers(0, 256, (2, 18, 32, 3), dtype=np.uint8)
-    cropped = view(frames)
-    assert cropped.base is frames
-    assert np.array_equal(cropped, frames[:, :, 4:28])
-
-
 def test_the_transform_equals_the_official_one_on_a_frame() -> None:
     with np.load(GOLDEN / "transform_frame.npz") as golden:
         frame, expected = golden["frame"], golden["clip"].astype(np.float32)
@@ -105,12 +97,9 @@ def test_what_inference_has_kept_can_be_trained_with() -> None:
     )
 
 
-def test_images_become_the_input_that_shows_them() -> None:
-    pixels = torch.randint(0, 256, (2, 3, 3, 8, 8), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
-    inputs = images_to_input(pixels / 255)
-    assert torch.equal(input_to_pixels(inputs), pixels)
-    frames = pixels.permute(0, 1, 3, 4, 2)
-    torch.testing.assert_close(inputs, pixels_to_input(frames, 8), rtol=0, atol=1e-5)
+def test_input_goes_back_to_the_image_that_it_is() -> None:
+    frames = torch.randint(0, 256, (2, 3, 8, 8, 3), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+    assert torch.equal(input_to_pixels(pixels_to_input(frames, 8)).permute(0, 1, 3, 4, 2), frames)
 
 
 @pytest.mark.parametrize("kind", ["released", "square", "letterbox"])
@@ -133,10 +122,6 @@ ALL = AugmentConfig(crop_scale=(0.3, 0.9), brightness=0.3, contrast=0.3, saturat
 def clip(seed: int = 0, *, batch: int = 2, time: int = 3) -> torch.Tensor:
     generator = torch.Generator().manual_seed(seed)
     return torch.randint(0, 256, (batch, time, 18, 24, 3), dtype=torch.uint8, generator=generator)
-
-
-def test_nothing_is_drawn_where_nothing_may_change() -> None:
-    assert draw(AugmentConfig(), 18, 24, seed=0, position=0) is None
 
 
 def test_a_draw_follows_from_seed_and_position_alone() -> None:
@@ -244,22 +229,3 @@ GREY = 0.299 * 100 + 0.587 * 200 + 0.114 * 10
 )
 def test_each_factor_blends_with_a_plainer_frame_and_clamps(factors: dict[str, float], expected: list[float]) -> None:
     assert jitter((100.0, 200.0, 10.0), **factors) == pytest.approx(expected, abs=1e-3)
-
-
-def test_a_grey_pixel_has_no_saturation_to_change() -> None:
-    assert jitter((90.0, 90.0, 90.0), saturation=1.9) == [pytest.approx(90.0, abs=1e-3)] * 3
-
-
-def test_contrast_spreads_around_the_mean() -> None:
-    pixels = torch.tensor([50.0, 150.0]).view(1, 1, 1, 2).expand(1, 3, 1, 2)
-    found = jittered(pixels, Augmentation((0, 0, 1, 2), contrast=1.5))
-    torch.testing.assert_close(found[0, 0, 0], torch.tensor([25.0, 175.0]))
-
-
-def test_a_dark_frame_stays_dark_whatever_the_others_are() -> None:
-    frames = torch.full((2, 20, 30, 3), 20, dtype=torch.uint8)
-    frames[1] = 200
-    shown = frames_as_seen(frames.numpy(), 16)
-    assert shown.shape == (2, 16, 16, 3)
-    assert (shown[0] == 20).all()
-    assert (shown[1] == 200).all()

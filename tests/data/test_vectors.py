@@ -17,10 +17,10 @@ from vector_sets import vectors, write_vectors
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.data.sources.registry import open_source
+from vjepa2_ac.data.sources.indexed_source import open_source
 from vjepa2_ac.episode import Batch, Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.inspection.check import check_data, findings_in
+from vjepa2_ac.inspection.check import findings_in
 from vjepa2_ac.inspection.sheet import plot_dataset
 from vjepa2_ac.inspection.statistics import CHANGED, inspect_dataset
 from vjepa2_ac.spaces import Spaces
@@ -60,12 +60,6 @@ def test_commands_of_a_model_step_are_those_of_its_control_steps_joined(
     clip = clip_at(dataset, 1, 4)
     written = vectors(24, 5, seed=1001)  # of control steps 4, 5 and 6, 7
     np.testing.assert_array_equal(clip.actions, join(written[4:8].reshape(2, 2, 5), axis=1).astype(np.float32))
-
-
-def test_at_stride_one_there_is_nothing_to_join(tmp_path: Path) -> None:
-    config = knobs(write_vectors(tmp_path, width=8, action_width=8), stride=1, actions="recorded")
-    clip = clip_at(open_dataset(config), 0, 0)
-    np.testing.assert_array_equal(clip.actions, vectors(24, 8, seed=1000)[:2].astype(np.float32))
 
 
 def test_a_pose_that_is_read_as_a_vector_is_not_turned_into_rotations(droid: Path) -> None:
@@ -193,16 +187,6 @@ def test_what_needs_poses_or_says_too_little_is_refused_with_the_config(
     values = {"path": "d", "source": "npz", "states": "vector"} | changes
     with pytest.raises(InputError, match=complaint):
         parse_config({"run_dir": "r", "model": {"base": "b"}, "data": values}, where="here")
-
-
-def test_the_check_says_how_wide_and_that_all_is_well(tmp_path: Path) -> None:
-    config = knobs(write_vectors(tmp_path, width=14, action_width=3), **recorded_by("sum"))
-    found = {one.about: one for one in check_data(config, clips=8)}
-    assert {one.level for one in found.values()} == {"ok"}
-    assert found["states"].text.startswith("14 numbers, -1")
-    assert found["actions"].text.startswith("3 numbers")
-    assert "states (2, 3, 14), actions (2, 2, 3)" in found["batch"].text
-    assert found["pictures"].text.startswith("0 of 16")
 
 
 FIVE = Spaces.of_vectors(Widths(5, 5), "difference")

@@ -292,9 +292,7 @@ def test_a_cache_has_the_clips_of_its_data_set_in_their_order(
 
 def test_clips_start_at_multiples_of_start_every_from_the_first_kept_step() -> None:
     table = EpisodeTable.of([EpisodeInfo("a", 40), EpisodeInfo("b", 20)])
-    kept = StepSelection(
-        *(np.array(column, np.int32) for column in ([0, 0, 1], [3, 20, 0], [16, 31, 20])), np.ones(2, bool)
-    )
+    kept = StepSelection(*(np.array(column, np.int32) for column in ([0, 0, 1], [3, 20, 0], [16, 31, 20])))
     config = DataConfig(path="nowhere", frames=3, stride=2, start_every=4)
     starts = clip_starts(table, kept, config)
     found = [

@@ -1,12 +1,10 @@
-"""What the machine has: in what its GPU computes, and how fast its network is, where a large file said so."""
+"""What the machine has: in what its GPU computes."""
 
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
 
-from vjepa2_ac.init import machine
 from vjepa2_ac.init.machine import this_machine
 
 
@@ -30,10 +28,3 @@ def test_a_card_has_bf16_from_ampere_on(
 def test_a_cpu_computes_in_fp32(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert this_machine().precision == "fp32"
-
-
-def test_a_small_file_says_nothing_about_the_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "file").write_bytes(bytes(2_000_000))
-    assert this_machine(str(tmp_path / "file")).read_bytes_per_s is not None
-    monkeypatch.setattr(machine, "_LEAST_BYTES", 3_000_000)
-    assert this_machine(str(tmp_path / "file")).read_bytes_per_s is None

@@ -9,7 +9,6 @@ import torch
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.episode import Batch
-from vjepa2_ac.errors import InputError
 from vjepa2_ac.inspection.check import check_data, findings_in
 from vjepa2_ac.inspection.excerpts import Finding
 from vjepa2_ac.inspection.statistics import at_some_stride
@@ -103,15 +102,3 @@ def test_an_auto_stride_is_looked_at_at_the_smallest_candidate(droid: Path) -> N
     findings = {finding.about: finding for finding in check_data(config, clips=2)}
     assert "smallest candidate, 2" in findings["stride"].text
     assert at_some_stride(open_dataset(config)).config.stride == 2
-
-
-def test_what_filters_remove_is_said(droid: Path) -> None:
-    dataset = open_dataset(knobs(droid))
-    names = [dataset.table.identity(number) for number in range(len(dataset.table))]
-    findings = {finding.about: finding for finding in check_data(knobs(droid, exclude=(names[0],)), clips=2)}
-    assert "1 episodes, " in findings["filter excluded"].text
-
-
-def test_data_that_are_not_there_are_an_input_error(tmp_path: Path) -> None:
-    with pytest.raises(InputError):
-        list(check_data(knobs(tmp_path / "nowhere")))

@@ -170,7 +170,7 @@ def in_memory(lengths: list[int], **changes: object) -> Dataset:
 
 def test_the_middle_of_the_longest_kept_range_is_looked_at() -> None:
     dataset = in_memory([300] * 4 + [20], exclude=())
-    ranges = StepSelection(*(np.array(column, np.int32) for column in ([4, 4], [0, 8], [5, 20])), np.arange(5) > 3)
+    ranges = StepSelection(*(np.array(column, np.int32) for column in ([4, 4], [0, 8], [5, 20])))
     dataset = Dataset(dataset.config, dataset.source, dataset.table, ranges, dataset.broken)
     (found,) = excerpts_of(dataset, steps=6)
     assert found.name == "episode 4"

@@ -14,7 +14,7 @@ from PIL import Image
 from lerobot_sets import recorded, write_v30
 from synthetic import write_synthetic_droid
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.sources.registry import open_source
+from vjepa2_ac.data.sources.indexed_source import open_source
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media import jpeg
 from vjepa2_ac.media.image_file import decode_image, read_image

@@ -10,7 +10,7 @@ import torch
 from adapted_run import write_adapted_run
 from decisions import STATE, image
 from vjepa2_ac.config.loading import config_as_dict, config_as_yaml
-from vjepa2_ac.data.sources.registry import open_source
+from vjepa2_ac.data.sources.indexed_source import open_source
 from vjepa2_ac.episode import Episode
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.checkpoints.loading import load_base

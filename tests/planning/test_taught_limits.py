@@ -11,7 +11,7 @@ from adapted_run import write_adapted_run
 from decisions import image
 from vjepa2_ac.config.loading import load_config
 from vjepa2_ac.config.planning import PlanningConfig
-from vjepa2_ac.data.sources.registry import open_source
+from vjepa2_ac.data.sources.indexed_source import open_source
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions, settle
 from vjepa2_ac.geometry import actions_from_states

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import pytest
 import torch
 
-from vjepa2_ac.data.streams import Copies, Cuda, ToDevice, ToHost
+from vjepa2_ac.data.streams import Cuda
 
 COMPUTING = "computing"
 
@@ -66,14 +66,6 @@ class RecordedStream:
 class RecordedEvent:
     cuda: RecordingCuda
     number: int
-
-    def synchronize(self) -> None:
-        self.cuda.calls.append(f"host: waits for event {self.number}")
-
-
-def recorded_copies(cuda: RecordingCuda) -> Copies:
-    """Return copies to a recording device (on side stream 1) and from it (2)."""
-    return Copies(ToDevice(cuda), ToHost(cuda), overlap=True)
 
 
 class Pinning:

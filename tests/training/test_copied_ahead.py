@@ -9,13 +9,14 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from recording_cuda import RecordingCuda, recorded_copies
+from recording_cuda import RecordingCuda
 from run_fixtures import set_up
 from same_run import assert_same_run
 from vjepa2_ac.data import loader
 from vjepa2_ac.data.clips import ClipRequest
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.loader import Batches, MicroBatch, training_loader
+from vjepa2_ac.data.streams import ToDevice
 from vjepa2_ac.episode import Clip
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.runs.checkpoint import read_state
@@ -50,7 +51,7 @@ def copied(run: Run, cuda: RecordingCuda) -> Batches:
     def rows() -> Generator[MicroBatch | InputError, None, None]:
         yield from map(MicroBatch, training_loader(run.dataset, seed=0, batch_size=2))
 
-    return Batches(rows(), run.dataset.broken, recorded_copies(cuda))
+    return Batches(rows(), run.dataset.broken, ToDevice(cuda))
 
 
 def micro_batch(event: int) -> list[str]:
@@ -90,7 +91,7 @@ def on_device(monkeypatch: pytest.MonkeyPatch) -> RecordingCuda:
         return DataLoader(*arguments, **knobs)
 
     cuda = RecordingCuda()
-    copies = recorded_copies(cuda)
+    copies = ToDevice(cuda)
     monkeypatch.setattr(setup, "copies_for", lambda _: copies)
     monkeypatch.setattr(loader, "DataLoader", unpinned)
     return cuda

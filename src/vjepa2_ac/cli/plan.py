@@ -134,7 +134,7 @@ def _search_line(config: PlanningConfig, *, on_cpu: bool) -> str:
 
 def _require_state(state: np.ndarray, config: Config) -> None:
     """Refuse a state that is none of the config's space; how wide a vector is, only the model knows."""
-    from vjepa2_ac.data.sources.configured_spaces import measured_space
+    from vjepa2_ac.data.sources.indexed_source import measured_space
     from vjepa2_ac.planning.input_checks import require_numbers
 
     require_numbers(state, measured_space(config.data, len(state)), where="--state")

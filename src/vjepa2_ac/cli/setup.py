@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from vjepa2_ac.cli import options as cli
 from vjepa2_ac.errors import InputError, UserError
 from vjepa2_ac.places import BUILTIN
-from vjepa2_ac.storage import is_url, try_writing_at, user_can_write, write_atomically
+from vjepa2_ac.storage import try_writing_at, user_can_write, write_atomically
 
 if TYPE_CHECKING:
     from vjepa2_ac.init.draft import Draft
@@ -100,7 +100,6 @@ def _init(options: argparse.Namespace) -> int:
     is_missing = path == _SIMULATED and not Path(path).exists()
     found = simulated(path) if is_missing else look_at(path, _LOOKED_AT_AS.get(form or "", form))
 
-    from vjepa2_ac.init.choices import download_of
     from vjepa2_ac.init.draft import TINY, choose_model, make_draft
     from vjepa2_ac.init.found import guesses
     from vjepa2_ac.init.look import measured
@@ -111,18 +110,18 @@ def _init(options: argparse.Namespace) -> int:
         found = found if is_missing else measured(found, reporter.task(INDEXING))
     model_path = options.model or (TINY if path == _SIMULATED or form == "sim" else None)
     model = choose_model("scratch" if form == "scratch" else "released", model_path)
-    machine = this_machine(found.sample if is_url(found.path) else "")
+    machine = this_machine()
     cli.show(f"Data: {'; '.join(found.about)}.\nMachine: {machine.about}.")
     draft = make_draft(found, machine, model, run_dir=f"runs/{name}")
     with user_can_write(f"--out {out}"):
         write_atomically(out, draft.text(found, machine).encode())
     guessed = [f"  guessed  {key}{': ' if why else ''}{why}" for key, why in guesses(draft.knobs).items()]
-    cli.show(*draft.costs(machine), f"Written: {out}", *guessed)
+    cli.show(*draft.costs, f"Written: {out}", *guessed)
     status = 0 if is_missing else _check(draft, out)
     if status:
         cli.show(f"\nMend this first, then: vjepa2-ac data check {out}")
     first = [(f"vjepa2-ac {_RECORD.format(path=path)}", "the data; half a minute on a core of its own")] * is_missing
-    if not Path(model.path).exists() and (fetch := download_of(model, machine)):
+    if not Path(model.path).exists() and (fetch := model.download):
         first.append((fetch[0], f"the model, once: {fetch[1]}"))
     cli.show("\nNext:", *(f"  {line}   # {about}" for line, about in [*first, *_next(draft, out, name)]))
     return status

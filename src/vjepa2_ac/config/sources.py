@@ -120,6 +120,7 @@ class RawDroidData(DataConfig):
 
     reader: ClassVar[str] = "vjepa2_ac.data.sources.droid_raw.source:RawDroidSource"
     has_vectors: ClassVar[bool] = False
+    same_identity_fix: ClassVar[str] = "Name a smaller folder in data.path"
 
     source: Annotated[Literal["droid_raw"], Affects.FORM] = "droid_raw"
     """droid_raw: DROID's folders with trajectory.h5 and MP4."""

@@ -13,7 +13,7 @@ from torch import Tensor
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import Dataset, require_widths
 from vjepa2_ac.data.selection import with_way_out
-from vjepa2_ac.data.sources.configured_spaces import measured_space
+from vjepa2_ac.data.sources.indexed_source import measured_space
 from vjepa2_ac.data.transforms import view
 from vjepa2_ac.episode import Augmentation, Batch, Clip, StoredLatents, Widths
 from vjepa2_ac.errors import InputError
@@ -53,12 +53,8 @@ def read_clip(dataset: Dataset, request: ClipRequest) -> Clip:
     extrinsics = None if recording.extrinsics is None else recording.extrinsics[list(steps)]
     if config.pose_frame == "camera":
         if extrinsics is None:
-            raise InputError(
-                where=f"episode {recording.info.id}",
-                found="no pose of the camera",
-                needed="one, for data.pose_frame: camera",
-                fix="Set data.pose_frame: base, or choose a camera that has one",
-            )
+            fix = "Set data.pose_frame: base, or choose a camera that has one"
+            raise InputError(where=f"episode {recording.info.id}", found="no pose of the camera", fix=fix)
         states = states_in_camera_frame(states, extrinsics)
     return Clip(
         frames=frames,
@@ -143,13 +139,9 @@ def _two_sizes(clips: Sequence[Clip]) -> InputError:
     sizes = [("x".join(map(str, one.frames.shape[1:3])), one.episode_id) for one in clips if one.frames is not None]
     size, first = sizes[0]
     other, name = next(pair for pair in sizes if pair[0] != size)
-    error = InputError(
-        where=f"episode {name}",
-        found=f"frames of {other} after the crop",
-        needed=f"{size}, as in episode {first}",
-        fix="Train on episodes of one size, or set training.batch_size: 1",
-    )
-    return with_way_out(error, [name], skippable=False)
+    found = f"frames of {other} after the crop; those of episode {first} are {size}"
+    fix = "Train on episodes of one size, or set training.batch_size: 1"
+    return with_way_out(InputError(where=f"episode {name}", found=found, fix=fix), [name], skippable=False)
 
 
 def joined_latents(latents: Sequence[StoredLatents], join: Callable[[list[Tensor]], Tensor]) -> StoredLatents:

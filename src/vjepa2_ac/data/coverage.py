@@ -11,20 +11,22 @@ plans worse than its base).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float
 
 from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.data.idle import in_order
+from vjepa2_ac.data.files import connections_to, in_parallel
 from vjepa2_ac.data.windows import spread
-from vjepa2_ac.episode import Episode, Progress, no_progress
+from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.geometry import states_in_camera_frame
 from vjepa2_ac.spaces import POSE, StateSpace
+
+T = TypeVar("T")
 
 PERCENTILE = 99  # of each number's change: what was taught
 PLAY = (
@@ -72,28 +74,39 @@ def sample_of(dataset: Dataset, count: int) -> list[int]:
     return [int(members[place]) for place in spread(len(members), count)]
 
 
-def read_sample(dataset: Dataset, count: int, progress: Progress = no_progress) -> Iterator[ReadEpisode]:
-    """Read at most `count` episodes, without frames; those that cannot be read are treated as `leave_out` says.
+def read_each(
+    dataset: Dataset, chosen: Sequence[int], read: Callable[[int], T], progress: Progress = no_progress
+) -> Iterator[tuple[int, T]]:
+    """Yield some episodes with what is read of each; those that cannot be read are treated as `leave_out` says.
 
     Raises:
         InputError: An episode cannot be read, and `data.broken_episodes` does not skip it.
     """
 
-    def look(index: int) -> Episode | InputError:
+    def look(index: int) -> T | InputError:
         try:
-            return dataset.source.read(index)
+            return read(index)
         except InputError as error:
             return error
 
-    chosen = sample_of(dataset, count)
-    found = in_order(look, chosen, dataset.config)
-    for done, (index, episode) in enumerate(zip(chosen, found, strict=True), start=1):
+    found = in_parallel(look, chosen, connections_to(dataset.config))
+    for done, (index, one) in enumerate(zip(chosen, found, strict=True), start=1):
         progress(done, len(chosen))
-        if isinstance(episode, InputError):
-            dataset.leave_out(index, episode)
+        if isinstance(one, InputError):
+            dataset.leave_out(index, one)
         else:
-            camera = episode.extrinsics if dataset.config.pose_frame == "camera" else None
-            yield ReadEpisode(index, np.asarray(episode.states, np.float64), tuple(dataset.kept.of(index)), camera)
+            yield index, one
+
+
+def read_sample(dataset: Dataset, count: int, progress: Progress = no_progress) -> Iterator[ReadEpisode]:
+    """Read at most `count` episodes, without frames.
+
+    Raises:
+        InputError: As `read_each`.
+    """
+    for index, episode in read_each(dataset, sample_of(dataset, count), dataset.source.read, progress):
+        camera = episode.extrinsics if dataset.config.pose_frame == "camera" else None
+        yield ReadEpisode(index, np.asarray(episode.states, np.float64), tuple(dataset.kept.of(index)), camera)
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -14,8 +13,8 @@ from jaxtyping import Bool, Int, UInt64
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.idle import FoundRanges, find_ranges
-from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable
+from vjepa2_ac.data.idle import find_ranges
+from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.data.selection import (
     BrokenEpisodes,
     StepSelection,
@@ -25,8 +24,7 @@ from vjepa2_ac.data.selection import (
     require_distinct,
     with_way_out,
 )
-from vjepa2_ac.data.sources.configured_spaces import spaces_of
-from vjepa2_ac.data.sources.registry import open_source
+from vjepa2_ac.data.sources.indexed_source import open_source, spaces_of
 from vjepa2_ac.data.windows import Windows, clip_starts, in_split, windows_of
 from vjepa2_ac.episode import POSE_WIDTHS, Episode, EpisodeSource, Progress, StepRanges, Widths
 from vjepa2_ac.errors import InputError
@@ -55,7 +53,7 @@ class Removed:
 class EncodedSource(EpisodeSource, Protocol):
     """A source of encoded episodes: its steps were selected when they were encoded."""
 
-    def kept_ranges(self) -> FoundRanges:
+    def kept_ranges(self) -> StepSelection:
         """Return the ranges that `data.idle` keeps."""
         ...
 
@@ -79,6 +77,13 @@ class Dataset:
     broken: BrokenEpisodes  # grows in the process that opened the set
     groups: UInt64[np.ndarray, " episodes"] | None = None  # hash of each one's group; None: `data.split_by` names none
 
+    @cached_property
+    def taking_part(self) -> Bool[np.ndarray, " episodes"]:
+        """Which episodes are used, although none of their steps may be kept."""
+        chosen = np.asarray(included(self.table, self.config) & of_outcome(self.table, self.config))
+        chosen[[place for place, _ in self.kept.problems]] = False
+        return chosen
+
     @property
     def split_hash(self) -> UInt64[np.ndarray, " episodes"]:
         """The hashes that determine the split of each episode."""
@@ -87,7 +92,7 @@ class Dataset:
     def members(self, split: Split) -> Bool[np.ndarray, " episodes"]:
         """Return which episodes are used and belong to a split."""
         among = of_outcome(self.table, self.config)
-        return np.asarray(self.kept.taking_part & in_split(self.split_hash, self.config, split, among))
+        return np.asarray(self.taking_part & in_split(self.split_hash, self.config, split, among))
 
     def windows(self, split: Split) -> Windows:
         """Return the clips of a split.
@@ -101,21 +106,18 @@ class Dataset:
         return windows_of(self.table, members, self.starts, self.config, split)
 
     def _empty_split(self, split: Split) -> InputError:
-        config, taking_part = self.config, self.kept.taking_part
+        config, taking_part = self.config, self.taking_part
         groups = None if config.split_by is None else len(np.unique(self.split_hash[taking_part]))
         together = "" if groups is None else f" in {groups} groups (data.split_by)"
         shares = f"validation_share {config.validation_share:g}, test_share {config.test_share:g}"
         share = {"train": 1.0, "validation": config.validation_share, "test": config.test_share}[split]
         always = f"above 0, three {'episodes' if groups is None else 'groups'} or more always have one"
         always += ", unless it is broken or in data.exclude" if share else ""
-        return InputError(
-            where=f"data.path: {config.path}",
-            found=f"no {split} episodes among {taking_part.sum()}{together} ({shares})",
-            needed="one or more",
-            fix="Lower data.validation_share or data.test_share"
-            if split == "train"
-            else f"Raise data.{split}_share: {always}",
-        )
+        fix = f"Raise data.{split}_share: {always}"
+        if split == "train":
+            fix = "Lower data.validation_share or data.test_share"
+        found = f"no {split} episodes among {taking_part.sum()}{together} ({shares})"
+        return InputError(where=f"data.path: {config.path}", found=found, fix=fix)
 
     def with_stride(self, stride: int) -> Dataset:
         """Return the data set with another stride.
@@ -124,12 +126,9 @@ class Dataset:
             InputError: The data is a latent cache, which has the frames of one stride only.
         """
         if self.config.is_cache and stride != self.config.stride:
-            raise InputError(
-                where=self.config.path,
-                found=f"latents that were encoded for clips at stride {self.config.stride}",
-                needed=f"stride {stride}",
-                fix="Use the data set itself, with data.cache: off",
-            )
+            found = f"latents that were encoded for clips at stride {self.config.stride}, not {stride}"
+            fix = "Use the data set itself, with data.cache: off"
+            raise InputError(where=self.config.path, found=found, fix=fix)
         return replace(self, config=self.config.with_stride(stride))
 
     @cached_property
@@ -137,7 +136,7 @@ class Dataset:
         """What each filter removed, in their order."""
         included_ones = included(self.table, self.config)
         chosen = included_ones & of_outcome(self.table, self.config)
-        masks = np.ones(len(self.table), bool), included_ones, chosen, self.kept.taking_part
+        masks = np.ones(len(self.table), bool), included_ones, chosen, self.taking_part
         left = [self._count(StepSelection.whole(self.table, mask)) for mask in masks]
         gone = -np.diff([*left, self._count(self.kept)], axis=0)
         excluded = sum(problem.name in self.config.exclude for problem in self.table.problems)
@@ -228,24 +227,21 @@ def open_dataset(config: DataConfig, *, progress: Progress | None = None) -> Dat
     source = open_source(config)
     table = EpisodeTable.of(source.infos(progress))
     broken = BrokenEpisodes(config, len(table) + len(table.problems))
-    taking_part = included(table, config)
-    require_distinct(table, taking_part, config)
-    broken.found(_not_excluded(table.problems, config))
-    taking_part &= of_outcome(table, config)
-    kept = StepSelection.whole(table, taking_part)
+    chosen = included(table, config)
+    require_distinct(table, chosen, config)
+    broken.found([problem for problem in table.problems if problem.name not in config.exclude])
+    chosen &= of_outcome(table, config)
+    kept = StepSelection.whole(table, chosen)
     if config.idle.rule != "none":
-        if isinstance(source, EncodedSource):
-            found = source.kept_ranges()
-        else:
-            found = find_ranges(source, table, config, progress)
-        met = [(place, problem) for place, problem in found.problems if taking_part[place]]
-        broken.found([problem for _, problem in met])
-        taking_part[[place for place, _ in met]] = False
-        kept = StepSelection(found.episode, found.start, found.end, taking_part).only(taking_part)
-    dataset = Dataset(config, source, table, kept, broken, groups_of(table, kept.taking_part, config))
+        found = None if not isinstance(source, EncodedSource) else source.kept_ranges()
+        found = found or find_ranges(source, table, config, progress)
+        broken.found([problem for place, problem in found.problems if chosen[place]])
+        kept = found.only(chosen)
+    dataset = Dataset(config, source, table, kept, broken)
+    dataset = replace(dataset, groups=groups_of(table, dataset.taking_part, config))
     if not len(dataset.episodes):
         raise _nothing_left(dataset)
-    logger.info("%s: %d episodes take part, %d steps of them", config.path, kept.taking_part.sum(), kept.steps)
+    logger.info("%s: %d episodes take part, %d steps of them", config.path, dataset.taking_part.sum(), kept.steps)
     return _settled(dataset)
 
 
@@ -267,20 +263,12 @@ def _settled(dataset: Dataset) -> Dataset:
     return replace(dataset, config=dataset.source.settle(dataset.starts.episode))
 
 
-def _not_excluded(problems: Sequence[EpisodeProblem], config: DataConfig) -> list[EpisodeProblem]:
-    excluded = frozenset(config.exclude)
-    return [problem for problem in problems if problem.name not in excluded]
-
-
 def _nothing_left(dataset: Dataset) -> InputError:
     filters = ", ".join(f"{one.name} {one.episodes}" for one in dataset.removed if one.episodes)
-    return InputError(
-        where=f"data.path: {dataset.config.path}",
-        found=f"none of {len(dataset.table) + len(dataset.table.problems)} episodes is left"
-        + (f" (left out: {filters})" if filters else ""),
-        needed="at least one",
-        fix="Look at data.exclude, data.outcome and data.idle" if filters else "",
-    )
+    found = f"none of {len(dataset.table) + len(dataset.table.problems)} episodes is left"
+    found += f" (left out: {filters})" if filters else ""
+    fix = "Look at data.exclude, data.outcome and data.idle" if filters else ""
+    return InputError(where=f"data.path: {dataset.config.path}", found=found, fix=fix)
 
 
 def widths_of(episode: Episode) -> Widths:
@@ -297,9 +285,7 @@ def require_widths(episode: Episode, widths: Widths) -> None:
     """
     found = widths_of(episode)
     if found != widths:
-        raise InputError(
-            where=f"episode {episode.info.id}",
-            found=f"states of {found.state} and actions of {found.action} numbers",
-            needed=f"{widths.state} and {widths.action}, as in the others",
-            fix="Keep the recordings of different robots in different data sets",
-        )
+        wrong = f"states of {found.state} and actions of {found.action} numbers"
+        needed = f"{widths.state} and {widths.action}, as in the others"
+        fix = "Keep the recordings of different robots in different data sets"
+        raise InputError(where=f"episode {episode.info.id}", found=wrong, needed=needed, fix=fix)

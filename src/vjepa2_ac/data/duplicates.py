@@ -49,7 +49,7 @@ def find_duplicates(dataset: Dataset) -> Duplicates:
     table = dataset.table
     if table.state_hash is None:
         return Duplicates(is_known=False)
-    members = np.flatnonzero(dataset.kept.taking_part & (table.state_hash != UNKNOWN))
+    members = np.flatnonzero(dataset.taking_part & (table.state_hash != UNKNOWN))
     members = members[np.argsort(table.id_rank[members])]
     hashes, count = np.unique(table.state_hash[members], return_counts=True)
     members = members[np.isin(table.state_hash[members], hashes[count > 1])]

@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-import json
 import logging
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import partial
-from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Float, Int32
+from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig, IdleConfig
 from vjepa2_ac.config.section import Affects, knobs_that_affect
-from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable, NotATableError, fingerprint_of, get_or_make, key_of
-from vjepa2_ac.data.selection import as_error, as_problem
+from vjepa2_ac.data.files import connections_to, in_parallel
+from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable, fingerprint_of, get_or_make, key_of
+from vjepa2_ac.data.selection import StepSelection, as_error, as_problem
 from vjepa2_ac.episode import Episode, EpisodeSource, Progress, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.spaces import POSE
-from vjepa2_ac.storage.npz_reader import arrays_as_bytes, read_arrays
 from vjepa2_ac.storage.structured import json_object, shown
 
 logger = logging.getLogger(__name__)
@@ -31,51 +26,11 @@ _MOST_BYTES = 1 << 28  # of a published list
 _ALL_BROKEN = 10  # so many broken episodes at the start, and no others, have one cause
 
 Found = list[tuple[int, int]] | EpisodeProblem
-T = TypeVar("T")
-
-
-@dataclass(frozen=True, eq=False)
-class FoundRanges:
-    """The remaining ranges [start, end) of all episodes of a table, and the episodes that could not be read."""
-
-    episode: Int32[np.ndarray, " ranges"]  # ascending
-    start: Int32[np.ndarray, " ranges"]
-    end: Int32[np.ndarray, " ranges"]
-    problems: tuple[tuple[int, EpisodeProblem], ...] = ()  # with the episode's place in the table
-
-    @classmethod
-    def of(cls, found: Sequence[Found]) -> FoundRanges:
-        """Join the results of all episodes."""
-        problems = tuple((place, one) for place, one in enumerate(found) if isinstance(one, EpisodeProblem))
-        ranges = [(place, *pair) for place, one in enumerate(found) if isinstance(one, list) for pair in one]
-        episode, start, end = np.ascontiguousarray(np.array(ranges, np.int32).reshape(-1, 3).T)
-        return cls(episode, start, end, problems)
-
-    def to_bytes(self) -> bytes:
-        """Return this as a file's content."""
-        text = json.dumps({"problems": [[place, vars(problem)] for place, problem in self.problems]}).encode()
-        columns = {"episode": self.episode, "start": self.start, "end": self.end}
-        return arrays_as_bytes({"text": np.frombuffer(text, np.uint8), **columns})
-
-    @classmethod
-    def from_bytes(cls, data: bytes) -> FoundRanges:
-        """Read the result of `to_bytes`.
-
-        Raises:
-            NotATableError: It is another kind of file, or damaged.
-        """
-        try:
-            arrays = read_arrays(data)
-            episode, start, end = (np.asarray(arrays[name], np.int32) for name in ("episode", "start", "end"))
-            problems = json.loads(arrays["text"].tobytes())["problems"]
-            return cls(episode, start, end, tuple((int(place), EpisodeProblem(**values)) for place, values in problems))
-        except (InputError, LookupError, TypeError, ValueError) as error:
-            raise NotATableError(f"no ranges of steps ({error})") from None
 
 
 def find_ranges(
     source: EpisodeSource, table: EpisodeTable, config: DataConfig, progress: Progress | None
-) -> FoundRanges:
+) -> StepSelection:
     """Return the ranges that `data.idle.rule` keeps, of all episodes, used or not.
 
     Raises:
@@ -88,7 +43,7 @@ def find_ranges(
         path = str(config.idle.ranges)
         make, parts["list"] = partial(published_ranges, path, table), _version(path)
     return get_or_make(
-        config.disk_cache, key_of(parts), make, to_bytes=FoundRanges.to_bytes, from_bytes=FoundRanges.from_bytes
+        config.disk_cache, key_of(parts), make, to_bytes=StepSelection.to_bytes, from_bytes=StepSelection.from_bytes
     )
 
 
@@ -100,7 +55,7 @@ def _version(path: str) -> list[object]:
         return [path]
 
 
-def _computed(source: EpisodeSource, table: EpisodeTable, config: DataConfig, progress: Progress) -> FoundRanges:
+def _computed(source: EpisodeSource, table: EpisodeTable, config: DataConfig, progress: Progress) -> StepSelection:
     def look(place: int) -> Found:
         try:
             return kept_ranges(source.read(place), config.idle)
@@ -108,25 +63,17 @@ def _computed(source: EpisodeSource, table: EpisodeTable, config: DataConfig, pr
             return as_problem(error, table.identity(place))
 
     found: list[Found] = []
-    for one in in_order(look, range(len(table)), config):
+    for one in in_parallel(look, range(len(table)), connections_to(config)):
         found.append(one)
         progress(len(found), len(table))
         if len(found) == min(_ALL_BROKEN, len(table)):
             problems = [problem for problem in found if isinstance(problem, EpisodeProblem)]
             if len(problems) == len(found):
                 raise as_error(problems[0])
-    return FoundRanges.of(found)
+    return StepSelection.of_each(found)
 
 
-def in_order(look: Callable[[int], T], places: Sequence[int], config: DataConfig) -> Iterator[T]:
-    """Yield what a function says of each episode, in order; several are read at once where the data is far away."""
-    threads = config.connections if storage.is_url(config.path) else 1
-    with ThreadPoolExecutor(threads) as pool:
-        for first in range(0, len(places), 4 * threads):
-            yield from pool.map(look, places[first : first + 4 * threads])
-
-
-def published_ranges(path: str, table: EpisodeTable) -> FoundRanges:
+def published_ranges(path: str, table: EpisodeTable) -> StepSelection:
     """Return the ranges of a list that somebody published; see `data.idle.ranges`.
 
     Raises:
@@ -143,12 +90,9 @@ def published_ranges(path: str, table: EpisodeTable) -> FoundRanges:
     listed = sum(name in lists for name in names)
     if not listed:
         first = next(iter(lists), "none at all")
-        raise InputError(
-            where=where,
-            found=f"none of the {len(table)} episodes; its first is {first}",
-            needed="the identities of the episodes" + (f", such as {names[0]}" if names else ""),
-            fix=another,
-        )
+        found_there = f"none of the {len(table)} episodes; its first is {first}"
+        needed = "the identities of the episodes" + (f", such as {names[0]}" if names else "")
+        raise InputError(where=where, found=found_there, needed=needed, fix=another)
     found: list[Found] = []
     for name, steps in zip(names, table.num_steps.tolist(), strict=True):
         pairs = _pairs(lists.get(name, []), steps)
@@ -160,7 +104,7 @@ def published_ranges(path: str, table: EpisodeTable) -> FoundRanges:
         logging.INFO if listed == len(table) else logging.WARNING,
         "%s: knows %d of the %d episodes; the other %d count as idle", path, listed, len(table), len(table) - listed,
     )  # fmt: skip
-    return FoundRanges.of(found)
+    return StepSelection.of_each(found)
 
 
 def _pairs(ranges: object, steps: int) -> list[tuple[int, int]] | None:
@@ -184,12 +128,8 @@ def kept_ranges(episode: Episode, config: IdleConfig) -> list[tuple[int, int]]:
         return moving_ranges(idle_by_motion(episode.states, config), config)
     where, velocities = f"episode {episode.info.id}", episode.joint_velocities
     if velocities is None:
-        raise InputError(
-            where=where,
-            found="no commanded joint velocities",
-            needed="them, for data.idle.rule commands",
-            fix="Set data.idle.rule: motion, which needs only poses, or name the feature with the velocities",
-        )
+        fix = "Set data.idle.rule: motion, which needs only poses, or name the feature with the velocities"
+        raise InputError(where=where, found="no commanded joint velocities", fix=fix)
     if not np.isfinite(velocities).all():
         raise InputError(where=where, found="a joint velocity that is not finite", needed="finite numbers")
     return moving_ranges(idle_by_commands(velocities, config), config)

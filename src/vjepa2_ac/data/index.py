@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TypeVar, overload
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int8, Int32, UInt64
@@ -36,7 +36,7 @@ _COLUMNS = ("num_steps", "success", "ids", "id_hash", "id_rank")
 _HASH, _LOCATOR, _LABEL = "state_hash", "locator.", "label."
 _HASH_BYTES = 8
 _CACHE = "VJEPA2_AC_CACHE"
-_VERSION = 4  # of the cache: another number makes all of it be rebuilt
+_VERSION = 5  # of the cache: another number makes all of it be rebuilt
 
 
 class NotATableError(ValueError):
@@ -129,16 +129,8 @@ class EpisodeTable(Sequence[EpisodeInfo]):
     def __len__(self) -> int:
         return len(self.num_steps)
 
-    @overload
-    def __getitem__(self, index: int) -> EpisodeInfo: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[EpisodeInfo]: ...
-
-    def __getitem__(self, index: int | slice) -> EpisodeInfo | Sequence[EpisodeInfo]:
-        """Return the facts about one episode, or several."""
-        if isinstance(index, slice):
-            return [self[number] for number in range(*index.indices(len(self)))]
+    def __getitem__(self, index: int) -> EpisodeInfo:  # type: ignore[override] # no slices
+        """Return the facts about one episode."""
         if not -len(self) <= index < len(self):
             raise IndexError(f"episode {index} of {len(self)}")
         index %= len(self)

@@ -29,7 +29,7 @@ from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.clips import ClipRequest, collate, no_clips, read_clip
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.selection import BrokenEpisodes, named, with_way_out
-from vjepa2_ac.data.streams import NO_COPIES, Copies
+from vjepa2_ac.data.streams import ToDevice
 from vjepa2_ac.data.transforms import draw
 from vjepa2_ac.data.windows import ClipOrder, drawn, far_neighbours, spread
 from vjepa2_ac.episode import Batch, Clip, Skipped
@@ -65,7 +65,7 @@ def training_loader(
     batch_size: int,
     start_position: int = 0,
     share: ProcessShare = WHOLE,
-    copies: Copies = NO_COPIES,
+    copies: ToDevice | None = None,
 ) -> Batches:
     """Yield the micro-batches of one process, endlessly, from any position of the run.
 
@@ -91,7 +91,7 @@ def training_loader(
         clips = _training_clips(dataset, seed)
     firsts = itertools.count(start_position + share.rank * batch_size, batch_size * share.processes)
     rows = (list(range(first, first + batch_size)) for first in firsts)
-    micro_batches = _micro_batches(clips, rows, dataset.config.workers, pinned=copies.overlap)
+    micro_batches = _micro_batches(clips, rows, dataset.config.workers, pinned=copies is not None)
     return Batches(micro_batches, dataset.broken, copies, replayed.broken if replayed else None)
 
 
@@ -145,12 +145,9 @@ def batches_of(dataset: Dataset, windows: Sequence[tuple[int, int]], *, batch_si
             empty = False
             yield batch
     if empty:
-        raise InputError(
-            where=f"data.path: {dataset.config.path}",
-            found=f"none of the clips can be read; broken episodes: {named(tuple(dataset.broken.reasons))}",
-            needed="at least one",
-            fix="Repair or fetch these episodes again, or add them to data.exclude",
-        )
+        found = f"none of the clips can be read; broken episodes: {named(tuple(dataset.broken.reasons))}"
+        fix = "Repair or fetch these episodes again, or add them to data.exclude"
+        raise InputError(where=f"data.path: {dataset.config.path}", found=found, fix=fix)
 
 
 def _chosen_clip(dataset: Dataset, windows: Sequence[tuple[int, int]], position: int) -> ClipRequest:
@@ -229,7 +226,7 @@ class Batches(Iterator[Batch]):
     Args:
         rows: The workers' results: micro-batches, or errors instead.
         broken: Records clips that could not be read.
-        copies: How batches are copied to the device; without overlap there are no copies and no prefetching.
+        copies: How batches are copied to the device; None: there are no copies and no prefetching.
         replayed: Records those of the second data set.
     """
 
@@ -237,7 +234,7 @@ class Batches(Iterator[Batch]):
         self,
         rows: Generator[MicroBatch | UserError, None, None],
         broken: BrokenEpisodes,
-        copies: Copies = NO_COPIES,
+        copies: ToDevice | None = None,
         replayed: BrokenEpisodes | None = None,
     ) -> None:
         self._rows, self._broken, self._copies = rows, broken, copies
@@ -260,7 +257,7 @@ class Batches(Iterator[Batch]):
 
     def prefetch_next(self) -> None:
         """Fetch the next batch and start its copy to the device."""
-        if self._copies.overlap and self._prefetched is None:
+        if self._copies is not None and self._prefetched is None:
             self._prefetched = self._fetched()
 
     def close(self) -> None:
@@ -271,9 +268,9 @@ class Batches(Iterator[Batch]):
     def _fetched(self) -> Exception | MicroBatch:
         try:
             row = next(self._rows)
-            if isinstance(row, UserError) or not self._copies.overlap:
+            if isinstance(row, UserError) or self._copies is None:
                 return row
-            held = [self._copies.to_device.start(row.batch.mapped)]
+            held = [self._copies.start(row.batch.mapped)]
         except Exception as error:  # also the end of the rows
             return error
         take_once = lambda: held.pop()() if held else None  # noqa: E731 - so that the copy is freed after use

@@ -12,9 +12,10 @@ import numpy as np
 from jaxtyping import Bool, Int32, UInt64
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable, identity_hash
+from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable, NotATableError, identity_hash
 from vjepa2_ac.episode import StepRanges
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage.npz_reader import arrays_as_bytes, read_arrays
 
 logger = logging.getLogger(__name__)
 
@@ -36,19 +37,26 @@ class StepSelection:
     episode: Int32[np.ndarray, " ranges"]  # index into the table
     start: Int32[np.ndarray, " ranges"]
     end: Int32[np.ndarray, " ranges"]
-    taking_part: Bool[np.ndarray, " episodes"]  # an episode may be used although none of its steps is kept
+    problems: tuple[tuple[int, EpisodeProblem], ...] = ()  # the episodes that could not be read, by the same index
 
     @classmethod
     def whole(cls, table: EpisodeTable, taking_part: Bool[np.ndarray, " episodes"]) -> StepSelection:
         """Keep every step of the used episodes."""
         episode = np.flatnonzero(taking_part).astype(np.int32)
-        return cls(episode, np.zeros(len(episode), np.int32), table.num_steps[episode], taking_part)
+        return cls(episode, np.zeros(len(episode), np.int32), table.num_steps[episode])
+
+    @classmethod
+    def of_each(cls, found: Sequence[list[tuple[int, int]] | EpisodeProblem]) -> StepSelection:
+        """Join the ranges of all episodes."""
+        problems = tuple((place, one) for place, one in enumerate(found) if isinstance(one, EpisodeProblem))
+        ranges = [(place, *pair) for place, one in enumerate(found) if isinstance(one, list) for pair in one]
+        episode, start, end = np.ascontiguousarray(np.array(ranges, np.int32).reshape(-1, 3).T)
+        return cls(episode, start, end, problems)
 
     def only(self, episodes: Bool[np.ndarray, " episodes"]) -> StepSelection:
         """Return the selection with these episodes only."""
         stays = episodes[self.episode]
-        ranges = replace(self, episode=self.episode[stays], start=self.start[stays], end=self.end[stays])
-        return replace(ranges, taking_part=self.taking_part & episodes)
+        return replace(self, episode=self.episode[stays], start=self.start[stays], end=self.end[stays])
 
     def of(self, episode: int) -> StepRanges:
         """Return the ranges of one episode."""
@@ -59,6 +67,26 @@ class StepSelection:
     def steps(self) -> int:
         """The total number of kept steps."""
         return int((self.end.astype(np.int64) - self.start).sum())
+
+    def to_bytes(self) -> bytes:
+        """Return this as a file's content."""
+        text = json.dumps([[place, vars(problem)] for place, problem in self.problems]).encode()
+        columns = {"episode": self.episode, "start": self.start, "end": self.end}
+        return arrays_as_bytes({"problems": np.frombuffer(text, np.uint8), **columns})
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> StepSelection:
+        """Read the result of `to_bytes`.
+
+        Raises:
+            NotATableError: It is another kind of file, or damaged.
+        """
+        try:
+            arrays = read_arrays(data)
+            problems = json.loads(arrays.pop("problems").tobytes())
+            return cls(**arrays, problems=tuple((place, EpisodeProblem(**values)) for place, values in problems))
+        except (InputError, LookupError, TypeError, ValueError) as error:
+            raise NotATableError(f"no ranges of steps ({error})") from None
 
 
 def included(table: EpisodeTable, config: DataConfig) -> Bool[np.ndarray, " episodes"]:
@@ -73,11 +101,9 @@ def included(table: EpisodeTable, config: DataConfig) -> Bool[np.ndarray, " epis
     found = {place: name for place in candidates if (name := table.identity(place)) in excluded}
     unknown = excluded.difference(found.values(), (problem.name for problem in table.problems))
     if unknown:
-        raise InputError(
-            where="data.exclude",
-            found=f"not the identity of any episode: {named(sorted(unknown))}",
-            needed="identities as errors name them" + (f", such as {table.identity(0)}" if len(table) else ""),
-        )
+        wrong = f"not the identity of any episode: {named(sorted(unknown))}"
+        needed = "identities as errors name them" + (f", such as {table.identity(0)}" if len(table) else "")
+        raise InputError(where="data.exclude", found=wrong, needed=needed)
     taking_part = np.ones(len(table), bool)
     taking_part[list(found)] = False
     return taking_part
@@ -92,12 +118,8 @@ def of_outcome(table: EpisodeTable, config: DataConfig) -> Bool[np.ndarray, " ep
     if config.outcome == "all":
         return np.ones(len(table), bool)
     if len(table) and (table.success < 0).all():
-        raise InputError(
-            where=f"data.outcome: {config.outcome}",
-            found=f"no episode of {config.path} says whether it succeeded",
-            needed="at least some that do",
-            fix="Set data.outcome: all",
-        )
+        found = f"no episode of {config.path} says whether it succeeded"
+        raise InputError(where=f"data.outcome: {config.outcome}", found=found, fix="Set data.outcome: all")
     return np.asarray(table.success == (config.outcome == "success"))
 
 
@@ -113,12 +135,8 @@ def require_distinct(table: EpisodeTable, taking_part: Bool[np.ndarray, " episod
     for place in members[np.isin(table.id_hash[members], hashes[counts > 1])].tolist():
         name = table.identity(place)
         if name in places:
-            error = InputError(
-                where=f"data.path: {config.path}",
-                found=f"episodes {places[name]} and {place} have the same identity: {name}",
-                needed="episodes that can be told apart: the split is a hash of the identity",
-                fix=config.same_identity_fix,
-            )
+            found, fix = f"episodes {places[name]} and {place} have the same identity: {name}", config.same_identity_fix
+            error = InputError(where=f"data.path: {config.path}", found=found, fix=fix)
             raise with_way_out(error, [name], skippable=False)
         places[name] = place
 
@@ -183,13 +201,11 @@ class BrokenEpisodes:
         if len(self) <= MOST_BROKEN * self._episodes:
             return
         name, reason = next(iter(self._reasons.items()))
-        raise InputError(
-            where=f"data.path: {self._config.path}",
-            found=f"{len(self)} of {self._episodes} episodes are broken: {named(tuple(self._reasons))}."
-            f" The first, {name}: {reason.rstrip('.')}",
-            needed=f"{MOST_BROKEN:.0%} at most: data.broken_episodes is skip",
-            fix="Repair or fetch them again, or add them to data.exclude",
-        )
+        found = f"{len(self)} of {self._episodes} episodes are broken: {named(tuple(self._reasons))}."
+        found += f" The first, {name}: {reason.rstrip('.')}"
+        needed = f"{MOST_BROKEN:.0%} at most: data.broken_episodes is skip"
+        fix = "Repair or fetch them again, or add them to data.exclude"
+        raise InputError(where=f"data.path: {self._config.path}", found=found, needed=needed, fix=fix)
 
 
 def as_error(problem: EpisodeProblem) -> InputError:
@@ -215,12 +231,8 @@ def with_way_out(error: InputError, names: Sequence[str], *, skippable: bool = T
     listed = json.dumps(list(names[:NAMED]), ensure_ascii=False)
     of_all = f" (the first {NAMED} of {len(names)})" if len(names) > NAMED else ""
     skip = "set data.broken_episodes: skip, or " if skippable else ""
-    return InputError(
-        where=error.where,
-        found=error.found,
-        needed=error.needed,
-        fix=f"{others}{fix}To go on without, {skip}add{of_all} to data.exclude: {listed}",
-    )
+    fix = f"{others}{fix}To go on without, {skip}add{of_all} to data.exclude: {listed}"
+    return InputError(where=error.where, found=error.found, needed=error.needed, fix=fix)
 
 
 def named(ids: Sequence[str], count: int | None = None) -> str:
@@ -251,12 +263,9 @@ def groups_of(
         from_source = split_by in table.labels
         reason = "the data set does not say it of" if from_source else "found nothing in the identities of"
         another = "choose another field" if from_source else "choose a pattern that fits every identity"
-        raise InputError(
-            where=f"data.split_by: {split_by}",
-            found=f"{reason} {len(lacking)} of {taking_part.sum()} episodes: {named(lacking)}",
-            needed="a group for every episode that takes part",
-            fix=f"Leave these out with data.exclude, or {another}",
-        )
+        found = f"{reason} {len(lacking)} of {taking_part.sum()} episodes: {named(lacking)}"
+        fix = f"Leave these out with data.exclude, or {another}"
+        raise InputError(where=f"data.split_by: {split_by}", found=found, fix=fix)
     hashes = {group: identity_hash(group) for group in groups if group}
     any_hash = next(iter(hashes.values()), 0)
     return np.array([hashes[group] if group else any_hash for group in groups], np.uint64)
@@ -267,12 +276,9 @@ def _groups(table: EpisodeTable, split_by: str) -> list[str | None]:
         return [labels.of_episode(place) for place in range(len(table))]
     identities = [table.identity(place) for place in range(len(table))]
     if split_by not in IN_IDENTITY and re.fullmatch(r"[A-Za-z_]+", split_by):
-        raise InputError(
-            where=f"data.split_by: {split_by}",
-            found=f"no such field; this data set has {', '.join(table.labels) or 'none of its own'}, and its identities"
-            f" may have {', '.join(IN_IDENTITY)}",
-            needed="a field, or a regular expression with one group for the identity"
-            + (f", such as {identities[0]}" if identities else ""),
-        )
+        own, such = ", ".join(table.labels) or "none of its own", f", such as {identities[0]}" if identities else ""
+        wrong = f"no such field; this data set has {own}, and its identities may have {', '.join(IN_IDENTITY)}"
+        needed = f"a field, or a regular expression with one group for the identity{such}"
+        raise InputError(where=f"data.split_by: {split_by}", found=wrong, needed=needed)
     search = re.compile(IN_IDENTITY.get(split_by, split_by)).search
     return [found.group(1) if (found := search(identity)) else None for identity in identities]

@@ -1,10 +1,9 @@
-"""Asynchronous copies between host and device: own CUDA streams and pinned memory, while the device computes."""
+"""Asynchronous copies of batches to the device: an own CUDA stream and pinned memory, while the device computes."""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, TypeVar
 
@@ -44,8 +43,8 @@ class Cuda:
         return pinned.to(self._device, non_blocking=True)
 
     def pinned_copy(self, tensor: Tensor) -> Tensor:
-        """Return a copy in pinned memory; from the device it is only enqueued."""
-        return torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True).copy_(tensor, non_blocking=True)
+        """Return a copy in pinned memory."""
+        return tensor.pin_memory()
 
     def used_by(self, tensor: Tensor, stream: Any) -> None:
         """Reserve the memory of a tensor until a stream other than its own has finished with it."""
@@ -98,68 +97,7 @@ class ToDevice:
         return taken
 
 
-class ToHost:
-    """Copies tensors from the device into pinned memory, on its own stream, once they are computed.
-
-    Args:
-        cuda: The device.
-    """
-
-    def __init__(self, cuda: Cuda) -> None:
-        self._cuda, self._stream = cuda, cuda.new_stream()
-
-    def start(self, mapped: Callable[[Change], _T]) -> Callable[[], _T]:
-        """Start to copy, as `ToDevice.start`; the returned function waits for these copies, not for work since."""
-        cuda, stream = self._cuda, self._stream
-
-        def copy(tensor: Tensor) -> Tensor:
-            cuda.used_by(tensor, stream)
-            return cuda.pinned_copy(tensor)
-
-        stream.wait_event(cuda.computing().record_event())
-        with cuda.on(stream):
-            moved = mapped(copy)
-        done = stream.record_event()
-
-        def taken() -> _T:
-            done.synchronize()
-            return moved
-
-        return taken
-
-
-class AtOnce:
-    """Copies without overlap; on a CPU nothing is copied.
-
-    Args:
-        device: The target.
-    """
-
-    def __init__(self, device: torch.device) -> None:
-        self._device = device
-
-    def start(self, mapped: Callable[[Change], _T]) -> Callable[[], _T]:
-        """Copy, as `ToDevice.start`."""
-        moved = mapped(lambda tensor: tensor.to(self._device))
-        return lambda: moved
-
-
-@dataclass(frozen=True)
-class Copies:
-    """Copies in both directions."""
-
-    to_device: ToDevice | AtOnce
-    to_host: ToHost | AtOnce
-    overlap: bool  # whether copies overlap with computation
-
-
 @lru_cache(maxsize=8)
-def copies_for(device: torch.device) -> Copies:
-    """Return the copies to a device and back; always the same streams."""
-    if device.type != "cuda":
-        return Copies(AtOnce(device), AtOnce(torch.device("cpu")), overlap=False)
-    cuda = Cuda(device)
-    return Copies(ToDevice(cuda), ToHost(cuda), overlap=True)
-
-
-NO_COPIES = copies_for(torch.device("cpu"))
+def copies_for(device: torch.device) -> ToDevice | None:
+    """Return the copies to a device, always on the same stream; None: they would not overlap with computation."""
+    return ToDevice(Cuda(device)) if device.type == "cuda" else None

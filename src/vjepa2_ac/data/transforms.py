@@ -110,11 +110,6 @@ def input_to_pixels(inputs: Float[Tensor, "*batch 3 size size"]) -> UInt8[Tensor
     return pixels.round().clamp(0, 255).to(torch.uint8)
 
 
-def images_to_input(images: Float[Tensor, "*batch 3 size size"]) -> Float[Tensor, "*batch 3 size size"]:
-    """Return images of the encoder's size, black 0 to white 1, as encoder input: with the same normalisation."""
-    return (images.float() * 255.0 - per_channel(_MEAN, images.device)) / per_channel(_STD, images.device)
-
-
 def frames_as_seen(
     frames: UInt8[np.ndarray, "time height width 3"], size: int
 ) -> UInt8[np.ndarray, "time size size 3"]:

@@ -147,24 +147,19 @@ def windows_of(
     names = tuple(table.identity(place) for place in short[: NAMED + 1].tolist())
     if len(short) and (config.short_episodes == "error" or len(short) == count):
         longest = int(short[np.argmax(table.num_steps[short])])
-        raise InputError(
-            where=where,
-            found=f"{len(short)} of {count} {split} episodes are shorter than a clip; the longest of these,"
-            f" {table.identity(longest)}, has {table.num_steps[longest]} steps. Too short: {named(names, len(short))}",
-            needed=length,
-            fix="Lower data.frames or data.stride"
-            + (", or set data.short_episodes: skip" if len(short) < count else ""),
+        found = f"{len(short)} of {count} {split} episodes are shorter than a clip; the longest of these,"
+        found += (
+            f" {table.identity(longest)}, has {table.num_steps[longest]} steps. Too short: {named(names, len(short))}"
         )
+        skip = ", or set data.short_episodes: skip" if len(short) < count else ""
+        raise InputError(where=where, found=found, needed=length, fix=f"Lower data.frames or data.stride{skip}")
     if len(short):
         _warn_of_short(config.path, split, config.clip_steps, count, len(short), names)
     own = starts.of(members[starts.episode])
     if not len(own):
-        raise InputError(
-            where=where,
-            found=f"no {split} episode has a range of kept steps as long as a clip (data.idle.rule {config.idle.rule})",
-            needed=length,
-            fix="Lower data.frames or data.stride, or set data.idle.rule: none",
-        )
+        found = f"no {split} episode has a range of kept steps as long as a clip (data.idle.rule {config.idle.rule})"
+        fix = "Lower data.frames or data.stride, or set data.idle.rule: none"
+        raise InputError(where=where, found=found, needed=length, fix=fix)
     return replace(own, short=tuple(short.tolist()))
 
 

@@ -15,7 +15,7 @@ from vjepa2_ac.config import Config, LimitsConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import batches_of, validation_windows
-from vjepa2_ac.data.sources.configured_spaces import measured_space
+from vjepa2_ac.data.sources.indexed_source import measured_space
 from vjepa2_ac.data.transforms import frames_as_seen, view
 from vjepa2_ac.data.windows import require_frames
 from vjepa2_ac.decoding.decoder_folder import load_decoder

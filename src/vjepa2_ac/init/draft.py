@@ -1,26 +1,19 @@
-"""A whole config: its sections, a batch that fits on the GPU, and what the run will cost."""
+"""A whole config: each value with its reason, a batch that fits on the GPU, and what the run will cost."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
 from dataclasses import dataclass
-from typing import Any
+from functools import cache
+from pathlib import Path
 
 from vjepa2_ac.config import Config, EncoderConfig, ModelConfig
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.config.model import ModelSizes
-from vjepa2_ac.init.choices import (
-    CLIPS_A_STEP,
-    ModelChoice,
-    adapter_knobs,
-    data_knobs,
-    following_knobs,
-    model_knobs,
-    training_knobs,
-)
 from vjepa2_ac.init.found import FoundData, Knob, Knobs, as_yaml, guesses, plain
 from vjepa2_ac.init.machine import Machine, duration
 from vjepa2_ac.model.checkpoints.loading import base_sizes
+from vjepa2_ac.model.checkpoints.published import OFFICIAL, PUBLISHED
 from vjepa2_ac.places import BUILTIN
 from vjepa2_ac.training.cost.flops import clip_flops, frame_flops
 from vjepa2_ac.training.cost.memory import GIGABYTE, estimate_memory
@@ -30,58 +23,47 @@ SCRATCH_ENCODER = "checkpoints/vjepa2.1-vitb-384.pt"
 TINY = f"{BUILTIN}sim-tiny"
 _UTILIZATION = 0.4  # of the speed of one large product: assumed
 _LARGEST_BATCH = 16
+_CLIPS_A_STEP = 32  # of every model but the tiny one
+_MODEL_STEP_S = 4 / 15  # the shortest of those that the released weights may know: 0.27, 0.53 and 1 s
+_FEW_EPISODES = 500  # to which the advice for few demonstrations applies
+_NEAR_S = 0.005
+_SHARES = ((5_000, 0.02), (500, 0.05), (100, 0.1), (0, 0.15))  # held out, by the number of episodes
+_LEAST_FRAMES = 3  # two rollout steps and the frame before them
+_PASSES = 3  # over the starts of clips
+_LEAST_STEPS, _MOST_STEPS = 200, 100_000
+_SHORT = 100  # control steps of an episode that has no pauses to spare
+_CACHE_SHARE = 1 / 3  # of the free disk
+_USUAL_BYTES_PER_S = 100e6 / 8  # 100 Mbit/s: assumed
+_IN_AND_OUT = ["predictor_embed", "predictor_proj", "action_encoder", "state_encoder"]
 
 
 @dataclass(frozen=True)
-class Draft:
-    """A config with its reasons, and what it costs."""
+class ModelChoice:
+    """The model that is trained."""
 
-    knobs: Knobs
-    config: Config
-    memory_bytes: int | None  # at the peak; None: of the tiny model
-    fits: bool
-    hours: float | None  # None: there is no GPU
-    encoding_hours: float  # of them, before the first step
-    cache_bytes: int | None
+    kind: str  # released, tiny, scratch
+    path: str
+    sizes: ModelSizes
 
-    def text(self, found: FoundData, machine: Machine) -> str:
-        """Return the config as a person reads it."""
-        head = [
-            f"Written by `vjepa2-ac init` for {found.path}: {'; '.join(found.about)}.",
-            f"Machine: {machine.about}.",
-            *self.costs(machine),
-            "Every other knob has its default: `vjepa2-ac config show` prints all, and docs/training.md explains them.",
-            "(sim): measured on the simulated arm with its tiny model, not on your robot.",
-        ]
-        if unsure := guesses(self.knobs):
-            head.append(f"Look at what is marked GUESSED: {', '.join(unsure)}.")
-        return as_yaml(head, self.knobs)
+    @property
+    def bytes_a_frame(self) -> int:
+        """Of its latents, in bfloat16."""
+        return 2 * self.sizes.tokens_per_frame * self.sizes.encoder.width
 
-    def costs(self, machine: Machine) -> list[str]:
-        """Return what the run is expected to take, a line each."""
-        lines = []
-        if self.memory_bytes is not None:
-            word = "fits on" if self.fits else "does NOT fit on"
-            needed = f"{self.memory_bytes / GIGABYTE:.1f} GB"
-            lines.append(f"Memory, as `vjepa2-ac doctor` counts: {needed}; {word} {machine.room}.")
-        if self.cache_bytes is not None:
-            lines.append(f"Disk: at most {max(0.1, self.cache_bytes / GIGABYTE):,.1f} GB of cached latents.")
-        if self.hours is not None:
-            speed = f"{(machine.flops or 0) / 1e12:.0f} TFLOP/s measured here for one product"
-            lines.append(f"Time: {duration(self.hours)}, if a step reaches {_UTILIZATION:.0%} (assumed) of {speed}.")
-        elif machine.gpu is None and self.memory_bytes is not None:
-            lines.append(
-                "Time: not known without the GPU; run `vjepa2-ac init` on the machine that has it: batch and precision"
-                " are then its own."
-            )
-        return lines
+    @property
+    def is_tiny(self) -> bool:
+        """Whether it is the one that comes with the package."""
+        return self.path.startswith(BUILTIN)
 
-    def time_of(self, steps: int) -> str | None:
-        """Return about how long so many optimizer steps take, with encoding before the first; None: not known."""
-        if self.hours is None:
+    @property
+    def download(self) -> tuple[str, str] | None:
+        """The command that fetches it, and what that costs; None, where it is none that is published."""
+        one = next((one for one in PUBLISHED if Path(self.path) == Path("checkpoints", one.file)), None)
+        if one is None:
             return None
-        share = steps / self.config.training.steps
-        return duration(self.encoding_hours + (self.hours - self.encoding_hours) * share)
+        time = duration(one.gigabytes * GIGABYTE / _USUAL_BYTES_PER_S / 3600)
+        name = "" if one.name == OFFICIAL else f" {one.name}"
+        return f"vjepa2-ac download{name}", f"{one.gigabytes:g} GB, {time} at 100 Mbit/s"
 
 
 def choose_model(kind: str, path: str | None) -> ModelChoice:
@@ -96,12 +78,44 @@ def choose_model(kind: str, path: str | None) -> ModelChoice:
     """
     path = path or (SCRATCH_ENCODER if kind == "scratch" else RELEASED)
     is_tiny = path.startswith(BUILTIN)
+    config = ModelConfig(base=path)
     if kind == "scratch" and not is_tiny:
         config = ModelConfig(encoder=EncoderConfig(path=path, frame="tubelet"), random=ModelSizes())
-    else:
-        config = ModelConfig(base=path)
-    sizes = base_sizes(config)
-    return ModelChoice("tiny" if is_tiny and kind != "scratch" else kind, path, sizes)
+    return ModelChoice("tiny" if is_tiny and kind != "scratch" else kind, path, base_sizes(config))
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A config with its reasons, and what it costs."""
+
+    knobs: Knobs
+    config: Config
+    costs: list[str]  # a line each
+    fits: bool = True
+    step_hours: float | None = None  # None: there is no GPU, or the model is the tiny one
+    encoding_hours: float = 0.0  # before the first step
+
+    def text(self, found: FoundData, machine: Machine) -> str:
+        """Return the config as a person reads it."""
+        head = [
+            f"Written by `vjepa2-ac init` for {found.path}: {'; '.join(found.about)}.",
+            f"Machine: {machine.about}.",
+            *self.costs,
+            "Every other knob has its default: `vjepa2-ac config show` prints all, and docs/training.md explains them.",
+            "(sim): measured on the simulated arm with its tiny model, not on your robot.",
+        ]
+        if unsure := guesses(self.knobs):
+            head.append(f"Look at what is marked GUESSED: {', '.join(unsure)}.")
+        return as_yaml(head, self.knobs)
+
+    def hours_of(self, steps: int) -> float | None:
+        """Return how long so many optimizer steps take, with encoding before the first; None: not known."""
+        return None if self.step_hours is None else self.encoding_hours + steps * self.step_hours
+
+    def time_of(self, steps: int) -> str | None:
+        """Return the same for people."""
+        hours = self.hours_of(steps)
+        return None if hours is None else duration(hours)
 
 
 def make_draft(found: FoundData, machine: Machine, model: ModelChoice, *, run_dir: str) -> Draft:
@@ -110,85 +124,234 @@ def make_draft(found: FoundData, machine: Machine, model: ModelChoice, *, run_di
     Raises:
         InputError: The values found do not make a config.
     """
-    training = training_knobs(found, machine, model)
+    training = _training(found, machine, model)
+    every = max(20, min(1_000, int(plain(training)["steps"]) // 10))
     knobs: Knobs = {
         "run_dir": Knob(run_dir),
         "seed": Knob(0),
-        "data": data_knobs(found, machine, model),
-        "model": model_knobs(model, machine),
-        "adapter": adapter_knobs(model, found),
+        "data": _data(found, machine, model),
+        "model": _model(model, machine),
+        "adapter": _adapter(model, found),
         "training": training,
-        **following_knobs(int(plain(training)["steps"])),
+        "validation": {"every": Knob(every, "the best checkpoint is rarely the last"), "clips": Knob(64)},
+        "checkpoint": {
+            "every": Knob(every),
+            "keep": Knob(3, "and the best one"),
+            "keep_best": Knob("ranking", "not by error: it may fall while planning gets worse (docs/training.md)"),
+        },
     }
     config = _config_of(knobs)
+    disk = []
+    if config.data.takes_latents:
+        disk = [f"Disk: at most {_gigabytes((found.steps or 0) * model.bytes_a_frame)} GB of cached latents."]
     if model.is_tiny:
-        return Draft(
-            knobs,
-            config,
-            None,
-            fits=True,
-            hours=None,
-            encoding_hours=0.0,
-            cache_bytes=_cache_bytes(config, found, model),
-        )
-    sizes = base_sizes(config.model)
-    batch, checkpointing, needed = _fit(config, sizes, machine)
+        return Draft(knobs, config, disk)
+    batch, checkpointing, needed = _fit(config, machine)
     fits = needed <= machine.gpu_bytes
-    fitted = _batch_knobs(batch, machine, checkpointing=checkpointing, fits=fits)
-    knobs = {**knobs, "training": {**training, **fitted}}
+    knobs = {**knobs, "training": {**training, **_batch(batch, machine, checkpointing=checkpointing, fits=fits)}}
     config = _config_of(knobs)
-    hours, encoding = _hours(config, sizes, found, machine)
-    return Draft(knobs, config, needed, fits, hours, encoding, _cache_bytes(config, found, model))
+    size = f"{needed / GIGABYTE:.1f} GB; {'fits on' if fits else 'does NOT fit on'} {machine.room}"
+    costs = [f"Memory, as `vjepa2-ac doctor` counts: {size}.", *disk]
+    if machine.flops is None:
+        unknown = "not known without the GPU; run `vjepa2-ac init` on the machine that has it: batch and precision are"
+        return Draft(knobs, config, [*costs, *[f"Time: {unknown} then its own."] * (machine.gpu is None)], fits)
+    sizes = base_sizes(config.model)
+    clip, an_hour = clip_flops(config, sizes), machine.flops * _UTILIZATION * 3600
+    encoding = (found.steps or 0) * frame_flops(sizes) / an_hour if config.data.takes_latents else 0.0
+    of_clip = (clip.predictor if config.data.takes_latents else clip.total) / an_hour
+    step = of_clip * config.training.batch_size * config.training.accumulation
+    draft = Draft(knobs, config, costs, fits, step, encoding)
+    speed = f"{machine.flops / 1e12:.0f} TFLOP/s measured here for one product"
+    time = draft.time_of(config.training.steps)
+    costs.append(f"Time: {time}, if a step reaches {_UTILIZATION:.0%} (assumed) of {speed}.")
+    return draft
 
 
 def _config_of(knobs: Knobs) -> Config:
     return parse_config(plain(knobs), where="vjepa2-ac init")
 
 
-def _fit(config: Config, sizes: ModelSizes, machine: Machine) -> tuple[int, bool, int]:
+def _gigabytes(size: float) -> str:
+    return f"{max(0.1, size / GIGABYTE):,.1f}"
+
+
+def _fit(config: Config, machine: Machine) -> tuple[int, bool, int]:
     """Return batch size, whether with checkpointing, and bytes at the peak: the largest batch that fits, 4 at first."""
-    room = machine.gpu_bytes
+    room, batch, sizes = machine.gpu_bytes, config.training.batch_size, base_sizes(config.model)
 
-    def needed(batch: int, *, checkpointing: bool) -> int:
-        if batch not in estimates:
-            training = config.training.model_copy(update={"batch_size": batch})
-            estimates[batch] = estimate_memory(config.model_copy(update={"training": training}), sizes)
-        return int(estimates[batch].total(checkpointing=checkpointing))
+    @cache
+    def needed(batch: int, checkpointing: bool) -> int:
+        training = config.training.model_copy(update={"batch_size": batch})
+        estimate = estimate_memory(config.model_copy(update={"training": training}), sizes)
+        return int(estimate.total(checkpointing=checkpointing))
 
-    estimates: dict[int, Any] = {}
-    batch = config.training.batch_size
-    if needed(batch, checkpointing=False) <= room:
-        while machine.gpu and batch < _LARGEST_BATCH and needed(2 * batch, checkpointing=False) <= room:
+    if needed(batch, False) <= room:
+        while machine.gpu and batch < _LARGEST_BATCH and needed(2 * batch, False) <= room:
             batch *= 2
-        return batch, False, needed(batch, checkpointing=False)
-    while batch > 1 and needed(batch, checkpointing=True) > room:
+        return batch, False, needed(batch, False)
+    while batch > 1 and needed(batch, True) > room:
         batch //= 2
-    return batch, True, needed(batch, checkpointing=True)
+    return batch, True, needed(batch, True)
 
 
-def _batch_knobs(batch: int, machine: Machine, *, checkpointing: bool, fits: bool) -> Mapping[str, Knob]:
-    why = f"{'does not fit' if checkpointing else 'fits'} without on {machine.room}"
+def _batch(batch: int, machine: Machine, *, checkpointing: bool, fits: bool) -> Knobs:
+    on = f"on {machine.room}"
     return {
-        "batch_size": Knob(
-            batch, f"the largest tried that fits on {machine.room}" if fits else f"does not fit on {machine.room}"
-        ),
-        "accumulation": Knob(max(1, CLIPS_A_STEP // batch), f"{CLIPS_A_STEP} clips a step"),
-        "gradient_checkpointing": Knob(checkpointing, why),
+        "batch_size": Knob(batch, f"the largest tried that fits {on}" if fits else f"does not fit {on}"),
+        "accumulation": Knob(max(1, _CLIPS_A_STEP // batch), f"{_CLIPS_A_STEP} clips a step"),
+        "gradient_checkpointing": Knob(checkpointing, f"{'does not fit' if checkpointing else 'fits'} without {on}"),
     }
 
 
-def _hours(config: Config, sizes: ModelSizes, found: FoundData, machine: Machine) -> tuple[float | None, float]:
-    """Return the hours of a run, and those of them that are for encoding before the first step."""
-    if machine.flops is None:
-        return None, 0.0
-    clip, training = clip_flops(config, sizes), config.training
-    clips = training.steps * training.batch_size * training.accumulation
-    an_hour = machine.flops * _UTILIZATION * 3600
-    if not config.data.takes_latents:
-        return clips * clip.total / an_hour, 0.0
-    encoding = (found.steps or 0) * frame_flops(sizes) / an_hour
-    return encoding + clips * clip.predictor / an_hour, encoding
+def _data(found: FoundData, machine: Machine, model: ModelChoice) -> Knobs:
+    """Return the section of the data."""
+    stride = max(1, round(found.rate_hz.value * _MODEL_STEP_S))
+    frames, why_frames = _frames(found, model, stride)
+    share, why_share = _share(found)
+    cached = _cache(found, machine, model)
+    workers = max(1, min(4 if "cache" in cached else 8, machine.cores - 1))
+    vector: dict[str, Knob] = {"states": Knob("vector", "the robot's own numbers: its actions are their differences")}
+    return {
+        "source": Knob(found.source),
+        "path": Knob(found.path),
+        **({} if found.states == "pose" else vector),
+        **found.knobs,
+        "frames": Knob(frames, why_frames),
+        "stride": Knob(stride, _why_stride(found, model, stride), found.rate_hz.is_guess),
+        "validation_share": Knob(share, why_share),
+        "test_share": Knob(share, "for `evaluate`; never seen in training"),
+        **({"idle": found.idle} if found.idle and (found.usual_steps or _SHORT) >= _SHORT else {}),
+        **cached,
+        "workers": Knob(workers, f"of {machine.cores} cores"),
+    }
 
 
-def _cache_bytes(config: Config, found: FoundData, model: ModelChoice) -> int | None:
-    return (found.steps or 0) * model.bytes_a_frame if config.data.takes_latents else None
+def _model(model: ModelChoice, machine: Machine) -> Knobs:
+    """Return the section of the model."""
+    dtype = Knob("float32" if model.is_tiny or machine.precision != "bf16" else "bfloat16")
+    if model.kind == "scratch":
+        return {
+            "encoder": {
+                "path": Knob(model.path, ": ".join(model.download or ())),
+                **({} if model.is_tiny else {"frame": Knob("tubelet")}),
+            },
+            "random": _fresh_predictor(model),
+            "random_start": Knob("persistence", "the first steps are not spent on learning to copy"),
+            "dtype": dtype,
+        }
+    tiny = "has seen a simulated arm only: to try the way, not a result"
+    why = tiny if model.is_tiny else ": ".join(model.download or ())
+    return {"base": Knob(model.path, why), "dtype": dtype}
+
+
+def _adapter(model: ModelChoice, found: FoundData) -> Knobs:
+    """Return the section of the adapter."""
+    if model.kind == "scratch":
+        return {"kind": Knob("none", "a fresh predictor has nothing to adapt: all of it is trained")}
+    whole = ["state_encoder", "action_encoder"] if found.states == "vector" else _IN_AND_OUT
+    why = "fresh: other numbers than a pose" if found.states == "vector" else "whole: helps at every rank (sim)"
+    return {
+        "kind": Knob("lora"),
+        "rank": Knob(32, "with in/out whole as good as full fine-tuning; 4 to 16 less (sim)"),
+        "alpha": Knob(32, "at any rank"),
+        "rslora": Knob(True),
+        "targets": Knob(["q", "k", "v", "o", "fc1", "fc2"]),
+        "modules_to_save": Knob(whole, why),
+    }
+
+
+def _training(found: FoundData, machine: Machine, model: ModelChoice) -> Knobs:
+    """Return the section of training; the batch is what `fit` changes."""
+    batch, accumulation = (8, 1) if model.is_tiny else (4, _CLIPS_A_STEP // 4)
+    steps, why = _steps(found, batch * accumulation)
+    weak = "it is weak, knowingly: it has never seen a real image"
+    return {
+        "steps": Knob(steps, why),
+        "batch_size": Knob(batch),
+        "accumulation": Knob(accumulation),
+        "rollout_steps": Knob(2),
+        "learning_rate": _learning_rate(model),
+        "precision": Knob(machine.precision, _why_precision(machine, model)),
+        "gradient_checkpointing": Knob(False),
+        **({"allow_weak_base": Knob(True, weak)} if model.is_tiny and model.kind == "tiny" else {}),
+    }
+
+
+def _why_stride(found: FoundData, model: ModelChoice, stride: int) -> str:
+    seconds = stride / found.rate_hz.value
+    why = f"a model step of {seconds:.2f} s"
+    if abs(seconds - _MODEL_STEP_S) > _NEAR_S:
+        why += f", as near to {_MODEL_STEP_S:.2f} s as whole control steps come"
+    if found.rate_hz.is_guess:
+        why = f"if the rate is {found.rate_hz.value:g} a second, {why}"
+    if model.kind == "tiny":
+        return f"{why}; the model was trained at {_MODEL_STEP_S:.2f} s"
+    if model.kind == "released" and found.states == "pose":
+        return f"{why}; whether the released weights know 0.27, 0.53 or 1 s is unsettled: data calibrate"
+    return f"{why}; data inspect shows how far the robot goes in it, and in longer ones"
+
+
+def _learning_rate(model: ModelChoice) -> Knob:
+    if model.is_tiny:
+        return Knob(3e-3)
+    if model.kind == "scratch":
+        return Knob(1.5e-4, "the released 4.25e-4, of 256 clips a step, times the root of 32 / 256: not measured")
+    return Knob(1e-4, "3e-4 is the other one to try")
+
+
+def _why_precision(machine: Machine, model: ModelChoice) -> str:
+    if machine.precision == "fp32":
+        return "no GPU here; on one from Ampere on: bf16" + ("" if model.is_tiny else ", and model.dtype: bfloat16")
+    return "this GPU has no bf16" if machine.precision == "fp16" else ""
+
+
+def _frames(found: FoundData, model: ModelChoice, stride: int) -> tuple[int, str]:
+    wanted = 4 if model.is_tiny else 16 if (found.episodes or 0) > _FEW_EPISODES else 8
+    if found.usual_steps is None or found.short_steps is None:
+        return wanted, "of a clip, one per model step"
+    most = 1 + (min(found.usual_steps // 2, found.short_steps) - 1) // stride
+    frames = max(_LEAST_FRAMES, min(most, wanted))
+    lengths = f"half of the episodes have {found.usual_steps} or more, one of ten at most {found.short_steps}"
+    return frames, f"a clip spans {(frames - 1) * stride + 1} steps; {lengths}"
+
+
+def _share(found: FoundData) -> tuple[float, str]:
+    if found.episodes is None:
+        return 0.05, "of the episodes, drawn by a hash, at least one"
+    share = next(share for least, share in _SHARES if found.episodes > least or least == 0)
+    count = max(1, round(share * found.episodes))
+    few = ": an interval over so few says little" if count < 5 else ""
+    return share, f"about {count:,} of {found.episodes:,} episodes, drawn by a hash{few}"
+
+
+def _cache(found: FoundData, machine: Machine, model: ModelChoice) -> dict[str, Knob]:
+    """Return the knobs of the latent cache, where it fits on the disk."""
+    if found.steps is None:
+        return {}
+    room = machine.free_bytes * _CACHE_SHARE
+    size = found.steps * model.bytes_a_frame
+    if size > room:
+        return {}
+    why = f"each frame is encoded once: {_gigabytes(size)} GB at most; training then needs no encoder"
+    return {"cache": Knob("auto", why)}
+
+
+def _steps(found: FoundData, clips_a_step: int) -> tuple[int, str]:
+    if found.steps is None:
+        return _LEAST_STEPS, "a first run; docs/training.md says how many"
+    wanted = math.ceil(_PASSES * found.steps / _CLIPS_A_STEP / 100) * 100  # a clip begins at every step
+    steps = max(_LEAST_STEPS, min(_MOST_STEPS, wanted))
+    passes = steps * clips_a_step / found.steps
+    return steps, f"{passes:.2g} passes over the starts of clips; the error falls for longer, planning may get worse"
+
+
+def _fresh_predictor(model: ModelChoice) -> Knobs:
+    if model.is_tiny:
+        return {"image_size": Knob(96), "predictor": {"width": Knob(128), "depth": Knob(4), "heads": Knob(4)}}
+    width = model.sizes.encoder.width
+    sizes = {
+        "width": Knob(width, "as wide as the latents: it can begin at copying"),
+        "depth": Knob(12),
+        "heads": Knob(width // 64),
+    }
+    return {"image_size": Knob(256, "256 tokens a frame"), "predictor": sizes}

@@ -81,4 +81,8 @@ class FoundData:
     idle: Knobs | None = None  # of `data.idle`; None: no rule
     about: tuple[str, ...] = ()  # what a person should know of it
     extra: str = ""  # of this package, that reads it
-    sample: str = ""  # one of its large files
+
+
+def idle_rule(*, has_velocities: bool) -> Knobs:
+    """Return the section of `data.idle`: by the commanded velocities if there are any."""
+    return {"rule": Knob("commands" if has_velocities else "motion", "pauses teach nothing")}

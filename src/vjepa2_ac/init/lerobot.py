@@ -7,11 +7,11 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from vjepa2_ac import storage
-from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, filled, read_info
+from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, read_info
 from vjepa2_ac.errors import InputError, UserError
-from vjepa2_ac.init.found import FoundData, Knob, Knobs
+from vjepa2_ac.init.found import FoundData, Knob, Knobs, idle_rule
 from vjepa2_ac.init.names import Column, Pose, find_pose, pick_camera, short_name
-from vjepa2_ac.storage.structured import json_object, read_json_object
+from vjepa2_ac.storage.structured import json_object
 
 _STATISTICS = ("meta/stats.json", "meta/episodes_stats.jsonl")
 _MOST_BYTES = 256 << 20  # of statistics
@@ -41,17 +41,20 @@ def look_at_lerobot(path: str) -> FoundData:
     }
     pose = find_pose(columns)
     first = pick_camera(list(cameras))
-    names = _distinct(cameras)
+    short = {name: short_name(name) for name in cameras}
+    used = list(short.values())
+    names = {name: one if used.count(one) == 1 else name for name, one in short.items()}
+    among = (
+        f"of {', '.join(names.values())}; the released weights saw DROID's exterior_1_left" if len(names) > 1 else ""
+    )
     fields = _pose_fields(info, pose) if pose else _vector_fields(info, columns)
     velocity = next((name for name in columns if "joint_vel" in name and name.startswith("action")), None)
     success = next((name for name in info.features if "success" in name), None)
-    raw = read_json_object(info.where, needed="a description")
-    frames = raw.get("total_frames")
     return FoundData(
         source="lerobot",
         path=path,
         knobs={
-            "camera": Knob(names[first], _camera_reason(list(names.values())), is_guess=len(cameras) > 1),
+            "camera": Knob(names[first], among if len(names) > 1 else "", is_guess=len(cameras) > 1),
             "lerobot": {
                 **fields,
                 "cameras": Knob({short: name for name, short in names.items()}),
@@ -62,34 +65,22 @@ def look_at_lerobot(path: str) -> FoundData:
         rate_hz=Knob(info.fps, "of meta/info.json"),
         states="pose" if pose else "vector",
         episodes=info.episodes,
-        steps=frames if type(frames) is int else None,
-        idle={"rule": Knob("commands" if velocity else "motion", "pauses teach nothing")} if pose else None,
+        steps=info.frames,
+        idle=idle_rule(has_velocities=velocity is not None) if pose else None,
         about=(f"LeRobot {info.version}, {info.episodes:,} episodes at {info.fps:g} a second",)
         + ((f"depth maps are not used: {', '.join(depth)}",) if depth else ()),
         extra="lerobot",
-        sample=storage.join(path, filled(info.data_path, 0, 0)),
     )
-
-
-def _camera_reason(names: list[str]) -> str:
-    return f"of {', '.join(names)}; the released weights saw DROID's exterior_1_left" if len(names) > 1 else ""
-
-
-def _distinct(cameras: Mapping[str, object]) -> dict[str, str]:
-    """Return a short name for each camera; the whole feature's where two would be called alike."""
-    short = {name: short_name(name) for name in cameras}
-    used = list(short.values())
-    return {name: one if used.count(one) == 1 else name for name, one in short.items()}
 
 
 def _pose_fields(info: DatasetInfo, pose: Pose) -> Knobs:
     reason = pose.why + ("" if not pose.is_guess else "; docs/data.md says what a pose is")
-    found = {
+    return {
         "state": Knob(list(pose.columns), reason, pose.is_guess),
         **({} if pose.select is None else {"select": Knob(list(pose.select))}),
         "rotation": Knob(pose.rotation, "the same guess" if pose.is_guess else "", pose.is_guess),
+        **_gripper(info, pose),
     }
-    return {**found, **_gripper(info, pose)}
 
 
 def _gripper(info: DatasetInfo, pose: Pose) -> Knobs:
@@ -97,18 +88,14 @@ def _gripper(info: DatasetInfo, pose: Pose) -> Knobs:
     column, number = pose.gripper
     if column == _DROID_GRIPPER and info.features.keys() >= _OF_DROID:
         return {"gripper_open": Knob(0.0, "DROID's"), "gripper_closed": Knob(1.0)}
-    found = _range_of(info.root, column, number)
-    if found is None:
-        opened, closed, why = 0.0, 1.0, "no statistics say its range"
-    else:
+    opened, closed, why = 0.0, 1.0, "no statistics say its range"
+    if found := _range_of(info.root, column, number):
         low, high = found
         why = f"its numbers go from {low:.3g} to {high:.3g}"
-        if high <= _METRES and high > 0:
+        if 0 < high <= _METRES:
             opened, closed, why = round(high, 4), 0.0, f"{why}: metres apart?"
         elif high > _UNIT:
             opened, closed, why = round(high, 1), max(0.0, round(low, 1)), f"{why}: percent open?"
-        else:
-            opened, closed = 0.0, 1.0
     why = f"{why}; `data check CONFIG --model` finds out whether it is inverted"
     return {"gripper_open": Knob(opened, why, is_guess=True), "gripper_closed": Knob(closed, "likewise", is_guess=True)}
 

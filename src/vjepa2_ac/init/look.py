@@ -12,20 +12,22 @@ import numpy as np
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.loading import admit_forms_of_data, parse_config
+from vjepa2_ac.data.files import walk, within
 from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.data.sources.droid_raw.episode_folders import find_episodes
+from vjepa2_ac.data.sources.indexed_source import open_source
 from vjepa2_ac.data.sources.lerobot.info import INFO
-from vjepa2_ac.data.sources.listing import walk, within
 from vjepa2_ac.data.sources.npz import FORMAT_HELP, opened_npz
-from vjepa2_ac.data.sources.registry import open_source
 from vjepa2_ac.episode import STATE_DIM, Progress
 from vjepa2_ac.errors import InputError, UserError
 from vjepa2_ac.init.converters import way_by
-from vjepa2_ac.init.found import FoundData, Knob, plain
+from vjepa2_ac.init.found import FoundData, Knob, idle_rule, plain
 from vjepa2_ac.init.lerobot import look_at_lerobot
 from vjepa2_ac.init.names import pick_camera
 from vjepa2_ac.init.rlds import droid, like_droid, look_at_rlds
 from vjepa2_ac.places import BUILTIN
+
+_CONNECTIONS = 16  # reads at once
 
 
 def look_at_npz(path: str) -> FoundData:
@@ -49,7 +51,6 @@ def look_at_npz(path: str) -> FoundData:
         rate = float(np.asarray(file.array("fps_hz")).reshape(-1)[0])
     steps, width = headers["states"].shape
     first = "frames" if "frames" in cameras else pick_camera(cameras)
-    velocities = "joint_velocities" in headers
     is_pose = width == STATE_DIM
     return FoundData(
         source="npz",
@@ -58,14 +59,9 @@ def look_at_npz(path: str) -> FoundData:
         rate_hz=Knob(rate, f"of {files[0]}"),
         states="pose" if is_pose else "vector",
         episodes=len(files),
-        idle={"rule": Knob("commands" if velocities else "motion", "pauses teach nothing")} if is_pose else None,
-        sample=where,
+        idle=idle_rule(has_velocities="joint_velocities" in headers) if is_pose else None,
         about=(f".npz, {len(files):,} episodes at {rate:g} a second, the first of {steps:,} steps",),
     )
-
-
-RAW_DROID = "gs://gresearch/robotics/droid_raw/1.0.1"
-_CONNECTIONS = 16  # reads at once
 
 
 def look_at_raw(path: str) -> FoundData:
@@ -188,13 +184,10 @@ def _recognized(path: str) -> tuple[str, str]:
     if any(name == "trajectory.h5" or name.startswith("metadata_") for name in names):
         return "raw", path
     way = next((text for end, text in _WAYS.items() for name in names if name.lower().endswith(end)), "")
-    shown = ", ".join(names[:5]) + (", …" if len(names) > 5 else "")
-    raise InputError(
-        where=path,
-        found=f"nothing that is read ({shown or 'an empty folder'})",
-        needed="LeRobot (meta/info.json), RLDS (dataset_info.json), .npz files, or raw DROID (trajectory.h5)",
-        fix=f"This looks like {way}" if way else "docs/data.md says how other data become one of these",
-    )
+    shown = ", ".join(names[:5]) + (", …" if len(names) > 5 else "") or "an empty folder"
+    needed = "LeRobot (meta/info.json), RLDS (dataset_info.json), .npz files, or raw DROID (trajectory.h5)"
+    fix = f"This looks like {way}" if way else "docs/data.md says how other data become one of these"
+    raise InputError(where=path, found=f"nothing that is read ({shown})", needed=needed, fix=fix)
 
 
 def _names_below(path: str) -> list[str]:
@@ -208,9 +201,6 @@ def _names_below(path: str) -> list[str]:
             break
         path = storage.join(path, inner)
     return names
-
-
-_MOST_ARE_LONGER = 0.1  # quantile
 
 
 def measured(found: FoundData, progress: Progress | None = None) -> FoundData:
@@ -234,5 +224,5 @@ def measured(found: FoundData, progress: Progress | None = None) -> FoundData:
         episodes=len(lengths),
         steps=int(lengths.sum()),
         usual_steps=int(np.median(lengths)),
-        short_steps=int(np.quantile(lengths, _MOST_ARE_LONGER)),
+        short_steps=int(np.quantile(lengths, 0.1)),
     )

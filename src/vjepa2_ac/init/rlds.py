@@ -10,7 +10,7 @@ from typing import Any
 from vjepa2_ac import storage
 from vjepa2_ac.data.sources.rlds.shards import dataset_name, find_shards
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.init.found import FoundData, Knob, Knobs
+from vjepa2_ac.init.found import FoundData, Knob, Knobs, idle_rule
 from vjepa2_ac.init.names import Column, find_pose, pick_camera, short_name
 from vjepa2_ac.storage.structured import read_json_object
 
@@ -35,20 +35,12 @@ class _Feature:
 
 def droid() -> FoundData:
     """Return what is known of DROID 1.0.1 without a look at it."""
-    return FoundData(
-        source="rlds",
-        path=DROID,
-        knobs={"camera": Knob(_DROID_CAMERA, _SEEN)},
-        rate_hz=Knob(_DROID_RATE_HZ),
-        episodes=_DROID_EPISODES,
+    published = Knob("published", "openpi's ranges; they are valid for 1.0.1 only")
+    return replace(
+        like_droid(DROID, _DROID_EPISODES, is_simulated=False),
         steps=_DROID_STEPS,
-        idle={
-            "rule": Knob("published", "openpi's ranges; they are valid for 1.0.1 only"),
-            "ranges": Knob(RANGES),
-        },
+        idle={"rule": published, "ranges": Knob(RANGES)},
         about=(f"DROID 1.0.1, {_DROID_EPISODES:,} episodes, 1.7 TB, fetched from Google Cloud as they are needed",),
-        extra="gcs",
-        sample=f"{DROID}/droid_101-train.tfrecord-00000-of-02048",
     )
 
 
@@ -64,7 +56,7 @@ def look_at_rlds(path: str) -> FoundData:
     name = dataset_name(path)
     if name in _DROID_NAMES and _DROID_FEATURE in features:
         is_simulated = storage.exists(storage.join(path, _SIMULATION))
-        return replace(like_droid(path, episodes, is_simulated=is_simulated), sample=shards[0].path)
+        return like_droid(path, episodes, is_simulated=is_simulated)
     images = [name for name, one in features.items() if one.kind == "image" and name.startswith("steps/")]
     if not images:
         where = storage.join(path, "features.json")
@@ -89,10 +81,9 @@ def look_at_rlds(path: str) -> FoundData:
         },
         rate_hz=rate,
         episodes=episodes,
-        idle={"rule": Knob("commands" if has_velocities else "motion", "pauses teach nothing")},
+        idle=idle_rule(has_velocities=has_velocities),
         about=(f"RLDS {name}, {episodes:,} episodes, {rate.value:g} steps a second{' (guessed)' * rate.is_guess}",),
         extra="gcs" if path.startswith("gs://") else "",
-        sample=shards[0].path,
     )
 
 
@@ -130,9 +121,8 @@ def _features(path: str) -> Iterator[tuple[str, _Feature]]:
         content = read_json_object(where, needed="a description as TFDS writes it")
     except FileNotFoundError:
         fix = "Name the features in the config by hand: `vjepa2-ac config text builtin:bridge` is an example"
-        raise InputError(
-            where=where, found="no such file", needed="the features, as TFDS writes them", fix=fix
-        ) from None
+        needed = "the features, as TFDS writes them"
+        raise InputError(where=where, found="no such file", needed=needed, fix=fix) from None
     except OSError as error:
         raise storage.unreadable(where, error) from None
     yield from _inside(content, "")
@@ -165,14 +155,12 @@ def _state(path: str, features: Mapping[str, _Feature], *, is_bridge: bool) -> K
         fix = "If others are the robot's numbers, name them in a config with `states: vector` (builtin:joints)"
         needed = "x, y, z, three angles and the gripper, measured"
         raise InputError(where=storage.join(path, "features.json"), found=found, needed=needed, fix=fix)
+    state = Knob(list(pose.columns), pose.why, pose.is_guess)
+    gripper = Knob("closedness", "whether 1 is closed or open: `data check CONFIG --model` tells", is_guess=True)
     if is_bridge:
         state = Knob(list(pose.columns), "x, y, z, three angles, the gripper")
-        return {"state": state, "gripper": Knob("openness", "1 is open in BridgeData")}
-    why = "whether 1 is closed or open: `data check CONFIG --model` tells"
-    return {
-        "state": Knob(list(pose.columns), pose.why, pose.is_guess),
-        "gripper": Knob("closedness", why, is_guess=True),
-    }
+        gripper = Knob("openness", "1 is open in BridgeData")
+    return {"state": state, "gripper": gripper}
 
 
 def _identity(features: Mapping[str, _Feature]) -> list[str]:

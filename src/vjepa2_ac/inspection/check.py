@@ -97,7 +97,7 @@ def _what_takes_part(dataset: Dataset) -> Iterator[Finding]:
         clip = f"clips of {config.frames} frames at stride {config.stride}"
         yield Finding("ok", split, f"{len(windows):,} {clip} in {episodes:,} episodes{short}")
     if config.split_by is not None:
-        groups = len(np.unique(dataset.split_hash[dataset.kept.taking_part]))
+        groups = len(np.unique(dataset.split_hash[dataset.taking_part]))
         yield Finding("ok", "groups", f"{groups:,} by {config.split_by}, each in one split")
     duplicates = find_duplicates(dataset)
     yield Finding("warning" if duplicates.episodes else "ok", "duplicates", str(duplicates))

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -22,10 +23,8 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from scipy.spatial.transform import Rotation
 
 from vjepa2_ac import storage
-from vjepa2_ac.data.coverage import sample_of
+from vjepa2_ac.data.coverage import read_each, sample_of
 from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.data.idle import in_order
-from vjepa2_ac.errors import InputError
 from vjepa2_ac.inspection.agreement import FEWEST_EPISODES, Agreement, agreement_of
 from vjepa2_ac.spaces import POSE, StateSpace
 
@@ -72,22 +71,11 @@ def excerpts_of(dataset: Dataset, *, episodes: int = EPISODES, steps: int = STEP
     Raises:
         InputError: As `Dataset.leave_out`.
     """
-
-    def look(index: int) -> Excerpt | InputError:
-        try:
-            return _read(dataset, index, steps)
-        except InputError as error:
-            return error
-
-    chosen = sample_of(dataset, episodes)
-    for index, found in zip(chosen, in_order(look, chosen, dataset.config), strict=True):
-        if isinstance(found, InputError):
-            dataset.leave_out(index, found)
-        else:
-            yield found
+    for _, found in read_each(dataset, sample_of(dataset, episodes), partial(_read, dataset, steps)):
+        yield found
 
 
-def _read(dataset: Dataset, index: int, steps: int) -> Excerpt:
+def _read(dataset: Dataset, steps: int, index: int) -> Excerpt:
     ranges = dataset.kept.of(index) or [(0, int(dataset.table.num_steps[index]))]
     start, end = max(ranges, key=lambda one: one[1] - one[0])
     first = start + max(0, end - start - steps) // 2

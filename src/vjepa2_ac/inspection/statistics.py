@@ -66,11 +66,6 @@ class Inspection:
         states = np.concatenate([one.states for one in self.sample])
         return np.stack([states.min(axis=0), states.max(axis=0)], axis=1)
 
-    def range_of(self, column: int) -> tuple[float, float]:
-        """Return the least and the greatest value of one number of the sample's states."""
-        low, high = self.ranges[column].tolist()
-        return low, high
-
     @cached_property
     def coverage(self) -> Coverage | None:
         """The coverage of actions by the sample at the config's stride; None: no step fits."""

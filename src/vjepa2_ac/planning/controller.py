@@ -14,7 +14,7 @@ from torch import Tensor
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.planning import PlanningConfig
-from vjepa2_ac.data.sources.configured_spaces import spaces_of
+from vjepa2_ac.data.sources.indexed_source import spaces_of
 from vjepa2_ac.data.transforms import Crop, view
 from vjepa2_ac.encoding.batch import encode_frames
 from vjepa2_ac.errors import InputError

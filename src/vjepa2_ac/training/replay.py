@@ -70,7 +70,7 @@ def require_same_form(first: Batch, replayed: Batch) -> None:
 
 def _held_out(dataset: Dataset, replayed: Dataset) -> list[str]:
     """Return the replayed training episodes that the first data set, by their identity, validates or tests on."""
-    held_out = dataset.table.id_hash[dataset.kept.taking_part & ~dataset.members("train")]
+    held_out = dataset.table.id_hash[dataset.taking_part & ~dataset.members("train")]
     places = np.flatnonzero(replayed.members("train") & np.isin(replayed.table.id_hash, held_out))
     return sorted(replayed.table.identity(int(place)) for place in places)
 

@@ -20,7 +20,7 @@ from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.duplicates import find_duplicates
 from vjepa2_ac.data.loader import Batches, Mixed, ProcessShare, training_loader, validation_batches
-from vjepa2_ac.data.streams import Copies, copies_for
+from vjepa2_ac.data.streams import ToDevice, copies_for
 from vjepa2_ac.distributed import PRECISIONS, broadcast_object, first_of_machine, make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, extrinsics_for, require_same_encoder
 from vjepa2_ac.episode import Batch, LatentBatch
@@ -87,8 +87,8 @@ class Run:
         return CastMatrices(self.world_model.predictor, PRECISIONS[self.config.training.precision])
 
     @property
-    def copies(self) -> Copies:
-        """The copies of batches to the run's device."""
+    def copies(self) -> ToDevice | None:
+        """The copies of batches to the run's device; None: none that overlap."""
         return copies_for(self.accelerator.device)
 
     @property

@@ -87,15 +87,3 @@ def test_a_folder_that_cannot_be_written_costs_a_warning(
     monkeypatch.setattr(storage, "write_atomically", refuse)
     assert len(kept(tmp_path, table=TABLE)) == 5
     assert "No space left on device" in caplog.text
-
-
-def test_two_that_write_one_index_at_once_do_not_meet(tmp_path: Path) -> None:
-    path = tmp_path / "index"
-    with storage.atomic_writer(path) as first:
-        first.write(b"fir")
-        with storage.atomic_writer(path) as second:
-            second.write(b"second")
-        assert path.read_bytes() == b"second"
-        first.write(b"st")
-    assert path.read_bytes() == b"first"
-    assert list(tmp_path.iterdir()) == [path]

@@ -2,7 +2,6 @@
 
 import json
 import pickle
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,12 +11,10 @@ import pytest
 
 from gcs import Gcs
 from hub import Hub, serve_hub
-from lerobot_sets import CAMERAS, STATE, Recorded, change_info, numbers_of, recorded, write_v21, write_v30
-from vjepa2_ac import storage
+from lerobot_sets import CAMERAS, STATE, Recorded, numbers_of, recorded, write_v21, write_v30
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.lerobot.source import LeRobotSource
 from vjepa2_ac.errors import InputError, UnreachableError
-from vjepa2_ac.storage import retries
 
 LENGTHS = (12, 13, 14, 15, 16)
 
@@ -101,40 +98,6 @@ def test_what_was_fetched_once_is_not_fetched_again(hub: Hub, tmp_path: Path) ->
     assert [path for path, _, _ in hub.ranges if path != "meta/info.json"] == []
 
 
-def test_a_clip_fetches_a_part_of_the_video(episodes: list[Recorded], tmp_path: Path) -> None:
-    generator = np.random.default_rng(0)
-    key = f"observation.images.{CAMERAS[0]}"
-    noise = [generator.integers(0, 256, (144, 256, 3), np.uint8) for _ in range(3)]
-    long = [
-        Recorded({name: np.repeat(episode.columns[name][:1], 60, axis=0) for name in STATE}, {key: noise * 20})
-        for episode in episodes
-    ]
-    root = write_v30(tmp_path / "set", long, episodes_per_video=5, gop=10)
-    with serve_hub({"lab/long": root}) as hub:
-        source = source_of("long", tmp_path)
-        source.infos()
-        before = storage.bytes_fetched()
-        source.read(3).read_frames([20, 24, 28])
-        whole = next(root.glob("videos/**/*.mp4")).stat().st_size
-        assert whole > 3_000_000
-        assert 0 < hub.bytes_read(".mp4") < whole / 4
-        assert storage.bytes_fetched() - before >= hub.bytes_read(".mp4")
-
-
-def test_a_passing_fault_is_tried_again(hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(retries, "DEFAULT", retries.RetryPolicy(attempts=3, first_wait_s=0.001))
-    source = source_of("v30", tmp_path)
-    source.infos()
-    hub.faults += [503, 429]
-    episode = source.read(0)
-    hub.faults += [500]
-    assert numbers_of(episode.read_frames([3])[0]) == (0, 3, 0)
-    hub.faults += [503] * 3
-    with pytest.raises(UnreachableError, match=r"hf://datasets/lab/v30/data/.*3 attempts"):
-        source.read(4)
-    assert not hub.faults
-
-
 def test_a_data_set_that_is_not_there_says_how_to_log_in(hub: Hub, tmp_path: Path) -> None:
     assert hub.url
     with pytest.raises(InputError, match=r"hf://datasets/lab/nothing.*hf auth login.*HF_TOKEN"):
@@ -150,16 +113,3 @@ def test_a_gated_data_set_says_how_to_log_in(hub: Hub, tmp_path: Path, monkeypat
             source_of("closed", tmp_path).infos()
     monkeypatch.setenv("HF_TOKEN", "hf_right")
     assert len(source_of("closed", tmp_path).infos()) == 1
-
-
-def test_files_that_are_not_there_are_problems(folder: Path, tmp_path: Path) -> None:
-    root = Path(shutil.copytree(folder / "v21", tmp_path / "set"))
-    next(root.glob(f"videos/*/*{CAMERAS[0]}/episode_000003.mp4")).unlink()
-    next(root.glob("data/*/episode_000001.parquet")).unlink()
-    with serve_hub({"lab/holes": root}):
-        infos = source_of("holes", tmp_path).infos()
-        assert [problem.name for problem in infos.problems] == ["episode_000001", "episode_000003"]
-        assert "no such video" in infos.problems[1].found
-    change_info(root, codebase_version="v9")
-    with serve_hub({"lab/holes": root}), pytest.raises(InputError, match="codebase_version 'v9'"):
-        source_of("holes", tmp_path).infos()

@@ -40,12 +40,3 @@ def test_without_its_reader_no_episode_is_called_broken(tmp_path: Path, monkeypa
     with pytest.raises(UnreachableError, match="pyarrow, which reads LeRobot data sets, is not installed") as raised:
         dataset_of(folder)
     assert "broken" not in str(raised.value)
-
-
-def test_without_its_decoder_a_set_of_videos_is_not_indexed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Or the states of a hundred thousand episodes would be read before the first frame is missed."""
-    folder, told = write_v21(tmp_path / "set", [recorded(0, 20)]), []
-    monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(UnreachableError, match=r"PyAV, which decodes video, is not installed.*pip install"):
-        dataset_of(folder, lambda *done: told.append(done))
-    assert told == []

@@ -8,31 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from accidents import mutated
 from lerobot_sets import recorded, write_v21, write_v30
 from recordings import write_raw_droid
 from synthetic import draw_frame, synthetic_states
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.sources.registry import open_source
+from vjepa2_ac.data.sources.indexed_source import open_source
 from vjepa2_ac.errors import InputError
 
 MUTATIONS = int(os.environ.get("VJEPA2_AC_MUTATIONS", "40"))  # of each kind of file; more in a longer run
 STATES = synthetic_states(6)
 FRAMES = np.stack([draw_frame(state, size=(36, 64)) for state in STATES])
-
-
-def mutated(data: bytes, generator: np.random.Generator) -> bytes:
-    """Return bytes after one accident: a flipped bit, a foreign, lost, repeated or blank stretch, an early end."""
-    start = int(generator.integers(len(data)))
-    end = min(len(data), start + int(2 ** generator.uniform(0, 12)))
-    middle = {
-        "flip": bytes([data[start] ^ 1 << int(generator.integers(8))]) + data[start + 1 : end],
-        "foreign": generator.bytes(end - start),
-        "lost": b"",
-        "twice": data[start:end] * 2,
-        "blank": bytes(end - start),
-        "cut": None,
-    }[str(generator.choice(["flip", "foreign", "lost", "twice", "blank", "cut"]))]
-    return data[:start] if middle is None else data[:start] + middle + data[end:]
 
 
 def write(form: str, root: Path) -> DataConfig:

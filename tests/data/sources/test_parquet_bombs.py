@@ -9,10 +9,11 @@ import pytest
 from pyarrow import parquet as pq
 
 from paths import GOLDEN
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.files import EpisodeFiles
 from vjepa2_ac.data.sources.lerobot import parquet
 from vjepa2_ac.data.sources.lerobot.parquet import ParquetRows, read_table
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage.block_file import DiskCache
 
 _MB = 1 << 20
 STATE = "observation.state"
@@ -58,7 +59,9 @@ def test_a_footer_that_contradicts_itself_is_damage_and_does_not_end_the_process
 
 
 def rows_of(path: Path, *columns: str) -> ParquetRows:
-    return ParquetRows(str, columns or [STATE], DiskCache(path, 0), "")
+    return ParquetRows(
+        EpisodeFiles(DataConfig(path="x", disk_cache={"dir": str(path), "limit_gb": 0.0})), columns or [STATE], ""
+    )
 
 
 def write(path: Path, rows: int, width: int = 7, row_group: int | None = None) -> Path:

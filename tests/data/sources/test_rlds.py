@@ -148,10 +148,8 @@ def test_length_is_that_of_the_states_where_no_step_is_flagged(spoiled: Spoil) -
         (lambda f: f.update({"steps/is_first": ("float_list", [1.0] * 12)}), "a float_list.*needed: a int64_list"),
         (lambda f: f.update({"steps/is_first": ("int64_list", [])}), "no steps.*needed: one or more"),
         (lambda f: at_step_2(f, "cartesian_position", float("nan")), "step 2: .*finite"),
-        (lambda f: at_step_2(f, "cartesian_position", 900.0), "step 2: .*within 5 m"),
         (lambda f: at_step_2(f, "gripper_position", 1.5), "step 2: .*gripper between 0 and 1"),
         (lambda f: in_degrees(f["steps/observation/cartesian_position"][1]), "radians"),
-        (lambda f: f["steps/observation/cartesian_position"][1].pop(), "71 numbers"),
         (
             lambda f: f["steps/observation/gripper_position"][1].extend([0.0] * 12),
             "position \\[6\\] .*position \\[2\\]",
@@ -167,15 +165,6 @@ def test_an_episode_that_cannot_be_used_is_a_problem_and_no_row(spoiled: Spoil, 
     [problem] = table.problems
     assert "tfrecord-00000-of-00002: record 0 at byte 0" in problem.where
     assert re.search(message, str(error_of(problem)))
-
-
-def test_a_problem_is_named_like_the_episode_wherever_that_can_be_read(spoiled: Spoil) -> None:
-    def spoil(features: Features) -> None:
-        at_step_2(features, "gripper_position", 7.0)
-
-    [problem] = open_droid(spoiled(spoil)).infos().problems
-    assert "episode_0000" in problem.name
-    assert "--" in problem.name
 
 
 def test_where_no_episode_can_be_used_the_first_says_why(tmp_path: Path, droid: Path) -> None:
@@ -212,12 +201,6 @@ def test_an_image_too_few_is_named(spoiled: Spoil) -> None:
         episode = open_droid(folder, camera=camera).read(0, "exterior_1_left")
         with pytest.raises(InputError, match=r"exterior_image_1_left: 11 images.*12 steps"):
             episode.read_frames([0])
-
-
-def test_more_images_than_steps_are_refused(spoiled: Spoil) -> None:
-    folder = spoiled(lambda features: features["steps/observation/exterior_image_1_left"][1].append(b"one more"))
-    with pytest.raises(InputError, match=r"more images.*12 steps"):
-        open_droid(folder).read(0).read_frames([0])
 
 
 def test_a_list_of_numbers_is_no_camera(droid: Path) -> None:
@@ -348,14 +331,12 @@ def test_a_folder_without_a_data_set_says_where_one_is(droid: Path, tmp_path: Pa
     ("text", "message"),
     [
         ("{", "not JSON"),
-        ('{"name": "a"}', "not a description"),
         ('{"name": "a", "splits": []}', "no episodes"),
         ('{"name": "a", "splits": [{"name": "train", "shardLengths": ["x"]}]}', "not a description"),
         (
             '{"name": "a", "splits": [{"name": "train", "shardLengths": [9999999999]}]}',
             "shard of 9,999,999,999 episodes",
         ),
-        ('{"name": "a", "splits": [{"name": "train", "shardLengths": [-1]}]}', "not a description"),
         (
             '{"name": "a", "splits": [{"name": "t", "shardLengths": [2, 2], "filepathTemplate": "one.tfrecord"}]}',
             "shards of one name",

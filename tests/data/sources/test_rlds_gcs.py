@@ -81,7 +81,7 @@ def test_an_index_reads_a_part_of_the_records_and_is_made_once(
     assert list(source.infos(lambda *counts: told.append(counts))) == list(
         RldsSource(DataConfig(path=str(folder))).infos()
     )
-    assert told == [(4, 4)]
+    assert told[-1] == (4, 4)
     assert gcs.bytes_read("-of-00001") < next(folder.glob("*.tfrecord-*")).stat().st_size / 2
     gcs.forget()
     far(folder).infos()
@@ -94,33 +94,6 @@ def test_shards_are_indexed_at_the_same_time(far: Callable[..., RldsSource], gcs
     gcs.hold(12, match=r"/download/.*tfrecord-000(0[1-9]|[12])")  # the first is read before the others
     source.infos()
     assert gcs.most_in_flight >= 12  # of 24
-
-
-def test_the_first_clip_of_an_episode_fetches_one_camera_and_later_ones_nothing(
-    long: Path, far: Callable[..., RldsSource], gcs: Gcs
-) -> None:
-    source = far(long)
-    record = source.infos().locators["length"][1]
-    for camera in ("exterior_1_left", "wrist_left"):
-        gcs.forget()
-        source.read(1, camera).read_frames([0, 4, 8, 12])
-        assert 0.3 < gcs.bytes_read() / record < 0.55
-        gcs.forget()
-        for start in (0, 20, 60):
-            source.read(1, camera).read_frames(range(start, start + 16, 4))
-        assert not gcs.requests
-
-
-def test_without_room_a_later_clip_fetches_its_frames_alone(
-    long: Path, far: Callable[..., RldsSource], gcs: Gcs
-) -> None:
-    source = far(long, limit_gb=0.0)
-    record = source.infos().locators["length"][1]
-    source.read(1).read_frames([0])
-    gcs.forget()
-    frames = source.read(1).read_frames(range(5, 75, 20))
-    assert np.array_equal(frames, RldsSource(DataConfig(path=str(long))).read(1).read_frames(range(5, 75, 20)))
-    assert 0 < gcs.bytes_read() / record < 0.1
 
 
 def test_only_the_images_of_needed_steps_are_kept(

@@ -9,6 +9,7 @@ import fsspec
 import numpy as np
 import pytest
 
+from accidents import mutated
 from synthetic import write_synthetic_droid
 from tfrecords import index_records, read_record
 from vjepa2_ac.config import DataConfig
@@ -50,24 +51,6 @@ def contents(source: RldsSource) -> Contents:
 
 def equal(one: tuple[Any, ...], other: tuple[Any, ...]) -> bool:
     return all(np.array_equal(a, b) if isinstance(a, np.ndarray) else a == b for a, b in zip(one, other, strict=True))
-
-
-def mutated(data: bytes, generator: np.random.Generator) -> bytes:
-    """Return bytes with one change of a random kind, at a random place."""
-    place, length = int(generator.integers(len(data))), int(generator.integers(1, 64))
-    other = int(generator.integers(len(data)))
-    noise = generator.bytes(length)
-    return [
-        data[:place] + bytes([data[place] ^ 1 << int(generator.integers(8))]) + data[place + 1 :],
-        data[:place] + noise + data[place + length :],
-        data[:place] + bytes(length) + data[place + length :],
-        data[:place],
-        data[:place] + noise + data[place:],
-        data[:place] + data[place + length :],
-        data[:place] + data[other : other + length] + data[place + length :],
-        data + noise,
-        data[place:] + data[:place],
-    ][int(generator.integers(9))]
 
 
 def outcome(source: RldsSource, file: str, true: Contents | None = None) -> str:

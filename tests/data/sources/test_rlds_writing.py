@@ -95,18 +95,6 @@ def test_a_full_disk_is_the_users_error_and_an_episodes_own_error_is_not(tmp_pat
         write_droid_rlds(tmp_path / "set", episodes(errno.ENOENT), shards=1)
 
 
-def test_a_folder_with_something_in_it_is_left_alone(tmp_path: Path) -> None:
-    (tmp_path / "mine").write_text("precious")
-    with pytest.raises(InputError, match="not empty"):
-        write_synthetic_droid(tmp_path, episodes=1, steps=2, shards=1)
-    assert (tmp_path / "mine").read_text() == "precious"
-
-
-def test_more_shards_than_episodes_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"1 episodes.*3 shards"):
-        write_synthetic_droid(tmp_path / "set", episodes=1, steps=2, shards=3, size=(16, 32))
-
-
 def test_an_episode_whose_parts_do_not_fit_is_refused(tmp_path: Path) -> None:
     good = synthetic_episode(0, steps=3, size=(16, 32))
     short = {**good.images, CAMERAS[0]: good.images[CAMERAS[0]][:2]}

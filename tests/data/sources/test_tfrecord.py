@@ -65,13 +65,6 @@ def test_a_file_that_ends_within_a_record_is_truncated_wherever_it_ends(file: Pa
             index_records(file)
 
 
-def test_a_file_that_shrinks_after_it_was_indexed_is_truncated(file: Path) -> None:
-    span = index_records(file)[2]
-    file.write_bytes(file.read_bytes()[: span.end - 1])
-    with pytest.raises(InputError, match="truncated"):
-        read_record(span)
-
-
 def test_every_flipped_bit_is_noticed(file: Path) -> None:
     whole = bytearray(file.read_bytes())
     for position in np.random.default_rng(0).integers(0, 8 * len(whole), 100):

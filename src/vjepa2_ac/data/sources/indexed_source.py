@@ -2,50 +2,123 @@
 
 from __future__ import annotations
 
+import importlib
+import logging
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Generic, TypeVar
 
 import numpy as np
 from jaxtyping import UInt8
 
-from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.cache import EpisodeFiles
-from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable
+from vjepa2_ac.data.files import EpisodeFiles, connections_to, in_parallel
+from vjepa2_ac.data.index import UNKNOWN, EpisodeProblem, EpisodeTable, labels_of
 from vjepa2_ac.data.selection import as_error, as_problem
-from vjepa2_ac.data.sources.listing import in_parallel
-from vjepa2_ac.episode import EpisodeInfo, Progress, no_progress
+from vjepa2_ac.episode import EpisodeInfo, EpisodeSource, Progress, Widths, no_progress
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage.block_file import DiskCache
-from vjepa2_ac.storage.npz_reader import arrays_as_bytes, read_arrays
+from vjepa2_ac.spaces import CAMERA_POSE, POSE, POSE_CHANGE, Spaces, StateSpace, vector_states
+
+logger = logging.getLogger(__name__)
+
+
+def open_source(config: DataConfig) -> EpisodeSource:
+    """Return the source of the data; nothing is read yet, and no other form's libraries are imported."""
+    module, _, name = config.reader.partition(":")
+    source: EpisodeSource = getattr(importlib.import_module(module), name)(config)
+    return source
+
+
+def measured_space(config: DataConfig, width: int) -> StateSpace:
+    """Return the space of the states that a source reads: of poses in the base frame, or of vectors so wide."""
+    return POSE if config.states == "pose" else vector_states(width)
+
+
+def spaces_of(config: DataConfig, widths: Widths) -> Spaces:
+    """Return the spaces of the states and actions of clips."""
+    if config.states == "pose":
+        return Spaces(POSE if config.pose_frame == "base" else CAMERA_POSE, POSE_CHANGE)
+    return Spaces.of_vectors(widths, "difference" if config.actions == "difference" else config.join_actions)
 
 
 @dataclass(frozen=True)
-class Opened:
-    """The state of an indexed data set; sources add what else they need to read an episode."""
+class Scanned:
+    """What the index keeps of an episode that can be used."""
 
-    table: EpisodeTable
+    info: EpisodeInfo
+    where: str  # its file, for messages
+    place: Mapping[str, Any] = field(default_factory=dict)  # numbers or bytes: what the source finds it by
+    state_hash: int = UNKNOWN
+    labels: Mapping[str, str | None] = field(default_factory=dict)
+    rate_hz: float | None = None  # control steps per second; None: the index does not know
+    kind: str = ""  # what all episodes must have in common, in words
+
+
+Found = Scanned | EpisodeProblem
+
+
+def table_of(found: Iterable[Found], config: DataConfig, total: int, progress: Progress = no_progress) -> EpisodeTable:
+    """Return the table of all episodes: of those with one identity the first stays, of kinds the most frequent one.
+
+    Args:
+        found: Every episode, in the source's order.
+        config: The data.
+        total: How many there are.
+        progress: Called after each.
+
+    Raises:
+        InputError: No episode can be used: the first one's error.
+    """
+    usable: dict[str, Scanned] = {}
+    problems: list[EpisodeProblem] = []
+    kinds: dict[str, int] = {}
+    for done, one in enumerate(found, start=1):
+        if isinstance(one, EpisodeProblem):
+            problems.append(one)
+        elif (first := usable.setdefault(one.info.id, one)) is one:
+            kinds[one.kind] = kinds.get(one.kind, 0) + 1
+        else:
+            wrong = f"the same identity as {first.where}: {one.info.id}"
+            needed = "episodes that can be told apart: the split is a hash of the identity"
+            problems.append(EpisodeProblem(one.info.id, one.where, wrong, needed, config.same_identity_fix))
+        progress(done, total)
+    if not usable:
+        raise as_error(problems[0])
+    usual = max(kinds, key=lambda kind: kinds[kind])
+    fix = "Resample the episode, or keep the recordings of different robots in different folders"
+    for name, one in usable.items():
+        if one.kind != usual:
+            problems.append(EpisodeProblem(name, one.where, one.kind, f"{usual}, as in most episodes", fix))
+    rows = [one for one in usable.values() if one.kind == usual]
+    logger.info("%s: %d episodes, %d that cannot be used", config.path, len(rows), len(problems))
+    hashes, rate = [one.state_hash for one in rows], rows[0].rate_hz
+    return EpisodeTable.of(
+        [one.info for one in rows],
+        problems=problems,
+        locators={name: np.array([one.place[name] for one in rows]) for name in rows[0].place},
+        texts={} if rate is None else {"control_rate_hz": str(rate)},
+        state_hashes=hashes if any(hashes) else None,
+        labels=labels_of([one.labels for one in rows]),
+    )
 
 
 Config = TypeVar("Config", bound=DataConfig)
-State = TypeVar("State", bound=Opened)
-Found = TypeVar("Found")
+More = TypeVar("More")
 
 
-class IndexedSource(ABC, Generic[Config, State]):
+class IndexedSource(ABC, Generic[Config, More]):
     """A source that is opened with the first call; pickled to a loader worker, it takes the index along.
 
-    Nothing is read before that call. Any number of threads may use it.
+    Nothing is read before that call. Any number of threads may use it. Besides the table it keeps what else is needed
+    to read an episode.
     """
 
     def __init__(self, config: Config) -> None:
         self._config = config
-        self._known: State | None = None
+        self._known: tuple[EpisodeTable, More] | None = None
         self._opening = threading.Lock()
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -59,27 +132,22 @@ class IndexedSource(ABC, Generic[Config, State]):
             InputError: No data set, one that does not fit the config, or no episode that can be used.
             OSError: Data behind a URL cannot be read.
         """
-        return self._open(progress or no_progress).table
+        return self._open(progress or no_progress)[0]
 
     @cached_property
     def _files(self) -> EpisodeFiles:
         return EpisodeFiles(self._config)
 
-    @property
-    def _connections(self) -> int:
-        """How many files are read at once: behind a URL, where each is waited for, several."""
-        return self._config.connections if storage.is_url(self._config.path) else 1
-
-    def _open(self, progress: Progress = no_progress) -> State:
+    def _open(self, progress: Progress = no_progress) -> tuple[EpisodeTable, More]:
         with self._opening:
             if self._known is None:
                 self._known = self._look(progress)
             return self._known
 
     def _scanned(
-        self, scan: Callable[[str], Found], identities: Mapping[str, str], progress: Progress
-    ) -> tuple[list[tuple[str, Found]], list[EpisodeProblem]]:
-        """Return the identity and content of every episode that can be used, and the problems of the others.
+        self, scan: Callable[[str], Scanned], identities: Mapping[str, str], progress: Progress
+    ) -> EpisodeTable:
+        """Return the table of every episode.
 
         Args:
             scan: Reads an episode, given by its key among the identities.
@@ -91,32 +159,23 @@ class IndexedSource(ABC, Generic[Config, State]):
             OSError: Data behind a URL cannot be read.
         """
 
-        def scan_one(key: str) -> Found | EpisodeProblem:
+        def scan_one(key: str) -> Found:
             try:
                 return scan(key)
             except InputError as error:
                 return as_problem(error, identities[key])
 
-        found: list[tuple[str, Found]] = []
-        problems: list[EpisodeProblem] = []
-        for identity, one in zip(
-            identities.values(), in_parallel(scan_one, [*identities], self._connections), strict=True
-        ):
-            if isinstance(one, EpisodeProblem):
-                problems.append(one)
-            else:
-                found.append((identity, one))
-            progress(len(found) + len(problems), len(identities))
-        if not found:
-            raise as_error(problems[0])
-        return found, problems
+        found = in_parallel(scan_one, [*identities], connections_to(self._config))
+        return table_of(found, self._config, len(identities), progress)
 
     @abstractmethod
-    def _look(self, progress: Progress) -> State:
+    def _look(self, progress: Progress) -> tuple[EpisodeTable, More]:
         """Open the data set: read its index from the cache, or scan it."""
 
 
-def _reopened(kind: type[IndexedSource[Any, Any]], config: DataConfig, known: Opened | None) -> object:
+def _reopened(
+    kind: type[IndexedSource[Any, Any]], config: DataConfig, known: tuple[EpisodeTable, Any] | None
+) -> object:
     source = kind(config)
     source._known = known
     return source
@@ -152,16 +211,3 @@ def require_as_indexed(found: int, info: EpisodeInfo, where: str) -> None:
     if found != info.num_steps:
         needed, fix = f"the {info.num_steps} that were indexed", "Do not change files while a run reads them"
         raise InputError(where=where, found=f"{found} steps", needed=needed, fix=fix)
-
-
-def stored_arrays(cache: DiskCache, key: str) -> dict[str, np.ndarray] | None:
-    """Return the arrays that `store_arrays` wrote; None if there are none, or they are damaged."""
-    data = cache.read(key)
-    with suppress(InputError):
-        return None if data is None else read_arrays(data)
-    return None
-
-
-def store_arrays(cache: DiskCache, key: str, arrays: Mapping[str, np.ndarray]) -> None:
-    """Keep what was parsed of an episode on this machine, within the limit of the disk cache."""
-    cache.write(key, arrays_as_bytes(arrays))

@@ -25,31 +25,31 @@ episodes.
 
 from __future__ import annotations
 
-import logging
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from math import prod
-from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float64, UInt8
+from jaxtyping import Float64, UInt8
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable, get_or_build, hash_of_states, index_key, labels_of
-from vjepa2_ac.data.sources.configured_spaces import measured_space
-from vjepa2_ac.data.sources.indexed_source import FramesByStep, IndexedSource, Opened, require_as_indexed
-from vjepa2_ac.data.sources.listing import walk, within
+from vjepa2_ac.data.files import walk, within
+from vjepa2_ac.data.index import EpisodeTable, get_or_build, hash_of_states, index_key
+from vjepa2_ac.data.sources.indexed_source import (
+    FramesByStep,
+    IndexedSource,
+    Scanned,
+    measured_space,
+    require_as_indexed,
+)
 from vjepa2_ac.episode import EXTRINSICS_DIM, STATE_DIM, Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.jpeg import require_bounded
 from vjepa2_ac.storage.block_file import BlockCachedFile
 from vjepa2_ac.storage.npz_reader import NpzFile
-
-logger = logging.getLogger(__name__)
 
 FORMAT_HELP = "docs/data.md says what an episode holds"
 
@@ -59,32 +59,7 @@ _MOST_TEXT_BYTES = 1 << 18
 _LABELS = ("scene", "building", "operator", "day")
 
 
-@dataclass(frozen=True)
-class _Content:
-    """The content of an episode's file, except the frames (legend: `vjepa2_ac.episode`)."""
-
-    states: Float[np.ndarray, "steps state_dim"]
-    fps_hz: float
-    success: bool | None
-    language: str | None
-    extrinsics: dict[str, Any]  # of each camera: [steps 6], or None
-    joint_velocities: Float[np.ndarray, "steps joints"] | None
-    commands: Float[np.ndarray, "steps action_dim"] | None
-    labels: dict[str, str | None]
-
-    @property
-    def kind(self) -> str:
-        """What all episodes of a data set must have in common, in words."""
-        action = "" if self.commands is None else f", {self.commands.shape[1]} an action"
-        return f"{self.fps_hz:g} steps a second (fps_hz), {self.states.shape[1]} numbers a state{action}"
-
-
-@dataclass(frozen=True)
-class _Opened(Opened):
-    version: str  # of all files: the key of the index
-
-
-class NpzSource(IndexedSource[DataConfig, _Opened]):
+class NpzSource(IndexedSource[DataConfig, None]):
     """The episodes of a folder of .npz files, in the order of their paths; a path without .npz is the identity.
 
     `infos` reads every file except the frames. Data from URLs is cached on this machine.
@@ -97,34 +72,55 @@ class NpzSource(IndexedSource[DataConfig, _Opened]):
             InputError: The file is missing or damaged, or has changed since it was indexed.
             OSError: Data behind a URL cannot be read.
         """
-        opened = self._open()
-        info = opened.table[index]
-        path, camera = self._path(info.id), camera or self._config.cameras[0]
-        found = self._content(path, opened.version, (camera,))
-        require_as_indexed(len(found.states), info, path)
-        return Episode(
-            info=info,
-            states=found.states,
-            read_frames=FramesByStep(info.num_steps, path, partial(self._frames, path, camera, info.num_steps)),
-            control_rate_hz=found.fps_hz,
-            extrinsics=found.extrinsics[camera],
-            joint_velocities=found.joint_velocities,
-            metadata={} if found.language is None else {"language": found.language},
-            commands=found.commands,
-        )
+        table = self.infos()
+        info = table[index]
+        episode, _ = self._episode(info.id, table.texts["index"], (camera or self._config.cameras[0],))
+        require_as_indexed(len(episode.states), info, self._path(info.id))
+        return episode
+
+    def _episode(self, identity: str, version: str, cameras: Sequence[str]) -> tuple[Episode, dict[str, str | None]]:
+        """Return an episode with the frames of the first of some cameras, and its labels.
+
+        Raises:
+            InputError: It is no episode, or impossible for a robot.
+        """
+        path, config = self._path(identity), self._config
+        with opened_npz(self._files.open(path, version=version), path) as file:
+            arrays, names = _Arrays(file, path), file.names
+            states = arrays.numbers("states", (None, STATE_DIM if config.states == "pose" else None))
+            steps = len(states)
+            measured_space(config, states.shape[1]).require_plausible(states, path, fix=FORMAT_HELP)
+            for camera in cameras:
+                arrays.require_frames(camera, steps)
+            extrinsics = [arrays.extrinsics(camera, steps) for camera in cameras]
+            if config.pose_frame == "camera" and any(one is None for one in extrinsics):
+                found, needed = "no poses of the camera", "extrinsics, or extrinsics_CAMERA for each of data.camera"
+                raise InputError(where=path, found=found, needed=needed, fix="Set data.pose_frame: base")
+            fps_hz = float(arrays.numbers("fps_hz", ()))
+            if fps_hz <= 0:
+                raise arrays.refused("fps_hz", f"{fps_hz:g}", "control steps per second")
+            language = arrays.text("language") if "language" in names else None
+            episode = Episode(
+                info=EpisodeInfo(identity, steps, bool(arrays.numbers("success", ())) if "success" in names else None),
+                states=states,
+                read_frames=FramesByStep(steps, path, partial(self._frames, path, version, cameras[0], steps)),
+                control_rate_hz=fps_hz,
+                extrinsics=extrinsics[0],
+                joint_velocities=arrays.optional("joint_velocities", (steps, None)),
+                metadata={} if language is None else {"language": language},
+                commands=arrays.numbers("actions", (steps, None)) if config.actions == "recorded" else None,
+            )
+            labels = {name: arrays.text(name) for name in _LABELS if arrays.is_text(name)}
+            return episode, {"task": language, **labels}
 
     def _frames(
-        self, path: str, camera: str, num_steps: int, steps: Sequence[int]
+        self, path: str, version: str, camera: str, num_steps: int, steps: Sequence[int]
     ) -> UInt8[np.ndarray, "time height width 3"]:
-        with opened_npz(self._files.open(path, version=self._open().version), path) as file:
-            _require_frames(file, camera, num_steps, path, count=len(set(steps)))
+        with opened_npz(self._files.open(path, version=version), path) as file:
+            _Arrays(file, path).require_frames(camera, num_steps, count=len(set(steps)))
             return np.asarray(file.rows(camera, steps))
 
-    def _content(self, path: str, version: str, cameras: Sequence[str]) -> _Content:
-        with opened_npz(self._files.open(path, version=version), path) as file:
-            return _content_of(file, path, cameras, self._config)
-
-    def _look(self, progress: Progress) -> _Opened:
+    def _look(self, progress: Progress) -> tuple[EpisodeTable, None]:
         """Return the cached table, or read every episode; a changed file changes the key."""
         config, root = self._config, self._config.path
         listed = sorted(
@@ -140,30 +136,15 @@ class NpzSource(IndexedSource[DataConfig, _Opened]):
             knobs |= {"states": config.states, "actions": config.actions}
         key = index_key({"source": "npz", **knobs, "listed": listed}, root)
         ids = [path.removesuffix(_SUFFIX) for path, _, _ in listed]
-        build = partial(self._scan_all, ids, key, progress)
-        return _Opened(get_or_build(config.disk_cache, key, root, build), key)
+        build = partial(self._scanned, partial(self._scan, key), dict(zip(ids, ids, strict=True)), progress)
+        return get_or_build(config.disk_cache, key, root, build), None
 
-    def _scan_all(self, ids: list[str], version: str, progress: Progress) -> EpisodeTable:
-        found, problems = self._scanned(
-            lambda name: self._content(self._path(name), version, self._config.cameras),
-            dict(zip(ids, ids, strict=True)),
-            progress,
-        )
-        usual = Counter(one.kind for _, one in found).most_common(1)[0][0]
-        problems += [self._unlike(name, one.kind, usual) for name, one in found if one.kind != usual]
-        usable = {name: one for name, one in found if one.kind == usual}
-        logger.info("%s: %d episodes, %d that cannot be used", self._config.path, len(usable), len(problems))
-        return EpisodeTable.of(
-            [EpisodeInfo(name, len(one.states), one.success) for name, one in usable.items()],
-            problems=problems,
-            texts={"control_rate_hz": str(next(iter(usable.values())).fps_hz)},
-            state_hashes=[hash_of_states(one.states) for one in usable.values()],
-            labels=labels_of([{"task": one.language, **one.labels} for one in usable.values()]),
-        )
-
-    def _unlike(self, identity: str, kind: str, usual: str) -> EpisodeProblem:
-        fix = "Resample the episode, or keep the recordings of different robots in different folders"
-        return EpisodeProblem(identity, self._path(identity), kind, f"{usual}, as in most episodes", fix)
+    def _scan(self, version: str, identity: str) -> Scanned:
+        episode, labels = self._episode(identity, version, self._config.cameras)
+        action = "" if episode.commands is None else f", {episode.commands.shape[1]} an action"
+        kind = f"{episode.control_rate_hz:g} steps a second (fps_hz), {episode.states.shape[1]} numbers a state{action}"
+        where, hashed = self._path(identity), hash_of_states(episode.states)
+        return Scanned(episode.info, where, {}, hashed, labels, episode.control_rate_hz, kind)
 
     def _path(self, identity: str) -> str:
         return storage.join(self._config.path, identity + _SUFFIX)
@@ -185,51 +166,6 @@ def opened_npz(opened: str | BlockCachedFile, path: str) -> Iterator[NpzFile]:
         raise storage.unreadable(path, error) from None
 
 
-def _content_of(file: NpzFile, path: str, cameras: Sequence[str], config: DataConfig) -> _Content:
-    """Return the content of a file except the frames of the cameras, whose shape is checked.
-
-    Raises:
-        InputError: It is no episode, or impossible for a robot.
-    """
-    arrays = _Arrays(file, path)
-    states = arrays.numbers("states", (None, STATE_DIM if config.states == "pose" else None))
-    steps = len(states)
-    measured_space(config, states.shape[1]).require_plausible(states, path, fix=FORMAT_HELP)
-    extrinsics = {}
-    for camera in cameras:
-        _require_frames(file, camera, steps, path)
-        extrinsics[camera] = arrays.extrinsics(camera, steps)
-        if config.pose_frame == "camera" and extrinsics[camera] is None:
-            found, needed = "no poses of the camera", f"extrinsics or extrinsics_{camera}"
-            raise InputError(where=path, found=found, needed=needed, fix="Set data.pose_frame: base")
-    fps_hz = float(arrays.numbers("fps_hz", ()))
-    if fps_hz <= 0:
-        raise _refused(f"{path}: fps_hz", f"{fps_hz:g}", "control steps per second")
-    has_velocities = "joint_velocities" in file.names
-    return _Content(
-        states=states,
-        fps_hz=fps_hz,
-        success=bool(arrays.numbers("success", ())) if "success" in file.names else None,
-        language=arrays.text("language") if "language" in file.names else None,
-        extrinsics=extrinsics,
-        joint_velocities=arrays.numbers("joint_velocities", (steps, None)) if has_velocities else None,
-        commands=arrays.numbers("actions", (steps, None)) if config.actions == "recorded" else None,
-        labels={name: arrays.text(name) for name in _LABELS if arrays.is_text(name)},
-    )
-
-
-def _require_frames(file: NpzFile, camera: str, steps: int, path: str, *, count: int = 1) -> None:
-    """Refuse an array that cannot be the frames of a camera, without reading it; `count` are read together."""
-    _require_array(file, camera, (steps, None, None, 3), "u", "frames (steps, height, width, 3)", path)
-    header = file.header(camera)
-    require_bounded(header.shape[1], header.shape[2], f"{path}: {camera}", count=count)
-    if header.dtype != np.uint8:
-        raise _refused(f"{path}: {camera}", f"frames of {header.dtype}", "uint8, 0 to 255")
-    if header.by_columns:
-        found = "frames in Fortran order, of which none can be read by itself"
-        raise InputError(where=f"{path}: {camera}", found=found, needed="C order", fix="Use numpy.ascontiguousarray")
-
-
 @dataclass(frozen=True)
 class _Arrays:
     """Reads arrays of known shapes from an untrusted file."""
@@ -237,17 +173,24 @@ class _Arrays:
     file: NpzFile
     path: str
 
+    def refused(self, name: str, found: str, needed: str) -> InputError:
+        """Return the error of an array."""
+        return InputError(where=f"{self.path}: {name}", found=found, needed=needed, fix=FORMAT_HELP)
+
     def numbers(self, name: str, shape: tuple[int | None, ...]) -> Float64[np.ndarray, ...]:
         """Return finite numbers of a shape; None stands for any length."""
-        _require_array(self.file, name, shape, "biuf", "numbers", self.path)
+        self._require(name, shape, "biuf", "numbers")
         if (count := prod(self.file.header(name).shape)) > _MOST_NUMBERS:
-            raise _refused(f"{self.path}: {name}", f"{count:,} numbers", f"at most {_MOST_NUMBERS:,} in an episode")
+            raise self.refused(name, f"{count:,} numbers", f"at most {_MOST_NUMBERS:,} in an episode")
         values = self.file.array(name).astype(np.float64)
         if not np.isfinite(values).all():
             step = np.argwhere(~np.isfinite(values))[0][:1].tolist()
-            at = f" at step {step[0]}" if step else ""
-            raise _refused(f"{self.path}: {name}", f"NaN or infinity{at}", "numbers")
+            raise self.refused(name, f"NaN or infinity{f' at step {step[0]}' if step else ''}", "numbers")
         return values
+
+    def optional(self, name: str, shape: tuple[int | None, ...]) -> Float64[np.ndarray, ...] | None:
+        """Return numbers, or None if there are none of this name."""
+        return self.numbers(name, shape) if name in self.file.names else None
 
     def is_text(self, name: str) -> bool:
         """Return whether there is an array of this name with one text; a camera may have that name, too."""
@@ -256,9 +199,9 @@ class _Arrays:
 
     def text(self, name: str) -> str:
         """Return a text."""
-        _require_array(self.file, name, (), "U", "one text", self.path)
+        self._require(name, (), "U", "one text")
         if (size := self.file.header(name).nbytes) > _MOST_TEXT_BYTES:
-            raise _refused(f"{self.path}: {name}", f"a text of {size:,} bytes", f"at most {_MOST_TEXT_BYTES:,}")
+            raise self.refused(name, f"a text of {size:,} bytes", f"at most {_MOST_TEXT_BYTES:,}")
         return str(self.file.array(name))
 
     def extrinsics(self, camera: str, steps: int) -> Float64[np.ndarray, "steps 6"] | None:
@@ -270,20 +213,25 @@ class _Arrays:
                 return np.broadcast_to(values, (steps, EXTRINSICS_DIM))
         return None
 
+    def require_frames(self, camera: str, steps: int, *, count: int = 1) -> None:
+        """Refuse an array that cannot be the frames of a camera, without reading it; `count` are read together."""
+        self._require(camera, (steps, None, None, 3), "u", "frames (steps, height, width, 3)")
+        header = self.file.header(camera)
+        require_bounded(header.shape[1], header.shape[2], f"{self.path}: {camera}", count=count)
+        if header.dtype != np.uint8:
+            raise self.refused(camera, f"frames of {header.dtype}", "uint8, 0 to 255")
+        if header.by_columns:
+            raise self.refused(camera, "frames in Fortran order", "C order, as by numpy.ascontiguousarray")
 
-def _require_array(
-    file: NpzFile, name: str, shape: tuple[int | None, ...], kinds: str, meaning: str, path: str
-) -> None:
-    """Refuse an array that is missing, or of another shape or type."""
-    if name not in file.names:
-        there = ", ".join(file.names)[:200] or "none"
-        raise _refused(f"{path}: {name}", "no such array", f"{meaning}; there are {there}")
-    header = file.header(name)
-    alike = len(header.shape) == len(shape) and all(b in {a, None} for a, b in zip(header.shape, shape, strict=True))
-    if not alike or header.dtype.kind not in kinds or (0 in header.shape[1:]):
-        wanted = " x ".join("any" if size is None else str(size) for size in shape) or "a single one"
-        raise _refused(f"{path}: {name}", f"shape {header.shape} of {header.dtype}", f"{meaning}: {wanted}")
-
-
-def _refused(where: str, found: str, needed: str) -> InputError:
-    return InputError(where=where, found=found, needed=needed, fix=FORMAT_HELP)
+    def _require(self, name: str, shape: tuple[int | None, ...], kinds: str, meaning: str) -> None:
+        """Refuse an array that is missing, or of another shape or type."""
+        if name not in self.file.names:
+            there = ", ".join(self.file.names)[:200] or "none"
+            raise self.refused(name, "no such array", f"{meaning}; there are {there}")
+        header = self.file.header(name)
+        alike = len(header.shape) == len(shape) and all(
+            b in {a, None} for a, b in zip(header.shape, shape, strict=True)
+        )
+        if not alike or header.dtype.kind not in kinds or (0 in header.shape[1:]):
+            wanted = " x ".join("any" if size is None else str(size) for size in shape) or "a single one"
+            raise self.refused(name, f"shape {header.shape} of {header.dtype}", f"{meaning}: {wanted}")

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vjepa2_ac import storage
-from vjepa2_ac.data.sources.listing import DEEPEST, in_parallel, list_folder, within
+from vjepa2_ac.data.files import DEEPEST, in_parallel, list_folder, within
 from vjepa2_ac.storage import FileInfo
 
 TRAJECTORY = "trajectory.h5"

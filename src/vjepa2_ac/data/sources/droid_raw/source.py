@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import json
-import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from pathlib import PurePosixPath
 from typing import Any
 
@@ -17,16 +16,7 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import RawDroidData
 from vjepa2_ac.config.section import Affects, knobs_that_affect
 from vjepa2_ac.config.sources import RAW_CAMERAS
-from vjepa2_ac.data.cache import fetched_data
-from vjepa2_ac.data.index import (
-    EpisodeProblem,
-    EpisodeTable,
-    get_or_build,
-    hash_of_states,
-    index_key,
-    key_of,
-    labels_of,
-)
+from vjepa2_ac.data.index import EpisodeTable, get_or_build, hash_of_states, index_key, key_of
 from vjepa2_ac.data.sources.droid_raw.episode_folders import (
     TRAJECTORY,
     VIDEOS,
@@ -39,19 +29,14 @@ from vjepa2_ac.data.sources.droid_raw.episode_folders import (
 from vjepa2_ac.data.sources.indexed_source import (
     FramesByStep,
     IndexedSource,
-    Opened,
+    Scanned,
     require_as_indexed,
-    store_arrays,
-    stored_arrays,
 )
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError, require_library
 from vjepa2_ac.media.video_reader import count_frames, frame_times, read_frames
 from vjepa2_ac.spaces import POSE, zero_steps
-from vjepa2_ac.storage.block_file import DiskCache
 from vjepa2_ac.storage.structured import json_object
-
-logger = logging.getLogger(__name__)
 
 _FIX = "Copy the episode again"
 _MOST_STEPS = 1_000_000  # a damaged header may claim any number
@@ -77,17 +62,7 @@ class _Place:
     frames: dict[str, int]  # how many the MP4 of each of the config's cameras has, by serial number
 
 
-@dataclass(frozen=True)
-class _Found:
-    """An episode that can be used."""
-
-    info: EpisodeInfo
-    place: _Place
-    state_hash: int
-    labels: dict[str, str | None]
-
-
-class RawDroidSource(IndexedSource[RawDroidData, Opened]):
+class RawDroidSource(IndexedSource[RawDroidData, None]):
     """The episodes of a raw DROID tree, or of a part of it, in the order of their paths.
 
     `infos` reads every trajectory and the headers of the MP4s of the config's cameras, once; data behind a URL is not
@@ -125,74 +100,52 @@ class RawDroidSource(IndexedSource[RawDroidData, Opened]):
             metadata={} if task is None else {"language": task},
         )
 
-    @cached_property
-    def _cache(self) -> DiskCache:
-        return fetched_data(self._config.disk_cache)
+    def _parsed(self, key: str, parse: Callable[[], dict[str, np.ndarray]]) -> Arrays:
+        """Return arrays that were parsed on this machine before, or now."""
+        found = self._files.arrays(key)
+        if found is None:
+            self._files.keep(key, found := parse())
+        return found
 
     def _frames(
         self, video: str, version: str, frames: Sequence[int], steps: Sequence[int]
     ) -> UInt8[np.ndarray, "time height width 3"]:
-        key = f"times {video} {version}"
-        known = stored_arrays(self._cache, key)
-        if known is None:
-            times = frame_times(self._files.open(video, version=version), where=video)
-            store_arrays(self._cache, key, known := {"times": np.array(times, np.int64)})
-        opened = self._files.open(video, version=version)
-        return read_frames(opened, [frames[step] for step in steps], where=video, times=known["times"].tolist())
+        opened = partial(self._files.open, video, version=version)
+        walk = lambda: {"times": np.array(frame_times(opened(), where=video), np.int64)}  # noqa: E731
+        times = self._parsed(f"times {video} {version}", walk)["times"].tolist()
+        return read_frames(opened(), [frames[step] for step in steps], where=video, times=times)
 
-    def _look(self, progress: Progress) -> Opened:
+    def _look(self, progress: Progress) -> tuple[EpisodeTable, None]:
         """Return the cached table, or scan every episode; a changed local file changes the key."""
         config, root = self._config, self._config.path
         folders = find_episodes(root, config.connections)
         if not folders:
-            raise InputError(
-                where="data.path",
-                found=f"no episodes under {root}",
-                needed=f"folders LAB/success|failure/DATE/TIME with a {TRAJECTORY}",
-                fix="DROID's are in gs://gresearch/robotics/droid_raw/1.0.1",
-            )
+            needed = f"folders LAB/success|failure/DATE/TIME with a {TRAJECTORY}"
+            fix = "DROID's are in gs://gresearch/robotics/droid_raw/1.0.1"
+            raise InputError(where="data.path", found=f"no episodes under {root}", needed=needed, fix=fix)
         listed: Sequence[EpisodeFolder | str] = folders
         if not storage.is_url(root):
             listed = [list_episode(root, folder) for folder in folders]
-        own = knobs_that_affect(Affects.INDEX, config.droid_raw)
         parts = {
             "source": "droid_raw",
             "cameras": config.cameras,
-            "droid_raw": " ".join(f"{name}={value!r}" for name, value in own.items()),
+            "droid_raw": knobs_that_affect(Affects.INDEX, config.droid_raw),
             "pose_frame": config.pose_frame,
             "folders": listed,
         }
         key = index_key(parts, root, named=identity_of(root, folders[0]))
-        return Opened(get_or_build(config.disk_cache, key, root, lambda: self._scan_all(folders, progress)))
+        identities = {folder: identity_of(root, folder) for folder in folders}
+        build = partial(self._scanned, self._scan, identities, progress)
+        return get_or_build(config.disk_cache, key, root, build), None
 
-    def _scan_all(self, folders: list[str], progress: Progress) -> EpisodeTable:
-        identities = {folder: identity_of(self._config.path, folder) for folder in folders}
-        found, problems = self._scanned(self._scan, identities, progress)
-        usable: dict[str, _Found] = {}
-        for identity, one in found:
-            if usable.setdefault(identity, one) is not one:
-                wrong, fix = f"a second episode of the same identity: {identity}", "Name a smaller folder in data.path"
-                where = self._path(one.place.folder, TRAJECTORY)
-                problems.append(EpisodeProblem(identity, where, wrong, "episodes that can be told apart", fix))
-        logger.info("%s: %d episodes, %d that cannot be used", self._config.path, len(usable), len(problems))
-        return EpisodeTable.of(
-            [one.info for one in usable.values()],
-            problems=problems,
-            locators={"place": np.array([json.dumps(vars(one.place)).encode() for one in usable.values()])},
-            texts={"control_rate_hz": str(self._config.droid_raw.control_rate_hz)},
-            state_hashes=[one.state_hash for one in usable.values()],
-            labels=labels_of([one.labels for one in usable.values()]),
-        )
-
-    def _scan(self, folder: str) -> _Found:
+    def _scan(self, folder: str) -> Scanned:
         identity = identity_of(self._config.path, folder)
         listed = list_episode(self._config.path, folder)
         if not listed.has_trajectory or listed.metadata is None:
             found = f"episode {identity} has no {'metadata_*.json' if listed.has_trajectory else TRAJECTORY}"
             raise InputError(where=self._path(folder, ""), found=found, needed="one", fix=_FIX)
         version, path = key_of({"files": listed}), self._path(folder, listed.metadata)
-        data = self._files.read(path, version=version, where=path)
-        metadata = json_object(data, where=path, needed="the metadata of an episode")
+        metadata = json_object(self._files.read(path, version=version), where=path, needed="the metadata of an episode")
         named = {camera: _named(metadata, camera) for camera in RAW_CAMERAS}
         known = {camera: serial for camera, serial in named.items() if serial}
         serials = tuple(_serial(known, camera, path) for camera in self._config.cameras)
@@ -200,7 +153,14 @@ class RawDroidSource(IndexedSource[RawDroidData, Opened]):
         states = _states_of(self._numbers(place, serials))
         success = metadata.get("success")
         outcome = success if isinstance(success, bool) else success_of(identity)
-        return _Found(EpisodeInfo(identity, len(states), outcome), place, hash_of_states(states), _labels(metadata))
+        return Scanned(
+            EpisodeInfo(identity, len(states), outcome),
+            self._path(folder, TRAJECTORY),
+            place={"place": json.dumps(vars(place)).encode()},
+            state_hash=hash_of_states(states),
+            labels=_labels(metadata),
+            rate_hz=self._config.droid_raw.control_rate_hz,
+        )
 
     def _counted(self, folder: str, listed: EpisodeFolder, serials: tuple[str, ...]) -> dict[str, int]:
         """Return the number of frames of each camera."""
@@ -222,10 +182,8 @@ class RawDroidSource(IndexedSource[RawDroidData, Opened]):
         """
         path = self._path(place.folder, TRAJECTORY)
         key = f"trajectory {path} {place.version} {serials}"
-        found: Arrays | None = stored_arrays(self._cache, key)
-        if found is None:
-            found = parse_trajectory(self._files.read(path, version=place.version, where=path), path, serials)
-            store_arrays(self._cache, key, found)
+        read = partial(self._files.read, path, version=place.version)
+        found = self._parsed(key, lambda: parse_trajectory(read(), path, serials))
         steps = len(found["pose"])
         for serial, count in place.frames.items():
             if abs(steps - count) > 1:

@@ -2,7 +2,7 @@
 
 cache.json     what the cache is: its key in full
 episodes.npz   every episode of the data set that it was made from, in its order, as `EpisodeTable.to_bytes` writes them
-kept.npz       the steps that `data.idle` leaves, as `FoundRanges.to_bytes` writes them; absent without an idle rule
+kept.npz       the steps that `data.idle` leaves, as `StepSelection.to_bytes` writes them; absent without an idle rule
 episodes/000/000123-CAMERA.safetensors   the latents of an episode, by its index, and a camera
 episodes/000/000123-CAMERA.broken        in its place: why the episode could not be read (`data.broken_episodes`)
 
@@ -39,8 +39,8 @@ from safetensors.torch import save
 from torch import Tensor
 
 from vjepa2_ac import storage
-from vjepa2_ac.data.idle import FoundRanges
 from vjepa2_ac.data.index import EpisodeTable, NotATableError
+from vjepa2_ac.data.selection import StepSelection
 from vjepa2_ac.data.sources.latents.cache_key import FORMAT, CacheKey
 from vjepa2_ac.episode import Episode, StoredLatents
 from vjepa2_ac.errors import InputError
@@ -105,7 +105,7 @@ def read_key(folder: Path) -> CacheKey:
     return CacheKey(key)
 
 
-def read_tables(folder: Path, *, has_idle_rule: bool) -> tuple[EpisodeTable, FoundRanges | None]:
+def read_tables(folder: Path, *, has_idle_rule: bool) -> tuple[EpisodeTable, StepSelection | None]:
     """Read the episodes of a cache and, if it has an idle rule, the ranges that the rule keeps.
 
     Raises:
@@ -115,7 +115,7 @@ def read_tables(folder: Path, *, has_idle_rule: bool) -> tuple[EpisodeTable, Fou
         table = EpisodeTable.from_bytes(storage.read_bounded(folder / EPISODES, _MOST_BYTES))
         if not has_idle_rule:
             return table, None
-        return table, FoundRanges.from_bytes(storage.read_bounded(folder / KEPT, _MOST_BYTES))
+        return table, StepSelection.from_bytes(storage.read_bounded(folder / KEPT, _MOST_BYTES))
     except (OSError, NotATableError) as error:
         found = f"{EPISODES} or {KEPT} cannot be read ({error})"
         raise InputError(where=str(folder), found=found, fix=_ENCODE) from None

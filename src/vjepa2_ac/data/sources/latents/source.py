@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Int
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.idle import FoundRanges
-from vjepa2_ac.data.sources.indexed_source import IndexedSource, Opened
+from vjepa2_ac.data.index import EpisodeTable
+from vjepa2_ac.data.selection import StepSelection
+from vjepa2_ac.data.sources.indexed_source import IndexedSource
 from vjepa2_ac.data.sources.latents.cache_files import OPTIONAL, LatentFiles, read_key, read_tables
 from vjepa2_ac.data.sources.latents.cache_key import CacheKey, clip_parts
 from vjepa2_ac.episode import Episode, Progress, StepRanges
@@ -19,13 +20,13 @@ from vjepa2_ac.errors import InputError
 
 
 @dataclass(frozen=True)
-class _Opened(Opened):
+class _Cache:
     key: CacheKey
     files: LatentFiles
-    kept: FoundRanges | None
+    kept: StepSelection | None
 
 
-class LatentSource(IndexedSource[DataConfig, _Opened]):
+class LatentSource(IndexedSource[DataConfig, _Cache]):
     """The episodes of the data set that a latent cache was made from, in that data set's order.
 
     An episode that could not be read while encoding is included, and raises an error here, too: so the clips are those
@@ -35,26 +36,21 @@ class LatentSource(IndexedSource[DataConfig, _Opened]):
     @property
     def key(self) -> CacheKey:
         """What the cache is."""
-        return self._open().key
+        return self._open()[1].key
 
     @property
     def cameras(self) -> tuple[str, ...]:
         """The cameras that clips are drawn from: the config's, or all of the cache."""
         return self.key.cameras if self._config.camera is None else self._config.cameras
 
-    @property
-    def settled_config(self) -> DataConfig:
-        """The config with the names of the cameras."""
-        return self._config.model_copy(update={"camera": self.cameras})
-
-    def kept_ranges(self) -> FoundRanges:
+    def kept_ranges(self) -> StepSelection:
         """Return the ranges that `data.idle` keeps, from the cache.
 
         Raises:
             InputError: No cache, or one of other clips than the config's.
             ValueError: The rule is none.
         """
-        if (kept := self._open().kept) is None:
+        if (kept := self._open()[1].kept) is None:
             raise ValueError("no idle rule")
         return kept
 
@@ -65,15 +61,16 @@ class LatentSource(IndexedSource[DataConfig, _Opened]):
             InputError: The file is missing or damaged, or the episode could not be read while encoding.
             ValueError: A camera that the cache does not have.
         """
-        opened, camera = self._open(), camera or self.cameras[0]
+        table, opened = self._open()
+        camera = camera or self.cameras[0]
         if camera not in opened.key.cameras:
             raise ValueError(f"camera {camera!r} is not one of {', '.join(opened.key.cameras)}")
         record = opened.files.open(index, camera)
         return Episode(
-            info=opened.table[index],
+            info=table[index],
             states=record.array("states"),
             read_frames=lambda steps: record.pictures(record.places_of(steps)),
-            control_rate_hz=float(opened.table.texts["control_rate_hz"]),
+            control_rate_hz=float(table.texts["control_rate_hz"]),
             metadata=record.metadata,
             read_latents=lambda steps: record.latents(record.places_of(steps)),
             frame_steps=record.frame_steps,
@@ -81,33 +78,23 @@ class LatentSource(IndexedSource[DataConfig, _Opened]):
         )
 
     def settle(self, episodes: Int[np.ndarray, " episodes"]) -> DataConfig:
-        """Return the config with the cameras that there are.
+        """Return the config with the names of the cameras.
 
         Raises:
-            InputError: As `require_encoded`.
+            InputError: Some of these episodes have no whole files: the cache is unfinished, damaged, or was made of
+                others.
         """
-        self.require_encoded(episodes)
-        return self.settled_config
-
-    def require_encoded(self, episodes: Int[np.ndarray, " episodes"]) -> None:
-        """Refuse a cache without whole files of these episodes: it is unfinished, damaged, or was made of others.
-
-        Raises:
-            InputError: Some are missing.
-        """
-        opened, wanted = self._open(), np.unique(episodes).tolist()
+        table, opened = self._open()
+        wanted = np.unique(episodes).tolist()
         lacking = [one for one in wanted if not all(opened.files.is_done(one, camera) for camera in self.cameras)]
         if lacking:
-            first = opened.table.identity(lacking[0])
-            raise InputError(
-                where=self._config.path,
-                found=f"no whole latents of {len(lacking)} of {len(wanted)} episodes, such as {first}",
-                needed="those of every episode that takes part",
-                fix="Run `vjepa2-ac encode` again, as the cache was made: it encodes what is missing; or leave these"
-                " episodes out (data.outcome, data.exclude)",
-            )
+            such = f"{len(lacking)} of {len(wanted)} episodes, such as {table.identity(lacking[0])}"
+            fix = "Run `vjepa2-ac encode` again, as the cache was made: it encodes what is missing; or leave these"
+            fix += " episodes out (data.outcome, data.exclude)"
+            raise InputError(where=self._config.path, found=f"no whole latents of {such}", fix=fix)
+        return self._config.model_copy(update={"camera": self.cameras})
 
-    def _look(self, progress: Progress) -> _Opened:  # noqa: ARG002 - at once
+    def _look(self, progress: Progress) -> tuple[EpisodeTable, _Cache]:  # noqa: ARG002 - at once
         folder = Path(self._config.path)
         key = read_key(folder)
         parts = clip_parts(self._config)
@@ -118,14 +105,12 @@ class LatentSource(IndexedSource[DataConfig, _Opened]):
         if differing:  # of other clips than the config's
             raise another_cache(folder, differing)
         table, kept = read_tables(folder, has_idle_rule=self._config.idle.rule != "none")
-        return _Opened(table, key, LatentFiles(folder, key.digest), kept)
+        return table, _Cache(key, LatentFiles(folder, key.digest), kept)
 
 
 def another_cache(folder: Path, differing: Sequence[str]) -> InputError:
     """Return the error of a cache with other settings than those in use."""
-    return InputError(
-        where=str(folder),
-        found=f"a latent cache that was made otherwise: {'; '.join(differing)}",
-        needed="one that was made with this model and these settings",
-        fix="Change the settings to those, or encode the data set again",
-    )
+    found = f"a latent cache that was made otherwise: {'; '.join(differing)}"
+    needed = "one that was made with this model and these settings"
+    fix = "Change the settings to those, or encode the data set again"
+    return InputError(where=str(folder), found=found, needed=needed, fix=fix)

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
 from vjepa2_ac import storage
-from vjepa2_ac.data.index import UNKNOWN, EpisodeTable, Labels, hash_of_bytes
-from vjepa2_ac.data.selection import as_problem
+from vjepa2_ac.data.index import UNKNOWN, EpisodeTable, hash_of_bytes
 from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, filled
-from vjepa2_ac.data.sources.lerobot.parquet import Opener, read_table
-from vjepa2_ac.episode import EpisodeInfo
+from vjepa2_ac.data.sources.lerobot.parquet import read_table
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.spaces import zero_steps
+from vjepa2_ac.storage.block_file import BlockCachedFile
 from vjepa2_ac.storage.structured import json_object
 
 TABLES = {  # templates of the files that list the episodes
@@ -32,42 +29,34 @@ _STATISTICS = ("min", "max", "mean", "std")
 
 
 @dataclass(frozen=True)
-class VideoPlace:
-    """The location of one camera's frames of an episode."""
-
-    chunk: int
-    file: int
-    start_s: float  # of the episode's first frame
-    length_s: float | None = None  # None: unknown
-
-
-@dataclass(frozen=True)
 class EpisodeRow:
     """The entry of one episode in the data set's tables."""
 
-    index: int
     length: int
-    chunk: int  # of its rows
-    file: int
-    tasks: tuple[str, ...] = ()
-    videos: Mapping[str, VideoPlace] = field(default_factory=dict)
+    place: Mapping[str, float]  # index; chunk and file of its rows; KEY.chunk, KEY.file and KEY.start_s of each video
+    task: str = ""
+    lengths_s: Mapping[str, float] = field(default_factory=dict)  # of its part of each video, where the table says it
     success: bool | None = None
     state_hash: int = UNKNOWN
+
+    @property
+    def index(self) -> int:
+        """Its number."""
+        return int(self.place["index"])
 
     @property
     def id(self) -> str:
         """Its identity: its number, the only name in LeRobot."""
         return f"episode_{self.index:06d}"
 
+    def data_file(self, info: DatasetInfo) -> str:
+        """Return the path, within the data set, of the file with its rows."""
+        return filled(info.data_path, int(self.place["chunk"]), int(self.place["file"]))
 
-def data_file(info: DatasetInfo, row: EpisodeRow) -> str:
-    """Return the path, within the data set, of the file with an episode's rows."""
-    return filled(info.data_path, row.chunk, row.file)
-
-
-def video_file(info: DatasetInfo, place: VideoPlace, key: str) -> str:
-    """Return the path, within the data set, of the file with an episode's frames."""
-    return filled(info.video_path or "", place.chunk, place.file, key)
+    def video_file(self, info: DatasetInfo, key: str) -> str:
+        """Return the path, within the data set, of the file with its frames."""
+        chunk, file = (int(self.place[f"{key}.{part}"]) for part in ("chunk", "file"))
+        return filled(info.video_path or "", chunk, file, key)
 
 
 def read_episodes(
@@ -76,7 +65,7 @@ def read_episodes(
     videos: Sequence[str],
     states: Sequence[str],
     success: str | None,
-    open_file: Opener,
+    open_file: Callable[[str], str | BlockCachedFile],
 ) -> list[EpisodeRow]:
     """Return every episode, sorted by number.
 
@@ -142,92 +131,64 @@ def _row_of(
     is_known = bool(of_states) and None not in of_states
     hashed = json.dumps([row["length"], *of_states], default=str).encode()
     tasks = row.get("tasks") or ()
+    place: dict[str, float] = {
+        "index": index,
+        "chunk": int(row["data/chunk_index"]),
+        "file": int(row["data/file_index"]),
+    }
+    lengths_s = {}
+    for key in videos:
+        name = f"videos/{key}"
+        start, end = float(row[f"{name}/from_timestamp"]), row.get(f"{name}/to_timestamp")
+        if not math.isfinite(start) or start < 0:
+            raise ValueError(f"{name}/from_timestamp {start}")
+        place |= {f"{key}.{part}": int(row[f"{name}/{part}_index"]) for part in ("chunk", "file")}
+        place[f"{key}.start_s"] = start
+        if end is not None:
+            lengths_s[key] = float(end) - start
     return EpisodeRow(
-        index=index,
         length=int(row["length"]),
-        chunk=int(row["data/chunk_index"]),
-        file=int(row["data/file_index"]),
-        tasks=tuple(map(str, tasks)) if isinstance(tasks, list | tuple) else (str(tasks),),
-        videos={key: _place(row, f"videos/{key}") for key in videos},
+        place=place,
+        task="; ".join(map(str, tasks)) if isinstance(tasks, list | tuple) else str(tasks),
+        lengths_s=lengths_s,
         success=bool(outcome) if isinstance(outcome, bool | int | float) else None,
         state_hash=hash_of_bytes(hashed) if is_known else UNKNOWN,
     )
 
 
-def _place(row: Mapping[str, Any], name: str) -> VideoPlace:
-    start, end = float(row[f"{name}/from_timestamp"]), row.get(f"{name}/to_timestamp")
-    if not math.isfinite(start) or start < 0:
-        raise ValueError(f"{name}/from_timestamp {start}")
-    length = None if end is None else float(end) - start
-    return VideoPlace(int(row[f"{name}/chunk_index"]), int(row[f"{name}/file_index"]), start, length)
-
-
-def problem_of(info: DatasetInfo, row: EpisodeRow, files: Set[str], keys: Sequence[str]) -> InputError | None:
-    """Return the problem of an episode that the data set's tables show, or None.
+def require_files(info: DatasetInfo, row: EpisodeRow, files: Set[str], keys: Sequence[str]) -> None:
+    """Refuse an episode that cannot be used, as far as the data set's tables show.
 
     Args:
         info: Of the data set.
         row: The episode.
         files: The existing files, within the data set.
         keys: Features of the cameras that are used.
-    """
-    if row.length == 0:
-        return zero_steps(f"{info.root}: {row.id}")
-    rows_in = data_file(info, row)
-    if rows_in not in files:
-        where, needed = f"{storage.join(info.root, rows_in)}: {row.id}", f"the {row.length} rows of the episode"
-        return InputError(where=where, found="no such file", needed=needed, fix=_FIX)
-    for key in keys:
-        if (place := row.videos.get(key)) is None:
-            continue
-        shown_in = video_file(info, place, key)
-        where, of_rows = f"{storage.join(info.root, shown_in)}: {row.id}", f"for {row.length} rows in {rows_in}"
-        if shown_in not in files:
-            return InputError(where=where, found=f"no such video, {of_rows}", needed=f"the frames of {key}", fix=_FIX)
-        if place.length_s is not None and not place.length_s > (row.length - 0.5) / info.fps:
-            found = f"{place.length_s:.3f} s of video, says the data set, {of_rows}"
-            needed = f"{row.length / info.fps:.3f} s"
-            return InputError(where=where, found=found, needed=needed, fix="Leave the episode out")
-    return None
-
-
-def table_of(rows: Sequence[EpisodeRow], problems: Mapping[int, InputError], texts: Mapping[str, str]) -> EpisodeTable:
-    """Return the usable episodes as a table, and the problems of the others, given by their numbers.
 
     Raises:
-        InputError: No episode can be used: the first one's error.
+        InputError: It has no steps; or its rows or frames are missing, or too few.
     """
-    usable = [row for row in rows if row.index not in problems]
-    if not usable and problems:
-        raise problems[min(problems)]
-    task_of = ["; ".join(row.tasks) for row in usable]
-    tasks = sorted(set(task_of))
-    numbers: dict[str, list[int]] = {
-        "index": [row.index for row in usable],
-        "chunk": [row.chunk for row in usable],
-        "file": [row.file for row in usable],
-        "task": [tasks.index(task) for task in task_of],
-    }
-    locators = {name: np.array(values, np.int64) for name, values in numbers.items()}
-    for key in usable[0].videos if usable else ():
-        places = [row.videos[key] for row in usable]
-        locators[f"{key}.chunk"] = np.array([place.chunk for place in places], np.int32)
-        locators[f"{key}.file"] = np.array([place.file for place in places], np.int32)
-        locators[f"{key}.start_s"] = np.array([place.start_s for place in places], np.float64)
-    labels, hashes = Labels.of(task_of), [row.state_hash for row in usable]
-    return EpisodeTable.of(
-        [EpisodeInfo(row.id, row.length, row.success) for row in usable],
-        problems=[as_problem(problems[row.index], row.id) for row in rows if row.index in problems],
-        locators=locators,
-        texts={"tasks": json.dumps(tasks), **texts},
-        state_hashes=hashes if any(hashes) else None,
-        labels={"task": labels} if labels.names else {},
+    if row.length == 0:
+        raise zero_steps(f"{info.root}: {row.id}")
+    rows_in = row.data_file(info)
+    if rows_in not in files:
+        where, needed = f"{storage.join(info.root, rows_in)}: {row.id}", f"the {row.length} rows of the episode"
+        raise InputError(where=where, found="no such file", needed=needed, fix=_FIX)
+    for key in keys:
+        if f"{key}.file" not in row.place:
+            continue
+        shown_in = row.video_file(info, key)
+        where, of_rows = f"{storage.join(info.root, shown_in)}: {row.id}", f"for {row.length} rows in {rows_in}"
+        if shown_in not in files:
+            raise InputError(where=where, found=f"no such video, {of_rows}", needed=f"the frames of {key}", fix=_FIX)
+        if not row.lengths_s.get(key, math.inf) > (row.length - 0.5) / info.fps:
+            found = f"{row.lengths_s[key]:.3f} s of video, says the data set, {of_rows}"
+            needed = f"{row.length / info.fps:.3f} s"
+            raise InputError(where=where, found=found, needed=needed, fix="Leave the episode out")
+
+
+def row_of(table: EpisodeTable, index: int) -> EpisodeRow:
+    """Return the location of an episode of a table; its task stays in the table."""
+    return EpisodeRow(
+        int(table.num_steps[index]), {name: column[index].item() for name, column in table.locators.items()}
     )
-
-
-def row_of(table: EpisodeTable, place: int) -> EpisodeRow:
-    """Return the location of an episode of a table; its tasks stay in the table."""
-    at = {name: column[place].item() for name, column in table.locators.items()}
-    keys = [name.removesuffix(".start_s") for name in at if name.endswith(".start_s")]
-    videos = {key: VideoPlace(at[f"{key}.chunk"], at[f"{key}.file"], at[f"{key}.start_s"]) for key in keys}
-    return EpisodeRow(at["index"], int(table.num_steps[place]), at["chunk"], at["file"], videos=videos)

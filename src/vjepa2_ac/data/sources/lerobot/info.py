@@ -13,7 +13,7 @@ from typing import Any
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import LeRobotData, LeRobotFields
-from vjepa2_ac.data.sources.listing import in_parallel
+from vjepa2_ac.data.files import in_parallel
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.video_reader import is_deep_grey
 from vjepa2_ac.storage import FileInfo
@@ -65,6 +65,7 @@ class DatasetInfo:
     version: str
     fps: float
     episodes: int
+    frames: int | None  # of all episodes; None: not said
     chunk_episodes: int  # v2.1: episodes per chunk folder
     data_path: str
     video_path: str | None
@@ -122,12 +123,10 @@ class DatasetInfo:
                 raise InputError(where=where, found=found, needed=f"0 to {width - 1}")
         needed, rotation = (7, "3 Euler angles") if fields.rotation == "euler_xyz" else (8, "a quaternion's 4")
         if config.states == "pose" and count != needed:
-            raise InputError(
-                where=where,
-                found=f"{count} numbers a step from {source}",
-                needed=f"{needed}: x, y, z, {rotation} (data.lerobot.rotation: {fields.rotation}), the gripper",
-                fix="Name other columns in data.lerobot.state, or choose among their numbers with data.lerobot.select",
-            )
+            found = f"{count} numbers a step from {source}"
+            wanted = f"{needed}: x, y, z, {rotation} (data.lerobot.rotation: {fields.rotation}), the gripper"
+            fix = "Name other columns in data.lerobot.state, or choose among their numbers with data.lerobot.select"
+            raise InputError(where=where, found=found, needed=wanted, fix=fix)
 
 
 def missing(where: str, kind: str, name: str, place: str, known: Iterable[str]) -> InputError:
@@ -171,6 +170,7 @@ def read_info(root: str) -> DatasetInfo:
 def _parsed(root: str, content: Mapping[str, Any]) -> DatasetInfo:
     video_path = content.get("video_path")
     fps, episodes, chunk = float(content["fps"]), content["total_episodes"], content.get("chunks_size", 1000)
+    frames = content.get("total_frames")
     if not 0 < fps <= 1000 or type(episodes) is not int or type(chunk) is not int or episodes < 0 or chunk < 1:
         raise ValueError(f"fps {fps}, total_episodes {episodes}, chunks_size {chunk}")
     return DatasetInfo(
@@ -178,6 +178,7 @@ def _parsed(root: str, content: Mapping[str, Any]) -> DatasetInfo:
         version=content["codebase_version"],
         fps=fps,
         episodes=episodes,
+        frames=frames if type(frames) is int else None,
         chunk_episodes=chunk,
         data_path=_template(content["data_path"]),
         video_path=None if video_path is None else _template(video_path),

@@ -16,16 +16,15 @@ import numpy as np
 from jaxtyping import Shaped
 
 from vjepa2_ac import storage
-from vjepa2_ac.data.sources.indexed_source import store_arrays, stored_arrays
+from vjepa2_ac.data.files import EpisodeFiles
 from vjepa2_ac.errors import InputError, require_library
-from vjepa2_ac.storage.block_file import BlockCachedFile, DiskCache
+from vjepa2_ac.storage.block_file import BlockCachedFile
 
 if TYPE_CHECKING:
     import pyarrow as pa
     from pyarrow import parquet
 
 Columns = Mapping[str, Shaped[np.ndarray, "rows _"]]
-Opener = Callable[[str], "str | BlockCachedFile"]  # a path, or a remote file
 
 EPISODE = "episode_index"
 
@@ -42,16 +41,15 @@ class ParquetRows:
     """Reads rows of Parquet files; each thread keeps the row group that it decoded last.
 
     Args:
-        open_file: Returns the path or file to open for a path.
-        columns: The wanted ones, if a file has them; the index of the episode is always read.
-        cache: On this machine's disk, of rows that share their row group with other episodes: so that a row group of
+        files: Opens them, and keeps rows that share their row group with other episodes: so that a row group of
             hundreds of episodes is not decoded for each of them.
+        columns: The wanted ones, if a file has them; the index of the episode is always read.
         version: Of the cached rows: changes with the data set or the wanted columns.
     """
 
-    def __init__(self, open_file: Opener, columns: Sequence[str], cache: DiskCache, version: str) -> None:
-        self._cache, self._version = cache, version
-        self._open, self._columns = open_file, list(dict.fromkeys([EPISODE, *columns]))
+    def __init__(self, files: EpisodeFiles, columns: Sequence[str], version: str) -> None:
+        self._files, self._version = files, version
+        self._columns = list(dict.fromkeys([EPISODE, *columns]))
         self._ranges: dict[str, list[tuple[float, float]]] = {}  # of each file that was opened: of each row group
         self._last = threading.local()
 
@@ -63,19 +61,19 @@ class ParquetRows:
             OSError: A remote file cannot be read.
         """
         key = f"rows {self._version} {path} {episode}"
-        if (known := stored_arrays(self._cache, key)) is not None:
+        if (known := self._files.arrays(key)) is not None:
             return known
         parts: list[Columns] = []
-        are_shared, opened = False, self._open(path)
-        with _opened(opened, path) as file:
-            for number in self._groups_with(path, file, opened, episode):
+        are_shared = False
+        with self._groups_with(path, episode) as (file, groups):
+            for number in groups:
                 group = self._group(path, file, number)
                 of_episode = group[EPISODE][:, 0] == episode
                 are_shared |= not of_episode.all()
                 parts.append({name: column[of_episode] for name, column in group.items()})
         rows = {name: np.concatenate([part[name] for part in parts]) for name in (parts[0] if parts else ())}
         if are_shared:
-            store_arrays(self._cache, key, rows)
+            self._files.keep(key, rows)
         return rows
 
     def images(self, path: str, column: str, episode: int) -> list[bytes]:
@@ -86,9 +84,8 @@ class ParquetRows:
             OSError: A remote file cannot be read.
         """
         found: list[Any] = []
-        opened = self._open(path)
-        with _opened(opened, path) as file:
-            for number in self._groups_with(path, file, opened, episode):
+        with self._groups_with(path, episode) as (file, groups):
+            for number in groups:
                 for part in _parts_of(file, path, [EPISODE, column], MOST_IMAGE_BYTES, row_groups=[number]):
                     rows = zip(part[column], part[EPISODE], strict=True)
                     found += [row.get("bytes") if isinstance(row, dict) else row for row, its in rows if its == episode]
@@ -97,13 +94,14 @@ class ParquetRows:
             raise InputError(where=f"{path}: {column}", found=wrong, needed=needed)
         return found
 
-    def _groups_with(
-        self, path: str, file: parquet.ParquetFile, opened: str | BlockCachedFile, episode: int
-    ) -> list[int]:
-        """Return the row groups that may have rows of an episode, as far as the file's statistics say."""
-        if path not in self._ranges:
-            self._ranges[path] = _episodes_of_groups(file, path, opened, self._columns)
-        return [number for number, (first, last) in enumerate(self._ranges[path]) if first <= episode <= last]
+    @contextmanager
+    def _groups_with(self, path: str, episode: int) -> Iterator[tuple[parquet.ParquetFile, list[int]]]:
+        """Open a file, and tell the row groups that may have rows of an episode, as far as its statistics say."""
+        opened = self._files.open(path, version=self._version)
+        with _opened(opened, path) as file:
+            if path not in self._ranges:
+                self._ranges[path] = _episodes_of_groups(file, path, opened, self._columns)
+            yield file, [n for n, (first, last) in enumerate(self._ranges[path]) if first <= episode <= last]
 
     def _group(self, path: str, file: parquet.ParquetFile, number: int) -> Columns:
         if getattr(self._last, "place", None) != (path, number):
@@ -166,9 +164,9 @@ def _no_numbers(where: str, kind: str, gaps: int) -> InputError:
 @contextmanager
 def _opened(opened: str | BlockCachedFile, path: str) -> Iterator[parquet.ParquetFile]:
     """Open a Parquet file with verified page checksums; its errors become errors for the user."""
-    pa, parquet = _library(path)
+    pa = _library(path)
     try:
-        with parquet.ParquetFile(
+        with pa.parquet.ParquetFile(
             opened, page_checksum_verification=True, pre_buffer=not isinstance(opened, str), memory_map=False
         ) as file:
             yield file
@@ -217,7 +215,7 @@ def _require_consistent(file: parquet.ParquetFile, opened: str | BlockCachedFile
     does not expect. A reader of one row makes the same checks, and raises. Of a remote file it reads none, and
     finds less: the blocks of every row group would be fetched.
     """
-    _, parquet = _library(str(opened))
+    parquet = _library(str(opened)).parquet
     rows = 1 if isinstance(opened, str) else 0
     with parquet.ParquetFile(opened, metadata=file.metadata, buffer_size=_BUFFER_BYTES, pre_buffer=False) as light:
         for group in range(file.num_row_groups):
@@ -250,7 +248,8 @@ def _bytes_in(value: Any) -> int:
     return sum(map(_bytes_in, value)) if isinstance(value, list) else 8
 
 
-def _library(where: str) -> tuple[Any, Any]:
+def _library(where: str) -> Any:
+    """Return pyarrow, with its module `parquet`."""
     called = "pyarrow, which reads LeRobot data sets"
-    pa = require_library("pyarrow", where=where, called=called, extra="lerobot")
-    return pa, require_library("pyarrow.parquet", where=where, called=called, extra="lerobot")
+    require_library("pyarrow.parquet", where=where, called=called, extra="lerobot")
+    return require_library("pyarrow", where=where, called=called, extra="lerobot")

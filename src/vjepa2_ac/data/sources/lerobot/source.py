@@ -2,51 +2,51 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Sequence, Set
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, Shaped, UInt8
+from scipy.spatial.transform import Rotation
 
 from vjepa2_ac import storage
-from vjepa2_ac.config import LeRobotData
+from vjepa2_ac.config import LeRobotData, LeRobotFields
 from vjepa2_ac.config.section import Affects, knobs_that_affect
-from vjepa2_ac.data.cache import fetched_data
+from vjepa2_ac.data.files import connections_to, in_parallel
 from vjepa2_ac.data.index import EpisodeTable, get_or_build, hash_of_states, index_key
-from vjepa2_ac.data.sources.indexed_source import FramesByStep, IndexedSource, Opened
-from vjepa2_ac.data.sources.lerobot.episodes import (
-    TABLES,
-    EpisodeRow,
-    data_file,
-    problem_of,
-    read_episodes,
-    row_of,
-    table_of,
-    video_file,
-)
-from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, list_by_template, read_info
-from vjepa2_ac.data.sources.lerobot.parquet import ParquetRows
-from vjepa2_ac.data.sources.lerobot.states import EpisodeContent, content_of, wanted_columns
-from vjepa2_ac.data.sources.listing import in_parallel
-from vjepa2_ac.episode import Episode, Progress, StepRanges
+from vjepa2_ac.data.selection import as_problem
+from vjepa2_ac.data.sources.indexed_source import Found, FramesByStep, IndexedSource, Scanned, table_of
+from vjepa2_ac.data.sources.lerobot.episodes import TABLES, EpisodeRow, read_episodes, require_files, row_of
+from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, list_by_template, missing, read_info
+from vjepa2_ac.data.sources.lerobot.parquet import EPISODE, Columns, ParquetRows
+from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.image_file import decode_image
 from vjepa2_ac.media.jpeg import require_bounded
 from vjepa2_ac.media.video_reader import Clock, read_frames, require_decoder
+from vjepa2_ac.spaces import POSE, require_finite
 from vjepa2_ac.storage.block_file import BlockCachedFile
-from vjepa2_ac.storage.structured import json_list
 
-logger = logging.getLogger(__name__)
+FRAME, TIME = "frame_index", "timestamp"
+
+_FIX = "Copy the file again, or leave the episode out"
+_FIX_STATES = "Check data.lerobot: state, select, rotation, gripper_open and gripper_closed"
+_FIX_VECTORS = "Leave the episode out, check data.lerobot: state, action, or set data.lerobot.joint_velocity: null"
+_UNIT_TOLERANCE = 1e-2
 
 
 @dataclass(frozen=True)
-class _Opened(Opened):
-    info: DatasetInfo
+class EpisodeContent:
+    """The data of an episode except its frames."""
+
+    states: Float[np.ndarray, "steps state_dim"]
+    joint_velocities: Float[np.ndarray, "steps joints"] | None
+    success: bool | None
+    commands: Float[np.ndarray, "steps action_dim"] | None = None
 
 
-class LeRobotSource(IndexedSource[LeRobotData, _Opened]):
+class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
     """The episodes of a LeRobot data set, v3.0 or v2.1, in the order of their numbers.
 
     Of a local data set `infos` checks the states of every episode; of a remote one it reads the files in meta, and
@@ -64,7 +64,8 @@ class LeRobotSource(IndexedSource[LeRobotData, _Opened]):
         table = self.infos()
         info, row = table[index], row_of(table, index)
         content = self._content(row)
-        task = self._tasks[table.locators["task"][index]]
+        tasks = table.labels.get("task")
+        task = None if tasks is None else tasks.of_episode(index)
         key = self._info.camera_key(self._config.lerobot, camera or self._config.cameras[0])
         return Episode(
             info=info,
@@ -78,44 +79,35 @@ class LeRobotSource(IndexedSource[LeRobotData, _Opened]):
 
     @cached_property
     def _info(self) -> DatasetInfo:
-        return read_info(self._config.path) if self._known is None else self._known.info
+        return read_info(self._config.path) if self._known is None else self._known[1]
 
     @property
     def _control_rate_hz(self) -> float:
         return self._config.lerobot.fps or self._info.fps
 
     @cached_property
-    def _tasks(self) -> list[str]:
-        return json_list(self.infos().texts["tasks"], where="the tasks of the index")
-
-    @cached_property
     def _parquet(self) -> ParquetRows:
-        cache = fetched_data(self._config.disk_cache)
-        return ParquetRows(self._open_file, wanted_columns(self._config), cache, self._data_version)
-
-    @property
-    def _is_far(self) -> bool:
-        return storage.is_url(self._config.path)
+        return ParquetRows(self._files, wanted_columns(self._config), self._data_version)
 
     @property
     def _data_version(self) -> str:
         """A version that changes with the data set's files and the wanted columns."""
-        return self._version if self._known is None else self._known.table.texts["version"]
+        return self._version if self._known is None else self._known[0].texts["index"]
 
     def _open_file(self, path: str) -> str | BlockCachedFile:
         return self._files.open(path, version=self._data_version)
 
-    def _look(self, progress: Progress) -> _Opened:
+    def _look(self, progress: Progress) -> tuple[EpisodeTable, DatasetInfo]:
         info, config = self._info, self._config
         info.require_mapping(config)
         keys = [info.camera_key(config.lerobot, camera) for camera in config.cameras]
         if any(info.features[key].dtype == "video" for key in keys):
             require_decoder(info.where)
-        tables = list_by_template(info.root, TABLES[info.version], connections=self._connections)
-        files = list_by_template(info.root, info.data_path, connections=self._connections)
+        listed = partial(list_by_template, info.root, connections=connections_to(config))
+        tables, files = listed(TABLES[info.version]), listed(info.data_path)
         for key in keys:
             if info.features[key].dtype == "video":
-                files |= list_by_template(info.root, info.video_path or "", key, connections=self._connections)
+                files |= listed(info.video_path or "", key)
         fields = knobs_that_affect(Affects.INDEX, config.lerobot)
         fields.pop("action")  # where it matters, it is among the columns
         parts = {
@@ -123,70 +115,63 @@ class LeRobotSource(IndexedSource[LeRobotData, _Opened]):
             "source": "lerobot",
             "fields": fields,
             "keys": keys,
-            "outcome": self._is_far and config.outcome != "all",
+            "outcome": storage.is_url(config.path) and config.outcome != "all",
             "info": repr(replace(info, root="")),
             "files": [(path, file.size, file.version) for path, file in [*tables.items(), *files.items()]],
         }
         self._version = index_key(parts, config.path)
         build = partial(self._built, list(tables), files.keys(), keys, progress)
-        return _Opened(get_or_build(config.disk_cache, self._version, config.path, build), info)
+        return get_or_build(config.disk_cache, self._version, config.path, build), info
 
     def _built(self, tables: list[str], files: Set[str], keys: list[str], progress: Progress) -> EpisodeTable:
-        info, fields = self._info, self._config.lerobot
+        info, config, fields = self._info, self._config, self._config.lerobot
+        is_far = storage.is_url(config.path)
         of_config = [key for key in dict.fromkeys(fields.cameras.values()) if key in info.features]
         videos = [key for key in of_config if info.features[key].dtype == "video"]
-        states = fields.state if self._is_far else ()  # of local rows the states themselves are hashed
+        states = fields.state if is_far else ()  # of local rows the states themselves are hashed
         rows = read_episodes(info, tables, videos, states, fields.success, self._open_file)
-        found = {row.index: problem_of(info, row, files, keys) for row in rows}
-        problems = {index: problem for index, problem in found.items() if problem is not None}
-        outcome_unknown = any(row.success is None for row in rows) and fields.success in info.features
-        if not self._is_far or (self._config.outcome != "all" and outcome_unknown):
-            rows = self._with_content(rows, problems, progress)
         if not rows:
             raise InputError(where=info.where, found="no episodes", needed="a data set with episodes")
-        texts = {"version": self._version, "control_rate_hz": str(self._control_rate_hz)}
-        table = table_of(rows, problems, texts)
-        logger.info("%s: %d episodes, %d steps", info.root, len(table), int(table.num_steps.sum()))
-        return table
+        outcome_unknown = any(row.success is None for row in rows) and fields.success in info.features
+        reads_rows = not is_far or (config.outcome != "all" and outcome_unknown)
 
-    def _with_content(
-        self, rows: list[EpisodeRow], problems: dict[int, InputError], progress: Progress
-    ) -> list[EpisodeRow]:
-        """Return the episodes with the facts in their rows; those that turn out unusable are added to `problems`."""
-        by_file: dict[str, list[EpisodeRow]] = {}
-        for row in rows:
-            if row.index not in problems:
-                by_file.setdefault(data_file(self._info, row), []).append(row)
-
-        def checked(row: EpisodeRow) -> EpisodeRow:
+        def look(row: EpisodeRow) -> Found:
+            success, state_hash = row.success, row.state_hash
             try:
-                content = self._content(row)
+                require_files(info, row, files, keys)
+                if reads_rows:
+                    content = self._content(row)
+                    success = success if content.success is None else content.success
+                    state_hash = hash_of_states(content.states)
             except InputError as error:
-                problems[row.index] = error
-                return row
-            success = row.success if content.success is None else content.success
-            return replace(row, success=success, state_hash=hash_of_states(content.states))
+                return as_problem(error, row.id)
+            facts, labels = EpisodeInfo(row.id, row.length, success), {"task": row.task}
+            return Scanned(facts, self._where(row), row.place, state_hash, labels, self._control_rate_hz)
 
-        read, done = [row for row in rows if row.index in problems], 0
-        for of_file in in_parallel(lambda some: [checked(row) for row in some], [*by_file.values()], self._connections):
-            read += of_file
-            done += len(of_file)
-            progress(done, len(rows))
-        return sorted(read, key=lambda row: row.index)
+        def look_at_all(some: list[EpisodeRow]) -> dict[str, Found]:
+            return {row.id: look(row) for row in some}
+
+        by_file: dict[str, list[EpisodeRow]] = {}  # so that a row group is decoded once
+        for row in rows:
+            by_file.setdefault(row.data_file(info), []).append(row)
+        found: dict[str, Found] = {}
+        for some in in_parallel(look_at_all, [*by_file.values()], connections_to(config)):
+            found |= some
+            progress(len(found), len(rows))
+        return table_of([found[row.id] for row in rows], config, len(rows))
 
     def _content(self, row: EpisodeRow) -> EpisodeContent:
-        rows = self._parquet.rows(storage.join(self._info.root, data_file(self._info, row)), row.index)
+        rows = self._parquet.rows(storage.join(self._info.root, row.data_file(self._info)), row.index)
         return content_of(rows, row.length, self._info, self._config, self._where(row))
 
     def _frames(self, row: EpisodeRow, key: str) -> FramesByStep:
         info = self._info
         if info.features[key].dtype == "image":
-            path, where = storage.join(info.root, data_file(info, row)), f"{self._where(row)}: {key}"
+            path, where = storage.join(info.root, row.data_file(info)), f"{self._where(row)}: {key}"
             read = cache(partial(self._parquet.images, path, key, row.index))
             return FramesByStep(row.length, where, partial(_stored_images, read, row.length, where))
-        place = row.videos[key]
-        path = storage.join(info.root, video_file(info, place, key))
-        clock, where = Clock(start_s=place.start_s, rate_hz=info.fps), f"{path}: {row.id}"
+        path = storage.join(info.root, row.video_file(info, key))
+        clock, where = Clock(start_s=row.place[f"{key}.start_s"], rate_hz=info.fps), f"{path}: {row.id}"
         return FramesByStep(row.length, where, partial(self._video_frames, path, clock, where))
 
     def _video_frames(
@@ -196,7 +181,7 @@ class LeRobotSource(IndexedSource[LeRobotData, _Opened]):
         return read_frames(self._open_file(path), steps, where=where, clock=clock)
 
     def _where(self, row: EpisodeRow) -> str:
-        return f"{storage.join(self._info.root, data_file(self._info, row))}: {row.id}"
+        return f"{storage.join(self._info.root, row.data_file(self._info))}: {row.id}"
 
 
 def _stored_images(
@@ -216,3 +201,103 @@ def _stored_images(
             raise InputError(where=at, found=found, needed=f"{needed}, as at step {steps[0]}")
         frames.append(frame)
     return np.stack(frames)
+
+
+def wanted_columns(config: LeRobotData) -> list[str]:
+    """Return the columns that are read if a file has them."""
+    fields = config.lerobot
+    optional = [name for name in (fields.joint_velocity, fields.success) if name is not None]
+    commands = fields.action if config.actions == "recorded" else ()
+    return [EPISODE, FRAME, TIME, *fields.state, *commands, *optional]
+
+
+def content_of(rows: Columns, length: int, info: DatasetInfo, config: LeRobotData, where: str) -> EpisodeContent:
+    """Return the data in the rows of an episode.
+
+    Args:
+        rows: As `ParquetRows.rows` returns them.
+        length: Their expected number.
+        info: The description of the data set's columns.
+        config: Names and conventions of the columns, and the kind of state.
+        where: File and episode, for messages.
+
+    Raises:
+        InputError: Rows or columns are missing, have another width, or are implausible states.
+    """
+    _require_rows(rows, length, info.fps, where)
+    fields = config.lerobot
+
+    def joined(names: Sequence[str]) -> Float[np.ndarray, "steps width"]:
+        numbers = np.concatenate([_column(rows, name, info, where).astype(np.float64) for name in names], axis=1)
+        require_finite(numbers, where, fix=_FIX_VECTORS)
+        return numbers
+
+    def has(name: str | None) -> bool:
+        if name is not None and name in info.features and name not in rows:
+            raise missing("data.lerobot", "column", name, where, rows)
+        return name is not None and name in rows
+
+    states = joined(fields.state)
+    if fields.select is not None:
+        states = states[:, list(fields.select)]
+    return EpisodeContent(
+        states=_poses(states, fields, where) if config.states == "pose" else states,
+        commands=joined(fields.action) if config.actions == "recorded" else None,
+        joint_velocities=joined([str(fields.joint_velocity)]) if has(fields.joint_velocity) else None,
+        success=bool(rows[str(fields.success)].any()) if has(fields.success) else None,
+    )
+
+
+def _poses(numbers: Float[np.ndarray, "steps _"], fields: LeRobotFields, where: str) -> Float[np.ndarray, "steps 7"]:
+    """Return states (legend: `vjepa2_ac.episode`) from the numbers of an episode.
+
+    Raises:
+        InputError: They are implausible under these settings: no unit quaternion, out of reach.
+    """
+    gripper = (numbers[:, -1:] - fields.gripper_open) / (fields.gripper_closed - fields.gripper_open)
+    states = np.concatenate([numbers[:, POSE.position], _euler(numbers[:, 3:-1], fields, where), gripper], axis=1)
+    POSE.require_plausible(states, where, fix=_FIX_STATES)
+    return states
+
+
+def _euler(rotation: Float[np.ndarray, "steps _"], fields: LeRobotFields, where: str) -> Float[np.ndarray, "steps 3"]:
+    if fields.rotation == "euler_xyz":
+        return rotation
+    lengths = np.linalg.norm(rotation, axis=1)
+    if (wrong := abs(lengths - 1) > _UNIT_TOLERANCE).any():
+        step = int(wrong.argmax())
+        found = f"the quaternion {np.array2string(rotation[step], precision=4)} of length {lengths[step]:.4g}"
+        raise InputError(where=f"{where}: step {step}", found=found, needed="a unit quaternion", fix=_FIX_STATES)
+    x_first = rotation if fields.rotation == "quaternion_xyzw" else np.roll(rotation, -1, axis=1)
+    return np.asarray(Rotation.from_quat(x_first).as_euler("xyz"))
+
+
+def _require_rows(rows: Columns, length: int, fps: float, where: str) -> None:
+    """Check that the rows are those of the episode, complete, in order, at the data set's rate."""
+    count = len(rows[EPISODE]) if rows else 0
+    if count != length:
+        raise InputError(where=where, found=f"{count} rows", needed=f"{length}, says the data set", fix=_FIX)
+    order = np.arange(length)
+    if FRAME in rows and not np.array_equal(rows[FRAME][:, 0], order):
+        found = f"{FRAME} that is not 0 to {length - 1} in order"
+        raise InputError(where=where, found=found, needed="a row for each step", fix=_FIX)
+    if TIME in rows and not (wrong := abs(rows[TIME][:, 0] - order / fps)).max() < 0.5 / fps:  # NaN is wrong, too
+        step = int(np.argmax(~(wrong < 0.5 / fps)))
+        found = f"the {TIME} {rows[TIME][step, 0]:.4g} s"
+        needed = f"{step / fps:.4g} s, at the {fps:g} rows per second that meta/info.json says"
+        fix = "Correct fps in meta/info.json, or leave the episode out"
+        raise InputError(where=f"{where}: step {step}", found=found, needed=needed, fix=fix)
+
+
+def _column(rows: Columns, name: str, info: DatasetInfo, where: str) -> Shaped[np.ndarray, "steps _"]:
+    if name not in rows:
+        raise missing("data.lerobot", "column", name, where, rows)
+    column, feature = rows[name], info.features.get(name)
+    found = needed = ""
+    if feature is not None and column.shape[1] != feature.width:
+        found, needed = f"{column.shape[1]} numbers a row", f"{feature.width}"
+    elif feature is not None and feature.dtype.startswith("float") and column.dtype.kind != "f":
+        found, needed = f"values of type {column.dtype}", feature.dtype
+    if found:
+        raise InputError(where=f"{where}: {name}", found=found, needed=f"{needed}, says {info.where}", fix=_FIX)
+    return column

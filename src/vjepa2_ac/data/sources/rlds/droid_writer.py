@@ -26,7 +26,6 @@ CAMERAS = ("exterior_image_1_left", "exterior_image_2_left", "wrist_image_left")
 _NAME = "r2d2_faceblur"
 _INFO, _FEATURES = "dataset_info.json", "features.json"
 _ASSETS = Path(str(importlib.resources.files("vjepa2_ac"))) / "assets" / "droid"
-_WIDTHS = {"action": 7, "cartesian": 6, "gripper": 1, "joint": 7}  # by the first word of a name
 
 
 @dataclass(frozen=True)
@@ -155,20 +154,16 @@ def _write_shards(
 
 
 def _check(episode: DroidEpisode, sizes: dict[str, tuple[int, int]]) -> None:
-    """Refuse an episode whose parts differ in length or shape; the images of a camera share one size."""
-    steps = episode.num_steps
-    for name, array in episode.arrays.items():
-        width = _WIDTHS[name.rsplit("/")[-1].split("_")[0]]
-        if array.shape != (steps, width) or not np.isfinite(array).all():
-            raise ValueError(f"{episode.file_path}: {name} must be {steps} x {width} finite numbers, is {array.shape}")
-    if steps == 0 or sorted(episode.images) != sorted(CAMERAS):
-        raise ValueError(f"{episode.file_path}: {steps} steps, cameras {sorted(episode.images)}; needed: {CAMERAS}")
+    """Refuse an episode whose parts differ in length; the images of a camera share one size."""
+    lengths = {len(part) for part in (*episode.arrays.values(), *episode.images.values())}
+    is_finite = all(np.isfinite(array).all() for array in episode.arrays.values())
+    if lengths != {episode.num_steps} or 0 in lengths or not is_finite or sorted(episode.images) != sorted(CAMERAS):
+        found = f"parts of {sorted(lengths)} steps, cameras {sorted(episode.images)}"
+        raise ValueError(f"{episode.file_path}: {found}; needed: finite numbers of as many steps, cameras {CAMERAS}")
     for camera, images in episode.images.items():
-        height, width, _, _ = simplejpeg.decode_jpeg_header(images[0])
-        expected = sizes.setdefault(camera, (height, width))
-        if len(images) != steps or expected != (height, width):
-            found, needed = f"{len(images)} images of {height}x{width}", f"{steps} of {expected[0]}x{expected[1]}"
-            raise ValueError(f"{episode.file_path}: {camera} has {found}; needed: {needed}")
+        size = simplejpeg.decode_jpeg_header(images[0])[:2]
+        if sizes.setdefault(camera, size) != size:
+            raise ValueError(f"{episode.file_path}: images of {camera} of {size}; needed: {sizes[camera]}")
 
 
 def _features_of(episode: DroidEpisode) -> dict[str, tuple[Kind, Sequence[Any] | np.ndarray]]:

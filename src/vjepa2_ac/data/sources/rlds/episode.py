@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
@@ -66,22 +66,19 @@ class Record:
             raise InputError(where=str(self._span), found=found_text, needed="an RLDS data set") from None
         return found
 
-    def require(self, names: Iterable[str]) -> None:
-        """Refuse a record that lacks a feature.
+    def place_of(self, name: str) -> Place:
+        """Return the position of a feature.
 
         Raises:
-            InputError: It does; names the features that it has.
+            InputError: The record lacks it; names the features that it has.
         """
-        for name in names:
-            if name not in self.located:
-                known = sorted(self.located)
-                close = difflib.get_close_matches(name, known, n=1)
-                raise InputError(
-                    where=str(self._span),
-                    found=f"no feature {name}; the record has {', '.join(known) or 'none'}",
-                    needed="the features that data.fields names",
-                    fix=f"Did you mean {close[0]}? Set data.fields" if close else "Set data.fields",
-                )
+        if name not in self.located:
+            known = sorted(self.located)
+            close = difflib.get_close_matches(name, known, n=1)
+            found = f"no feature {name}; the record has {', '.join(known) or 'none'}"
+            fix = f"Did you mean {close[0]}? Set data.fields" if close else "Set data.fields"
+            raise InputError(where=str(self._span), found=found, fix=fix)
+        return self.located[name]
 
     def floats(self, name: str) -> Float32[np.ndarray, " values"]:
         """Return the numbers of a feature.
@@ -97,8 +94,7 @@ class Record:
         Raises:
             InputError: There is no such feature, it has values of another type or too many, or the file ends within it.
         """
-        self.require([name])
-        offset, length = self.located[name]
+        offset, length = self.place_of(name)
         where = f"{self._span}: {name}"
         if length > _MOST_BYTES:
             raise InputError(where=where, found=f"{length:,} bytes", needed=f"at most {_MOST_BYTES:,}")
@@ -145,7 +141,7 @@ def num_steps_of(record: Record, config: RldsData) -> int:
         InputError: There is neither.
     """
     if config.states == "vector":  # of any width: only the flag gives the count
-        record.require([STEP_FLAG])
+        record.place_of(STEP_FLAG)
     if STEP_FLAG in record.located:
         return len(record.values(STEP_FLAG, "int64_list"))
     return sum(len(record.floats(name)) for name in config.fields.state) // STATE_DIM
@@ -175,27 +171,6 @@ def episode_of(record: Record, config: RldsData, info: EpisodeInfo, read_frames:
         metadata={"language": _first_text(record, language)} if language in record.located else {},
         commands=commands_of(record, config, steps, where),
     )
-
-
-def check_record(
-    record: Record, config: RldsData, cameras: Sequence[str], where: str
-) -> tuple[int, Float[np.ndarray, "steps state_dim"]]:
-    """Return number of steps and states of a record that has everything an episode needs.
-
-    Args:
-        record: The record.
-        config: Names of the features, and what a state is.
-        cameras: Image features that it must have.
-        where: File, record and identity, for messages.
-
-    Raises:
-        InputError: A feature is missing, has no uniform shape over all steps, or has implausible numbers.
-    """
-    record.require([*config.fields.identity, *step_features(config), *cameras])
-    steps = num_steps_of(record, config)
-    states = states_of(record, config, steps, where)
-    commands_of(record, config, steps, where)
-    return steps, states
 
 
 def states_of(record: Record, config: RldsData, steps: int, where: str) -> Float[np.ndarray, "steps state_dim"]:

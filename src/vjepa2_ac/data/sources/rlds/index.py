@@ -9,51 +9,38 @@ copy whose images or texts were encoded again has another length, and is not fou
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Float, Int64
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import RldsData
+from vjepa2_ac.data.files import in_parallel
 from vjepa2_ac.data.index import UNKNOWN, EpisodeProblem, EpisodeTable, hash_of_states
-from vjepa2_ac.data.selection import as_error, as_problem
-from vjepa2_ac.data.sources.listing import in_parallel
+from vjepa2_ac.data.selection import as_problem
+from vjepa2_ac.data.sources.indexed_source import Found, Scanned, table_of
 from vjepa2_ac.data.sources.rlds.episode import (
     STEP_FLAG,
     Record,
-    check_record,
+    commands_of,
     identity_of,
     info_of,
     num_steps_of,
     states_of,
+    step_features,
 )
 from vjepa2_ac.data.sources.rlds.shards import Shard, open_shard
 from vjepa2_ac.data.sources.rlds.tfrecord import HEADER_BYTES, Read, RecordSpan, require_intact, span_at
-from vjepa2_ac.episode import EpisodeInfo, Progress
+from vjepa2_ac.episode import Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.spaces import zero_steps
-
-logger = logging.getLogger(__name__)
 
 FEWEST_IN_FLIGHT = 128  # reads behind a URL: they are small, and sequential within a shard
 _SAMPLES = 4
 _PLACE = ("shard", "record", "offset", "length")  # columns of the table
 _LENGTH_BYTES = 5  # lengths that grow with a name: of text, list, feature, entry of the map, and all of them
-
-
-@dataclass(frozen=True)
-class ScannedEpisode:
-    """A usable episode, and its record."""
-
-    info: EpisodeInfo
-    span: RecordSpan
-    state_hash: int = UNKNOWN
-
-
-Found = ScannedEpisode | EpisodeProblem
 
 
 def build_index(shards: Sequence[Shard], config: RldsData, cameras: Sequence[str], progress: Progress) -> EpisodeTable:
@@ -69,17 +56,18 @@ def build_index(shards: Sequence[Shard], config: RldsData, cameras: Sequence[str
         InputError: A shard cannot be read, or no episode can be used.
         UnreachableError: The network fails.
     """
+    is_far = storage.is_url(config.path)
+    threads = max(config.connections, FEWEST_IN_FLIGHT) if is_far else config.connections
+    if is_far:
+        _require_fitting(shards, config, cameras)
 
-    def scan(shard: Shard) -> list[Found]:
-        with open_shard(shard) as read:
-            return list(_scan(shard, read, config, cameras))
+    def scan(number: int) -> list[Found]:
+        with open_shard(shards[number]) as read:
+            return list(_scan(shards[number], number, read, config, cameras))
 
-    if not storage.is_url(config.path):
-        return _table_of(shards, in_parallel(scan, shards, config.connections), progress)
-    threads = max(config.connections, FEWEST_IN_FLIGHT)
-    _require_fitting(shards, config, cameras)
-    table = _table_of(shards, in_parallel(scan, shards, threads), progress)
-    return _with_hashes_of_copies(table, shards, config, threads)
+    found = (one for of_shard in in_parallel(scan, range(len(shards)), threads) for one in of_shard)
+    table = table_of(found, config, sum(shard.episodes for shard in shards), progress)
+    return _with_hashes_of_copies(table, shards, config, threads) if is_far else table
 
 
 def position_of(table: EpisodeTable, shards: Sequence[Shard], index: int) -> tuple[Shard, RecordSpan]:
@@ -88,7 +76,7 @@ def position_of(table: EpisodeTable, shards: Sequence[Shard], index: int) -> tup
     return shards[number], RecordSpan(shards[number].path, *place)
 
 
-def _scan(shard: Shard, read: Read, config: RldsData, cameras: Sequence[str]) -> Iterator[Found]:
+def _scan(shard: Shard, place: int, read: Read, config: RldsData, cameras: Sequence[str]) -> Iterator[Found]:
     """Yield the result of each expected record of a shard; after damage that hides the others, a problem for each."""
     offset = 0
     for number in range(shard.episodes):
@@ -101,7 +89,7 @@ def _scan(shard: Shard, read: Read, config: RldsData, cameras: Sequence[str]) ->
         except InputError as error:
             yield from (as_problem(error, f"{shard.name}: record {one}") for one in hidden)
             return
-        yield _examine(read, span, f"{shard.name}: record {number}", config, cameras)
+        yield _examine(read, span, place, f"{shard.name}: record {number}", config, cameras)
         offset = span.end
     if offset != shard.size:
         yield _wrong_count(shard, shard.episodes, f"{shard.size - offset:,} bytes after the last record")
@@ -113,23 +101,37 @@ def _wrong_count(shard: Shard, number: int, found: str) -> EpisodeProblem:
     return EpisodeProblem(name, where, found, needed, "Download the file again")
 
 
-def _examine(read: Read, span: RecordSpan, name: str, config: RldsData, cameras: Sequence[str]) -> Found:
+def _examine(read: Read, span: RecordSpan, shard: int, name: str, config: RldsData, cameras: Sequence[str]) -> Found:
     """Return the episode in a record, or why there is none; it is named like the record if it has no identity."""
-    is_remote, fields = storage.is_url(span.path), config.fields
-    record = Record(read, span)
+    is_far, fields, record = storage.is_url(span.path), config.fields, Record(read, span)
     try:
-        if is_remote:
+        if is_far:
             by_states = [{*fields.identity, *fields.state}] if config.states == "pose" else []
             record = Record(read, span, record.locate([{*fields.identity, STEP_FLAG}, *by_states]))
         name = identity_of(record, fields)
-        if not is_remote:
-            steps, states = check_record(record, config, cameras, f"{span} ({name})")
-            return ScannedEpisode(info_of(name, steps), span, hash_of_states(states))
-        if steps := num_steps_of(record, config):
-            return ScannedEpisode(info_of(name, steps), span)
-        raise zero_steps(f"{span} ({name})")
+        states = None if is_far else _checked_states(record, config, cameras, f"{span} ({name})")
+        steps = num_steps_of(record, config) if states is None else len(states)
+        if steps == 0:
+            raise zero_steps(f"{span} ({name})")
     except InputError as error:
-        return as_problem(error if is_remote else _damage_or(error, read, span), name)
+        return as_problem(error if is_far else _damage_or(error, read, span), name)
+    place = dict(zip(_PLACE, (shard, span.number, span.offset, span.length), strict=True))
+    return Scanned(info_of(name, steps), str(span), place, UNKNOWN if states is None else hash_of_states(states))
+
+
+def _checked_states(
+    record: Record, config: RldsData, cameras: Sequence[str], where: str
+) -> Float[np.ndarray, "steps _"]:
+    """Return the states of a record that has everything an episode needs.
+
+    Raises:
+        InputError: A feature is missing, has no uniform shape over all steps, or has implausible numbers.
+    """
+    for name in (*config.fields.identity, *step_features(config), *cameras):
+        record.place_of(name)
+    states = states_of(record, config, num_steps_of(record, config), where)
+    commands_of(record, config, len(states), where)
+    return states
 
 
 def _damage_or(error: InputError, read: Read, span: RecordSpan) -> InputError:
@@ -152,53 +154,11 @@ def _require_fitting(shards: Sequence[Shard], config: RldsData, cameras: Sequenc
         try:
             with open_shard(shard) as read:
                 span = span_at(read(0, HEADER_BYTES), shard.path, 0, 0, shard.size)
-                check_record(Record(read, span), config, cameras, str(span))
+                _checked_states(Record(read, span), config, cameras, str(span))
                 return
         except InputError as error:
             errors.append(error)
     raise errors[0]
-
-
-def _table_of(shards: Sequence[Shard], found: Iterator[list[Found]], progress: Progress) -> EpisodeTable:
-    """Return the table of the results, shard by shard; of episodes with one identity the first stays.
-
-    Raises:
-        InputError: No episode can be used: the first one's error.
-    """
-    usable: dict[str, tuple[int, ScannedEpisode]] = {}  # with the number of the shard
-    problems: list[EpisodeProblem] = []
-    done, total = 0, sum(shard.episodes for shard in shards)
-    for number, (shard, of_shard) in enumerate(zip(shards, found, strict=True)):
-        for one in of_shard:
-            if isinstance(one, EpisodeProblem):
-                problems.append(one)
-            elif one.info.id in usable:
-                problems.append(_same_identity(one, usable[one.info.id][1].span))
-            else:
-                usable[one.info.id] = number, one
-        done += shard.episodes
-        progress(done, total)
-    if not usable:
-        raise as_error(problems[0])
-    logger.info("%d episodes in %d shards; %d cannot be used", len(usable), len(shards), len(problems))
-    rows = [row for _, row in usable.values()]
-    places = [(number, row.span.number, row.span.offset, row.span.length) for number, row in usable.values()]
-    return EpisodeTable.of(
-        [row.info for row in rows],
-        problems=problems,
-        locators=dict(zip(_PLACE, np.array(places, np.int64).T.copy(), strict=True)),
-        state_hashes=[row.state_hash for row in rows],
-    )
-
-
-def _same_identity(row: ScannedEpisode, first: RecordSpan) -> EpisodeProblem:
-    return EpisodeProblem(
-        name=row.info.id,
-        where=str(row.span),
-        found=f"the same identity as {first}: {row.info.id}",
-        needed="episodes that can be told apart: the split is a hash of the identity",
-        fix="Add a feature to data.fields.identity that differs between them",
-    )
 
 
 def _with_hashes_of_copies(

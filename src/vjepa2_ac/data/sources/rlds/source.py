@@ -1,35 +1,54 @@
-"""Source of RLDS episodes: one tf.train.Example each, read without TensorFlow, images on demand."""
+"""Source of RLDS episodes: one tf.train.Example each, read without TensorFlow, images on demand.
+
+Of a record behind a URL, the positions of its features and images are stored on this machine without limit, some 4 KB
+an episode; its numbers, and the images of steps that clips may come from, within the limit of `data.disk_cache`. The
+first time all of the camera's images are fetched, because only that gives their positions. Later exactly those of a
+clip are, where they are not stored: blocks of any size would be several times as much.
+"""
 
 from __future__ import annotations
 
+import json
 import os
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import UInt8
+
 from vjepa2_ac import storage
-from vjepa2_ac.config import RldsData
+from vjepa2_ac.config import DiskCacheConfig, RldsData
 from vjepa2_ac.config.section import Affects, knobs_that_affect
-from vjepa2_ac.data.index import cache_folder, get_or_build, index_key
-from vjepa2_ac.data.sources.indexed_source import IndexedSource, Opened
-from vjepa2_ac.data.sources.rlds import episode
-from vjepa2_ac.data.sources.rlds.images import RemoteEpisode, images_here
+from vjepa2_ac.data.files import fetched_data
+from vjepa2_ac.data.index import EpisodeTable, cache_folder, get_or_build, index_key
+from vjepa2_ac.data.sources.indexed_source import FramesByStep, IndexedSource
+from vjepa2_ac.data.sources.rlds.episode import STEP_FLAG, Record, episode_of, step_features
 from vjepa2_ac.data.sources.rlds.index import build_index, position_of
-from vjepa2_ac.data.sources.rlds.shards import Shard, find_shards, open_shard
-from vjepa2_ac.data.sources.rlds.tfrecord import require_intact
+from vjepa2_ac.data.sources.rlds.shards import Shard, find_shards, naming, open_shard
+from vjepa2_ac.data.sources.rlds.tfrecord import (
+    NotAnExampleError,
+    Place,
+    Read,
+    RecordSpan,
+    item_places,
+    require_intact,
+)
 from vjepa2_ac.episode import Episode, Progress, StepRanges
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.media.jpeg import decode_jpegs
+from vjepa2_ac.storage.block_file import DiskCache
 
 _CHECKED = b"\xc3"  # not all bits equal, so that a damaged file seldom contains false marks
+_GROUP_STEPS = 32  # images of so many steps are one entry of the cache
+_GAP_BYTES = 1 << 15  # images at most this far apart are fetched by one read
+_CHUNK_BYTES = 1 << 20  # all of a camera's images are fetched in parallel chunks of this size
+_NO_LIMIT = 1 << 62
 
 
-@dataclass(frozen=True)
-class _Opened(Opened):
-    shards: tuple[Shard, ...]
-    checked: Path  # a byte for each record whose CRC was checked on this machine, shared by all processes
-
-
-class RldsSource(IndexedSource[RldsData, _Opened]):
+class RldsSource(IndexedSource[RldsData, tuple[Shard, ...]]):
     """The episodes of an RLDS data set, in the order of its shards.
 
     `infos` scans every record once and caches the result; `read` reads the states only, and images are read and decoded
@@ -48,33 +67,33 @@ class RldsSource(IndexedSource[RldsData, _Opened]):
             UnreachableError: The network fails.
             ValueError: A camera that the config does not know.
         """
-        opened, config, fields = self._open(), self._config, self._config.fields
+        table, shards = self._open()
+        config, fields = self._config, self._config.fields
         camera = camera or config.cameras[0]
         if camera not in fields.cameras:
             raise ValueError(f"camera {camera!r} is not one of {', '.join(fields.cameras)}")
-        feature, info = fields.cameras[camera], opened.table[index]
-        shard, span = position_of(opened.table, opened.shards, index)
+        feature, info = fields.cameras[camera], table[index]
+        shard, span = position_of(table, shards, index)
         where = f"{span} ({info.id})"
+        of_images = f"{where}: {feature}"
         if storage.is_url(shard.path):
             remote = RemoteEpisode(shard, span, config.disk_cache)
-            names = [episode.STEP_FLAG, *episode.step_features(config), fields.joint_velocity, fields.language]
+            names = [STEP_FLAG, *step_features(config), fields.joint_velocity, fields.language]
             record = remote.record([name for name in names if name])
-            record.require([feature])
-            place = record.located[feature]
-            images = remote.images(feature, place, info.num_steps, needed, f"{where}: {feature}")
-            return episode.episode_of(record, config, info, images, where)
+            place = record.place_of(feature)
+            images = remote.images(feature, place, info.num_steps, needed, of_images)
+            return episode_of(record, config, info, images, where)
         with open_shard(shard) as read:
-            if config.check_crc == "always":
+            checked = cache_folder(config.disk_cache) / "index" / f"{table.texts['index']}.checked"
+            is_checked = config.check_crc == "once" and _is_marked(checked, index)
+            if config.check_crc != "never" and not is_checked:
                 require_intact(read, span)
-            elif config.check_crc == "once" and not _is_marked(opened.checked, index):
-                require_intact(read, span)
-                _mark(opened.checked, index)
-            record = episode.Record(read, span)
-            record.require([feature])
-            images = images_here(shard, record.located[feature], info.num_steps, f"{where}: {feature}")
-            return episode.episode_of(record, config, info, images, where)
+                _mark(checked, index)
+            record = Record(read, span)
+            images = images_here(shard, record.place_of(feature), info.num_steps, of_images)
+            return episode_of(record, config, info, images, where)
 
-    def _look(self, progress: Progress) -> _Opened:
+    def _look(self, progress: Progress) -> tuple[EpisodeTable, tuple[Shard, ...]]:
         config, fields = self._config, self._config.fields
         shards = tuple(find_shards(config.path))
         cameras = [fields.cameras[camera] for camera in config.cameras]
@@ -88,8 +107,7 @@ class RldsSource(IndexedSource[RldsData, _Opened]):
         key = index_key(parts, config.path)
         build = partial(build_index, shards, config, cameras, progress)
         table = get_or_build(config.disk_cache, key, config.path, build)
-        table = replace(table, texts={**table.texts, "control_rate_hz": str(fields.control_rate_hz)})
-        return _Opened(table, shards, cache_folder(config.disk_cache) / "index" / f"{key}.checked")
+        return replace(table, texts={**table.texts, "control_rate_hz": str(fields.control_rate_hz)}), shards
 
 
 def _is_marked(file: Path, number: int) -> bool:
@@ -110,3 +128,150 @@ def _mark(file: Path, number: int) -> None:
             os.pwrite(handle, _CHECKED, number)
         finally:
             os.close(handle)
+
+
+def images_here(shard: Shard, feature: Place, num_steps: int, where: str) -> FramesByStep:
+    """Return the reader of the images in a local shard; `where`: file, record, identity and feature, for messages."""
+
+    def decode(steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
+        with open_shard(shard) as read:
+            places = _places_of(read, feature, num_steps, where)
+            return decode_jpegs([read(*places[step]) for step in steps], steps, where)
+
+    return FramesByStep(num_steps, where, decode)
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """Bytes of a file from an offset on, read as the file is."""
+
+    start: int
+    data: bytes
+
+    def __call__(self, offset: int, length: int) -> bytes:
+        return self.data[offset - self.start : offset - self.start + length]
+
+
+class RemoteEpisode:
+    """One record behind a URL: its numbers, and the images of its cameras.
+
+    Args:
+        shard: Its file.
+        span: Its position in the file.
+        config: Of the cache of this machine.
+    """
+
+    def __init__(self, shard: Shard, span: RecordSpan, config: DiskCacheConfig) -> None:
+        self._shard, self._span = shard, span
+        self._places, self._contents = DiskCache(cache_folder(config) / "places", _NO_LIMIT), fetched_data(config)
+        self._key = f"{shard.path} {shard.version} {shard.size} {span.offset}"
+
+    def record(self, names: Sequence[str]) -> Record:
+        """Return the record with these features fetched, as far as it has them.
+
+        Raises:
+            InputError: It cannot be read, or is no Example.
+            UnreachableError: The network fails.
+        """
+        located = self._located()
+        places = [located[name] for name in names if name in located]
+        key = f"{self._key} {' '.join(names)}"
+        with naming(self._shard):
+            data = self._contents.read(key)
+            if data is None:
+                data = b"".join(storage.read_ranges(self._shard.path, places))
+                self._contents.write(key, data)
+        pieces, position = {}, 0
+        for offset, length in places:
+            pieces[offset] = _Piece(offset, data[position : position + length])
+            position += length
+        return Record(lambda offset, length: pieces[offset](offset, length), self._span, located)
+
+    def images(self, name: str, feature: Place, num_steps: int, needed: StepRanges | None, where: str) -> FramesByStep:
+        """Return the reader of one camera's images.
+
+        Args:
+            name: The feature's.
+            feature: Its position.
+            num_steps: Of the episode.
+            needed: Steps whose images are cached, with those beside them; None: all.
+            where: File, record, identity and feature, for messages.
+        """
+        key = f"{self._key} {name}"
+
+        def decode(steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
+            with naming(self._shard):
+                stored = self._places.read(key)
+                if stored is None:
+                    images = self._fetch_all(key, feature, num_steps, needed, where)
+                else:
+                    places = np.frombuffer(stored, np.uint32).reshape(-1, 2) + np.array([feature[0], 0])
+                    images = self._some(key, list(map(tuple, places.tolist())), steps)
+            return decode_jpegs([images[step] for step in steps], steps, where)
+
+        return FramesByStep(num_steps, where, decode)
+
+    def _located(self) -> dict[str, Place]:
+        cached = self._places.read(self._key)
+        if cached is not None:
+            return {name: tuple(place) for name, place in json.loads(cached).items()}
+        with open_shard(self._shard) as read:
+            located = Record(read, self._span).located
+        self._places.write(self._key, json.dumps(located).encode())
+        return located
+
+    def _fetch_all(
+        self, key: str, feature: Place, num_steps: int, needed: StepRanges | None, where: str
+    ) -> dict[int, bytes]:
+        """Fetch all of a camera's images; cache their positions, and the groups with needed ones."""
+        start, end = feature[0], sum(feature)
+        chunks = [(place, min(_CHUNK_BYTES, end - place)) for place in range(start, end, _CHUNK_BYTES)]
+        piece = _Piece(start, b"".join(storage.read_ranges(self._shard.path, chunks)))
+        places = _places_of(piece, feature, num_steps, where)
+        self._places.write(key, (np.array(places) - (start, 0)).astype(np.uint32).tobytes())
+        steps = {step for first, stop in needed or [(0, num_steps)] for step in range(max(0, first), stop)}
+        for group in sorted({step // _GROUP_STEPS for step in steps if step < num_steps}):
+            members = places[group * _GROUP_STEPS : (group + 1) * _GROUP_STEPS]
+            self._contents.write(f"{key} {group}", piece(*_range_of(members)))
+        return {step: piece(*place) for step, place in enumerate(places)}
+
+    def _some(self, key: str, places: list[Place], steps: Sequence[int]) -> dict[int, bytes]:
+        """Return images whose positions are known: from cached groups, or fetched, neighbours by one read."""
+        found: dict[int, bytes] = {}
+        for group in sorted({step // _GROUP_STEPS for step in steps}):
+            cached = self._contents.read(f"{key} {group}")
+            if cached is not None:
+                piece = _Piece(places[group * _GROUP_STEPS][0], cached)
+                found |= {step: piece(*places[step]) for step in steps if step // _GROUP_STEPS == group}
+        runs: list[list[int]] = []
+        for step in sorted(set(steps) - found.keys()):
+            if runs and places[step][0] - sum(places[runs[-1][-1]]) <= _GAP_BYTES:
+                runs[-1].append(step)
+            else:
+                runs.append([step])
+        ranges = [_range_of([places[step] for step in run]) for run in runs]
+        for run, (start, _), data in zip(runs, ranges, storage.read_ranges(self._shard.path, ranges), strict=True):
+            found |= {step: _Piece(start, data)(*places[step]) for step in run}
+        return found
+
+
+def _places_of(read: Read, feature: Place, num_steps: int, where: str) -> list[Place]:
+    """Return the position of each image of a feature.
+
+    Raises:
+        InputError: It is not a list of images, or not of one for each step.
+    """
+    try:
+        places = item_places(read, feature, num_steps + 1)
+    except NotAnExampleError as error:
+        raise InputError(where=where, found=str(error), needed="a list of images") from None
+    if len(places) != num_steps:
+        found = f"{len(places)} images" if len(places) < num_steps else "more images"
+        needed = f"one for each of the {num_steps} steps"
+        raise InputError(where=where, found=found, needed=needed)
+    return places
+
+
+def _range_of(places: Sequence[Place]) -> Place:
+    """Return the position from the start of the first place to the end of the last."""
+    return places[0][0], sum(places[-1]) - places[0][0]

@@ -1,0 +1,144 @@
+"""The files of a data set: listed, read by several threads, and fetched once where they are behind a URL."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from typing import TypeVar
+
+import numpy as np
+
+from vjepa2_ac import storage
+from vjepa2_ac.config import DataConfig, DiskCacheConfig
+from vjepa2_ac.data.index import cache_folder
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage import FileInfo
+from vjepa2_ac.storage.block_file import BlockCachedFile, DiskCache
+from vjepa2_ac.storage.npz_reader import arrays_as_bytes, read_arrays
+
+DEEPEST = 8  # folders below the data set's
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+
+def fetched_data(config: DiskCacheConfig) -> DiskCache:
+    """Return the cache of fetched data: one for all sources and runs, with one limit."""
+    return DiskCache(cache_folder(config) / "fetched", int(config.limit_gb * 1e9))
+
+
+class EpisodeFiles:
+    """Reads files; what comes from URLs or was parsed is cached on this machine, within `data.disk_cache.limit_gb`."""
+
+    def __init__(self, config: DataConfig) -> None:
+        self._cache = fetched_data(config.disk_cache)
+
+    def open(self, path: str, *, version: str) -> str | BlockCachedFile:
+        """Return what to open for partial reads: a local path itself, or a file of cached blocks.
+
+        Args:
+            path: Local path or URL.
+            version: Changes with the file's content; the size is requested once for each version.
+
+        Raises:
+            OSError: A file behind a URL does not exist or cannot be reached.
+        """
+        if not storage.is_url(path):
+            return path
+        size = self._cached(f"size {path} {version}", lambda: str(storage.file_size(path)).encode())
+        return BlockCachedFile(path, version=version, size=int(size), cache=self._cache)
+
+    def read(self, path: str, *, version: str) -> bytes:
+        """Return the content of a file.
+
+        Raises:
+            InputError: There is no such file; an UnreachableError if a local one cannot be read.
+            OSError: A file behind a URL cannot be read.
+        """
+        try:
+            if storage.is_url(path):
+                return self._cached(f"{path}@{version}", lambda: storage.read_bytes(path))
+            return storage.read_bytes(path)
+        except FileNotFoundError:
+            raise InputError(where=path, found="no such file", fix="Copy the episode again") from None
+        except OSError as error:
+            if storage.is_url(path):
+                raise
+            raise storage.unreadable(path, error) from None
+
+    def arrays(self, key: str) -> dict[str, np.ndarray] | None:
+        """Return the arrays that were kept under a key; None if there are none, or they are damaged."""
+        data = self._cache.read(key)
+        with suppress(InputError):
+            return None if data is None else read_arrays(data)
+        return None
+
+    def keep(self, key: str, arrays: Mapping[str, np.ndarray]) -> None:
+        """Keep what was parsed of an episode."""
+        self._cache.write(key, arrays_as_bytes(arrays))
+
+    def _cached(self, key: str, fetch: Callable[[], bytes]) -> bytes:
+        data = self._cache.read(key)
+        if data is None:
+            self._cache.write(key, data := fetch())
+        return data
+
+
+def connections_to(config: DataConfig) -> int:
+    """Return how many files are read at once: behind a URL, where each is waited for, several."""
+    return config.connections if storage.is_url(config.path) else 1
+
+
+def in_parallel(function: Callable[[Item], Result], items: Sequence[Item], connections: int) -> Iterator[Result]:
+    """Yield the result of a function for every item, in order, from several threads; or raise the first error."""
+    if connections == 1 or len(items) < 2:
+        yield from map(function, items)
+        return
+    pool = ThreadPoolExecutor(min(connections, len(items)))
+    try:
+        yield from pool.map(function, items)
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def walk(root: str, connections: int) -> Iterator[tuple[str, FileInfo]]:
+    """Yield all files, with their folder relative to `root`; names that begin with a dot are skipped.
+
+    A folder with several links to it is visited once: its files would be episodes under several names.
+
+    Raises:
+        OSError: A folder cannot be listed.
+        InputError: A name is not UTF-8.
+    """
+    folders, known = [""], {storage.absolute(root)}
+    for _ in range(DEEPEST):
+        below: list[str] = []
+        listed = in_parallel(lambda folder: list_folder(root, folder), folders, connections)
+        for folder, (files, names) in zip(folders, listed, strict=True):
+            yield from ((folder, file) for file in files if not file.name.startswith("."))
+            below += [within(folder, name) for name in names]
+        places = {storage.absolute(storage.join(root, folder)): folder for folder in reversed(below)}
+        folders = sorted(folder for place, folder in places.items() if place not in known)
+        known |= places.keys()
+
+
+def list_folder(root: str, folder: str) -> tuple[list[FileInfo], list[str]]:
+    """Return the files of a folder, and the names of its folders except hidden ones.
+
+    Raises:
+        OSError: It cannot be listed.
+        InputError: A name is not UTF-8.
+    """
+    place = storage.join(root, folder) if folder else root
+    files, names = storage.list_files(place), storage.list_names(place)
+    for name in names:  # the identity of an episode must be text that can be encoded
+        if not name.isascii() and any("\ud800" <= letter <= "\udfff" for letter in name):
+            raise InputError(where=place, found=f"the name {name!r}", needed="names in UTF-8", fix="Rename it")
+    known = {file.name for file in files}
+    return files, [name for name in names if name not in known and not name.startswith(".")]
+
+
+def within(folder: str, name: str) -> str:
+    """Return the path of an entry of a folder, with the same base as the folder's path."""
+    return f"{folder}/{name}" if folder else name
