@@ -69,7 +69,7 @@ def add_download(commands: Commands) -> None:
     """Add `download` to a parser."""
     text = (
         "Fetch a published checkpoint: Meta's world model, or an encoder of V-JEPA 2 or 2.1. It goes on where it"
-        " stopped; size, and SHA-256 where it is known, are checked."
+        " stopped; its size is checked."
     )
     parser = command(commands, "download", _download, text)
     argument(parser, "name NAME", "as --list shows it (default: vjepa2-ac-vitg, the world model, 11.7 GB)", nargs="?")
@@ -221,7 +221,7 @@ def _download(options: argparse.Namespace) -> None:
     from vjepa2_ac.places import literal
 
     if options.list:
-        show(published_table(PUBLISHED), *published_notes(PUBLISHED))
+        show(published_table(PUBLISHED), *published_notes())
         return
     known = find_published(options.name or OFFICIAL)
     path, url = options.to or Path("checkpoints") / known.file, options.url or known.url

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import importlib.resources
-import json
 from pathlib import Path
 from typing import Any
-
-from pydantic import ValidationError
 
 from vjepa2_ac.config import ModelConfig, ModelSizes
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.places import BUILTIN, HUB
-from vjepa2_ac.storage.structured import message_of, read_json_object
+from vjepa2_ac.storage import unreadable
+from vjepa2_ac.storage.structured import read_json_object, record_of
 
 ASSETS = Path(str(importlib.resources.files("vjepa2_ac"))) / "assets"
 FORMAT = "vjepa2-ac world model 1"
 CONFIG = "config.json"
+ENCODER_NEEDED = "an encoder of V-JEPA 2 or 2.1: Meta's .pt, a transformers folder, or a model of this project"
 
 _TINY = f"{BUILTIN}sim-tiny"
 _NEEDED = "a folder written by `vjepa2-ac export` or WorldModel.save_pretrained"
@@ -29,12 +28,21 @@ def find_base(name: str) -> Path:
     Raises:
         InputError: There is none.
     """
-    return find_model(
-        name,
-        knob="model.base",
-        needed=f"the official .pt, a folder written by `vjepa2-ac export`, or {_TINY}",
-        fix="`vjepa2-ac download` fetches the official checkpoint to checkpoints/vjepa2-ac-vitg.pt",
-    )
+    needed = f"the official .pt, a folder written by `vjepa2-ac export`, or {_TINY}"
+    fix = "`vjepa2-ac download` fetches the official checkpoint to checkpoints/vjepa2-ac-vitg.pt"
+    return _find(name, f"model.base: {name}", needed, fix)
+
+
+def find_encoder_path(name: str) -> Path | None:
+    """Return the file or folder that `model.encoder.path` names; None: it is on the Hub.
+
+    Raises:
+        InputError: There is none.
+    """
+    if name.startswith(HUB):
+        return None
+    fix = "`vjepa2-ac download --list` shows those that are published"
+    return _find(name, f"model.encoder.path: {name}", ENCODER_NEEDED, fix)
 
 
 def require_model(config: ModelConfig) -> None:
@@ -49,56 +57,28 @@ def require_model(config: ModelConfig) -> None:
         find_encoder_path(config.encoder.path)
 
 
-def find_encoder_path(name: str) -> Path | None:
-    """Return the file or folder that `model.encoder.path` names; None: it is on the Hub.
-
-    Raises:
-        InputError: There is none.
-    """
-    if name.startswith(HUB):
-        return None
-    return find_model(
-        name,
-        knob="model.encoder.path",
-        needed="an encoder of V-JEPA 2 or 2.1: Meta's .pt, a transformers folder, or a model of this project",
-        fix="`vjepa2-ac download --list` shows those that are published",
-    )
-
-
-def find_model(name: str, *, knob: str, needed: str, fix: str) -> Path:
-    """Return the file or folder of a model.
-
-    Args:
-        name: As the user says it.
-        knob: That says it.
-        needed: What it should be.
-        fix: How to get one.
-
-    Raises:
-        InputError: There is none.
-    """
+def _find(name: str, where: str, needed: str, fix: str) -> Path:
     path = ASSETS / name.removeprefix(BUILTIN) if name.startswith(BUILTIN) else Path(name)
     if name.startswith(BUILTIN) and not (path / CONFIG).is_file():
         there = ", ".join(sorted(f"{BUILTIN}{config.parent.name}" for config in ASSETS.glob(f"*/{CONFIG}")))
         found = f"no model of that name in the package; it has {there or 'none: install it again, or run `make base`'}"
-        raise InputError(where=f"{knob}: {name}", found=found, needed=_TINY)
+        raise InputError(where=where, found=found, needed=_TINY)
     if not path.exists():
-        raise InputError(where=f"{knob}: {name}", found="no such file or folder", needed=needed, fix=fix)
+        raise InputError(where=where, found="no such file or folder", needed=needed, fix=fix)
     return path
 
 
-def read_model_config(folder: Path, *, needed: str = _NEEDED, fix: str = _FIX) -> dict[str, Any]:
-    """Return the config.json in the folder of a model.
+def read_model_json(path: Path, *, needed: str = _NEEDED, fix: str = _FIX) -> dict[str, Any]:
+    """Return the JSON object beside a model's weights.
 
     Raises:
         InputError: There is none, or it is no JSON object.
+        UnreachableError: The system refuses to read it.
     """
     try:
-        return read_json_object(folder / CONFIG, needed=needed, fix=fix)
+        return read_json_object(path, needed=needed, fix=fix)
     except OSError as error:
-        is_missing = isinstance(error, FileNotFoundError | NotADirectoryError)
-        found = "no such file" if is_missing else f"cannot be read ({error})"
-        raise InputError(where=str(folder / CONFIG), found=found, needed=needed, fix=fix) from None
+        raise unreadable(str(path), error, needed=needed, fix=fix) from None
 
 
 def read_sizes(folder: Path) -> ModelSizes:
@@ -107,14 +87,10 @@ def read_sizes(folder: Path) -> ModelSizes:
     Raises:
         InputError: The folder is not a world model.
     """
-    where, card = str(folder / CONFIG), read_model_config(folder)
+    where, card = str(folder / CONFIG), read_model_json(folder / CONFIG)
     if card.get("format") != FORMAT:
         raise InputError(where=where, found="not the config of a world model", needed=_NEEDED, fix=_FIX)
-    try:
-        return ModelSizes.model_validate_json(json.dumps(card.get("sizes")))
-    except ValidationError as error:
-        said = [f"{'.'.join(map(str, ('sizes', *one['loc'])))}: {message_of(one)}" for one in error.errors()[:4]]
-        raise InputError(where=where, found="; ".join(said), needed=_NEEDED, fix=_FIX) from None
+    return record_of(ModelSizes, card.get("sizes"), where=f"{where}: sizes", needed=_NEEDED, fix=_FIX)
 
 
 def check_sizes(found: ModelSizes, given: ModelSizes, *, where: str) -> None:

@@ -55,7 +55,7 @@ def test_sizes_that_a_folder_has_and_defaults_are_fine(model: WorldModel, tmp_pa
 
 
 def test_a_folder_that_is_no_model_gives_the_command_that_makes_one_of_a_run(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"config\.json: no such file.*`vjepa2-ac export RUN FOLDER` makes one"):
+    with pytest.raises(InputError, match=r"config\.json: cannot be read: No such.*`vjepa2-ac export RUN FOLDER`"):
         load_with(tmp_path, ModelSizes())
 
 

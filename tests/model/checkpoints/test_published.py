@@ -15,7 +15,7 @@ def test_files_do_not_collide_on_a_disk_that_is_blind_to_case() -> None:
 
 def test_every_name_of_a_file_leads_to_it() -> None:
     for one in PUBLISHED:
-        for name in (one.name, one.file, one.remote, one.remote.removesuffix(".pt"), *one.aliases):
+        for name in (one.name, one.file, one.remote, one.remote.removesuffix(".pt"), one.hub_name):
             assert find_published(name) is one
         assert one in {published_as(one.file), published_as(one.remote)}
 

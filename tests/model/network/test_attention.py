@@ -170,9 +170,3 @@ def test_auto_compiles_only_for_long_sequences_with_gradients_on_cuda(monkeypatc
     assert best_kind(cpu, 64, 15, gradients=True) == "per_step"
     monkeypatch.setattr(attention, "has_triton", lambda: False)
     assert best_kind(cuda, 64, 15, gradients=True) == "per_step"
-
-
-def test_a_sequence_of_broken_steps_is_refused() -> None:
-    query = torch.zeros(1, 1, 11, 16)
-    with pytest.raises(ValueError, match="not a whole number of steps"):
-        block_causal_attention(query, query, query, PER_STEP)

@@ -28,7 +28,7 @@ def rotated_by_hand(x: list[float], places: tuple[int, int, int]) -> list[float]
 @pytest.mark.parametrize("head_dim", [12, 16, 64])
 def test_each_token_is_turned_by_its_time_row_and_column(head_dim: int) -> None:
     layout = TokenLayout(steps=3, grid=2, conditioning=2)
-    x = torch.randn(1, layout.length, 1, head_dim, generator=torch.Generator().manual_seed(0))
+    x = torch.randn(1, layout.steps * layout.tokens_per_step, 1, head_dim, generator=torch.Generator().manual_seed(0))
     turned = rotate(x, rotary_tables(layout, head_dim, CPU))
     places = [
         (time, *place) for time in range(3) for place in [(0, 0), (0, 0), (0, 0), (0, 1), (1, 0), (1, 1)]
@@ -54,7 +54,7 @@ def test_tables_made_in_inference_mode_can_be_trained_with() -> None:
 
 def test_bfloat16_loses_nothing_but_the_rounding_of_its_result() -> None:
     layout = TokenLayout(steps=16, grid=16)
-    x = torch.randn(1, layout.length, 1, 64, generator=torch.Generator().manual_seed(0)).bfloat16()
+    x = torch.randn(1, 16 * 16**2, 1, 64, generator=torch.Generator().manual_seed(0)).bfloat16()
     tables = rotary_tables(layout, 64, CPU)
     turned = rotate(x, tables)
     assert turned.dtype == torch.bfloat16
@@ -73,7 +73,7 @@ def test_gradients_are_those_of_differences() -> None:
 def test_compiled_a_gradient_comes_through(dtype: torch.dtype) -> None:
     layout = TokenLayout(steps=2, grid=3, conditioning=2)
     tables = rotary_tables(layout, 12, CPU)
-    drawn = torch.randn(1, layout.length, 2, 12, generator=torch.Generator().manual_seed(0)).to(dtype)
+    drawn = torch.randn(1, 2 * 11, 2, 12, generator=torch.Generator().manual_seed(0)).to(dtype)
 
     def turned_and_learned(turn: Callable[..., torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
         given = drawn.clone().requires_grad_()

@@ -17,6 +17,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from vjepa2_ac.config import AdapterConfig
+from vjepa2_ac.config.model import PEFT_NAMES
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.adapter_folder import (
@@ -25,22 +26,31 @@ from vjepa2_ac.model.adapter.adapter_folder import (
     LORA_WEIGHTS,
     Card,
     Heads,
-    adapter_of,
-    read_adapter_file,
     read_card,
     read_weights,
     write_trained,
 )
 from vjepa2_ac.model.adapter.low_rank import LowRankLayer, low_rank_linear
-from vjepa2_ac.model.adapter.targets import lora_arguments
+from vjepa2_ac.model.base_model import read_model_json
 from vjepa2_ac.model.network.input_heads import fit_heads, require_trained
 from vjepa2_ac.model.network.predictor_network import PredictorNetwork
 from vjepa2_ac.model.network.world_model import Adaptation, WorldModel, base_weights
 from vjepa2_ac.model.quiet_imports import quiet_imports
+from vjepa2_ac.storage.structured import record_of, shown
 
 with quiet_imports():
     from peft import LoraConfig, PeftModel, get_peft_model, get_peft_model_state_dict, set_peft_model_state_dict
     from peft.tuners.lora import Linear, LoraLayer
+
+_SETS = {"attention": ("q", "k", "v", "o"), "mlp": ("fc1", "fc2")}
+_NEEDED = "a LoRA adapter of V-JEPA 2-AC's predictor, as this program writes it in PEFT's format"
+_FIX = "Copy the adapter again, or train it again: other kinds of PEFT's are not read"
+_INFORMATIONAL = frozenset({  # origin and purpose
+    "auto_mapping", "base_model_name_or_path", "inference_mode", "megatron_core", "peft_type", "peft_version",
+    "revision", "task_type",
+})  # fmt: skip
+_LITERAL = re.compile(r"[\w.]+")  # names of layers, which as regular expressions cannot take long
+_MOST_RANK, _MOST_ALPHA = 1024, 1e6
 
 
 class LoraLinear(Linear, LowRankLayer):  # type: ignore[misc]  # PEFT has no types
@@ -130,7 +140,7 @@ def add_adapter(model: WorldModel, config: AdapterConfig, seed: int) -> None:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)  # of initialisations that are drawn by PEFT
         _wrap(model, config, start=config.peft.get("init_lora_weights", True))
-    _written(model, where="adapter.peft")  # or it could not be read again
+    knobs_of(_lora_config(model).to_dict(), where="adapter.peft")  # or it could not be read again
     layers = lora_layers(model)
     if config.peft.get("init_lora_weights", True) is True:
         _draw_first_matrices(layers, torch.Generator().manual_seed(seed))
@@ -148,7 +158,7 @@ def with_adapter(predictor: PredictorNetwork, config: AdapterConfig, start: bool
     Raises:
         InputError: A knob does not fit the predictor, or PEFT refuses it.
     """
-    arguments = lora_arguments(predictor, config) | {"init_lora_weights": start}
+    arguments = _peft_arguments(predictor, config) | {"init_lora_weights": start}
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", RuntimeWarning)  # a pattern that no layer has
@@ -226,7 +236,7 @@ def load_trained(model: WorldModel, folder: str | Path, trainable: bool | None =
 
 def lora_layers(model: WorldModel) -> dict[str, Any]:
     """Return the layers of the predictor that have an adapter (PEFT's LoraLayer), by name."""
-    return _layers_of(model.base_predictor)
+    return {name: layer for name, layer in model.base_predictor.named_modules() if isinstance(layer, LoraLayer)}
 
 
 def adaptation_of(model: WorldModel) -> Adaptation:
@@ -238,10 +248,6 @@ def adaptation_of(model: WorldModel) -> Adaptation:
     if model.adaptation is None:
         raise ValueError("this model has not been adapted: add_adapter or load_trained first")
     return model.adaptation
-
-
-def _layers_of(predictor: nn.Module) -> dict[str, Any]:
-    return {name: layer for name, layer in predictor.named_modules() if isinstance(layer, LoraLayer)}
 
 
 def _card_of(model: WorldModel) -> Card:
@@ -319,11 +325,6 @@ def _lora_config(model: WorldModel) -> Any:
     return config
 
 
-def _written(model: WorldModel, *, where: str) -> AdapterConfig:
-    """Return the knobs that a model's adapter is read with after it was written."""
-    return adapter_of(_lora_config(model).to_dict(), LoraConfig().to_dict(), where=where)
-
-
 def _set_trainable(model: WorldModel, trainable: bool) -> None:
     lora = isinstance(model.predictor, PeftModel)
     for name, value in model.predictor.named_parameters():
@@ -332,21 +333,94 @@ def _set_trainable(model: WorldModel, trainable: bool) -> None:
 
 
 def _load_lora(model: WorldModel, folder: Path) -> None:
-    knobs = read_adapter_file(folder, LoraConfig().to_dict())
+    path = folder / ADAPTER_FILE
+    knobs = knobs_of(read_model_json(path, needed=_NEEDED, fix=_FIX), where=str(path))
     if model.adaptation is None:
         try:
             _wrap(model, knobs)
         except InputError as error:
-            where = f"{folder / ADAPTER_FILE}: {error.where}"
+            where = f"{path}: {error.where}"
             raise InputError(where=where, found=error.found, needed=error.needed, fix=error.fix) from None
     else:
-        own = _written(model, where=str(folder))
+        own = knobs_of(_lora_config(model).to_dict(), where=str(folder))
         for name in AdapterConfig.model_fields.keys() - {"dropout"}:
-            found, needed = getattr(knobs, name), getattr(own, name)
-            if found != needed:
-                raise InputError(
-                    where=str(folder),
-                    found=f"an adapter with {name} {found}",
-                    needed=f"{needed}, as the model has",
-                )
+            if (found := getattr(knobs, name)) != (needed := getattr(own, name)):
+                found, needed = f"an adapter with {name} {found}", f"{needed}, as the model has"
+                raise InputError(where=str(folder), found=found, needed=needed)
     set_peft_model_state_dict(model.predictor, read_weights(folder / LORA_WEIGHTS, _lora_weights(model)))
+
+
+def knobs_of(values: Mapping[str, Any], *, where: str) -> AdapterConfig:
+    """Return the knobs of a saved adapter, which may be a stranger's, from its options of PEFT's LoraConfig.
+
+    Layers are named, never matched by a regular expression, and options have plain values: none of them runs code,
+    takes long, or takes more memory than an adapter of rank 1,024. PEFT never sees the file.
+
+    Raises:
+        InputError: It is another kind of adapter, or has an option that is not read.
+    """
+    defaults: dict[str, Any] = LoraConfig().to_dict()
+    given: dict[str, Any] = {"kind": "lora", "rslora": False}  # not rsLoRA: PEFT's default
+    given |= {ours: values[peft] for peft, ours in PEFT_NAMES.items() if values.get(peft) is not None}
+    options = {name: value for name, value in values.items() if name not in _INFORMATIONAL and name not in PEFT_NAMES}
+    options = {name: value for name, value in options.items() if not _is_off(value, defaults.get(name))}
+    unread = {name: value for name, value in options.items() if not _can_be_read(name, value, defaults.get(name))}
+    if values.get("peft_type") != "LORA":
+        unread = {"peft_type": values.get("peft_type")}
+    unread |= {peft: None for peft in ("r", "lora_alpha", "target_modules") if values.get(peft) is None}
+    if unread:
+        listed = ", ".join(f"{shown(name)} {shown(value)}" for name, value in unread.items())
+        found = f"an adapter with {listed}, which is not read here"
+        raise InputError(where=where, found=found, needed=_NEEDED, fix=_FIX)
+    return record_of(AdapterConfig, {**given, "peft": options}, where=where, needed=_NEEDED, fix=_FIX)
+
+
+def _is_off(value: object, default: object) -> bool:
+    return value is None or value is False or value in ([], {}) or value == default
+
+
+def _can_be_read(name: str, value: object, default: object) -> bool:
+    """Return whether an option is a pattern of whole names, a start (a knob says which), or a number as PEFT has it."""
+    if name in {"rank_pattern", "alpha_pattern"}:
+        kinds, most = ((int,), _MOST_RANK) if name == "rank_pattern" else ((int, float), _MOST_ALPHA)
+        return isinstance(value, dict) and all(
+            _LITERAL.fullmatch(key) and type(one) in kinds and 0 < one <= most for key, one in value.items()
+        )
+    return name == "init_lora_weights" or (isinstance(value, bool | int | float) and type(value) is type(default))
+
+
+def _peft_arguments(predictor: PredictorNetwork, config: AdapterConfig) -> dict[str, Any]:
+    """Return the arguments of PEFT's LoraConfig, sets of targets replaced by their layers.
+
+    Layers without input cannot have an adapter; `all` excludes layers that are trained directly.
+
+    Raises:
+        InputError: A target or a layer to train whole matches no layer, or a layer is named twice.
+    """
+    whole = config.modules_to_save
+    if missing := [name for name in whole if not hasattr(predictor, name)]:
+        raise InputError(
+            where="adapter.modules_to_save",
+            found=f"{', '.join(missing)}, which this predictor does not have: it was made without states",
+            fix="Leave it out, and set model.sizes.predictor.use_states=false: both are then checked before loading",
+        )
+    layers = {name for name, layer in predictor.named_modules() if isinstance(layer, nn.Linear)}
+    layers -= set(predictor.unused_layers)
+    kinds = {name.rpartition(".")[2] for name in layers}
+    sets = {**_SETS, "all": tuple(sorted(kinds - set(whole)))}
+    targets = list(dict.fromkeys(layer for target in config.targets for layer in sets.get(target, (target,))))
+    unknown = [target for target in targets if target not in kinds | layers]
+    if unknown or not targets:
+        raise InputError(
+            where="adapter.targets",
+            found=", ".join(unknown) + " matches no layer of the predictor" if unknown else "no target",
+            needed=f"some of {', '.join(sorted(kinds))}; or {', '.join(sets)}",
+        )
+    if twice := sorted(set(targets) & set(whole)):
+        raise InputError(
+            where="adapter.modules_to_save",
+            found=f"{', '.join(twice)}, which adapter.targets names too",
+            needed="each layer once: trained whole, or with an adapter",
+        )
+    arguments = {peft: getattr(config, ours) for peft, ours in PEFT_NAMES.items()}
+    return arguments | {"target_modules": targets, "modules_to_save": list(whole) or None} | config.peft

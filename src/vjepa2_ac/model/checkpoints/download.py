@@ -32,16 +32,15 @@ def download(
 
     Args:
         url: What to fetch.
-        path: Where the whole file goes; it appears there only when it is whole and checked. One that is there is
-            kept, if it can be the file.
-        known: The published checkpoint that it has to be, whose size and SHA-256 are checked; None: any file.
+        path: Where the whole file goes; it appears there only when it is whole. One that is there is kept, if it can
+            be the file.
+        known: The published checkpoint that it has to be, whose size is checked; None: any file.
         reporter: Is told how far it is, in megabytes.
         policy: How often in a row the line may break without a byte having come, and the waits.
 
     Raises:
         InputError: The server does not say how large the file is, or sends another size than the published file can
-            have; its SHA-256 is another one; the disk has too little space; the address is none; the path cannot be
-            written.
+            have; the disk has too little space; the address is none; the path cannot be written.
         UnreachableError: The server refuses, or cannot be reached.
     """
     path = Path(path)
@@ -52,7 +51,6 @@ def download(
             raise InputError(where=str(path), found="a folder", needed="the name of a file", fix="Name a file in it")
         if path.exists():
             _require_size(known, _size(path), where=str(path))
-            _require_hash(known, path)
             return path
         path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f"{path.name}.{known.name}.part" if known else f"{path.name}.part")
@@ -70,11 +68,6 @@ def download(
         found = f"{error.found}; {_size(part)} bytes are in {part}"
         fix = "Check the network and start again: it goes on where it stopped"
         raise UnreachableError(where=url, found=found, fix=fix) from None
-    try:
-        _require_hash(known, part)
-    except InputError:
-        part.unlink()
-        raise
     return part.replace(path)
 
 
@@ -87,12 +80,12 @@ def _fetch(url: str, part: Path, known: Published | None, reporter: Reporter, ti
     except (http.client.InvalidURL, ValueError):
         raise _no_address(url) from None
     except urllib.error.HTTPError as error:
-        if error.code == 416 and error.headers.get("Content-Range", "").endswith(f"/{start}"):  # nothing is left
+        if error.code != 416:
+            raise
+        if error.headers.get("Content-Range", "").endswith(f"/{start}"):  # nothing is left
             return
-        if error.code == 416:
-            part.unlink()
-            raise http.client.HTTPException("the part that is here does not fit the file; starting again") from None
-        raise
+        part.unlink()
+        raise http.client.HTTPException("the part that is here does not fit the file; starting again") from None
     with answer:
         start = start if answer.headers.get("Content-Range", "").startswith(f"bytes {start}-") else 0
         promised = answer.headers.get("Content-Length", "")
@@ -126,17 +119,6 @@ def _require_size(known: Published | None, size: int, *, where: str) -> None:
         needed = f"{known.name}, of {least:,} to {most:,} bytes"
         fix = f"{_PROXY}; or delete the file, or name another with --to"
         raise InputError(where=where, found=f"a file of {size:,} bytes", needed=needed, fix=fix)
-
-
-def _require_hash(known: Published | None, file: Path) -> None:
-    """Refuse a whole file of another SHA-256 than the published one."""
-    if known is None or known.sha256 is None:
-        return
-    found = storage.sha256_of_file(file)
-    if found != known.sha256:
-        needed = f"{known.sha256} ({known.name})"
-        fix = "Delete it if it is still there, and start again; if it ends so again, the address holds another file"
-        raise InputError(where=str(file), found=f"SHA-256 {found}", needed=needed, fix=fix)
 
 
 def _no_address(url: str) -> InputError:

@@ -17,13 +17,12 @@ from vjepa2_ac.model.network.encoder_origin import VIT_B, VIT_G, VIT_H, VIT_L, E
 OFFICIAL = "vjepa2-ac-vitg"  # Meta's world model, which `download` fetches without a name
 
 _URL = "https://dl.fbaipublicfiles.com/vjepa2/"
-_MIT = "MIT"
 _TOLERANCE = 0.25  # of a size that is only estimated
 
 
 @dataclass(frozen=True)
 class Published:
-    """A file that can be downloaded."""
+    """A file that can be downloaded; Meta publishes no hashes."""
 
     name: str  # for `vjepa2-ac download`; names differ by more than the case of a letter
     remote: str  # Meta's name of the file
@@ -32,11 +31,10 @@ class Published:
     encoder: EncoderShape
     image_size: int  # at which it was trained last, in pixels
     key: str  # of the encoder's weights in the file
+    hub_name: str  # its name in Meta's torch.hub
     gigabytes: float  # about: encoder, its average, predictor and the optimizer's moments, in float32
     bytes: int | None = None  # exactly, where known
-    sha256: str | None = None  # where known; Meta publishes none
-    licence: str = _MIT  # of Meta's repository; Meta's server sends none with the file
-    aliases: tuple[str, ...] = ()  # its names in Meta's torch.hub
+    licence: str = "MIT"  # of Meta's repository; Meta's server sends none with the file
 
     @property
     def url(self) -> str:
@@ -64,17 +62,6 @@ class Published:
         return round(self.gigabytes * (1 - _TOLERANCE) * 10**9), round(self.gigabytes * (1 + _TOLERANCE) * 10**9)
 
     @property
-    def encoder_parameters(self) -> int:
-        """Number of weights of the encoder."""
-        width, hidden = self.encoder.width, self.encoder.hidden
-        block = 4 * width * (width + 1) + 2 * width * hidden + hidden + width + 4 * width
-        patch = 3 * 16 * 16 * width
-        video = self.encoder.depth * block + 2 * patch + width
-        if self.family == "v2":
-            return video + 2 * width  # the last norm
-        return video + patch + width + 2 * width + 4 * 2 * width  # images' patches, two embeddings, four norms
-
-    @property
     def knob(self) -> str:
         """The knob of a config that takes the file."""
         return "model.base" if self.holds == "world model" else "model.encoder.path"
@@ -82,40 +69,40 @@ class Published:
 
 PUBLISHED: tuple[Published, ...] = (
     Published(
-        "vjepa2-ac-vitg", "vjepa2-ac-vitg.pt", "world model", "v2", VIT_g, 256, "encoder", 11.7,
-        aliases=("vjepa2_ac_vit_giant",),
+        "vjepa2-ac-vitg", "vjepa2-ac-vitg.pt", "world model", "v2", VIT_g, 256, "encoder",
+        "vjepa2_ac_vit_giant", 11.7,
     ),
     Published(
-        "vjepa2-vitl", "vitl.pt", "encoder", "v2", VIT_L, 256, "target_encoder", 5.1,
-        aliases=("vjepa2_vit_large",),
+        "vjepa2-vitl", "vitl.pt", "encoder", "v2", VIT_L, 256, "target_encoder",
+        "vjepa2_vit_large", 5.1,
     ),
     Published(
-        "vjepa2-vith", "vith.pt", "encoder", "v2", VIT_H, 256, "target_encoder", 10.4,
-        aliases=("vjepa2_vit_huge",),
+        "vjepa2-vith", "vith.pt", "encoder", "v2", VIT_H, 256, "target_encoder",
+        "vjepa2_vit_huge", 10.4,
     ),
     Published(
-        "vjepa2-vitg", "vitg.pt", "encoder", "v2", VIT_g, 256, "target_encoder", 16.5,
-        aliases=("vjepa2_vit_giant",),
+        "vjepa2-vitg", "vitg.pt", "encoder", "v2", VIT_g, 256, "target_encoder",
+        "vjepa2_vit_giant", 16.5,
     ),
     Published(
-        "vjepa2-vitg-384", "vitg-384.pt", "encoder", "v2", VIT_g, 384, "target_encoder", 16.5,
-        aliases=("vjepa2_vit_giant_384",),
+        "vjepa2-vitg-384", "vitg-384.pt", "encoder", "v2", VIT_g, 384, "target_encoder",
+        "vjepa2_vit_giant_384", 16.5,
     ),
     Published(
-        "vjepa2.1-vitb-384", "vjepa2_1_vitb_dist_vitG_384.pt", "encoder", "v2.1", VIT_B, 384, "ema_encoder", 1.66,
-        bytes=1_664_223_428, aliases=("vjepa2_1_vit_base_384",),
+        "vjepa2.1-vitb-384", "vjepa2_1_vitb_dist_vitG_384.pt", "encoder", "v2.1", VIT_B, 384, "ema_encoder",
+        "vjepa2_1_vit_base_384", 1.66, 1_664_223_428,
     ),
     Published(
-        "vjepa2.1-vitl-384", "vjepa2_1_vitl_dist_vitG_384.pt", "encoder", "v2.1", VIT_L, 384, "ema_encoder", 5.1,
-        aliases=("vjepa2_1_vit_large_384",),
+        "vjepa2.1-vitl-384", "vjepa2_1_vitl_dist_vitG_384.pt", "encoder", "v2.1", VIT_L, 384, "ema_encoder",
+        "vjepa2_1_vit_large_384", 5.1,
     ),
     Published(
-        "vjepa2.1-vitg-1b-384", "vjepa2_1_vitg_384.pt", "encoder", "v2.1", VIT_g, 384, "target_encoder", 16.5,
-        aliases=("vjepa2_1_vit_giant_384",),
+        "vjepa2.1-vitg-1b-384", "vjepa2_1_vitg_384.pt", "encoder", "v2.1", VIT_g, 384, "target_encoder",
+        "vjepa2_1_vit_giant_384", 16.5,
     ),
     Published(
-        "vjepa2.1-vitG-2b-384", "vjepa2_1_vitG_384.pt", "encoder", "v2.1", VIT_G, 384, "target_encoder", 29.8,
-        aliases=("vjepa2_1_vit_gigantic_384",),
+        "vjepa2.1-vitG-2b-384", "vjepa2_1_vitG_384.pt", "encoder", "v2.1", VIT_G, 384, "target_encoder",
+        "vjepa2_1_vit_gigantic_384", 29.8,
     ),
 )  # fmt: skip
 
@@ -134,17 +121,17 @@ def find_published(text: str) -> Published:
     Raises:
         InputError: None has this name.
     """
-    names = {_plain(name): one for one in PUBLISHED for name in (one.name, one.remote, *one.aliases)}
+    names = {_plain(name): one for one in PUBLISHED for name in (one.name, one.remote, one.hub_name)}
     if (meant := names.get(_plain(text))) is not None:
         return meant
-    folded = [(name.casefold(), one.name) for name, one in names.items()]
-    near = difflib.get_close_matches(_plain(text.rpartition("/")[2]).casefold(), [name for name, _ in folded], n=3)
-    close = list(dict.fromkeys(ours for name, ours in folded if name in near))
-    meant_perhaps = f"Did you mean {' or '.join(close)}? " if close else ""
+    folded = [name.casefold() for name in names]
+    near = difflib.get_close_matches(_plain(text.rpartition("/")[2]).casefold(), folded, n=3)
+    close = " or ".join(dict.fromkeys(one.name for name, one in names.items() if name.casefold() in near))
     raise InputError(
         where=f"download {text}",
         found="no published checkpoint of this name",
-        fix=f"{meant_perhaps}`vjepa2-ac download --list` shows all; where the file goes is said by --to",
+        fix=f"{f'Did you mean {close}? ' if close else ''}`vjepa2-ac download --list` shows all; where the file goes is"
+        " said by --to",
     )
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -42,21 +42,12 @@ def block_causal_attention(
     the short ones at the start of a rollout are not worth it. A function in place of a kind computes it.
 
     Raises:
-        ValueError: A sequence is not a whole number of steps, there are fewer keys than queries, or the kind is
-            unknown.
         InputError: FlexAttention was compiled for too many sizes; uncompiled it would hold all scores in memory.
     """
-    for length in (query.shape[2], key.shape[2]):
-        if length % tokens_per_step:
-            raise ValueError(f"a sequence of {length} tokens is not a whole number of steps of {tokens_per_step}")
-    if key.shape[2] < query.shape[2]:
-        raise ValueError(f"{query.shape[2]} queries would look at {key.shape[2]} keys: each token has a key of its own")
     if kind == "auto":
         steps = query.shape[2] // tokens_per_step
         kind = best_kind(query.device, query.shape[-1], steps, gradients=torch.is_grad_enabled())
-    attend = kind if callable(kind) else _IMPLEMENTATIONS.get(kind)
-    if attend is None:
-        raise ValueError(f"unknown attention {kind!r}; known: {', '.join(get_args(AttentionKind))}")
+    attend = kind if callable(kind) else _IMPLEMENTATIONS[kind]
     return attend(query, key, value, tokens_per_step)
 
 

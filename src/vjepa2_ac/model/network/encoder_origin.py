@@ -25,12 +25,15 @@ class EncoderShape:
     heads: int
     hidden: int  # width of the MLP
 
+    @property
+    def parameters(self) -> int:
+        """About how many weights it has: those of blocks and patches, without biases and norms."""
+        return self.depth * (4 * self.width**2 + 2 * self.width * self.hidden) + 2 * 3 * 16**2 * self.width
+
     def sizes(self, family: Family, frame: FramePath) -> EncoderSizes:
         """Return the sizes of an encoder of this shape."""
-        ratio = self.hidden / self.width
-        return EncoderSizes(
-            width=self.width, depth=self.depth, heads=self.heads, mlp_ratio=ratio, family=family, frame=frame
-        )
+        own = {"width": self.width, "depth": self.depth, "heads": self.heads, "mlp_ratio": self.hidden / self.width}
+        return EncoderSizes.model_validate({**own, "family": family, "frame": frame})
 
 
 VIT_B = EncoderShape("ViT-B", 768, 12, 12, 3072)

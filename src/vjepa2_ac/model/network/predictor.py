@@ -6,10 +6,9 @@ import torch
 from torch import Generator, nn
 from transformers import PreTrainedConfig, PreTrainedModel
 
-from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.episode import ACTION_DIM, STATE_DIM
 from vjepa2_ac.model.network.blocks import initialise
-from vjepa2_ac.model.network.predictor_network import PredictorNetwork, predictor_fields
+from vjepa2_ac.model.network.predictor_network import PredictorNetwork
 
 
 class PredictorConfig(PreTrainedConfig):  # type: ignore[misc]  # transformers has no types
@@ -28,11 +27,6 @@ class PredictorConfig(PreTrainedConfig):  # type: ignore[misc]  # transformers h
     use_states: bool = True
     action_dim: int = ACTION_DIM
     state_dim: int = STATE_DIM
-
-    @classmethod
-    def from_sizes(cls, sizes: ModelSizes) -> PredictorConfig:
-        """Return the sizes of the predictor of a world model."""
-        return cls(**predictor_fields(sizes))
 
 
 class ActionConditionedPredictor(PredictorNetwork, PreTrainedModel):  # type: ignore[misc]  # transformers has no types

@@ -30,11 +30,6 @@ class TokenLayout:
         """Conditioning tokens and patches of one step."""
         return self.conditioning + self.grid**2
 
-    @property
-    def length(self) -> int:
-        """Tokens of the whole sequence."""
-        return self.steps * self.tokens_per_step
-
 
 class RotaryTables(NamedTuple):
     """Tables by which every layer rotates queries and keys; always float32, so positions stay exact in bfloat16."""

@@ -19,6 +19,7 @@ from vjepa2_ac.model.network.dynamics import LatentDynamics, normalise_latents
 from vjepa2_ac.model.network.encoder import Encoder
 from vjepa2_ac.model.network.encoder_origin import EncoderOrigin, beyond_tensors, described, identified
 from vjepa2_ac.model.network.predictor import ActionConditionedPredictor, PredictorConfig
+from vjepa2_ac.model.network.predictor_network import predictor_fields
 from vjepa2_ac.model.network.pretrained_folder import (
     ENCODER,
     PREDICTOR,
@@ -67,7 +68,7 @@ class WorldModel(LatentDynamics):
         super().__init__()
         self.sizes = sizes
         self.encoder: Encoder | AbsentEncoder = Encoder(sizes)
-        self.predictor: nn.Module = ActionConditionedPredictor(PredictorConfig.from_sizes(sizes))
+        self.predictor: nn.Module = ActionConditionedPredictor(PredictorConfig(**predictor_fields(sizes)))
         self.predictor.requires_grad_(False)
         self.adaptation: Adaptation | None = None
         self.fresh_heads: FreshHeads | None = None
