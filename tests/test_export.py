@@ -144,7 +144,7 @@ def poison(path: Path) -> str:
 def test_an_adapter_that_spoils_its_base_is_refused_and_leaves_nothing(copied, tmp_path: Path, form: Any) -> None:
     run = copied()
     rewrite_adapter(run, lora_alpha=1e300)
-    with pytest.raises(InputError, match=r"lora_alpha: .*less than or equal"):
+    with pytest.raises(InputError, match=r"alpha: .*less than or equal"):
         export_run(run, tmp_path / "out", form)
     assert not (tmp_path / "out").exists()
 

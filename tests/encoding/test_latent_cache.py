@@ -40,7 +40,8 @@ from vjepa2_ac.data.sources.latents.cache_files import (
 )
 from vjepa2_ac.data.sources.rlds.droid_writer import write_droid_rlds
 from vjepa2_ac.data.windows import clip_starts
-from vjepa2_ac.encoding.latent_cache import LatentCache, needed_frames, require_encoding, through_cache
+from vjepa2_ac.encoding import batch
+from vjepa2_ac.encoding.latent_cache import LatentCache, needed_frames, through_cache
 from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, StoredLatents
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.inspection.check import check_data
@@ -467,16 +468,17 @@ def test_a_cache_of_other_clips_is_refused_and_the_difference_named(
     ids=str,
 )
 def test_a_cache_of_another_encoder_is_refused_and_the_difference_named(
-    a_cache: tuple[Dataset, Dataset, Path], change: dict[str, Any], reported: str
+    a_cache: tuple[Dataset, Dataset, Path], change: dict[str, Any], reported: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     original, through, _ = a_cache
     encoding = replace(NUMBERS, **change)
+    monkeypatch.setattr(batch, "encoding_of", lambda model, _: model)
     with pytest.raises(InputError, match=f"no latent cache.*Other caches there: 1; .*{reported}.*vjepa2-ac encode"):
         through_cache(original, encoding)
     with pytest.raises(InputError, match=reported):
-        require_encoding(alone(through), encoding)
-    require_encoding(alone(through), NUMBERS)
-    require_encoding(original, encoding)  # no cache
+        batch.require_same_encoder(encoding, alone(through), None)  # type: ignore[arg-type]
+    batch.require_same_encoder(NUMBERS, alone(through), None)  # type: ignore[arg-type]
+    batch.require_same_encoder(encoding, original, None)  # type: ignore[arg-type]  # no cache
 
 
 def test_a_data_set_that_has_changed_has_another_cache(droid_with_rests: Path, tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import UnreachableError
 from vjepa2_ac.media.video_reader import count_frames, read_frames
 from vjepa2_ac.media.video_writer import write_video
 

@@ -5,6 +5,8 @@ Training, evaluation and planning only see the result of this module.
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import torch
 from jaxtyping import Float, Float32, UInt8
@@ -14,8 +16,8 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.sources.latents.cache_files import unpack_latents
 from vjepa2_ac.data.sources.latents.cache_key import Encoding
+from vjepa2_ac.data.sources.latents.source import LatentSource, another_cache
 from vjepa2_ac.data.transforms import Crop, pixels_to_input, view
-from vjepa2_ac.encoding.latent_cache import require_encoding
 from vjepa2_ac.episode import Batch, LatentBatch, Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.input_heads import heads_to_replace, widths_as_text
@@ -84,13 +86,15 @@ def encoding_of(world_model: WorldModel, config: Config) -> Encoding:
 
 
 def require_same_encoder(world_model: WorldModel, dataset: Dataset, config: Config) -> None:
-    """Refuse cached latents of another encoder or precision; other data sets pass.
+    """Refuse cached latents of another encoder, image size or precision; other data sets pass.
 
     Raises:
         InputError: Names what differs.
     """
-    if dataset.config.is_cache:  # else the weights need not be hashed
-        require_encoding(dataset, encoding_of(world_model, config))
+    if isinstance(dataset.source, LatentSource):  # else the weights need not be hashed
+        differing = dataset.source.key.differences_of(encoding_of(world_model, config))
+        if differing:
+            raise another_cache(Path(dataset.config.path), differing)
 
 
 def _latents_of(world_model: WorldModel, batch: Batch, chunk: int) -> Float[Tensor, "batch time tokens dim"]:

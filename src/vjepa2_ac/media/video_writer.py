@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from vjepa2_ac.errors import InputError, pip_install
+from vjepa2_ac.errors import require_library
 from vjepa2_ac.storage import atomic_writer
 
 _QUALITY = "20"  # x264's constant rate factor: text stays sharp
@@ -27,7 +27,7 @@ def write_video(path: str | Path, frames: Iterable[UInt8[np.ndarray, "height wid
         rate_hz: Frames per second.
 
     Raises:
-        InputError: PyAV is not installed.
+        UnreachableError: PyAV is not installed.
         ValueError: No frames, or of different sizes.
     """
     av = video_library()
@@ -56,14 +56,9 @@ def video_library() -> Any:
     """Return PyAV.
 
     Raises:
-        InputError: It is not installed.
+        UnreachableError: It is not installed.
     """
-    try:
-        import av
-    except ImportError:
-        found, fix = "PyAV, which writes videos, is not installed", f"Run `{pip_install('video')}`, or ask for no video"
-        raise InputError(where="video", found=found, fix=fix) from None
-    return av
+    return require_library("av", where="video", called="PyAV, which writes videos", extra="video")
 
 
 def write_gif(

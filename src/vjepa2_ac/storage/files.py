@@ -365,21 +365,19 @@ def _nearest(path: Path) -> Path:
 def _new_partial(parent: Path, name: str) -> Path:
     """Return the temporary path of a file or folder that will be renamed to `name`; its folder is there."""
     parent.mkdir(parents=True, exist_ok=True)
-    _remove_abandoned_once(parent.absolute())
+    remove_abandoned(parent.absolute())
     short = name.encode(errors="surrogateescape")[:_NAME_BYTES].decode(errors="ignore")
     return parent / f".{short}.{secrets.token_hex(4)}.partial"
 
 
+@functools.cache
 def remove_abandoned(folder: Path) -> None:
-    """Remove the partial files in a folder that are unchanged for a day; those that cannot be removed stay."""
+    """Remove the partial files in a folder that are unchanged for a day; those that cannot be removed stay.
+
+    A folder is scanned only the first time that this process writes there: it may hold thousands of files.
+    """
     with suppress(OSError):
         for path in [path for path in folder.iterdir() if _PARTIAL.fullmatch(path.name) and not path.is_symlink()]:
             with suppress(OSError):
                 if time.time() - max(one.lstat().st_mtime for one in (path, *path.rglob("*"))) > _OLD_S:
                     shutil.rmtree(path) if path.is_dir() else path.unlink()
-
-
-@functools.cache
-def _remove_abandoned_once(folder: Path) -> None:
-    """Scan a folder only the first time that this process writes there: it may hold thousands of files."""
-    remove_abandoned(folder)

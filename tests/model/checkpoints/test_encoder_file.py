@@ -172,7 +172,7 @@ def test_the_same_from_the_hub_and_then_without_a_network(tmp_path: Path, monkey
         model = model_of("hf://facebook/tiny")
         assert model.encoder_fingerprint() == model_of(V2).encoder_fingerprint()
         assert str(model.encoder_origin) == "hf://facebook/tiny"
-        for wrong, said in (("facebook/none", "no such model"), ("facebook/tiny@v9", "no such revision")):
+        for wrong, said in (("facebook/none", "no such model"), ("facebook/tiny@v9", "no such model or revision")):
             with pytest.raises(RefusedError, match=said):
                 model_of(f"hf://{wrong}")
     again = model_of("hf://facebook/tiny")  # out of the cache
