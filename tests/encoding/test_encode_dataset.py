@@ -369,19 +369,6 @@ def test_a_run_on_latents_has_no_encoder_on_its_device_and_does_not_count_its_wo
     assert set_up(make_config(), reporter).encodes
 
 
-def test_check_says_what_would_be_encoded_and_tries_the_rest_on_frames(
-    make_config: MakeConfig, cache: Path, reporter: SilentReporter, encoded_frames: list[int]
-) -> None:
-    config = make_config(data__cache="auto", data__cache_dir=str(cache))
-    train(config, reporter, check_only=True)
-    assert not cache.exists()
-    (reported,) = [note for note in reporter.notes if "would first encode" in note]
-    assert f"{needed(config)} of {needed(config)} frames" in reported
-    assert "frames/s" in reported
-    assert "Everything is in place" in reporter.notes[-1]
-    assert 16 < sum(encoded_frames) < needed(config)  # a timed chunk, and the clips that were tried
-
-
 def test_two_processes_of_a_run_share_the_encoding_before_the_first_step(
     make_config: MakeConfig, tmp_path: Path, cache: Path
 ) -> None:

@@ -113,13 +113,6 @@ def test_everything_else_of_an_episode_comes_back_bit_for_bit(tmp_path: Path, ex
     assert abs(file.pictures([3, 1]).mean(axis=(1, 2, 3)) - [220, 40]).max() < (1e-6 if exact else 3)
 
 
-def test_a_file_opens_with_plain_safetensors(tmp_path: Path) -> None:
-    with safe_open(written(tmp_path, "bf16").path(0, "left"), framework="pt") as file:
-        assert file.get_slice("latents").get_shape() == [len(FRAMES), TOKENS, DIM]
-        assert torch.equal(file.get_slice("latents")[2:3], drawn_latents()[2:3].bfloat16())
-        assert file.metadata()["id"] == "lab/episode 1"
-
-
 # ---- a damaged file ----------------------------------------------------------------------------------------------
 
 
@@ -532,10 +525,6 @@ def test_a_cache_has_one_stride(a_cache: tuple[Dataset, Dataset, Path]) -> None:
 def test_knobs_that_contradict_a_cache_are_errors(tmp_path: Path, knobs: dict[str, Any], reported: str) -> None:
     with pytest.raises(ValidationError, match=reported):
         config_of(tmp_path, tmp_path, **knobs)
-
-
-def test_off_needs_no_quotes(tmp_path: Path) -> None:
-    assert config_of(tmp_path, tmp_path, cache=False).cache == "off"
 
 
 def test_a_cache_can_be_checked_and_inspected(a_cache: tuple[Dataset, Dataset, Path], tmp_path: Path) -> None:

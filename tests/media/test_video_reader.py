@@ -132,13 +132,6 @@ def test_with_its_times_at_hand_a_video_is_not_walked(
     np.testing.assert_array_equal(read_frames(path, [31, 2], where="a", times=times), expected)
 
 
-def test_a_file_that_is_open_is_read_and_stays_open(tmp_path: Path) -> None:
-    path = write_mp4(tmp_path / "a.mp4", FRAMES)
-    with path.open("rb") as file:
-        np.testing.assert_array_equal(read_frames(file, [3], where="a"), read_frames(path, [3], where="a"))
-        assert not file.closed
-
-
 class FailingFile(io.BytesIO):
     """Reads that fail after a while, as a network's do."""
 
@@ -202,17 +195,6 @@ def test_a_frame_past_the_end_is_named(tmp_path: Path, clock: Clock | None) -> N
     path = write_mp4(tmp_path / "a.mp4", FRAMES)
     with pytest.raises(InputError, match=r"40 frames. needed: at least 43|no frame at 2.800 s"):
         read_frames(path, [3, 42], where="a", clock=clock)
-
-
-def test_a_missing_video_is_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"here: .*No such file"):
-        read_frames(tmp_path / "a.mp4", [0], where="here")
-
-
-def test_no_steps_or_one_before_the_first_are_the_programmers_errors(tmp_path: Path) -> None:
-    for steps in ([], [-1]):
-        with pytest.raises(ValueError, match="steps"):
-            read_frames(tmp_path / "a.mp4", steps, where="a")
 
 
 def test_without_pyav_the_way_to_install_it_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -44,5 +44,5 @@ def test_nothing_is_left_of_a_video_that_cannot_be(tmp_path: Path) -> None:
 
 def test_missing_pyav_is_one_clear_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(InputError, match=r"pip install .*\[video\]"):
+    with pytest.raises(UnreachableError, match=r"pip install .*\[video\]"):
         write_video(tmp_path / "film.mp4", frames(), rate_hz=4.0)

@@ -93,16 +93,6 @@ def test_reading_on_takes_fewer_and_fewer_fetches_and_a_long_read_one() -> None:
     assert served.bytes <= 7 * MB + 2 * 128 * 1024
 
 
-def test_a_file_that_was_closed_is_not_read() -> None:
-    served = Served(b"123")
-    with served.file as file:
-        assert (file.readable(), file.seekable(), file.read(1)) == (True, True, b"1")
-    with pytest.raises(ValueError, match="closed"):
-        served.file.read(1)
-    with pytest.raises(ValueError, match="negative"):
-        Served(b"123").file.seek(-1)
-
-
 def test_a_block_is_fetched_once_per_machine_and_not_used_for_another_version(gcs: Gcs, tmp_path: Path) -> None:
     data = os.urandom(5 * BLOCK_BYTES + 77)
     url, cache = gcs.put("bucket/file", data), DiskCache(tmp_path, 10 * MB)
@@ -178,20 +168,6 @@ def test_the_limit_holds_and_what_was_just_written_is_there(
         assert size_of(folder) <= 1000
     DiskCache(folder / "none", 0).write("a", b"1")
     assert not (folder / "none").exists()
-
-
-def test_a_folder_that_may_only_be_read_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    DiskCache(tmp_path, 1000).write("a", b"content")
-
-    def refuse(*_: object, **__: object) -> None:
-        raise OSError(errno.EROFS, "Read-only file system")
-
-    monkeypatch.setattr(os, "utime", refuse)
-    monkeypatch.setattr(Path, "write_bytes", refuse)
-    cache = DiskCache(tmp_path, 1000)
-    cache.write("b", b"content")
-    assert cache.read("a") == b"content"
-    assert cache.read("b") is None
 
 
 @pytest.mark.parametrize("fault", ["full", "no folder"])

@@ -1,7 +1,6 @@
 """Files: complete or absent, and URLs read like local paths. With real processes that are killed."""
 
 import errno
-import hashlib
 import os
 import signal
 import subprocess
@@ -183,12 +182,6 @@ def test_a_folder_that_changed_today_names_of_others_and_links_are_left_alone(tm
 
 
 # ---- reading ----
-
-
-def test_a_hash_is_that_of_the_whole_file(tmp_path: Path) -> None:
-    data = bytes(range(256)) * 10_000
-    (tmp_path / "file").write_bytes(data)
-    assert storage.sha256_of_file(tmp_path / "file") == hashlib.sha256(data).hexdigest()
 
 
 @pytest.fixture(params=["local", "memory"])

@@ -13,20 +13,6 @@ from vjepa2_ac.storage.retries import RetryPolicy, with_retries
 AT_ONCE = RetryPolicy(attempts=3, first_wait_s=0.0, longest_wait_s=0.0)
 
 
-def test_waits_double_to_the_longest_and_half_of_each_is_chance() -> None:
-    policy = RetryPolicy(first_wait_s=1.0, longest_wait_s=8.0)
-    for failures, longest in ((1, 1.0), (2, 2.0), (4, 8.0), (5, 8.0), (60, 8.0)):
-        waits = [policy.wait_s(failures) for _ in range(50)]
-        assert longest / 2 <= min(waits) < max(waits) <= longest
-
-
-def test_a_run_that_cannot_reach_anything_gives_up_within_minutes() -> None:
-    policy = retries.DEFAULT
-    waits = sum(min(policy.first_wait_s * 2**number, policy.longest_wait_s) for number in range(policy.attempts - 1))
-    assert waits <= 60
-    assert policy.attempts * policy.timeout_s + waits <= 300
-
-
 @pytest.mark.parametrize("error", [TypeError("ours"), KeyError("ours"), AssertionError("ours")])
 def test_a_mistake_of_ours_is_neither_tried_again_nor_blamed_on_the_network(error: Exception) -> None:
     calls = []

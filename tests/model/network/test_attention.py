@@ -26,28 +26,6 @@ def drawn(dtype: torch.dtype = torch.float32, steps: int = 4, device: str = "cpu
     return [torch.randn(shape, generator=generator).to(device, dtype).requires_grad_() for _ in range(3)]
 
 
-def output_and_gradients(kind: AttentionKind, inputs: list[Tensor]) -> list[Tensor]:
-    output = block_causal_attention(*inputs, PER_STEP, kind)
-    weights = torch.randn(output.shape, generator=torch.Generator().manual_seed(1)).to(output)
-    return [output, *torch.autograd.grad((output * weights).sum(), inputs)]
-
-
-@pytest.mark.parametrize("steps", [1, 4])
-@pytest.mark.parametrize("kind", ["per_step", "auto"])
-def test_every_way_gives_the_output_and_gradients_of_the_dense_mask(kind: AttentionKind, steps: int) -> None:
-    inputs = drawn(steps=steps)
-    for found, expected in zip(output_and_gradients(kind, inputs), output_and_gradients("dense", inputs), strict=True):
-        torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
-
-
-@pytest.mark.parametrize("kind", ["per_step", "dense"])
-def test_the_last_steps_alone_see_what_they_see_among_all(kind: AttentionKind) -> None:
-    query, key, value = (x.detach() for x in drawn())
-    whole = block_causal_attention(query, key, value, PER_STEP, "dense")
-    last = block_causal_attention(query[:, :, 2 * PER_STEP :], key, value, PER_STEP, kind)
-    torch.testing.assert_close(last, whole[:, :, 2 * PER_STEP :], rtol=1e-5, atol=1e-6)
-
-
 @pytest.mark.filterwarnings("ignore:flex_attention called without torch.compile")  # eager on purpose: no compiler here
 def test_flex_gives_the_output_of_the_dense_mask() -> None:
     inputs = [value.detach() for value in drawn()]

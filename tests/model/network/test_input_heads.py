@@ -94,16 +94,6 @@ def test_fresh_heads_are_decided_by_the_seed_and_drawn_as_the_recipe_draws() -> 
     assert torch.equal(fitted(Widths(7, 14)).predictor.action_encoder.weight, one.predictor.action_encoder.weight)
 
 
-def test_heads_are_replaced_once_and_before_adapting() -> None:
-    model = fitted(Widths(14, 14))
-    with pytest.raises(ValueError, match="replaced once"):
-        fit_heads(model, Widths(8, 8), seed=0)
-    adapted = base()
-    add_adapter(adapted, LORA, seed=0)
-    with pytest.raises(ValueError, match="before the model is adapted"):
-        fit_heads(adapted, Widths(8, 8), seed=0)
-
-
 def test_a_fresh_head_that_would_not_be_trained_is_refused_with_the_line_to_add() -> None:
     plain = LORA.model_copy(update={"modules_to_save": ()})
     with pytest.raises(InputError, match=r"modules_to_save=\[action_encoder, state_encoder\]"):

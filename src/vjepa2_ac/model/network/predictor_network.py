@@ -123,7 +123,7 @@ class PredictorNetwork(nn.Module):
             keep: How many of the steps are added, from the first; None: all.
 
         Raises:
-            ValueError: The tokens do not match the image size, or extrinsics are missing or unexpected.
+            ValueError: Extrinsics are missing or unexpected.
         """
         tokens, layout = self._assemble(latents, actions, states, extrinsics, cache)
         tokens = self._through_blocks(tokens, layout, cache, keep)
@@ -141,11 +141,6 @@ class PredictorNetwork(nn.Module):
         cache: KeyValueCache | None = None,
     ) -> tuple[Tensor, TokenLayout]:
         """Return the sequence of tokens, step by step, and its layout."""
-        if latents.shape[2] != self.grid**2:
-            raise ValueError(
-                f"{latents.shape[2]} tokens a step do not make a frame of {self.config.image_size} px with patches of"
-                f" {self.config.patch_size} px ({self.grid} x {self.grid} = {self.grid**2} tokens)"
-            )
         if self.config.use_extrinsics != (extrinsics is not None):
             raise ValueError(
                 f"use_extrinsics is {self.config.use_extrinsics}, extrinsics given: {extrinsics is not None}"
