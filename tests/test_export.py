@@ -23,7 +23,7 @@ from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.result import Row
 from vjepa2_ac.export import CARD, Exported, export_run
-from vjepa2_ac.model.adapter.merging import base_only
+from vjepa2_ac.model.adapter.lora import base_only
 from vjepa2_ac.model.checkpoints.loading import load_official
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reports.metrics_json import METRICS_FILE

@@ -18,8 +18,7 @@ from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.result import Row
 from vjepa2_ac.model.adapter.adapter_folder import ADAPTER_FILE
-from vjepa2_ac.model.adapter.lora import adapted_report
-from vjepa2_ac.model.adapter.merging import merge_adapter
+from vjepa2_ac.model.adapter.lora import adapted_report, merge_adapter
 from vjepa2_ac.model.checkpoints.loading import to_official
 from vjepa2_ac.model.network.input_heads import widths_as_text, widths_of_model
 from vjepa2_ac.model.network.pretrained_folder import require_finite

@@ -30,7 +30,7 @@ from vjepa2_ac.evaluation.evaluate import ClipName, Contender, FramesOfRow, Repe
 from vjepa2_ac.evaluation.measure import ClipSample
 from vjepa2_ac.evaluation.request import EvaluationOptions, settle
 from vjepa2_ac.evaluation.result import About, Evaluation, Measurement, Role, TrainingCurve
-from vjepa2_ac.model.adapter.merging import base_only, unadapted_copy
+from vjepa2_ac.model.adapter.lora import base_only, unadapted_copy
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.input_heads import heads_to_replace, widths_as_text
 from vjepa2_ac.model.network.world_model import WorldModel

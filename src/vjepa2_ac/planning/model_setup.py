@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from vjepa2_ac.config.planning import PlanningConfig
-from vjepa2_ac.model.adapter.merging import unadapted_copy
+from vjepa2_ac.model.adapter.lora import unadapted_copy
 from vjepa2_ac.model.network.compilation import require_compiler
 from vjepa2_ac.model.network.world_model import WorldModel, fingerprint
 

@@ -23,7 +23,7 @@ from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
 from vjepa2_ac.decoding.imagine import AS_RECORDED, Imagination, Imagined, Start, rolled_out, shown
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.media.image_file import encode_png
-from vjepa2_ac.model.adapter.merging import base_only
+from vjepa2_ac.model.adapter.lora import base_only
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reports.figures.film import draw_strip
 from vjepa2_ac.reports.imagined import strip_of

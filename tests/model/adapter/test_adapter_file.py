@@ -10,8 +10,8 @@ from pydantic import ValidationError
 
 from vjepa2_ac.config import AdapterConfig
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.adapter.adapter_folder import ADAPTER_FILE, CARD
-from vjepa2_ac.model.adapter.lora import add_adapter, knobs_of, load_trained, save_trained
+from vjepa2_ac.model.adapter.adapter_folder import ADAPTER_FILE, CARD, load_trained, save_trained
+from vjepa2_ac.model.adapter.lora import add_adapter, knobs_of
 from vjepa2_ac.model.network.world_model import WorldModel
 
 Fresh = Callable[..., WorldModel]

@@ -13,8 +13,8 @@ from torch import Tensor
 from model_fixtures import tiny_inputs, tiny_model
 from vjepa2_ac.config import AdapterConfig, ModelSizes
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.adapter.lora import add_adapter, load_trained, save_trained, trainable_report
-from vjepa2_ac.model.adapter.merging import base_only, merge_adapter
+from vjepa2_ac.model.adapter.adapter_folder import load_trained, save_trained
+from vjepa2_ac.model.adapter.lora import add_adapter, base_only, merge_adapter, trainable_report
 from vjepa2_ac.model.network.predictor import ActionConditionedPredictor
 from vjepa2_ac.model.network.world_model import WorldModel
 

@@ -11,7 +11,8 @@ from tiny_models import DIM, draw, tiny_model
 from vjepa2_ac.config import AdapterConfig, ModelConfig
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.adapter.lora import add_adapter, load_trained, save_trained
+from vjepa2_ac.model.adapter.adapter_folder import load_trained, save_trained
+from vjepa2_ac.model.adapter.lora import add_adapter
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.input_heads import fit_heads, heads_to_replace, widths_of_model
 from vjepa2_ac.model.network.predictor import ActionConditionedPredictor

@@ -11,9 +11,24 @@ from typing import Annotated, Literal
 from pydantic import Field
 from torch import Tensor
 
+from vjepa2_ac.config import AdapterConfig
 from vjepa2_ac.config.model import VectorWidth
+from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.adapter.lora import (
+    FIX,
+    NEEDED,
+    adaptation_of,
+    knobs_of,
+    lora_config,
+    lora_weights,
+    set_lora_weights,
+    set_trainable,
+    train_everything,
+    wrap,
+)
 from vjepa2_ac.model.base_model import read_model_json
+from vjepa2_ac.model.network.input_heads import fit_heads
 from vjepa2_ac.model.network.pretrained_folder import read_tensors, save_tensors
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.storage.structured import record_of
@@ -44,19 +59,78 @@ class Card:
     fresh_heads: Heads | None = None  # None: the base's own heads are used
 
 
-def write_trained(folder: Path, card: Card, weights: Mapping[str, Tensor]) -> None:
-    """Write weights and their card.
+def save_trained(model: WorldModel, folder: str | Path) -> None:
+    """Write the trained weights: an adapter in PEFT's format, or the whole predictor; and the base's identity.
+
+    Args:
+        model: The adapted model.
+        folder: Where to.
 
     Raises:
         OSError: The disk is full, or another system error.
+        ValueError: The model is not adapted.
     """
+    folder, adaptation, sizes, heads = Path(folder), adaptation_of(model), model.sizes.predictor, None
+    if model.fresh_heads is not None:
+        heads = Heads(sizes.action_dim, sizes.state_dim, model.fresh_heads.seed)
+    card = Card(adaptation.kind, adaptation.base, adaptation.encoder, model.encoder_in_words, heads)
     folder.mkdir(parents=True, exist_ok=True)
-    save_tensors(weights, folder / (LORA_WEIGHTS if card.kind == "lora" else FULL_WEIGHTS))
+    if card.kind == "lora":
+        save_tensors(lora_weights(model), folder / LORA_WEIGHTS)
+        lora_config(model).save_pretrained(str(folder))
+    else:
+        save_tensors(model.predictor.state_dict(), folder / FULL_WEIGHTS)
     fields = {name: value for name, value in asdict(card).items() if value is not None}
     (folder / CARD).write_text(json.dumps(fields, indent=1) + "\n", encoding="utf-8")
 
 
-def read_card(folder: Path, model: WorldModel) -> Card:
+def load_trained(model: WorldModel, folder: str | Path, trainable: bool | None = None) -> None:
+    """Load what `save_trained` wrote onto its base, or into an existing adapter.
+
+    Args:
+        model: The base, or a model adapted in the same way; it is not wrapped again.
+        folder: The folder.
+        trainable: Whether it can be trained; None leaves an existing adapter unchanged, and freezes a new one.
+
+    Raises:
+        InputError: The folder is not an adapter, is damaged, belongs to another base, or differs from the existing
+            one.
+    """
+    folder = Path(folder)
+    fresh, card = model.adaptation is None, _read_card(folder, model)
+    heads = card.fresh_heads
+    if heads is not None and fresh and model.fresh_heads is None:
+        fit_heads(model, Widths(heads.state_dim, heads.action_dim), heads.seed)
+    if card.kind == "lora":
+        _load_lora(model, folder)
+    else:
+        weights = _read_weights(folder / FULL_WEIGHTS, model.predictor.state_dict())
+        if fresh:
+            train_everything(model)
+        model.predictor.load_state_dict(weights)
+    if fresh or trainable is not None:
+        set_trainable(model, bool(trainable))
+
+
+def _load_lora(model: WorldModel, folder: Path) -> None:
+    path = folder / ADAPTER_FILE
+    knobs = knobs_of(read_model_json(path, needed=NEEDED, fix=FIX), where=str(path))
+    if model.adaptation is None:
+        try:
+            wrap(model, knobs)
+        except InputError as error:
+            where = f"{path}: {error.where}"
+            raise InputError(where=where, found=error.found, needed=error.needed, fix=error.fix) from None
+    else:
+        own = knobs_of(lora_config(model).to_dict(), where=str(folder))
+        for name in AdapterConfig.model_fields.keys() - {"dropout"}:
+            if (found := getattr(knobs, name)) != (needed := getattr(own, name)):
+                found, needed = f"an adapter with {name} {found}", f"{needed}, as the model has"
+                raise InputError(where=str(folder), found=found, needed=needed)
+    set_lora_weights(model, _read_weights(folder / LORA_WEIGHTS, lora_weights(model)))
+
+
+def _read_card(folder: Path, model: WorldModel) -> Card:
     """Return the card of trained weights, after checking that they belong to this model.
 
     Raises:
@@ -87,11 +161,6 @@ def read_card(folder: Path, model: WorldModel) -> Card:
     return card
 
 
-def read_weights(path: Path, like: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Read weights that must have the names and shapes of given ones.
-
-    Raises:
-        InputError: The file is missing or damaged, or holds other tensors, or NaN or infinity.
-    """
+def _read_weights(path: Path, like: Mapping[str, Tensor]) -> dict[str, Tensor]:
     fix = "Use an older checkpoint, or train it again"
     return read_tensors(path, like, needed="the weights of an adapter", fix=fix)
