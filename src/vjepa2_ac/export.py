@@ -20,8 +20,8 @@ from vjepa2_ac.evaluation.result import Row
 from vjepa2_ac.model.adapter.adapter_folder import ADAPTER_FILE
 from vjepa2_ac.model.adapter.lora import adapted_report, merge_adapter
 from vjepa2_ac.model.checkpoints.loading import to_official
-from vjepa2_ac.model.network.input_heads import widths_as_text, widths_of_model
 from vjepa2_ac.model.network.pretrained_folder import require_finite
+from vjepa2_ac.model.network.world_model import widths_as_text, widths_of_model
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, Metrics, read_metrics
 from vjepa2_ac.reports.write import PLOT
 from vjepa2_ac.runs.checkpoint import ADAPTER, SELECTED, read_state

@@ -13,7 +13,7 @@ pytest.importorskip("av", reason="the extra `video` is not installed")
 
 from tiny_models import tiny_model
 from vjepa2_ac.cli import main
-from vjepa2_ac.media.video_writer import write_video
+from vjepa2_ac.media.video import write_video
 from vjepa2_ac.planning.goal_folder import read_goal_folder
 from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
 

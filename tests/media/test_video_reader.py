@@ -14,8 +14,8 @@ from paths import GOLDEN
 from recordings import write_mp4
 from synthetic import draw_frame, synthetic_states
 from vjepa2_ac.errors import InputError, UnreachableError
-from vjepa2_ac.media import video_reader
-from vjepa2_ac.media.video_reader import Clock, count_frames, frame_times, read_frames
+from vjepa2_ac.media import video as video_reader
+from vjepa2_ac.media.video import Clock, count_frames, frame_times, read_frames
 
 STEPS = 40
 FRAMES = [draw_frame(state, size=(36, 64)) for state in synthetic_states(STEPS)]

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from vjepa2_ac.errors import UnreachableError
-from vjepa2_ac.media.video_reader import count_frames, read_frames
-from vjepa2_ac.media.video_writer import write_video
+from vjepa2_ac.media.video import count_frames, read_frames, write_video
 
 av = pytest.importorskip("av", reason="the extra `video` is not installed")
 

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from gcs import Gcs
@@ -144,7 +144,7 @@ def test_what_is_written_is_read_by_every_cache_on_the_folder(tmp_path: Path) ->
 
 
 def test_the_entry_used_longest_ago_goes_first(tmp_path: Path) -> None:
-    cache = DiskCache(tmp_path, 4 * 100)
+    cache = DiskCache(tmp_path, 410)
     for second, key in enumerate("abcd"):
         before = set(entries(tmp_path))
         cache.write(key, bytes(96))
@@ -156,6 +156,7 @@ def test_the_entry_used_longest_ago_goes_first(tmp_path: Path) -> None:
 
 
 @settings(max_examples=30)
+@example(writes=[(0, 1), (0, 172), (0, 796), (0, 16)])  # full to less than what is written between two looks
 @given(writes=st.lists(st.tuples(st.integers(0, 9), st.integers(1, 1000)), max_size=30))
 def test_the_limit_holds_and_what_was_just_written_is_there(
     tmp_path_factory: pytest.TempPathFactory, writes: list[tuple[int, int]]

@@ -228,7 +228,7 @@ def _of_clip(options: argparse.Namespace, out: Path, reporter: Reporter) -> Imag
 
 def _of_image(options: argparse.Namespace) -> Imagination:
     from vjepa2_ac.evaluation.imagined import Seen, imagine_image
-    from vjepa2_ac.media.image_file import read_image
+    from vjepa2_ac.media.images import read_image
 
     state, extrinsics = as_numbers(options.state, "--state"), camera_pose(options.extrinsics)
     require_to_plan(options)

@@ -216,8 +216,7 @@ def _config(options: argparse.Namespace) -> None:
 def _download(options: argparse.Namespace) -> None:
     from vjepa2_ac.console.progress import ConsoleReporter, show
     from vjepa2_ac.console.setup import published_notes, published_summary, published_table
-    from vjepa2_ac.model.checkpoints.download import download
-    from vjepa2_ac.model.checkpoints.published import OFFICIAL, PUBLISHED, find_published
+    from vjepa2_ac.model.checkpoints.published import OFFICIAL, PUBLISHED, download, find_published
     from vjepa2_ac.places import literal
 
     if options.list:

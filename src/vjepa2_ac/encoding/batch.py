@@ -20,8 +20,7 @@ from vjepa2_ac.data.sources.latents.source import LatentSource, another_cache
 from vjepa2_ac.data.transforms import Crop, pixels_to_input, view
 from vjepa2_ac.episode import Batch, LatentBatch, Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.network.input_heads import heads_to_replace, widths_as_text
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.network.world_model import WorldModel, heads_to_replace, widths_as_text
 
 
 @torch.no_grad()

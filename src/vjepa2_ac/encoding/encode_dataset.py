@@ -188,7 +188,8 @@ def _encode_together(
         if left := cache.missing():
             encode_share(cache, left, make_encoder(), share, reporter)
         return
-    attempt = broadcast_object(accelerator, first_only(accelerator, partial(_begin_attempt, cache)))
+    attempt = cache.folder / f".attempt-{broadcast_object(accelerator, uuid.uuid4().hex)}"
+    first_only(accelerator, partial(_begin, cache, attempt))
     try:
         _require_seen(attempt, share)
         if left := cache.missing():
@@ -202,12 +203,10 @@ def _encode_together(
         attempt.unlink(missing_ok=True)
 
 
-def _begin_attempt(cache: LatentCache) -> Path:
+def _begin(cache: LatentCache, attempt: Path) -> None:
     cache.require_own()
-    attempt = cache.folder / f".attempt-{uuid.uuid4().hex}"
     with user_can_write(cache.folder):
         write_atomically(attempt, "")
-    return attempt
 
 
 def _require_seen(attempt: Path, share: ProcessShare) -> None:

@@ -133,7 +133,6 @@ def _parts(
     dataset: Dataset,
     wanted: Sequence[FramesToEncode],
     encoder: EncoderOnDevice,
-    *,
     ahead: int,
 ) -> _Parts:
     """Yield parts in the requested order, while threads read the next ones; an episode is opened once."""

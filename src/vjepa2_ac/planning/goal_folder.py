@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import ConfigDict, Field
 
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.image_file import encode_png, read_image
+from vjepa2_ac.media.images import encode_png, read_image
 from vjepa2_ac.planning.goals import GripperMode, SubGoal
 from vjepa2_ac.planning.input_checks import require_image
 from vjepa2_ac.storage import unreadable

@@ -10,8 +10,8 @@ from jaxtyping import Float
 
 from vjepa2_ac.decoding.imagine import AS_RECORDED, Imagination, Imagined
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.image_file import encode_png
-from vjepa2_ac.media.video_writer import write_gif, write_video
+from vjepa2_ac.media.images import encode_png
+from vjepa2_ac.media.video import write_gif, write_video
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.reports.figures.film import FilmStrip, Kind, StripRow, draw_strip, durations, film_frames, held
 from vjepa2_ac.storage import user_can_write, write_atomically

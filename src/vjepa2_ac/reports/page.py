@@ -21,7 +21,7 @@ from vjepa2_ac.evaluation.estimates import gain_over, over_persistence
 from vjepa2_ac.evaluation.result import L1, EpisodeScore, Evaluation, Row, RowTable, sections
 from vjepa2_ac.evaluation.rows import rows_of
 from vjepa2_ac.evaluation.verdict import verdict
-from vjepa2_ac.media.jpeg import encode_jpeg
+from vjepa2_ac.media.images import encode_jpeg
 from vjepa2_ac.reports.figures import evaluation as figures
 from vjepa2_ac.reports.figures.film import draw_strip
 from vjepa2_ac.reports.figures.page import svg_of, visible

@@ -191,7 +191,9 @@ def _version_of(found: Mapping[str, Any]) -> str:
 
 def _read_once(url: str, start: int, length: int, timeout_s: float) -> bytes:
     """Read a range; accept a short answer only at the end of the file."""
-    bare = {} if _filesystem(url).async_impl else {"cache_type": "none"}  # else megabytes are prefetched
+    bare: dict[str, Any] = (
+        {} if _filesystem(url).async_impl else {"cache_type": "none"}
+    )  # else megabytes are prefetched
     try:
         data: bytes = _ask(url, "cat_file", timeout_s, start=start, end=start + length, **bare)
     except Exception as error:

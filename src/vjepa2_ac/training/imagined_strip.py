@@ -22,7 +22,7 @@ from vjepa2_ac.data.transforms import frames_as_seen
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
 from vjepa2_ac.decoding.imagine import AS_RECORDED, Imagination, Imagined, Start, rolled_out, shown
 from vjepa2_ac.episode import Batch, LatentBatch
-from vjepa2_ac.media.image_file import encode_png
+from vjepa2_ac.media.images import encode_png
 from vjepa2_ac.model.adapter.lora import base_only
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reports.figures.film import draw_strip

@@ -13,8 +13,7 @@ from vjepa2_ac import storage
 from vjepa2_ac.cli import main
 from vjepa2_ac.errors import InputError, UnreachableError
 from vjepa2_ac.model.checkpoints import published
-from vjepa2_ac.model.checkpoints.download import download
-from vjepa2_ac.model.checkpoints.published import VIT_B, Published
+from vjepa2_ac.model.checkpoints.published import VIT_B, Published, download
 from vjepa2_ac.storage.retries import RetryPolicy
 
 CONTENT = bytes(range(256)) * 400

@@ -18,9 +18,8 @@ from hub import serve_hub
 from paths import GOLDEN
 from vjepa2_ac.config import EncoderSizes, ModelConfig
 from vjepa2_ac.errors import InputError, RefusedError, UnreachableError
-from vjepa2_ac.model.base_model import find_base
+from vjepa2_ac.model.base_model import beyond_tensors, find_base, identified
 from vjepa2_ac.model.checkpoints.loading import load_base, load_official, to_official
-from vjepa2_ac.model.network.encoder_origin import beyond_tensors, identified
 from vjepa2_ac.model.network.world_model import WorldModel, fingerprint
 
 FILES = GOLDEN / "encoders"

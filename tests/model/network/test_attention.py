@@ -10,9 +10,14 @@ from torch.utils.checkpoint import checkpoint
 from tracing import tracing
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network import attention
-from vjepa2_ac.model.network.attention import AttentionKind, best_kind, block_causal_attention
+from vjepa2_ac.model.network.attention import (
+    AttentionKind,
+    TokenLayout,
+    best_kind,
+    block_causal_attention,
+    rotary_tables,
+)
 from vjepa2_ac.model.network.blocks import Block
-from vjepa2_ac.model.network.rotary import TokenLayout, rotary_tables
 
 PER_STEP = 5
 REAL_STEP, REAL_STEPS = 66, 7  # 462 tokens: no multiple of a kernel's tiles, and more than short kernels take

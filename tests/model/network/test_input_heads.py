@@ -12,9 +12,8 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.adapter_folder import load_trained, save_trained
 from vjepa2_ac.model.adapter.lora import add_adapter, base_only, merge_adapter
 from vjepa2_ac.model.checkpoints.loading import load_base
-from vjepa2_ac.model.network.input_heads import fit_heads, heads_to_replace, widths_of_model
 from vjepa2_ac.model.network.predictor import ActionConditionedPredictor
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.network.world_model import WorldModel, fit_heads, heads_to_replace, widths_of_model
 
 TINY = ModelSizes.model_validate(
     {

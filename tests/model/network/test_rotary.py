@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from tracing import tracing
-from vjepa2_ac.model.network.rotary import TokenLayout, rotary_tables, rotate
+from vjepa2_ac.model.network.attention import TokenLayout, rotary_tables, rotate
 
 CPU = torch.device("cpu")
 

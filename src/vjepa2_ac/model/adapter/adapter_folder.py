@@ -28,9 +28,8 @@ from vjepa2_ac.model.adapter.lora import (
     wrap,
 )
 from vjepa2_ac.model.base_model import read_model_json
-from vjepa2_ac.model.network.input_heads import fit_heads
 from vjepa2_ac.model.network.pretrained_folder import read_tensors, save_tensors
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.network.world_model import WorldModel, fit_heads
 from vjepa2_ac.storage.structured import record_of
 
 CARD = "vjepa2_ac.json"

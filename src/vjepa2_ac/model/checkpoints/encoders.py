@@ -24,6 +24,8 @@ from vjepa2_ac.model.base_model import (
     CONFIG,
     ENCODER_NEEDED,
     FORMAT,
+    HEADS,
+    EncoderOrigin,
     check_sizes,
     find_encoder_path,
     read_model_json,
@@ -32,7 +34,6 @@ from vjepa2_ac.model.base_model import (
 from vjepa2_ac.model.checkpoints.meta_file import ENCODER_KEYS, FIX, MetaFile, Rename, depth_of, official_name, part_of
 from vjepa2_ac.model.checkpoints.published import published_as
 from vjepa2_ac.model.network.blocks import mlp_ratio_of
-from vjepa2_ac.model.network.encoder_origin import HEADS, EncoderOrigin
 from vjepa2_ac.model.network.pretrained_folder import ENCODER, open_safetensors, read_encoder_origin
 from vjepa2_ac.storage.hub import from_hub
 from vjepa2_ac.storage.structured import record_of

@@ -20,8 +20,7 @@ from torch import Tensor, nn
 
 from vjepa2_ac import storage
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.base_model import CONFIG, FORMAT, read_model_json
-from vjepa2_ac.model.network.encoder_origin import EncoderOrigin
+from vjepa2_ac.model.base_model import CONFIG, FORMAT, EncoderOrigin, read_model_json
 from vjepa2_ac.storage.structured import record_of
 
 ENCODER, PREDICTOR = "encoder.safetensors", "predictor/model.safetensors"

@@ -22,7 +22,7 @@ from vjepa2_ac.data.sources.rlds.droid_writer import (
 )
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.jpeg import encode_jpeg
+from vjepa2_ac.media.images import encode_jpeg
 from vjepa2_ac.simulation.recording.demonstration import INSTRUCTIONS, RecordingSpec, arm_of, carry_out, episode_folder
 from vjepa2_ac.simulation.recording.simulation_file import SIMULATION_FILE, simulation_text
 from vjepa2_ac.simulation.world.arm import SimulatedArm

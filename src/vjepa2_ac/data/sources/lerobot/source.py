@@ -32,9 +32,8 @@ from vjepa2_ac.data.sources.lerobot.states import EpisodeContent, content_of, wa
 from vjepa2_ac.data.sources.listing import in_parallel
 from vjepa2_ac.episode import Episode, Progress, StepRanges
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.image_file import decode_image
-from vjepa2_ac.media.jpeg import require_bounded
-from vjepa2_ac.media.video_reader import Clock, read_frames, require_decoder
+from vjepa2_ac.media.images import decode_image, require_bounded
+from vjepa2_ac.media.video import Clock, read_frames, require_decoder
 from vjepa2_ac.storage.block_file import BlockCachedFile
 from vjepa2_ac.storage.structured import json_list
 

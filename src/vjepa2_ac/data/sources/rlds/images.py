@@ -25,7 +25,7 @@ from vjepa2_ac.data.sources.rlds.shards import Shard, naming, open_shard
 from vjepa2_ac.data.sources.rlds.tfrecord import NotAnExampleError, Place, Read, RecordSpan, item_places
 from vjepa2_ac.episode import StepRanges
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.jpeg import decode_jpegs
+from vjepa2_ac.media.images import decode_jpegs
 from vjepa2_ac.storage.block_file import DiskCache
 
 _GROUP_STEPS = 32  # images of so many steps are one entry of the cache
