@@ -1,10 +1,17 @@
+"""The predictor; and its cache: steps computed one after another equal those computed at once."""
+
+import dataclasses
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
-from vjepa2_ac.config import EncoderSizes, ModelSizes, PredictorSizes
+from vjepa2_ac.config import AdapterConfig, EncoderSizes, ModelSizes, PredictorSizes
+from vjepa2_ac.model.adapter.lora import add_adapter
 from vjepa2_ac.model.network.predictor import ActionConditionedPredictor, PredictorConfig
+from vjepa2_ac.model.network.predictor_network import KeyValueCache
 from vjepa2_ac.model.network.world_model import WorldModel
 
 WIDE = PredictorConfig(
@@ -71,3 +78,149 @@ def test_transformers_loads_the_predictor_by_itself(model: WorldModel, tmp_path:
     alone = ActionConditionedPredictor.from_pretrained(tmp_path / "model" / "predictor")
     expected = model.predictor(inputs.latents, inputs.actions, inputs.states)
     assert torch.equal(alone(inputs.latents, inputs.actions, inputs.states), expected)
+
+
+LORA = AdapterConfig(rank=4, alpha=8.0, dropout=0.0)
+ADAPTERS = {
+    "lora": LORA,
+    "dora": LORA.model_copy(update={"dora": True}),
+    "none": AdapterConfig(kind="none"),
+}
+PARTS = [(1, 1, 1, 1), (2, 2), (3, 1), (1, 3)]
+
+
+def adapted(sizes: ModelSizes, adapter: str = "lora", *, extrinsics: bool = False) -> WorldModel:
+    """Return a model whose adapter does something."""
+    predictor = sizes.predictor.model_copy(update={"use_extrinsics": extrinsics})
+    model = WorldModel.random(sizes.model_copy(update={"predictor": predictor}), seed=0)
+    add_adapter(model, ADAPTERS[adapter], seed=0)
+    generator = torch.Generator().manual_seed(2)
+    for value in trained(model):
+        value.data += 0.05 * torch.randn(value.shape, generator=generator)
+    return model.train()  # type: ignore[return-value]
+
+
+def trained(model: WorldModel) -> list[Tensor]:
+    return [value for value in model.parameters() if value.requires_grad]
+
+
+def arguments(inputs: Any, *, extrinsics: bool = False) -> list[Tensor]:
+    """Return latents, actions, states and perhaps extrinsics that ask for gradients."""
+    given = [inputs.latents, inputs.actions, inputs.states]
+    if extrinsics:
+        given.append(torch.randn(2, 4, 6, generator=torch.Generator().manual_seed(3)))
+    return [value.clone().requires_grad_() for value in given]
+
+
+def in_parts(model: WorldModel, given: list[Tensor], steps: tuple[int, ...]) -> Tensor:
+    cache = KeyValueCache()
+    parts = zip(*(value.split(steps, dim=1) for value in given), strict=True)
+    return torch.cat([model.predict(*part, cache=cache) for part in parts], dim=1)
+
+
+def output_and_gradients(model: WorldModel, predicted: Tensor, given: list[Tensor]) -> list[Tensor]:
+    towards = torch.randn(predicted.shape, generator=torch.Generator().manual_seed(4))
+    loss = (predicted * towards).sum()
+    return [predicted, *torch.autograd.grad(loss, [*given, *trained(model)])]
+
+
+def assert_same(found: list[Tensor], expected: list[Tensor], tolerance: float = 1e-5) -> None:
+    """Each tensor differs from its twin by rounding, measured against the whole of it."""
+    for one, other in zip(found, expected, strict=True):
+        assert other.any()
+        assert (one - other).norm() <= tolerance * other.norm()
+
+
+@pytest.mark.parametrize("parts", PARTS)
+@pytest.mark.parametrize("extrinsics", [False, True])
+@pytest.mark.parametrize("checkpointing", [False, True])
+def test_steps_in_parts_give_the_predictions_and_gradients_of_all_at_once(
+    sizes: ModelSizes, inputs, parts: tuple[int, ...], extrinsics: bool, checkpointing: bool
+) -> None:
+    model = adapted(sizes, extrinsics=extrinsics)
+    given = arguments(inputs, extrinsics=extrinsics)
+    expected = output_and_gradients(model, model.predict(*given), given)
+    model.set_gradient_checkpointing(checkpointing)
+    assert_same(output_and_gradients(model, in_parts(model, given, parts), given), expected)
+
+
+@pytest.mark.parametrize("adapter", ADAPTERS)
+@pytest.mark.parametrize("checkpointing", [False, True])
+def test_every_kind_of_adapter_lets_gradients_through_the_cache(
+    sizes: ModelSizes, inputs, adapter: str, checkpointing: bool
+) -> None:
+    model, given = adapted(sizes, adapter), arguments(inputs)
+    expected = output_and_gradients(model, model.predict(*given), given)
+    model.set_gradient_checkpointing(checkpointing)
+    assert_same(output_and_gradients(model, in_parts(model, given, (1, 3)), given), expected)
+
+
+@pytest.mark.parametrize("kind", ["dense", "per_step"])
+def test_every_way_of_attention_sees_the_cache(sizes: ModelSizes, inputs, kind: Any) -> None:
+    model, given = adapted(sizes), arguments(inputs)
+    expected = output_and_gradients(model, model.predict(*given), given)
+    model.set_attention(kind)
+    assert_same(output_and_gradients(model, in_parts(model, given, (2, 2)), given), expected)
+
+
+def test_what_is_kept_of_the_first_steps_is_all_that_later_steps_see(sizes: ModelSizes, inputs) -> None:
+    model, cache = adapted(sizes), KeyValueCache()
+    given = arguments(inputs)
+    model.predict(*given, cache=cache, keep=1)
+    assert cache.tokens == 9 + 2
+    found = model.predict(*(value[:, 2:] for value in given), cache=cache)
+    seen = [torch.cat([value[:, :1], value[:, 2:]], dim=1) for value in given]
+    torch.testing.assert_close(found, model.predict(*seen)[:, 1:], rtol=1e-5, atol=1e-5)
+
+
+def test_what_is_kept_holds_nothing_of_the_rest(sizes: ModelSizes, inputs) -> None:
+    cache = KeyValueCache()
+    adapted(sizes).predict(*arguments(inputs), cache=cache, keep=1)
+    for layer in range(sizes.predictor.depth):
+        (piece,) = cache.layer(layer)
+        assert piece.untyped_storage().nbytes() == piece.nbytes == 2 * 2 * (9 + 2) * sizes.predictor.width * 4
+
+
+def plain_rollout(model: WorldModel, context: Tensor, actions: Tensor, states: Tensor) -> Tensor:
+    """Compute everything again for each prediction."""
+    latents = context
+    for time in range(context.shape[1], actions.shape[1] + 1):
+        following = model.predict(latents, actions[:, :time], states[:, :time])[:, -1:]
+        latents = torch.cat([latents, following], dim=1)
+    return latents[:, context.shape[1] :]
+
+
+@pytest.mark.parametrize("adapter", [None, "lora"])
+@pytest.mark.parametrize("context", [1, 2, 3, 4])
+@torch.no_grad()
+def test_a_rollout_is_the_one_that_computes_everything_again(
+    sizes: ModelSizes, inputs, context: int, adapter: str | None
+) -> None:
+    model = WorldModel.random(sizes, seed=0) if adapter is None else adapted(sizes, adapter)
+    given = (inputs.latents[:, :context], inputs.actions, inputs.states)
+    torch.testing.assert_close(model.rollout(*given), plain_rollout(model, *given), rtol=1e-5, atol=1e-5)
+
+
+@torch.no_grad()
+def test_a_rollout_in_bfloat16_is_the_plain_one_to_its_precision(fresh, inputs) -> None:
+    model = fresh(dtype=torch.bfloat16)
+    given = (inputs.latents[:, :1], inputs.actions, inputs.states)
+    with torch.autocast("cpu", torch.bfloat16):
+        found, expected = model.rollout(*given), plain_rollout(model, *given)
+    assert (found - expected).norm() <= 2e-2 * expected.norm()
+
+
+@torch.no_grad()
+def test_many_samples_go_on_from_one_start_that_was_computed_once(sizes: ModelSizes, inputs) -> None:
+    model, cache = adapted(sizes), KeyValueCache()
+    one = dataclasses.replace(inputs, latents=inputs.latents[:1], actions=inputs.actions[:1], states=inputs.states[:1])
+    model.predict(one.latents[:, :2], one.actions[:, :2], one.states[:, :2], cache=cache)
+    actions = torch.randn(5, 4, 7, generator=torch.Generator().manual_seed(5))
+    actions[:, :2] = one.actions[:, :2]
+    latents, states = one.latents[:, :3].expand(5, -1, -1, -1), one.states.expand(5, -1, -1)
+    expected = model.rollout(latents, actions, states)
+    many = cache.expanded(5)
+    for _ in range(2):  # the cache is left as it is
+        found = model.rollout(latents[:, 2:], actions[:, 2:], states[:, 2:], cache=many)
+        torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
+    assert many.layer(0)[0].untyped_storage().data_ptr() == cache.layer(0)[0].untyped_storage().data_ptr()
