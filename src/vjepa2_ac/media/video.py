@@ -35,6 +35,9 @@ _STRICT = {
 }
 _START = -(1 << 40)  # before every frame
 _FIX = "Copy the file again, or leave the episode out"
+_QUALITY = "20"  # x264's constant rate factor: text stays sharp
+_COLOURS = 255  # of a GIF
+_SAMPLED = 4  # every so many-th pixel decides about the palette
 
 Frame = UInt8[np.ndarray, "height width 3"]
 
@@ -127,7 +130,7 @@ def is_deep_grey(pixel_format: str) -> bool:
 @contextmanager
 def _opened(file: str | Path | ByteReader, where: str) -> Iterator[_Video]:
     """Open a video for decoding in one thread: the loader's workers are the parallelism."""
-    av = _library(where)
+    av = video_library(where)
     if isinstance(file, (str, Path)):
         try:
             opened = storage.open_to_read(file)
@@ -305,22 +308,13 @@ def _unusable(where: str, found: str, needed: str) -> InputError:
     return InputError(where=where, found=found, needed=needed, fix=_FIX)
 
 
-def require_decoder(where: str) -> None:
-    """Check that videos can be decoded, before a data set with videos is used.
+def video_library(where: str = "video") -> Any:
+    """Return PyAV.
 
     Raises:
-        UnreachableError: PyAV is not installed.
+        UnreachableError: It is not installed.
     """
-    _library(where)
-
-
-def _library(where: str) -> Any:
-    return require_library("av", where=where, called="PyAV, which decodes video", extra="video")
-
-
-_QUALITY = "20"  # x264's constant rate factor: text stays sharp
-_COLOURS = 255  # of a GIF
-_SAMPLED = 4  # every so many-th pixel decides about the palette
+    return require_library("av", where=where, called="PyAV, which decodes and writes video", extra="video")
 
 
 def write_video(path: str | Path, frames: Iterable[UInt8[np.ndarray, "height width 3"]], *, rate_hz: float) -> Path:
@@ -355,15 +349,6 @@ def write_video(path: str | Path, frames: Iterable[UInt8[np.ndarray, "height wid
             raise ValueError("a video without frames")
         container.mux(stream.encode(None))
     return Path(path)
-
-
-def video_library() -> Any:
-    """Return PyAV.
-
-    Raises:
-        UnreachableError: It is not installed.
-    """
-    return require_library("av", where="video", called="PyAV, which writes videos", extra="video")
 
 
 def write_gif(

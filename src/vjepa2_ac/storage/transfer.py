@@ -26,12 +26,6 @@ _AWAY = frozenset({
 _PIECE_BYTES = 32 << 20
 
 
-def place(path: str) -> str:
-    """Return the canonical name of a folder: an absolute path, also for `file://`, or a URL; no trailing slash."""
-    path = path.removeprefix("file://")
-    return path.rstrip("/") if is_url(path) else str(Path(path).resolve())
-
-
 def upload(source: Path, target: str) -> None:
     """Copy a local file to another place, replacing any file there; readers never see a part of it.
 

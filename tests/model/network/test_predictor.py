@@ -11,11 +11,13 @@ from torch import Tensor
 from vjepa2_ac.config import AdapterConfig, EncoderSizes, ModelSizes, PredictorSizes
 from vjepa2_ac.model.adapter.lora import add_adapter
 from vjepa2_ac.model.network.predictor import ActionConditionedPredictor, PredictorConfig
-from vjepa2_ac.model.network.predictor_network import KeyValueCache
+from vjepa2_ac.model.network.predictor_network import KeyValueCache, predictor_fields
 from vjepa2_ac.model.network.world_model import WorldModel
 
-WIDE = PredictorConfig(
-    image_size=32, latent_dim=24, hidden_size=240, num_hidden_layers=3, num_attention_heads=4, mlp_ratio=2.0
+WIDE = ModelSizes(
+    image_size=32,
+    encoder=EncoderSizes(width=24, heads=2),
+    predictor=PredictorSizes(width=240, depth=3, heads=4, mlp_ratio=2.0),
 )
 
 
@@ -43,7 +45,7 @@ def test_other_image_sizes_work(image_size: int) -> None:
 
 @pytest.mark.parametrize("by_transformers", [True, False])
 def test_output_layers_start_smaller_the_deeper_they_are(by_transformers: bool) -> None:
-    predictor = ActionConditionedPredictor(WIDE)
+    predictor = ActionConditionedPredictor(PredictorConfig(**predictor_fields(WIDE)))
     if not by_transformers:
         predictor.initialise(torch.Generator().manual_seed(0))
     for layer, block in enumerate(predictor.blocks, start=1):

@@ -28,7 +28,7 @@ from vjepa2_ac.runs.folder import CONFIG, check_run_folder, with_settled_stride
 from vjepa2_ac.runs.mirror.background_sync import Mirror, reason_of
 from vjepa2_ac.runs.mirror.remote_checkpoints import Listing, RemoteCheckpoints, complete
 from vjepa2_ac.runs.mirror.upload import SMALL_FILES, RemoteUpdate
-from vjepa2_ac.storage import download, is_url, join, place, sync, try_writing
+from vjepa2_ac.storage import absolute, download, is_url, join, sync, try_writing
 from vjepa2_ac.storage.retries import quietly
 
 logger = logging.getLogger(__name__)
@@ -78,7 +78,7 @@ def open_remote(
     """
     if config.checkpoint.remote is None:
         return None
-    remote = Remote(place(config.checkpoint.remote), config)
+    remote = Remote(absolute(config.checkpoint.remote), config)
     _refuse_own_folder(remote.place, Path(config.run_dir))
     step, run_id = _where_this_machine_stands(Path(config.run_dir))
     checkpoints = RemoteCheckpoints(remote.place)

@@ -36,7 +36,7 @@ class RemoteCheckpoints:
     """The checkpoints at a place; every method raises UnreachableError if it cannot be reached.
 
     Attributes:
-        place: What `storage.place` returned.
+        place: What `storage.absolute` returned.
     """
 
     place: str

@@ -33,7 +33,7 @@ from vjepa2_ac.data.sources.listing import in_parallel
 from vjepa2_ac.episode import Episode, Progress, StepRanges
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import decode_image, require_bounded
-from vjepa2_ac.media.video import Clock, read_frames, require_decoder
+from vjepa2_ac.media.video import Clock, read_frames, video_library
 from vjepa2_ac.storage.block_file import BlockCachedFile
 from vjepa2_ac.storage.structured import json_list
 
@@ -109,7 +109,7 @@ class LeRobotSource(IndexedSource[LeRobotData, _Opened]):
         info.require_mapping(config)
         keys = [info.camera_key(config.lerobot, camera) for camera in config.cameras]
         if any(info.features[key].dtype == "video" for key in keys):
-            require_decoder(info.where)
+            video_library(info.where)
         tables = list_by_template(info.root, TABLES[info.version], connections=self._connections)
         files = list_by_template(info.root, info.data_path, connections=self._connections)
         for key in keys:
