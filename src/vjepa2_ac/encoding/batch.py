@@ -37,7 +37,7 @@ def encode_batch(world_model: WorldModel, batch: Batch, *, device: torch.device,
         chunk: Frames per encoder call.
 
     Raises:
-        InputError: The model needs camera poses and a clip has none; or cached latents are of another width.
+        InputError: The model needs camera poses and a clip has none.
     """
     arrived = batch.on_device() if batch.on_device else None  # None, too, if it was used before
     batch = (arrived or batch).mapped(lambda tensor: tensor.to(device, non_blocking=True))
@@ -102,14 +102,6 @@ def _latents_of(world_model: WorldModel, batch: Batch, chunk: int) -> Float[Tens
             raise ValueError("a batch with neither frames nor latents")
         inputs = pixels_to_input(batch.frames, world_model.image_size, batch.augmentations)
         return world_model.encode(inputs, chunk=chunk)
-    values = batch.latents.values
-    if values.shape[-2:] != (world_model.num_tokens, world_model.latent_dim):
-        raise InputError(
-            where="data.path",
-            found=f"cached latents of {values.shape[-2]} tokens of {values.shape[-1]} numbers",
-            needed=f"{world_model.num_tokens} of {world_model.latent_dim}, as this model's encoder makes them",
-            fix="Use a cache that was made with this model",
-        )
     return unpack_latents(batch.latents)
 
 
