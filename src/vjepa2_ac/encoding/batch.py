@@ -27,7 +27,7 @@ from vjepa2_ac.model.network.world_model import WorldModel, heads_to_replace, wi
 def encode_batch(world_model: WorldModel, batch: Batch, *, device: torch.device, chunk: int) -> LatentBatch:
     """Encode the frames of a batch on the device, each independently; a training batch is also augmented there.
 
-    Latents of a batch from a cache are used unchanged: `require_encoding` has compared the encoders.
+    Latents of a batch from a cache are used unchanged: `require_same_encoder` has compared the encoders.
 
     Args:
         world_model: The model whose frozen encoder is used.

@@ -115,7 +115,7 @@ def add_adapter(model: WorldModel, config: AdapterConfig, seed: int) -> None:
 
     Raises:
         InputError: A target matches no layer, another knob does not fit the predictor or PEFT, or a fresh head
-            (`input_heads`) would not be trained.
+            (`fit_heads`) would not be trained.
         ValueError: The model is already adapted.
     """
     if model.adaptation is not None:

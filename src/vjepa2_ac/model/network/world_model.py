@@ -45,7 +45,7 @@ class Adaptation:
 
 @dataclass(frozen=True)
 class FreshHeads:
-    """Fresh heads of the predictor by `input_heads`: encoders for states or actions of other widths than the base's."""
+    """Fresh heads of the predictor (`fit_heads`): encoders for states or actions of other widths than the base's."""
 
     replaced: dict[str, Tensor]  # the base's own, by their names in the predictor
     seed: int  # of the new ones
