@@ -20,7 +20,7 @@ from tiny_models import tiny_model
 from vjepa2_ac.cli import main
 from vjepa2_ac.console.tables import benchmark_notes
 from vjepa2_ac.decoding.decoder_folder import load_decoder
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, UnreachableError
 from vjepa2_ac.media.video import count_frames
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.session import load_to_plan
@@ -227,7 +227,7 @@ def test_a_missing_library_is_reported_before_anything_is_done(
     model: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(InputError, match="PyAV"):
+    with pytest.raises(UnreachableError, match="PyAV"):
         run_benchmark(of_session(load_to_plan(model)), BenchmarkOptions(), tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
