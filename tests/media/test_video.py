@@ -4,6 +4,7 @@ import io
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import av
@@ -16,6 +17,7 @@ from synthetic import draw_frame, synthetic_states
 from vjepa2_ac.errors import InputError, UnreachableError
 from vjepa2_ac.media import video as video_reader
 from vjepa2_ac.media.video import Clock, count_frames, frame_times, read_frames, write_video
+from vjepa2_ac.reports import imagined
 
 STEPS = 40
 FRAMES = [draw_frame(state, size=(36, 64)) for state in synthetic_states(STEPS)]
@@ -254,3 +256,16 @@ def test_nothing_is_left_of_a_video_that_cannot_be(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match=wrong):
             write_video(tmp_path / "film.mp4", made, rate_hz=4.0)
         assert not list(tmp_path.iterdir())
+
+
+def test_a_film_without_pyav_is_a_gif_and_a_note(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    noted: list[str] = []
+    monkeypatch.setitem(sys.modules, "av", None)
+    for name, value in (("draw_strip", FRAMES[0]), ("film_frames", FRAMES[:2]), ("durations", [0.1, 0.1])):
+        monkeypatch.setattr(imagined, name, lambda *_, value=value, **__: value)
+    for name in ("strip_of", "_as_dict"):
+        monkeypatch.setattr(imagined, name, lambda _: {})
+    written = imagined.write_film_of(None, tmp_path, reporter=SimpleNamespace(note=noted.append))  # type: ignore[arg-type]
+    assert imagined.VIDEO not in {path.name for path in written}
+    assert all(path.is_file() for path in written)
+    assert "pip install" in noted[0]

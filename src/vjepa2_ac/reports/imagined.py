@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from vjepa2_ac.decoding.imagine import AS_RECORDED, Imagination, Imagined
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import UnreachableError
 from vjepa2_ac.media.images import encode_png
 from vjepa2_ac.media.video import write_gif, write_video
 from vjepa2_ac.reporter import SILENT, Reporter
@@ -76,9 +76,7 @@ def write_film_of(imagination: Imagination, folder: Path, *, reporter: Reporter 
         written = [folder / STRIP, write_gif(folder / GIF, frames, seconds=seconds)]
         try:
             written.append(write_video(folder / VIDEO, held(frames, seconds, _RATE_HZ), rate_hz=_RATE_HZ))
-        except InputError as error:
-            if error.where != "video":
-                raise
+        except UnreachableError as error:  # PyAV is not installed
             reporter.note(f"No {VIDEO}: {error}")
         write_atomically(folder / JSON, json_text(_as_dict(imagination)))
     return [*written, folder / JSON]
