@@ -23,7 +23,7 @@ from typing import Any
 import av
 import numpy as np
 
-from vjepa2_ac.media.video_reader import Clock, read_frames
+from vjepa2_ac.media.video import Clock, read_frames
 
 FRAMES, STRIDE, RATE = 16, 4, 15
 WINDOW = (FRAMES - 1) * STRIDE + 1

@@ -14,7 +14,7 @@ from vjepa2_ac.cli import main
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.config.section import marks_of
-from vjepa2_ac.media.image_file import read_image
+from vjepa2_ac.media.images import read_image
 
 PAGE = (ROOT / "docs/planning.md").read_text()
 START = [0.498, -0.111, 0.211, 3.142, 0.0, -1.175, 0.0]

@@ -11,7 +11,7 @@ import pytest
 
 from paths import ROOT
 from simulated import IN_EXAMPLES
-from vjepa2_ac.media.image_file import read_image
+from vjepa2_ac.media.images import read_image
 
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 QUICK = ("training.steps=2", "training.warmup_steps=0", "training.allow_weak_base=true", "validation.every=2")

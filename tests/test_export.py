@@ -23,7 +23,7 @@ from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.result import Row
 from vjepa2_ac.export import CARD, Exported, export_run
-from vjepa2_ac.model.adapter.merging import base_only
+from vjepa2_ac.model.adapter.lora import base_only
 from vjepa2_ac.model.checkpoints.loading import load_official
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reports.metrics_json import METRICS_FILE
@@ -143,7 +143,7 @@ def poison(path: Path) -> str:
 def test_an_adapter_that_spoils_its_base_is_refused_and_leaves_nothing(copied, tmp_path: Path, form: Any) -> None:
     run = copied()
     rewrite_adapter(run, lora_alpha=1e300)
-    with pytest.raises(InputError, match=r"lora_alpha: .*less than or equal"):
+    with pytest.raises(InputError, match=r"alpha: .*less than or equal"):
         export_run(run, tmp_path / "out", form)
     assert not (tmp_path / "out").exists()
 

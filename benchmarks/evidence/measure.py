@@ -25,7 +25,7 @@ from vjepa2_ac.encoding.encode_dataset import with_latents_if_there
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.evaluation.measure import prediction_errors
 from vjepa2_ac.evaluation.result import PredictionErrors, Way
-from vjepa2_ac.model.adapter.merging import base_only, merge_adapter
+from vjepa2_ac.model.adapter.lora import base_only, merge_adapter
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller

@@ -11,7 +11,7 @@ import sys
 
 from openpi_client.websocket_client_policy import WebsocketClientPolicy
 
-from vjepa2_ac.media.video_writer import write_gif
+from vjepa2_ac.media.video import write_gif
 from vjepa2_ac.simulation.closed_loop.agent import ServedPlanner
 from vjepa2_ac.simulation.closed_loop.benchmark import film_frames
 from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, run_task

@@ -10,7 +10,7 @@ from pathlib import Path, PurePath
 from typing import Literal
 
 from huggingface_hub import EvalResult, ModelCardData
-from jinja2 import Environment, PackageLoader, StrictUndefined, TemplateError, select_autoescape
+from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
 from vjepa2_ac import __version__
 from vjepa2_ac.config import Config
@@ -18,11 +18,10 @@ from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.result import Row
 from vjepa2_ac.model.adapter.adapter_folder import ADAPTER_FILE
-from vjepa2_ac.model.adapter.lora import adapted_report
-from vjepa2_ac.model.adapter.merging import merge_adapter
+from vjepa2_ac.model.adapter.lora import adapted_report, merge_adapter
 from vjepa2_ac.model.checkpoints.loading import to_official
-from vjepa2_ac.model.network.input_heads import widths_as_text, widths_of_model
 from vjepa2_ac.model.network.pretrained_folder import require_finite
+from vjepa2_ac.model.network.world_model import widths_as_text, widths_of_model
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, Metrics, read_metrics
 from vjepa2_ac.reports.write import PLOT
 from vjepa2_ac.runs.checkpoint import ADAPTER, SELECTED, read_state, write_torch
@@ -72,29 +71,22 @@ def export_run(folder: Path, destination: Path, form: Form = "merged", checkpoin
         )
     metrics = read_metrics(folder) if form == "hub" and (folder / METRICS_FILE).exists() else None
     run = load_run(folder, checkpoint)
-    if form == "hub":
-        card = _card(run, folder, metrics)
-        _merge(run)  # the merged model is not written, but an adapter that makes it not finite is of no use
-        _write_hub(run, folder, destination, card, metrics)
-        return Exported(destination, run.chosen)
-    _merge(run)
-    if form == "merged":
-        run.world_model.save_pretrained(destination)
-        return Exported(destination, run.chosen)
-    path = destination if destination.suffix == ".pt" else destination / OFFICIAL_NAME
-    with user_can_write(path), atomic_writer(path) as file:
-        write_torch(to_official(run.world_model), file)
-    return Exported(path, run.chosen)
-
-
-def _merge(run: TrainedRun) -> None:
-    """Merge the trained weights into the model, and check that every weight is then finite."""
-    merge_adapter(run.world_model)
+    card = _card(run, folder, metrics) if form == "hub" else ""
+    merge_adapter(run.world_model)  # also for the Hub: an adapter that makes it not finite is of no use
     require_finite(
         run.world_model.predictor.state_dict(),
         where=f"{run.checkpoint}, merged into its base",
         fix="Check lora_alpha in its adapter_config.json, or export another checkpoint: --checkpoint best",
     )
+    if form == "hub":
+        _write_hub(run, folder, destination, card, metrics)
+    elif form == "merged":
+        run.world_model.save_pretrained(destination)
+    else:
+        destination = destination if destination.suffix == ".pt" else destination / OFFICIAL_NAME
+        with user_can_write(destination), atomic_writer(destination) as file:
+            write_torch(to_official(run.world_model), file)
+    return Exported(destination, run.chosen)
 
 
 def _check_free(destination: Path, form: Form) -> None:
@@ -133,39 +125,31 @@ def _card(run: TrainedRun, folder: Path, metrics: Metrics | None) -> str:
         keep_trailing_newline=True,
     )
     environment.filters |= {"code": lambda name: f"`{name}`", "count": _count, "ratio": _ratio}
-    try:
-        measured = None if metrics is None else _measured(metrics)
-        front = ModelCardData(
-            library_name="peft",
-            pipeline_tag="robotics",
-            tags=["v-jepa-2-ac", "world-model", "lora"],
-            model_name=name,
-            eval_results=_eval_results(config, metrics) if metrics and measured == run.checkpoint.name else None,
-        )
-        return environment.get_template("model_card.md.jinja").render(
-            **dict(config),
-            run=run,
-            name=name,
-            evaluation=metrics,
-            measured=measured,
-            plot=PLOT if metrics is not None and (folder / PLOT).is_file() else None,
-            base=model.adaptation,
-            heads=None if model.fresh_heads is None else widths_of_model(model.sizes),
-            takes=widths_as_text(model.sizes),
-            steps=read_state(run.checkpoint).step,
-            trained=adapted_report(model),
-            version=__version__,
-            front=str(front.to_yaml()),
-            base_arguments=_base_arguments(config),
-            every_setting=config_as_yaml(config.model_copy(update={"run_dir": name})),
-        )
-    except (KeyError, TypeError, AttributeError, TemplateError) as error:
-        raise InputError(
-            where=str(folder / METRICS_FILE),
-            found=f"metrics that cannot be used ({error!r})",
-            needed="what `vjepa2-ac evaluate` writes",
-            fix=f"Write it again with `vjepa2-ac evaluate {folder}`, or delete it",
-        ) from None
+    measured = None if metrics is None else _measured(metrics)
+    front = ModelCardData(
+        library_name="peft",
+        pipeline_tag="robotics",
+        tags=["v-jepa-2-ac", "world-model", "lora"],
+        model_name=name,
+        eval_results=_eval_results(config, metrics) if metrics and measured == run.checkpoint.name else None,
+    )
+    return environment.get_template("model_card.md.jinja").render(
+        **dict(config),
+        run=run,
+        name=name,
+        evaluation=metrics,
+        measured=measured,
+        plot=PLOT if metrics is not None and (folder / PLOT).is_file() else None,
+        base=model.adaptation,
+        heads=None if model.fresh_heads is None else widths_of_model(model.sizes),
+        takes=widths_as_text(model.sizes),
+        steps=read_state(run.checkpoint).step,
+        trained=adapted_report(model),
+        version=__version__,
+        front=str(front.to_yaml()),
+        base_arguments=_base_arguments(config),
+        every_setting=config_as_yaml(config.model_copy(update={"run_dir": name})),
+    )
 
 
 def _eval_results(config: Config, metrics: Metrics) -> list[EvalResult]:

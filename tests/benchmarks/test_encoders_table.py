@@ -58,7 +58,8 @@ def test_only_prints_and_writes_nothing(
 @pytest.mark.parametrize("published", [one for one in PUBLISHED if one.holds == "encoder"], ids=lambda one: one.name)
 def test_parameters_of_a_published_encoder_are_those_of_its_name(published: Any) -> None:
     config = load_config(ROOT / "configs/scratch_vitb.yaml", [f"model.encoder.path=nowhere/{published.name}.pt"])
-    assert count_parameters(config, base_sizes(config.model)).encoder == published.encoder_parameters
+    found = count_parameters(config, base_sizes(config.model)).encoder
+    assert found == pytest.approx(published.encoder.parameters, rel=0.02)
 
 
 @pytest.mark.parametrize(("name", "gpu_gb"), [("scratch_vitb", 8), ("scratch_vitl", 16)])

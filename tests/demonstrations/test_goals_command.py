@@ -15,7 +15,7 @@ from tiny_models import tiny_model
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.indexed_source import open_source
-from vjepa2_ac.media.video_writer import write_video
+from vjepa2_ac.media.video import write_video
 from vjepa2_ac.planning.goals import read_goal_folder
 from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
 

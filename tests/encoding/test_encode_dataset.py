@@ -369,19 +369,6 @@ def test_a_run_on_latents_has_no_encoder_on_its_device_and_does_not_count_its_wo
     assert set_up(make_config(), reporter).encodes
 
 
-def test_check_says_what_would_be_encoded_and_tries_the_rest_on_frames(
-    make_config: MakeConfig, cache: Path, reporter: SilentReporter, encoded_frames: list[int]
-) -> None:
-    config = make_config(data__cache="auto", data__cache_dir=str(cache))
-    train(config, reporter, check_only=True)
-    assert not cache.exists()
-    (reported,) = [note for note in reporter.notes if "would first encode" in note]
-    assert f"{needed(config)} of {needed(config)} frames" in reported
-    assert "frames/s" in reported
-    assert "Everything is in place" in reporter.notes[-1]
-    assert 16 < sum(encoded_frames) < needed(config)  # a timed chunk, and the clips that were tried
-
-
 def test_two_processes_of_a_run_share_the_encoding_before_the_first_step(
     make_config: MakeConfig, tmp_path: Path, cache: Path
 ) -> None:
@@ -517,10 +504,10 @@ def test_an_error_that_only_the_first_process_can_meet_is_told_to_all(
 
 
 def test_a_folder_that_processes_do_not_share_is_refused_before_the_work(
-    together: tuple[LatentCache, Callable], monkeypatch: pytest.MonkeyPatch, encoded_frames: list[int], tmp_path: Path
+    together: tuple[LatentCache, Callable], monkeypatch: pytest.MonkeyPatch, encoded_frames: list[int]
 ) -> None:
     monkeypatch.setattr(encode_dataset, "_LONGEST_UNSEEN_S", 0.0)
-    monkeypatch.setattr(encode_dataset, "broadcast_object", lambda _, value: tmp_path / "elsewhere" / value.name)
+    monkeypatch.setattr(encode_dataset, "first_only", lambda _accelerator, _work: None)  # it writes elsewhere
     with pytest.raises(InputError, match="all machines of the run share"):
         together[1]()
     assert not encoded_frames

@@ -40,7 +40,8 @@ from vjepa2_ac.data.sources.latents.cache_files import (
 )
 from vjepa2_ac.data.sources.rlds.droid_writer import write_droid_rlds
 from vjepa2_ac.data.windows import clip_starts
-from vjepa2_ac.encoding.latent_cache import LatentCache, needed_frames, require_encoding, through_cache
+from vjepa2_ac.encoding import batch
+from vjepa2_ac.encoding.latent_cache import LatentCache, needed_frames, through_cache
 from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, StoredLatents
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.inspection.check import check_data
@@ -110,13 +111,6 @@ def test_everything_else_of_an_episode_comes_back_bit_for_bit(tmp_path: Path, ex
     assert file.frame_steps.tolist() == list(FRAMES)
     assert file.places_of([11, 0]) == [3, 0]
     assert abs(file.pictures([3, 1]).mean(axis=(1, 2, 3)) - [220, 40]).max() < (1e-6 if exact else 3)
-
-
-def test_a_file_opens_with_plain_safetensors(tmp_path: Path) -> None:
-    with safe_open(written(tmp_path, "bf16").path(0, "left"), framework="pt") as file:
-        assert file.get_slice("latents").get_shape() == [len(FRAMES), TOKENS, DIM]
-        assert torch.equal(file.get_slice("latents")[2:3], drawn_latents()[2:3].bfloat16())
-        assert file.metadata()["id"] == "lab/episode 1"
 
 
 # ---- a damaged file ----------------------------------------------------------------------------------------------
@@ -465,16 +459,17 @@ def test_a_cache_of_other_clips_is_refused_and_the_difference_named(
     ids=str,
 )
 def test_a_cache_of_another_encoder_is_refused_and_the_difference_named(
-    a_cache: tuple[Dataset, Dataset, Path], change: dict[str, Any], reported: str
+    a_cache: tuple[Dataset, Dataset, Path], change: dict[str, Any], reported: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     original, through, _ = a_cache
     encoding = replace(NUMBERS, **change)
+    monkeypatch.setattr(batch, "encoding_of", lambda model, _: model)
     with pytest.raises(InputError, match=f"no latent cache.*Other caches there: 1; .*{reported}.*vjepa2-ac encode"):
         through_cache(original, encoding)
     with pytest.raises(InputError, match=reported):
-        require_encoding(alone(through), encoding)
-    require_encoding(alone(through), NUMBERS)
-    require_encoding(original, encoding)  # no cache
+        batch.require_same_encoder(encoding, alone(through), None)  # type: ignore[arg-type]
+    batch.require_same_encoder(NUMBERS, alone(through), None)  # type: ignore[arg-type]
+    batch.require_same_encoder(encoding, original, None)  # type: ignore[arg-type]  # no cache
 
 
 def test_a_data_set_that_has_changed_has_another_cache(droid_with_rests: Path, tmp_path: Path) -> None:
@@ -528,10 +523,6 @@ def test_a_cache_has_one_stride(a_cache: tuple[Dataset, Dataset, Path]) -> None:
 def test_knobs_that_contradict_a_cache_are_errors(tmp_path: Path, knobs: dict[str, Any], reported: str) -> None:
     with pytest.raises(ValidationError, match=reported):
         config_of(tmp_path, tmp_path, **knobs)
-
-
-def test_off_needs_no_quotes(tmp_path: Path) -> None:
-    assert config_of(tmp_path, tmp_path, cache=False).cache == "off"
 
 
 def test_a_cache_can_be_checked_and_inspected(a_cache: tuple[Dataset, Dataset, Path], tmp_path: Path) -> None:

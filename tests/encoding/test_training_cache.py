@@ -8,11 +8,9 @@ import torch
 
 from latent_sets import encode_for
 from same_run import assert_same_run, metrics, trained_weights
-from vjepa2_ac.calibration.variants import calibrate_config
 from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.measure import ClipSample
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
@@ -137,9 +135,3 @@ def test_a_run_is_evaluated_from_its_cache_as_from_its_data(make_config, reporte
     for one in found:
         one.pop("about")
     assert found[0] == found[1]
-
-
-def test_a_cache_alone_cannot_tell_the_stride(make_config, tmp_path) -> None:
-    config = make_config(data__cache_dir=str(tmp_path / "caches"))
-    with pytest.raises(InputError, match="encoded for clips at stride 2"):
-        calibrate_config(make_config(**of_cache(encoded(config))), ClipSample())

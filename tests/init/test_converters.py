@@ -22,7 +22,7 @@ from synthetic import draw_frame, synthetic_states
 from vjepa2_ac import open_dataset
 from vjepa2_ac.cli import main
 from vjepa2_ac.init.look import look_at
-from vjepa2_ac.media.video_writer import write_video
+from vjepa2_ac.media.video import write_video
 
 STEPS, RATE_HZ = 20, 10.0
 STATES = synthetic_states(STEPS, seed=1)

@@ -16,8 +16,8 @@ from synthetic import write_synthetic_droid
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.indexed_source import open_source
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media import jpeg
-from vjepa2_ac.media.image_file import decode_image, read_image
+from vjepa2_ac.media import images as jpeg
+from vjepa2_ac.media.images import decode_image, read_image
 
 PIXELS = np.random.default_rng(0).integers(0, 256, (20, 30, 3), dtype=np.uint8)
 

@@ -10,7 +10,7 @@ import pytest
 
 from decisions import image
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.image_file import encode_png
+from vjepa2_ac.media.images import encode_png
 from vjepa2_ac.planning.goals import GOALS_FILE, NoiseFloor, SubGoal, read_goal_folder, read_goals, write_goals
 
 NOISE = NoiseFloor(0.08, 12, "a" * 64, "l1")

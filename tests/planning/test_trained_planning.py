@@ -16,9 +16,8 @@ from vjepa2_ac.config import AdapterConfig
 from vjepa2_ac.config.planning import CemConfig, PlanningConfig
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.model.adapter.lora import add_adapter
-from vjepa2_ac.model.network.input_heads import fit_heads
 from vjepa2_ac.model.network.predictor import ActionConditionedPredictor
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.network.world_model import WorldModel, fit_heads
 from vjepa2_ac.planning import controller
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.model_setup import prepare_for_planning

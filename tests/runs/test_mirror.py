@@ -96,7 +96,7 @@ def place(request: pytest.FixtureRequest, tmp_path: Path) -> str:
     if request.param == "gs":
         request.getfixturevalue("bucket")
     return {
-        "gs": PLACE, "folder": str(tmp_path / "disk/run"), "file": storage.place(f"file://{tmp_path}/disk/run"),
+        "gs": PLACE, "folder": str(tmp_path / "disk/run"), "file": storage.absolute(f"file://{tmp_path}/disk/run"),
         "memory": f"memory://{tmp_path.name}/run",
     }[request.param]  # fmt: skip
 

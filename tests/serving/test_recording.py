@@ -10,7 +10,7 @@ import pytest
 
 from served import STATE, controller, image, request, session
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.image_file import read_image
+from vjepa2_ac.media.images import read_image
 from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.serving import recording
 from vjepa2_ac.serving.recording import DECISIONS, IMAGES, Recorder, require_new_record

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from gcs import Gcs
@@ -93,16 +93,6 @@ def test_reading_on_takes_fewer_and_fewer_fetches_and_a_long_read_one() -> None:
     assert served.bytes <= 7 * MB + 2 * 128 * 1024
 
 
-def test_a_file_that_was_closed_is_not_read() -> None:
-    served = Served(b"123")
-    with served.file as file:
-        assert (file.readable(), file.seekable(), file.read(1)) == (True, True, b"1")
-    with pytest.raises(ValueError, match="closed"):
-        served.file.read(1)
-    with pytest.raises(ValueError, match="negative"):
-        Served(b"123").file.seek(-1)
-
-
 def test_a_block_is_fetched_once_per_machine_and_not_used_for_another_version(gcs: Gcs, tmp_path: Path) -> None:
     data = os.urandom(5 * BLOCK_BYTES + 77)
     url, cache = gcs.put("bucket/file", data), DiskCache(tmp_path, 10 * MB)
@@ -154,7 +144,7 @@ def test_what_is_written_is_read_by_every_cache_on_the_folder(tmp_path: Path) ->
 
 
 def test_the_entry_used_longest_ago_goes_first(tmp_path: Path) -> None:
-    cache = DiskCache(tmp_path, 4 * 100)
+    cache = DiskCache(tmp_path, 410)
     for second, key in enumerate("abcd"):
         before = set(entries(tmp_path))
         cache.write(key, bytes(96))
@@ -166,6 +156,7 @@ def test_the_entry_used_longest_ago_goes_first(tmp_path: Path) -> None:
 
 
 @settings(max_examples=30)
+@example(writes=[(0, 1), (0, 172), (0, 796), (0, 16)])  # full to less than what is written between two looks
 @given(writes=st.lists(st.tuples(st.integers(0, 9), st.integers(1, 1000)), max_size=30))
 def test_the_limit_holds_and_what_was_just_written_is_there(
     tmp_path_factory: pytest.TempPathFactory, writes: list[tuple[int, int]]
@@ -178,20 +169,6 @@ def test_the_limit_holds_and_what_was_just_written_is_there(
         assert size_of(folder) <= 1000
     DiskCache(folder / "none", 0).write("a", b"1")
     assert not (folder / "none").exists()
-
-
-def test_a_folder_that_may_only_be_read_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    DiskCache(tmp_path, 1000).write("a", b"content")
-
-    def refuse(*_: object, **__: object) -> None:
-        raise OSError(errno.EROFS, "Read-only file system")
-
-    monkeypatch.setattr(os, "utime", refuse)
-    monkeypatch.setattr(Path, "write_bytes", refuse)
-    cache = DiskCache(tmp_path, 1000)
-    cache.write("b", b"content")
-    assert cache.read("a") == b"content"
-    assert cache.read("b") is None
 
 
 @pytest.mark.parametrize("fault", ["full", "no folder"])

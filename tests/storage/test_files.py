@@ -1,7 +1,6 @@
 """Files: complete or absent, and URLs read like local paths. With real processes that are killed."""
 
 import errno
-import hashlib
 import os
 import signal
 import subprocess
@@ -149,11 +148,11 @@ def test_what_was_not_whole_never_has_its_name(tmp_path: Path, popen: Popen, kin
     left = names(tmp_path)
     assert len(left) == (number == signal.SIGKILL), "a writer that is told to end leaves nothing"
     assert storage.is_empty(tmp_path)
-    remove_abandoned(tmp_path)
+    remove_abandoned.__wrapped__(tmp_path)
     assert names(tmp_path) == left, "another writer may be at work on it"
     for path in tmp_path.iterdir():
         age(path, days=1.1)
-    remove_abandoned(tmp_path)
+    remove_abandoned.__wrapped__(tmp_path)
     assert names(tmp_path) == []
 
 
@@ -176,19 +175,13 @@ def test_a_folder_that_changed_today_names_of_others_and_links_are_left_alone(tm
     (precious / "inner" / "file").touch()
     (tmp_path / ".l.0123abcd.partial").symlink_to(precious / "inner")
     before = names(tmp_path)
-    remove_abandoned(tmp_path)
+    remove_abandoned.__wrapped__(tmp_path)
     assert names(tmp_path) == before
     assert (precious / "inner" / "file").exists()
     assert not storage.is_empty(tmp_path)
 
 
 # ---- reading ----
-
-
-def test_a_hash_is_that_of_the_whole_file(tmp_path: Path) -> None:
-    data = bytes(range(256)) * 10_000
-    (tmp_path / "file").write_bytes(data)
-    assert storage.sha256_of_file(tmp_path / "file") == hashlib.sha256(data).hexdigest()
 
 
 @pytest.fixture(params=["local", "memory"])

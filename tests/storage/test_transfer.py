@@ -182,8 +182,10 @@ def test_what_can_only_be_read_is_refused(tmp_path: Path) -> None:
 
 def test_a_place_has_one_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert storage.place("runs/one/") == storage.place(f"file://{tmp_path}/runs/one") == str(tmp_path / "runs/one")
-    assert storage.place("gs://bucket/run/") == "gs://bucket/run"
+    assert (
+        storage.absolute("runs/one/") == storage.absolute(f"file://{tmp_path}/runs/one") == str(tmp_path / "runs/one")
+    )
+    assert storage.absolute("gs://bucket/run/") == "gs://bucket/run"
 
 
 def test_failures_are_said_below_warnings_where_that_is_asked_for(

@@ -21,7 +21,7 @@ def facts() -> dict[str, Any]:
     from work import imagined_model, largest_batch  # type: ignore[import-not-found]
 
     from vjepa2_ac.config import AdapterConfig, EncoderSizes, ModelSizes, PredictorSizes
-    from vjepa2_ac.model.adapter.merging import merge_adapter
+    from vjepa2_ac.model.adapter.lora import merge_adapter
     from vjepa2_ac.model.network.world_model import WorldModel
 
     found: dict[str, Any] = {}

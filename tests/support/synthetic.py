@@ -15,7 +15,7 @@ from vjepa2_ac.data.sources.rlds.droid_writer import (
     DroidMeasurements,
     write_droid_rlds,
 )
-from vjepa2_ac.media.jpeg import encode_jpeg
+from vjepa2_ac.media.images import encode_jpeg
 
 
 def synthetic_states(steps: int, *, seed: int = 0) -> Float[np.ndarray, "steps 7"]:

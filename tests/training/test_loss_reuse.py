@@ -11,7 +11,7 @@ from torch.nn.functional import layer_norm
 from vjepa2_ac.config import AdapterConfig, EncoderSizes, ModelSizes, PredictorSizes
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.model.adapter.lora import add_adapter
-from vjepa2_ac.model.network import dynamics
+from vjepa2_ac.model.network import predictor_network as dynamics
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.training.loss import prediction_losses
 

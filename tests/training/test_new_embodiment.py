@@ -20,7 +20,7 @@ from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 from vjepa2_ac.export import export_run
 from vjepa2_ac.model.base_model import read_sizes
 from vjepa2_ac.model.checkpoints.loading import load_base
-from vjepa2_ac.model.network.input_heads import widths_of_model
+from vjepa2_ac.model.network.world_model import widths_of_model
 from vjepa2_ac.reports.metrics_json import metrics_as_dict
 from vjepa2_ac.reports.write import evaluate_subject
 from vjepa2_ac.runs.loading import load_run

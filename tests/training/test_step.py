@@ -19,7 +19,7 @@ from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.encoding.batch import extrinsics_for
 from vjepa2_ac.episode import Batch, Clip
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.image_file import read_image
+from vjepa2_ac.media.images import read_image
 from vjepa2_ac.training import optim
 from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.resume import save_checkpoint

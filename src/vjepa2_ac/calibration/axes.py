@@ -34,7 +34,7 @@ from vjepa2_ac.evaluation.action_use import RolloutStart, evaluate_actions, star
 from vjepa2_ac.evaluation.measure import Predictor
 from vjepa2_ac.evaluation.result import Row
 from vjepa2_ac.intervals import Estimate, bootstrapped, mean_of, ratio
-from vjepa2_ac.model.adapter.merging import merge_adapter
+from vjepa2_ac.model.adapter.lora import merge_adapter
 from vjepa2_ac.planning.axes import FORMAT, require_axes_in
 from vjepa2_ac.planning.model_setup import Axes, Fingerprints
 from vjepa2_ac.planning.planner import Planner

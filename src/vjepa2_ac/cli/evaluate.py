@@ -209,7 +209,7 @@ def _of_clip(options: argparse.Namespace, out: Path, reporter: Reporter) -> Imag
 
 def _of_image(options: argparse.Namespace) -> Imagination:
     from vjepa2_ac.evaluation.imagined import Seen, imagine_image
-    from vjepa2_ac.media.image_file import read_image
+    from vjepa2_ac.media.images import read_image
 
     state, extrinsics = cli.as_numbers(options.state, "--state"), cli.camera_pose(options.extrinsics)
     cli.require_to_plan(options)

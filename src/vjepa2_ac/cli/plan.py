@@ -144,7 +144,7 @@ def _images(
     options: argparse.Namespace,
 ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | GoalFolder, np.ndarray | None]:
     """Return start, goals and mask; refuse what cannot be planned with, before a model is loaded."""
-    from vjepa2_ac.media.image_file import read_image
+    from vjepa2_ac.media.images import read_image
     from vjepa2_ac.planning.input_checks import require_image, require_mask
 
     folder = None

@@ -202,15 +202,14 @@ def _config(options: argparse.Namespace) -> None:
 def _download(options: argparse.Namespace) -> None:
     """Fetch a published checkpoint: Meta's world model, or an encoder of V-JEPA 2 or 2.1.
 
-    It goes on where it stopped; size, and SHA-256 where it is known, are checked.
+    It goes on where it stopped; its size is checked.
     """
     from vjepa2_ac.console.setup import published_notes, published_summary, published_table
-    from vjepa2_ac.model.checkpoints.download import download
-    from vjepa2_ac.model.checkpoints.published import OFFICIAL, PUBLISHED, find_published
+    from vjepa2_ac.model.checkpoints.published import OFFICIAL, PUBLISHED, download, find_published
     from vjepa2_ac.places import literal
 
     if options.list:
-        cli.show(published_table(PUBLISHED), *published_notes(PUBLISHED))
+        cli.show(published_table(PUBLISHED), *published_notes())
         return
     known = find_published(options.name or OFFICIAL)
     path, url = options.to or Path("checkpoints") / known.file, options.url or known.url

@@ -57,21 +57,22 @@ def published_table(published: Sequence[Published]) -> Table:
     for column in _COLUMNS:
         table.add_column(column, overflow="fold")
     for one in published:
-        encoder = f"{one.encoder.name}, {one.encoder_parameters / _MILLION:,.0f} M"
+        encoder = f"{one.encoder.name}, {one.encoder.parameters / _MILLION:,.0f} M"
         pixels = str(one.image_size)
         table.add_row(one.name, one.holds, one.family, encoder, pixels, one.size, one.licence, one.key)
     return table
 
 
-def published_notes(published: Sequence[Published]) -> list[str]:
+def published_notes() -> list[str]:
     """Return what the table does not say, a line each."""
     encoders = (
         "Beside an encoder: its parameters, and the key of its weights in the file; pixels are those of its images."
     )
-    lines = [encoders, "The licence is that of Meta's repository. Sizes with 'about' are estimates."]
-    if not any(one.sha256 for one in published):
-        lines.append("No SHA-256 of these files is known: what is checked is the size.")
-    return lines
+    return [
+        encoders,
+        "The licence is that of Meta's repository. Sizes with 'about' are estimates.",
+        "Meta publishes no hashes of these files: what is checked is the size.",
+    ]
 
 
 def published_summary(one: Published, url: str) -> str:
@@ -79,8 +80,7 @@ def published_summary(one: Published, url: str) -> str:
     parts = (
         "encoder and action-conditioned predictor" if one.holds == "world model" else "without a predictor for actions"
     )
-    checked = "size and SHA-256 are checked" if one.sha256 else "its size is checked, for no SHA-256 is known"
     return (
         f"{one.name}: {one.holds}, {parts}; V-JEPA {one.family.removeprefix('v')}, {one.encoder.name},"
-        f" {one.image_size} px\n{one.size}, licence {one.licence}; from {url}; {checked}"
+        f" {one.image_size} px\n{one.size}, licence {one.licence}; from {url}; its size is checked"
     )

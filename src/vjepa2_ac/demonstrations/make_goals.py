@@ -33,7 +33,7 @@ from vjepa2_ac.demonstrations.key_frames import (
 from vjepa2_ac.encoding.batch import encode_frames
 from vjepa2_ac.episode import FrameReader, Progress, no_progress
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.video_reader import count_frames, read_frames
+from vjepa2_ac.media.video import count_frames, read_frames
 from vjepa2_ac.planning.energy import distance
 from vjepa2_ac.planning.goals import NoiseFloor, SubGoal, write_goals
 from vjepa2_ac.planning.session import PlanningSession

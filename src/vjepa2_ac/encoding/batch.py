@@ -5,6 +5,8 @@ Training, evaluation and planning only see the result of this module.
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import torch
 from jaxtyping import Float, Float32, UInt8
@@ -14,19 +16,18 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.sources.latents.cache_files import unpack_latents
 from vjepa2_ac.data.sources.latents.cache_key import Encoding
+from vjepa2_ac.data.sources.latents.source import LatentSource, another_cache
 from vjepa2_ac.data.transforms import Crop, pixels_to_input, view
-from vjepa2_ac.encoding.latent_cache import require_encoding
 from vjepa2_ac.episode import Batch, LatentBatch, Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.network.input_heads import heads_to_replace, widths_as_text
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.network.world_model import WorldModel, heads_to_replace, widths_as_text
 
 
 @torch.no_grad()
 def encode_batch(world_model: WorldModel, batch: Batch, *, device: torch.device, chunk: int) -> LatentBatch:
     """Encode the frames of a batch on the device, each independently; a training batch is also augmented there.
 
-    Latents of a batch from a cache are used unchanged: `require_encoding` has compared the encoders.
+    Latents of a batch from a cache are used unchanged: `require_same_encoder` has compared the encoders.
 
     Args:
         world_model: The model whose frozen encoder is used.
@@ -36,7 +37,7 @@ def encode_batch(world_model: WorldModel, batch: Batch, *, device: torch.device,
         chunk: Frames per encoder call.
 
     Raises:
-        InputError: The model needs camera poses and a clip has none; or cached latents are of another width.
+        InputError: The model needs camera poses and a clip has none.
     """
     arrived = batch.on_device() if batch.on_device else None  # None, too, if it was used before
     batch = (arrived or batch).mapped(lambda tensor: tensor.to(device, non_blocking=True))
@@ -84,13 +85,15 @@ def encoding_of(world_model: WorldModel, config: Config) -> Encoding:
 
 
 def require_same_encoder(world_model: WorldModel, dataset: Dataset, config: Config) -> None:
-    """Refuse cached latents of another encoder or precision; other data sets pass.
+    """Refuse cached latents of another encoder, image size or precision; other data sets pass.
 
     Raises:
         InputError: Names what differs.
     """
-    if dataset.config.is_cache:  # else the weights need not be hashed
-        require_encoding(dataset, encoding_of(world_model, config))
+    if isinstance(dataset.source, LatentSource):  # else the weights need not be hashed
+        differing = dataset.source.key.differences_of(encoding_of(world_model, config))
+        if differing:
+            raise another_cache(Path(dataset.config.path), differing)
 
 
 def _latents_of(world_model: WorldModel, batch: Batch, chunk: int) -> Float[Tensor, "batch time tokens dim"]:
@@ -99,14 +102,6 @@ def _latents_of(world_model: WorldModel, batch: Batch, chunk: int) -> Float[Tens
             raise ValueError("a batch with neither frames nor latents")
         inputs = pixels_to_input(batch.frames, world_model.image_size, batch.augmentations)
         return world_model.encode(inputs, chunk=chunk)
-    values = batch.latents.values
-    if values.shape[-2:] != (world_model.num_tokens, world_model.latent_dim):
-        raise InputError(
-            where="data.path",
-            found=f"cached latents of {values.shape[-2]} tokens of {values.shape[-1]} numbers",
-            needed=f"{world_model.num_tokens} of {world_model.latent_dim}, as this model's encoder makes them",
-            fix="Use a cache that was made with this model",
-        )
     return unpack_latents(batch.latents)
 
 

@@ -183,33 +183,29 @@ def _encode_together(
     its files. What stops one of them is written into a file of this attempt, and stops the others.
     """
     share = ProcessShare(accelerator.process_index, accelerator.num_processes)
-    attempt = (
-        None
-        if share.processes == 1
-        else broadcast_object(accelerator, first_only(accelerator, partial(_begin_attempt, cache)))
-    )
+    if share.processes == 1:
+        if left := cache.missing():
+            encode_share(cache, left, make_encoder(), share, reporter)
+        return
+    attempt = cache.folder / f".attempt-{broadcast_object(accelerator, uuid.uuid4().hex)}"
+    first_only(accelerator, partial(_begin, cache, attempt))
     try:
-        if attempt is not None:
-            _require_seen(attempt, share)
+        _require_seen(attempt, share)
         if left := cache.missing():
             encode_share(cache, left, make_encoder(), share, reporter)
     except BaseException as error:
-        if attempt is not None:
-            with contextlib.suppress(OSError):
-                write_atomically(attempt, f"process {share.rank}: {str(error) or type(error).__name__}")
+        with contextlib.suppress(OSError):
+            write_atomically(attempt, f"process {share.rank}: {str(error) or type(error).__name__}")
         raise
-    if attempt is not None:
-        _wait_for_others(cache, left, attempt)
-        if accelerator.is_main_process:
-            attempt.unlink(missing_ok=True)
+    _wait_for_others(cache, left, attempt)
+    if accelerator.is_main_process:
+        attempt.unlink(missing_ok=True)
 
 
-def _begin_attempt(cache: LatentCache) -> Path:
+def _begin(cache: LatentCache, attempt: Path) -> None:
     cache.require_own()
-    attempt = cache.folder / f".attempt-{uuid.uuid4().hex}"
     with user_can_write(cache.folder):
         write_atomically(attempt, "")
-    return attempt
 
 
 def _require_seen(attempt: Path, share: ProcessShare) -> None:

@@ -16,7 +16,6 @@ from vjepa2_ac.data.idle import find_ranges
 from vjepa2_ac.data.index import cache_folder, fingerprint_of
 from vjepa2_ac.data.sources.latents.cache_files import CACHE, EPISODES, KEPT, LatentFiles, bytes_per_frame, read_key
 from vjepa2_ac.data.sources.latents.cache_key import CacheKey, Encoding, key_of_cache, require_own_folder
-from vjepa2_ac.data.sources.latents.source import LatentSource, another_cache
 from vjepa2_ac.encoding.pipeline import FramesToEncode
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage import free_bytes, user_can_write, write_atomically
@@ -190,18 +189,6 @@ def through_cache(dataset: Dataset, encoding: Encoding) -> Dataset:
     if not cache.is_begun:
         raise _no_cache(dataset.config, cache)
     return through_latents(dataset, cache.folder)
-
-
-def require_encoding(dataset: Dataset, encoding: Encoding) -> None:
-    """Refuse cached latents of another encoder, image size or precision; other data sets pass.
-
-    Raises:
-        InputError: Names what differs.
-    """
-    if isinstance(dataset.source, LatentSource):
-        differing = dataset.source.key.differences_of(encoding)
-        if differing:
-            raise another_cache(Path(dataset.config.path), differing)
 
 
 def _no_cache(config: DataConfig, cache: LatentCache) -> InputError:

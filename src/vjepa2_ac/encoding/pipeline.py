@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from itertools import groupby, islice
+from itertools import groupby
 from operator import itemgetter
 
 import numpy as np
@@ -108,7 +108,7 @@ def encode_files(
     done, total = 0, sum(len(one.steps) for one in wanted)
     progress(done, total)
     with ThreadPoolExecutor(threads, "decode") as decoders, ThreadPoolExecutor(1, "write") as writer:
-        parts_ahead = _ahead(_started(decoders, dataset, wanted, encoder), threads * _PREFETCHED_PARTS)
+        parts_ahead = _parts(decoders, dataset, wanted, encoder, threads * _PREFETCHED_PARTS)
         try:
             for one, parts in groupby(parts_ahead, itemgetter(0)):
                 try:
@@ -128,25 +128,26 @@ def encode_files(
             decoders.shutdown(cancel_futures=True)
 
 
-def _ahead(started: _Parts, count: int) -> _Parts:
-    """Yield parts in the requested order, while threads read the next ones."""
-    waiting = deque(islice(started, count))
-    while waiting:
-        part = waiting.popleft()
-        waiting.extend(islice(started, 1))
-        yield part
-
-
-def _started(
-    pool: ThreadPoolExecutor, dataset: Dataset, wanted: Sequence[FramesToEncode], encoder: EncoderOnDevice
+def _parts(
+    pool: ThreadPoolExecutor,
+    dataset: Dataset,
+    wanted: Sequence[FramesToEncode],
+    encoder: EncoderOnDevice,
+    ahead: int,
 ) -> _Parts:
-    """Start to read part after part; an episode is opened once, before the first of its parts."""
+    """Yield parts in the requested order, while threads read the next ones; an episode is opened once."""
     frames = encoder.chunk * max(1, FRAMES_AT_ONCE // encoder.chunk)  # whole chunks, but for the last of an episode
+    waiting = deque[tuple[FramesToEncode, Future[tuple[Episode, _Frames]]]]()
     for one in wanted:
         recording = pool.submit(_open, dataset, one)
         for first in range(0, len(one.steps), frames):
             steps = one.steps[first : first + frames].tolist()
-            yield one, pool.submit(_read, dataset, recording, steps, pinned=encoder.device.type == "cuda")
+            pinned = encoder.device.type == "cuda"
+            waiting.append((one, pool.submit(_read, dataset, recording, steps, pinned=pinned)))
+            if len(waiting) > ahead:
+                yield waiting.popleft()
+    while waiting:
+        yield waiting.popleft()
 
 
 def _open(dataset: Dataset, one: FramesToEncode) -> Episode:

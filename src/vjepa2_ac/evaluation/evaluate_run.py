@@ -30,10 +30,9 @@ from vjepa2_ac.evaluation.evaluate import ClipName, Contender, FramesOfRow, Repe
 from vjepa2_ac.evaluation.measure import ClipSample
 from vjepa2_ac.evaluation.request import EvaluationOptions, settle
 from vjepa2_ac.evaluation.result import PERSISTENCE, About, Evaluation, Measurement, Role, TrainingCurve
-from vjepa2_ac.model.adapter.merging import base_only, unadapted_copy
+from vjepa2_ac.model.adapter.lora import base_only, unadapted_copy
 from vjepa2_ac.model.checkpoints.loading import load_base
-from vjepa2_ac.model.network.input_heads import heads_to_replace, widths_as_text
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.network.world_model import WorldModel, heads_to_replace, widths_as_text
 from vjepa2_ac.places import BUILTIN
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import select_checkpoint

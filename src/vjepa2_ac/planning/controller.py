@@ -18,8 +18,7 @@ from vjepa2_ac.data.sources.indexed_source import spaces_of
 from vjepa2_ac.data.transforms import Crop, view
 from vjepa2_ac.encoding.batch import encode_frames
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.network.input_heads import heads_to_replace, widths_as_text, widths_of_model
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.network.world_model import WorldModel, heads_to_replace, widths_as_text, widths_of_model
 from vjepa2_ac.planning.axes import require_base_frame
 from vjepa2_ac.planning.energy import Goal, Scene, WorldModelCost, distance, patch_weights
 from vjepa2_ac.planning.goals import REACHED, GoalProgress, GripperMode, SubGoal, timed, with_shares

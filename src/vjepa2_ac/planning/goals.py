@@ -17,7 +17,7 @@ from pydantic import ConfigDict, Field
 
 from vjepa2_ac.config.planning import GoalsConfig
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.image_file import encode_png, read_image
+from vjepa2_ac.media.images import encode_png, read_image
 from vjepa2_ac.planning.input_checks import require_image
 from vjepa2_ac.storage import unreadable
 from vjepa2_ac.storage.files import folder_writer

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.adapter.merging import unadapted_copy
+from vjepa2_ac.model.adapter.lora import unadapted_copy
 from vjepa2_ac.model.network.compilation import require_compiler
 from vjepa2_ac.model.network.world_model import WorldModel, fingerprint
 from vjepa2_ac.planning.axes import read_axes

@@ -16,7 +16,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.distributed import has_bf16, is_on_cpu, require_type_of_weights
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.adapter.merging import merge_adapter
+from vjepa2_ac.model.adapter.lora import merge_adapter
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float
 
 from vjepa2_ac.decoding.imagine import AS_RECORDED, Imagination
-from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.image_file import encode_png
-from vjepa2_ac.media.video_writer import write_gif, write_video
+from vjepa2_ac.errors import UnreachableError
+from vjepa2_ac.media.images import encode_png
+from vjepa2_ac.media.video import write_gif, write_video
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.reports.figures.film import FilmStrip, StripRow, draw_strip, durations, film_frames, held
 from vjepa2_ac.storage import user_can_write, write_atomically
@@ -79,9 +79,7 @@ def write_film_of(imagination: Imagination, folder: Path, *, reporter: Reporter 
         written = [folder / STRIP, write_gif(folder / GIF, frames, seconds=seconds)]
         try:
             written.append(write_video(folder / VIDEO, held(frames, seconds, _RATE_HZ), rate_hz=_RATE_HZ))
-        except InputError as error:
-            if error.where != "video":
-                raise
+        except UnreachableError as error:  # PyAV is not installed
             reporter.note(f"No {VIDEO}: {error}")
         write_atomically(folder / JSON, json_text(_as_dict(imagination)))
     return [*written, folder / JSON]

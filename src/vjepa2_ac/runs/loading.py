@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.model.adapter.lora import load_trained
+from vjepa2_ac.model.adapter.adapter_folder import load_trained
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.runs.checkpoint import ADAPTER, SELECTED, select_checkpoint

@@ -77,7 +77,7 @@ class RemoteCheckpoints:
     """The checkpoints at a place; every method raises UnreachableError if it cannot be reached.
 
     Attributes:
-        place: What `storage.place` returned.
+        place: What `storage.absolute` returned.
     """
 
     place: str
@@ -203,7 +203,7 @@ def open_remote(
     """
     if config.checkpoint.remote is None:
         return None
-    remote = Remote(storage.place(config.checkpoint.remote), config)
+    remote = Remote(storage.absolute(config.checkpoint.remote), config)
     checkpoints, own = RemoteCheckpoints(remote.place), Path(config.run_dir).resolve()
     if not storage.is_url(remote.place) and Path(remote.place).is_relative_to(own):
         found, needed = f"{remote.place}, and run_dir is {own}", "a place outside the run's folder"

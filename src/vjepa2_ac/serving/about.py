@@ -13,7 +13,7 @@ from vjepa2_ac import __version__
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.image_file import read_image
+from vjepa2_ac.media.images import read_image
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.goals import GOALS_FILE, GoalFolder, SubGoal, read_goal_folder
 from vjepa2_ac.planning.input_checks import require_image

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.image_file import encode_png
+from vjepa2_ac.media.images import encode_png
 from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.storage import user_can_write, write_atomically
 from vjepa2_ac.storage.structured import json_text, plain, utc_now

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, UInt8
 from vjepa2_ac.episode import Episode
 from vjepa2_ac.errors import InputError, UserError
 from vjepa2_ac.evaluation.imagined import Film
-from vjepa2_ac.media.jpeg import decode_jpegs, encode_jpeg
+from vjepa2_ac.media.images import decode_jpegs, encode_jpeg
 from vjepa2_ac.simulation.closed_loop.rollout import send_action
 from vjepa2_ac.simulation.recording.record import (
     JPEG_QUALITY,

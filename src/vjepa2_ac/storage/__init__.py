@@ -28,4 +28,4 @@ from vjepa2_ac.storage.files import (
     write_atomically,
 )
 from vjepa2_ac.storage.remote import FileInfo, ShortReadError, bytes_fetched
-from vjepa2_ac.storage.transfer import download, file_sizes, place, remove, remove_folder, try_writing, upload
+from vjepa2_ac.storage.transfer import download, file_sizes, remove, remove_folder, try_writing, upload

@@ -179,7 +179,7 @@ class DiskCache:
             self._written = 0
             entries = sorted(self._entries())
             total = sum(size for _, size, _ in entries)
-            if total <= self._limit:
+            if total <= self._limit * (1 - _CHECK_SHARE):  # what it writes until its next look fits, too
                 return
             for _, size, path in entries:
                 if total <= self._limit * _KEPT_SHARE:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import errno
 import functools
 import hashlib
+import io
 import os
 import re
 import secrets
@@ -23,12 +24,12 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
-from typing import BinaryIO, Protocol, runtime_checkable
+from typing import BinaryIO
 
 from vjepa2_ac.errors import InputError, UnreachableError, UserError
 from vjepa2_ac.places import is_url
 from vjepa2_ac.storage import remote
-from vjepa2_ac.storage.block_file import open_remote
+from vjepa2_ac.storage.block_file import RangedFile, open_remote
 from vjepa2_ac.storage.remote import FileInfo, ShortReadError, complete
 
 _HASH_CHUNK_BYTES = 1 << 20
@@ -40,21 +41,8 @@ _NAME_BYTES = 200  # of the 255 that a name may have
 _OLD_S = 86_400.0
 
 
-@runtime_checkable
-class ByteReader(Protocol):
-    """A file open for reading, on this machine or behind a URL."""
-
-    def read(self, size: int = -1, /) -> bytes:
-        """Return the next bytes; all remaining ones with -1."""
-        ...
-
-    def seek(self, offset: int, /) -> int:
-        """Go to an offset from the start."""
-        ...
-
-    def close(self) -> None:
-        """Close the file."""
-        ...
+ByteReader = RangedFile | io.BufferedIOBase
+"""A file open for reading and seeking, behind a URL or on this machine."""
 
 
 # ---- find and read ----
@@ -66,8 +54,12 @@ def join(folder: str | Path, name: str) -> str:
 
 
 def absolute(path: str | Path) -> str:
-    """Return the absolute path with links resolved, independent of the working directory; a URL unchanged."""
-    return str(path) if is_url(path) else str(Path(path).resolve())
+    """Return the one name of a place: an absolute path with links resolved, also for `file://`; or a URL.
+
+    It does not depend on the working directory, and has no trailing slash.
+    """
+    local = str(path).removeprefix("file://")
+    return local.rstrip("/") if is_url(local) else str(Path(local).resolve())
 
 
 def exists(path: str | Path) -> bool:
@@ -365,21 +357,19 @@ def _nearest(path: Path) -> Path:
 def _new_partial(parent: Path, name: str) -> Path:
     """Return the temporary path of a file or folder that will be renamed to `name`; its folder is there."""
     parent.mkdir(parents=True, exist_ok=True)
-    _remove_abandoned_once(parent.absolute())
+    remove_abandoned(parent.absolute())
     short = name.encode(errors="surrogateescape")[:_NAME_BYTES].decode(errors="ignore")
     return parent / f".{short}.{secrets.token_hex(4)}.partial"
 
 
+@functools.cache
 def remove_abandoned(folder: Path) -> None:
-    """Remove the partial files in a folder that are unchanged for a day; those that cannot be removed stay."""
+    """Remove the partial files in a folder that are unchanged for a day; those that cannot be removed stay.
+
+    A folder is scanned only the first time that this process writes there: it may hold thousands of files.
+    """
     with suppress(OSError):
         for path in [path for path in folder.iterdir() if _PARTIAL.fullmatch(path.name) and not path.is_symlink()]:
             with suppress(OSError):
                 if time.time() - max(one.lstat().st_mtime for one in (path, *path.rglob("*"))) > _OLD_S:
                     shutil.rmtree(path) if path.is_dir() else path.unlink()
-
-
-@functools.cache
-def _remove_abandoned_once(folder: Path) -> None:
-    """Scan a folder only the first time that this process writes there: it may hold thousands of files."""
-    remove_abandoned(folder)

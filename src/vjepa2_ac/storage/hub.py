@@ -25,21 +25,15 @@ def from_hub(name: str, files: Sequence[str], *, where: str) -> Path:
     from huggingface_hub import errors, snapshot_download
 
     model, _, revision = name.removeprefix(HUB).partition("@")
-    log_in = "for one that is not public, `hf auth login` or set HF_TOKEN"
     try:
         return Path(snapshot_download(model, revision=revision or None, allow_patterns=list(files)))
-    except errors.GatedRepoError:
-        fix = f"Ask for it on its page; then {log_in}"
-        raise RefusedError(where=where, found="a model that must be asked for", needed="access", fix=fix) from None
-    except (errors.RepositoryNotFoundError, errors.RevisionNotFoundError) as error:
-        found = (
-            "no such revision" if isinstance(error, errors.RevisionNotFoundError) else "no such model, or none for you"
-        )
-        fix = f"Check the name (hf://owner/name@revision); {log_in}"
-        raise RefusedError(where=where, found=found, fix=fix) from None
+    except (errors.RepositoryNotFoundError, errors.RevisionNotFoundError):  # or gated
+        fix = "Check the name (hf://owner/name@revision). A gated model must be asked for on its page; for one that is"
+        found = "no such model or revision, or none for you"
+        raise RefusedError(where=where, found=found, fix=f"{fix} not public, `hf auth login` or set HF_TOKEN") from None
     except errors.LocalEntryNotFoundError:
         fix = "Check the network, or name a folder of this machine"
         raise UnreachableError(where=where, found="the Hub cannot be reached", fix=fix) from None
     except (errors.HfHubHTTPError, OSError, ValueError) as error:
-        said = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        said = next(iter(str(error).strip().splitlines()), type(error).__name__)
         raise InputError(where=where, found=said, needed="the files of a model", fix="Check name and disk") from None

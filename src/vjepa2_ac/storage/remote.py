@@ -1,4 +1,4 @@
-"""Reading remote data: `gs://`, `hf://`, `s3://` and every other protocol of fsspec.
+"""Remote files: `gs://`, `hf://`, `s3://` and every other protocol of fsspec.
 
 All network failures are handled here (see `retries`): the result is the data, FileNotFoundError as from a disk, or
 UnreachableError. Every function may be called from many threads, and in every process.
@@ -10,17 +10,19 @@ import os
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from vjepa2_ac.errors import InputError, pip_install
+from vjepa2_ac.errors import InputError, RefusedError, pip_install
 from vjepa2_ac.storage import retries
 
 _T = TypeVar("_T")
 
 _THREADS = 64  # concurrent reads of `read_ranges` in a process
 _PIECE_BYTES = 16 << 20  # longer reads are split: each piece has the full time-out
+_SLOWEST_BYTES_PER_S = 1 << 20  # when writing: allowed in addition to the time-out of any request
 _VERSION_KEYS = ("generation", "etag", "ETag", "blob_id", "mtime", "last_modified", "LastModified", "created")
 
 _LOG_IN = {"gs": "gcloud auth application-default login", "hf": "hf auth login", "s3": "aws configure"}
@@ -47,7 +49,7 @@ class FileInfo(NamedTuple):
     is_file: bool = True
 
 
-# ---- reads, with retries ----
+# ---- requests, with retries ----
 
 
 def file_size(url: str) -> int:
@@ -67,7 +69,7 @@ def file_version(url: str) -> str:
         FileNotFoundError: There is no such file or folder.
         UnreachableError: It cannot be reached.
     """
-    return _version_of(_persist(url, lambda timeout_s: ask(url, "info", timeout_s)))
+    return _version_of(_persist(url, lambda timeout_s: _ask(url, "info", timeout_s)))
 
 
 def list_folder(url: str) -> list[FileInfo]:
@@ -77,18 +79,56 @@ def list_folder(url: str) -> list[FileInfo]:
         UnreachableError: It cannot be reached.
     """
     try:
-        listed = _persist(url, lambda timeout_s: ask(url, "ls", timeout_s, detail=True, refresh=True))
+        listed = _persist(url, lambda timeout_s: _ask(url, "ls", timeout_s, detail=True, refresh=True))
     except FileNotFoundError:
         return []
-    return sorted(
-        FileInfo(
-            name=str(found["name"]).rstrip("/").rsplit("/", 1)[-1],
-            size=int(found.get("size") or 0),
-            version=_version_of(found),
-            is_file=found["type"] == "file",
-        )
-        for found in listed
-    )
+    names = {str(found["name"]).rstrip("/").rsplit("/", 1)[-1]: found for found in listed}
+    return [
+        FileInfo(name, int(found.get("size") or 0), _version_of(found), found["type"] == "file")
+        for name, found in sorted(names.items())
+    ]
+
+
+def sizes_below(url: str) -> dict[str, int]:
+    """Return the sizes of all files below a folder by their relative paths; one request, not cached.
+
+    Raises:
+        FileNotFoundError: There is no such folder; of Google's, no such bucket.
+        UnreachableError: It cannot be reached.
+    """
+    filesystem = _filesystem(url)
+    root = filesystem._strip_protocol(url).rstrip("/") + "/"
+
+    def find(timeout_s: float) -> Any:
+        filesystem.invalidate_cache()
+        return _once(filesystem, "find", timeout_s, root, detail=True)
+
+    found = _persist(url, find)
+    return {name.removeprefix(root): int(about.get("size") or 0) for name, about in found.items() if name != root}
+
+
+def send(source: Path, url: str) -> None:
+    """Write a local file to a URL; folders are created where the file system has them.
+
+    Raises:
+        FileNotFoundError: There is no such local file; of Google's, no such bucket.
+        UnreachableError: It cannot be written; a RefusedError if that is permanent.
+    """
+    filesystem = _filesystem(url, writing=True)
+    names = (str(source), filesystem._strip_protocol(url))
+    pieces = {"chunksize": _PIECE_BYTES} if _protocol(url) == "gs" else {}  # a piece is read while other reads wait
+    allowed_s = retries.DEFAULT.timeout_s + source.stat().st_size / _SLOWEST_BYTES_PER_S
+    _persist(url, lambda timeout_s: _once(filesystem, "put_file", timeout_s, *names, **pieces), "written", allowed_s)
+
+
+def remove(url: str) -> None:
+    """Remove a file.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        UnreachableError: It cannot be removed; a RefusedError if that is permanent.
+    """
+    _persist(url, lambda timeout_s: _ask(url, "rm_file", timeout_s, writing=True), "written")
 
 
 def read_range(url: str, start: int, length: int) -> bytes:
@@ -155,7 +195,7 @@ def _read_once(url: str, start: int, length: int, timeout_s: float) -> bytes:
         {} if _filesystem(url).async_impl else {"cache_type": "none"}
     )  # else megabytes are prefetched
     try:
-        data: bytes = ask(url, "cat_file", timeout_s, start=start, end=start + length, **bare)
+        data: bytes = _ask(url, "cat_file", timeout_s, start=start, end=start + length, **bare)
     except Exception as error:
         if retries.status_of(error) != 416:
             raise
@@ -173,58 +213,24 @@ def _read_once(url: str, start: int, length: int, timeout_s: float) -> bytes:
 def _size_once(url: str, timeout_s: float) -> int:
     """Return the size of a file, with one request; at Google without checking whether it is a folder."""
     method = "get_object" if hasattr(_filesystem(url), "_get_object") else "info"
-    return int(ask(url, method, timeout_s)["size"])
+    return int(_ask(url, method, timeout_s)["size"])
 
 
-def _persist(url: str, action: Callable[[float], _T]) -> _T:
-    return retries.with_retries(url, action, policy=retries.DEFAULT, access=login_hint(url))
+def _persist(url: str, action: Callable[[float], _T], doing: str = "read", timeout_s: float | None = None) -> _T:
+    policy = replace(retries.DEFAULT, timeout_s=timeout_s or retries.DEFAULT.timeout_s)
+    try:
+        return retries.with_retries(url, action, policy=policy, access=login_hint(url), doing=doing)
+    except NotImplementedError:
+        raise RefusedError(where=url, found=f"{_protocol(url)}:// cannot be {doing}", needed=_KNOWN) from None
 
 
 # ---- fsspec's file systems, and their credentials ----
 
 
-def ask(url: str, method: str, timeout_s: float, *, writing: bool = False, **arguments: Any) -> Any:
-    """Call a method of the URL's file system with the URL's path, once; with a time-out where that is possible.
-
-    Args:
-        url: What it is about.
-        method: Its name.
-        timeout_s: The time-out.
-        writing: Whether it changes something: only then is permission to do so requested.
-        arguments: Others of the method.
-
-    Raises:
-        Exception: Whatever the library raises.
-        InputError: The library is not installed, or does not exist.
-    """
+def _ask(url: str, method: str, timeout_s: float, *, writing: bool = False, **arguments: Any) -> Any:
+    """Call a method of the URL's file system with the URL's path, once; with a time-out where that is possible."""
     filesystem = _filesystem(url, writing=writing)
     return _once(filesystem, method, timeout_s, filesystem._strip_protocol(url), **arguments)
-
-
-def send(source: Path, url: str, timeout_s: float) -> None:
-    """Write a local file to a URL, once; folders are created where the file system has them.
-
-    Raises:
-        Exception: Whatever the library raises.
-        InputError: As `ask`.
-    """
-    filesystem = _filesystem(url, writing=True)
-    pieces = {"chunksize": _PIECE_BYTES} if _protocol(url) == "gs" else {}  # a piece is read while other reads wait
-    _once(filesystem, "put_file", timeout_s, str(source), filesystem._strip_protocol(url), **pieces)
-
-
-def sizes_below(url: str, timeout_s: float) -> dict[str, int]:
-    """Return the sizes of all files below a folder by their relative paths; one request, not cached.
-
-    Raises:
-        Exception: Whatever the library raises.
-        InputError: As `ask`.
-    """
-    filesystem = _filesystem(url)
-    filesystem.invalidate_cache()
-    root = filesystem._strip_protocol(url).rstrip("/") + "/"
-    found = _once(filesystem, "find", timeout_s, root, detail=True)
-    return {name.removeprefix(root): int(about.get("size") or 0) for name, about in found.items() if name != root}
 
 
 def _once(filesystem: Any, method: str, timeout_s: float, *arguments: Any, **options: Any) -> Any:

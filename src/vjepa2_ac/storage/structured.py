@@ -11,7 +11,7 @@ import math
 import re
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -121,12 +121,12 @@ def utc_now() -> str:
 _adapter: Callable[[Any], Any] = cache(TypeAdapter)
 
 
-def record_of(kind: type[T], values: Mapping[str, Any], *, where: str, needed: str = "", fix: str = "") -> T:
-    """Return a dataclass of values from JSON: no value is converted to another type.
+def record_of(kind: type[T], values: Any, *, where: str, needed: str = "", fix: str = "") -> T:
+    """Return a dataclass, or a model of pydantic's, of values from JSON: none is converted to another type.
 
     Args:
-        kind: The dataclass; its annotations may have pydantic's bounds.
-        values: Of its fields; those with a default may be missing.
+        kind: The class; its annotations may have pydantic's bounds.
+        values: A mapping of its fields; those with a default may be missing.
         where: The file, for messages.
         needed: What it should be.
         fix: How to fix it.
@@ -134,12 +134,15 @@ def record_of(kind: type[T], values: Mapping[str, Any], *, where: str, needed: s
     Raises:
         InputError: A value is missing, unknown, of another type or beyond its bounds.
     """
-    known = {field.name for field in fields(kind)}  # type: ignore[arg-type] # that is what `kind` is
-    problems = [f"{key}: unknown" for key in values if key not in known]
+    problems: list[str] = []
+    if is_dataclass(kind) and isinstance(values, dict):
+        problems += [f"{key}: unknown" for key in values.keys() - {field.name for field in fields(kind)}]
     try:
-        record: T = _adapter(kind).validate_json(json.dumps(dict(values)), strict=True)
+        record: T = _adapter(kind).validate_json(json.dumps(values), strict=True)
     except ValidationError as error:
-        problems += [f"{'.'.join(map(str, one['loc']))}: {message_of(one)}" for one in error.errors()]
+        problems += [
+            ".".join(map(str, one["loc"])) + ": " * bool(one["loc"]) + message_of(one) for one in error.errors()
+        ]
     if problems:
         more = f"; and {len(problems) - _MOST_PROBLEMS} more" if len(problems) > _MOST_PROBLEMS else ""
         raise InputError(where=where, found="; ".join(problems[:_MOST_PROBLEMS]) + more, needed=needed, fix=fix)

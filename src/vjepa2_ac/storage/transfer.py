@@ -10,32 +10,20 @@ import errno
 import secrets
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
 
 from vjepa2_ac.errors import RefusedError, UnreachableError
 from vjepa2_ac.places import is_url
-from vjepa2_ac.storage import remote, retries
+from vjepa2_ac.storage import remote
 from vjepa2_ac.storage.files import atomic_writer, join, try_writing_at
-from vjepa2_ac.storage.retries import RetryPolicy
-
-_T = TypeVar("_T")
 
 _AWAY = frozenset({
     errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.ENOTCONN, errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.ENOSPC,
     errno.EDQUOT,
 })  # fmt: skip
 _PIECE_BYTES = 32 << 20
-_SLOWEST_BYTES_PER_S = 1 << 20  # to a URL: allowed in addition to the time-out of any request
-
-
-def place(path: str) -> str:
-    """Return the canonical name of a folder: an absolute path, also for `file://`, or a URL; no trailing slash."""
-    path = path.removeprefix("file://")
-    return path.rstrip("/") if is_url(path) else str(Path(path).resolve())
 
 
 def upload(source: Path, target: str) -> None:
@@ -49,10 +37,8 @@ def upload(source: Path, target: str) -> None:
         with source.open("rb") as file, _explained(target), atomic_writer(target) as copy:
             shutil.copyfileobj(file, copy)
         return
-    allowed_s = source.stat().st_size / _SLOWEST_BYTES_PER_S
-    policy = replace(retries.DEFAULT, timeout_s=retries.DEFAULT.timeout_s + allowed_s)
     try:
-        _persist(target, lambda timeout_s: remote.send(source, target, timeout_s), policy)
+        remote.send(source, target)
     except FileNotFoundError:
         if not source.is_file():
             raise
@@ -85,7 +71,7 @@ def remove(path: str) -> None:
     """
     if is_url(path):
         with suppress(FileNotFoundError):
-            _persist(path, lambda timeout_s: remote.ask(path, "rm_file", timeout_s, writing=True), retries.DEFAULT)
+            remote.remove(path)
         return
     with _explained(path):
         Path(path).unlink(missing_ok=True)
@@ -116,7 +102,7 @@ def file_sizes(folder: str) -> dict[str, int]:
             files = [path for path in Path(folder).rglob("*") if path.is_file()]
             return {path.relative_to(folder).as_posix(): path.stat().st_size for path in files}
     try:
-        return _persist(folder, lambda timeout_s: remote.sizes_below(folder, timeout_s), retries.DEFAULT, doing="read")
+        return remote.sizes_below(folder)
     except FileNotFoundError:
         if folder.startswith(("gs://", "gcs://")):  # which has no folders: only buckets can be missing
             raise _no_bucket(folder) from None
@@ -149,14 +135,6 @@ def _explained(path: str) -> Iterator[None]:
         kind = UnreachableError if error.errno in _AWAY else RefusedError
         found = f"cannot be written: {error.strerror or error}"
         raise kind(where=path, found=found, fix="Check its permissions, and the disk") from error
-
-
-def _persist(url: str, action: Callable[[float], _T], policy: RetryPolicy, doing: str = "written") -> _T:
-    try:
-        return retries.with_retries(url, action, policy=policy, access=remote.login_hint(url), doing=doing)
-    except NotImplementedError:
-        found = f"{url.partition('://')[0]}:// cannot be written"
-        raise RefusedError(where=url, found=found, needed="a folder of this machine, gs:// or s3://") from None
 
 
 def _no_bucket(url: str) -> RefusedError:

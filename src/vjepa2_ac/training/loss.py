@@ -14,8 +14,7 @@ from torch.nn.functional import smooth_l1_loss
 from vjepa2_ac.config import TrainingConfig
 from vjepa2_ac.distances import absolute_difference
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.model.network.dynamics import LatentDynamics
-from vjepa2_ac.model.network.predictor_network import KeyValueCache
+from vjepa2_ac.model.network.predictor_network import KeyValueCache, LatentDynamics
 from vjepa2_ac.registry import LOSSES
 
 Distance = Callable[[Tensor, Tensor], Tensor]  # of predicted and true latents, number by number

@@ -28,8 +28,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.lora import add_adapter, trainable_report
 from vjepa2_ac.model.adapter.low_rank import CastMatrices
 from vjepa2_ac.model.checkpoints.loading import base_sizes, load_base
-from vjepa2_ac.model.network.input_heads import fit_heads, heads_to_replace, require_trained
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.network.world_model import WorldModel, fit_heads, heads_to_replace, require_trained
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import RunState
 from vjepa2_ac.runs.folder import with_stride

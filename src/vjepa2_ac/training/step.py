@@ -233,7 +233,7 @@ class ClipRecorder:
         """
         clips = [(batch, row, loss) for batch, loss in self._kept for row in range(len(batch.starts))]
         clips.sort(key=lambda clip: (_is_finite(*clip[:2]), bool(torch.isfinite(clip[2]))))
-        from vjepa2_ac.media.image_file import encode_png
+        from vjepa2_ac.media.images import encode_png
 
         try:
             for number, (batch, row, _) in enumerate(clips[:MOST_CLIPS]):

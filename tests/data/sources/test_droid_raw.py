@@ -17,7 +17,7 @@ from synthetic import draw_frame, synthetic_states
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.droid_raw.source import RawDroidSource
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media import video_reader
+from vjepa2_ac.media import video as video_reader
 
 STEPS, SIZE = 24, (72, 128)
 LEFT, RIGHT, WRIST = "23404442", "29838012", "16787047"

@@ -28,7 +28,7 @@ def test_without_its_decoder_no_episode_is_offered_for_exclusion(
 ) -> None:
     dataset = dataset_of(write_v21(tmp_path / "set", [recorded(0, 20)]))
     monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(UnreachableError, match="PyAV, which decodes video, is not installed") as raised:
+    with pytest.raises(UnreachableError, match="PyAV, which decodes and writes video, is not installed") as raised:
         clip_at(dataset, 0, 0)
     assert "pip install" in raised.value.fix
     assert "exclude" not in str(raised.value)
@@ -40,3 +40,12 @@ def test_without_its_reader_no_episode_is_called_broken(tmp_path: Path, monkeypa
     with pytest.raises(UnreachableError, match="pyarrow, which reads LeRobot data sets, is not installed") as raised:
         dataset_of(folder)
     assert "broken" not in str(raised.value)
+
+
+def test_without_its_decoder_a_set_of_videos_is_not_indexed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Or the states of a hundred thousand episodes would be read before the first frame is missed."""
+    folder, told = write_v21(tmp_path / "set", [recorded(0, 20)]), []
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(UnreachableError, match=r"PyAV, which decodes and writes video, is not installed.*pip install"):
+        dataset_of(folder, lambda *done: told.append(done))
+    assert told == []

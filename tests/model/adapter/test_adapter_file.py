@@ -6,13 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from peft import LoraConfig
 from pydantic import ValidationError
 
 from vjepa2_ac.config import AdapterConfig
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.adapter.adapter_folder import ADAPTER_FILE, CARD, read_adapter_file
-from vjepa2_ac.model.adapter.lora import add_adapter, load_trained, save_trained
+from vjepa2_ac.model.adapter.adapter_folder import ADAPTER_FILE, CARD, load_trained, save_trained
+from vjepa2_ac.model.adapter.lora import add_adapter, knobs_of
 from vjepa2_ac.model.network.world_model import WorldModel
 
 Fresh = Callable[..., WorldModel]
@@ -43,7 +42,7 @@ def rewrite(folder: Path, changes: dict[str, Any], file: str = ADAPTER_FILE) -> 
 
 
 def test_what_this_program_writes_names_its_layers_and_holds_no_pattern_of_the_users(folder: Path) -> None:
-    read = read_adapter_file(folder, LoraConfig().to_dict())
+    read = knobs_of(json.loads((folder / ADAPTER_FILE).read_text()), where="it")
     ranks = {f"blocks.{index}.mlp.fc1": 6 for index in range(2)}
     resolved = {"rank_pattern": ranks, "alpha_pattern": {"blocks.0.mlp.fc1": 3.5}}
     assert read == KNOBS.model_copy(update={"targets": ("fc1", "q"), "peft": resolved})
@@ -52,29 +51,21 @@ def test_what_this_program_writes_names_its_layers_and_holds_no_pattern_of_the_u
 @pytest.mark.parametrize(
     ("changes", "complaint"),
     [
-        ({"target_modules": "(.*)*(a+)+$"}, "target_modules: Input should be a list"),
-        ({"target_modules": ["q", 3]}, "target_modules.1: Input should be a valid string"),
+        ({"target_modules": "(.*)*(a+)+$"}, "targets: Input should be a list"),
         ({"target_modules": ["(a+)+$"]}, "matches no layer of the predictor"),
         ({"target_modules": []}, "no target"),
-        ({"target_modules": None}, "no targets"),
+        ({"target_modules": None}, "'target_modules' None"),
         ({"rank_pattern": {"(a+)+$": 4}}, "'rank_pattern'"),
         ({"alpha_pattern": {"(a|a)*": 4}}, "'alpha_pattern'"),
         ({"rank_pattern": {"fc1": 2**40}}, "'rank_pattern'"),
-        ({"rank_pattern": {"fc1": True}}, "'rank_pattern'"),
-        ({"alpha_pattern": {"fc1": 1e300}}, "'alpha_pattern'"),
-        ({"r": "8"}, "r: Input should be a valid integer"),
-        ({"r": 10**9}, "r: Input should be less than or equal to 1024"),
+        ({"r": 10**9}, "rank: Input should be less than or equal to 1024"),
         ({"lora_alpha": float("nan")}, "adapter_config.json"),
-        ({"lora_alpha": 1e300}, "lora_alpha: Input should be less than"),
-        ({"lora_dropout": 1.5}, "lora_dropout: Input should be less than 1"),
-        ({"use_dora": "yes"}, "use_dora: Input should be a valid boolean"),
+        ({"lora_alpha": 1e300}, "alpha: Input should be less than"),
         ({"init_lora_weights": "pissa"}, "peft.init_lora_weights 'pissa' changes the base"),
         ({"modules_to_save": ["blocks"]}, "modules_to_save.0: Input should be 'predictor_embed'"),
-        ({"peft_type": "IA3"}, "an adapter with peft_type 'IA3'. needed: peft_type LORA"),
+        ({"peft_type": "IA3"}, "an adapter with 'peft_type' 'IA3'"),
         ({"bias": "all"}, "an adapter with 'bias' 'all'"),
-        ({"layer_replication": [[0, 4], [2, 5]]}, "'layer_replication'"),
         ({"exclude_modules": "(a+)+"}, "'exclude_modules'"),
-        ({"trainable_token_indices": 3}, "'trainable_token_indices'"),
         ({"use_of_the_future": 1}, "'use_of_the_future'"),
     ],
 )
@@ -114,10 +105,8 @@ def test_an_option_that_is_a_knob_is_called_so() -> None:
     ("changes", "complaint"),
     [
         ({"kind": ["lora"]}, "kind: Input should be 'lora' or 'none'"),
-        ({"base_predictor": 3}, "base_predictor: Input should be a valid string"),
         ({"encoder": None}, "encoder: Input should be a valid string"),
         ({"fresh_heads": {"state_dim": 10**9, "action_dim": 7, "seed": 0}}, "fresh_heads.state_dim: "),
-        ({"fresh_heads": [1]}, "fresh_heads: "),
         ({"fresh_heads": {"state_dim": 8}}, "fresh_heads.action_dim: missing"),
         ({"more": 1}, "more: unknown"),
     ],

@@ -18,9 +18,8 @@ from hub import serve_hub
 from paths import GOLDEN
 from vjepa2_ac.config import EncoderSizes, ModelConfig
 from vjepa2_ac.errors import InputError, RefusedError, UnreachableError
-from vjepa2_ac.model.base_model import find_base
+from vjepa2_ac.model.base_model import beyond_tensors, find_base, identified
 from vjepa2_ac.model.checkpoints.loading import load_base, load_official, to_official
-from vjepa2_ac.model.network.encoder_origin import beyond_tensors, identified
 from vjepa2_ac.model.network.world_model import WorldModel, fingerprint
 
 FILES = GOLDEN / "encoders"
@@ -72,16 +71,6 @@ def test_the_image_path_equals_the_official_one_at_every_size() -> None:
     for size in (96, 80, 256):
         model = model_of(V21, size, frame="image")
         assert_equal_to_rounding(model.present_encoder(io[f"frames.{size}"]), io[f"image.{size}"])
-
-
-@pytest.mark.parametrize("frame", ["tubelet", "image"])
-def test_a_video_equals_the_official_one(golden: Golden, frame: str) -> None:
-    size = golden.facts["video_px"]
-    if frame == "image" and not golden.is_newer:
-        return
-    video = golden.io[f"video.{size}"].transpose(1, 2)
-    found = model_of(golden.path, size, frame=frame).present_encoder.encode_videos(video)
-    assert_equal_to_rounding(found, golden.io[f"video_features.{size}"])
 
 
 def test_another_key_is_another_encoder(golden: Golden) -> None:
@@ -147,13 +136,9 @@ def write_transformers(folder: Path, named: Named = as_plain, shards: int = 1, *
     if shards == 1:
         save_file(weights, folder / "model.safetensors", metadata={"format": "pt"})
         return folder
-    index = {}
     for shard in range(shards):
-        file = f"model-{shard + 1:05}-of-{shards:05}.safetensors"
         own = dict(list(weights.items())[shard::shards])
-        save_file(own, folder / file, metadata={"format": "pt"})
-        index |= dict.fromkeys(own, file)
-    (folder / "model.safetensors.index.json").write_text(json.dumps({"metadata": {}, "weight_map": index}))
+        save_file(own, folder / f"model-{shard + 1:05}-of-{shards:05}.safetensors", metadata={"format": "pt"})
     return folder
 
 
@@ -186,7 +171,7 @@ def test_the_same_from_the_hub_and_then_without_a_network(tmp_path: Path, monkey
         model = model_of("hf://facebook/tiny")
         assert model.encoder_fingerprint() == model_of(V2).encoder_fingerprint()
         assert str(model.encoder_origin) == "hf://facebook/tiny"
-        for wrong, said in (("facebook/none", "no such model"), ("facebook/tiny@v9", "no such revision")):
+        for wrong, said in (("facebook/none", "no such model"), ("facebook/tiny@v9", "no such model or revision")):
             with pytest.raises(RefusedError, match=said):
                 model_of(f"hf://{wrong}")
     again = model_of("hf://facebook/tiny")  # out of the cache
@@ -282,9 +267,9 @@ def only_predictor(whole: dict[str, Any]) -> dict[str, Any]:
         (without_a_block, r"12 tensors do not fit \(missing: blocks\.7\."),
         (not_finite, r"blocks\.3|layer\.3\.mlp\.fc1\.weight holds NaN or infinity"),
         (only_predictor, r"no encoder \(keys: predictor\).*download --list"),
-        (lambda _: [1], "a list. needed: an encoder of V-JEPA 2 or 2.1"),
+        (lambda _: [1], "a list. needed: a checkpoint of V-JEPA 2, 2.1"),
         (lambda _: {"encoder": {"a": 1}}, "no weights under 'encoder'"),
-        (lambda _: {"encoder": {"a": torch.zeros(1)}}, "no tensor 'patch_embed.proj.weight'"),
+        (lambda _: {"encoder": {"a": torch.zeros(1)}}, "no tensor 'patch_embed.proj.weight' in encoder"),
     ],
 )
 def test_a_file_that_is_not_a_whole_encoder_is_refused(rewritten, change: Any, message: str) -> None:
@@ -329,20 +314,14 @@ def test_a_transformers_folder_that_says_something_else_is_refused(
         model_of(folder)
 
 
-def test_a_folder_that_is_damaged_or_hostile_is_refused(tmp_path: Path) -> None:
+def test_a_folder_that_is_damaged_is_refused(tmp_path: Path) -> None:
     folder = write_transformers(tmp_path / "hf", shards=2)
-    index = folder / "model.safetensors.index.json"
-    told = index.read_text()
-    index.write_text(told.replace("model-00001", "../model-00001"))
-    with pytest.raises(InputError, match="no list of files beside it"):
-        model_of(folder)
-    index.write_text(told)
     shard = folder / "model-00002-of-00002.safetensors"
     shard.write_bytes(shard.read_bytes()[:2000])
     with pytest.raises(InputError, match="not a whole safetensors file"):
         model_of(folder)
     shard.unlink()
-    with pytest.raises(InputError, match="no such file"):
+    with pytest.raises(InputError, match=r"tensors do not fit \(missing: "):
         model_of(folder)
     with pytest.raises(InputError, match="Leave it out"):
         model_of(folder, key="encoder")

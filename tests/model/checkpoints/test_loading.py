@@ -1,14 +1,20 @@
-"""`model.base`: found, or reported missing with a fix."""
+"""`model.base`: found, or reported missing with a fix; and a predictor without states in Meta's layout."""
 
+import logging
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
 from safetensors.torch import load_file, save_file
 
+from paths import GOLDEN
+from predictor_files import write_predictor_file
+from tiny_models import draw, tiny_model
 from vjepa2_ac.config import EncoderSizes, ModelConfig, ModelSizes, PredictorSizes
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model import base_model
-from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.checkpoints.loading import load_base, load_official
 from vjepa2_ac.model.network.pretrained_folder import ENCODER, PREDICTOR
 from vjepa2_ac.model.network.world_model import WorldModel
 
@@ -55,7 +61,7 @@ def test_sizes_that_a_folder_has_and_defaults_are_fine(model: WorldModel, tmp_pa
 
 
 def test_a_folder_that_is_no_model_gives_the_command_that_makes_one_of_a_run(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"config\.json: no such file.*`vjepa2-ac export RUN FOLDER` makes one"):
+    with pytest.raises(InputError, match=r"config\.json: cannot be read: No such.*`vjepa2-ac export RUN FOLDER`"):
         load_with(tmp_path, ModelSizes())
 
 
@@ -69,3 +75,85 @@ def test_a_weight_that_is_not_finite_is_named(model: WorldModel, tmp_path: Path,
     save_file(weights, tmp_path / part)
     with pytest.raises(InputError, match=rf"{part}: {name} holds NaN or infinity"):
         load_with(tmp_path, ModelSizes())
+
+
+MODEL = tiny_model(states=False)
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return write_predictor_file(tmp_path / "vjepa2_ac_droid.pth.tar", MODEL)
+
+
+@pytest.fixture
+def encoder(tmp_path: Path) -> Path:
+    MODEL.save_pretrained(tmp_path / "encoder")
+    return tmp_path / "encoder"
+
+
+def loaded(file: Path, encoder: Path, **settings: Any) -> WorldModel:
+    sizes = {"image_size": 48, "predictor": {"width": 36, "heads": 3}}  # as tensors do not show
+    config = {"base": str(file), "encoder": {"path": str(encoder)}, "sizes": sizes, "dtype": "float32", **settings}
+    return load_base(ModelConfig.model_validate(config), seed=0)
+
+
+def test_it_predicts_as_the_model_that_was_written_and_its_licence_is_told_once(
+    file: Path, encoder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.WARNING):
+        model = loaded(file, encoder)
+    assert model.sizes == MODEL.sizes
+    given = draw(1, 3, 9, 24), draw(1, 3, 7), draw(1, 3, 7)
+    with torch.no_grad():
+        assert torch.equal(model.predict(*given), MODEL.predict(*given))
+        frames = draw(1, 2, 3, 48, 48)
+        assert torch.equal(model.encode(frames), MODEL.encode(frames))
+    licence, unknown = (record.getMessage() for record in caplog.records)
+    assert licence.startswith(f"{file}: a predictor without states and without an encoder. ")
+    assert "CC-BY-NC 4.0: for non-commercial use only" in licence
+    assert f"{file} does not say which encoder its predictor was trained on" in unknown
+
+
+def test_what_does_not_fit_is_refused(file: Path, encoder: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"predictor\.use_extrinsics|predictor: 2 tensors do not fit"):
+        loaded(file, encoder, sizes={"image_size": 48, "predictor": {"width": 36, "heads": 3, "use_extrinsics": True}})
+    with pytest.raises(InputError, match=r"no encoder \(keys: predictor, opt, scaler, epoch\)"):
+        load_official(file, MODEL.sizes)
+    wider = WorldModel.random(
+        ModelSizes(
+            image_size=48,
+            encoder=EncoderSizes(width=48, depth=1, heads=2, mlp_ratio=2.0),
+            predictor=PredictorSizes(width=36, depth=1, heads=3),
+        ),
+        seed=0,
+    )
+    wider.save_pretrained(tmp_path / "wider")
+    with pytest.raises(InputError, match=r"predictor_embed.weight is \[36, 24\], not \[36, 48\].*model.encoder"):
+        loaded(file, tmp_path / "wider")
+    with pytest.raises(InputError, match=r"an encoder of its own, and model.encoder names another"):
+        loaded(tmp_path / "wider", encoder)
+    with pytest.raises(InputError, match=r"an encoder of its own, and model.encoder names another"):
+        loaded(GOLDEN / "model" / "tiny.pt", encoder)
+    whole = torch.load(file, weights_only=True)
+    whole["predictor"]["module.predictor_proj.bias"][0] = float("nan")
+    torch.save(whole, file)
+    with pytest.raises(InputError, match=r"predictor_proj\.bias holds NaN"):
+        loaded(file, encoder)
+
+
+def test_beside_an_encoder_it_is_read_whole_and_no_licence_is_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    whole = torch.load(GOLDEN / "model" / "tiny.pt", weights_only=True)
+    for name in [name for name in whole["predictor"] if "state_encoder" in name or "extrinsics_encoder" in name]:
+        del whole["predictor"][name]
+    torch.save(whole, tmp_path / "whole.pt")
+    sizes = ModelSizes(image_size=64, encoder=EncoderSizes(heads=2), predictor=PredictorSizes(heads=4))
+    with caplog.at_level(logging.WARNING):
+        model = load_official(tmp_path / "whole.pt", sizes)
+    assert not model.sizes.predictor.use_states
+    assert not caplog.records
+    assert load_official(tmp_path / "whole.pt", model.sizes).sizes == model.sizes
+    other = sizes.model_copy(update={"predictor": sizes.predictor.model_copy(update={"use_states": False})})
+    with pytest.raises(InputError, match=r"predictor\.use_states True\. needed: predictor\.use_states False"):
+        load_official(GOLDEN / "model" / "tiny.pt", other)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import pytest
 import torch
-from safetensors.torch import load_file, save
+from safetensors.torch import load_file
 from torch import Tensor
 
 from paths import GOLDEN
@@ -184,9 +184,9 @@ def other_actions(whole: Whole) -> None:
         (drop_head, r"predictor: 1 tensors do not fit \(missing: state_encoder.weight\)"),
         (drop_predictor, "no weights under 'predictor'"),
         (narrow, r"predictor_proj.weight is \[24, 64\], not \[48, 64\]"),
-        (other_actions, "action_encoder.weight of 4 columns. needed: 7"),
-        (lambda _: [1, 2], "changed.pt: a list. needed: a checkpoint of V-JEPA 2-AC"),
-        (lambda whole: {"model": whole["encoder"]}, r"no weights under 'encoder' \(keys: model\)"),
+        (other_actions, r"action_encoder.weight is \[64, 4\], not \[64, 7\]"),
+        (lambda _: [1, 2], "changed.pt: a list. needed: a checkpoint of V-JEPA"),
+        (lambda whole: {"model": whole["encoder"]}, r"no encoder \(keys: model\)"),
     ],
 )
 def test_a_checkpoint_that_does_not_fit_is_explained(rewritten, change: Callable[[Whole], Any], message: str) -> None:
@@ -212,7 +212,7 @@ def test_sizes_that_contradict_the_tensors_are_refused(sizes: ModelSizes, messag
 def test_a_truncated_and_a_missing_file_are_refused(tmp_path: Path) -> None:
     whole = (GOLDEN / "model" / "tiny.pt").read_bytes()
     (tmp_path / "cut.pt").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(InputError, match=r"cut\.pt: 0.00 GB that torch cannot read .*truncated.* 11.7 GB"):
+    with pytest.raises(InputError, match=r"cut\.pt: 0.00 GB, beginning with b.PK.*truncated"):
         load_official(tmp_path / "cut.pt", TINY_SIZES)
     with pytest.raises(InputError, match=r"none\.pt: no such file"):
         load_official(tmp_path / "none.pt", TINY_SIZES)
@@ -238,27 +238,23 @@ def in_the_new_format(value: object) -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "said"),
+    ("content", "said"),
     [
-        ("a.pt", b"hello", "no file of torch.save"),
-        ("a.pt", b"", "no file of torch.save"),
-        ("a.pt", b"version https://git-lfs.github.com/spec/v1\noid", "a pointer of Git LFS"),
-        ("a.pt", b"<!DOCTYPE html><html>not found</html>", "a web page"),
-        ("a.pt", save({"weight": torch.zeros(1)}), "a safetensors file"),
-        ("a.pt", pickle.dumps({"encoder": Hostile()}), r"a pickle, .*neither is loaded, for it could run foreign code"),
-        ("a.pt", in_the_new_format({"encoder": Hostile()}), r"would call posix\.mkdir: it was refused"),
-        ("a.pt", in_the_old_format({"encoder": Hostile()}), r"a pickle, .*neither is loaded"),
-        ("a.pt", in_the_old_format({"encoder": {"weight": torch.zeros(1)}}), "a file of an old version of torch"),
+        (b"", "beginning with b''"),
+        (b"version https://git-lfs.github.com/spec/v1\noid", "beginning with b'version https://git-lfs"),
+        (b"<!DOCTYPE html><html>not found</html>", "beginning with b'<!DOCTYPE html>"),
+        (pickle.dumps({"encoder": Hostile()}), "that torch cannot read"),
+        (in_the_new_format({"encoder": Hostile()}), r"would call posix\.mkdir: it was refused"),
+        (in_the_old_format({"encoder": Hostile()}), "that torch cannot read"),
     ],
 )
-def test_a_file_that_is_no_checkpoint_is_called_what_it_is_and_never_executed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, content: bytes, said: str
+def test_a_file_that_is_no_checkpoint_shows_how_it_begins_and_is_never_executed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: bytes, said: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    Path(name).write_bytes(content)
-    with pytest.raises(InputError, match=said) as caught:
-        load_official(name, TINY_SIZES)
-    assert "truncated" not in str(caught.value)
+    Path("a.pt").write_bytes(content)
+    with pytest.raises(InputError, match=said):
+        load_official("a.pt", TINY_SIZES)
     assert not Path("it-was-executed").exists()
 
 

@@ -1,11 +1,22 @@
-"""The published checkpoints: their names cannot be mistaken for one another, and other spellings are understood."""
+"""The published checkpoints: their names cannot be mistaken; a file arrives whole, or not at all."""
+
+import re
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 
 import pytest
 
+from vjepa2_ac import storage
+from vjepa2_ac.cli import main
 from vjepa2_ac.console.progress import PlainConsole
 from vjepa2_ac.console.setup import published_table
-from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.checkpoints.published import PUBLISHED, find_published, published_as
+from vjepa2_ac.errors import InputError, UnreachableError
+from vjepa2_ac.model.checkpoints import published
+from vjepa2_ac.model.checkpoints.published import PUBLISHED, VIT_B, Published, download, find_published, published_as
+from vjepa2_ac.storage.retries import RetryPolicy
 
 
 def test_files_do_not_collide_on_a_disk_that_is_blind_to_case() -> None:
@@ -15,7 +26,7 @@ def test_files_do_not_collide_on_a_disk_that_is_blind_to_case() -> None:
 
 def test_every_name_of_a_file_leads_to_it() -> None:
     for one in PUBLISHED:
-        for name in (one.name, one.file, one.remote, one.remote.removesuffix(".pt"), *one.aliases):
+        for name in (one.name, one.file, one.remote, one.remote.removesuffix(".pt"), one.hub_name):
             assert find_published(name) is one
         assert one in {published_as(one.file), published_as(one.remote)}
 
@@ -63,3 +74,233 @@ def test_the_table_names_every_checkpoint_whole(width: int, capsys: pytest.Captu
     for one in PUBLISHED:
         assert sum(f" {one.name} " in line for line in lines) == 1
     assert all(len(line) <= width for line in lines)
+
+
+CONTENT = bytes(range(256)) * 400
+MADE_UP = Published(
+    "made-up", "elsewhere.pt", "encoder", "v2.1", VIT_B, 384, "ema_encoder", "made_up_hub", 0.0001,
+    bytes=102_400, licence="of the test",
+)  # fmt: skip
+twice, at_once = RetryPolicy(attempts=2, first_wait_s=0.0), RetryPolicy(first_wait_s=0.0)
+PART = "made-up.pt.made-up.part"
+
+
+class Told:
+    """Keeps what is told of the progress."""
+
+    def __init__(self) -> None:
+        self.lines: list[tuple[str, int, int]] = []
+
+    def note(self, text: str) -> None: ...
+
+    def task(self, title: str, unit: str = "") -> Callable[[int, int], None]:  # noqa: ARG002
+        return lambda done, total: self.lines.append((title, done, total))
+
+
+@dataclass
+class Behaviour:
+    """What the server does: how many bytes it sends before it hangs up, which answers come first, what it can."""
+
+    content: bytes = CONTENT
+    cut_after: list[int] = field(default_factory=list)
+    answers: list[int] = field(default_factory=list)
+    resumes: bool = True
+    says_size: bool = True
+    seen: list[int] = field(default_factory=list)  # where each request started
+
+
+@pytest.fixture
+def serve() -> Iterator[Callable[[Behaviour], str]]:
+    servers: list[ThreadingHTTPServer] = []
+
+    def start(behaviour: Behaviour) -> str:
+        server = ThreadingHTTPServer(("127.0.0.1", 0), handler_for(behaviour))
+        servers.append(server)
+        threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
+        return f"http://127.0.0.1:{server.server_port}/model.pt"
+
+    yield start
+    for server in servers:
+        server.shutdown()
+        server.server_close()
+
+
+def handler_for(behaviour: Behaviour) -> type[BaseHTTPRequestHandler]:
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            match = re.fullmatch(r"bytes=(\d+)-", self.headers.get("Range", ""))
+            start = int(match[1]) if match and behaviour.resumes else 0
+            behaviour.seen.append(start)
+            if behaviour.answers:
+                self.send_error(behaviour.answers.pop(0))
+                return
+            size = len(behaviour.content)
+            if start >= size:
+                self.send_response(416)
+                self.send_header("Content-Range", f"bytes */{size}")
+                self.end_headers()
+                return
+            self.send_response(206 if start else 200)
+            if start:
+                self.send_header("Content-Range", f"bytes {start}-{size - 1}/{size}")
+            if behaviour.says_size:
+                self.send_header("Content-Length", str(size - start))
+            self.end_headers()
+            end = start + behaviour.cut_after.pop(0) if behaviour.cut_after else size
+            self.wfile.write(behaviour.content[start:end])
+
+        def log_message(self, *_: object) -> None: ...
+
+    return Handler
+
+
+def test_a_file_arrives_whole_and_progress_is_told(serve, tmp_path: Path) -> None:
+    content = bytes(range(256)) * 2**13
+    told = Told()
+    path = download(serve(Behaviour(content=content)), tmp_path / "new" / "model.pt", reporter=told)
+    assert path.read_bytes() == content
+    assert told.lines[-1] == ("model.pt (MB)", 2, 2)
+    assert [entry.name for entry in path.parent.iterdir()] == ["model.pt"]
+
+
+@pytest.mark.parametrize(
+    ("part", "behaviour", "seen"),
+    [
+        (b"", Behaviour(cut_after=[1000, 5000]), [0, 1000, 6000]),
+        (CONTENT, Behaviour(), None),
+        (CONTENT + b"more", Behaviour(), None),
+        (b"", Behaviour(cut_after=[1000], resumes=False), [0, 0]),
+        (b"", Behaviour(answers=[503, 503]), None),
+    ],
+    ids=["resumed where it broke", "whole part", "longer part", "a server that cannot resume", "a busy server"],
+)
+def test_it_arrives_however_often_the_line_breaks(serve, tmp_path: Path, part, behaviour, seen) -> None:
+    if part:
+        (tmp_path / "model.pt.part").write_bytes(part)
+    assert download(serve(behaviour), tmp_path / "model.pt", policy=at_once).read_bytes() == CONTENT
+    assert seen in (None, behaviour.seen)
+
+
+def test_a_part_from_an_earlier_call_is_gone_on_with(serve, tmp_path: Path) -> None:
+    behaviour = Behaviour(cut_after=[1000, 0, 0])
+    url = serve(behaviour)
+    with pytest.raises(UnreachableError, match=r"not reached in 2 attempts.*1000 bytes are in .*model\.pt\.part"):
+        download(url, tmp_path / "model.pt", policy=twice)
+    assert not (tmp_path / "model.pt").exists()
+    assert download(url, tmp_path / "model.pt").read_bytes() == CONTENT
+    assert behaviour.seen == [0, 1000, 1000, 1000]
+
+
+def test_a_refusal_is_final_and_no_network_is_said(serve, tmp_path: Path) -> None:
+    behaviour = Behaviour(answers=[404])
+    with pytest.raises(UnreachableError, match=r"cannot be read \(HTTP 404: .*Not Found"):
+        download(serve(behaviour), tmp_path / "model.pt", policy=at_once)
+    assert behaviour.seen == [0]
+    with pytest.raises(UnreachableError, match=r"not reached in 2 attempts.*refused.* Check the network"):
+        download("http://127.0.0.1:9/model.pt", tmp_path / "model.pt", policy=twice)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_that_is_here_is_not_fetched_again(serve, tmp_path: Path) -> None:
+    (tmp_path / "model.pt").write_bytes(b"mine")
+    behaviour = Behaviour()
+    assert download(serve(behaviour), tmp_path / "model.pt").read_bytes() == b"mine"
+    assert behaviour.seen == []
+
+
+def test_a_file_whose_size_is_not_said_is_refused(serve, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"needed: its size \(Content-Length\)"):
+        download(serve(Behaviour(says_size=False)), tmp_path / "model.pt")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_less_than_the_published_file_is_not_taken_for_it(serve, tmp_path: Path) -> None:
+    part = tmp_path / PART
+    part.write_bytes(CONTENT[:1000])
+    url = serve(Behaviour(content=b"please wait", resumes=False))
+    with pytest.raises(InputError, match=r"a file of 11 bytes\. needed: made-up, of 102,400 to 102,400 bytes.*proxy"):
+        download(url, tmp_path / "made-up.pt", known=MADE_UP)
+    assert part.read_bytes() == CONTENT[:1000]  # hours of a good line are not thrown away
+    assert download(serve(Behaviour()), tmp_path / "made-up.pt", known=MADE_UP).read_bytes() == CONTENT
+
+
+def test_a_size_that_is_estimated_is_a_range(serve, tmp_path: Path) -> None:
+    estimated = replace(MADE_UP, bytes=None, gigabytes=len(CONTENT) / 1.2e9)
+    assert download(serve(Behaviour()), tmp_path / "a.pt", known=estimated).read_bytes() == CONTENT
+    for wrong in (0.5e9, 2e9):
+        other = replace(estimated, gigabytes=len(CONTENT) / wrong)
+        with pytest.raises(InputError, match=r"a file of 102,400 bytes\. needed: made-up, of [\d,]+ to [\d,]+ bytes"):
+            download(serve(Behaviour()), tmp_path / "b.pt", known=other)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["a.pt"]
+
+
+def test_a_file_that_is_here_and_cannot_be_the_published_one_is_named(serve, tmp_path: Path) -> None:
+    behaviour = Behaviour()
+    path, url = tmp_path / "made-up.pt", serve(behaviour)
+    path.write_bytes(b"<html>")
+    with pytest.raises(InputError, match=r"made-up\.pt: a file of 6 bytes.*or name another with --to"):
+        download(url, path, known=MADE_UP)
+    with pytest.raises(InputError, match=r"a folder\. needed: the name of a file"):
+        download(url, tmp_path, known=MADE_UP)
+    assert behaviour.seen == []
+
+
+def test_a_part_of_another_checkpoint_is_not_gone_on_with(serve, tmp_path: Path) -> None:
+    path, other = tmp_path / "model.pt", replace(MADE_UP, name="other")
+    behaviour = Behaviour(content=CONTENT[::-1], cut_after=[1000, 0, 0])
+    with pytest.raises(UnreachableError):
+        download(serve(behaviour), path, known=other, policy=twice)
+    assert download(serve(Behaviour()), path, known=MADE_UP).read_bytes() == CONTENT
+
+
+@pytest.mark.parametrize(("free", "fits"), [(101_400, True), (101_399, False)])
+def test_disk_space_for_the_rest_is_checked_before_the_first_byte(
+    serve, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, free: int, fits: bool
+) -> None:
+    monkeypatch.setattr(storage, "free_bytes", lambda _: free)
+    part = tmp_path / PART
+    part.write_bytes(CONTENT[:1000])
+    if fits:
+        assert download(serve(Behaviour()), tmp_path / "made-up.pt", known=MADE_UP).read_bytes() == CONTENT
+        return
+    with pytest.raises(InputError, match=r"GB free on its disk\. needed: 0\.0001024 GB.*--to"):
+        download(serve(Behaviour()), tmp_path / "made-up.pt", known=MADE_UP)
+    assert part.read_bytes() == CONTENT[:1000]
+
+
+def test_the_command_says_what_the_file_is_and_which_knob_takes_it(
+    serve, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(published, "PUBLISHED", (MADE_UP,))
+    monkeypatch.chdir(tmp_path)
+    assert main(["download", "made_up", "--url", serve(Behaviour())]) == 0
+    shown = capsys.readouterr().out
+    assert "made-up: encoder" in shown
+    assert "102,400 bytes, licence of the test" in shown
+    assert shown.endswith("model.encoder.path: checkpoints/made-up.pt\n")
+    assert Path("checkpoints", MADE_UP.file).read_bytes() == CONTENT
+
+
+@pytest.mark.parametrize("url", ["foo.pt", "file:///etc/passwd", "http://[", "http://a:b/", "http://a b/"])
+def test_what_is_no_address_is_told_at_once(tmp_path: Path, url: str) -> None:
+    with pytest.raises(InputError, match=r"not an address.*https://"):
+        download(url, tmp_path / "model.pt")
+
+
+@pytest.mark.parametrize("place", ["file/model.pt", "folder.part"])
+def test_a_path_that_cannot_be_written_is_told_at_once(serve, tmp_path: Path, place: str) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "folder.part").mkdir()
+    behaviour = Behaviour()
+    with pytest.raises(InputError, match=rf"{place}: cannot be written"):
+        download(serve(behaviour), tmp_path / place.removesuffix(".part"))
+    assert len(behaviour.seen) <= 1
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a disk that is always full")
+def test_a_full_disk_is_told_and_not_tried_again(serve, tmp_path: Path) -> None:
+    (tmp_path / "model.pt.part").symlink_to("/dev/full")
+    behaviour = Behaviour()
+    with pytest.raises(InputError, match=r"model\.pt\.part: cannot be written: No space left.*Free some space"):
+        download(serve(behaviour), tmp_path / "model.pt")
+    assert behaviour.seen == [0]

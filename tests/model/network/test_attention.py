@@ -1,3 +1,7 @@
+"""Rotary positions, and every way of block-causal attention."""
+
+import math
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -10,9 +14,95 @@ from torch.utils.checkpoint import checkpoint
 from tracing import tracing
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network import attention
-from vjepa2_ac.model.network.attention import AttentionKind, best_kind, block_causal_attention
+from vjepa2_ac.model.network.attention import (
+    AttentionKind,
+    TokenLayout,
+    best_kind,
+    block_causal_attention,
+    rotary_tables,
+    rotate,
+)
 from vjepa2_ac.model.network.blocks import Block
-from vjepa2_ac.model.network.rotary import TokenLayout, rotary_tables
+
+CPU = torch.device("cpu")
+
+
+def rotated_by_hand(x: list[float], places: tuple[int, int, int]) -> list[float]:
+    """The rule of FACTS 1, one number at a time: three equal parts, neighbours are pairs, frequencies are tiled."""
+    part = 2 * ((len(x) // 3) // 2)
+    half = part // 2
+    out = list(x)
+    for axis, place in enumerate(places):
+        for index in range(part):
+            angle = place * 10000 ** (-(index % half) / half)
+            at = axis * part + index
+            partner = x[at + 1] if index % 2 == 0 else x[at - 1]
+            sign = -1 if index % 2 == 0 else 1
+            out[at] = x[at] * math.cos(angle) + sign * partner * math.sin(angle)
+    return out
+
+
+@pytest.mark.parametrize("head_dim", [12, 16, 64])
+def test_each_token_is_turned_by_its_time_row_and_column(head_dim: int) -> None:
+    layout = TokenLayout(steps=3, grid=2, conditioning=2)
+    x = torch.randn(1, layout.steps * layout.tokens_per_step, 1, head_dim, generator=torch.Generator().manual_seed(0))
+    turned = rotate(x, rotary_tables(layout, head_dim, CPU))
+    places = [
+        (time, *place) for time in range(3) for place in [(0, 0), (0, 0), (0, 0), (0, 1), (1, 0), (1, 1)]
+    ]  # two conditioning tokens have only a time
+    for token, place in enumerate(places):
+        expected = torch.tensor(rotated_by_hand(x[0, token, 0].tolist(), place))
+        torch.testing.assert_close(turned[0, token, 0], expected, rtol=1e-5, atol=1e-6)
+
+
+def test_a_later_start_is_the_rest_of_a_longer_sequence() -> None:
+    whole, rest = rotary_tables(TokenLayout(4, 3, 2), 12, CPU), rotary_tables(TokenLayout(3, 3, 2, start=1), 12, CPU)
+    for longer, later in zip(whole, rest, strict=True):
+        torch.testing.assert_close(later, longer[11:])
+
+
+def test_tables_made_in_inference_mode_can_be_trained_with() -> None:
+    with torch.inference_mode():
+        tables = rotary_tables(TokenLayout(2, 5, 1), 12, CPU)
+    x = torch.ones(1, 52, 1, 12, requires_grad=True)
+    rotate(x, tables).sum().backward()
+    assert x.grad is not None
+
+
+def test_bfloat16_loses_nothing_but_the_rounding_of_its_result() -> None:
+    layout = TokenLayout(steps=16, grid=16)
+    x = torch.randn(1, 16 * 16**2, 1, 64, generator=torch.Generator().manual_seed(0)).bfloat16()
+    tables = rotary_tables(layout, 64, CPU)
+    turned = rotate(x, tables)
+    assert turned.dtype == torch.bfloat16
+    assert torch.equal(turned, rotate(x.float(), tables).bfloat16())
+
+
+def test_gradients_are_those_of_differences() -> None:
+    tables = rotary_tables(TokenLayout(2, 2, 1), 14, torch.device("cpu"))
+    tokens = torch.randn(1, 10, 2, 14, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    assert torch.autograd.gradcheck(lambda given: rotate(given, tables), tokens.requires_grad_())
+
+
+@pytest.mark.filterwarnings(*(one.args[0] for one in tracing))
+@pytest.mark.usefixtures("traced")
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_compiled_a_gradient_comes_through(dtype: torch.dtype) -> None:
+    layout = TokenLayout(steps=2, grid=3, conditioning=2)
+    tables = rotary_tables(layout, 12, CPU)
+    drawn = torch.randn(1, 2 * 11, 2, 12, generator=torch.Generator().manual_seed(0)).to(dtype)
+
+    def turned_and_learned(turn: Callable[..., torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+        given = drawn.clone().requires_grad_()
+        turned = turn(given, tables)
+        (of_given,) = torch.autograd.grad(turned.float().square().sum(), given)
+        return turned, of_given
+
+    compiled = torch.compile(lambda given, tables: rotate(given * 1, tables), backend="eager", fullgraph=True)
+    found, expected = turned_and_learned(compiled), turned_and_learned(rotate)
+    assert expected[1].abs().min() > 0
+    torch.testing.assert_close(found, expected)
+
 
 PER_STEP = 5
 REAL_STEP, REAL_STEPS = 66, 7  # 462 tokens: no multiple of a kernel's tiles, and more than short kernels take
@@ -24,28 +114,6 @@ def drawn(dtype: torch.dtype = torch.float32, steps: int = 4, device: str = "cpu
     generator = torch.Generator().manual_seed(0)
     shape = (2, 2, steps * PER_STEP, 16)
     return [torch.randn(shape, generator=generator).to(device, dtype).requires_grad_() for _ in range(3)]
-
-
-def output_and_gradients(kind: AttentionKind, inputs: list[Tensor]) -> list[Tensor]:
-    output = block_causal_attention(*inputs, PER_STEP, kind)
-    weights = torch.randn(output.shape, generator=torch.Generator().manual_seed(1)).to(output)
-    return [output, *torch.autograd.grad((output * weights).sum(), inputs)]
-
-
-@pytest.mark.parametrize("steps", [1, 4])
-@pytest.mark.parametrize("kind", ["per_step", "auto"])
-def test_every_way_gives_the_output_and_gradients_of_the_dense_mask(kind: AttentionKind, steps: int) -> None:
-    inputs = drawn(steps=steps)
-    for found, expected in zip(output_and_gradients(kind, inputs), output_and_gradients("dense", inputs), strict=True):
-        torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
-
-
-@pytest.mark.parametrize("kind", ["per_step", "dense"])
-def test_the_last_steps_alone_see_what_they_see_among_all(kind: AttentionKind) -> None:
-    query, key, value = (x.detach() for x in drawn())
-    whole = block_causal_attention(query, key, value, PER_STEP, "dense")
-    last = block_causal_attention(query[:, :, 2 * PER_STEP :], key, value, PER_STEP, kind)
-    torch.testing.assert_close(last, whole[:, :, 2 * PER_STEP :], rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.filterwarnings("ignore:flex_attention called without torch.compile")  # eager on purpose: no compiler here
@@ -170,9 +238,3 @@ def test_auto_compiles_only_for_long_sequences_with_gradients_on_cuda(monkeypatc
     assert best_kind(cpu, 64, 15, gradients=True) == "per_step"
     monkeypatch.setattr(attention, "has_triton", lambda: False)
     assert best_kind(cuda, 64, 15, gradients=True) == "per_step"
-
-
-def test_a_sequence_of_broken_steps_is_refused() -> None:
-    query = torch.zeros(1, 1, 11, 16)
-    with pytest.raises(ValueError, match="not a whole number of steps"):
-        block_causal_attention(query, query, query, PER_STEP)

@@ -9,12 +9,11 @@ from torch import Tensor
 from vjepa2_ac.config import AdapterConfig, ModelConfig, ModelSizes
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.adapter.lora import add_adapter, load_trained, save_trained
-from vjepa2_ac.model.adapter.merging import base_only, merge_adapter
+from vjepa2_ac.model.adapter.adapter_folder import load_trained, save_trained
+from vjepa2_ac.model.adapter.lora import add_adapter, base_only, merge_adapter
 from vjepa2_ac.model.checkpoints.loading import load_base
-from vjepa2_ac.model.network.input_heads import fit_heads, heads_to_replace, widths_of_model
 from vjepa2_ac.model.network.predictor import ActionConditionedPredictor
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.network.world_model import WorldModel, fit_heads, heads_to_replace, widths_of_model
 
 TINY = ModelSizes.model_validate(
     {
@@ -92,16 +91,6 @@ def test_fresh_heads_are_decided_by_the_seed_and_drawn_as_the_recipe_draws() -> 
         assert not getattr(one.predictor, name).bias.any()
     assert not torch.equal(one.predictor.action_encoder.weight, one.predictor.state_encoder.weight)
     assert torch.equal(fitted(Widths(7, 14)).predictor.action_encoder.weight, one.predictor.action_encoder.weight)
-
-
-def test_heads_are_replaced_once_and_before_adapting() -> None:
-    model = fitted(Widths(14, 14))
-    with pytest.raises(ValueError, match="replaced once"):
-        fit_heads(model, Widths(8, 8), seed=0)
-    adapted = base()
-    add_adapter(adapted, LORA, seed=0)
-    with pytest.raises(ValueError, match="before the model is adapted"):
-        fit_heads(adapted, Widths(8, 8), seed=0)
 
 
 def test_a_fresh_head_that_would_not_be_trained_is_refused_with_the_line_to_add() -> None:

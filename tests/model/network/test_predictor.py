@@ -1,14 +1,23 @@
+"""The predictor; and its cache: steps computed one after another equal those computed at once."""
+
+import dataclasses
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
-from vjepa2_ac.config import EncoderSizes, ModelSizes, PredictorSizes
+from vjepa2_ac.config import AdapterConfig, EncoderSizes, ModelSizes, PredictorSizes
+from vjepa2_ac.model.adapter.lora import add_adapter
 from vjepa2_ac.model.network.predictor import ActionConditionedPredictor, PredictorConfig
+from vjepa2_ac.model.network.predictor_network import KeyValueCache, predictor_fields
 from vjepa2_ac.model.network.world_model import WorldModel
 
-WIDE = PredictorConfig(
-    image_size=32, latent_dim=24, hidden_size=240, num_hidden_layers=3, num_attention_heads=4, mlp_ratio=2.0
+WIDE = ModelSizes(
+    image_size=32,
+    encoder=EncoderSizes(width=24, heads=2),
+    predictor=PredictorSizes(width=240, depth=3, heads=4, mlp_ratio=2.0),
 )
 
 
@@ -34,14 +43,9 @@ def test_other_image_sizes_work(image_size: int) -> None:
     assert model.predict(latents, torch.zeros(1, 2, 7), torch.zeros(1, 2, 7)).shape == latents.shape
 
 
-def test_tokens_of_another_image_size_are_refused(model: WorldModel, inputs) -> None:
-    with pytest.raises(ValueError, match="8 tokens a step do not make a frame of 48 px"):
-        model.predict(inputs.latents[:, :, :8], inputs.actions, inputs.states)
-
-
 @pytest.mark.parametrize("by_transformers", [True, False])
 def test_output_layers_start_smaller_the_deeper_they_are(by_transformers: bool) -> None:
-    predictor = ActionConditionedPredictor(WIDE)
+    predictor = ActionConditionedPredictor(PredictorConfig(**predictor_fields(WIDE)))
     if not by_transformers:
         predictor.initialise(torch.Generator().manual_seed(0))
     for layer, block in enumerate(predictor.blocks, start=1):
@@ -53,20 +57,6 @@ def test_output_layers_start_smaller_the_deeper_they_are(by_transformers: bool) 
         ):
             assert weight.std().item() == pytest.approx(std, rel=0.03), f"{name} of layer {layer}"
     assert not any(value.any() for name, value in predictor.named_parameters() if name.endswith("bias"))
-
-
-def test_gradient_checkpointing_changes_no_gradient(model: WorldModel, inputs) -> None:
-    model.predictor.requires_grad_(True)
-
-    def gradients(checkpointing: bool) -> list[torch.Tensor]:
-        model.set_gradient_checkpointing(checkpointing)
-        loss = model.rollout(inputs.latents[:, :2], inputs.actions, inputs.states).square().mean()
-        used = [p for name, p in model.predictor.named_parameters() if not name.startswith("extrinsics")]
-        return list(torch.autograd.grad(loss, used))
-
-    for kept, computed_again in zip(gradients(False), gradients(True), strict=True):
-        assert kept.any()
-        assert torch.equal(kept, computed_again)
 
 
 def test_gradient_checkpointing_keeps_less(model: WorldModel, inputs) -> None:
@@ -92,4 +82,147 @@ def test_transformers_loads_the_predictor_by_itself(model: WorldModel, tmp_path:
     assert torch.equal(alone(inputs.latents, inputs.actions, inputs.states), expected)
 
 
-HALF = torch.bfloat16
+LORA = AdapterConfig(rank=4, alpha=8.0, dropout=0.0)
+ADAPTERS = {
+    "lora": LORA,
+    "dora": LORA.model_copy(update={"dora": True}),
+    "none": AdapterConfig(kind="none"),
+}
+PARTS = [(1, 1, 1, 1), (2, 2), (3, 1), (1, 3)]
+
+
+def adapted(sizes: ModelSizes, adapter: str = "lora", *, extrinsics: bool = False) -> WorldModel:
+    """Return a model whose adapter does something."""
+    predictor = sizes.predictor.model_copy(update={"use_extrinsics": extrinsics})
+    model = WorldModel.random(sizes.model_copy(update={"predictor": predictor}), seed=0)
+    add_adapter(model, ADAPTERS[adapter], seed=0)
+    generator = torch.Generator().manual_seed(2)
+    for value in trained(model):
+        value.data += 0.05 * torch.randn(value.shape, generator=generator)
+    return model.train()  # type: ignore[return-value]
+
+
+def trained(model: WorldModel) -> list[Tensor]:
+    return [value for value in model.parameters() if value.requires_grad]
+
+
+def arguments(inputs: Any, *, extrinsics: bool = False) -> list[Tensor]:
+    """Return latents, actions, states and perhaps extrinsics that ask for gradients."""
+    given = [inputs.latents, inputs.actions, inputs.states]
+    if extrinsics:
+        given.append(torch.randn(2, 4, 6, generator=torch.Generator().manual_seed(3)))
+    return [value.clone().requires_grad_() for value in given]
+
+
+def in_parts(model: WorldModel, given: list[Tensor], steps: tuple[int, ...]) -> Tensor:
+    cache = KeyValueCache()
+    parts = zip(*(value.split(steps, dim=1) for value in given), strict=True)
+    return torch.cat([model.predict(*part, cache=cache) for part in parts], dim=1)
+
+
+def output_and_gradients(model: WorldModel, predicted: Tensor, given: list[Tensor]) -> list[Tensor]:
+    towards = torch.randn(predicted.shape, generator=torch.Generator().manual_seed(4))
+    loss = (predicted * towards).sum()
+    return [predicted, *torch.autograd.grad(loss, [*given, *trained(model)])]
+
+
+def assert_same(found: list[Tensor], expected: list[Tensor], tolerance: float = 1e-5) -> None:
+    """Each tensor differs from its twin by rounding, measured against the whole of it."""
+    for one, other in zip(found, expected, strict=True):
+        assert other.any()
+        assert (one - other).norm() <= tolerance * other.norm()
+
+
+@pytest.mark.parametrize("parts", PARTS)
+@pytest.mark.parametrize("extrinsics", [False, True])
+@pytest.mark.parametrize("checkpointing", [False, True])
+def test_steps_in_parts_give_the_predictions_and_gradients_of_all_at_once(
+    sizes: ModelSizes, inputs, parts: tuple[int, ...], extrinsics: bool, checkpointing: bool
+) -> None:
+    model = adapted(sizes, extrinsics=extrinsics)
+    given = arguments(inputs, extrinsics=extrinsics)
+    expected = output_and_gradients(model, model.predict(*given), given)
+    model.set_gradient_checkpointing(checkpointing)
+    assert_same(output_and_gradients(model, in_parts(model, given, parts), given), expected)
+
+
+@pytest.mark.parametrize("adapter", ADAPTERS)
+@pytest.mark.parametrize("checkpointing", [False, True])
+def test_every_kind_of_adapter_lets_gradients_through_the_cache(
+    sizes: ModelSizes, inputs, adapter: str, checkpointing: bool
+) -> None:
+    model, given = adapted(sizes, adapter), arguments(inputs)
+    expected = output_and_gradients(model, model.predict(*given), given)
+    model.set_gradient_checkpointing(checkpointing)
+    assert_same(output_and_gradients(model, in_parts(model, given, (1, 3)), given), expected)
+
+
+@pytest.mark.parametrize("kind", ["dense", "per_step"])
+def test_every_way_of_attention_sees_the_cache(sizes: ModelSizes, inputs, kind: Any) -> None:
+    model, given = adapted(sizes), arguments(inputs)
+    expected = output_and_gradients(model, model.predict(*given), given)
+    model.set_attention(kind)
+    assert_same(output_and_gradients(model, in_parts(model, given, (2, 2)), given), expected)
+
+
+def test_what_is_kept_of_the_first_steps_is_all_that_later_steps_see(sizes: ModelSizes, inputs) -> None:
+    model, cache = adapted(sizes), KeyValueCache()
+    given = arguments(inputs)
+    model.predict(*given, cache=cache, keep=1)
+    assert cache.tokens == 9 + 2
+    found = model.predict(*(value[:, 2:] for value in given), cache=cache)
+    seen = [torch.cat([value[:, :1], value[:, 2:]], dim=1) for value in given]
+    torch.testing.assert_close(found, model.predict(*seen)[:, 1:], rtol=1e-5, atol=1e-5)
+
+
+def test_what_is_kept_holds_nothing_of_the_rest(sizes: ModelSizes, inputs) -> None:
+    cache = KeyValueCache()
+    adapted(sizes).predict(*arguments(inputs), cache=cache, keep=1)
+    for layer in range(sizes.predictor.depth):
+        (piece,) = cache.layer(layer)
+        assert piece.untyped_storage().nbytes() == piece.nbytes == 2 * 2 * (9 + 2) * sizes.predictor.width * 4
+
+
+def plain_rollout(model: WorldModel, context: Tensor, actions: Tensor, states: Tensor) -> Tensor:
+    """Compute everything again for each prediction."""
+    latents = context
+    for time in range(context.shape[1], actions.shape[1] + 1):
+        following = model.predict(latents, actions[:, :time], states[:, :time])[:, -1:]
+        latents = torch.cat([latents, following], dim=1)
+    return latents[:, context.shape[1] :]
+
+
+@pytest.mark.parametrize("adapter", [None, "lora"])
+@pytest.mark.parametrize("context", [1, 2, 3, 4])
+@torch.no_grad()
+def test_a_rollout_is_the_one_that_computes_everything_again(
+    sizes: ModelSizes, inputs, context: int, adapter: str | None
+) -> None:
+    model = WorldModel.random(sizes, seed=0) if adapter is None else adapted(sizes, adapter)
+    given = (inputs.latents[:, :context], inputs.actions, inputs.states)
+    torch.testing.assert_close(model.rollout(*given), plain_rollout(model, *given), rtol=1e-5, atol=1e-5)
+
+
+@torch.no_grad()
+def test_a_rollout_in_bfloat16_is_the_plain_one_to_its_precision(fresh, inputs) -> None:
+    model = fresh(dtype=torch.bfloat16)
+    given = (inputs.latents[:, :1], inputs.actions, inputs.states)
+    with torch.autocast("cpu", torch.bfloat16):
+        found, expected = model.rollout(*given), plain_rollout(model, *given)
+    assert (found - expected).norm() <= 2e-2 * expected.norm()
+
+
+@torch.no_grad()
+def test_many_samples_go_on_from_one_start_that_was_computed_once(sizes: ModelSizes, inputs) -> None:
+    model, cache = adapted(sizes), KeyValueCache()
+    one = dataclasses.replace(inputs, latents=inputs.latents[:1], actions=inputs.actions[:1], states=inputs.states[:1])
+    model.predict(one.latents[:, :2], one.actions[:, :2], one.states[:, :2], cache=cache)
+    actions = torch.randn(5, 4, 7, generator=torch.Generator().manual_seed(5))
+    actions[:, :2] = one.actions[:, :2]
+    latents, states = one.latents[:, :3].expand(5, -1, -1, -1), one.states.expand(5, -1, -1)
+    expected = model.rollout(latents, actions, states)
+    many = cache.expanded(5)
+    for _ in range(2):  # the cache is left as it is
+        found = model.rollout(latents[:, 2:], actions[:, 2:], states[:, 2:], cache=many)
+        torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
+    assert many.layer(0)[0].untyped_storage().data_ptr() == cache.layer(0)[0].untyped_storage().data_ptr()

@@ -21,7 +21,7 @@ from vjepa2_ac.cli import main
 from vjepa2_ac.console.tables import benchmark_notes
 from vjepa2_ac.decoding.decoder_folder import load_decoder
 from vjepa2_ac.errors import UserError
-from vjepa2_ac.media.video_reader import count_frames
+from vjepa2_ac.media.video import count_frames
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.session import load_to_plan
 from vjepa2_ac.serving.about import metadata_of

@@ -15,7 +15,7 @@ from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.distributed import PRECISIONS
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.model.adapter.low_rank import CastMatrices
-from vjepa2_ac.model.network.rotary import TokenLayout, rotary_tables
+from vjepa2_ac.model.network.attention import TokenLayout, rotary_tables
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.training.cost import step as cost_step
 from vjepa2_ac.training.cost.step import LiveStorages, measure_step

@@ -47,7 +47,7 @@ from vjepa2_ac.data.sources.indexed_source import (
 )
 from vjepa2_ac.episode import EXTRINSICS_DIM, STATE_DIM, Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.jpeg import require_bounded
+from vjepa2_ac.media.images import require_bounded
 from vjepa2_ac.storage.block_file import BlockCachedFile
 from vjepa2_ac.storage.npz_reader import NpzFile
 

@@ -1,15 +1,16 @@
-"""Trainable weights: a LoRA adapter on the predictor, or the whole predictor: add, save, load.
+"""Trainable weights: a LoRA adapter on the predictor, or the whole predictor: added, switched off, merged.
 
-The only module that uses PEFT. Disabling an adapter, and merging it into the base: `merging`.
+The only module that uses PEFT. Saving and loading: `adapter_folder`.
 """
 
 from __future__ import annotations
 
+import copy
 import math
 import re
 import warnings
-from collections.abc import Mapping
-from pathlib import Path
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext
 from typing import Any, NamedTuple
 
 import torch
@@ -17,30 +18,27 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from vjepa2_ac.config import AdapterConfig
-from vjepa2_ac.episode import Widths
+from vjepa2_ac.config.model import PEFT_NAMES
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.adapter.adapter_folder import (
-    ADAPTER_FILE,
-    FULL_WEIGHTS,
-    LORA_WEIGHTS,
-    Card,
-    Heads,
-    adapter_of,
-    read_adapter_file,
-    read_card,
-    read_weights,
-    write_trained,
-)
 from vjepa2_ac.model.adapter.low_rank import LowRankLayer, low_rank_linear
-from vjepa2_ac.model.adapter.targets import lora_arguments
-from vjepa2_ac.model.network.input_heads import fit_heads, require_trained
 from vjepa2_ac.model.network.predictor_network import PredictorNetwork
-from vjepa2_ac.model.network.world_model import Adaptation, WorldModel, base_weights
+from vjepa2_ac.model.network.world_model import Adaptation, WorldModel, base_weights, require_trained
 from vjepa2_ac.model.quiet_imports import quiet_imports
+from vjepa2_ac.storage.structured import record_of, shown
 
 with quiet_imports():
     from peft import LoraConfig, PeftModel, get_peft_model, get_peft_model_state_dict, set_peft_model_state_dict
     from peft.tuners.lora import Linear, LoraLayer
+
+_SETS = {"attention": ("q", "k", "v", "o"), "mlp": ("fc1", "fc2")}
+NEEDED = "a LoRA adapter of V-JEPA 2-AC's predictor, as this program writes it in PEFT's format"
+FIX = "Copy the adapter again, or train it again: other kinds of PEFT's are not read"
+_INFORMATIONAL = frozenset({  # origin and purpose
+    "auto_mapping", "base_model_name_or_path", "inference_mode", "megatron_core", "peft_type", "peft_version",
+    "revision", "task_type",
+})  # fmt: skip
+_LITERAL = re.compile(r"[\w.]+")  # names of layers, which as regular expressions cannot take long
+_MOST_RANK, _MOST_ALPHA = 1024, 1e6
 
 
 class LoraLinear(Linear, LowRankLayer):  # type: ignore[misc]  # PEFT has no types
@@ -117,20 +115,20 @@ def add_adapter(model: WorldModel, config: AdapterConfig, seed: int) -> None:
 
     Raises:
         InputError: A target matches no layer, another knob does not fit the predictor or PEFT, or a fresh head
-            (`input_heads`) would not be trained.
+            (`fit_heads`) would not be trained.
         ValueError: The model is already adapted.
     """
     if model.adaptation is not None:
         raise ValueError("this model has been adapted already: merge_adapter first, or load_trained into it")
     if config.kind == "none":
-        _train_everything(model)
+        train_everything(model)
         return
     if model.fresh_heads is not None:
         require_trained(tuple(dict.fromkeys(name.split(".")[0] for name in model.fresh_heads.replaced)), config)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)  # of initialisations that are drawn by PEFT
-        _wrap(model, config, start=config.peft.get("init_lora_weights", True))
-    _written(model, where="adapter.peft")  # or it could not be read again
+        wrap(model, config, start=config.peft.get("init_lora_weights", True))
+    knobs_of(lora_config(model).to_dict(), where="adapter.peft")  # or it could not be read again
     layers = lora_layers(model)
     if config.peft.get("init_lora_weights", True) is True:
         _draw_first_matrices(layers, torch.Generator().manual_seed(seed))
@@ -148,7 +146,7 @@ def with_adapter(predictor: PredictorNetwork, config: AdapterConfig, start: bool
     Raises:
         InputError: A knob does not fit the predictor, or PEFT refuses it.
     """
-    arguments = lora_arguments(predictor, config) | {"init_lora_weights": start}
+    arguments = _peft_arguments(predictor, config) | {"init_lora_weights": start}
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", RuntimeWarning)  # a pattern that no layer has
@@ -178,55 +176,9 @@ def adapted_report(model: WorldModel) -> TrainableReport:
     return trainable_report(model)._replace(trained=sum(trained))
 
 
-def save_trained(model: WorldModel, folder: str | Path) -> None:
-    """Write the trained weights: an adapter in PEFT's format, or the whole predictor; and the base's identity.
-
-    Args:
-        model: The adapted model.
-        folder: Where to.
-
-    Raises:
-        ValueError: The model is not adapted.
-    """
-    folder = Path(folder)
-    if adaptation_of(model).kind == "lora":
-        write_trained(folder, _card_of(model), _lora_weights(model))
-        _lora_config(model).save_pretrained(str(folder))
-    else:
-        write_trained(folder, _card_of(model), model.predictor.state_dict())
-
-
-def load_trained(model: WorldModel, folder: str | Path, trainable: bool | None = None) -> None:
-    """Load what `save_trained` wrote onto its base, or into an existing adapter.
-
-    Args:
-        model: The base, or a model adapted in the same way; it is not wrapped again.
-        folder: The folder.
-        trainable: Whether it can be trained; None leaves an existing adapter unchanged, and freezes a new one.
-
-    Raises:
-        InputError: The folder is not an adapter, is damaged, belongs to another base, or differs from the existing
-            one.
-    """
-    folder = Path(folder)
-    fresh, card = model.adaptation is None, read_card(folder, model)
-    heads = card.fresh_heads
-    if heads is not None and fresh and model.fresh_heads is None:
-        fit_heads(model, Widths(heads.state_dim, heads.action_dim), heads.seed)
-    if card.kind == "lora":
-        _load_lora(model, folder)
-    else:
-        weights = read_weights(folder / FULL_WEIGHTS, model.predictor.state_dict())
-        if fresh:
-            _train_everything(model)
-        model.predictor.load_state_dict(weights)
-    if fresh or trainable is not None:
-        _set_trainable(model, bool(trainable))
-
-
 def lora_layers(model: WorldModel) -> dict[str, Any]:
     """Return the layers of the predictor that have an adapter (PEFT's LoraLayer), by name."""
-    return _layers_of(model.base_predictor)
+    return {name: layer for name, layer in model.base_predictor.named_modules() if isinstance(layer, LoraLayer)}
 
 
 def adaptation_of(model: WorldModel) -> Adaptation:
@@ -240,25 +192,16 @@ def adaptation_of(model: WorldModel) -> Adaptation:
     return model.adaptation
 
 
-def _layers_of(predictor: nn.Module) -> dict[str, Any]:
-    return {name: layer for name, layer in predictor.named_modules() if isinstance(layer, LoraLayer)}
-
-
-def _card_of(model: WorldModel) -> Card:
-    adaptation, sizes, heads = adaptation_of(model), model.sizes.predictor, None
-    if model.fresh_heads is not None:
-        heads = Heads(sizes.action_dim, sizes.state_dim, model.fresh_heads.seed)
-    return Card(adaptation.kind, adaptation.base, adaptation.encoder, model.encoder_in_words, heads)
-
-
-def _train_everything(model: WorldModel) -> None:
+def train_everything(model: WorldModel) -> None:
+    """Train every weight of the predictor that has an input."""
     start = {name: value.detach().to("cpu", copy=True) for name, value in model.predictor.state_dict().items()}
     model.adaptation = Adaptation("none", model.predictor_fingerprint(), model.encoder_fingerprint(), start)
     model.predictor.float()
-    _set_trainable(model, trainable=True)
+    set_trainable(model, trainable=True)
 
 
-def _wrap(model: WorldModel, config: AdapterConfig, start: bool | str = True) -> None:
+def wrap(model: WorldModel, config: AdapterConfig, start: bool | str = True) -> None:
+    """Put a LoRA adapter around the predictor; errors as of `with_adapter`."""
     base = model.predictor_fingerprint()
     checkpointing = model.base_predictor.gradient_checkpointing
     model.set_gradient_checkpointing(False)  # or PEFT hooks the input: not needed without re-entrance
@@ -289,11 +232,17 @@ def _is_trained(name: str) -> bool:
     return ".lora_" in name or ".modules_to_save." in name
 
 
-def _lora_weights(model: WorldModel) -> dict[str, Tensor]:
+def lora_weights(model: WorldModel) -> dict[str, Tensor]:
+    """Return the weights of an adapter by the names of PEFT's file."""
     return dict(get_peft_model_state_dict(model.predictor, save_embedding_layers=False))
 
 
-def _lora_config(model: WorldModel) -> Any:
+def set_lora_weights(model: WorldModel, weights: dict[str, Tensor]) -> None:
+    """Load what `lora_weights` returned."""
+    set_peft_model_state_dict(model.predictor, weights)
+
+
+def lora_config(model: WorldModel) -> Any:
     """Return the config that is written: it names its layers, and so holds no regular expression of the user's."""
     predictor: Any = model.predictor
     own, layers = predictor.peft_config["default"], lora_layers(model)
@@ -319,34 +268,151 @@ def _lora_config(model: WorldModel) -> Any:
     return config
 
 
-def _written(model: WorldModel, *, where: str) -> AdapterConfig:
-    """Return the knobs that a model's adapter is read with after it was written."""
-    return adapter_of(_lora_config(model).to_dict(), LoraConfig().to_dict(), where=where)
-
-
-def _set_trainable(model: WorldModel, trainable: bool) -> None:
+def set_trainable(model: WorldModel, trainable: bool) -> None:
+    """Thaw or freeze what was added."""
     lora = isinstance(model.predictor, PeftModel)
     for name, value in model.predictor.named_parameters():
         chosen = _is_trained(name) if lora else name.split(".", 1)[0] not in model.base_predictor.unused_layers
         value.requires_grad_(trainable and chosen)
 
 
-def _load_lora(model: WorldModel, folder: Path) -> None:
-    knobs = read_adapter_file(folder, LoraConfig().to_dict())
+def knobs_of(values: Mapping[str, Any], *, where: str) -> AdapterConfig:
+    """Return the knobs of a saved adapter, which may be a stranger's, from its options of PEFT's LoraConfig.
+
+    Layers are named, never matched by a regular expression, and options have plain values: none of them runs code,
+    takes long, or takes more memory than an adapter of rank 1,024. PEFT never sees the file.
+
+    Raises:
+        InputError: It is another kind of adapter, or has an option that is not read.
+    """
+    defaults: dict[str, Any] = LoraConfig().to_dict()
+    given: dict[str, Any] = {"kind": "lora", "rslora": False}  # not rsLoRA: PEFT's default
+    given |= {ours: values[peft] for peft, ours in PEFT_NAMES.items() if values.get(peft) is not None}
+    options = {name: value for name, value in values.items() if name not in _INFORMATIONAL and name not in PEFT_NAMES}
+    options = {name: value for name, value in options.items() if not _is_off(value, defaults.get(name))}
+    unread = {name: value for name, value in options.items() if not _can_be_read(name, value, defaults.get(name))}
+    if values.get("peft_type") != "LORA":
+        unread = {"peft_type": values.get("peft_type")}
+    unread |= {peft: None for peft in ("r", "lora_alpha", "target_modules") if values.get(peft) is None}
+    if unread:
+        listed = ", ".join(f"{shown(name)} {shown(value)}" for name, value in unread.items())
+        found = f"an adapter with {listed}, which is not read here"
+        raise InputError(where=where, found=found, needed=NEEDED, fix=FIX)
+    return record_of(AdapterConfig, {**given, "peft": options}, where=where, needed=NEEDED, fix=FIX)
+
+
+def _is_off(value: object, default: object) -> bool:
+    return value is None or value is False or value in ([], {}) or value == default
+
+
+def _can_be_read(name: str, value: object, default: object) -> bool:
+    """Return whether an option is a pattern of whole names, a start (a knob says which), or a number as PEFT has it."""
+    if name in {"rank_pattern", "alpha_pattern"}:
+        kinds, most = ((int,), _MOST_RANK) if name == "rank_pattern" else ((int, float), _MOST_ALPHA)
+        return isinstance(value, dict) and all(
+            _LITERAL.fullmatch(key) and type(one) in kinds and 0 < one <= most for key, one in value.items()
+        )
+    return name == "init_lora_weights" or (isinstance(value, bool | int | float) and type(value) is type(default))
+
+
+def _peft_arguments(predictor: PredictorNetwork, config: AdapterConfig) -> dict[str, Any]:
+    """Return the arguments of PEFT's LoraConfig, sets of targets replaced by their layers.
+
+    Layers without input cannot have an adapter; `all` excludes layers that are trained directly.
+
+    Raises:
+        InputError: A target or a layer to train whole matches no layer, or a layer is named twice.
+    """
+    whole = config.modules_to_save
+    if missing := [name for name in whole if not hasattr(predictor, name)]:
+        raise InputError(
+            where="adapter.modules_to_save",
+            found=f"{', '.join(missing)}, which this predictor does not have: it was made without states",
+            fix="Leave it out, and set model.sizes.predictor.use_states=false: both are then checked before loading",
+        )
+    layers = {name for name, layer in predictor.named_modules() if isinstance(layer, nn.Linear)}
+    layers -= set(predictor.unused_layers)
+    kinds = {name.rpartition(".")[2] for name in layers}
+    sets = {**_SETS, "all": tuple(sorted(kinds - set(whole)))}
+    targets = list(dict.fromkeys(layer for target in config.targets for layer in sets.get(target, (target,))))
+    unknown = [target for target in targets if target not in kinds | layers]
+    if unknown or not targets:
+        raise InputError(
+            where="adapter.targets",
+            found=", ".join(unknown) + " matches no layer of the predictor" if unknown else "no target",
+            needed=f"some of {', '.join(sorted(kinds))}; or {', '.join(sets)}",
+        )
+    if twice := sorted(set(targets) & set(whole)):
+        raise InputError(
+            where="adapter.modules_to_save",
+            found=f"{', '.join(twice)}, which adapter.targets names too",
+            needed="each layer once: trained whole, or with an adapter",
+        )
+    arguments = {peft: getattr(config, ours) for peft, ours in PEFT_NAMES.items()}
+    return arguments | {"target_modules": targets, "modules_to_save": list(whole) or None} | config.peft
+
+
+# ---- without it, and for good ----
+
+
+@contextmanager
+def base_only(model: WorldModel) -> Iterator[None]:
+    """Let the model predict as its base within the block; a model without adapter is the base.
+
+    A model with fresh heads returns to their initial values: not a base for comparison.
+    """
     if model.adaptation is None:
-        try:
-            _wrap(model, knobs)
-        except InputError as error:
-            where = f"{folder / ADAPTER_FILE}: {error.where}"
-            raise InputError(where=where, found=error.found, needed=error.needed, fix=error.fix) from None
-    else:
-        own = _written(model, where=str(folder))
-        for name in AdapterConfig.model_fields.keys() - {"dropout"}:
-            found, needed = getattr(knobs, name), getattr(own, name)
-            if found != needed:
-                raise InputError(
-                    where=str(folder),
-                    found=f"an adapter with {name} {found}",
-                    needed=f"{needed}, as the model has",
-                )
-    set_peft_model_state_dict(model.predictor, read_weights(folder / LORA_WEIGHTS, _lora_weights(model)))
+        yield
+        return
+    trained = [(value, value.requires_grad) for value in model.predictor.parameters()]
+    predictor: Any = model.predictor
+    start = model.adaptation.start
+    try:
+        with predictor.disable_adapter() if start is None else _weights(predictor, start):
+            yield
+    finally:
+        for value, requires_grad in trained:  # PEFT enables gradients when it enables an adapter
+            value.requires_grad_(requires_grad)
+
+
+def merge_adapter(model: WorldModel) -> None:
+    """Merge the trained weights into the predictor: added in float32, then cast to the base's type, frozen.
+
+    A surrounding autocast has no effect.
+
+    Raises:
+        ValueError: The model is not adapted.
+    """
+    adaptation = adaptation_of(model)
+    never_trained = model.base_predictor.predictor_norm.weight  # beside an adapter
+    dtype = (adaptation.start or {}).get("predictor_norm.weight", never_trained).dtype
+    if adaptation.kind == "lora":
+        kind = model.device.type
+        has_autocast = torch.amp.is_autocast_available(kind)  # some, such as meta, have none
+        with torch.autocast(kind, enabled=False) if has_autocast else nullcontext():  # or its type would be computed in
+            model.predictor = model.predictor.float().merge_and_unload()  # type: ignore[operator]  # PEFT is untyped
+    model.predictor.to(dtype).requires_grad_(False)
+    model.adaptation = model.fresh_heads = None
+
+
+def unadapted_copy(model: WorldModel) -> WorldModel:
+    """Return a model for inference with a shared encoder and its own predictor, into which the adapter is merged.
+
+    The given model is not changed.
+    """
+    own = WorldModel.empty(model.sizes)
+    own.encoder, own.predictor = model.encoder, copy.deepcopy(model.predictor)
+    own.adaptation, own.fresh_heads = model.adaptation, model.fresh_heads
+    if own.adaptation is not None:
+        merge_adapter(own)
+    return own.eval()
+
+
+@contextmanager
+def _weights(predictor: Any, weights: Mapping[str, Tensor]) -> Iterator[None]:
+    now = {name: value.detach().clone() for name, value in predictor.state_dict().items()}
+    predictor.load_state_dict(weights)
+    try:
+        yield
+    finally:
+        predictor.load_state_dict(now)

@@ -12,12 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from pydantic import ValidationError
 from torch import Tensor
 
-from vjepa2_ac.config import ModelConfig, ModelSizes, PredictorSizes
-from vjepa2_ac.config.model import EncoderConfig, EncoderKey
-from vjepa2_ac.episode import ACTION_DIM, POSE_WIDTHS
+from vjepa2_ac.config import ModelConfig, ModelSizes
+from vjepa2_ac.config.model import EncoderKey
+from vjepa2_ac.episode import POSE_WIDTHS
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.base_model import check_sizes, find_base, read_sizes
 from vjepa2_ac.model.checkpoints.encoders import (
@@ -29,24 +28,21 @@ from vjepa2_ac.model.checkpoints.encoders import (
 )
 from vjepa2_ac.model.checkpoints.meta_file import (
     ENCODER_KEYS,
+    FIX,
+    MetaFile,
     depth_of,
     fill,
     official_name,
-    open_file,
     part_of,
-    tensors_of,
     to_official_names,
 )
 from vjepa2_ac.model.network.blocks import mlp_ratio_of
-from vjepa2_ac.model.network.encoder_origin import HEADS
-from vjepa2_ac.model.network.input_heads import widths_as_text, widths_of_model
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.network.world_model import WorldModel, widths_as_text, widths_of_model
 from vjepa2_ac.places import BUILTIN
+from vjepa2_ac.storage.structured import record_of
 
 logger = logging.getLogger(__name__)
 
-_NEEDED = "a checkpoint of V-JEPA 2-AC as Meta publishes it (vjepa2-ac-vitg.pt), 11.7 GB"
-_FIX = "`vjepa2-ac download` fetches it, and goes on with a part of it"
 _NON_COMMERCIAL = "The weights that jepa-wms publishes so are CC-BY-NC 4.0: for non-commercial use only"
 _KEYS: tuple[EncoderKey, ...] = ("encoder", "target_encoder")  # one encoder twice: it was frozen
 
@@ -71,14 +67,20 @@ def load_base(config: ModelConfig, *, seed: int) -> WorldModel:
     if config.base is None:
         raise ValueError("a ModelConfig has a base or random sizes")
     path = find_base(config.base)
-    if path.is_dir():
-        if found is not None:
-            raise _own_encoder(config.base, found)
-        check_sizes(read_sizes(path), config.sizes, where=f"model.base: {config.base}")
-        return WorldModel.from_pretrained(path, dtype=dtype)
-    if found is not None:
-        return _load_predictor(path, found, config.sizes, dtype)
-    return load_official(path, config.sizes, dtype)
+    if not path.is_dir() and found is None:
+        return load_official(path, config.sizes, dtype)
+    file = None if path.is_dir() else MetaFile.open(path)
+    if found is not None and (file is None or any(key in file.parts for key in ENCODER_KEYS)):
+        raise InputError(
+            where=f"model.base: {config.base}",
+            found=f"an encoder of its own, and model.encoder names another ({found.where})",
+            needed="the encoder that the predictor was trained on: on other latents it predicts noise",
+            fix="Leave out model.encoder; or train a fresh predictor on it, with model.random in place of model.base",
+        )
+    if file is not None and found is not None:
+        return _load_predictor(file, found, config.sizes, dtype)
+    check_sizes(read_sizes(path), config.sizes, where=f"model.base: {config.base}")
+    return WorldModel.from_pretrained(path, dtype=dtype)
 
 
 def base_sizes(config: ModelConfig) -> ModelSizes:
@@ -113,13 +115,10 @@ def load_official(path: str | Path, sizes: ModelSizes | None = None, dtype: torc
     Raises:
         InputError: The file is missing, truncated, of another kind, contradicts the sizes, or a weight is not finite.
     """
-    path, given = Path(path), sizes or ModelSizes()
-    whole = open_file(path, needed=_NEEDED, fix=_FIX)
-    key = next((one for one in _KEYS if one in whole), _KEYS[0])
-    patches = tensors_of(whole, key, where=str(path), needed=_NEEDED, fix=_FIX).get("patch_embed.proj.weight")
-    heads = None if patches is not None and patches.shape[0] in HEADS else given.encoder.heads
-    asked = EncoderConfig(path=str(path), key=key, frame=given.encoder.frame, heads=heads)
-    return _beneath(path, whole, encoder_in_file(path, whole, asked), given, dtype)
+    file, given = MetaFile.open(Path(path)), sizes or ModelSizes()
+    key = next((one for one in _KEYS if one in file.parts), _KEYS[0])
+    found = encoder_in_file(file, key, given.encoder.frame, given.encoder.heads)
+    return _with_predictor(file, found, given, dtype)
 
 
 def to_official(model: WorldModel) -> dict[str, Any]:
@@ -149,101 +148,77 @@ def to_official(model: WorldModel) -> dict[str, Any]:
     }
 
 
-def _load_predictor(path: Path, found: FoundEncoder, sizes: ModelSizes, dtype: torch.dtype) -> WorldModel:
+def _load_predictor(file: MetaFile, found: FoundEncoder, sizes: ModelSizes, dtype: torch.dtype) -> WorldModel:
     """Read a file that holds a predictor alone, and put an encoder from elsewhere under it."""
-    whole = open_file(path, needed=_NEEDED, fix=_FIX)
-    if any(key in whole for key in ENCODER_KEYS):
-        raise _own_encoder(str(path), found)
-    model = _beneath(path, whole, found, sizes, dtype)
+    model = _with_predictor(file, found, sizes, dtype)
     model.encoder_origin = found.origin
     if not model.sizes.predictor.use_states:
-        logger.warning("%s: a predictor without states and without an encoder. %s", path, _NON_COMMERCIAL)
+        logger.warning("%s: a predictor without states and without an encoder. %s", file.path, _NON_COMMERCIAL)
     logger.warning(
         "%s does not say which encoder its predictor was trained on: on any other than %s it predicts noise. The first"
         " validation shows it (its error beside that of persistence).",
-        path,
+        file.path,
         found.origin,
     )
     return model
 
 
-def _beneath(
-    path: Path, whole: Mapping[str, Any], found: FoundEncoder, given: ModelSizes, dtype: torch.dtype
-) -> WorldModel:
+def _with_predictor(file: MetaFile, found: FoundEncoder, given: ModelSizes, dtype: torch.dtype) -> WorldModel:
     """Return the model of the predictor in a file and an encoder."""
-    predictor = tensors_of(whole, "predictor", where=str(path), needed=_NEEDED, fix=_FIX)
+    predictor = file.tensors("predictor")
     if "mask_tokens" in {name.partition(".")[0] for name in predictor} and "action_encoder.weight" not in predictor:
         raise InputError(
-            where=f"model.base: {path}",
+            where=f"model.base: {file.path}",
             found="a checkpoint of pretraining: its predictor fills in masked patches, and knows no actions",
-            needed=_NEEDED,
+            needed="a checkpoint of V-JEPA 2-AC (`vjepa2-ac download`)",
             fix="Its encoder can be used: set model.encoder.path to this file, and model.random in place of model.base"
             " for a fresh predictor (configs/scratch_vitb.yaml)",
         )
-    model = _on_encoder(found, _sizes(predictor, found, given, where=str(path)), dtype)
+    model = _on_encoder(found, _sizes(file, predictor, found, given), dtype)
     model.encoder_origin = None  # the file is the model's own
-    rename = partial(official_name, part="predictor")
-    fill(model.predictor, predictor, rename, dtype, where=f"{path}: predictor", fix="Check model.base and model.sizes")
-    logger.info("read %s: %s", path, model.sizes.model_dump())
+    fill(
+        model.predictor,
+        predictor,
+        partial(official_name, part="predictor"),
+        dtype,
+        where=f"{file.path}: predictor",
+        fix="Check model.base, model.sizes, and model.encoder: the predictor's latents are of one encoder",
+    )
+    logger.info("read %s: %s", file.path, model.sizes.model_dump())
     return model
 
 
 def _on_encoder(found: FoundEncoder, sizes: ModelSizes, dtype: torch.dtype) -> WorldModel:
     """Return a model with this encoder, and a predictor without weights."""
     model = WorldModel.empty(sizes)
-    found.fill(model.present_encoder, dtype)
+    fix = f"Get the original file. {FIX}"
+    fill(model.present_encoder, found.weights(), found.rename, dtype, where=found.where, fix=fix)
     model.encoder_origin = found.origin
     return model
 
 
-def _own_encoder(base: str, found: FoundEncoder) -> InputError:
-    return InputError(
-        where=f"model.base: {base}",
-        found=f"an encoder of its own, and model.encoder names another ({found.where})",
-        needed="the encoder that the predictor was trained on: on other latents it predicts noise",
-        fix="Leave out model.encoder; or train a fresh predictor on it, with model.random in place of model.base",
-    )
-
-
-def _sizes(predictor: Mapping[str, Tensor], encoder: FoundEncoder, given: ModelSizes, *, where: str) -> ModelSizes:
+def _sizes(file: MetaFile, predictor: Mapping[str, Tensor], encoder: FoundEncoder, given: ModelSizes) -> ModelSizes:
     """Return the sizes of the tensors; heads, image size and extrinsics are those given."""
     own = given.predictor
     try:
-        width, action_width = predictor["action_encoder.weight"].shape
-        hidden, latent = predictor["predictor_blocks.0.mlp.fc1.weight"].shape[0], predictor["predictor_embed.weight"]
+        width, hidden = len(predictor["action_encoder.weight"]), len(predictor["predictor_blocks.0.mlp.fc1.weight"])
         depth = depth_of(predictor, "predictor_blocks")
-    except (KeyError, ValueError) as missing:
-        raise InputError(where=where, found=f"no tensor {missing} in it", needed=_NEEDED, fix=_FIX) from None
-    if action_width != ACTION_DIM:
-        found = f"action_encoder.weight of {action_width} columns"
-        raise InputError(where=where, found=found, needed=f"{ACTION_DIM} columns", fix=_FIX)
-    if latent.shape[-1] != encoder.sizes.width:
-        raise InputError(
-            where=f"model.base: {where}",
-            found=f"a predictor of latents of width {latent.shape[-1]}",
-            needed=f"one of width {encoder.sizes.width}, as {encoder.where} makes them",
-            fix="Set model.encoder to the encoder that the predictor was trained on",
-        )
-    try:
-        found_sizes = ModelSizes(
-            image_size=given.image_size,
-            patch_size=encoder.patch_size,
-            encoder=encoder.sizes,
-            predictor=PredictorSizes(
-                width=width,
-                depth=depth,
-                heads=own.heads,
-                mlp_ratio=mlp_ratio_of(width, hidden, own.mlp_ratio),
-                use_extrinsics=own.use_extrinsics,
-                use_states=any(name.startswith("state_encoder.") for name in predictor),
-            ),
-        )
-    except ValidationError as error:
-        raise InputError(
-            where=where,
-            found=f"sizes that do not go with model.sizes ({error.errors()[0]['msg']})",
-            needed="image size and heads of the checkpoint",
-            fix="Set them in model.sizes: the tensors cannot tell",
-        ) from None
-    check_sizes(found_sizes, given, where=where)
-    return found_sizes
+    except KeyError as missing:
+        raise file.lacks(f"tensor {missing} in predictor") from None
+    told = {
+        "image_size": given.image_size,
+        "patch_size": encoder.patch_size,
+        "encoder": encoder.sizes.model_dump(),
+        "predictor": {
+            "width": width,
+            "depth": depth,
+            "heads": own.heads,
+            "mlp_ratio": mlp_ratio_of(width, hidden, own.mlp_ratio),
+            "use_extrinsics": own.use_extrinsics,
+            "use_states": any(name.startswith("state_encoder.") for name in predictor),
+        },
+    }
+    fix = "Set image size and heads in model.sizes: the tensors cannot tell"
+    found = record_of(ModelSizes, told, where=str(file.path), needed="sizes that go with model.sizes", fix=fix)
+    check_sizes(found, given, where=str(file.path))
+    return found

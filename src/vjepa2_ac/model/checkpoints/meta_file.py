@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,11 +18,13 @@ from vjepa2_ac.model.network.pretrained_folder import check_tensors, require_fin
 ENCODER_KEYS = ("ema_encoder", "target_encoder", "encoder")
 """Where an encoder can be in a file. The first that is there is taken: an average of weights, which Meta's own use is
 of; `encoder` is the one that was trained by gradient."""
+FIX = "`vjepa2-ac download --list` shows those that are published; the Hub has facebook/vjepa2-vitl-fpc64-256"
 
 Part = Literal["encoder", "encoder 2.1", "predictor"]
 Rename = Callable[[str], tuple[str, int | None]]
 """Our name of a tensor -> the file's, and which third of a fused one it is (None: all of it)."""
 
+_NEEDED = "a checkpoint of V-JEPA 2, 2.1 or 2-AC as Meta publishes it"
 _SPLIT = ("q", "k", "v")
 _PREFIXES = re.compile(r"^(?:(?:module|backbone)\.)+")
 _IGNORED = "pos_embed"  # may be in a file: a network with rotary positions does not use it
@@ -43,43 +46,49 @@ _NAMES: dict[Part, list[tuple[str, str]]] = {  # ours -> Meta's, as (pattern, re
     ],
     "predictor": [(r"^blocks\.", "predictor_blocks."), (r"\.attn\.o\.", ".attn.proj.")],
 }
-_FOREIGN = (  # what a file begins with
-    (b"\x80", "a pickle, or a file of an old version of torch.save: neither is loaded, for it could run foreign code"),
-    (b"version https://git-lfs", "a pointer of Git LFS, in place of the file itself"),
-    (b"<", "a web page, or XML"),
-)
 
 
-def open_file(path: Path, *, needed: str, fix: str) -> dict[str, Any]:
-    """Map a checkpoint and return its parts by their keys; reads no values, and executes nothing.
+@dataclass(frozen=True)
+class MetaFile:
+    """A mapped checkpoint."""
 
-    Raises:
-        InputError: There is no such file, or it is of another kind, or truncated.
-    """
-    if not path.is_file():
-        raise InputError(where=str(path), found="no such file", needed=needed, fix=fix)
-    try:
-        whole = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except Exception as error:  # a damaged pickle ends in any of them
-        raise InputError(where=str(path), found=_foreign(path, error), needed=needed, fix=fix) from None
-    if not isinstance(whole, dict):
-        raise InputError(where=str(path), found=f"a {type(whole).__name__}", needed=needed, fix=fix)
-    return {str(key): value for key, value in whole.items()}
+    path: Path
+    parts: Mapping[str, Any]  # by its keys
 
+    @classmethod
+    def open(cls, path: Path) -> MetaFile:
+        """Map a file; reads no values, and executes nothing.
 
-def tensors_of(whole: Mapping[str, Any], key: str, *, where: str, needed: str, fix: str) -> dict[str, Tensor]:
-    """Return the tensors of a part by Meta's names without prefixes.
+        Raises:
+            InputError: There is no such file, or it is of another kind, or truncated.
+        """
+        if not path.is_file():
+            raise InputError(where=str(path), found="no such file", needed=_NEEDED, fix=FIX)
+        try:
+            whole = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+        except Exception as error:  # a damaged pickle ends in any of them
+            raise InputError(where=str(path), found=_unreadable(path, error), needed=_NEEDED, fix=FIX) from None
+        if not isinstance(whole, dict):
+            raise InputError(where=str(path), found=f"a {type(whole).__name__}", needed=_NEEDED, fix=FIX)
+        return cls(path, {str(key): value for key, value in whole.items()})
 
-    Raises:
-        InputError: There is no such part, it holds more than tensors, or nothing.
-    """
-    part = whole.get(key)
-    if not isinstance(part, dict) or not part or not all(isinstance(value, Tensor) for value in part.values()):
-        found = f"no weights under {key!r} (keys: {', '.join(list(whole)[:8])})"
-        raise InputError(where=where, found=found, needed=needed, fix=fix)
-    named = {_PREFIXES.sub("", str(name)): value for name, value in part.items()}
-    named.pop(_IGNORED, None)
-    return named
+    def tensors(self, key: str) -> dict[str, Tensor]:
+        """Return the tensors of a part by Meta's names without prefixes.
+
+        Raises:
+            InputError: There is no such part, it holds more than tensors, or nothing.
+        """
+        part = self.parts.get(key)
+        if not isinstance(part, dict) or not part or not all(isinstance(value, Tensor) for value in part.values()):
+            raise self.lacks(f"weights under {key!r}")
+        named = {_PREFIXES.sub("", str(name)): value for name, value in part.items()}
+        named.pop(_IGNORED, None)
+        return named
+
+    def lacks(self, what: str, fix: str = FIX) -> InputError:
+        """Return the error of a file without a part."""
+        found = f"no {what} (keys: {', '.join(list(self.parts)[:8])})"
+        return InputError(where=str(self.path), found=found, needed=_NEEDED, fix=fix)
 
 
 def part_of(family: Family) -> Part:
@@ -103,13 +112,13 @@ def fill(
     Raises:
         InputError: A tensor is missing, unknown or of another shape, or a weight is not finite.
     """
-    names = {ours: rename(ours) for ours in network.state_dict()}
-    needed: dict[str, tuple[int, ...]] = {}
-    for ours, value in network.state_dict().items():
-        theirs, third = names[ours]
-        needed[theirs] = tuple(value.shape) if third is None else (3 * value.shape[0], *value.shape[1:])
-    check_tensors({name: tuple(value.shape) for name, value in weights.items()}, needed, where=where, fix=fix)
-    own = {}
+    own = network.state_dict()
+    names = {ours: rename(ours) for ours in own}
+    needed = {
+        theirs: own[ours].shape if third is None else (3 * len(own[ours]), *own[ours].shape[1:])
+        for ours, (theirs, third) in names.items()
+    }
+    check_tensors({name: value.shape for name, value in weights.items()}, needed, where=where, fix=fix)
     for ours, (theirs, third) in names.items():
         value = weights[theirs] if third is None else weights[theirs].chunk(3)[third]
         own[ours] = value.to(dtype, copy=True)
@@ -118,16 +127,12 @@ def fill(
     network.requires_grad_(False)
 
 
-def to_official_names(weights: Mapping[str, Tensor], part: Part, *, prefix: str = "module.") -> dict[str, Tensor]:
+def to_official_names(weights: Mapping[str, Tensor], part: Part) -> dict[str, Tensor]:
     """Return our weights by Meta's names, q, k and v fused."""
-    pieces: dict[str, dict[int | None, Tensor]] = {}
-    for name, value in weights.items():
-        fused, third = official_name(name, part)
-        pieces.setdefault(fused, {})[third] = value.detach()
-    return {
-        f"{prefix}{name}": thirds[None] if None in thirds else torch.cat([thirds[index] for index in range(3)])
-        for name, thirds in pieces.items()
-    }
+    pieces: dict[str, list[Tensor]] = {}
+    for name, value in weights.items():  # q, k and v in this order, as everywhere
+        pieces.setdefault(official_name(name, part)[0], []).append(value.detach())
+    return {f"module.{name}": own[0] if len(own) == 1 else torch.cat(own) for name, own in pieces.items()}
 
 
 def depth_of(names: Mapping[str, object], blocks: str) -> int:
@@ -142,15 +147,13 @@ def depth_of(names: Mapping[str, object], blocks: str) -> int:
     return 1 + max(numbers)
 
 
-def _foreign(path: Path, error: Exception) -> str:
-    """Return what a file is that torch did not load."""
+def _unreadable(path: Path, error: Exception) -> str:
+    """Return what a file is that torch did not load: how it begins tells a web page or a pointer of Git LFS."""
     refused = re.search(r"GLOBAL ([\w.]+)", str(error))
     if refused:
         return f"a pickle that would call {refused[1]}: it was refused, since loading it could run foreign code"
     with path.open("rb") as file:
-        head = file.read(64)
-    if not head.startswith(b"PK"):
-        kind = "a safetensors file" if head[8:10] == b'{"' else "no file of torch.save"
-        return next((known for start, known in _FOREIGN if head.startswith(start)), kind)
-    size, (reason, *_) = path.stat().st_size / 1e9, [*str(error).splitlines(), type(error).__name__]
-    return f"{size:.2f} GB that torch cannot read ({reason[:120]}): truncated, or of another kind"
+        head = file.read(24)
+    reason = next(iter(str(error).splitlines()), type(error).__name__)[:120]
+    size = path.stat().st_size / 1e9
+    return f"{size:.2f} GB, beginning with {head!r}, that torch cannot read ({reason}): truncated, or of another kind"

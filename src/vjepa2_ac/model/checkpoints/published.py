@@ -1,29 +1,37 @@
-"""The checkpoints that Meta has published: names, addresses, sizes and what is in them. PyTorch is not imported.
+"""The checkpoints that Meta has published: names, addresses, sizes; and their download over an unstable connection.
 
+A download is resumed where it stopped, checked, then renamed. PyTorch is not imported.
 Sources: facebookresearch/vjepa2 @ 204698b, src/hub/backbones.py and app/vjepa_2_1/models; the models' cards on the Hub.
 """
 
 from __future__ import annotations
 
 import difflib
+import http.client
+import math
 import re
+import urllib.error
+import urllib.request
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
+from vjepa2_ac import storage
 from vjepa2_ac.config.model import Family
-from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.network.encoder_origin import VIT_B, VIT_G, VIT_H, VIT_L, EncoderShape, VIT_g
+from vjepa2_ac.errors import InputError, RefusedError, UnreachableError
+from vjepa2_ac.model.base_model import VIT_B, VIT_G, VIT_H, VIT_L, EncoderShape, VIT_g
+from vjepa2_ac.reporter import SILENT, Reporter
+from vjepa2_ac.storage.retries import RetryPolicy, with_retries
 
 OFFICIAL = "vjepa2-ac-vitg"  # Meta's world model, which `download` fetches without a name
 
 _URL = "https://dl.fbaipublicfiles.com/vjepa2/"
-_MIT = "MIT"
 _TOLERANCE = 0.25  # of a size that is only estimated
 
 
 @dataclass(frozen=True)
 class Published:
-    """A file that can be downloaded."""
+    """A file that can be downloaded; Meta publishes no hashes."""
 
     name: str  # for `vjepa2-ac download`; names differ by more than the case of a letter
     remote: str  # Meta's name of the file
@@ -32,11 +40,10 @@ class Published:
     encoder: EncoderShape
     image_size: int  # at which it was trained last, in pixels
     key: str  # of the encoder's weights in the file
+    hub_name: str  # its name in Meta's torch.hub
     gigabytes: float  # about: encoder, its average, predictor and the optimizer's moments, in float32
     bytes: int | None = None  # exactly, where known
-    sha256: str | None = None  # where known; Meta publishes none
-    licence: str = _MIT  # of Meta's repository; Meta's server sends none with the file
-    aliases: tuple[str, ...] = ()  # its names in Meta's torch.hub
+    licence: str = "MIT"  # of Meta's repository; Meta's server sends none with the file
 
     @property
     def url(self) -> str:
@@ -64,17 +71,6 @@ class Published:
         return round(self.gigabytes * (1 - _TOLERANCE) * 10**9), round(self.gigabytes * (1 + _TOLERANCE) * 10**9)
 
     @property
-    def encoder_parameters(self) -> int:
-        """Number of weights of the encoder."""
-        width, hidden = self.encoder.width, self.encoder.hidden
-        block = 4 * width * (width + 1) + 2 * width * hidden + hidden + width + 4 * width
-        patch = 3 * 16 * 16 * width
-        video = self.encoder.depth * block + 2 * patch + width
-        if self.family == "v2":
-            return video + 2 * width  # the last norm
-        return video + patch + width + 2 * width + 4 * 2 * width  # images' patches, two embeddings, four norms
-
-    @property
     def knob(self) -> str:
         """The knob of a config that takes the file."""
         return "model.base" if self.holds == "world model" else "model.encoder.path"
@@ -82,40 +78,40 @@ class Published:
 
 PUBLISHED: tuple[Published, ...] = (
     Published(
-        "vjepa2-ac-vitg", "vjepa2-ac-vitg.pt", "world model", "v2", VIT_g, 256, "encoder", 11.7,
-        aliases=("vjepa2_ac_vit_giant",),
+        "vjepa2-ac-vitg", "vjepa2-ac-vitg.pt", "world model", "v2", VIT_g, 256, "encoder",
+        "vjepa2_ac_vit_giant", 11.7,
     ),
     Published(
-        "vjepa2-vitl", "vitl.pt", "encoder", "v2", VIT_L, 256, "target_encoder", 5.1,
-        aliases=("vjepa2_vit_large",),
+        "vjepa2-vitl", "vitl.pt", "encoder", "v2", VIT_L, 256, "target_encoder",
+        "vjepa2_vit_large", 5.1,
     ),
     Published(
-        "vjepa2-vith", "vith.pt", "encoder", "v2", VIT_H, 256, "target_encoder", 10.4,
-        aliases=("vjepa2_vit_huge",),
+        "vjepa2-vith", "vith.pt", "encoder", "v2", VIT_H, 256, "target_encoder",
+        "vjepa2_vit_huge", 10.4,
     ),
     Published(
-        "vjepa2-vitg", "vitg.pt", "encoder", "v2", VIT_g, 256, "target_encoder", 16.5,
-        aliases=("vjepa2_vit_giant",),
+        "vjepa2-vitg", "vitg.pt", "encoder", "v2", VIT_g, 256, "target_encoder",
+        "vjepa2_vit_giant", 16.5,
     ),
     Published(
-        "vjepa2-vitg-384", "vitg-384.pt", "encoder", "v2", VIT_g, 384, "target_encoder", 16.5,
-        aliases=("vjepa2_vit_giant_384",),
+        "vjepa2-vitg-384", "vitg-384.pt", "encoder", "v2", VIT_g, 384, "target_encoder",
+        "vjepa2_vit_giant_384", 16.5,
     ),
     Published(
-        "vjepa2.1-vitb-384", "vjepa2_1_vitb_dist_vitG_384.pt", "encoder", "v2.1", VIT_B, 384, "ema_encoder", 1.66,
-        bytes=1_664_223_428, aliases=("vjepa2_1_vit_base_384",),
+        "vjepa2.1-vitb-384", "vjepa2_1_vitb_dist_vitG_384.pt", "encoder", "v2.1", VIT_B, 384, "ema_encoder",
+        "vjepa2_1_vit_base_384", 1.66, 1_664_223_428,
     ),
     Published(
-        "vjepa2.1-vitl-384", "vjepa2_1_vitl_dist_vitG_384.pt", "encoder", "v2.1", VIT_L, 384, "ema_encoder", 5.1,
-        aliases=("vjepa2_1_vit_large_384",),
+        "vjepa2.1-vitl-384", "vjepa2_1_vitl_dist_vitG_384.pt", "encoder", "v2.1", VIT_L, 384, "ema_encoder",
+        "vjepa2_1_vit_large_384", 5.1,
     ),
     Published(
-        "vjepa2.1-vitg-1b-384", "vjepa2_1_vitg_384.pt", "encoder", "v2.1", VIT_g, 384, "target_encoder", 16.5,
-        aliases=("vjepa2_1_vit_giant_384",),
+        "vjepa2.1-vitg-1b-384", "vjepa2_1_vitg_384.pt", "encoder", "v2.1", VIT_g, 384, "target_encoder",
+        "vjepa2_1_vit_giant_384", 16.5,
     ),
     Published(
-        "vjepa2.1-vitG-2b-384", "vjepa2_1_vitG_384.pt", "encoder", "v2.1", VIT_G, 384, "target_encoder", 29.8,
-        aliases=("vjepa2_1_vit_gigantic_384",),
+        "vjepa2.1-vitG-2b-384", "vjepa2_1_vitG_384.pt", "encoder", "v2.1", VIT_G, 384, "target_encoder",
+        "vjepa2_1_vit_gigantic_384", 29.8,
     ),
 )  # fmt: skip
 
@@ -134,19 +130,134 @@ def find_published(text: str) -> Published:
     Raises:
         InputError: None has this name.
     """
-    names = {_plain(name): one for one in PUBLISHED for name in (one.name, one.remote, *one.aliases)}
+    names = {_plain(name): one for one in PUBLISHED for name in (one.name, one.remote, one.hub_name)}
     if (meant := names.get(_plain(text))) is not None:
         return meant
-    folded = [(name.casefold(), one.name) for name, one in names.items()]
-    near = difflib.get_close_matches(_plain(text.rpartition("/")[2]).casefold(), [name for name, _ in folded], n=3)
-    close = list(dict.fromkeys(ours for name, ours in folded if name in near))
-    meant_perhaps = f"Did you mean {' or '.join(close)}? " if close else ""
+    folded = [name.casefold() for name in names]
+    near = difflib.get_close_matches(_plain(text.rpartition("/")[2]).casefold(), folded, n=3)
+    close = " or ".join(dict.fromkeys(one.name for name, one in names.items() if name.casefold() in near))
     raise InputError(
         where=f"download {text}",
         found="no published checkpoint of this name",
-        fix=f"{meant_perhaps}`vjepa2-ac download --list` shows all; where the file goes is said by --to",
+        fix=f"{f'Did you mean {close}? ' if close else ''}`vjepa2-ac download --list` shows all; where the file goes is"
+        " said by --to",
     )
 
 
 def _plain(name: str) -> str:
     return re.sub(r"[-_. ]", "", name.removesuffix(".pt"))
+
+
+CHUNK_BYTES = 2**20
+_POLICY = RetryPolicy(attempts=5, first_wait_s=2.0, total_s=math.inf)
+_MEGABYTE = 10**6
+_PROXY = "Check the URL, and whether a proxy answers in the server's place"
+
+
+def download(
+    url: str,
+    path: str | Path,
+    *,
+    known: Published | None = None,
+    reporter: Reporter = SILENT,
+    policy: RetryPolicy = _POLICY,
+) -> Path:
+    """Fetch a file to `path`; a part that an earlier call left beside it is gone on with.
+
+    Args:
+        url: What to fetch.
+        path: Where the whole file goes; it appears there only when it is whole. One that is there is kept, if it can
+            be the file.
+        known: The published checkpoint that it has to be, whose size is checked; None: any file.
+        reporter: Is told how far it is, in megabytes.
+        policy: How often in a row the line may break without a byte having come, and the waits.
+
+    Raises:
+        InputError: The server does not say how large the file is, or sends another size than the published file can
+            have; the disk has too little space; the address is none; the path cannot be written.
+        UnreachableError: The server refuses, or cannot be reached.
+    """
+    path = Path(path)
+    if not url.lower().startswith(("http://", "https://")):
+        raise _no_address(url)
+    with storage.user_can_write(path):
+        if path.is_dir():
+            raise InputError(where=str(path), found="a folder", needed="the name of a file", fix="Name a file in it")
+        if path.exists():
+            _require_size(known, _size(path), where=str(path))
+            return path
+        path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f"{path.name}.{known.name}.part" if known else f"{path.name}.part")
+    try:
+        with_retries(
+            url,
+            lambda timeout_s: _fetch(url, part, known, reporter, timeout_s),
+            policy=policy,
+            access="Check the URL",
+            progress=lambda: _size(part),
+        )
+    except RefusedError:
+        raise
+    except UnreachableError as error:
+        found = f"{error.found}; {_size(part)} bytes are in {part}"
+        fix = "Check the network and start again: it goes on where it stopped"
+        raise UnreachableError(where=url, found=found, fix=fix) from None
+    return part.replace(path)
+
+
+def _fetch(url: str, part: Path, known: Published | None, reporter: Reporter, timeout_s: float) -> None:
+    """Bring the rest of a file."""
+    start = _size(part)
+    try:
+        request = urllib.request.Request(url, headers={"Range": f"bytes={start}-"} if start else {})  # noqa: S310  # the user's
+        answer = urllib.request.urlopen(request, timeout=timeout_s)  # noqa: S310  # of http or https
+    except (http.client.InvalidURL, ValueError):
+        raise _no_address(url) from None
+    except urllib.error.HTTPError as error:
+        if error.code != 416:
+            raise
+        if error.headers.get("Content-Range", "").endswith(f"/{start}"):  # nothing is left
+            return
+        part.unlink()
+        raise http.client.HTTPException("the part that is here does not fit the file; starting again") from None
+    with answer:
+        start = start if answer.headers.get("Content-Range", "").startswith(f"bytes {start}-") else 0
+        promised = answer.headers.get("Content-Length", "")
+        if not promised.isdigit():
+            needed = "its size (Content-Length): without it, half a file looks like a whole one"
+            raise InputError(where=url, found="a server that does not say it", needed=needed, fix=_PROXY)
+        whole = start + int(promised)
+        _require_size(known, whole, where=url)
+        free = storage.free_bytes(part.parent.absolute()) + _size(part)
+        if whole > free:
+            raise InputError(
+                where=str(part),
+                found=f"{free / 1e9:.4g} GB free on its disk",
+                needed=f"{whole / 1e9:.4g} GB, of which {start / 1e9:.4g} GB are here",
+                fix="Free some space, or name a file on a larger disk with --to",
+            )
+        show = reporter.task(f"{part.name.removesuffix('.part')} (MB)")
+        with storage.user_can_write(part), part.open("ab" if start else "wb") as file:
+            while block := answer.read(CHUNK_BYTES):
+                file.write(block)
+                show(file.tell() // _MEGABYTE, whole // _MEGABYTE)
+        if _size(part) < whole:
+            raise http.client.IncompleteRead(b"", whole - _size(part))
+
+
+def _require_size(known: Published | None, size: int, *, where: str) -> None:
+    if known is None:
+        return
+    least, most = known.bytes_range
+    if not least <= size <= most:
+        needed = f"{known.name}, of {least:,} to {most:,} bytes"
+        fix = f"{_PROXY}; or delete the file, or name another with --to"
+        raise InputError(where=where, found=f"a file of {size:,} bytes", needed=needed, fix=fix)
+
+
+def _no_address(url: str) -> InputError:
+    return InputError(where=f"URL {url!r}", found="not an address", needed="one such as https://host/model.pt")
+
+
+def _size(path: Path) -> int:
+    return path.stat().st_size if path.exists() else 0

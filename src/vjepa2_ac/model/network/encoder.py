@@ -1,8 +1,7 @@
-"""The frozen encoder of V-JEPA 2 or 2.1: features of one frame at a time, or of a whole video."""
+"""The frozen encoder of V-JEPA 2 or 2.1: features of one frame at a time."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -13,15 +12,15 @@ from torch.nn.functional import layer_norm, linear
 
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.config.model import FramePath
+from vjepa2_ac.model.network.attention import TokenLayout, rotary_tables, rotate
 from vjepa2_ac.model.network.blocks import NORM_EPSILON, initialise, output_std, without_needless_autocast
-from vjepa2_ac.model.network.rotary import TokenLayout, rotary_tables, rotate
 from vjepa2_ac.model.quiet_imports import quiet_imports
 
 with quiet_imports():
     from transformers import VJEPA2Config
     from transformers.models.vjepa2.modeling_vjepa2 import VJEPA2Encoder, VJEPA2RopeAttention
 
-TUBELET = 2  # frames per tubelet: of a still the same one twice, of a video two
+TUBELET = 2  # frames per tubelet: the same one twice
 _GRID_OF_POSITIONS = 16  # V-JEPA 2.1 scales the positions of any grid to those of 256 px
 _LEVELS = 4  # of V-JEPA 2.1, each with a norm of its own; the last one's is the last norm
 
@@ -66,29 +65,12 @@ class Encoder(nn.Module):
         Raises:
             ValueError: The frames differ in size from the model's: the positions would be wrong.
         """
-        self._require_size(frames)
+        if frames.shape[-2:] != (self.image_size, self.image_size):
+            raise ValueError(
+                f"frames of {frames.shape[-2]} x {frames.shape[-1]} px; this encoder needs {self.image_size} x"
+                f" {self.image_size} px (model.sizes.image_size)"
+            )
         return torch.cat([self._encode(part) for part in torch.split(frames, chunk)])
-
-    @torch.no_grad()
-    def encode_videos(
-        self, videos: Float[Tensor, "batch time 3 height width"], chunk: int = 16
-    ) -> Float[Tensor, "batch tokens dim"]:
-        """Return the features of each video as the network was pre-trained: tubelets of two frames, with their times.
-
-        Every token sees all frames. The predictor was not trained on these features: they are for comparing videos.
-
-        Args:
-            videos: Frames normalised as in training; tokens are ordered by time, row and column.
-            chunk: Frames that go through the network at once, but one video at least: bounds the memory.
-
-        Raises:
-            ValueError: An odd number of frames, or frames of another size than the model's.
-        """
-        time = videos.shape[1]
-        if time % TUBELET or not time:
-            raise ValueError(f"a video of {time} frames; tubelets are of {TUBELET}")
-        self._require_size(videos)
-        return torch.cat([self._encode_video(part) for part in torch.split(videos, max(1, chunk // time))])
 
     def train(self, mode: bool = True) -> Encoder:  # noqa: ARG002  # a frozen encoder has one mode
         """Stay in eval mode, independent of the surrounding model."""
@@ -107,23 +89,6 @@ class Encoder(nn.Module):
         for index, block in enumerate(self.vit.layer):
             for output in (block.attention.proj, block.mlp.fc2):
                 nn.init.trunc_normal_(output.weight, std=output_std(index + 1), generator=generator)
-
-    def _require_size(self, frames: Tensor) -> None:
-        if frames.shape[-2:] != (self.image_size, self.image_size):
-            raise ValueError(
-                f"frames of {frames.shape[-2]} x {frames.shape[-1]} px; this encoder needs {self.image_size} x"
-                f" {self.image_size} px (model.sizes.image_size)"
-            )
-
-    def _encode_video(self, videos: Tensor) -> Tensor:
-        weight = next(self.vit.parameters())
-        tubelets = rearrange(videos.to(weight.dtype), "n time c h w -> n c time h w")
-        with without_needless_autocast(tubelets, weight):
-            tokens = self.vit.embeddings.patch_embeddings.proj.of_videos(tubelets)
-            for layer in self.vit.layer:
-                tokens = layer(tokens, None)[0]
-            features: Tensor = self.vit.layernorm(tokens)
-        return features
 
     def _encode(self, frames: Tensor) -> Tensor:
         weight = next(self.vit.parameters())
@@ -159,12 +124,6 @@ class _FramePatches(nn.Conv3d):
         rows = frames.shape[-2] // side
         return rearrange(embedded, "n (time rows columns) dim -> n dim time rows columns", time=1, rows=rows)
 
-    def of_videos(self, videos: Float[Tensor, "batch 3 time height width"]) -> Float[Tensor, "batch tokens dim"]:
-        """Return the result of the convolution for tubelets of two real frames, as tokens."""
-        form = "n c (time t) (rows p) (columns q) -> n (time rows columns) (c t p q)"
-        patches = rearrange(videos, form, t=TUBELET, p=self.kernel_size[-1], q=self.kernel_size[-1])
-        return linear(patches, self.weight.flatten(1), self.bias)
-
 
 class _PatchesByKind(_FramePatches):
     """The patch embeddings of V-JEPA 2.1: of tubelets and of images, each with a vector that says which they are.
@@ -188,10 +147,6 @@ class _PatchesByKind(_FramePatches):
             return super().forward(tubelets) + _as_channels(self.video_kind)
         return self._embedded(tubelets[:, :, 0], self.of_images) + _as_channels(self.image_kind)
 
-    def of_videos(self, videos: Float[Tensor, "batch 3 time height width"]) -> Float[Tensor, "batch tokens dim"]:
-        """Return the patches of tubelets of two real frames, as tokens."""
-        return super().of_videos(videos) + self.video_kind
-
 
 def _as_channels(vector: Float[Tensor, "1 1 dim"]) -> Float[Tensor, "1 dim 1 1 1"]:
     return vector.flatten()[None, :, None, None, None]
@@ -206,8 +161,7 @@ class _ExactAttention(VJEPA2RopeAttention):  # type: ignore[misc]  # transformer
 
     def apply_rotary_embeddings(self, qk: Tensor, pos_ids: Any) -> Tensor:  # noqa: ARG002  # positions are the layout's
         """Return queries or keys [batch heads sequence head_dim], rotated by their position."""
-        layout = replace(self.layout, steps=qk.shape[2] // self.layout.tokens_per_step)  # more than one of a video
-        tables = rotary_tables(layout, qk.shape[-1], qk.device)
+        tables = rotary_tables(self.layout, qk.shape[-1], qk.device)
         return rotate(qk.transpose(1, 2), tables).transpose(1, 2)
 
 

@@ -6,33 +6,14 @@ import torch
 from torch import Generator, nn
 from transformers import PreTrainedConfig, PreTrainedModel
 
-from vjepa2_ac.config import ModelSizes
-from vjepa2_ac.episode import ACTION_DIM, STATE_DIM
 from vjepa2_ac.model.network.blocks import initialise
-from vjepa2_ac.model.network.predictor_network import PredictorNetwork, predictor_fields
+from vjepa2_ac.model.network.predictor_network import PredictorNetwork
 
 
 class PredictorConfig(PreTrainedConfig):  # type: ignore[misc]  # transformers has no types
-    """Sizes of the predictor in the form transformers stores them; the defaults are the released ones."""
+    """Sizes of the predictor in the form transformers stores them: those of `predictor_fields`."""
 
     model_type = "vjepa2_ac_predictor"
-
-    image_size: int = 256
-    patch_size: int = 16
-    latent_dim: int = 1408
-    hidden_size: int = 1024
-    num_hidden_layers: int = 24
-    num_attention_heads: int = 16
-    mlp_ratio: float = 4.0
-    use_extrinsics: bool = False
-    use_states: bool = True
-    action_dim: int = ACTION_DIM
-    state_dim: int = STATE_DIM
-
-    @classmethod
-    def from_sizes(cls, sizes: ModelSizes) -> PredictorConfig:
-        """Return the sizes of the predictor of a world model."""
-        return cls(**predictor_fields(sizes))
 
 
 class ActionConditionedPredictor(PredictorNetwork, PreTrainedModel):  # type: ignore[misc]  # transformers has no types

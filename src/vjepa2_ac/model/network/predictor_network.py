@@ -1,4 +1,4 @@
-"""The network of the action-conditioned predictor: its layers, the pass through them, and the cache of keys and values.
+"""The network of the action-conditioned predictor: layers, pass, cache; predict a step, roll out many.
 
 It needs PyTorch alone.
 """
@@ -12,13 +12,14 @@ import torch
 from einops import rearrange
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn.functional import layer_norm
 from torch.utils.checkpoint import checkpoint
 
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.episode import EXTRINSICS_DIM
-from vjepa2_ac.model.network.attention import Attend, AttentionKind
+from vjepa2_ac.model.network.attention import Attend, AttentionKind, TokenLayout, rotary_tables
 from vjepa2_ac.model.network.blocks import NORM_EPSILON, Block, hidden_width, normalised
-from vjepa2_ac.model.network.rotary import TokenLayout, rotary_tables
+from vjepa2_ac.model.network.compilation import When
 
 
 class KeyValueCache:
@@ -123,7 +124,7 @@ class PredictorNetwork(nn.Module):
             keep: How many of the steps are added, from the first; None: all.
 
         Raises:
-            ValueError: The tokens do not match the image size, or extrinsics are missing or unexpected.
+            ValueError: Extrinsics are missing or unexpected.
         """
         tokens, layout = self._assemble(latents, actions, states, extrinsics, cache)
         tokens = self._through_blocks(tokens, layout, cache, keep)
@@ -141,11 +142,6 @@ class PredictorNetwork(nn.Module):
         cache: KeyValueCache | None = None,
     ) -> tuple[Tensor, TokenLayout]:
         """Return the sequence of tokens, step by step, and its layout."""
-        if latents.shape[2] != self.grid**2:
-            raise ValueError(
-                f"{latents.shape[2]} tokens a step do not make a frame of {self.config.image_size} px with patches of"
-                f" {self.config.patch_size} px ({self.grid} x {self.grid} = {self.grid**2} tokens)"
-            )
         if self.config.use_extrinsics != (extrinsics is not None):
             raise ValueError(
                 f"use_extrinsics is {self.config.use_extrinsics}, extrinsics given: {extrinsics is not None}"
@@ -209,3 +205,92 @@ def _in_own_type(layer: Any, values: Tensor, dtype: torch.dtype) -> Tensor:
     if torch.is_autocast_enabled(values.device.type):
         return layer(values)  # type: ignore[no-any-return]  # PEFT may be around it, untyped
     return layer(values.to(layer.weight.dtype)).to(dtype)  # type: ignore[no-any-return]  # the same
+
+
+class LatentDynamics(nn.Module):
+    """A predictor of latents, with or without an adapter around it; predictions are layer-normalised, in float32."""
+
+    predictor: nn.Module
+
+    @property
+    def device(self) -> torch.device:
+        """The device of the predictor's weights."""
+        return next(self.predictor.parameters()).device
+
+    @property
+    def base_predictor(self) -> Any:
+        """The predictor itself, without a surrounding adapter."""
+        wrapped = getattr(self.predictor, "get_base_model", None)  # PEFT's
+        return wrapped() if wrapped else self.predictor
+
+    def predict(
+        self,
+        latents: Float[Tensor, "batch time tokens dim"],
+        actions: Float[Tensor, "batch time action_dim"],
+        states: Float[Tensor, "batch time state_dim"],
+        extrinsics: Float[Tensor, "batch time 6"] | None = None,
+        cache: KeyValueCache | None = None,
+        keep: int | None = None,
+    ) -> Float[Tensor, "batch time tokens dim"]:
+        """Return, at each step, the prediction of the next step's latents from the given ones (teacher forcing).
+
+        With a cache the steps come after those in it; the first `keep` of them are added to it (None: all).
+        """
+        if cache is None:
+            return normalise_latents(self.predictor(latents, actions, states, extrinsics))
+        return normalise_latents(self.predictor(latents, actions, states, extrinsics, cache=cache, keep=keep))
+
+    def rollout(
+        self,
+        context: Float[Tensor, "batch context tokens dim"],
+        actions: Float[Tensor, "batch time action_dim"],
+        states: Float[Tensor, "batch time state_dim"],
+        extrinsics: Float[Tensor, "batch time 6"] | None = None,
+        cache: KeyValueCache | None = None,
+    ) -> Float[Tensor, "batch steps tokens dim"]:
+        """Return predictions of the steps after the context, each fed back to predict the next.
+
+        With frames counted from 0, the context holds frames 0 .. context-1 and the result frames context .. time: the
+        first is predicted from the context alone, so index h - 1 is horizon h, and there are time - context + 1 of
+        them. Actions and states are the true ones throughout. A context need not be true: to continue from a
+        known prediction, append it to the context.
+
+        The context is computed at once, then one step at a time: keys and values are cached. With a cache, context,
+        actions and states come after the steps in it; it is not changed, so that many rollouts can start from it.
+
+        Raises:
+            ValueError: There are fewer actions than context latents.
+        """
+        first, last = context.shape[1], actions.shape[1]
+        if last < first:
+            raise ValueError(f"{last} actions do not reach the end of a context of {first} latents")
+        cache = KeyValueCache() if cache is None else cache.copy()
+        latents, start = context, 0
+        predicted = []
+        for end in range(first, last + 1):
+            camera = None if extrinsics is None else extrinsics[:, start:end]
+            keep = None if end < last else 0  # nothing comes after the last
+            following = self.predict(latents, actions[:, start:end], states[:, start:end], camera, cache, keep)
+            latents, start = following[:, -1:], end
+            predicted.append(latents)
+        return torch.cat(predicted, dim=1)
+
+    def set_gradient_checkpointing(self, enabled: bool) -> None:
+        """Choose whether predictor blocks are recomputed in the backward pass instead of storing their activations."""
+        predictor = self.base_predictor
+        predictor.gradient_checkpointing = enabled
+        predictor.has_dropout = any(isinstance(one, nn.Dropout) and one.p > 0 for one in predictor.blocks.modules())
+
+    def set_compiled(self, when: When) -> None:
+        """Choose when predictor blocks are compiled (see `model.network.compilation`)."""
+        for block in self.base_predictor.blocks:
+            block.compiled = when
+
+    def set_attention(self, kind: AttentionKind | Attend) -> None:
+        """Choose how the predictor computes block-causal attention (see `model.network.attention`)."""
+        self.base_predictor.attention = kind
+
+
+def normalise_latents(features: Float[Tensor, "*batch dim"]) -> Float[Tensor, "*batch dim"]:
+    """Return features layer-normalised over `dim` without affine, in float32."""
+    return layer_norm(features.float(), features.shape[-1:])

@@ -5,7 +5,9 @@ And what every file of weights is checked for: names, shapes, and that each numb
 
 from __future__ import annotations
 
+import errno
 import json
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,9 +20,8 @@ from torch import Tensor, nn
 
 from vjepa2_ac import storage
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.base_model import CONFIG, FORMAT
-from vjepa2_ac.model.network.encoder_origin import EncoderOrigin
-from vjepa2_ac.storage.structured import read_json_object, record_of
+from vjepa2_ac.model.base_model import CONFIG, FORMAT, EncoderOrigin, read_model_json
+from vjepa2_ac.storage.structured import record_of
 
 ENCODER, PREDICTOR = "encoder.safetensors", "predictor/model.safetensors"
 
@@ -39,14 +40,25 @@ def write_folder(folder: Path, card: dict[str, Any], encoder: nn.Module, predict
     """
     with storage.folder_writer(folder, CONFIG) as fresh:
         (fresh / PREDICTOR).parent.mkdir()
-        try:
-            save_file(_whole(encoder), fresh / ENCODER, metadata={"format": "pt"})
-            save_file(_whole(predictor), fresh / PREDICTOR, metadata={"format": "pt"})
-        except SafetensorError as error:  # which is no OSError, even if the disk is full
-            raise InputError(where=str(folder), found=f"cannot be written: {error}") from None
+        save_tensors(encoder.state_dict(), fresh / ENCODER)
+        save_tensors(predictor.state_dict(), fresh / PREDICTOR)
         predictor.config.architectures = [type(predictor).__name__]
         predictor.config.save_pretrained(fresh / "predictor")
         (fresh / CONFIG).write_text(json.dumps({"format": FORMAT, **card}, indent=1) + "\n", encoding="utf-8")
+
+
+def save_tensors(tensors: Mapping[str, Tensor], path: Path) -> None:
+    """Write tensors to a safetensors file.
+
+    Raises:
+        OSError: The disk is full, or another error of the system.
+    """
+    try:
+        whole = {name: value.detach().to("cpu").contiguous() for name, value in tensors.items()}
+        save_file(whole, path, metadata={"format": "pt"})
+    except SafetensorError as error:  # whose text alone has the system's number
+        number = re.search(r"os error (\d+)", str(error))
+        raise OSError(int(number[1]) if number else errno.EIO, str(error), str(path)) from None
 
 
 def read_encoder_origin(folder: Path) -> EncoderOrigin | None:
@@ -55,11 +67,9 @@ def read_encoder_origin(folder: Path) -> EncoderOrigin | None:
     Raises:
         InputError: The folder says it in a way that nobody understands.
     """
-    told = read_json_object(folder / CONFIG, needed="the config of a world model").get("encoder_origin")
-    if told is None:
-        return None
+    told = read_model_json(folder / CONFIG).get("encoder_origin")
     where, needed = f"{folder / CONFIG}: encoder_origin", "file, key and licence of an encoder"
-    return record_of(EncoderOrigin, told if isinstance(told, dict) else {}, where=where, needed=needed)
+    return None if told is None else record_of(EncoderOrigin, told, where=where, needed=needed)
 
 
 def load_safetensors(module: nn.Module, path: Path, dtype: torch.dtype | None) -> None:
@@ -70,10 +80,7 @@ def load_safetensors(module: nn.Module, path: Path, dtype: torch.dtype | None) -
     """
     fix = "Copy or write the folder again"
     weights = read_tensors(path, module.state_dict(), needed="the weights of a world model", fix=fix, dtype=dtype)
-    frozen = {name: value.requires_grad for name, value in module.named_parameters()}
-    module.load_state_dict(weights, strict=True, assign=True)
-    for name, value in module.named_parameters():
-        value.requires_grad_(frozen[name])
+    module.load_state_dict(weights, assign=True)
 
 
 def read_tensors(
@@ -93,10 +100,10 @@ def read_tensors(
     """
     with open_safetensors(path, needed=needed) as file:
         found = {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118  # no iterator
-        check_tensors(found, {name: tuple(value.shape) for name, value in like.items()}, where=str(path), fix=fix)
-        values = {name: file.get_tensor(name) for name in like}
+        check_tensors(found, {name: value.shape for name, value in like.items()}, where=str(path), fix=fix)
+        mapped = {name: file.get_tensor(name) for name in like}
         # copied: the file may be replaced while it is in use
-        weights = {name: value.to(dtype or value.dtype, copy=True) for name, value in values.items()}
+        weights = {name: value.to(dtype or value.dtype, copy=True) for name, value in mapped.items()}
     require_finite(weights, where=str(path), fix=fix)
     return weights
 
@@ -120,11 +127,7 @@ def open_safetensors(path: Path, *, needed: str) -> Iterator[Any]:
 
 
 def check_tensors(
-    found: Mapping[str, tuple[int, ...]],
-    needed: Mapping[str, tuple[int, ...]],
-    *,
-    where: str,
-    fix: str = "Check model.base and model.sizes",
+    found: Mapping[str, tuple[int, ...]], needed: Mapping[str, tuple[int, ...]], *, where: str, fix: str
 ) -> None:
     """Refuse tensors that are missing, unknown or of another shape, and name some of them.
 
@@ -133,19 +136,13 @@ def check_tensors(
     """
     problems = [f"missing: {name}" for name in needed.keys() - found.keys()]
     problems += [f"unknown: {name}" for name in found.keys() - needed.keys()]
-    problems += [
-        f"{name} is {list(found[name])}, not {list(needed[name])}"
-        for name in needed.keys() & found.keys()
-        if found[name] != needed[name]
-    ]
+    for name in needed.keys() & found.keys():
+        if found[name] != needed[name]:
+            problems.append(f"{name} is {list(found[name])}, not {list(needed[name])}")
     if problems:
         shown = "; ".join(sorted(problems)[:4]) + (f"; and {len(problems) - 4} more" if len(problems) > 4 else "")
-        raise InputError(
-            where=where,
-            found=f"{len(problems)} tensors do not fit ({shown})",
-            needed="every tensor of the model, and no other",
-            fix=fix,
-        )
+        found_text = f"{len(problems)} tensors do not fit ({shown})"
+        raise InputError(where=where, found=found_text, needed="every tensor of the model, and no other", fix=fix)
 
 
 def first_not_finite(tensors: Mapping[str, Tensor]) -> str | None:
@@ -162,18 +159,8 @@ def first_not_finite(tensors: Mapping[str, Tensor]) -> str | None:
 def require_finite(tensors: Mapping[str, Tensor], *, where: str, fix: str) -> None:
     """Refuse tensors that hold NaN or infinity.
 
-    Args:
-        tensors: By name.
-        where: Their owner, for messages.
-        fix: How to fix it, as a sentence.
-
     Raises:
         InputError: Names the first such tensor.
     """
-    name = first_not_finite(tensors)
-    if name is not None:
+    if (name := first_not_finite(tensors)) is not None:
         raise InputError(where=where, found=f"{name} holds NaN or infinity", needed="finite weights", fix=fix)
-
-
-def _whole(module: nn.Module) -> dict[str, Tensor]:
-    return {name: value.detach().contiguous() for name, value in module.state_dict().items()}

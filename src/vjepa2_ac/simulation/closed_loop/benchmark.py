@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from vjepa2_ac import __version__
-from vjepa2_ac.media.video_writer import video_library, write_video
+from vjepa2_ac.media.video import video_library, write_video
 from vjepa2_ac.planning.goals import read_goal_folder
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.reports.figures.film import side_by_side

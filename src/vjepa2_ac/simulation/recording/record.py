@@ -29,7 +29,7 @@ from vjepa2_ac.data.sources.rlds.droid_writer import (
 )
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.jpeg import encode_jpeg
+from vjepa2_ac.media.images import encode_jpeg
 from vjepa2_ac.simulation.closed_loop.tasks import arm_for
 from vjepa2_ac.simulation.world.arm import SimulatedArm
 from vjepa2_ac.simulation.world.domains import Domain, DomainRanges, named_domain, sample_domain

@@ -27,9 +27,8 @@ from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.distributed import PRECISIONS
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.model.adapter.low_rank import CastMatrices
-from vjepa2_ac.model.network.dynamics import LatentDynamics
-from vjepa2_ac.model.network.predictor_network import PredictorNetwork, predictor_fields
-from vjepa2_ac.model.network.rotary import rotary_tables
+from vjepa2_ac.model.network.attention import rotary_tables
+from vjepa2_ac.model.network.predictor_network import LatentDynamics, PredictorNetwork, predictor_fields
 from vjepa2_ac.training.loss import Objective
 
 Kind = Literal["cpu", "cuda"]

@@ -34,7 +34,7 @@ from vjepa2_ac.data.sources.indexed_source import (
 )
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError, require_library
-from vjepa2_ac.media.video_reader import count_frames, frame_times, read_frames
+from vjepa2_ac.media.video import count_frames, frame_times, read_frames
 from vjepa2_ac.spaces import POSE, zero_steps
 from vjepa2_ac.storage.structured import json_object
 

@@ -44,7 +44,7 @@ from vjepa2_ac.data.selection import StepSelection
 from vjepa2_ac.data.sources.latents.cache_key import FORMAT, CacheKey
 from vjepa2_ac.episode import Episode, StoredLatents
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.jpeg import decode_jpegs, encode_jpeg
+from vjepa2_ac.media.images import decode_jpegs, encode_jpeg
 from vjepa2_ac.storage.structured import json_object, read_json_object
 
 CacheType = Literal["bf16", "fp32", "int8"]

@@ -15,7 +15,7 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import LeRobotData, LeRobotFields
 from vjepa2_ac.data.files import in_parallel
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.video_reader import is_deep_grey
+from vjepa2_ac.media.video import is_deep_grey
 from vjepa2_ac.storage import FileInfo
 from vjepa2_ac.storage.structured import read_json_object
 

@@ -22,9 +22,8 @@ from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, list_by_template, m
 from vjepa2_ac.data.sources.lerobot.parquet import EPISODE, Columns, ParquetRows
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.image_file import decode_image
-from vjepa2_ac.media.jpeg import require_bounded
-from vjepa2_ac.media.video_reader import Clock, read_frames, require_decoder
+from vjepa2_ac.media.images import decode_image, require_bounded
+from vjepa2_ac.media.video import Clock, read_frames
 from vjepa2_ac.spaces import POSE, require_finite
 from vjepa2_ac.storage.block_file import BlockCachedFile
 
@@ -102,7 +101,7 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
         info.require_mapping(config)
         keys = [info.camera_key(config.lerobot, camera) for camera in config.cameras]
         if any(info.features[key].dtype == "video" for key in keys):
-            require_decoder(info.where)
+            video_library(info.where)
         listed = partial(list_by_template, info.root, connections=connections_to(config))
         tables, files = listed(TABLES[info.version]), listed(info.data_path)
         for key in keys:

@@ -38,7 +38,7 @@ from vjepa2_ac.data.sources.rlds.tfrecord import (
 )
 from vjepa2_ac.episode import Episode, Progress, StepRanges
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.jpeg import decode_jpegs
+from vjepa2_ac.media.images import decode_jpegs
 from vjepa2_ac.storage.block_file import DiskCache
 
 _CHECKED = b"\xc3"  # not all bits equal, so that a damaged file seldom contains false marks

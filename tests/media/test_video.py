@@ -1,9 +1,10 @@
-"""Video frames: independent of which other frames are decoded."""
+"""Video frames: independent of which other frames are decoded; and films."""
 
 import io
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import av
@@ -14,8 +15,9 @@ from paths import GOLDEN
 from recordings import write_mp4
 from synthetic import draw_frame, synthetic_states
 from vjepa2_ac.errors import InputError, UnreachableError
-from vjepa2_ac.media import video_reader
-from vjepa2_ac.media.video_reader import Clock, count_frames, frame_times, read_frames
+from vjepa2_ac.media import video as video_reader
+from vjepa2_ac.media.video import Clock, count_frames, frame_times, read_frames, write_video
+from vjepa2_ac.reports import imagined
 
 STEPS = 40
 FRAMES = [draw_frame(state, size=(36, 64)) for state in synthetic_states(STEPS)]
@@ -132,13 +134,6 @@ def test_with_its_times_at_hand_a_video_is_not_walked(
     np.testing.assert_array_equal(read_frames(path, [31, 2], where="a", times=times), expected)
 
 
-def test_a_file_that_is_open_is_read_and_stays_open(tmp_path: Path) -> None:
-    path = write_mp4(tmp_path / "a.mp4", FRAMES)
-    with path.open("rb") as file:
-        np.testing.assert_array_equal(read_frames(file, [3], where="a"), read_frames(path, [3], where="a"))
-        assert not file.closed
-
-
 class FailingFile(io.BytesIO):
     """Reads that fail after a while, as a network's do."""
 
@@ -204,17 +199,6 @@ def test_a_frame_past_the_end_is_named(tmp_path: Path, clock: Clock | None) -> N
         read_frames(path, [3, 42], where="a", clock=clock)
 
 
-def test_a_missing_video_is_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"here: .*No such file"):
-        read_frames(tmp_path / "a.mp4", [0], where="here")
-
-
-def test_no_steps_or_one_before_the_first_are_the_programmers_errors(tmp_path: Path) -> None:
-    for steps in ([], [-1]):
-        with pytest.raises(ValueError, match="steps"):
-            read_frames(tmp_path / "a.mp4", steps, where="a")
-
-
 def test_without_pyav_the_way_to_install_it_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(UnreachableError, match=r"pip install .*\[video\]"):
@@ -243,3 +227,45 @@ def test_a_clock_too_coarse_for_its_frames_shows_none_twice(tmp_path: Path) -> N
     path.write_bytes(data)
     with pytest.raises(InputError, match=r"times in units of 1 s for 15 frames a second\. needed: a time for each"):
         read_frames(path, [0, 5], where="a", clock=Clock(0.0, 15.0))
+
+
+def frames(count: int = 5, height: int = 33, width: int = 48) -> list[np.ndarray]:
+    shades = np.linspace(40, 220, count).astype(np.uint8)
+    made = [np.full((height, width, 3), shade, dtype=np.uint8) for shade in shades]
+    for frame in made:
+        frame[:, : width // 2, 0] = 200
+        frame[:, : width // 2, 2] = 30
+    return made
+
+
+def test_what_was_written_is_what_is_shown(tmp_path: Path) -> None:
+    made = frames()
+    path = write_video(tmp_path / "new" / "film.mp4", iter(made), rate_hz=3.75)
+    assert count_frames(path, where="film") == 5
+    shown = read_frames(path, range(5), where="film")
+    assert shown.shape == (5, 32, 48, 3)  # an odd row is left out
+    for ours, theirs in zip(made, shown, strict=True):
+        np.testing.assert_allclose(theirs.mean(axis=(0, 1)), ours[:32].mean(axis=(0, 1)), atol=6)
+    with av.open(str(path)) as file:
+        assert float(file.duration / av.time_base) == pytest.approx(5 / 3.75, abs=0.05)
+        assert file.streams.video[0].codec_context.pix_fmt == "yuv420p"
+
+
+def test_nothing_is_left_of_a_video_that_cannot_be(tmp_path: Path) -> None:
+    for made, wrong in (([], "without frames"), ([*frames(1), *frames(1, 20)], "in one video")):
+        with pytest.raises(ValueError, match=wrong):
+            write_video(tmp_path / "film.mp4", made, rate_hz=4.0)
+        assert not list(tmp_path.iterdir())
+
+
+def test_a_film_without_pyav_is_a_gif_and_a_note(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    noted: list[str] = []
+    monkeypatch.setitem(sys.modules, "av", None)
+    for name, value in (("draw_strip", FRAMES[0]), ("film_frames", FRAMES[:2]), ("durations", [0.1, 0.1])):
+        monkeypatch.setattr(imagined, name, lambda *_, value=value, **__: value)
+    for name in ("strip_of", "_as_dict"):
+        monkeypatch.setattr(imagined, name, lambda _: {})
+    written = imagined.write_film_of(None, tmp_path, reporter=SimpleNamespace(note=noted.append))  # type: ignore[arg-type]
+    assert imagined.VIDEO not in {path.name for path in written}
+    assert all(path.is_file() for path in written)
+    assert "pip install" in noted[0]
