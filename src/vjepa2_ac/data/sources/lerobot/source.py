@@ -23,7 +23,7 @@ from vjepa2_ac.data.sources.lerobot.parquet import EPISODE, Columns, ParquetRows
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import decode_image, require_bounded
-from vjepa2_ac.media.video import Clock, read_frames
+from vjepa2_ac.media.video import Clock, read_frames, video_library
 from vjepa2_ac.spaces import POSE, require_finite
 from vjepa2_ac.storage.block_file import BlockCachedFile
 
