@@ -131,7 +131,9 @@ def test_the_menu_is_short() -> None:
     assert len(entries) <= 16
 
 
-SECTIONS = "adapter checkpoint data decoder model planning replay tracking training validation".split()
+SECTIONS = (
+    "adapter", "checkpoint", "data", "decoder", "model", "planning", "replay", "tracking", "training", "validation",
+)  # fmt: skip
 
 
 def test_knobs_that_are_named_are_there() -> None:
