@@ -18,8 +18,7 @@ from vjepa2_ac.config.loading import config_path, config_schema, packaged_config
 
 _COLUMNS = "88"  # of a help text
 _REFERENCE = {  # page: what it has; below these, all that the code makes
-    "commands": "all commands, a line each",
-    "made/commands": "what each `--help` prints",
+    "made/commands": "all commands, a line each, and what each `--help` prints",
     "made/config_keys": "every config key with its range and default",
     "made/configs": "the configs of the package, whole",
     "made/api": "the public names of Python",
@@ -81,10 +80,12 @@ def contents_page(title: str, pages: Mapping[str, str]) -> str:
 def commands_page() -> str:
     """Return a section for each command, with what `--help` prints."""
     os.environ["COLUMNS"] = _COLUMNS
+    leaves = {" ".join(words): parser for words, parser in _leaves(_parser(), ())}
     lines = ["# Every command", "", "As `vjepa2-ac COMMAND --help` prints them.", ""]
-    for words, parser in _leaves(_parser(), ()):
-        lines += [f"## {' '.join(words)}", "", "```text", parser.format_help().strip(), "```", ""]
-    return "\n".join(lines)
+    lines += [f"- [{name}](#{name.replace(' ', '-')}): {_first_sentence(one)}" for name, one in leaves.items()]
+    for name, parser in leaves.items():
+        lines += ["", f"## {name}", "", "```text", parser.format_help().strip(), "```"]
+    return "\n".join([*lines, ""])
 
 
 def keys_page() -> str:
@@ -164,6 +165,12 @@ def _leaves(
     for one in inner:
         for name, below in one.choices.items():
             yield from _leaves(below, (*words, name))
+
+
+def _first_sentence(parser: argparse.ArgumentParser) -> str:
+    """Return what a command does, in short: the beginning of its description, as Markdown."""
+    found = re.match(r".*?[^.](?=[.;]\s|[.]?$)", re.sub(r"\s+", " ", parser.description or ""))
+    return re.sub(r"([<>*_\[\]|])", r"\\\1", found[0]) if found else ""
 
 
 def _resolved(one: Mapping[str, Any], schema: Mapping[str, Any]) -> Mapping[str, Any]:
