@@ -38,6 +38,7 @@ PAGES = {
     "docs/planning.md": "[sim]",
     "docs/python.md": "[sim]",
     "docs/serving.md": "[serve]",
+    "docs/troubleshooting.md": "[data]",
 }
 NO_GUIDES = {
     "CONTRIBUTING.md": "of developers: the extra dev",

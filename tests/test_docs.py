@@ -13,11 +13,12 @@ from paths import ROOT
 from vjepa2_ac.config.loading import all_keys, parse_config
 from vjepa2_ac.registry import REGISTRIES
 
-BLOCKS = re.findall(r"```yaml\n(.*?)```", (ROOT / "docs/data.md").read_text(), flags=re.DOTALL)
+OF_DATA = [(ROOT / f"docs/{name}.md").read_text() for name in ("data", "data_reference")]
+BLOCKS = [text for page in OF_DATA for text in re.findall(r"```yaml\n(.*?)```", page, flags=re.DOTALL)]
 
 
 @pytest.mark.parametrize("text", BLOCKS, ids=lambda text: text.splitlines()[0])
-def test_every_config_of_the_data_page_is_complete(text: str) -> None:
+def test_every_config_of_the_data_pages_is_complete(text: str) -> None:
     parse_config(yaml.safe_load(text), where="docs/data.md")
 
 
@@ -35,6 +36,7 @@ PACKAGE = ROOT / "src/vjepa2_ac"
 OURS = {path.name for root in (ROOT, PACKAGE, ROOT / "tests") for path in root.iterdir() if path.is_dir()}
 OURS -= {"src", "demo"}  # the second is made by commands
 
+GUIDES = ("data", "training", "evaluation", "decoding", "planning", "serving", "scaling", "encoders")
 FILES = ("json", "md", "npz", "png", "pt", "safetensors", "yaml")
 
 
@@ -100,3 +102,60 @@ def test_modules_that_are_named_are_there() -> None:
         named = [name for name in whole + within if not name.endswith(FILES) and f"vjepa2_ac.{name}" not in GROUPS]
         wrong += [f"{path.relative_to(ROOT)}: {name}" for name in named if not is_module_or_part_of_one(name)]
     assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize("name", GUIDES)
+def test_a_guide_is_short_begins_with_one_command_and_leads_on(name: str) -> None:
+    text = (ROOT / f"docs/{name}.md").read_text()
+    assert len(text.split()) <= 1_500
+    first = re.search(r"```sh\n(.*?)```", text, flags=re.DOTALL)
+    assert first
+    assert first[1].replace("\\\n", "").count("\n") == 1
+    assert len(text[: first.start()].split()) < 15, "its title stands before it, no more"
+    assert f"]({name}.md" in (ROOT / "docs/start.md").read_text(), "one click from the start page"
+    if (ROOT / f"docs/{name}_reference.md").exists():
+        assert f"]({name}_reference.md)" in text
+
+
+def words_of(path: Path) -> int:
+    """Count what has a letter or a digit: no marks of tables and lists."""
+    return sum(bool(re.search(r"\w", word)) for word in path.read_text().split())
+
+
+def test_the_pages_are_short_together() -> None:
+    """Without the log, which tells of how things were."""
+    pages = [ROOT / "README.md", *(path for path in (ROOT / "docs").glob("*.md") if path.name != "log.md")]
+    assert sum(map(words_of, pages)) <= 25_000
+    assert len((ROOT / "README.md").read_text().split()) <= 1_200
+
+
+def test_the_menu_is_short() -> None:
+    trees = re.findall(r"```{toctree}\n(.*?)```", (ROOT / "docs/index.md").read_text(), flags=re.DOTALL)
+    entries = [line for tree in trees for line in tree.splitlines() if line and not line.startswith(":")]
+    assert entries[0] == "start"
+    assert len(entries) <= 16
+
+
+SECTIONS = (
+    "adapter", "checkpoint", "data", "decoder", "model", "planning", "replay", "tracking", "training", "validation",
+)  # fmt: skip
+
+
+def test_knobs_that_are_named_are_there() -> None:
+    wrong = []
+    for path in [path for path in DOCS if path.name not in ("log.md", "IMPLEMENTATION_NOTES.md")]:
+        named = re.findall(rf"`((?:{'|'.join(SECTIONS)})\.[a-z_]+(?:\.[a-z_]+)*)(?:[:=][^`]*)?`", path.read_text())
+        wrong += [
+            f"{path.name}: {name}" for name in named
+            if not name.endswith(FILES) and not is_knob(name) and not is_module_or_part_of_one(name)
+        ]  # fmt: skip
+    assert not wrong, "\n".join(wrong)
+
+
+def test_whoever_shows_one_way_of_installing_an_extra_shows_both() -> None:
+    for path in DOCS:
+        if path.name not in ("log.md", "CONTRIBUTING.md", "releasing.md"):
+            text = path.read_text()
+            clone = set(re.findall(r'constraints\.txt -e "\.\[([\w,]+)\]"', text))
+            wheel = set(re.findall(r'pip install "(?:vjepa2-ac|\$\(ls dist/\*\.whl\))\[([\w,]+)\]"', text))
+            assert clone <= wheel, path.name

@@ -17,6 +17,29 @@ from vjepa2_ac.cli.program import _parser
 from vjepa2_ac.config.loading import config_path, config_schema, packaged_configs
 
 _COLUMNS = "88"  # of a help text
+_REFERENCE = {  # page: what it has; below these, all that the code makes
+    "made/commands": "all commands, a line each, and what each `--help` prints",
+    "made/config_keys": "every config key with its range and default",
+    "made/configs": "the configs of the package, whole",
+    "made/api": "the public names of Python",
+    "made/examples": "the scripts of `examples/`, whole",
+    "extending": "a loss, a planner, a metric, a form of data or a robot of your own",
+    "data_reference": "forms of data in detail, caches, splits, what damage is found",
+    "training_reference": "a run's folder, checkpoints, adapters, metrics",
+    "evaluation_reference": "every number, and `metrics.json`",
+    "decoding_reference": "decoders, what images can show, image metrics",
+    "planning_reference": "energies, solvers, axes, closed loop, `plan.json`",
+    "serving_reference": "messages, access, records",
+    "encoders_reference": "costs, keys of weights, what is refused",
+}
+_PROJECT = {
+    "made/results": "tables that commands of the repository write",
+    "IMPLEMENTATION_NOTES": "how it works, and how exactness is checked",
+    "made/changelog": "what changed for users",
+    "made/contributing": "how to take part",
+    "releasing": "the steps of a release",
+    "made/security": "what is trusted, and what is not",
+}
 _BOUNDS = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
 
 
@@ -29,6 +52,8 @@ def write_pages(folder: Path) -> None:
         "configs.md": configs_page(),
         "examples.md": examples_page(),
         **dict(results_pages()),
+        "reference.md": contents_page("Reference", _REFERENCE),
+        "project.md": contents_page("Project", _PROJECT),
         "readme.txt": on_site((ROOT / "README.md").read_text(encoding="utf-8"), "README.md", "index.md"),
         **{f"{name.lower()}.md": _of_the_root(f"{name}.md") for name in ("CHANGELOG", "CONTRIBUTING", "SECURITY")},
     }
@@ -45,13 +70,22 @@ def write_pages(folder: Path) -> None:
         shutil.copyfile(image, folder / "results" / image.name)
 
 
+def contents_page(title: str, pages: Mapping[str, str]) -> str:
+    """Return a page that lists others, and has them below it in the menu."""
+    links = [f"- {{doc}}`/{page}`: {about}" for page, about in pages.items()]
+    entries = [f"/{page}" for page in pages]
+    return "\n".join([f"# {title}", "", *links, "", "```{toctree}", ":hidden:", "", *entries, "```", ""])
+
+
 def commands_page() -> str:
     """Return a section for each command, with what `--help` prints."""
     os.environ["COLUMNS"] = _COLUMNS
+    leaves = {" ".join(words): parser for words, parser in _leaves(_parser(), ())}
     lines = ["# Every command", "", "As `vjepa2-ac COMMAND --help` prints them.", ""]
-    for words, parser in _leaves(_parser(), ()):
-        lines += [f"## {' '.join(words)}", "", "```text", parser.format_help().strip(), "```", ""]
-    return "\n".join(lines)
+    lines += [f"- [{name}](#{name.replace(' ', '-')}): {_first_sentence(one)}" for name, one in leaves.items()]
+    for name, parser in leaves.items():
+        lines += ["", f"## {name}", "", "```text", parser.format_help().strip(), "```"]
+    return "\n".join([*lines, ""])
 
 
 def keys_page() -> str:
@@ -131,6 +165,12 @@ def _leaves(
     for one in inner:
         for name, below in one.choices.items():
             yield from _leaves(below, (*words, name))
+
+
+def _first_sentence(parser: argparse.ArgumentParser) -> str:
+    """Return what a command does, in short: the beginning of its description, as Markdown."""
+    found = re.match(r".*?[^.](?=[.;]\s|[.]?$)", re.sub(r"\s+", " ", parser.description or ""))
+    return re.sub(r"([<>*_\[\]|])", r"\\\1", found[0]) if found else ""
 
 
 def _resolved(one: Mapping[str, Any], schema: Mapping[str, Any]) -> Mapping[str, Any]:

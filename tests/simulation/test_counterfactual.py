@@ -161,7 +161,7 @@ def test_other_data_are_refused(recorded, droid: Path) -> None:
 
 
 def test_the_pages_example_runs(recorded, capsys: pytest.CaptureFixture[str]) -> None:
-    examples = re.findall(r"```py\n(.*?)```", (ROOT / "docs/planning.md").read_text(), flags=re.DOTALL)
+    examples = re.findall(r"```py\n(.*?)```", (ROOT / "docs/planning_reference.md").read_text(), flags=re.DOTALL)
     (example,) = (one for one in examples if "resimulate" in one)
     exec(example.replace("data/sim", str(recorded("A"))), {})  # noqa: S102 - our own page
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == ["none", "up", "left", "close"]
