@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from vjepa2_ac.calibration.data import mirrored
-from vjepa2_ac.geometry import actions_from_states
+from vjepa2_ac.evaluation.calibration.data import mirrored
+from vjepa2_ac.spaces import actions_from_states
 
 LATE, EARLY, STALE_EVERY, NOISE_M = 8, 2, 5, 0.02
 

@@ -20,8 +20,8 @@ import torch
 from jaxtyping import Float
 
 from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig
-from vjepa2_ac.demonstrations.key_frames import OF_MODEL_STEPS, gripper_key_frames
 from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.planning.demonstrations.key_frames import OF_MODEL_STEPS, gripper_key_frames
 from vjepa2_ac.planning.energy import distance
 from vjepa2_ac.planning.session import load_to_plan
 from vjepa2_ac.simulation.closed_loop.rollout import put

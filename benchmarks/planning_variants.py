@@ -18,13 +18,13 @@ from torch.nn.functional import layer_norm
 
 from vjepa2_ac.config import AdapterConfig, EncoderSizes, ModelSizes, PredictorSizes
 from vjepa2_ac.config.planning import CemConfig, EnergyConfig, PlanningConfig
-from vjepa2_ac.geometry import apply_action
 from vjepa2_ac.model.adapter.lora import add_adapter, lora_layers
 from vjepa2_ac.model.checkpoints.loading import to_official
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.energy import Goal, Scene, WorldModelCost, distance
 from vjepa2_ac.planning.model_setup import prepare_for_planning
 from vjepa2_ac.planning.planner import Cost, Plan, Planner
+from vjepa2_ac.spaces import apply_action
 from vjepa2_ac.training.cost.flops import plan_flops
 
 POSE = (0.45, 0.10, 0.35, 3.0, 0.1, -0.4, 0.3)  # of an arm that points down

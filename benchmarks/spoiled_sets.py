@@ -20,15 +20,15 @@ from pathlib import Path
 import numpy as np
 from faults import CLEAN, FAULTS, Fault, Recording, spoiled
 
-from vjepa2_ac.calibration.data import VariantProbe, probe_config
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import load_config, parse_config
 from vjepa2_ac.data.coverage import sample_of
 from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.inspection.check import check_data
+from vjepa2_ac.data.inspection.excerpts import Finding
+from vjepa2_ac.data.inspection.statistics import at_some_stride
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.inspection.check import check_data
-from vjepa2_ac.inspection.excerpts import Finding
-from vjepa2_ac.inspection.statistics import at_some_stride
+from vjepa2_ac.evaluation.calibration.data import VariantProbe, probe_config
 from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
 
 HELD_OUT = 0.7  # of the episodes: the probe measures these

@@ -13,7 +13,7 @@ import missing
 # Where arrays change shape, each call is checked while testing. In the other rooms it would double the suite's time
 # for what mypy proves already.
 CHECKED = [
-    "vjepa2_ac.geometry",
+    "vjepa2_ac.spaces",
     "vjepa2_ac.media",
     "vjepa2_ac.data.clips",
     "vjepa2_ac.data.transforms",

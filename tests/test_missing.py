@@ -11,7 +11,7 @@ from jaxtyping import TypeCheckError
 
 from missing import SHAPES, STORAGE, WITHOUT, absent, is_installed
 from paths import ROOT
-from vjepa2_ac.geometry import apply_action
+from vjepa2_ac.spaces import apply_action
 
 NOT_THERE = "import sys; sys.modules.update(dict.fromkeys({missing!r}))"  # importing them is an error then
 A_TEST_OF_EACH = """

@@ -9,8 +9,16 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.indexed_source import measured_space, spaces_of
 from vjepa2_ac.episode import POSE_WIDTHS, Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.geometry import actions_from_states
-from vjepa2_ac.spaces import CAMERA_POSE, POSE, POSE_CHANGE, POSES, Spaces, require_finite, vector_states
+from vjepa2_ac.spaces import (
+    CAMERA_POSE,
+    POSE,
+    POSE_CHANGE,
+    POSES,
+    Spaces,
+    actions_from_states,
+    require_finite,
+    vector_states,
+)
 
 STATES = np.array([[0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2], [0.5, 0.1, 0.3, -3.1, 0.0, 0.2, 0.3]])
 

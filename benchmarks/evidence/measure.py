@@ -14,7 +14,6 @@ import torch
 from cells import PLANNING, SHIFTS, Cell, energies_of, method_of
 from prepare import base_model, data_a, data_shifted, training_episodes
 
-from vjepa2_ac.calibration.axes import calibrate_axes
 from vjepa2_ac.config import Config, DataConfig, ModelConfig, PlanningConfig, ValidationConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.training import CheckpointConfig
@@ -23,6 +22,7 @@ from vjepa2_ac.data.loader import validation_batches
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.encoding.encode_dataset import with_latents_if_there
 from vjepa2_ac.episode import LatentBatch
+from vjepa2_ac.evaluation.calibration.axes import calibrate_axes
 from vjepa2_ac.evaluation.measure import prediction_errors
 from vjepa2_ac.evaluation.result import PredictionErrors, Way
 from vjepa2_ac.model.adapter.lora import base_only, merge_adapter

@@ -29,7 +29,6 @@ from torch import Tensor, nn
 
 from vjepa2_ac.config import Config, ModelConfig, TrainingConfig
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.network.compilation import require_compiler
 
 _log = logging.getLogger(__name__)
 
@@ -73,8 +72,7 @@ def computing_device(training: TrainingConfig) -> torch.device:
     On a CPU without instructions for bfloat16 a config that asks for it is warned of.
 
     Raises:
-        InputError: CUDA was requested and there is none, fp16 without CUDA, bfloat16 on a GPU that has none, or nothing
-            to compile with.
+        InputError: CUDA was requested and there is none, fp16 without CUDA, or bfloat16 on a GPU that has none.
     """
     on_cpu = is_on_cpu(training)
     if training.precision == "fp16" and on_cpu:
@@ -85,8 +83,6 @@ def computing_device(training: TrainingConfig) -> torch.device:
     if training.precision == "bf16":  # fp32 is for float32 weights only, and fp16 casts any weights
         fix = f"Set training.precision={'fp32 with model.dtype=float32' if on_cpu else 'fp16'}"
         _require_bf16(device, where="training.precision", found="bf16", fix=fix)
-    if training.compile == "blocks":
-        require_compiler(device.type, where="training.compile")
     return device
 
 

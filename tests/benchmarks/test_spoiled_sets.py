@@ -13,8 +13,8 @@ import yaml
 
 from benches import imported
 from moving_arms import RATE_HZ, STEPS, spot_frames, spot_states, write_spots
-from vjepa2_ac.calibration.data import VariantProbe
-from vjepa2_ac.calibration.variants import VariantResult
+from vjepa2_ac.evaluation.calibration.data import VariantProbe
+from vjepa2_ac.evaluation.calibration.variants import VariantResult
 from vjepa2_ac.intervals import Estimate
 
 EPISODES = 10

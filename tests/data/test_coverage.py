@@ -9,12 +9,11 @@ from scipy.spatial.transform import Rotation
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.coverage import PLAY, Coverage, ReadEpisode, coverage_by, coverage_in, coverage_of
 from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.geometry import matrices_from_euler, rotation_differences, states_in_camera_frame
-from vjepa2_ac.inspection.check import check_data
-from vjepa2_ac.inspection.statistics import inspect_dataset
+from vjepa2_ac.data.inspection.check import check_data
+from vjepa2_ac.data.inspection.statistics import inspect_dataset
 from vjepa2_ac.simulation.world.domains import named_domain
 from vjepa2_ac.simulation.world.motion import MotionRecipe, random_reaching
-from vjepa2_ac.spaces import POSE, vector_states
+from vjepa2_ac.spaces import POSE, matrices_from_euler, rotation_differences, states_in_camera_frame, vector_states
 
 
 def moving(*scales: float, lift: tuple[float, ...] = (0, 0, 0), steps: int = 400, seed: int = 0) -> np.ndarray:

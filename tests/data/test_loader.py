@@ -28,7 +28,7 @@ from vjepa2_ac.data.loader import ProcessShare, collate, training_loader, valida
 from vjepa2_ac.data.streams import ToDevice, copies_for
 from vjepa2_ac.episode import Batch, Episode
 from vjepa2_ac.errors import InputError, UnreachableError
-from vjepa2_ac.geometry import actions_from_states, states_in_camera_frame
+from vjepa2_ac.spaces import actions_from_states, states_in_camera_frame
 
 Names = list[tuple[str, int]]
 

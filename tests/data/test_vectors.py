@@ -17,12 +17,12 @@ from vector_sets import vectors, write_vectors
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.data.inspection.check import findings_in
+from vjepa2_ac.data.inspection.statistics import CHANGED, inspect_dataset
 from vjepa2_ac.data.sources.indexed_source import open_source
 from vjepa2_ac.episode import Batch, Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.inspection.check import findings_in
-from vjepa2_ac.inspection.sheet import plot_dataset
-from vjepa2_ac.inspection.statistics import CHANGED, inspect_dataset
+from vjepa2_ac.reports.sheet import plot_dataset
 from vjepa2_ac.spaces import Spaces
 
 JOINTS = ("steps/observation/joint_position", "steps/observation/gripper_position")
@@ -215,7 +215,7 @@ def test_the_check_tells_numbers_that_teach_nothing(states: np.ndarray, about: s
 
 
 def test_inspection_and_frame_of_vectors(tmp_path: Path) -> None:
-    from vjepa2_ac.console.tables import motion_table
+    from vjepa2_ac.cli.console.tables import motion_table
 
     dataset = open_dataset(knobs(write_vectors(tmp_path / "set", width=14)))
     found = inspect_dataset(dataset)

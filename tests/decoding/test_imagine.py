@@ -10,8 +10,10 @@ from random_decoder import write_decoder
 from tiny_models import tiny_model
 from vjepa2_ac.data.transforms import frames_as_seen, view
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
-from vjepa2_ac.decoding.imagine import Start, imagine_plan, imagined_next, rolled_out, shown
-from vjepa2_ac.planning.counterfactual import counterfactual_states, named_actions
+from vjepa2_ac.decoding.imagine import Start, rolled_out, shown
+from vjepa2_ac.evaluation.imagined_plan import imagine_plan, imagined_next
+from vjepa2_ac.model.state_integration import counterfactual_states
+from vjepa2_ac.planning.counterfactual import named_actions
 from vjepa2_ac.spaces import POSE
 
 STEPS, TOKENS, DIM = 4, 4, 12

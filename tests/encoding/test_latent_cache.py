@@ -25,6 +25,8 @@ from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.clips import frames_of
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.index import EpisodeTable
+from vjepa2_ac.data.inspection.check import check_data
+from vjepa2_ac.data.inspection.statistics import inspect_dataset
 from vjepa2_ac.data.loader import batches_of, training_loader, validation_batches
 from vjepa2_ac.data.selection import BrokenEpisodes, StepSelection
 from vjepa2_ac.data.sources.latents.cache_files import (
@@ -44,9 +46,7 @@ from vjepa2_ac.encoding import batch
 from vjepa2_ac.encoding.latent_cache import LatentCache, needed_frames, through_cache
 from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, StoredLatents
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.inspection.check import check_data
-from vjepa2_ac.inspection.sheet import plot_dataset
-from vjepa2_ac.inspection.statistics import inspect_dataset
+from vjepa2_ac.reports.sheet import plot_dataset
 
 STEPS, FRAMES, TOKENS, DIM = 12, (0, 2, 5, 11), 4, 24
 

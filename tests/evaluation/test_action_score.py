@@ -20,8 +20,8 @@ from vjepa2_ac.evaluation.action_score import (
 )
 from vjepa2_ac.evaluation.request import SCORED
 from vjepa2_ac.evaluation.result import Evaluation, PlanningStudy, Plans
+from vjepa2_ac.model.state_integration import states_along
 from vjepa2_ac.planning.planner import Plan, Planner
-from vjepa2_ac.planning.state_integration import states_along
 from vjepa2_ac.reports.metrics_json import metrics_as_dict
 from vjepa2_ac.spaces import vector_actions
 from worlds import DIM, TIME, TOKENS, Copier, Oracle, actions_of, clips_batch, in_batches, moved, rows

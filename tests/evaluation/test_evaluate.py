@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from torch import Tensor
 
-from vjepa2_ac.calibration.axes import infer_axes
+from vjepa2_ac.evaluation.calibration.axes import infer_axes
 from vjepa2_ac.evaluation.estimates import (
     difference_to,
     gain_over,

@@ -4,8 +4,8 @@ from pathlib import Path
 
 from evaluation_results import evaluation
 from planned import with_plans
-from vjepa2_ac.console.progress import PlainConsole
-from vjepa2_ac.console.tables import row_tables
+from vjepa2_ac.cli.console.progress import PlainConsole
+from vjepa2_ac.cli.console.tables import row_tables
 from vjepa2_ac.evaluation.estimates import gain_over, over_persistence, rank_difference, stratum_gain
 from vjepa2_ac.evaluation.result import L1
 from vjepa2_ac.evaluation.rows import rows_of

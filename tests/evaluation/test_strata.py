@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vjepa2_ac.evaluation.clips import clips_of, strata_of
+from vjepa2_ac.evaluation.evaluate import clips_of, strata_of
 from vjepa2_ac.evaluation.result import Clips
 from vjepa2_ac.spaces import POSE_CHANGE, ActionSpace, vector_actions
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from evaluation_results import ranking_of
-from vjepa2_ac.evaluation.clips import clips_of
+from vjepa2_ac.evaluation.evaluate import clips_of
 from vjepa2_ac.evaluation.result import (
     L1,
     L2,

@@ -13,16 +13,16 @@ import torch
 from adapted_run import write_adapted_run
 from decisions import STATE, image
 from tiny_models import actions, goal, scene, tiny_model
-from vjepa2_ac.calibration.axes import TRIED_DEGREES, fit_axes
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.planning import CemConfig, EnergyConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.calibration.axes import TRIED_DEGREES, fit_axes
 from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.state_integration import apply_actions
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.energy import WorldModelCost
 from vjepa2_ac.planning.model_setup import Axes, Fingerprints
 from vjepa2_ac.planning.session import load_to_plan
-from vjepa2_ac.planning.state_integration import apply_actions
 from vjepa2_ac.runs.loading import load_run
 from vjepa2_ac.spaces import CAMERA_POSE, POSE_CHANGE, Spaces
 

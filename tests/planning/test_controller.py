@@ -9,10 +9,9 @@ from tiny_models import tiny_model
 from vjepa2_ac.config.planning import CemConfig, EnergyConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.geometry import actions_from_states, apply_action
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.spaces import Spaces
+from vjepa2_ac.spaces import Spaces, actions_from_states, apply_action
 
 QUICK = PlanningConfig(samples=12, iterations=2, horizon=2, cem=CemConfig(elites=4))
 

@@ -8,11 +8,10 @@ from torch import Tensor
 from tiny_models import DIM, TOKENS, actions, cost, draw, goal, scene, tiny_model
 from vjepa2_ac.config.planning import EnergyConfig, GradientConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.episode import Widths
-from vjepa2_ac.geometry import apply_action
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.energy import Goal, Scene, WorldModelCost, distance, patch_weights
 from vjepa2_ac.planning.planner import Planner
-from vjepa2_ac.spaces import Spaces
+from vjepa2_ac.spaces import Spaces, apply_action
 
 
 @torch.no_grad()

@@ -7,15 +7,9 @@ import pytest
 
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.geometry import actions_from_states
-from vjepa2_ac.planning.counterfactual import (
-    ACTION_NAMES,
-    counterfactual_states,
-    feasible_actions,
-    named_actions,
-    read_actions,
-)
-from vjepa2_ac.spaces import vector_states
+from vjepa2_ac.model.state_integration import counterfactual_states, feasible_actions
+from vjepa2_ac.planning.counterfactual import ACTION_NAMES, named_actions, read_actions
+from vjepa2_ac.spaces import actions_from_states, vector_states
 
 START = np.array([0.4, 0.1, 0.3, np.pi - 0.01, 0.02, -0.7, 0.4])
 ROWS = np.array([[0.05, 0.0, 0.0, 0.0, 0.0, 0.1, 0.0], [0.0, -0.02, 0.01, 0.0, 0.0, 0.0, -0.75]])

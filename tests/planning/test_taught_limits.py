@@ -14,12 +14,12 @@ from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.sources.indexed_source import open_source
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions, settle
-from vjepa2_ac.geometry import actions_from_states
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.session import load_to_plan
 from vjepa2_ac.planning.settings import beyond_taught, planning_settings
 from vjepa2_ac.runs.folder import read_run_config
 from vjepa2_ac.runs.loading import load_run
+from vjepa2_ac.spaces import actions_from_states
 from vjepa2_ac.training.loop import train
 
 PLANNING = {"samples": 12, "iterations": 2, "horizon": 2, "cem": {"elites": 4}}

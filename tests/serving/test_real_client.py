@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from served import STATE, controller, image, serving, session
-from vjepa2_ac.geometry import apply_action
 from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.serving.about import roboarena_metadata
 from vjepa2_ac.serving.access import Access
 from vjepa2_ac.serving.session import SessionOptions
+from vjepa2_ac.spaces import apply_action
 
 CLIENT = "openpi-client==0.1.2"
 KEY = "correct-horse-battery-staple"

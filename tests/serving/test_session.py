@@ -13,11 +13,11 @@ from hypothesis.extra.numpy import arrays
 from served import STATE, controller, image, request, session, vector_controller
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.geometry import apply_action
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.serving.session import ActionForm, GoneError, Session, SessionOptions, has_black_bars
 from vjepa2_ac.serving.wire import pack, unpack
+from vjepa2_ac.spaces import apply_action
 
 CUP = {"cup": (SubGoal(image(50), "cup"),), "two": (SubGoal(image(51), "a", at_most=1), SubGoal(image(52), "b"))}
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from vjepa2_ac.geometry import actions_from_states, apply_action
 from vjepa2_ac.serving.motion import waypoints
+from vjepa2_ac.spaces import actions_from_states, apply_action
 
 STATE = np.array([0.4, 0.1, 0.3, np.pi - 0.02, 0.1, -1.2, 0.5])
 ACTION = np.array([0.02, -0.01, 0.03, 0.3, -0.2, 0.4, 0.25])

@@ -18,7 +18,7 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.rlds.source import RldsSource
 from vjepa2_ac.episode import Episode
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.geometry import actions_from_states
+from vjepa2_ac.spaces import actions_from_states
 
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from vjepa2_ac.calibration.axes import TRIED_DEGREES, AxisFit, fit_axes
+from vjepa2_ac.evaluation.calibration.axes import TRIED_DEGREES, AxisFit, fit_axes
 from vjepa2_ac.evaluation.estimates import episode_scores
 from vjepa2_ac.evaluation.result import (
     ACTIONS,

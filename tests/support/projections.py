@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vjepa2_ac.geometry import matrices_from_euler
+from vjepa2_ac.spaces import matrices_from_euler
 
 if TYPE_CHECKING:
     from vjepa2_ac.simulation.world.arm import SimulatedArm

@@ -11,16 +11,16 @@ import yaml
 from run_fixtures import KilledError, dying_reporter
 from same_run import assert_same_run
 from vector_sets import write_vectors
-from vjepa2_ac.calibration.variants import calibrate_config
 from vjepa2_ac.config import Config, ModelConfig
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.calibration.variants import calibrate_config
 from vjepa2_ac.evaluation.measure import ClipSample
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
-from vjepa2_ac.export import export_run
 from vjepa2_ac.model.base_model import read_sizes
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import widths_of_model
+from vjepa2_ac.reports.export import export_run
 from vjepa2_ac.reports.metrics_json import metrics_as_dict
 from vjepa2_ac.reports.write import evaluate_subject
 from vjepa2_ac.runs.loading import load_run

@@ -229,7 +229,7 @@ def _run_benchmark(options: argparse.Namespace) -> int:
     else:
         _refuse(options, ("checkpoint", "config", "decoder", "overrides"), needed="the model itself; not its server")
 
-    from vjepa2_ac.console.tables import benchmark_notes, benchmark_table
+    from vjepa2_ac.cli.console.tables import benchmark_notes, benchmark_table
     from vjepa2_ac.simulation.closed_loop.benchmark import BenchmarkOptions, run_benchmark
     from vjepa2_ac.simulation.world.scene import load_mujoco
 

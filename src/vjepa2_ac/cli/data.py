@@ -88,8 +88,8 @@ def _check(options: argparse.Namespace) -> int:
 
 def check_and_print(config: Config, *, clips: int = 32) -> int:
     """Look at the data of a config and print what is found; return 1 where training would learn nothing."""
-    from vjepa2_ac.console.tables import print_finding
-    from vjepa2_ac.inspection.check import check_data
+    from vjepa2_ac.cli.console.tables import print_finding
+    from vjepa2_ac.data.inspection.check import check_data
     from vjepa2_ac.reporter import INDEXING
 
     status, batch_size = 0, config.training.batch_size
@@ -102,11 +102,11 @@ def check_and_print(config: Config, *, clips: int = 32) -> int:
 
 
 def _probe(config: Config, model: str, *, clips: int) -> None:
-    from vjepa2_ac.calibration.data import probe_config
-    from vjepa2_ac.console.tables import print_finding, variants_table
+    from vjepa2_ac.cli.console.tables import print_finding, variants_table
     from vjepa2_ac.data.dataset import open_dataset
-    from vjepa2_ac.inspection.excerpts import Finding
-    from vjepa2_ac.inspection.statistics import at_some_stride
+    from vjepa2_ac.data.inspection.excerpts import Finding
+    from vjepa2_ac.data.inspection.statistics import at_some_stride
+    from vjepa2_ac.evaluation.calibration.data import probe_config
 
     dataset = at_some_stride(open_dataset(config.data))
     with cli.reporter() as reporter:
@@ -120,7 +120,7 @@ def _index(options: argparse.Namespace) -> None:
     """Build the index of a data set, or show the one that is kept on this machine."""
     config = cli.read_config(options.config, options.overrides).data
 
-    from vjepa2_ac.console.tables import index_lines
+    from vjepa2_ac.cli.console.tables import index_lines
     from vjepa2_ac.data.dataset import open_dataset
     from vjepa2_ac.data.index import record_usage
     from vjepa2_ac.reporter import INDEXING
@@ -136,11 +136,11 @@ def _inspect(options: argparse.Namespace) -> None:
     config = cli.read_config(options.config, options.overrides)
     cli.make_folder(options.out)
 
-    from vjepa2_ac.console.tables import motion_table
+    from vjepa2_ac.cli.console.tables import motion_table
     from vjepa2_ac.data.dataset import open_dataset
-    from vjepa2_ac.inspection.sheet import plot_dataset
-    from vjepa2_ac.inspection.statistics import RELEASED, at_some_stride, inspect_dataset
+    from vjepa2_ac.data.inspection.statistics import RELEASED, at_some_stride, inspect_dataset
     from vjepa2_ac.reporter import INDEXING
+    from vjepa2_ac.reports.sheet import plot_dataset
     from vjepa2_ac.storage import write_atomically
 
     with cli.reporter() as reporter:
@@ -169,8 +169,8 @@ def _calibrate(options: argparse.Namespace) -> int:
         cli.require_subject(options.model)
     cli.make_folder(options.out)
 
-    from vjepa2_ac.calibration.variants import calibrate_config
-    from vjepa2_ac.console.tables import variants_table
+    from vjepa2_ac.cli.console.tables import variants_table
+    from vjepa2_ac.evaluation.calibration.variants import calibrate_config
     from vjepa2_ac.evaluation.measure import ClipSample
     from vjepa2_ac.storage import write_atomically
 
@@ -200,8 +200,8 @@ def _calibrate_axes(options: argparse.Namespace, config: Config) -> int:
     require_axes_in(config.data)
     cli.make_folder(options.out)
 
-    from vjepa2_ac.calibration.axes import calibrate_axes
-    from vjepa2_ac.console.tables import row_tables
+    from vjepa2_ac.cli.console.tables import row_tables
+    from vjepa2_ac.evaluation.calibration.axes import calibrate_axes
     from vjepa2_ac.reports.figures.planning import plot_axes
     from vjepa2_ac.storage import write_atomically
     from vjepa2_ac.storage.structured import json_text

@@ -95,7 +95,7 @@ def _evaluate(options: argparse.Namespace) -> None:
         settle(subject, how)
         cli.require_subject(subject)
 
-    from vjepa2_ac.console.tables import row_tables
+    from vjepa2_ac.cli.console.tables import row_tables
     from vjepa2_ac.evaluation.rows import rows_of
     from vjepa2_ac.evaluation.verdict import spread, verdict
     from vjepa2_ac.reports.write import evaluate_subject
@@ -144,7 +144,7 @@ def _compare(options: argparse.Namespace) -> None:
 
     comparison = compare(options.runs)
 
-    from vjepa2_ac.console.tables import row_tables
+    from vjepa2_ac.cli.console.tables import row_tables
     from vjepa2_ac.reports.figures.evaluation import plot_comparison
 
     tables = row_tables(comparison.rows, comparison.title)

@@ -12,14 +12,14 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias, TypeVar
 
-from vjepa2_ac import places
 from vjepa2_ac.errors import InputError, printable
+from vjepa2_ac.storage import places
 
 if TYPE_CHECKING:
     import numpy as np
 
+    from vjepa2_ac.cli.console.progress import ConsoleReporter
     from vjepa2_ac.config import Config
-    from vjepa2_ac.console.progress import ConsoleReporter
     from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
     from vjepa2_ac.planning.session import PlanningSession
 
@@ -111,14 +111,14 @@ def record_of_options(kind: Callable[..., _Record], options: argparse.Namespace,
 
 def show(*parts: Any, files: Iterable[str | Path] = ()) -> None:
     """Print texts and tables one below another, and the files that were written."""
-    from vjepa2_ac.console.progress import show
+    from vjepa2_ac.cli.console.progress import show
 
     show(*parts, files=files)
 
 
 def reporter() -> ConsoleReporter:
     """Return what shows messages and progress."""
-    from vjepa2_ac.console.progress import ConsoleReporter
+    from vjepa2_ac.cli.console.progress import ConsoleReporter
 
     return ConsoleReporter()
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from vjepa2_ac.config import Config
     from vjepa2_ac.config.planning import PlanningConfig
-    from vjepa2_ac.demonstrations.make_goals import Recording
+    from vjepa2_ac.planning.demonstrations.make_goals import Recording
     from vjepa2_ac.planning.goals import GoalFolder
     from vjepa2_ac.planning.session import PlanningSession
 
@@ -86,8 +86,8 @@ def _plan(options: argparse.Namespace) -> int:
     cli.make_folder(options.out)
     start, goals, mask = _images(options)
 
-    from vjepa2_ac.console.tables import plan_table
-    from vjepa2_ac.decoding.imagine import imagine_plan
+    from vjepa2_ac.cli.console.tables import plan_table
+    from vjepa2_ac.evaluation.imagined_plan import imagine_plan
     from vjepa2_ac.planning.decision import PLAN_FILE, PlanRequest, decide, summarize, write_plan
     from vjepa2_ac.reports.figures.planning import PLAN_IMAGE, plot_plan
     from vjepa2_ac.storage import user_can_write
@@ -189,8 +189,8 @@ def _goals(options: argparse.Namespace) -> None:
     cli.require_new_place(options.out)
     recording, stride = _recording(options)
 
-    from vjepa2_ac.console.tables import goals_notes, goals_table
-    from vjepa2_ac.demonstrations.make_goals import KeyFrameOptions, make_goals, recording_of_film
+    from vjepa2_ac.cli.console.tables import goals_notes, goals_table
+    from vjepa2_ac.planning.demonstrations.make_goals import KeyFrameOptions, make_goals, recording_of_film
     from vjepa2_ac.reports.figures.planning import GOALS_IMAGE, plot_goals
     from vjepa2_ac.storage import user_can_write
 
@@ -229,7 +229,7 @@ def _way(options: argparse.Namespace) -> tuple[str, int | None]:
 def _recording(options: argparse.Namespace) -> tuple[Recording, int]:
     """Return the demonstration, and the frames of a model step."""
     if _is_film(options):
-        from vjepa2_ac.demonstrations.make_goals import recording_of_film
+        from vjepa2_ac.planning.demonstrations.make_goals import recording_of_film
 
         for name, given in {"--episode": options.episode, "key=value": options.overrides}.items():
             if given:
@@ -245,7 +245,7 @@ def _recording(options: argparse.Namespace) -> tuple[Recording, int]:
         found, fix = "auto", "Say how many control steps a model step has: --stride 4"
         raise InputError(where="data.stride", found=found, needed="a number", fix=fix)
 
-    from vjepa2_ac.demonstrations.make_goals import recording_of_episode
+    from vjepa2_ac.planning.demonstrations.make_goals import recording_of_episode
     from vjepa2_ac.reporter import INDEXING
 
     with cli.reporter() as reporter:

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
 from vjepa2_ac.errors import InputError, UserError
-from vjepa2_ac.places import BUILTIN
 from vjepa2_ac.storage import try_writing_at, user_can_write, write_atomically
+from vjepa2_ac.storage.places import BUILTIN
 
 if TYPE_CHECKING:
     from vjepa2_ac.init.draft import Draft
@@ -204,9 +204,9 @@ def _download(options: argparse.Namespace) -> None:
 
     It goes on where it stopped; its size is checked.
     """
-    from vjepa2_ac.console.setup import published_notes, published_summary, published_table
+    from vjepa2_ac.cli.console.setup import published_notes, published_summary, published_table
     from vjepa2_ac.model.checkpoints.published import OFFICIAL, PUBLISHED, download, find_published
-    from vjepa2_ac.places import literal
+    from vjepa2_ac.storage.places import literal
 
     if options.list:
         cli.show(published_table(PUBLISHED), *published_notes())
@@ -230,7 +230,7 @@ def _doctor(options: argparse.Namespace) -> int:
 
     import torch
 
-    from vjepa2_ac.console.setup import memory_lines, verdict
+    from vjepa2_ac.cli.console.setup import memory_lines, verdict
     from vjepa2_ac.distributed import slow_bf16
     from vjepa2_ac.model.checkpoints.loading import base_sizes
     from vjepa2_ac.training.cost.memory import USUAL_GPU, estimate_memory, ways_to_fit

@@ -65,7 +65,7 @@ def _train(options: argparse.Namespace) -> None:
         cli.say_places_elsewhere(options.config)
     config = read_run_config(path) if options.resume else cli.read_config(path, options.overrides, base=True)
 
-    from vjepa2_ac.console.training import TrainingConsole
+    from vjepa2_ac.cli.console.training import TrainingConsole
     from vjepa2_ac.training.loop import train
 
     with TrainingConsole() as reporter:
@@ -109,7 +109,7 @@ def _decoder(options: argparse.Namespace) -> None:
     """
     config = cli.read_config(options.config, options.overrides, base=True)
 
-    from vjepa2_ac.console.tables import held_out_table
+    from vjepa2_ac.cli.console.tables import held_out_table
     from vjepa2_ac.decoding.decoder_folder import read_card
     from vjepa2_ac.decoding.training import train_decoder
 
@@ -130,7 +130,7 @@ def _export(options: argparse.Namespace) -> None:
 
     read_run_config(options.run)
 
-    from vjepa2_ac.export import export_run
+    from vjepa2_ac.reports.export import export_run
 
     written = export_run(options.run, options.folder, options.to, options.checkpoint)
     what = {"merged": "merged model", "official": "official checkpoint", "hub": "adapter with its model card"}

@@ -20,7 +20,7 @@ from vjepa2_ac.config.section import (
     Section,
     Share,
 )
-from vjepa2_ac.places import is_url
+from vjepa2_ac.storage.places import is_url
 
 # A serial number is a name, also where YAML takes it for a number.
 _CameraName = Annotated[str, BeforeValidator(lambda name: str(name) if type(name) is int else name)]

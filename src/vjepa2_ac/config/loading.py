@@ -19,8 +19,8 @@ from vjepa2_ac.config.data import source_of
 from vjepa2_ac.config.run import ReplayConfig
 from vjepa2_ac.config.section import marks_of
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.places import BUILTIN
 from vjepa2_ac.registry import SOURCES, import_plugins
+from vjepa2_ac.storage.places import BUILTIN
 from vjepa2_ac.storage.structured import message_of, parse_yaml
 
 _PACKAGED = Path(str(importlib.resources.files("vjepa2_ac"))) / "assets" / "configs"

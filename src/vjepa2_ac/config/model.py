@@ -7,8 +7,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from vjepa2_ac import places
 from vjepa2_ac.config.section import Affects, PositiveInt, Section, Share
+from vjepa2_ac.storage import places
 
 # Far beyond every such model (released: width 1408, depth 40, 1.3 billion weights): a file may claim any size.
 Width = Annotated[int, Field(ge=1, le=16_384)]

@@ -6,13 +6,13 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field, model_validator
 
-from vjepa2_ac import places
 from vjepa2_ac.config.data import DataConfig
 from vjepa2_ac.config.model import AdapterConfig, ModelConfig
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.config.section import Affects, AtMost, Section
 from vjepa2_ac.config.sources import RldsData  # noqa: F401 - all forms of data
 from vjepa2_ac.config.training import CheckpointConfig, DecoderConfig, TrackingConfig, TrainingConfig, ValidationConfig
+from vjepa2_ac.storage import places
 
 
 def _run_folder(path: str) -> str:

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Self, get_args
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 from pydantic.fields import FieldInfo
 
-from vjepa2_ac import places
+from vjepa2_ac.storage import places
 
 PositiveInt = Annotated[int, Field(ge=1, le=1_000_000_000)]  # no machine has memory for more of anything
 Count = Annotated[int, Field(ge=0)]

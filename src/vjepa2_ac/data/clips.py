@@ -17,7 +17,7 @@ from vjepa2_ac.data.sources.indexed_source import measured_space
 from vjepa2_ac.data.transforms import view
 from vjepa2_ac.episode import Augmentation, Batch, Clip, StoredLatents, Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.geometry import states_in_camera_frame
+from vjepa2_ac.spaces import states_in_camera_frame
 
 Augment = Callable[[int, int], Augmentation | None]  # from the height and width of a clip's frames
 

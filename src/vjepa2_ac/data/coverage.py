@@ -23,8 +23,7 @@ from vjepa2_ac.data.files import connections_to, in_parallel
 from vjepa2_ac.data.windows import spread
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.geometry import states_in_camera_frame
-from vjepa2_ac.spaces import POSE, StateSpace
+from vjepa2_ac.spaces import POSE, StateSpace, states_in_camera_frame
 
 T = TypeVar("T")
 

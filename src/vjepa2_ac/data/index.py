@@ -19,10 +19,11 @@ from typing import TypeVar
 import numpy as np
 from jaxtyping import Float, Int8, Int32, UInt64
 
-from vjepa2_ac import places, storage
+from vjepa2_ac import storage
 from vjepa2_ac.config import DiskCacheConfig
 from vjepa2_ac.episode import EpisodeInfo
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage import places
 from vjepa2_ac.storage.npz_reader import arrays_as_bytes, read_arrays
 
 logger = logging.getLogger(__name__)

@@ -22,8 +22,8 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.base_model import ASSETS
 from vjepa2_ac.model.network.pretrained_folder import read_tensors
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.places import BUILTIN
 from vjepa2_ac.storage import folder_writer
+from vjepa2_ac.storage.places import BUILTIN
 from vjepa2_ac.storage.structured import read_json_object, record_of
 
 CARD, WEIGHTS, LINEAR = "decoder.json", "decoder.safetensors", "linear.safetensors"

@@ -14,14 +14,11 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from vjepa2_ac.data.transforms import frames_as_seen, view
-from vjepa2_ac.data.windows import spread_with_ends
-from vjepa2_ac.decoding.decoder_folder import DecoderCard, TrainedDecoder
+from vjepa2_ac.decoding.decoder_folder import DecoderCard
 from vjepa2_ac.decoding.network import Decoder, as_pixels
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.planning.controller import Decision
-from vjepa2_ac.planning.counterfactual import counterfactual_states, feasible_actions
-from vjepa2_ac.planning.decision import PlanResult
+from vjepa2_ac.media.film import FilmStrip, StripRow
+from vjepa2_ac.model.state_integration import counterfactual_states, feasible_actions
 from vjepa2_ac.spaces import StateSpace
 
 Actions = Float[np.ndarray, "steps action_dim"]
@@ -30,6 +27,10 @@ Film = UInt8[np.ndarray, "steps size size 3"]
 
 AS_RECORDED = "as recorded"
 _MUCH_WORSE_DB = 5.0
+_LONGEST_NAME = 44  # characters
+_LEAST_CM, _LEAST_GRIP = 0.15, 0.05  # smaller parts of an action are not named
+_POSE = 7  # numbers
+_WAYS = (("forward", "back"), ("left", "right"), ("up", "down"))  # of x, y, z in the robot base frame
 
 
 class Rolls(Protocol):
@@ -126,50 +127,47 @@ def shown(decoder: Decoder, latents: Float[Tensor, "steps tokens dim"]) -> Film:
     return as_pixels(decoder.decode(latents.float()))
 
 
-# ---- what a planner imagined: decoded from the predictions that its plan was chosen by ----
-
-_MOST_STEPS = 8
-
-
-@dataclass(frozen=True, eq=False)
-class ImaginedPlan:
-    """Images of a plan, all as the encoder sees them."""
-
-    start: Image  # decoded
-    steps: dict[int, Image]  # imagined after so many model steps; empty without a plan
-    goal: Image  # the one that applies at the end
-    decoded_goal: Image
-
-
-def imagine_plan(answer: PlanResult, decoder: TrainedDecoder) -> ImaginedPlan:
-    """Decode the rollout of a plan, of some steps if there are many, and what it started from and aimed at.
-
-    Args:
-        answer: The decision.
-        decoder: Of the model's encoder; it is moved to the model's device.
-    """
-    controller, goal = answer.controller, answer.question.goals[answer.decision.goals[-1]]
-    decoder.to(controller.device)
-    given = torch.stack([controller.encoded(image) for image in (answer.question.start, goal)])
-    start, decoded_goal = shown(decoder.decoder, given)
-    frames = _rollout(answer.decision, decoder, steps=answer.space.steps)
-    places = spread_with_ends(len(frames), _MOST_STEPS)
-    seen = frames_as_seen(view(goal[None], controller.crop), decoder.card.shape.image_size)[0]
-    return ImaginedPlan(start, {place + 1: frames[place] for place in places}, seen, decoded_goal)
+def strip_of(imagination: Imagination) -> FilmStrip:
+    """Return the rows: truth, decoded truth, recorded actions as each model imagines them, then other actions."""
+    told, first, decoded_first = imagination, imagination.first[None], imagination.decoded_first[None]
+    recorded = [one for one in told.rollouts if one.name == AS_RECORDED]
+    rows = []
+    if told.truth is not None:
+        captions = ("", *map(_short_action, recorded[0].actions)) if recorded else ()
+        rows.append(StripRow("what happened", "recorded", np.concatenate([first, told.truth]), captions))
+    if told.decoded_truth is not None:
+        frames = np.concatenate([decoded_first, told.decoded_truth])
+        rows.append(StripRow("what happened,\nencoded and decoded", "decoded", frames))
+    for one in sorted(told.rollouts, key=lambda one: one.name != AS_RECORDED):
+        label = f"{one.model} imagines,\nsame actions"
+        if one.name != AS_RECORDED:
+            length = 100 * float(np.linalg.norm(one.actions[0, :3])) if one.actions.shape[1] == _POSE else 0.0
+            label = f"{one.model} imagines:\n{one.name}" + (f", {length:.1f} cm a step" if length >= _LEAST_CM else "")
+        rows.append(StripRow(label, "imagined", np.concatenate([decoded_first, one.frames])))
+        if one.truth is not None and one.name != AS_RECORDED:
+            frames = np.concatenate([first, one.truth])
+            rows.append(StripRow(f"what really happens:\n{one.name}", "simulated", frames))
+    clip = f"{_short(told.episode_id)} from control step {told.start}"
+    title = f"{told.subject}, {clip if told.episode_id else 'from an image'}"
+    times = range(len(rows[0].frames)) if rows else range(0)
+    return FilmStrip(title, tuple(rows), tuple(time * told.seconds_per_step for time in times))
 
 
-def imagined_next(decision: Decision, decoder: TrainedDecoder) -> Image | None:
-    """Return the next frame as the planner imagined it when it decided; None: it imagined none."""
-    frames = _rollout(decision, decoder, steps=1)
-    return frames[0] if len(frames) else None
+def _short_action(action: Float[np.ndarray, " action_dim"]) -> str:
+    """Return a pose's action in a few words, in the robot's directions; of a vector nothing."""
+    if len(action) != _POSE:
+        return ""
+    words = []
+    for amount, (plus, minus) in zip(100 * action[:3], _WAYS, strict=True):
+        if abs(amount) >= _LEAST_CM:
+            words.append((abs(amount), f"{plus if amount > 0 else minus} {abs(amount):.1f}"))
+    named = [text for _, text in sorted(words, reverse=True)[:2]]
+    if abs(action[6]) >= _LEAST_GRIP:
+        named.append("close" if action[6] > 0 else "open")
+    return ", ".join(named) + " cm" * bool(words) if named else "still"
 
 
-@torch.no_grad()
-def _rollout(decision: Decision, decoder: TrainedDecoder, *, steps: int) -> Film:
-    """Return the images after the first steps of a plan; none without a plan, or if the predictions are not finite."""
-    side = decoder.card.shape.image_size
-    none = np.zeros((0, side, side, 3), np.uint8)
-    if decision.plan is None or decision.cost is None:
-        return none
-    latents: Float[torch.Tensor, "steps tokens dim"] = decision.cost.imagine(decision.plan.actions[None, :steps])[0][0]
-    return shown(decoder.decoder, latents) if bool(torch.isfinite(latents).all()) else none
+def _short(name: str) -> str:
+    """Return the end of an episode's name; of DROID's, which name several files, that of the first folder."""
+    own = name.split("--", maxsplit=1)[0].removesuffix("/recordings/MP4").rstrip("/")
+    return own if len(own) <= _LONGEST_NAME else f"...{own[-_LONGEST_NAME:]}"

@@ -21,10 +21,10 @@ from vjepa2_ac.evaluation.measure import Predictor
 from vjepa2_ac.evaluation.request import FRAMES_SEEN, SCORED, STEPS
 from vjepa2_ac.evaluation.result import Evaluation, PlanningStudy, Plans
 from vjepa2_ac.intervals import Estimate, bootstrapped, mean_of, ratio
+from vjepa2_ac.model.state_integration import states_along
 from vjepa2_ac.planning.energy import distance
 from vjepa2_ac.planning.planner import Plan, Planner
 from vjepa2_ac.planning.search_space import SearchSpace, pose_space
-from vjepa2_ac.planning.state_integration import states_along
 from vjepa2_ac.spaces import POSE
 
 _RANDOM_PLANS = 64  # of each start: their mean error is the random plan's

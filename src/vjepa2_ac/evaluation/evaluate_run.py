@@ -33,13 +33,13 @@ from vjepa2_ac.evaluation.result import PERSISTENCE, About, Evaluation, Measurem
 from vjepa2_ac.model.adapter.lora import base_only, unadapted_copy
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel, heads_to_replace, widths_as_text
-from vjepa2_ac.places import BUILTIN
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import select_checkpoint
 from vjepa2_ac.runs.folder import METRICS, is_run
 from vjepa2_ac.runs.loading import TrainedRun, load_run
 from vjepa2_ac.runs.metrics_log import read_metrics_log, warnings_of
 from vjepa2_ac.storage import try_writing_at, user_can_write
+from vjepa2_ac.storage.places import BUILTIN
 from vjepa2_ac.storage.structured import utc_now
 
 BASE = "base"

@@ -17,10 +17,9 @@ from jaxtyping import Bool, Float, UInt8
 from pydantic import BeforeValidator
 
 from vjepa2_ac.config.planning import PlanningConfig
-from vjepa2_ac.distances import absolute_difference, squared_difference
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.registry import METRICS
-from vjepa2_ac.spaces import ActionSpace
+from vjepa2_ac.spaces import ActionSpace, absolute_difference, squared_difference
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -14,7 +14,7 @@ from vjepa2_ac.init.found import FoundData, Knob, Knobs, as_yaml, guesses, plain
 from vjepa2_ac.init.machine import Machine, duration
 from vjepa2_ac.model.checkpoints.loading import base_sizes
 from vjepa2_ac.model.checkpoints.published import OFFICIAL, PUBLISHED
-from vjepa2_ac.places import BUILTIN
+from vjepa2_ac.storage.places import BUILTIN
 from vjepa2_ac.training.cost.flops import clip_flops, frame_flops
 from vjepa2_ac.training.cost.memory import GIGABYTE, estimate_memory
 

@@ -25,7 +25,7 @@ from vjepa2_ac.init.found import FoundData, Knob, idle_rule, plain
 from vjepa2_ac.init.lerobot import look_at_lerobot
 from vjepa2_ac.init.names import pick_camera
 from vjepa2_ac.init.rlds import droid, like_droid, look_at_rlds
-from vjepa2_ac.places import BUILTIN
+from vjepa2_ac.storage.places import BUILTIN
 
 _CONNECTIONS = 16  # reads at once
 

@@ -17,8 +17,8 @@ from typing import Any
 from vjepa2_ac.config import EncoderSizes, ModelConfig, ModelSizes
 from vjepa2_ac.config.model import Family, FramePath
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.places import BUILTIN, HUB
 from vjepa2_ac.storage import unreadable
+from vjepa2_ac.storage.places import BUILTIN, HUB
 from vjepa2_ac.storage.structured import read_json_object, record_of
 
 ASSETS = Path(str(importlib.resources.files("vjepa2_ac"))) / "assets"

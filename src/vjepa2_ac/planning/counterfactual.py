@@ -9,15 +9,13 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import torch
 from jaxtyping import Float
 
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.episode import ACTION_DIM
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.search_space import GRIPPER
-from vjepa2_ac.planning.state_integration import states_along
-from vjepa2_ac.spaces import POSE, POSE_CHANGE, StateSpace
+from vjepa2_ac.spaces import POSE_CHANGE
 
 STEP_M, GRIPPER_STEP = 0.05, 0.75
 """Metres, and change of closedness, of a named step: the largest that upstream plans (`planning.limits`). A run may
@@ -107,31 +105,6 @@ def read_actions(path: str | Path, *, steps: int | None = None) -> Float[np.ndar
     if steps is not None and len(actions) < steps:
         raise InputError(where=str(path), found=f"{len(actions)} actions", needed=f"{steps}, one for each model step")
     return actions[:steps]
-
-
-def counterfactual_states(
-    state: Float[np.ndarray, " state_dim"], actions: Float[np.ndarray, "steps state_dim"], space: StateSpace = POSE
-) -> Float[np.ndarray, "steps+1 state_dim"]:
-    """Return the states before and after actions that were not taken: integrated from the first, in double precision.
-
-    Never take them from a recording: later states of what did happen would give the model the truth. The gripper stays
-    within 0 .. 1. Of poses without the lag of a real arm, which covers some 95 % of a commanded step.
-    """
-    first, changes = (torch.from_numpy(np.array(one, dtype=np.float64)) for one in (state, actions))
-    return states_along(first, changes[None], space)[0].numpy()
-
-
-def feasible_actions(
-    state: Float[np.ndarray, " state_dim"], actions: Float[np.ndarray, "steps state_dim"], space: StateSpace = POSE
-) -> Float[np.ndarray, "steps state_dim"]:
-    """Return actions whose gripper changes only as far as it can: those of `counterfactual_states`, as data would have.
-
-    A measured closedness does not change any more at its end, so a model has never seen further changes there.
-    """
-    feasible = np.array(actions, dtype=np.float64)
-    if space.gripper is not None:
-        feasible[:, space.gripper] = np.diff(counterfactual_states(state, actions, space)[:, space.gripper])
-    return feasible
 
 
 def _size_along(axis: int, size_m: float, limits: LimitsConfig | None) -> float:

@@ -15,16 +15,15 @@ from torch.nn.functional import adaptive_avg_pool2d, cosine_similarity
 from torch.utils.checkpoint import checkpoint
 
 from vjepa2_ac.config.planning import EnergyConfig
-from vjepa2_ac.distances import absolute_difference, squared_difference
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.model.network.predictor_network import KeyValueCache
 from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.state_integration import states_along
 from vjepa2_ac.planning.model_setup import Axes
 from vjepa2_ac.planning.planner import Cost, reporting
 from vjepa2_ac.planning.search_space import SearchSpace
-from vjepa2_ac.planning.state_integration import states_along
 from vjepa2_ac.registry import ENERGIES
-from vjepa2_ac.spaces import POSES, Spaces
+from vjepa2_ac.spaces import POSES, Spaces, absolute_difference, squared_difference
 
 
 @dataclass(frozen=True)

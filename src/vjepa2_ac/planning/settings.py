@@ -17,10 +17,10 @@ from vjepa2_ac.config.loading import load_config_of_run, parse_config
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.config.section import Affects, mark_of
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.places import literal
 from vjepa2_ac.planning.axes import require_axes
 from vjepa2_ac.runs.folder import CHANGES, CONFIG, is_run
 from vjepa2_ac.spaces import POSE, REACH_M, vector_states
+from vjepa2_ac.storage.places import literal
 from vjepa2_ac.storage.structured import read_json_object, record_of
 
 logger = logging.getLogger(__name__)

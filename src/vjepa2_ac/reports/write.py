@@ -17,19 +17,19 @@ from jaxtyping import UInt8
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from vjepa2_ac.calibration.axes import infer_axes
-from vjepa2_ac.calibration.variants import calibrate_model
+from vjepa2_ac.evaluation.calibration.axes import infer_axes
+from vjepa2_ac.evaluation.calibration.variants import calibrate_model
 from vjepa2_ac.evaluation.estimates import Curve, gain_over, over_persistence
 from vjepa2_ac.evaluation.evaluate_run import measure_subject
 from vjepa2_ac.evaluation.request import EvaluationOptions
 from vjepa2_ac.evaluation.result import L1, DecodedStrip, EpisodeScore, Evaluation, Example, Row, RowTable, sections
 from vjepa2_ac.evaluation.rows import rows_of
 from vjepa2_ac.evaluation.verdict import verdict
+from vjepa2_ac.media.figure import svg_of, visible
+from vjepa2_ac.media.film import draw_strip
 from vjepa2_ac.media.images import encode_jpeg
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.reports.figures.evaluation import decoded_strip, drawings, example_strip, plot_evaluation
-from vjepa2_ac.reports.figures.film import draw_strip
-from vjepa2_ac.reports.figures.page import svg_of, visible
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, write_metrics
 from vjepa2_ac.storage import write_atomically
 

@@ -37,9 +37,9 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import changed_keys, config_as_flat_dict, config_as_yaml, load_config_of_run
 from vjepa2_ac.config.section import Affects, mark_of
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.places import BUILTIN, is_url, literal
 from vjepa2_ac.runs.checkpoint import CHECKPOINTS, remove_leavings
 from vjepa2_ac.storage import read_bounded, try_writing_at, user_can_write, write_atomically
+from vjepa2_ac.storage.places import BUILTIN, is_url, literal
 from vjepa2_ac.storage.structured import MOST_BYTES, json_list, shown, utc_now
 
 logger = logging.getLogger(__name__)

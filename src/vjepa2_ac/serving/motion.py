@@ -9,9 +9,8 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from vjepa2_ac.config.planning import LimitsConfig
-from vjepa2_ac.geometry import apply_action, euler_from_matrices, matrices_from_euler
 from vjepa2_ac.planning.search_space import Workspace, is_allowed
-from vjepa2_ac.spaces import StateSpace
+from vjepa2_ac.spaces import StateSpace, apply_action, euler_from_matrices, matrices_from_euler
 
 
 def waypoints(

@@ -1,6 +1,5 @@
 """File access on this machine and behind URLs: listing, reading, writing and hashing."""
 
-from vjepa2_ac.places import is_url
 from vjepa2_ac.storage.files import (
     ByteReader,
     absolute,
@@ -27,5 +26,6 @@ from vjepa2_ac.storage.files import (
     user_can_write,
     write_atomically,
 )
+from vjepa2_ac.storage.places import is_url
 from vjepa2_ac.storage.remote import FileInfo, ShortReadError, bytes_fetched
 from vjepa2_ac.storage.transfer import download, file_sizes, remove, remove_folder, try_writing, upload

@@ -27,9 +27,9 @@ from pathlib import Path
 from typing import BinaryIO
 
 from vjepa2_ac.errors import InputError, UnreachableError, UserError
-from vjepa2_ac.places import is_url
 from vjepa2_ac.storage import remote
 from vjepa2_ac.storage.block_file import RangedFile, open_remote
+from vjepa2_ac.storage.places import is_url
 from vjepa2_ac.storage.remote import FileInfo, ShortReadError, complete
 
 _HASH_CHUNK_BYTES = 1 << 20

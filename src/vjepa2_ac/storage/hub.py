@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from vjepa2_ac.errors import InputError, RefusedError, UnreachableError
-from vjepa2_ac.places import HUB
+from vjepa2_ac.storage.places import HUB
 
 
 def from_hub(name: str, files: Sequence[str], *, where: str) -> Path:

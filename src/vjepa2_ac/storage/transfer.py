@@ -15,9 +15,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from vjepa2_ac.errors import RefusedError, UnreachableError
-from vjepa2_ac.places import is_url
 from vjepa2_ac.storage import remote
 from vjepa2_ac.storage.files import atomic_writer, join, try_writing_at
+from vjepa2_ac.storage.places import is_url
 
 _AWAY = frozenset({
     errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.ENOTCONN, errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.ENOSPC,

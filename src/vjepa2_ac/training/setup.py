@@ -28,6 +28,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.lora import add_adapter, trainable_report
 from vjepa2_ac.model.adapter.low_rank import CastMatrices
 from vjepa2_ac.model.checkpoints.loading import base_sizes, load_base
+from vjepa2_ac.model.network.compilation import require_compiler
 from vjepa2_ac.model.network.world_model import WorldModel, fit_heads, heads_to_replace, require_trained
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import RunState
@@ -36,8 +37,8 @@ from vjepa2_ac.training.loss import Objective
 from vjepa2_ac.training.optim import make_optimizer, trained_parameters
 
 if TYPE_CHECKING:
-    from vjepa2_ac.calibration.variants import Calibration
     from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
+    from vjepa2_ac.evaluation.calibration.variants import Calibration
     from vjepa2_ac.training.imagined_strip import ImaginedStrip
 
 _CLIPS_TRIED = 8  # one is read; the others are for clips skipped by data.broken_episodes
@@ -119,8 +120,10 @@ def set_up(
         InputError: Something cannot be used.
     """
     accelerator, is_auto = accelerator or make_accelerator(config), config.data.stride == "auto"
+    if config.training.compile == "blocks":
+        require_compiler(accelerator.device.type, where="training.compile")
     if is_auto:
-        from vjepa2_ac.calibration.variants import require_learned
+        from vjepa2_ac.evaluation.calibration.variants import require_learned
 
         require_learned(config.model)
     decoder = _decoder_of(config)
@@ -263,7 +266,7 @@ def choose_stride(
     Raises:
         InputError: There is none, or as `calibrate_model`.
     """
-    from vjepa2_ac.calibration.variants import calibrate_model
+    from vjepa2_ac.evaluation.calibration.variants import calibrate_model
     from vjepa2_ac.evaluation.measure import ClipSample
 
     reporter.note("data.stride is auto: measuring the model at each candidate stride")

@@ -34,7 +34,7 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.lerobot.source import LeRobotSource
 from vjepa2_ac.episode import Episode, EpisodeSource
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.geometry import euler_from_matrices, matrices_from_euler
+from vjepa2_ac.spaces import euler_from_matrices, matrices_from_euler
 
 LENGTHS = (12, 13, 14, 15, 16)
 KEY = "observation.images.exterior_1_left"

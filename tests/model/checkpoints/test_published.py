@@ -11,8 +11,8 @@ import pytest
 
 from vjepa2_ac import storage
 from vjepa2_ac.cli import main
-from vjepa2_ac.console.progress import PlainConsole
-from vjepa2_ac.console.setup import published_table
+from vjepa2_ac.cli.console.progress import PlainConsole
+from vjepa2_ac.cli.console.setup import published_table
 from vjepa2_ac.errors import InputError, UnreachableError
 from vjepa2_ac.model.checkpoints import published
 from vjepa2_ac.model.checkpoints.published import PUBLISHED, VIT_B, Published, download, find_published, published_as

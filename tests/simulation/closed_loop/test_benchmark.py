@@ -18,7 +18,7 @@ from random_decoder import write_decoder
 from served import serving
 from tiny_models import tiny_model
 from vjepa2_ac.cli import main
-from vjepa2_ac.console.tables import benchmark_notes
+from vjepa2_ac.cli.console.tables import benchmark_notes
 from vjepa2_ac.decoding.decoder_folder import load_decoder
 from vjepa2_ac.errors import UserError
 from vjepa2_ac.media.video import count_frames

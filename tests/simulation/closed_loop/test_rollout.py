@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from vjepa2_ac.config.planning import CemConfig, LimitsConfig, PlanningConfig
-from vjepa2_ac.geometry import actions_from_states
 from vjepa2_ac.simulation.closed_loop.tasks import TaskProblem, make_problem
 from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B
+from vjepa2_ac.spaces import actions_from_states
 
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 

@@ -8,9 +8,9 @@ pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 from decisions import QUICK
 from tiny_models import tiny_model
 from vjepa2_ac.config.planning import LimitsConfig
-from vjepa2_ac.demonstrations.key_frames import gripper_key_frames
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.planning.demonstrations.key_frames import gripper_key_frames
 from vjepa2_ac.simulation.closed_loop.policies import Planning
 from vjepa2_ac.simulation.closed_loop.rollout import put, run_episode
 from vjepa2_ac.simulation.closed_loop.sub_goals import (

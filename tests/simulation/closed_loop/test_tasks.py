@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from vjepa2_ac.geometry import matrices_from_euler
 from vjepa2_ac.simulation.closed_loop.tasks import (
     GRASP_M,
     HOLDING,
@@ -17,6 +16,7 @@ from vjepa2_ac.simulation.closed_loop.tasks import (
 from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B, Domain
 from vjepa2_ac.simulation.world.motion import MotionRecipe, forward_kinematics, inverse_kinematics, rest_joints
 from vjepa2_ac.simulation.world.scene import BLOCK_M, FINGER_INSIDE_M, FINGER_TRAVEL_M, FINGERTIP_M, MARK_M, WORK_AREA_M
+from vjepa2_ac.spaces import matrices_from_euler
 
 RECIPE = MotionRecipe()
 

@@ -7,9 +7,9 @@ import pytest
 
 from projections import hand_pixel
 from vjepa2_ac.errors import InputError, UnreachableError
-from vjepa2_ac.geometry import matrices_from_euler
 from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B, Domain, DomainRanges, named_domain, sample_domain
 from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ, HIGH, HOME, LOW, forward_kinematics, rest_joints
+from vjepa2_ac.spaces import matrices_from_euler
 
 mujoco = pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from vjepa2_ac.geometry import matrices_from_euler
 from vjepa2_ac.simulation.world.motion import (
     HIGH,
     HOME,
@@ -14,6 +13,7 @@ from vjepa2_ac.simulation.world.motion import (
     forward_kinematics,
     inverse_kinematics,
 )
+from vjepa2_ac.spaces import matrices_from_euler
 
 # Franka's table once more, as (a, alpha, d): independent of the product under test.
 FRANKA_TABLE = [

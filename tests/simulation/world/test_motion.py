@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from vjepa2_ac.geometry import matrices_from_euler
 from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B
 from vjepa2_ac.simulation.world.motion import (
     HIGH,
@@ -16,6 +15,7 @@ from vjepa2_ac.simulation.world.motion import (
     rest_joints,
     tracking_share,
 )
+from vjepa2_ac.spaces import matrices_from_euler
 
 RECIPE = MotionRecipe()
 

@@ -38,7 +38,7 @@ from vjepa2_ac.model.checkpoints.meta_file import (
 )
 from vjepa2_ac.model.network.blocks import mlp_ratio_of
 from vjepa2_ac.model.network.world_model import WorldModel, widths_as_text, widths_of_model
-from vjepa2_ac.places import BUILTIN
+from vjepa2_ac.storage.places import BUILTIN
 from vjepa2_ac.storage.structured import record_of
 
 logger = logging.getLogger(__name__)

@@ -14,7 +14,7 @@ from matplotlib.patches import Patch, Rectangle
 
 from vjepa2_ac.data.coverage import ENOUGH_NEAR
 from vjepa2_ac.data.transforms import CropBox
-from vjepa2_ac.reports.figures.page import BLUE, GREEN, GREY, ORANGE, written_figure
+from vjepa2_ac.media.figure import BLUE, GREEN, GREY, ORANGE, written_figure
 
 _IDLE = "#c9c9c9"
 _OUTCOME = {True: ("success", GREEN), False: ("failure", "#c0392b"), None: ("", "#b5b5b5")}

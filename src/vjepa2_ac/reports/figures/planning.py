@@ -12,15 +12,15 @@ import numpy as np
 from matplotlib.patches import Rectangle
 
 from vjepa2_ac.data.transforms import crop_box
+from vjepa2_ac.media.figure import BLUE, GREY, ORANGE, RED, headline, written_figure
+from vjepa2_ac.media.film import MEANING, Kind, show_framed
 from vjepa2_ac.planning.decision import PlanResult, summarize
-from vjepa2_ac.reports.figures.film import MEANING, Kind, show_framed
-from vjepa2_ac.reports.figures.page import BLUE, GREY, ORANGE, RED, headline, written_figure
 from vjepa2_ac.spaces import POSE
 
 if TYPE_CHECKING:  # of other rooms, which the figure of one need not load
-    from vjepa2_ac.calibration.axes import AxisFit
-    from vjepa2_ac.decoding.imagine import ImaginedPlan
-    from vjepa2_ac.demonstrations.make_goals import EnergyCourse, MadeGoals
+    from vjepa2_ac.evaluation.calibration.axes import AxisFit
+    from vjepa2_ac.evaluation.imagined_plan import ImaginedPlan
+    from vjepa2_ac.planning.demonstrations.make_goals import EnergyCourse, MadeGoals
     from vjepa2_ac.planning.planner import Plan
 
 PLAN_IMAGE, GOALS_IMAGE = "plan.png", "goals.png"

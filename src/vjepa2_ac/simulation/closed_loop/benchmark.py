@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from vjepa2_ac import __version__
+from vjepa2_ac.media.film import side_by_side
 from vjepa2_ac.media.video import video_library, write_video
 from vjepa2_ac.planning.goals import read_goal_folder
 from vjepa2_ac.reporter import SILENT, Reporter
-from vjepa2_ac.reports.figures.film import side_by_side
 from vjepa2_ac.simulation.closed_loop.agent import Agent
 from vjepa2_ac.simulation.closed_loop.policies import GoalsOf, Oracle, Policy, RandomActions, ZeroActions
 from vjepa2_ac.simulation.closed_loop.rollout import ClosedLoopResult, EpisodeResult, RolloutSpec, run_task

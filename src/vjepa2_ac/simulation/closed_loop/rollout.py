@@ -13,13 +13,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from vjepa2_ac.episode import Progress, no_progress
-from vjepa2_ac.geometry import apply_action
 from vjepa2_ac.intervals import Estimate, mean_of, share_of
 from vjepa2_ac.simulation.closed_loop.policies import Moves, Planning, Policy
 from vjepa2_ac.simulation.closed_loop.tasks import STEPS, TaskName, TaskProblem, arm_for, make_problem
 from vjepa2_ac.simulation.world.arm import SimulatedArm
 from vjepa2_ac.simulation.world.domains import Domain, named_domain
 from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ, HIGH, LOW, OutOfReachError, rest_joints
+from vjepa2_ac.spaces import apply_action
 
 
 @dataclass(frozen=True)

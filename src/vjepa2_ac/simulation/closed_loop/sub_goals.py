@@ -9,14 +9,14 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from vjepa2_ac.config.planning import LimitsConfig
-from vjepa2_ac.demonstrations.key_frames import (
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.planning.demonstrations.key_frames import (
     OF_MODEL_STEPS,
     Timing,
     gripper_key_frames,
     sub_goals_of,
     with_frames_between,
 )
-from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.simulation.closed_loop.policies import Oracle
 from vjepa2_ac.simulation.closed_loop.rollout import run_episode

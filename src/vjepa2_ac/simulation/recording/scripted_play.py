@@ -14,12 +14,12 @@ from jaxtyping import Float
 
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.episode import ACTION_DIM
-from vjepa2_ac.geometry import apply_action
 from vjepa2_ac.simulation.closed_loop.policies import Oracle, shortened
 from vjepa2_ac.simulation.closed_loop.rollout import put, ways_along
 from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, TaskProblem, make_problem
 from vjepa2_ac.simulation.world.arm import SimulatedArm
 from vjepa2_ac.simulation.world.motion import Motion, MotionRecipe, OutOfReachError
+from vjepa2_ac.spaces import apply_action
 
 _NOISE_M = 0.008  # standard deviation of the noise on each axis of an oracle's step
 _LOWEST_M, _HIGHEST_M = 0.155, 0.34  # of the flange while playing

@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
-from vjepa2_ac.geometry import euler_from_matrices
 from vjepa2_ac.simulation.world.camera import FRAME_SIZE, RayCamera
 from vjepa2_ac.simulation.world.domains import Domain
 from vjepa2_ac.simulation.world.motion import (
@@ -21,6 +20,7 @@ from vjepa2_ac.simulation.world.motion import (
     tracking_share,
 )
 from vjepa2_ac.simulation.world.scene import FINGER_TRAVEL_M, SUBSTEPS, compile_scene, load_mujoco
+from vjepa2_ac.spaces import euler_from_matrices
 
 State = Float[np.ndarray, " 7"]  # or an action; legend: episode.py
 

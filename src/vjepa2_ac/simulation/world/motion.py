@@ -9,8 +9,8 @@ from jaxtyping import Float
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
-from vjepa2_ac.geometry import euler_from_matrices, matrices_from_euler
 from vjepa2_ac.simulation.world.domains import Domain
+from vjepa2_ac.spaces import euler_from_matrices, matrices_from_euler
 
 Joints = Float[np.ndarray, " 7"]  # angles in radians
 Jacobian = Float[np.ndarray, "6 7"]

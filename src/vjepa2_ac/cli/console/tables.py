@@ -1,0 +1,211 @@
+"""Tables and notes of the commands: what was measured, planned, simulated, trained and found in data."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import groupby
+from typing import TYPE_CHECKING
+
+import numpy as np
+from rich.table import Table
+from rich.text import Text
+
+from vjepa2_ac.cli.console.progress import MetricsTable, console
+from vjepa2_ac.evaluation.result import Row, sections
+from vjepa2_ac.intervals import Estimate
+from vjepa2_ac.spaces import POSE
+
+if TYPE_CHECKING:
+    from vjepa2_ac.data.index import EpisodeTable, Usage
+    from vjepa2_ac.data.inspection.excerpts import Finding
+    from vjepa2_ac.data.inspection.statistics import StepSizes
+    from vjepa2_ac.decoding.decoder_folder import DecoderCard
+    from vjepa2_ac.evaluation.calibration.variants import VariantResult
+    from vjepa2_ac.planning.decision import PlanResult
+    from vjepa2_ac.planning.demonstrations.make_goals import MadeGoals
+    from vjepa2_ac.simulation.closed_loop.benchmark import ClosedLoopBenchmark
+
+_COLOURS = {"ok": "green", "warning": "yellow", "error": "red"}
+_USUAL = {"planned", "nothing", "random", "scripted"}  # reasons of actions that are not mentioned
+_DECODERS = {"decoder": "decoder", "linear": "linear decoder", "mean_image": "mean image"}
+
+
+def row_tables(rows: Sequence[Row], title: str) -> list[Table]:
+    """Return the rows that are for a screen; groups of the same columns share a table."""
+    tables: list[Table] = []
+    has_intervals = any(row.estimate.has_interval for row in rows)
+    sure = "95 % interval over episodes" if has_intervals else "one episode: no interval"
+    for columns, group in groupby(sections([row for row in rows if not row.detail]), lambda one: one.columns):
+        shared = list(group)
+        with_chance = any(chance for section in shared for _, chance, _ in section.lines)
+        head = ["", *(["by nothing or chance"] if with_chance else []), *columns]
+        table = MetricsTable("" if tables else f"{title} ({sure})", head)
+        for section in shared:
+            table.add_section()
+            table.add_row(section.title)
+            for label, chance, cells in section.lines:
+                table.add_row(f"  {label}", *([chance] if with_chance else []), *cells)
+        tables.append(table)
+    return tables
+
+
+def plan_table(answer: PlanResult) -> Table:
+    """Return a row for each model step: its action, and the state after it; of a vector a row for each number."""
+    is_pose, turns = answer.state_space.is_pose, bool(answer.actions[:, POSE.rotation].any())
+    names = ["number", "changes by", "then"]
+    if is_pose:
+        turn = ["turn (degrees)"] * turns
+        names = ["dx (cm)", "dy (cm)", "dz (cm)", *turn, "gripper", "then x, y, z (m)", "gripper"]
+    table = MetricsTable(f"Plan: {answer.decision.why}", ["step", *names], labelled=False)
+    for step, (action, after) in enumerate(zip(answer.actions, answer.states[1:], strict=True), start=1):
+        if is_pose:
+            way = [f"{value * 100:+.2f}" for value in action[POSE.position]]
+            turn = [" ".join(f"{value:+.1f}" for value in np.degrees(action[POSE.rotation]))] * turns
+            then = " ".join(f"{value:.3f}" for value in after[POSE.position])
+            table.add_row(str(step), *way, *turn, f"{action[POSE.gripper]:+.2f}", then, f"{after[POSE.gripper]:.2f}")
+            continue
+        for one in answer.space.free.tolist():
+            table.add_row(str(step), answer.state_space.names[one], f"{action[one]:+.4g}", f"{after[one]:.4g}")
+    return table
+
+
+def goals_table(made: MadeGoals) -> Table:
+    """Return a row for each goal."""
+    energies = [] if made.course is None else ["energy when it begins", "a model step before its end"]
+    columns = ["goal", "frame", "at least", "at most", "share", "gripper", *energies]
+    table = MetricsTable(f"Goals of {made.recording.name} (at least and at most: model steps)", columns)
+    for place, (key, goal) in enumerate(zip(made.keys, made.goals, strict=True)):
+        name = f"{place + 1} {goal.name}".strip()
+        row = [name, str(key.frame), str(goal.at_least), "" if goal.at_most is None else str(goal.at_most)]
+        row += ["" if goal.share is None else f"{goal.share:g}", goal.gripper or ""]
+        if made.course is not None:
+            began, before = made.course.began[place], made.course.step_before[place]
+            row += [f"{began:.4g}", f"{before:.4g}" + (f" ({before / began:.0%})" if began > 0 else "")]
+        table.add_row(*row)
+    return table
+
+
+def goals_notes(made: MadeGoals) -> tuple[str, ...]:
+    """Return what is worth knowing about the noise floor: a line each."""
+    if made.course is None:
+        return ("No energies and no noise floor: --model measures them.",)
+    if made.noise is None:
+        found = "No noise floor: this recording shows no arm that is known to rest."
+        return (
+            f"{found} --still VIDEO, of a resting arm, measures it; without it thresholds may lie within the noise.",
+        )
+    floor = made.noise.energy
+    notes = [f"Noise floor: energy {floor:.4g}, the 95th percentile of {made.noise.pairs} pairs of resting frames."]
+    for place, (goal, began) in enumerate(zip(made.goals, made.course.began, strict=True), start=1):
+        if began <= floor:
+            notes.append(f"Goal {place} begins within the noise ({began:.4g}): no share can tell when it is reached.")
+        elif goal.share is not None and goal.share * began < floor:
+            notes.append(
+                f"Goal {place}: its threshold, {goal.share * began:.4g}, is within the noise, which replaces it."
+            )
+    return tuple(notes)
+
+
+def benchmark_table(benchmark: ClosedLoopBenchmark) -> Table:
+    """Return a table with a row for each policy; the intervals are 95 %, over episodes."""
+    from vjepa2_ac.simulation.closed_loop.tasks import ALSO, SUCCESS_M
+
+    options = benchmark.options
+    also = f", {ALSO[options.task]}," if ALSO[options.task] else ""
+    criterion = f"within {100 * SUCCESS_M[options.task]:g} cm{also}"
+    table = MetricsTable(
+        f"{options.task} in domain {options.domain}: {options.episodes} problems of seed {options.seed},"
+        f" {options.model_steps} steps of {options.seconds_per_step:.2f} s (95 % interval over episodes)",
+        ["", f"{criterion} at the end", "once on the way", "left at the end, cm", "steps", "s per decision"],
+    )
+    for result in benchmark.results:
+        table.add_row(
+            result.policy,
+            f"{result.success_rate:.0%}",
+            f"{result.success_ever_rate:.0%}",
+            f"{result.final_distance_cm:.1f}",
+            "" if result.steps_needed is None else f"{result.steps_needed.value:.1f}",
+            f"{result.seconds_per_decision.value:.2f}",
+        )
+    return table
+
+
+def benchmark_notes(benchmark: ClosedLoopBenchmark) -> tuple[str, ...]:
+    """Return notes on unusual decisions and commands: a line each, none if all was as usual."""
+    notes = []
+    for result in benchmark.results:
+        unusual = {why: number for why, number in result.why_counts.items() if why not in _USUAL}
+        if unusual:
+            counts = ", ".join(f"{why} {number}" for why, number in unusual.items())
+            notes.append(f"{result.policy}: of {result.seconds.size} decisions {counts}")
+        if result.unreachable.any():
+            notes.append(f"{result.policy}: {result.unreachable.sum()} commands led out of the arm's reach")
+    return tuple(notes)
+
+
+def held_out_table(card: DecoderCard) -> Table:
+    """Return a table of how well the decoder shows frames of held-out episodes, beside what needs no network."""
+    held_out = card.held_out
+    table = MetricsTable(
+        f"{held_out['frames']:,} frames of {held_out['episodes']:,} held-out episodes (95 % interval over episodes)",
+        ["", "PSNR, dB", "SSIM"],
+    )
+    for name, label in _DECODERS.items():
+        psnr, ssim = (_estimate(held_out[name][metric]) for metric in ("psnr_db", "ssim"))
+        table.add_row(label, f"{psnr:.1f}", f"{ssim:.3f}")
+    return table
+
+
+def _estimate(values: dict[str, float | None]) -> Estimate:
+    return Estimate(*(math.nan if values[name] is None else float(values[name]) for name in ("value", "low", "high")))  # type: ignore[arg-type]
+
+
+def print_finding(finding: Finding) -> None:
+    """Print one line of `data check`."""
+    level = Text(f"{finding.level:<7}", style=_COLOURS[finding.level])
+    console.print(level, console.render_str(f"{finding.about:<16}{finding.text}"), sep="  ")
+
+
+def index_lines(table: EpisodeTable, watch: Usage, seconds: float) -> list[str]:
+    """Return the output of `data index`."""
+    lines = [f"{len(table):,} episodes, {int(table.num_steps.sum()):,} steps; opened in {seconds:.2f} s"]
+    if table.problems:
+        lines.append(f"{len(table.problems):,} broken episodes; the first: {table.problems[0].where}")
+    for path in dict.fromkeys(watch.files):
+        size = f"{path.stat().st_size / 1e6:.2f} MB" if path.is_file() else "could not be kept"
+        lines.append(f"  {path}  {size}")
+    return lines
+
+
+def motion_table(steps: Sequence[StepSizes]) -> Table:
+    """Return the percentiles of the motion, or of the change of vectors, per model step at several strides."""
+    from vjepa2_ac.data.inspection.statistics import CHANGED, MOVED, TURNED
+
+    changes = "the number that changes most (% of its range)"
+    sizes = {MOVED: "moves by (cm)", TURNED: "turns by (degrees)", CHANGED: changes}
+    names = list(steps[0].sizes)
+    title = f"{'Change' if CHANGED in names else 'Motion'} per model step: 10 / 50 / 90 / 99 %"
+    table = MetricsTable(title, ["stride", "seconds", *(sizes[name] for name in names)], labelled=False)
+    for one in steps:
+        cells = [" / ".join(f"{value:.1f}" for value in row) or "no step fits" for row in one.percentiles.values()]
+        table.add_row(str(one.stride), f"{one.seconds:.2f}", *cells)
+    return table
+
+
+def variants_table(
+    title: str, results: Sequence[VariantResult], columns: Sequence[str], best: VariantResult | None = None
+) -> Table:
+    """Return the table of `data check --model` and of `data calibrate`: a row for each variant of the same clips."""
+    table = MetricsTable(f"{title} (95 % interval over episodes)", ["variant", "error / persistence", *columns])
+    for one in results:
+        moved = "" if one.moved_cm is None else f"{one.moved_cm:.1f} cm"
+        cells = {
+            "difference": str(one.difference or ""),
+            "error": f"{one.error:.4f}",
+            "persistence": f"{one.persistence:.4f}",
+            "moves by": moved,
+            "clips (episodes)": f"{one.clips} ({one.episodes})",
+        }
+        table.add_row(f"{one.name}{' <' * (one is best)}", str(one.ratio), *(cells[column] for column in columns))
+    return table

@@ -1,0 +1,53 @@
+"""A training run in a terminal: its bar, its validations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from vjepa2_ac.cli.console.progress import ConsoleReporter, console
+from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persistence
+from vjepa2_ac.evaluation.result import ACTIONS, Validation
+
+_MUCH_WAITING = 0.2  # share of a step's time; above it more data.workers, or a nearer copy of the data, would help
+
+
+class TrainingConsole(ConsoleReporter):
+    """Shows a training run."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._steps, self._validation = 0, ""
+
+    def started(self, done: int, total: int) -> None:
+        """Begin the bar."""
+        bar, self._steps = self.task("training"), total
+        if done < total:
+            bar(done, total)
+
+    def stepped(self, step: int, metrics: Mapping[str, float]) -> None:
+        """Move the bar."""
+        speed = metrics["samples_per_second"]
+        words = [f"loss {metrics['loss']:.4f}", self._validation, f"{speed:.{1 if speed >= 10 else 2}f} clips/s"]
+        if "bytes_per_clip" in metrics:
+            words.append(f"{metrics['bytes_per_clip'] / 1e6:.2f} MB/clip")
+        if metrics.get("data_wait_share", 0.0) > _MUCH_WAITING:
+            words.append(f"waits for data {metrics['data_wait_share']:.0%} of the time")
+        self._bar(step, self._steps, "  ".join(word for word in words if word))
+
+    def validated(self, step: int, found: Validation) -> None:
+        """Print a line of the validation's metrics."""
+        errors = found.errors
+        true, zero, shuffled = (one_step_over_persistence(errors, actions).value for actions in ACTIONS)
+        self._validation = f"error/persistence {true:.3f}"
+        horizons = "  ".join(f"{h}: {r.value:.3f}" for h, r in enumerate(over_persistence(errors, "rollout"), start=1))
+        console.print(
+            f"validation at step {step}: one-step error/persistence {true:.3f}"
+            f" (zero actions {zero:.3f}, shuffled {shuffled:.3f});"
+            f" rollout by horizon  {horizons}"
+        )
+        if found.ranking is not None:
+            ranking = found.ranking
+            console.print(
+                f"  mean rank of the true action {ranking.rank} (0 best, 0.5 chance): in a box {ranking.box.value:.3f},"
+                f" among other directions {ranking.shell.value:.3f}; spread of the energy {ranking.spread.value:.3f}"
+            )

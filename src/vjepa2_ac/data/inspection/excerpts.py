@@ -1,0 +1,230 @@
+"""Excerpts of episodes, in grey: whether frames and states belong together, and signs of wrong ones, without a model.
+
+The limits follow from measurements (docs/log.md: simulated arms, BridgeData and DROID excerpts, unchanged and spoiled):
+each limit is well away from all clean sets, so slight errors pass.
+
+                                    clean sets                spoiled                              limit
+    stale poses, share of steps     0 to 0.01                 0.19 (every 5th), 0.80 (4 of 5)      0.05; error 0.5
+    copied steps, share             0                         0.46 and more (each twice)           0.2
+    frames without motion, share    0                         0.5 (each twice, poses not)          0.2
+    neighbours over far frames      0.04 to 0.33              1.0 (noise)                          0.9
+    median distance from base       0.33 m to 0.60 m          0.02 m and less (deltas)             0.05 m
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, UInt8
+from scipy.spatial.transform import Rotation
+
+from vjepa2_ac import storage
+from vjepa2_ac.data.coverage import read_each, sample_of
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.inspection.agreement import FEWEST_EPISODES, Agreement, agreement_of
+from vjepa2_ac.spaces import POSE, StateSpace
+
+EPISODES, _EPISODES_FAR = 24, 12  # far away, of some 5 MB each, for DROID
+STEPS = 64
+_ROWS, _COLUMNS = 24, 32  # of a small frame: an arm is still some pixels wide, and a camera's noise is averaged out
+_STILL_FRAME = 0.1  # of an episode's median change: the codec noise of a repeated frame
+_STALE, _MOSTLY_STALE = 0.05, 0.5
+_COPIED = 0.2
+_FAR_LIKE_NEAR, _FEWEST_STEPS = 0.9, 8
+_INSIDE_M, _DELTA_JUMPS = 0.05, 0.3
+
+Level = Literal["ok", "warning", "error"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of `data check`."""
+
+    level: Level
+    about: str
+    text: str
+
+
+@dataclass(frozen=True, eq=False)
+class Excerpt:
+    """Neighbouring control steps of an episode."""
+
+    name: str  # the episode's identity
+    states: Float[np.ndarray, "steps state_dim"]
+    grey: Float32[np.ndarray, "steps rows columns"]  # 0 to 255
+
+    @property
+    def frame_change(self) -> Float[np.ndarray, " changes"]:
+        """The difference of each frame from the one before: the mean over its pixels."""
+        return np.asarray(np.abs(np.diff(self.grey, axis=0)).mean(axis=(1, 2)), np.float64)
+
+
+def excerpts_of(dataset: Dataset, *, episodes: int = EPISODES, steps: int = STEPS) -> Iterator[Excerpt]:
+    """Yield the middle of some used episodes: always the same draw.
+
+    Episodes that cannot be read are skipped, or raise an error, as `data.broken_episodes` says.
+
+    Raises:
+        InputError: As `Dataset.leave_out`.
+    """
+    for _, found in read_each(dataset, sample_of(dataset, episodes), partial(_read, dataset, steps)):
+        yield found
+
+
+def _read(dataset: Dataset, steps: int, index: int) -> Excerpt:
+    ranges = dataset.kept.of(index) or [(0, int(dataset.table.num_steps[index]))]
+    start, end = max(ranges, key=lambda one: one[1] - one[0])
+    first = start + max(0, end - start - steps) // 2
+    chosen = range(first, min(end, first + steps))
+    episode = dataset.source.read(index, None, dataset.needed_steps(index))
+    states = np.asarray(episode.states[chosen.start : chosen.stop], np.float64)
+    return Excerpt(episode.info.id, states, small_grey(episode.read_frames(chosen)))
+
+
+def small_grey(frames: UInt8[np.ndarray, "steps height width 3"]) -> Float32[np.ndarray, "steps rows columns"]:
+    """Return frames in grey, each pixel the mean of a part; smaller frames are not reduced."""
+    grey = frames.mean(axis=3, dtype=np.float32)
+    for axis, wanted in ((1, _ROWS), (2, _COLUMNS)):
+        size = grey.shape[axis]
+        edges = np.linspace(0, size, min(wanted, size) + 1).astype(int)
+        shape = [1, 1, 1]
+        shape[axis] = -1
+        grey = np.add.reduceat(grey, edges[:-1], axis=axis) / np.diff(edges).reshape(shape).astype(np.float32)
+    return np.asarray(grey)
+
+
+def excerpt_findings(dataset: Dataset) -> Iterator[Finding]:
+    """Read some episodes and yield what is unusual in them.
+
+    Raises:
+        InputError: An episode cannot be read, and `data.broken_episodes` does not skip it.
+    """
+    if dataset.config.is_cache:
+        yield Finding("ok", "agreement", "not looked at in a latent cache: check the data set that it was made from")
+        return
+    episodes = _EPISODES_FAR if storage.is_url(dataset.config.path) else EPISODES
+    space, stride = dataset.spaces.state, dataset.config.model_stride
+    yield from signs_in(list(excerpts_of(dataset, episodes=episodes)), space, stride, dataset.control_rate_hz)
+
+
+def signs_in(excerpts: Sequence[Excerpt], space: StateSpace, stride: int, control_rate_hz: float) -> Iterator[Finding]:
+    """Yield what is unusual in excerpts, and whether frames and states belong together; reads nothing."""
+    excerpts = [one for one in excerpts if len(one.states) > 1]
+    if not excerpts:
+        return
+    moved = _motion_in(excerpts, space)
+    wrong = [*_noise_as_frames(excerpts), *_repetitions(excerpts, moved)]
+    if space.position is not None:
+        wrong += _deltas_for_poses(excerpts)
+    yield from wrong
+    found = agreement_of([(one, other.frame_change) for one, other in zip(moved, excerpts, strict=True)], stride)
+    yield _agreement(found, stride, control_rate_hz, is_sound=not wrong)
+
+
+def _motion_in(excerpts: Sequence[Excerpt], space: StateSpace) -> list[Float[np.ndarray, " _"]]:
+    """Return the motion of each episode at each step: the sum over its numbers, each in units of its typical change."""
+    changes = [_change(one.states, space) for one in excerpts]
+    scale = np.sqrt((np.concatenate(changes) ** 2).mean(axis=0))
+    scale = np.where(scale > 0, scale, np.inf)  # constant numbers do not count
+    return [np.abs(change / scale).sum(axis=1) for change in changes]
+
+
+def _change(states: Float[np.ndarray, "steps dim"], space: StateSpace) -> Float[np.ndarray, "changes dim"]:
+    change = space.differences(states)
+    if space.rotation is not None:
+        change[:, space.rotation] = Rotation.from_euler("xyz", change[:, space.rotation]).as_rotvec()
+    return change
+
+
+def _noise_as_frames(excerpts: Sequence[Excerpt]) -> Iterator[Finding]:
+    """Report neighbouring frames that differ as much as those half an excerpt apart."""
+    excerpts = [one for one in excerpts if len(one.grey) >= _FEWEST_STEPS]
+    near = sum(float(one.frame_change.sum()) for one in excerpts)
+    far = sum(_far_change(one.grey) * (len(one.grey) - 1) for one in excerpts)
+    if far > 0 and near >= _FAR_LIKE_NEAR * far:
+        text = f"neighbouring frames differ as much as far ones ({near / far:.0%}): noise, or frames in no order"
+        yield Finding("error", "pictures", text)
+
+
+def _far_change(grey: Float32[np.ndarray, "steps rows columns"]) -> float:
+    half = len(grey) // 2
+    return float(np.abs(grey[half:] - grey[: len(grey) - half]).mean())
+
+
+def _repetitions(excerpts: Sequence[Excerpt], moved: Sequence[Float[np.ndarray, " _"]]) -> Iterator[Finding]:
+    """Report repetitions: of poses while frames change, of frames while poses change, or of single steps of both."""
+    each_held = [(np.diff(one.states, axis=0) == 0).all(axis=1) for one in excerpts]
+    each_still = [_is_still(one.frame_change) for one in excerpts]
+    singly = np.concatenate([_alone(one & other) for one, other in zip(each_held, each_still, strict=True)])
+    held, still = np.concatenate(each_held), np.concatenate(each_still)
+    fast = np.concatenate([one > np.median(one) for one in moved])
+    if (stale := _share(held, ~still)) > _STALE:
+        text = f"{stale:.0%} repeat the one before while the frame changes: measured more seldom, or stale"
+        yield Finding("error" if stale > _MOSTLY_STALE else "warning", "stale poses", text)
+    if (shown_again := _share(still, fast & ~held)) > _COPIED:
+        text = f"{shown_again:.0%} of the frames repeat the one before while the robot moves"
+        yield Finding("warning", "repeated", f"{text}: filmed at a lower rate. Check the control rate")
+    if (copied := float(singly.mean())) > _COPIED:
+        text = f"{copied:.0%} of the steps repeat the one before, singly: recorded at a lower rate than stated"
+        yield Finding("warning", "repeated", f"{text}. Check the control rate, or double data.stride")
+
+
+def _is_still(change: Float[np.ndarray, " changes"]) -> Bool[np.ndarray, " changes"]:
+    changing = change[change > 0]
+    return np.asarray(change <= (_STILL_FRAME * np.median(changing) if len(changing) else 0.0))
+
+
+def _share(mask: Bool[np.ndarray, " changes"], among: Bool[np.ndarray, " changes"]) -> float:
+    return float(mask[among].mean()) if among.any() else 0.0
+
+
+def _alone(mask: Bool[np.ndarray, " changes"]) -> Bool[np.ndarray, " changes"]:
+    """Return which values are true while both neighbours are not."""
+    padded = np.pad(mask, 1)
+    return np.asarray(mask & ~padded[:-2] & ~padded[2:])
+
+
+def _deltas_for_poses(excerpts: Sequence[Excerpt]) -> Iterator[Finding]:
+    """Report positions that are impossible for a flange: at the base, as differences of positions are."""
+    positions = [one.states[:, POSE.position] for one in excerpts]
+    median_m = float(np.median(np.linalg.norm(np.concatenate(positions), axis=1)))
+    if not 0 < median_m < _INSIDE_M:
+        return
+    steps = np.concatenate([np.diff(one, axis=0) for one in positions])
+    jumps = float(np.sqrt((steps**2).mean()) / np.sqrt((np.concatenate(positions) ** 2).mean()))
+    text = f"half of the positions lie within {median_m * 100:.1f} cm of the robot's base"
+    if jumps > _DELTA_JUMPS:
+        text += f", and change by {jumps:.0%} of that from step to step: differences, not poses"
+        yield Finding("error", "position", f"{text}. Sum them up, or choose the field with the measured pose")
+    else:
+        yield Finding("warning", "position", f"{text}: poses are needed in the frame of the base, in metres")
+
+
+def _agreement(found: Agreement, stride: int, control_rate_hz: float, *, is_sound: bool) -> Finding:
+    measure = f"rank correlation of their changes over {found.episodes} episodes"
+    text = f"{measure} {found.best:.2f}, {found.chance:.2f} with another episode's frames"
+    if found.episodes < FEWEST_EPISODES:
+        needed = f"{FEWEST_EPISODES} are needed to tell whether frames and states belong together"
+        return Finding("ok", "agreement", f"not known of {found.episodes} moving episodes of enough steps: {needed}")
+    if found.verdict == "reversed":
+        text = f"{measure} {found.backwards:.2f} with the frames backwards, {found.best:.2f} forwards"
+        return Finding("error", "agreement", f"frames and states run against each other in time: {text}")
+    steps = "1 step" if abs(found.lag) == 1 else f"{abs(found.lag)} steps"
+    shift = f"{steps} {'late' if found.lag > 0 else 'early'}"
+    if found.verdict == "late":
+        text = f"{measure} {found.best:.2f} so, {found.unshifted:.2f} as they are"
+        fix = f"Give each frame the state of {steps} {'before' if found.lag > 0 else 'after'}"
+        by = f"frames are {'at least ' * found.is_farthest}{shift} ({abs(found.lag) / control_rate_hz:.2f} s)"
+        is_step = abs(found.lag) >= stride  # then each action is paired with another one's frames
+        return Finding("error" if is_step else "warning", "agreement", f"{by}: {text}. {fix}")
+    if found.verdict == "foreign" and is_sound:
+        fix = "Are they of these episodes, and of this robot?"
+        return Finding("warning", "agreement", f"frames do not change when the robot moves: {text}. {fix}")
+    if found.verdict == "together":
+        best = f", best where frames are {shift}" if found.lag else ""
+        return Finding("ok", "agreement", f"frames change when the robot moves: {text}{best}")
+    return Finding("ok", "agreement", f"not known whether frames and states belong together: {text}")

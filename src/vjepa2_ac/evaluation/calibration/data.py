@@ -1,0 +1,244 @@
+"""Data variants: under which does a trained model predict best: unchanged, mirrored, shifted, ...?
+
+The same clips are measured unchanged and with one thing changed at a time, of every episode and nothing on disk; a
+variant that is certainly better is most likely the true reading of the data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from vjepa2_ac.config import Config, DataConfig
+from vjepa2_ac.config.data import Split
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.loader import validation_windows
+from vjepa2_ac.data.windows import spread
+from vjepa2_ac.distributed import make_accelerator
+from vjepa2_ac.encoding.batch import encode_batch
+from vjepa2_ac.episode import Batch, Episode, LatentBatch, Progress, no_progress
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.calibration.variants import (
+    ReadOnce,
+    SameClips,
+    Variant,
+    VariantResult,
+    load_named,
+    measure_variants,
+)
+from vjepa2_ac.evaluation.measure import ClipSample, Predictor
+from vjepa2_ac.spaces import POSE, euler_from_matrices, matrices_from_euler
+
+SHIFTS = (1, 2, 4, 8)  # control steps
+AS_THEY_ARE = "as they are"
+_CANDIDATES_PER_CLIP = 8  # windows checked per clip, since shifts need room on both sides
+_EPISODES_TO_BE_SURE = 5
+_GAIN = 0.01  # of persistence: smaller gains are irrelevant
+
+
+@dataclass(frozen=True)
+class VariantProbe:
+    """The results of all variants, each compared with the unchanged data."""
+
+    plain: VariantResult  # of these
+    results: tuple[VariantResult, ...]
+
+    @property
+    def better(self) -> VariantResult | None:
+        """The variant that fits best, if it certainly fits better than the unchanged data."""
+        certain = [
+            one
+            for one in self.results
+            if one.is_certainly_better(needed=_EPISODES_TO_BE_SURE)
+            and one.gain > _GAIN
+            and one.ratio.high < 1  # else it only fails less
+        ]
+        return max(certain, key=lambda one: one.gain, default=None)
+
+    def verdict(self) -> str:
+        """Return as text whether the unchanged data fit the model best."""
+        plain, better = self.plain, self.better
+        text = f"error / persistence {plain.ratio} on {plain.clips} clips of {plain.episodes} episodes"
+        if better is not None and (found := better.difference) is not None:
+            less = f"{-found.value:.3f} [{-found.high:.3f}, {-found.low:.3f}]"
+            return f"{text}, and {less} less with {better.name}: {better.repair}"
+        if plain.episodes < _EPISODES_TO_BE_SURE:
+            return f"{text}: too few episodes to compare, {_EPISODES_TO_BE_SURE} are needed"
+        if plain.ratio.value >= 1:
+            return f"{text}: the model predicts none of this better than persistence, so the result is unknown"
+        return f"{text}; no variant certainly fits better"
+
+
+def probe_config(
+    config: Config, dataset: Dataset, *, model: str, clips: int = 64, progress: Progress = no_progress
+) -> VariantProbe:
+    """Probe the data of a config, opened at a fixed stride, with a model.
+
+    Args:
+        config: The device and the precision.
+        dataset: The data.
+        model: What `model.base` takes, or the folder of a run.
+        clips: Number of clips, of the validation episodes; of training episodes if there are no others.
+        progress: Called with the number of measured clips.
+
+    Raises:
+        InputError: The data or the model cannot be used.
+    """
+    accelerator = make_accelerator(config)
+    world_model = load_named(config, dataset, model).to(accelerator.device)
+    encode = partial(encode_batch, world_model, device=accelerator.device, chunk=config.model.encode_chunk)
+    split: Split = "validation"
+    try:
+        dataset.windows(split)
+    except InputError:
+        split = "train"
+    with accelerator.autocast(), torch.no_grad():
+        sample = ClipSample(split, clips, batch_size=config.validation.batch_size)
+        return probe_variants(world_model, encode, dataset, sample, progress)
+
+
+def probe_variants(
+    model: Predictor,
+    encode: Callable[[Batch], LatentBatch],
+    dataset: Dataset,
+    sample: ClipSample,
+    progress: Progress = no_progress,
+) -> VariantProbe:
+    """Measure a model's one-step error on unchanged clips, and under each variant.
+
+    Args:
+        model: The predictor.
+        encode: Turns a batch of pixels into latents on the model's device.
+        dataset: The source of clips, at a fixed stride.
+        sample: The clips.
+        progress: Called with (clips done, clips in total).
+
+    Raises:
+        InputError: The split is empty, or a clip cannot be read.
+    """
+    # Of whole clips, as a cache has them.
+    candidates = validation_windows(dataset, sample.split, clips=sample.clips * _CANDIDATES_PER_CLIP)
+    frames = sample.frames_of(dataset.config)
+    dataset = replace(dataset, config=dataset.config.model_copy(update={"frames": frames}))
+    windows, shifts = _with_room(dataset, candidates, sample.clips)
+    variants = [Variant(AS_THEY_ARE, lambda same: same), *variants_of(dataset.config, shifts)]
+    clips = SameClips(dataset, windows, sample.batch_size)
+    plain, *measured = measure_variants(model, encode, clips, variants, progress)
+    space = dataset.spaces.action
+    results = [
+        found.result(one.name, space, beside=plain, repair=one.repair)
+        for one, found in zip(variants[1:], measured, strict=True)
+    ]
+    return VariantProbe(plain.result(AS_THEY_ARE, space), tuple(results))
+
+
+def _with_room(
+    dataset: Dataset, candidates: list[tuple[int, int]], clips: int
+) -> tuple[list[tuple[int, int]], tuple[int, ...]]:
+    """Return the starts of clips, and the shifts for which each has states before and after it."""
+    steps, length = dataset.table.num_steps, dataset.config.clip_steps
+    enough = max(1, min(clips, len(candidates) // 4))
+    fitting: list[tuple[int, int]] = candidates
+    shifts: tuple[int, ...] = ()
+    for count in range(1, len(SHIFTS) + 1):
+        room = SHIFTS[count - 1]
+        wider = [(episode, start) for episode, start in fitting if room <= start <= steps[episode] - length - room]
+        if len(wider) < enough:
+            break
+        fitting, shifts = wider, SHIFTS[:count]
+    return [fitting[place] for place in spread(len(fitting), clips)], shifts
+
+
+def variants_of(config: DataConfig, shifts: Sequence[int]) -> list[Variant]:
+    """Return the variants that apply to this data.
+
+    Args:
+        config: The data.
+        shifts: Control steps by which to shift frames against states.
+    """
+    found = [
+        _variant(
+            f"frames {_steps(shift)} {'late' if shift > 0 else 'early'}",
+            f"give each frame the state of {_steps(shift)} {'before' if shift > 0 else 'after'}",
+            partial(shifted, late=shift),
+        )
+        for size in shifts
+        for shift in (size, -size)
+    ]
+    if config.actions == "difference":  # a command has no opposite
+        found.append(_variant("the states backwards", "reverse the order of the frames", _of_states(_backwards)))
+    if config.states == "pose":
+        for axis, name in enumerate("xy"):
+            repair = f"negate {name}, with the rotation (as of a mirror)"
+            found.append(_variant(f"{name} negated", repair, _of_states(partial(mirrored, axis=axis))))
+        found.append(_variant("the gripper inverted", config.gripper_fix, _of_states(_with_gripper_inverted)))
+    if not config.is_cache:
+        exchanged, flipped = (
+            partial(_with_changed_frames, change=change)
+            for change in (lambda frames: frames[..., ::-1], lambda frames: frames[:, :, ::-1])
+        )
+        repair = "exchange red and blue (OpenCV reads and writes BGR) where the data is written"
+        found.append(_variant("red and blue exchanged", repair, exchanged, has_frames=True))
+        repair = "flip the frames, left to right, where the data is written"
+        found.append(_variant("frames mirrored", repair, flipped, has_frames=True))
+    return found
+
+
+def _variant(name: str, repair: str, change: Callable[[Episode], Episode], *, has_frames: bool = False) -> Variant:
+    """Return a variant of changed episodes; without frames where they are the same."""
+
+    def changed(episode: Episode) -> Episode:
+        found = change(episode)
+        return found if has_frames else replace(found, read_frames=_no_frames, read_latents=None)
+
+    def view(dataset: Dataset) -> Dataset:
+        return replace(dataset, source=ReadOnce(dataset.source, changed))
+
+    return Variant(name, view, has_frames, repair)
+
+
+def mirrored(states: Float[np.ndarray, "steps 7"], axis: int) -> Float[np.ndarray, "steps 7"]:
+    """Return poses mirrored across the plane of two axes: one coordinate and two rotations negated."""
+    mirror = np.ones(3)
+    mirror[axis] = -1
+    rotations = matrices_from_euler(states[:, POSE.rotation]) * mirror[:, None] * mirror
+    return np.concatenate([states[:, POSE.position] * mirror, euler_from_matrices(rotations), states[:, -1:]], axis=1)
+
+
+def _no_frames(steps: Sequence[int]) -> np.ndarray:
+    return np.zeros((len(steps), 1, 1, 3), np.uint8)
+
+
+def _steps(shift: int) -> str:
+    return "1 step" if abs(shift) == 1 else f"{abs(shift)} steps"
+
+
+def shifted(episode: Episode, *, late: int) -> Episode:
+    """Give each step the state, and the command, of `late` steps before; beyond the ends, the first or the last."""
+    steps = np.clip(np.arange(len(episode.states)) - late, 0, len(episode.states) - 1)
+    commands = None if episode.commands is None else episode.commands[steps]
+    return replace(episode, states=episode.states[steps], commands=commands)
+
+
+def _of_states(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Episode], Episode]:
+    return lambda episode: replace(episode, states=change(episode.states))
+
+
+def _backwards(states: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(states[::-1])
+
+
+def _with_gripper_inverted(states: np.ndarray) -> np.ndarray:
+    return np.concatenate([states[:, : POSE.gripper], 1 - states[:, POSE.gripper :]], axis=1)
+
+
+def _with_changed_frames(episode: Episode, change: Callable[[np.ndarray], np.ndarray]) -> Episode:
+    def read(steps: Sequence[int]) -> np.ndarray:
+        return np.ascontiguousarray(change(episode.read_frames(steps)))
+
+    return replace(episode, read_frames=read)

@@ -1,0 +1,142 @@
+"""Progress of a run: a bar in a terminal, lines elsewhere."""
+
+import io
+import re
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+from rich.table import Table
+
+import vjepa2_ac
+from evaluation_results import ranking_of
+from vjepa2_ac.cli import main
+from vjepa2_ac.cli.console import progress as console_module
+from vjepa2_ac.cli.console import tables, training
+from vjepa2_ac.cli.console.progress import ConsoleReporter, ProgressBar
+from vjepa2_ac.cli.console.training import TrainingConsole
+from vjepa2_ac.data.inspection.excerpts import Finding
+from vjepa2_ac.evaluation.measure import VALIDATED
+from vjepa2_ac.evaluation.result import PredictionErrors, Validation
+
+PACKAGE = Path(vjepa2_ac.__file__).parent
+FIGURES = {"loss": 0.51234, "samples_per_second": 1.5, "data_wait_share": 0.1}
+
+
+def shown_on(monkeypatch: pytest.MonkeyPatch, *, terminal: bool) -> io.StringIO:
+    """Let the console write where a test can read it."""
+    written = io.StringIO()
+    shown = Console(
+        file=written, force_terminal=terminal, width=140, highlight=False, soft_wrap=True, color_system=None
+    )
+    for module in (console_module, training):
+        monkeypatch.setattr(module, "console", shown)
+    return written
+
+
+def errors() -> PredictionErrors:
+    ones = np.ones((4, 3))
+    better = {("true", "rollout"): 0.5, ("true", "teacher_forced"): 0.25}
+    arrays = {(way, mode, "l1"): ones * better.get((way, mode), 1.0) for way, mode in VALIDATED}
+    return PredictionErrors(("a", "b", "c", "d"), arrays)
+
+
+def test_lines_have_loss_error_speed_and_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    written = shown_on(monkeypatch, terminal=False)
+    now = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    reporter = TrainingConsole()
+    reporter.validated(10, Validation(errors(), ranking_of(np.array([0.1, 0.2]), ("a", "b"))))
+    reporter.started(10, 100)
+    for step in (11, 12, 13):
+        now[0] += 6.0
+        reporter.stepped(step, FIGURES)
+    validation, ranked, *lines = written.getvalue().splitlines()
+    assert validation.startswith("validation at step 10: one-step error/persistence 0.250")
+    assert ranked.startswith("  mean rank of the true action 0.150 [")
+    words = "loss 0.5123  error/persistence 0.250  1.50 clips/s"
+    assert lines == [f"training 12/100  {words}  0:08:48 left"], "a line every 10 seconds"
+
+
+@pytest.mark.parametrize(("share", "reported"), [(0.2, False), (0.35, True)])
+def test_waiting_for_data_is_shown_where_it_is_much(monkeypatch, share: float, *, reported: bool) -> None:
+    written = shown_on(monkeypatch, terminal=False)
+    reporter = TrainingConsole()
+    reporter.started(0, 1)
+    reporter.stepped(1, {**FIGURES, "data_wait_share": share})
+    assert ("waits for data 35% of the time" in written.getvalue()) == reported
+    assert "left" not in written.getvalue(), "nothing is left"
+
+
+def test_a_terminal_has_one_bar_with_the_same_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    written = shown_on(monkeypatch, terminal=True)
+    reporter = TrainingConsole()
+    reporter.started(0, 2)
+    reporter.stepped(1, FIGURES)
+    reporter.stepped(2, {**FIGURES, "bytes_per_clip": 2.5e6})
+    reporter.__exit__()
+    last = [line for line in written.getvalue().splitlines() if "training" in line][-1]
+    assert "2/2" in last
+    assert "loss 0.5123  1.50 clips/s  2.50 MB/clip" in last
+
+
+def test_a_task_with_a_unit_shows_its_speed_and_the_next_one_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    written = shown_on(monkeypatch, terminal=True)
+    now = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    with ConsoleReporter() as reporter:
+        encoding = reporter.task("encoding frames", "frames")
+        assert not written.getvalue(), "a bar begins with its work"
+        encoding(0, 96)
+        now[0] = 4.0
+        encoding(48, 96)
+        reporter.task("measuring")(1, 2)
+        reporter.note("done")
+    shown = written.getvalue()
+    assert "12.0 frames/s" in [line for line in shown.splitlines() if "48/96" in line][-1]
+    assert shown.rindex("frames/s") < shown.index("measuring")
+    assert "done" in shown
+
+
+HOSTILE = "run[lr=0.01] [/b] :smile: \x1b[31m\x1b]0;x\x07"
+SHOWN = r"run[lr=0.01] [/b] :smile: \x1b[31m\x1b]0;x\x07"
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_no_name_is_markup_wherever_it_is_shown(monkeypatch: pytest.MonkeyPatch, *, terminal: bool) -> None:
+    written = io.StringIO()
+    shown = console_module.PlainConsole(file=written, force_terminal=terminal, width=140, color_system="standard")
+    monkeypatch.setattr(console_module, "console", shown)
+    shown.print(f"The run is in {HOSTILE}")
+    table = Table(title=HOSTILE)
+    table.add_column(HOSTILE)
+    table.add_row(HOSTILE)
+    shown.print(table)
+    ProgressBar(HOSTILE)(1, 1, HOSTILE)
+    assert written.getvalue().count(SHOWN) >= 6, "a line, a title, a column, a cell, a bar and its words"
+    assert "\x1b]" not in written.getvalue()
+    assert "\x1b[31m" not in written.getvalue(), "colours are the bar's own"
+
+
+def test_a_finding_has_its_colour_and_its_name_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    written = io.StringIO()
+    shown = console_module.PlainConsole(file=written, force_terminal=True, width=140, color_system="standard")
+    monkeypatch.setattr(tables, "console", shown)
+    tables.print_finding(Finding("error", "source", HOSTILE))
+    assert written.getvalue() == f"\x1b[31merror  \x1b[0m  source          {SHOWN}\n"
+
+
+def test_errors_warnings_and_words_on_the_command_line_are_shown_as_they_are(capsys) -> None:
+    assert main(["train", f"{HOSTILE}.yaml"]) == 2
+    assert f"error: {SHOWN}.yaml: no such file" in capsys.readouterr().err
+    with pytest.raises(SystemExit, match="2"):
+        main(["train", "--no\x1b[31m", "x"])
+    assert r"--no\x1b[31m" in capsys.readouterr().err
+
+
+def test_there_is_one_console_and_no_markup_in_the_program() -> None:
+    assert isinstance(console_module.console, console_module.PlainConsole)
+    others = [path for path in PACKAGE.rglob("*.py") if re.search(r"\bConsole\(|from_markup|\[/", path.read_text())]
+    assert others == []

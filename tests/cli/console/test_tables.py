@@ -1,0 +1,99 @@
+"""Every number of a table is readable, on narrow and wide terminals, whatever the length of a cell."""
+
+import re
+from collections.abc import Callable
+from typing import Any, cast
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+import torch
+from rich.table import Table
+
+from vjepa2_ac.cli.console.progress import PlainConsole
+from vjepa2_ac.cli.console.tables import benchmark_table, motion_table, plan_table, row_tables, variants_table
+from vjepa2_ac.data.inspection.statistics import CHANGED, MOVED, TURNED, StepSizes
+from vjepa2_ac.evaluation.calibration.variants import VariantResult
+from vjepa2_ac.evaluation.evaluate import Contender, evaluate
+from vjepa2_ac.evaluation.request import ProbeOptions
+from vjepa2_ac.evaluation.result import Row
+from vjepa2_ac.evaluation.rows import rows_of
+from vjepa2_ac.intervals import Estimate
+from vjepa2_ac.planning.decision import PlanResult
+from vjepa2_ac.simulation.closed_loop.benchmark import ClosedLoopBenchmark
+from vjepa2_ac.simulation.closed_loop.rollout import ClosedLoopResult
+from vjepa2_ac.spaces import POSE, vector_states
+from worlds import Copier, Halfway, about, again, clips_batch
+
+SURE = Estimate(-0.123, -0.145, -0.101)
+SHARE = Estimate(0.912, 0.888, 0.934)
+
+
+def variants() -> list[Table]:
+    results = [
+        VariantResult(f"{name} or some other thing", SHARE, 0.4321, 0.5432, 12.3, 1024, 128, difference)
+        for name, difference in (("late", None), ("mirrored", SURE))
+    ]
+    return [variants_table("variants", results, ["difference", "error", "moves by", "clips (episodes)"], results[1])]
+
+
+def motions() -> list[Table]:
+    sizes = np.array([1234.5, 2345.6, 3456.7, 4567.8])
+    return [motion_table([StepSizes(15, 1.0, dict.fromkeys(names, sizes))]) for names in ((MOVED, TURNED), (CHANGED,))]
+
+
+def evaluations() -> list[Table]:
+    names = ["base", "adapter", "runs/of-another-day/with-a-long-name", "vjepa2-ac-vitg.pt"]
+    contenders = [Contender(name, "trained" if name == "adapter" else "base", Halfway()) for name in names[:2]]
+    contenders += [Contender(name, "other", Copier()) for name in names[2:]]
+    probes = ProbeOptions(sensitivity_clips=4, samples=4, landscape_clips=2, nodes=3, examples=0)
+    found = evaluate(cast("Any", contenders), again(clips_batch(12, 0)), about(), probes=probes)
+    return row_tables(rows_of(found), "Held-out episodes")
+
+
+def comparisons() -> list[Table]:
+    runs = ("first", "a/run/with/a/name/that/does/not/end/anywhere/near")
+    lines = ("4.00 s ahead", "one step", "4.00 s, L2")
+    rows = [Row("a group", line, line, run, 0.912, 0.888, 0.934) for run in runs for line in lines]
+    return row_tables(rows, "L1 error over persistence")
+
+
+def plans() -> list[Table]:
+    actions, states = np.full((3, 7), -0.12345), np.full((4, 7), -0.54321)
+    answers = [
+        Mock(
+            spec=PlanResult, actions=actions, states=states, decision=Mock(why="planned"), state_space=space,
+            space=Mock(free=torch.arange(7)),
+        )
+        for space in (POSE, vector_states(7))
+    ]  # fmt: skip
+    return [plan_table(answer) for answer in answers]
+
+
+def benchmarks() -> list[Table]:
+    result = Mock(
+        spec=ClosedLoopResult,
+        policy="the model of runs/of-another-day", success_rate=SHARE, success_ever_rate=SHARE,
+        final_distance_cm=Estimate(12.3, 10.1, 14.5), steps_needed=SHARE,
+        seconds_per_decision=Estimate(16.2, 15.0, 17.0),
+    )  # fmt: skip
+    options = Mock(task="reach", domain="B", episodes=100, seed=5, model_steps=20, seconds_per_step=0.27)
+    return [benchmark_table(Mock(spec=ClosedLoopBenchmark, options=options, results=(result,)))]
+
+
+@pytest.mark.parametrize("width", [80, 120])
+@pytest.mark.parametrize("made", [variants, motions, evaluations, comparisons, plans, benchmarks])
+def test_no_figure_and_no_word_is_cut_off(made: Callable[[], list[Table]], width: int) -> None:
+    for table in made():
+        console = PlainConsole(width=width)
+        with console.capture() as capture:
+            console.print(table)
+        shown = capture.get()
+        assert all(len(line) <= width for line in shown.splitlines() if line and line[0] in "│┃┏┡├└")  # not the title
+        assert "…" not in shown
+        words = re.split(r"[\s│┃]+", shown)
+        for column in table.columns:
+            for cell in (column.header, *column.cells):
+                for word in str(cell).split():
+                    assert word in words or len(word) > 16, (word, shown)
+        assert all(word in words for word in str(table.caption or "").split())

@@ -1,0 +1,104 @@
+"""Checks of batches: each kind of wrong numbers has its own finding."""
+
+import itertools
+from pathlib import Path
+
+import pytest
+import torch
+
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.data.inspection.check import check_data, findings_in
+from vjepa2_ac.data.inspection.excerpts import Finding
+from vjepa2_ac.data.inspection.statistics import at_some_stride
+from vjepa2_ac.episode import Batch
+
+ONLY_MOVES = torch.tensor([1.0, 1, 1, 0, 0, 0, 1])
+TURNS_BY_2_5 = torch.tensor([0.0, 0, 0, 2.5, 0, 0, 0])
+IN_METRES = torch.tensor([1.0, 1, 1, 1, 1, 1, 0.08])  # the last is a gripper's width
+
+
+def good(clips: int = 4, time: int = 5) -> dict[str, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    states = torch.rand((clips, time, 7), generator=generator) * 0.5
+    states[..., 6] = torch.rand((clips, time), generator=generator)
+    return {
+        "frames": torch.randint(0, 256, (clips, time, 8, 8, 3), dtype=torch.uint8, generator=generator),
+        "states": states,
+        "actions": (states[:, 1:] - states[:, :-1]) * 0.3,
+    }
+
+
+def found_in(**changes: torch.Tensor) -> dict[str, Finding]:
+    values = good() | changes
+    ids = tuple(f"episode {number}" for number in range(len(values["states"])))
+    batch = Batch(**values, extrinsics=None, episode_ids=ids, starts=(0,) * len(ids))
+    return {finding.about: finding for finding in findings_in([batch])}
+
+
+def with_column(column: int, value: float) -> torch.Tensor:
+    states = good()["states"].clone()
+    states[..., column] = value
+    return states
+
+
+def test_good_numbers_are_all_well() -> None:
+    assert {finding.level for finding in found_in().values()} == {"ok"}
+
+
+@pytest.mark.parametrize(
+    ("about", "level", "words", "changes"),
+    [
+        ("pixels", "error", "all are 0", {"frames": torch.zeros_like(good()["frames"])}),
+        ("pixels", "warning", "nearly black", {"frames": good()["frames"] // 100}),
+        ("pictures", "error", "although the robot moved", {"frames": good()["frames"][:, :1].repeat(1, 5, 1, 1, 1)}),
+        ("position", "error", "never changes", {"states": torch.zeros_like(good()["states"])}),
+        ("position", "warning", "metres", {"states": good()["states"] * 8}),
+        ("position", "warning", "within 1 cm", {"states": good()["states"] * 0.01}),
+        ("rotation", "warning", "never changes", {"actions": good()["actions"] * ONLY_MOVES}),
+        ("rotation", "warning", "wild", {"actions": good()["actions"] + TURNS_BY_2_5}),
+        ("gripper", "warning", "never moves in 4 clips", {"states": with_column(6, 1.0)}),
+        ("gripper", "warning", "width in metres", {"states": good()["states"] * IN_METRES}),
+        ("actions", "error", "all are zero", {"actions": torch.zeros_like(good()["actions"])}),
+        ("actions", "warning", "nearly still", {"actions": good()["actions"] * 1e-3}),
+        ("actions", "warning", "very far", {"actions": good()["actions"] * 10}),
+    ],
+)  # fmt: skip
+def test_wrong_numbers_are_named(about: str, level: str, words: str, changes: dict[str, torch.Tensor]) -> None:
+    finding = found_in(**changes)[about]
+    assert (finding.level, words in finding.text) == (level, True), finding
+
+
+def knobs(droid: Path, **changes: object) -> DataConfig:
+    values = {"path": str(droid), "frames": 3, "stride": 2, "workers": 0, "validation_share": 0.3, "test_share": 0.0}
+    return DataConfig.model_validate(values | changes)
+
+
+def test_a_whole_set_is_looked_at_as_training_would(droid: Path) -> None:
+    clock = itertools.count()
+    findings = list(check_data(knobs(droid), batch_size=2, clips=6, clock=lambda: float(next(clock))))
+    about = {finding.about: finding for finding in findings}
+    assert "6 episodes, 87 steps" in about["index"].text
+    assert "frames (2, 3, 48, 65, 3) uint8" in about["batch"].text
+    assert "first batch of 2 after 1.00 s, then 4.0 clips/s with 0 workers" in about["timing"].text
+    assert "network" not in about
+    assert not [finding for finding in findings if finding.level == "error"]
+
+
+def test_training_that_could_not_begin_is_an_error_line(droid: Path) -> None:
+    findings = check_data(knobs(droid, validation_share=0.0), clips=2)
+    assert {finding.about: finding.level for finding in findings}["validation"] == "error"
+
+
+def test_an_empty_test_split_is_an_error_line_where_one_is_asked_for_as_training_refuses_it(droid: Path) -> None:
+    in_one_group = {"split_by": "(episode|.)"}
+    for share, level in ((0.001, "error"), (0.0, "ok")):
+        findings = check_data(knobs(droid, test_share=share, validation_share=0.0, **in_one_group), clips=2)
+        assert {finding.about: finding.level for finding in findings}["test"] == level
+
+
+def test_an_auto_stride_is_looked_at_at_the_smallest_candidate(droid: Path) -> None:
+    config = knobs(droid, stride="auto", stride_candidates=(4, 2, 5))
+    findings = {finding.about: finding for finding in check_data(config, clips=2)}
+    assert "smallest candidate, 2" in findings["stride"].text
+    assert at_some_stride(open_dataset(config)).config.stride == 2

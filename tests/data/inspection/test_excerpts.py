@@ -1,0 +1,183 @@
+"""Checks of excerpts: frames and states that do not match are found without a model; matching ones give no alarm."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from clips import dataset_in_memory
+from latent_sets import write_cache
+from memory_source import MemorySource
+from moving_arms import COLUMNS, ROWS, STEPS, spot_excerpt, spot_frames, spot_states, write_spots
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.inspection.check import check_data
+from vjepa2_ac.data.inspection.excerpts import Finding, excerpts_of, signs_in, small_grey
+from vjepa2_ac.data.selection import StepSelection
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.spaces import POSE, StateSpace, vector_states
+
+Pair = tuple[np.ndarray, np.ndarray]
+Spoil = Callable[[list[Pair]], list[Pair]]
+
+EPISODES = 12
+
+
+def recorded(seed: int = 0, episodes: int = EPISODES, steps: int = STEPS) -> list[Pair]:
+    ways = [spot_states(1000 * seed + number, steps) for number in range(episodes)]
+    return [(states, spot_frames(states)) for states in ways]
+
+
+def each(spoil: Callable[[np.ndarray, np.ndarray], Pair]) -> Spoil:
+    return lambda pairs: [spoil(states, frames) for states, frames in pairs]
+
+
+def stale(states: np.ndarray) -> np.ndarray:
+    states = states.copy()
+    states[4::5] = states[3::5][: len(states[4::5])]
+    return states
+
+
+def noise_like(frames: np.ndarray) -> np.ndarray:
+    return np.random.default_rng(0).integers(0, 256, frames.shape).astype(np.uint8)
+
+
+def twice(values: np.ndarray) -> np.ndarray:
+    return np.repeat(values, 2, axis=0)[: len(values)]
+
+
+SPOILS: dict[str, Spoil] = {
+    "as it is": each(lambda s, f: (s, f)),
+    "a step late": each(lambda s, f: (s[1:], f[:-1])),
+    "late": each(lambda s, f: (s[8:], f[:-8])),
+    "early": each(lambda s, f: (s[:-2], f[2:])),
+    "reversed": each(lambda s, f: (s, f[::-1])),
+    "foreign": lambda pairs: [(s, pairs[(n + 1) % len(pairs)][1]) for n, (s, _) in enumerate(pairs)],
+    "stale poses": each(lambda s, f: (stale(s), f)),
+    "held poses": each(lambda s, f: (s[np.arange(len(s)) // 5 * 5], f)),
+    "deltas": each(lambda s, f: (np.diff(s, axis=0, append=s[-1:]), f)),
+    "noise": each(lambda s, f: (s, noise_like(f))),
+    "each step twice": each(lambda s, f: (twice(s), twice(f))),
+    "each frame twice": each(lambda s, f: (s, f[np.arange(len(f)) // 2 * 2])),
+    "near the base": each(lambda s, f: (s - np.append(s[0, :3], [0, 0, 0, 0]) * [1, 1, 1, 0, 0, 0, 0], f)),
+}
+
+
+def found_in(pairs: list[Pair], *, stride: int = 4, space: StateSpace = POSE) -> list[Finding]:
+    excerpts = [spot_excerpt(number, *pair) for number, pair in enumerate(pairs)]
+    return list(signs_in(excerpts, space, stride, 15.0))
+
+
+def alarms_in(pairs: list[Pair], **about: object) -> list[Finding]:
+    return [finding for finding in found_in(pairs, **about) if finding.level != "ok"]  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("space", [POSE, vector_states(7)], ids=["poses", "vectors"])
+def test_what_belongs_together_gives_no_alarm(seed: int, space: StateSpace) -> None:
+    findings = found_in(recorded(seed), space=space)
+    assert not [finding for finding in findings if finding.level != "ok"]
+    assert findings[-1].text.startswith("frames change when the robot moves: rank correlation")
+
+
+@pytest.mark.parametrize(
+    ("how", "level", "about", "words"),
+    [
+        ("late", "error", "agreement", "frames are 8 steps late (0.53 s)"),
+        ("early", "warning", "agreement", "frames are 2 steps early (0.13 s)"),
+        ("reversed", "error", "agreement", "against each other in time"),
+        ("foreign", "warning", "agreement", "do not change when the robot moves"),
+        ("stale poses", "warning", "stale poses", "while the frame changes"),
+        ("held poses", "error", "stale poses", "while the frame changes"),
+        ("deltas", "error", "position", "differences, not poses"),
+        ("noise", "error", "pictures", "differ as much as far ones"),
+        ("each step twice", "warning", "repeated", "recorded at a lower rate"),
+        ("each frame twice", "warning", "repeated", "filmed at a lower rate"),
+    ],
+)
+def test_what_does_not_is_said_once_and_in_its_own_words(how: str, level: str, about: str, words: str) -> None:
+    (alarm,) = alarms_in(SPOILS[how](recorded()))
+    assert (alarm.level, alarm.about, words in alarm.text) == (level, about, True), alarm
+
+
+def test_positions_around_the_base_that_drift_are_no_differences() -> None:
+    alarms = alarms_in([(s * [0.1, 0.1, 0.1, 1, 1, 1, 1], f) for s, f in SPOILS["near the base"](recorded())])
+    assert [(alarm.level, alarm.about) for alarm in alarms] == [("warning", "position")]
+
+
+def test_a_camera_that_is_one_step_behind_is_none_but_at_stride_1_it_is_a_whole_model_step() -> None:
+    assert found_in(SPOILS["a step late"](recorded()))[-1].text.endswith("best where frames are 1 step late")
+    (alarm,) = alarms_in(SPOILS["a step late"](recorded()), stride=1)
+    assert (alarm.level, "are 1 step late (0.07 s)" in alarm.text) == ("error", True)
+
+
+@pytest.mark.parametrize("how", ["as it is", "foreign", "reversed"])
+def test_of_few_or_short_or_still_episodes_nothing_is_claimed(how: str) -> None:
+    for pairs in (recorded(episodes=5), recorded(steps=5), [(s[:1].repeat(STEPS, 0), f) for s, f in recorded()]):
+        findings = found_in(SPOILS[how](pairs))
+        assert [finding.level for finding in findings if finding.about == "agreement"] == ["ok"]
+        assert "not known" in findings[-1].text
+    assert found_in([(s[:1], f[:1]) for s, f in recorded()]) == []
+
+
+def test_episodes_may_be_of_any_length() -> None:
+    pairs = [(states[number:], frames[number:]) for number, (states, frames) in enumerate(recorded())]
+    assert not alarms_in(pairs)
+    assert [alarm.about for alarm in alarms_in(SPOILS["late"](pairs))] == ["agreement"]
+
+
+def test_a_standing_robot_before_a_standing_camera_is_neither_stale_nor_copied() -> None:
+    rest = np.concatenate([np.arange(10), np.full(20, 10), np.arange(10, STEPS)])
+    assert not alarms_in([(states[rest], frames[rest]) for states, frames in recorded()])
+
+
+def test_small_frames_are_means_of_parts() -> None:
+    frames = np.random.default_rng(0).integers(0, 256, (2, 2 * ROWS + 5, 3 * COLUMNS, 3)).astype(np.uint8)
+    grey = small_grey(frames)
+    assert grey.shape == (2, ROWS, COLUMNS)
+    rows = np.linspace(0, 2 * ROWS + 5, ROWS + 1).astype(int)
+    by_hand = frames[1, rows[3] : rows[4], 15:18].astype(float).mean()
+    assert grey[1, 3, 5] == pytest.approx(by_hand, abs=1e-3)
+    assert small_grey(frames[:, :7, :9]).shape == (2, 7, 9)
+
+
+def config_of(path: Path, tmp_path: Path, **changes: object) -> DataConfig:
+    values = {
+        "source": "npz", "path": str(path), "frames": 3, "stride": 4, "workers": 0, "validation_share": 0.4,
+        "test_share": 0.0, "disk_cache": {"dir": str(tmp_path / "cache")},
+    }  # fmt: skip
+    return DataConfig.model_validate(values | changes)
+
+
+def test_the_check_of_a_set_says_it_and_one_of_a_latent_cache_refers_to_the_set(tmp_path: Path) -> None:
+    late = config_of(write_spots(tmp_path / "late", SPOILS["late"](recorded())), tmp_path)
+    findings = {finding.about: finding for finding in check_data(late, clips=2)}
+    assert (findings["agreement"].level, "8 steps" in findings["agreement"].text) == ("error", True)
+    cached = config_of(write_cache(open_dataset(late)), tmp_path, source="latents")
+    findings = {finding.about: finding for finding in check_data(cached, clips=2)}
+    assert (findings["agreement"].level, "latent cache" in findings["agreement"].text) == ("ok", True)
+
+
+def in_memory(lengths: list[int], **changes: object) -> Dataset:
+    return dataset_in_memory(MemorySource(lengths, unreadable=frozenset({3})), **changes)
+
+
+def test_the_middle_of_the_longest_kept_range_is_looked_at() -> None:
+    dataset = in_memory([300] * 4 + [20], exclude=())
+    ranges = StepSelection(*(np.array(column, np.int32) for column in ([4, 4], [0, 8], [5, 20])))
+    dataset = Dataset(dataset.config, dataset.source, dataset.table, ranges, dataset.broken)
+    (found,) = excerpts_of(dataset, steps=6)
+    assert found.name == "episode 4"
+    np.testing.assert_array_equal(found.states, dataset.source.read(4).states[11:17])
+    source = dataset.source
+    assert isinstance(source, MemorySource)
+    assert source.decoded == [(4, step) for step in range(11, 17)]
+
+
+def test_an_episode_that_cannot_be_read_is_counted_or_named() -> None:
+    many = [30] * 300
+    found = list(excerpts_of(in_memory(many, broken_episodes="skip"), episodes=300, steps=4))
+    assert len(found) == 299
+    with pytest.raises(InputError, match=r"episode 3: damaged.*data\.exclude"):
+        list(excerpts_of(in_memory(many), episodes=300, steps=4))

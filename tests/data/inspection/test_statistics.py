@@ -1,0 +1,111 @@
+"""Statistics of a data set: equal to those computed by hand."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from clips import dataset_in_memory, split_of
+from memory_source import MemorySource
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.coverage import sample_of
+from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.inspection.statistics import MOVED, RELEASED_STEP_CM, TURNED, idle_runs, inspect_dataset
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.reports import sheet as figure
+from vjepa2_ac.reports.figures.contact_sheet import ContactSheet
+from vjepa2_ac.reports.sheet import plot_dataset
+
+
+def knobs(droid: Path, **changes: object) -> DataConfig:
+    values = {"path": str(droid), "frames": 3, "stride": 2, "validation_share": 0.3, "test_share": 0.0}
+    return DataConfig.model_validate(values | changes)
+
+
+def straight_on(steps: int) -> np.ndarray:
+    """One centimetre and one degree (about z, past pi) a step."""
+    states = np.zeros((steps, 7))
+    states[:, 0] = 0.01 * np.arange(steps)
+    states[:, 5] = (np.pi - 0.05 + np.deg2rad(np.arange(steps)) + np.pi) % (2 * np.pi) - np.pi
+    return states
+
+
+def test_motion_per_step_is_in_centimetres_and_degrees_at_every_stride() -> None:
+    source = MemorySource([40], states=lambda _: straight_on(40))
+    dataset = dataset_in_memory(source, stride_candidates=(1, 4, 15, 40))
+    *found, too_wide = inspect_dataset(dataset).steps
+    for one, stride in zip(found, (1, 4, 15), strict=True):
+        assert (one.stride, one.seconds) == (stride, stride / 15)
+        assert len(one.sizes[MOVED]) == 40 - stride
+        assert one.percentiles[MOVED] == pytest.approx([stride] * 4)
+        assert one.percentiles[TURNED] == pytest.approx([stride] * 4)
+    assert too_wide.percentiles == {MOVED: [], TURNED: []}
+
+
+def test_standing_still_counts_from_a_run_that_is_long_enough() -> None:
+    states = straight_on(30)
+    states[5:10] = states[5]  # steps 6 to 9 are idle: too short a run
+    states[15:25] = states[15]
+    assert np.flatnonzero(idle_runs(states, DataConfig(path="x"))).tolist() == list(range(16, 25))
+
+
+def test_figures_of_a_whole_set(droid: Path) -> None:
+    dataset = open_dataset(knobs(droid))
+    found = inspect_dataset(dataset)
+    values = found.values
+    assert values["length_percentiles_0_10_50_90_100"] == [12, 12, 14, 16, 17]
+    assert values["hours"] == pytest.approx(87 / 15 / 3600)
+    assert values["success_share"] == pytest.approx(4 / 6)
+    assert len(found.sample) == 6
+    assert [one.stride for one in found.steps] == [4, 8, 15]
+    splits = [split_of(info.id, dataset.config) for info in dataset.table]
+    assert {name: one["episodes"] for name, one in values["splits"].items()} == {
+        name: splits.count(name) for name in ("train", "validation", "test")
+    }
+    assert [values["splits"][name]["windows"] for name in ("train", "validation", "test")] == [
+        *(len(dataset.windows(split)) for split in ("train", "validation")), 0,
+    ]  # fmt: skip
+    by_hand = np.concatenate([dataset.source.read(index).states for index in range(6)])
+    assert found.ranges[6].tolist() == pytest.approx([by_hand[:, 6].min(), by_hand[:, 6].max()])
+
+
+def test_a_sample_is_drawn_from_those_that_take_part_and_is_always_the_same(droid: Path) -> None:
+    dataset = open_dataset(knobs(droid, outcome="failure"))
+    assert sorted(sample_of(dataset, 10)) == np.flatnonzero(dataset.table.success == 0).tolist()
+    assert sample_of(dataset, 1) == sample_of(dataset, 1)
+    assert len(inspect_dataset(dataset, episodes=1).sample) == 1
+
+
+def hundred(broken: frozenset[int], policy: str, pictureless: frozenset[int] = frozenset()) -> Dataset:
+    return dataset_in_memory(
+        MemorySource([60] * 100, unreadable=broken, pictureless=pictureless), broken_episodes=policy
+    )
+
+
+def test_an_episode_of_the_sample_that_cannot_be_read_is_counted_and_named(caplog: pytest.LogCaptureFixture) -> None:
+    dataset = hundred(frozenset({7}), "skip")
+    assert len(inspect_dataset(dataset).sample) == 99
+    assert list(dataset.broken.reasons) == ["episode 7"]
+    assert "memory: episode 7: damaged" in caplog.text
+    with pytest.raises(InputError, match="2 of 100 episodes are broken"):
+        inspect_dataset(hundred(frozenset({7, 8}), "skip"))
+    with pytest.raises(InputError, match=r"memory: episode 7: damaged\..*add to data\.exclude: \[\"episode 7\"\]"):
+        inspect_dataset(hundred(frozenset({7}), "error"))
+
+
+def test_a_broken_frame_is_left_out_of_the_contact_sheet(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    sheets: list[ContactSheet] = []
+    monkeypatch.setattr(figure, "plot_contact_sheet", lambda sheet, path: sheets.append(sheet) or path)
+    dataset = hundred(frozenset(), "skip", frozenset({7}))
+    plot_dataset(inspect_dataset(dataset), tmp_path / "sheet.png", rows=100)
+    assert len(sheets[0].strips) == 99
+    assert list(dataset.broken.reasons) == ["episode 7"]
+    dataset = hundred(frozenset(), "error", frozenset({7}))
+    with pytest.raises(InputError, match=r"pictures of episode 7: damaged\..*add to data\.exclude"):
+        plot_dataset(inspect_dataset(dataset), tmp_path / "sheet.png", rows=100)
+
+
+def test_the_example_of_upstream_moves_as_far_as_is_said(shared: Path) -> None:
+    with np.load(shared / "data" / "franka_example_traj.npz") as file:
+        states = np.squeeze(file["states"])
+    assert np.linalg.norm(states[1, :3] - states[0, :3]) * 100 == pytest.approx(RELEASED_STEP_CM, abs=0.05)

@@ -1,0 +1,114 @@
+"""The axes of an oracle that is turned by a known angle are found; a model without axes is said to have none."""
+
+import functools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from vjepa2_ac.evaluation.action_use import RolloutStart, start_of
+from vjepa2_ac.evaluation.calibration.axes import AxisFit, infer_axes
+from vjepa2_ac.intervals import Estimate
+from vjepa2_ac.planning.model_setup import Axes
+from worlds import TIME, Copier, Oracle, clips_batch
+
+CLIPS = 30
+
+
+class Turned(Oracle):
+    """Knows the world, but in axes of its own: it sees turned, and longer, what the robot does."""
+
+    def __init__(self, degrees: float, gain: float = 1.0, *, mirrored: bool = False) -> None:
+        self.back, self.gain, self.side = Axes(-np.deg2rad(degrees)), gain, -1.0 if mirrored else 1.0
+
+    def predict(self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
+        back = self.back.actions(actions) / torch.tensor([self.gain, self.side * self.gain, 1, 1, 1, 1, 1])
+        return super().predict(latents, back, states, extrinsics)
+
+
+def turn(degrees: float, gain: float = 1.0) -> np.ndarray:
+    angle = np.deg2rad(degrees)
+    flat = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    return flat * [gain, gain, 1.0]
+
+
+def starts(**changes: object) -> list[RolloutStart]:
+    batch = clips_batch(CLIPS, **changes)  # type: ignore[arg-type]
+    return [start_of(batch, clip, 1, clip) for clip in range(CLIPS)]
+
+
+def fitted(model: object, **changes: object) -> AxisFit:
+    return infer_axes(model, starts(**changes), at_once=64)  # type: ignore[arg-type]
+
+
+@functools.cache
+def fitted_to_turned(degrees: float) -> AxisFit:
+    return fitted(Turned(degrees))
+
+
+@pytest.mark.parametrize("degrees", [0.0, -60.0, 135.0, 179.9])
+def test_the_angle_of_a_turned_oracle_is_recovered_within_half_a_degree(degrees: float) -> None:
+    found = fitted_to_turned(degrees)
+    for yaw in (found.yaw_degrees, found.fitted_yaw_degrees):
+        assert yaw.value == pytest.approx(degrees, abs=0.5)
+        assert yaw.low <= yaw.value <= yaw.high < yaw.low + 3
+    assert found.error.value == (1.0 if degrees == 0.0 else pytest.approx(0.0, abs=0.02))
+    assert found.gain.value == pytest.approx(1.0, abs=0.02)
+    assert found.condition.value == pytest.approx(1.0, abs=0.03)
+    assert found.problem is None
+    assert (found.pairs, found.episodes) == (CLIPS, CLIPS // 2)
+
+
+def test_gain_and_condition_are_those_of_the_matrix() -> None:
+    found = fitted(Turned(30.0, gain=0.6))
+    np.testing.assert_allclose(found.matrix, turn(30.0, gain=0.6), atol=0.04)
+    assert found.gain.value == pytest.approx(0.6, abs=0.02)
+    assert found.condition.value == pytest.approx(1 / 0.6, abs=0.1)
+    assert found.residual_cm.value < 0.5
+
+
+def test_a_model_that_ignores_actions_is_refused_as_ill_conditioned() -> None:
+    assert "ill-conditioned" in (fitted(Copier()).problem or "")
+
+
+def test_a_turn_that_predicts_no_better_than_none_and_one_of_a_wide_interval_are_refused() -> None:
+    found = fitted_to_turned(-60.0)
+    unsure = replace(found, error=Estimate(0.98, 0.95, 1.01))
+    assert (unsure.problem or "").startswith("no better than none")
+    wide = replace(found, yaw_degrees=Estimate(-60.0, -80.0, -30.0))
+    assert (wide.problem or "").startswith("uncertain: yaw -60 degrees, 95 % interval -80 to -30")
+
+
+def test_mirrored_axes_and_one_episode_are_refused_by_name() -> None:
+    assert "mirrored" in (fitted(Turned(0.0, mirrored=True)).problem or "")
+    batch = clips_batch(2)
+    alone = infer_axes(Oracle(), [start_of(batch, clip, step, 0) for clip in (0, 1) for step in range(TIME - 1)],
+                       at_once=64)  # fmt: skip
+    assert "1 episode" in (alone.problem or "")
+
+
+class Placed(Turned):
+    """Expects the hand at a place, too: elsewhere its predictions are off."""
+
+    def __init__(self, degrees: float, place: Tensor) -> None:
+        super().__init__(degrees)
+        self.place = place
+
+    def predict(self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
+        off = (states[..., :3] - self.place).norm(dim=-1)[..., None, None]
+        return super().predict(latents, actions, states, extrinsics) + 5 * off
+
+
+@pytest.mark.parametrize("about", ["base", "middle"])
+def test_the_place_that_is_turned_about_is_found(about: str) -> None:
+    """A mounting is turned about the base; a camera leaves what it looks at where it is."""
+    there = torch.tensor([0.4, 0.1, 0.3, 0.0, 0.0, 0.0, 0.0])
+    expected = there if about == "middle" else Axes(np.deg2rad(45.0)).poses(there)
+    begun = [replace(start, state=there) for start in starts()]
+    found = infer_axes(Placed(45.0, expected[:3]), begun, at_once=64)
+    assert found.yaw_degrees.value == pytest.approx(45.0, abs=0.5)
+    assert found.centre_m == pytest.approx((0.4, 0.1) if about == "middle" else (0.0, 0.0))
+    assert ("about its base" in found.words()) == (about == "base")
+    assert found.as_dict()["centre_m"] == list(found.centre_m)

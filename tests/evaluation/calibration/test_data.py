@@ -1,0 +1,282 @@
+"""An oracle finds the variant in which the data were written, and no variant for good data."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from memory_source import MemorySource
+from moving_arms import STEPS, spot_states
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.selection import BrokenEpisodes, StepSelection
+from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, LatentBatch, StepRanges
+from vjepa2_ac.evaluation.calibration.data import (
+    AS_THEY_ARE,
+    VariantProbe,
+    mirrored,
+    probe_variants,
+    shifted,
+    variants_of,
+)
+from vjepa2_ac.evaluation.calibration.variants import VariantResult
+from vjepa2_ac.evaluation.measure import ClipSample
+from vjepa2_ac.intervals import Estimate
+from vjepa2_ac.spaces import actions_from_states, matrices_from_euler
+from worlds import Copier
+
+EPISODES, BEYOND = 8, 8  # episodes; steps before the first and behind the last one, for shifts
+ROTATION = slice(3, 12)
+RIGHT = 7  # of blue
+
+Fault = Callable[[np.ndarray], np.ndarray]
+
+
+@cache
+def truth(number: int, steps: int = STEPS) -> np.ndarray:
+    """Return where the spot of an episode really is at each step, and for some steps around."""
+    return spot_states(number, steps + 2 * BEYOND)
+
+
+def at(shift: int) -> Fault:
+    return lambda states: states[BEYOND + shift : len(states) - BEYOND + shift]
+
+
+def with_inverted_gripper(states: np.ndarray) -> np.ndarray:
+    return np.concatenate([states[:, :6], 1 - states[:, 6:]], axis=1)
+
+
+class TwoSided(MemorySource):
+    """Its frames hold at the right other steps than at the left, and another blue."""
+
+    def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:
+        """Return an episode."""
+        episode = super().read(index, camera, needed)
+
+        def frames(steps: Sequence[int]) -> np.ndarray:
+            frames = episode.read_frames(steps)
+            frames[:, :, 3:, 1] = (7 * frames[:, :, 3:, 1] + 3) % STEPS
+            frames[:, :, 3:, 2] = RIGHT
+            return frames
+
+        return replace(episode, read_frames=frames)
+
+
+class Knowing:
+    """An oracle for the time of each frame, and for the effect of an action on position, rotation and gripper."""
+
+    def __init__(self, steps: int = STEPS, *, sees_bgr: bool = False, sees_mirrored: bool = False) -> None:
+        self._latents = [self._latent(at(0)(truth(number, steps))) for number in range(EPISODES)]
+        self._channels = [2, 1, 0] if sees_bgr else [0, 1, 2]
+        self._column = -1 if sees_mirrored else 0
+        self.encoded = 0
+
+    @staticmethod
+    def _latent(states: np.ndarray) -> np.ndarray:
+        rotations = matrices_from_euler(states[:, 3:6]).reshape(len(states), 9)
+        return np.concatenate([states[:, :3], rotations, states[:, 6:]], axis=1)
+
+    def _at(self, episode: int, step: int) -> np.ndarray:
+        latents = self._latents[episode % EPISODES]
+        return latents[step % len(latents)]
+
+    def encode(self, batch: Batch) -> LatentBatch:
+        """Look up what is to be seen: a frame holds its episode and its step as colours."""
+        assert batch.frames is not None
+        self.encoded += 1
+        seen = batch.frames[:, :, 0, self._column][..., self._channels].numpy().astype(int)
+        found = [[self._at(episode, step) for episode, step, _ in clip] for clip in seen]
+        latents = torch.from_numpy(np.array(found)).float()[:, :, None]
+        return LatentBatch(latents, batch.states, batch.actions, None, batch.episode_ids, batch.starts)
+
+    def predict(self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
+        """Return the place that an action leads to."""
+        del states, extrinsics
+        after, by = latents.clone(), actions[:, :, None]
+        after[..., :3] += by[..., :3]
+        turned = torch.from_numpy(matrices_from_euler(by[..., 3:6].double().numpy())).float()
+        after[..., ROTATION] = (turned @ after[..., ROTATION].unflatten(-1, (3, 3))).flatten(-2)
+        after[..., 12:] += by[..., 6:]
+        return after
+
+    def rollout(self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
+        """Not used."""
+        raise NotImplementedError
+
+
+def dataset_of(fault: Fault, *, episodes: int = EPISODES, steps: int = STEPS, **changes: object) -> Dataset:
+    values = {"path": "memory", "frames": 3, "validation_share": 0.0, "test_share": 0.0, "workers": 0}
+    config = DataConfig.model_validate(values | changes)
+    source = TwoSided([steps] * episodes, states=lambda number: fault(truth(number, steps)))
+    table = source.infos()
+    kept = StepSelection.whole(table, np.ones(episodes, bool))
+    return Dataset(config, source, table, kept, BrokenEpisodes(config, episodes))
+
+
+def probed(dataset: Dataset, model: Knowing | Copier | None = None) -> VariantProbe:
+    knowing = model if isinstance(model, Knowing) else Knowing()
+    return probe_variants(model or knowing, knowing.encode, dataset, ClipSample("train", 16))
+
+
+FAULTS: dict[str, Fault] = {
+    **{f"frames {n} step{'s' * (n > 1)} late": at(n) for n in (1, 8)},
+    **{f"frames {n} step{'s' * (n > 1)} early": at(-n) for n in (2, 4)},
+    "the states backwards": lambda states: at(0)(states)[::-1].copy(),
+    "x negated": lambda states: mirrored(at(0)(states), 0),
+    "y negated": lambda states: mirrored(at(0)(states), 1),
+    "the gripper inverted": lambda states: with_inverted_gripper(at(0)(states)),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_each_fault_is_named_and_mending_it_makes_the_model_fit(name: str) -> None:
+    probe = probed(dataset_of(FAULTS[name]))
+    assert probe.better is not None
+    assert probe.better.name == name
+    assert probe.better.ratio.value < 0.02 < 0.1 < probe.plain.ratio.value
+    assert probe.verdict().endswith(f"less with {name}: {probe.better.repair}")
+
+
+@pytest.mark.parametrize("name", ["red and blue exchanged", "frames mirrored"])
+def test_changed_frames_are_named(name: str) -> None:
+    knowing = Knowing(sees_bgr=name.startswith("red"), sees_mirrored=name.startswith("frames"))
+    probe = probed(dataset_of(at(0)), knowing)
+    assert probe.better is not None
+    assert probe.better.name == name
+
+
+def test_of_good_data_no_variant_fits_better_and_only_changed_frames_are_encoded_again() -> None:
+    knowing = Knowing()
+    probe = probed(dataset_of(at(0)), knowing)
+    assert probe.better is None
+    assert probe.plain.ratio.value < 0.02
+    assert min(one.difference.value for one in probe.results) > 0.1
+    assert probe.verdict().endswith("on 16 clips of 8 episodes; no variant certainly fits better")
+    assert knowing.encoded == 2 * 3  # two batches; again with red and blue exchanged, and mirrored
+    assert {one.name for one in probe.results} >= {*FAULTS, "red and blue exchanged"}
+
+
+def test_of_few_episodes_nothing_is_claimed() -> None:
+    probe = probed(dataset_of(FAULTS["the states backwards"], episodes=4))
+    assert min(one.difference.value for one in probe.results) < -0.1
+    assert probe.better is None
+    assert "too few episodes to compare, 5 are needed" in probe.verdict()
+
+
+def test_what_is_worse_than_persistence_is_no_better_reading() -> None:
+    def found(ratio: Estimate) -> VariantResult | None:
+        difference = Estimate(-0.2, -0.25, -0.15)
+        plain = VariantResult(AS_THEY_ARE, Estimate(1.3, 1.2, 1.4), 0.4, 0.3, None, clips=64, episodes=12)
+        other = replace(plain, name="y negated", ratio=ratio, difference=difference)
+        return VariantProbe(plain, (other,)).better
+
+    assert found(Estimate(1.1, 1.05, 1.15)) is None
+    assert found(Estimate(0.95, 0.85, 1.05)) is None
+    assert found(Estimate(0.9, 0.85, 0.95)) is not None
+
+
+def test_a_model_that_predicts_nothing_gives_no_result() -> None:
+    probe = probed(dataset_of(FAULTS["y negated"]), Copier())
+    assert probe.better is None
+    assert "the result is unknown" in probe.verdict()
+
+
+@pytest.mark.parametrize(("steps", "widest"), [(STEPS, 8), (22, 4), (14, 2), (11, 1), (9, 0)])
+def test_shifts_are_measured_as_far_as_states_reach_on_both_sides(steps: int, widest: int) -> None:
+    dataset = dataset_of(at(0), steps=steps)
+    knowing = Knowing(steps)
+    asked: list[tuple[int, int]] = []
+
+    def encode(batch: Batch) -> LatentBatch:
+        asked.extend(
+            (dataset.table.find(name) or 0, start) for name, start in zip(batch.episode_ids, batch.starts, strict=True)
+        )
+        return knowing.encode(batch)
+
+    probe = probe_variants(knowing, encode, dataset, ClipSample("train", 16))
+    results = {one.name for one in probe.results}
+    for shift in (1, 2, 4, 8):
+        assert (f"frames {shift} step{'s' * (shift > 1)} late" in results) == (shift <= widest)
+    assert asked
+    assert all(widest <= start <= steps - 9 - widest for _, start in asked)
+    assert probe.better is None
+
+
+def test_long_clips_are_looked_at_in_part_where_whole_ones_fit() -> None:
+    dataset = dataset_of(at(0), steps=41, frames=11, stride=4)
+    seen: list[Batch] = []
+    knowing = Knowing(41)
+
+    def encode(batch: Batch) -> LatentBatch:
+        seen.append(batch)
+        return knowing.encode(batch)
+
+    probe = probe_variants(knowing, encode, dataset, ClipSample("train", 8))
+    assert {batch.states.shape[1] for batch in seen} == {8}
+    assert {start for batch in seen for start in batch.starts} == {0}  # a latent cache has nothing else
+    assert probe.plain.clips == EPISODES
+
+
+def test_vectors_are_shifted_and_turned_only_and_latents_keep_their_colours() -> None:
+    def names(**changes: object) -> set[str]:
+        return {one.name for one in variants_of(DataConfig.model_validate({"path": "set"} | changes), [1])}
+
+    shifted = {"frames 1 step late", "frames 1 step early"}
+    colours = {"red and blue exchanged", "frames mirrored"}
+    poses = {"x negated", "y negated", "the gripper inverted"}
+    assert names() == shifted | colours | poses | {"the states backwards"}
+    assert names(source="latents") == shifted | poses | {"the states backwards"}
+    assert names(source="npz", states="vector") == shifted | colours | {"the states backwards"}
+    assert names(source="npz", states="vector", actions="recorded", join_actions="sum") == shifted | colours
+
+
+def an_episode(states: np.ndarray, commands: np.ndarray | None = None) -> Episode:
+    def frames(steps: Sequence[int]) -> np.ndarray:
+        return np.array([[[[step, 0, 9]]] for step in steps], np.uint8)
+
+    return Episode(EpisodeInfo("one", len(states)), states, frames, 15.0, commands=commands)
+
+
+def test_commands_are_shifted_with_the_states() -> None:
+    states = np.arange(6.0)[:, None]
+    found = shifted(an_episode(states, states + 10), late=2)
+    assert found.states[:, 0].tolist() == [0, 0, 0, 1, 2, 3]
+    assert found.commands is not None
+    assert found.commands[:, 0].tolist() == [10, 10, 10, 11, 12, 13]
+    assert shifted(an_episode(states), late=-2).states[:, 0].tolist() == [2, 3, 4, 5, 5, 5]
+
+
+def test_of_changed_frames_persistence_is_another_one_too() -> None:
+    """Or what moves less in latents would fit better."""
+    knowing = Knowing()
+
+    def encode(batch: Batch) -> LatentBatch:
+        assert batch.frames is not None
+        is_mirrored = bool((batch.frames[:, :, 0, 0, 2] == RIGHT).all())
+        latents = knowing.encode(batch)
+        return replace(latents, latents=latents.latents * 0.01) if is_mirrored else latents
+
+    dataset = dataset_of(at(0))
+    probe = probe_variants(Copier(), encode, dataset, ClipSample("train", 16))
+    (mirrored_ones,) = [one for one in probe.results if one.name == "frames mirrored"]
+    assert mirrored_ones.ratio.value == pytest.approx(1)
+    assert probe.better is None
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_mirror_of_a_mirror_is_the_world_and_hands_stay_right_hands(axis: int) -> None:
+    generator = np.random.default_rng(axis)
+    states = generator.uniform(-1, 1, (50, 7)) * [1, 1, 1, np.pi, 1.5, np.pi, 1]
+    seen = mirrored(states, axis)
+    np.testing.assert_allclose(np.linalg.det(matrices_from_euler(seen[:, 3:6])), 1)
+    np.testing.assert_allclose(mirrored(seen, axis), states, atol=1e-9)
+    np.testing.assert_allclose(seen[:, axis], -states[:, axis])
+    np.testing.assert_allclose(np.delete(seen, [axis, 3, 4, 5], axis=1), np.delete(states, [axis, 3, 4, 5], axis=1))
+    actions, of_seen = actions_from_states(states), actions_from_states(seen)
+    np.testing.assert_allclose(mirrored(actions, axis), of_seen, atol=1e-9)  # so do its actions
+    pointing, of_mirror = (matrices_from_euler(one[:, 3:6])[:, :, 2] for one in (states, seen))
+    np.testing.assert_allclose(of_mirror, pointing * np.where(np.arange(3) == axis, -1, 1), atol=1e-9)

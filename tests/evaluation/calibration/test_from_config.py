@@ -1,0 +1,107 @@
+"""`data check --model` measures the data with a model, unchanged and in variants, for every source."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from adapted_run import write_adapted_run
+from latent_sets import encode_for
+from vector_sets import write_vectors
+from vjepa2_ac.cli import main
+from vjepa2_ac.config import Config
+from vjepa2_ac.config.loading import config_as_yaml
+from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.evaluation.calibration.data import VariantProbe, probe_config
+from vjepa2_ac.model.checkpoints.loading import load_base
+
+MakeConfig = Callable[..., Config]
+Printed = pytest.CaptureFixture[str]
+
+
+def written(config: Config, tmp_path: Path) -> str:
+    path = tmp_path / "config.yaml"
+    path.write_text(config_as_yaml(config))
+    return str(path)
+
+
+def check(config: Config, tmp_path: Path, model: str) -> int:
+    return main(["data", "check", written(config, tmp_path), "--limit", "4", "--model", model])
+
+
+def probed(config: Config, model: str, clips: int = 4) -> VariantProbe:
+    return probe_config(config, open_dataset(config.data), model=model, clips=clips)
+
+
+def names(probe: VariantProbe) -> set[str]:
+    return {one.name for one in probe.results}
+
+
+def test_the_probe_prints_a_table_and_a_verdict_after_the_findings(
+    make_config: MakeConfig, tmp_path: Path, capsys: Printed
+) -> None:
+    assert check(make_config(), tmp_path, "builtin:sim-tiny") == 0
+    printed = capsys.readouterr().out
+    findings, table = printed.split("One-step error / persistence of the data, read otherwise")
+    assert "\nok       agreement" in findings
+    for variant in ("as they are", "frames 1 step late", "the states backwards", "y negated", "red and blue"):
+        assert variant in table
+    assert table.splitlines()[-1].split()[1] == "probe"
+    assert "on 8 clips of 5 episodes: the model predicts none of this" in table.splitlines()[-1]  # it knows no drawings
+
+
+def test_a_run_is_a_model_too(make_config: MakeConfig) -> None:
+    config = make_config()
+    run = write_adapted_run(config)
+    trained, base = (probed(config, model).plain.ratio.value for model in (str(run), str(config.model.base)))
+    assert trained != pytest.approx(base, rel=1e-3)
+
+
+def test_without_a_validation_split_training_episodes_are_probed(
+    make_config: MakeConfig, tmp_path: Path, capsys: Printed
+) -> None:
+    config = make_config(data__validation_share=0.0, data__test_share=0.0)
+    assert probed(config, str(config.model.base), clips=16).plain.episodes == 8
+    assert check(config, tmp_path, str(config.model.base)) == 1  # training could not validate
+    printed = capsys.readouterr().out
+    assert "error    validation" in printed
+    assert printed.splitlines()[-1].split()[1] == "probe"
+
+
+def test_vectors_are_probed_by_a_model_that_takes_them_and_others_are_refused(
+    make_config: MakeConfig, tmp_path: Path, capsys: Printed
+) -> None:
+    def of_width(width: int) -> Config:
+        folder = write_vectors(tmp_path / f"set {width}", width=width)
+        return make_config(
+            data__source="npz", data__path=str(folder), data__states="vector", adapter__modules_to_save=[
+                "action_encoder", "state_encoder"
+            ],
+        )  # fmt: skip
+
+    config = of_width(7)
+    assert names(probed(config, str(config.model.base))) == {
+        *(f"frames {n} {when}" for n in ("1 step", "2 steps", "4 steps") for when in ("late", "early")),
+        "the states backwards", "red and blue exchanged", "frames mirrored",
+    }  # fmt: skip
+    assert check(of_width(8), tmp_path, str(config.model.base)) == 2
+    assert "data with states of 8 and actions of 8 numbers" in capsys.readouterr().err
+
+
+def test_a_latent_cache_is_probed_by_the_model_that_encoded_it_without_other_frames(
+    make_config: MakeConfig, tmp_path: Path, capsys: Printed
+) -> None:
+    of_frames = make_config(data__frames=10, data__start_every=2)
+    base = str(of_frames.model.base)
+    cache = encode_for(of_frames, load_base(of_frames.model, seed=0), open_dataset(of_frames.data))
+    config = make_config(
+        data__source="latents", data__path=str(cache), data__camera=None, data__frames=10, data__start_every=2
+    )
+    probe, expected = probed(config, base), probed(of_frames, base)
+    assert probe.plain.ratio.value == pytest.approx(expected.plain.ratio.value, rel=2e-3)  # kept in bfloat16
+    assert names(probe) == names(expected) - {"red and blue exchanged", "frames mirrored"}
+    differences = {one.name: one.difference.value for one in expected.results}
+    for one in probe.results:
+        assert one.difference.value == pytest.approx(differences[one.name], rel=0.02, abs=0.02)
+    assert check(config, tmp_path, "builtin:sim-tiny") == 2
+    assert "encoder" in capsys.readouterr().err

@@ -1,0 +1,80 @@
+"""Pose integration equals the official code and geometry.py, and gradients flow through it."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from paths import GOLDEN
+from synthetic import synthetic_states
+from vjepa2_ac.model.state_integration import apply_actions, euler_from_matrices, matrices_from_euler, states_along
+from vjepa2_ac.spaces import actions_from_states, apply_action
+
+
+def assert_same_poses(found: torch.Tensor, expected: np.ndarray, tolerance: float) -> None:
+    """Compare positions and grippers as numbers, orientations as rotations."""
+    places = [0, 1, 2, 6]
+    np.testing.assert_allclose(found.numpy()[..., places], expected[..., places], atol=tolerance)
+    turned = [Rotation.from_euler("xyz", one[..., 3:6].reshape(-1, 3)) for one in (found.numpy(), expected)]
+    assert (turned[0] * turned[1].inv()).magnitude().max() <= tolerance
+
+
+@pytest.mark.parametrize("which", [0, 1])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-6), (torch.float32, 1e-5)])
+def test_composed_poses_are_the_official_ones(which: int, dtype: torch.dtype, tolerance: float) -> None:
+    with np.load(GOLDEN / "poses.npz") as official:
+        poses, deltas = (torch.from_numpy(official[f"{name}_{which}"]).to(dtype) for name in ("poses", "deltas"))
+        assert_same_poses(apply_actions(poses[:-1], deltas), official[f"composed_{which}"], tolerance)
+
+
+def test_poses_are_those_of_geometry_but_for_the_grippers_ends() -> None:
+    generator = np.random.default_rng(0)
+    states, actions = generator.uniform(-3, 3, (2, 500, 7))
+    states[:, 6], actions[:, 6] = generator.uniform(0, 1, 500), generator.uniform(-0.75, 0.75, 500)
+    expected = apply_action(states, actions)
+    expected[:, 6] = expected[:, 6].clip(0, 1)
+    assert_same_poses(apply_actions(torch.from_numpy(states), torch.from_numpy(actions)), expected, 1e-7)
+
+
+def test_a_trajectorys_actions_lead_along_it() -> None:
+    states = synthetic_states(30)
+    actions = torch.from_numpy(actions_from_states(states))
+    found = states_along(torch.from_numpy(states[0]), torch.stack([actions, actions * 0]))
+    assert_same_poses(found[0], states, 1e-6)
+    assert_same_poses(found[1], np.repeat(states[:1], 30, axis=0), 1e-6)
+
+
+@pytest.mark.parametrize("pitch", [np.pi / 2, -np.pi / 2, np.pi / 2 - 1e-9, 1.5, 0.0])
+def test_angles_at_and_near_gimbal_lock_are_still_the_rotation(pitch: float) -> None:
+    matrices = matrices_from_euler(torch.tensor([[0.4, pitch, -1.1]], dtype=torch.float64))
+    torch.testing.assert_close(matrices_from_euler(euler_from_matrices(matrices)), matrices, atol=2e-6, rtol=0)
+
+
+def test_at_gimbal_lock_the_yaw_is_zero_and_gradients_are_finite() -> None:
+    up = torch.tensor([[0.0, 0.6, 0.8], [0.0, 0.8, -0.6], [-1.0, 0.0, 0.0]], requires_grad=True)
+    angles = euler_from_matrices(up)
+    assert not angles[2].detach()
+    torch.testing.assert_close(matrices_from_euler(angles), up)
+    angles.sum().backward()
+    assert torch.isfinite(up.grad).all()
+
+
+@pytest.mark.parametrize("pitch", [np.pi / 2, 0.3])
+def test_gradients_are_finite_everywhere(pitch: float) -> None:
+    state = torch.tensor([0.4, 0.0, 0.3, np.pi, pitch, 0.2, 0.5], dtype=torch.float64)
+    actions = torch.zeros(1, 3, 7, dtype=torch.float64, requires_grad=True)
+    states_along(state, actions).sum().backward()
+    assert torch.isfinite(actions.grad).all()
+
+
+def test_gradients_are_those_of_finite_differences() -> None:
+    state = torch.tensor([0.4, 0.0, 0.3, 3.0, 0.3, 0.2, 0.5], dtype=torch.float64)
+    actions = 0.1 * torch.randn(2, 3, 7, generator=torch.Generator().manual_seed(0)).double()
+    assert torch.autograd.gradcheck(lambda given: states_along(state, given), (actions.requires_grad_(),))
+
+
+def test_autocast_does_not_coarsen_poses() -> None:
+    states, actions = torch.rand(5, 7), 0.1 * torch.rand(5, 7)
+    plain = apply_actions(states, actions)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(apply_actions(states, actions), plain)

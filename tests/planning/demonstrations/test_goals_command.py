@@ -1,0 +1,213 @@
+"""`vjepa2-ac goals` makes a folder of goals of an episode or a film, and `plan` and `simulate` take it."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+
+pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
+pytest.importorskip("av", reason="the extra `video` is not installed")
+
+from tiny_models import tiny_model
+from vjepa2_ac.cli import main
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.sources.indexed_source import open_source
+from vjepa2_ac.media.video import write_video
+from vjepa2_ac.planning.goals import read_goal_folder
+from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
+
+QUICK = ["planning.samples=8", "planning.iterations=2", "planning.cem.elites=4"]
+STATE = "0.4,0.0,0.3,3.1,0.0,0.1,0.2"
+
+
+@pytest.fixture(scope="module")
+def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data set of two picks, a config, a model, a film of the first episode, and one of a resting arm with noise."""
+    here = tmp_path_factory.mktemp("workshop")
+    record_dataset(here / "set", RecordingSpec("A", 41, seed=3, task="pick"), episodes=2)
+    config = {"run_dir": str(here / "run"), "data": {"path": str(here / "set"), "frames": 4}, "model": {"base": "none"}}
+    (here / "config.yaml").write_text(yaml.safe_dump(config))
+    tiny_model().save_pretrained(here / "model")
+    rng = np.random.default_rng(0)
+    frames = [rng.integers(0, 256, (48, 64, 3), dtype=np.uint8) for _ in range(3)]
+    ways = [np.linspace(0, 1, 12)[:, None, None, None] * (b.astype(float) - a) + a for a, b in [frames[:2], frames[1:]]]
+    write_video(here / "film.mp4", np.concatenate(ways).astype(np.uint8), rate_hz=15.0)
+    still = [(frames[0] / 2 + rng.integers(0, 30, frames[0].shape)).astype(np.uint8) for _ in range(9)]
+    write_video(here / "still.mp4", still, rate_hz=15.0)
+    return here
+
+
+def goals(here: Path, out: Path, *more: str, source: str = "config.yaml") -> tuple[int, dict]:
+    status = main(["goals", str(here / source), "--out", str(out), *more])
+    return status, json.loads((out / "goals.json").read_text()) if status == 0 else {}
+
+
+def test_an_episode_becomes_goals_by_its_gripper(
+    workshop: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, file = goals(workshop, tmp_path / "goals", "--share", "0.5", "--slack", "1")
+    assert status == 0
+    assert [goal["name"] for goal in file["goals"]] == ["before closing", "closed", "end"]
+    assert [goal["gripper"] for goal in file["goals"]] == ["held", "close", "held"]
+    assert [goal["frame"] for goal in file["goals"]] == [16, 18, 40]
+    assert [(goal["at_least"], goal["at_most"]) for goal in file["goals"]] == [(3, 5), (1, 2), (5, None)]
+    assert [goal["share"] for goal in file["goals"]] == [0.5, 0.5, None]
+    assert file["noise"] is None
+    origin = file["origin"]
+    assert (origin["data"], origin["by"], origin["stride"], origin["frames"]) == (
+        str(workshop / "set"), "gripper", 4, 41,
+    )  # fmt: skip
+    with Image.open(tmp_path / "goals/goals.png") as sheet:
+        assert sheet.width == 1300
+    printed = capsys.readouterr().out
+    assert "No energies and no noise floor: --model measures them." in printed
+    assert "before closing" in printed
+    assert str(tmp_path / "goals/goals.json") in printed
+
+
+def test_a_model_adds_energies_and_the_noise_of_a_resting_arm(
+    workshop: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = ["--model", str(workshop / "model"), "--share", "0.001"]
+    status, file = goals(workshop, tmp_path / "goals", *model, "--still", str(workshop / "still.mp4"))
+    assert status == 0
+    assert all(goal["began"] > 0 for goal in file["goals"])
+    noise = file["noise"]
+    assert (noise["pairs"], noise["distance"]) == (5, "l1"), "nine frames, pairs four apart"
+    assert noise["energy"] > 0.001 * file["goals"][0]["began"]
+    printed = capsys.readouterr().out
+    assert "Noise floor: energy" in printed
+    assert "Goal 1: its threshold" in printed
+    found = read_goal_folder(tmp_path / "goals").for_model(noise["encoder"], "l1")
+    assert [goal.floor for goal in found] == [noise["energy"]] * 3
+
+
+def test_the_arm_of_an_episode_may_rest_itself(workshop: Path, tmp_path: Path) -> None:
+    states = open_source(DataConfig(path=str(workshop / "set"))).read(0).states
+    rests = (np.abs(np.diff(states, axis=0)) < 5e-4).all(axis=1)
+    status, file = goals(workshop, tmp_path / "goals", "--model", str(workshop / "model"))
+    assert status == 0
+    assert (file["noise"] is not None) == bool(rests.any())
+
+
+def test_an_episode_is_named_or_numbered_and_every_so_many_frames_are_taken(workshop: Path, tmp_path: Path) -> None:
+    _, numbered = goals(workshop, tmp_path / "a", "--episode", "1", "--by", "every", "10", "data.stride=5")
+    name = numbered["origin"]["episode"]
+    _, named = goals(workshop, tmp_path / "b", "--episode", name, "--by", "every", "10", "data.stride=5")
+    assert named["goals"] == numbered["goals"]
+    assert [goal["frame"] for goal in named["goals"]] == [10, 20, 30, 40]
+    assert [goal["at_most"] for goal in named["goals"]] == [5, 5, 5, None]
+    assert named["origin"]["every"] == 10
+
+
+def test_a_film_without_states_becomes_goals_by_latents(workshop: Path, tmp_path: Path) -> None:
+    model = ["--model", str(workshop / "model")]
+    status, file = goals(
+        workshop, tmp_path / "goals", *model, "--stride", "2", "--stop-share", "0.3", source="film.mp4"
+    )
+    assert status == 0
+    assert [goal["frame"] for goal in file["goals"]][-1] == 23
+    assert {goal["gripper"] for goal in file["goals"]} == {None}
+    assert file["goals"][-1]["share"] == 0.3
+    assert file["origin"]["film"] == str(workshop / "film.mp4")
+    status, plain = goals(workshop, tmp_path / "plain", "--by", "every", "8", "--stride", "4", source="film.mp4")
+    assert [goal["frame"] for goal in plain["goals"]] == [8, 16, 23]
+
+
+def test_plan_and_simulate_take_the_folder(workshop: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder, model = tmp_path / "goals", str(workshop / "model")
+    goals(workshop, folder, "--share", "0.5", "--model", model)
+    given = ["--goals", str(folder), "--state", STATE, "--nodes", "0", "--out", str(tmp_path / "plan"), *QUICK]
+    assert main(["plan", model, "--start", str(folder / "goal_3.png"), *given]) == 0
+    plan = json.loads((tmp_path / "plan/plan.json").read_text())
+    assert plan["goals"] == [str(folder)]
+    assert [goal["gripper"] for goal in plan["sub_goals"]] == ["held", "close", "held"]
+    assert {row[6] for row in plan["actions"]} == {0.0}, "it is held on the way to the first goal"
+    given = ["--task", "pick", "--episodes", "1", "--films", "0", "--goals", str(folder), *QUICK]
+    assert main(["simulate", model, *given, "--out", str(tmp_path / "loop")]) == 0
+    about = json.loads((tmp_path / "loop/closed_loop.json").read_text())["about"]
+    assert (about["goals"], about["sub_goals"]) == (str(folder), "none")
+    capsys.readouterr()
+    assert main(["simulate", model, *given, "--sub-goals", "demonstration"]) == 2
+    assert "needed: one of the two" in capsys.readouterr().err
+
+
+def test_a_folder_that_cannot_be_followed_is_told_before_anything_is_planned(
+    workshop: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, model = tmp_path / "goals", str(workshop / "model")
+    goals(workshop, folder)
+    start = ["plan", model, "--start", str(folder / "goal_1.png"), "--state", STATE, "--out", str(tmp_path / "plan")]
+    capsys.readouterr()
+    for more, wrong in (
+        (["--goals", str(folder), "--durations", "3"], "a folder says how long its goals apply"),
+        (["--goals", str(workshop)], "goals.json: cannot be read"),
+    ):
+        assert main([*start, *more, *QUICK]) == 2
+        assert wrong in capsys.readouterr().err
+    with pytest.raises(SystemExit, match="2"):
+        main([*start, "--goals", str(folder), "--goal", str(folder / "goal_1.png")])
+    content = json.loads((folder / "goals.json").read_text())
+    content["goals"][0]["at_most"] = None
+    (folder / "goals.json").write_text(json.dumps(content))
+    capsys.readouterr()
+    assert main([*start, "--goals", str(folder), *QUICK]) == 2
+    assert "goal 1: a goal that would never end" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "wrong"),
+    [
+        (["config.yaml", "--by", "every"], "--by: every. needed: gripper, latent, or every N"),
+        (["config.yaml", "--by", "sound"], "--by: sound"),
+        (["config.yaml", "--by", "latent"], "--by latent: no model"),
+        (["config.yaml", "--still", "still.mp4"], "--still: no model"),
+        (["config.yaml", "--episode", "9"], "--episode 9: no such episode"),
+        (["config.yaml", "--by", "every", "9", "--apart", "3"], "--apart"),
+        (["config.yaml", "data.stride=auto"], "data.stride: auto"),
+        (["none.yaml"], "none.yaml"),
+        (["film.mp4", "--stride", "4"], "--by latent: no model"),
+        (["film.mp4", "--by", "gripper", "--stride", "4"], "--by gripper: film.mp4: no measured poses"),
+        (["film.mp4", "--by", "every", "9"], "--stride: a film"),
+        (["film.mp4", "--by", "every", "9", "--episode", "0"], "--episode"),
+        (["none.mp4", "--by", "every", "9", "--stride", "4"], "none.mp4: cannot be read"),
+        (["text.mp4", "--by", "every", "9", "--stride", "4"], "text.mp4: cannot be read as a video"),
+    ],
+)
+def test_what_cannot_be_is_one_line_and_leaves_nothing(
+    words: list[str], wrong: str, workshop: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (workshop / "text.mp4").write_text("no film")
+    source, *more = words
+    more = [str(workshop / word) if word.endswith(".mp4") else word for word in more]
+    status, _ = goals(workshop, tmp_path / "goals", *more, source=source)
+    assert status == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert wrong in error
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_holds_something_is_left_as_it_is(
+    workshop: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mine.txt").write_text("mine")
+    assert goals(workshop, tmp_path)[0] == 2
+    assert "already there and not empty" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_of_a_long_film_every_so_many_frames_are_looked_at(
+    workshop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("vjepa2_ac.planning.demonstrations.make_goals._MOST_ENCODED", 10)
+    given = ["--model", str(workshop / "model"), "--stride", "2", "--apart", "6"]
+    status, file = goals(workshop, tmp_path / "goals", *given, source="film.mp4")
+    assert status == 0
+    assert "encoding frames 9/9" in capsys.readouterr().out, "24 frames, every third, and the last"
+    frames = [goal["frame"] for goal in file["goals"]]
+    assert frames[-1] == 23
+    assert all(frame % 3 == 0 for frame in frames[:-1])

@@ -1,0 +1,169 @@
+"""Key frames of made-up demonstrations: by the gripper, by latents, and every so many."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vjepa2_ac.planning.demonstrations.key_frames import (
+    OF_MODEL_STEPS,
+    KeyFrame,
+    Timing,
+    every_key_frame,
+    gripper_key_frames,
+    latent_key_frames,
+    resting,
+    resting_pairs,
+    sub_goals_of,
+    with_frames_between,
+)
+
+
+def way(*parts: tuple[int, float, float]) -> np.ndarray:
+    """Return states: so many frames each, along which x changes by metres and the gripper by closedness, evenly."""
+    x, grip = [0.4], [0.0]
+    for frames, metres, closes in parts:
+        x += (x[-1] + metres * np.arange(1, frames + 1) / frames).tolist()
+        grip += (grip[-1] + closes * np.arange(1, frames + 1) / frames).tolist()
+    states = np.zeros((len(x), 7))
+    states[:, 0], states[:, 3], states[:, 6] = x, np.pi, grip
+    return states
+
+
+def named(states: np.ndarray) -> list[tuple[int, str]]:
+    return [(key.frame, key.name) for key in gripper_key_frames(states)]
+
+
+GO, LIFT = (10, 0.2, 0), (9, 0.2, 0)  # without the gripper
+CASES = {
+    "a grasp begins and ends, and the lift is the last": (
+        (GO, (5, 0, 0.5), GO), [(10, "before closing"), (15, "closed"), (25, "end")],
+    ),
+    "a stop counts if it lasts": ((GO, (6, 0, 0), GO), [(10, "stop"), (26, "end")]),
+    "too short": ((GO, (3, 0, 0), GO), [(23, "end")]),
+    "a rest at the start is none": (((6, 0, 0), GO), [(16, "end")]),
+    "an arm that rests at the end had ended before": ((GO, (20, 0, 0)), [(10, "end")]),
+    "likewise after a grasp": ((GO, (4, 0, 0.4), (20, 0, 0)), [(10, "before closing"), (14, "closed")]),
+    "a stop to grip is no key frame of its own": (
+        (GO, (2, 0, 0), (5, 0, 0.5), (3, 0, 0), LIFT), [(12, "before closing"), (17, "closed"), (29, "end")],
+    ),
+    "a grip at the very start has no goal before it": (((5, 0, 0.5), GO), [(5, "closed"), (15, "end")]),
+    "an arm that leaves while the fingers still close has gripped before": (
+        (GO, (4, 0, 0.25), (2, 0.04, 0.1), LIFT), [(10, "before closing"), (14, "closed"), (25, "end")],
+    ),
+    "it never stood still": ((GO, (6, 0.12, 0.6), LIFT), [(10, "before closing"), (16, "closed"), (25, "end")]),
+    "a pause of the fingers does not divide a grip": (
+        (LIFT, (2, 0, 0.2), (2, 0, 0), (2, 0, 0.2), LIFT), [(9, "before closing"), (15, "closed"), (24, "end")],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("parts", "keys"), CASES.values(), ids=CASES)
+def test_key_frames_are_where_the_gripper_changes_and_the_arm_stops(parts: tuple, keys: list) -> None:
+    assert named(way(*parts)) == keys
+
+
+def test_pick_and_place_opens_again() -> None:
+    names = [name for _, name in named(way((10, 0.2, 0), (5, 0, 0.5), (10, 0.2, 0), (5, 0, -0.5), (10, -0.2, 0)))]
+    assert names == ["before closing", "closed", "before opening", "opened", "end"]
+
+
+def test_fingers_that_tremble_change_nothing() -> None:
+    states = way((10, 0.2, 0), (20, 0.2, 0))
+    states[:, 6] += 0.05 * np.random.default_rng(0).random(len(states))
+    assert named(states) == [(30, "end")]
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(1, 12), st.sampled_from([0.0, 0.1, -0.2]), st.sampled_from([0.0, 0.0, 0.5])), min_size=1
+    )
+)
+def test_key_frames_ascend_leave_out_the_start_and_are_few(parts: list) -> None:
+    states = way(*parts)
+    states[:, 6] = np.abs((states[:, 6] + 1) % 2 - 1)  # to and fro between 0 and 1
+    for rule in (None, OF_MODEL_STEPS):
+        frames = [key.frame for key in gripper_key_frames(states, rule)]
+        assert frames == sorted(set(frames))
+        assert 0 < frames[0] <= frames[-1] < len(states)
+
+
+def test_one_frame_is_no_demonstration() -> None:
+    for make in (lambda: gripper_key_frames(way()), lambda: every_key_frame(1, 3), lambda: every_key_frame(9, 0),
+                 lambda: latent_key_frames(1, lambda _: np.zeros(1), 3)):  # fmt: skip
+        with pytest.raises(ValueError, match="frame"):
+            make()
+
+
+@given(st.integers(2, 60), st.integers(1, 20))
+def test_every_so_many_frames_end_with_the_last(frames: int, step: int) -> None:
+    found = [key.frame for key in every_key_frame(frames, step)]
+    gaps = np.diff([0, *found])
+    assert found[-1] == frames - 1
+    assert (gaps[:-1] == step).all()
+    assert step / 2 <= gaps[-1] < 1.5 * step or len(found) == 1
+
+
+@given(st.lists(st.integers(1, 9), min_size=1, max_size=5), st.integers(1, 6))
+def test_frames_between_keep_the_key_frames_and_are_so_far_apart(gaps: list[int], step: int) -> None:
+    keys = [KeyFrame(int(frame), f"key {frame}") for frame in np.cumsum(gaps)]
+    found = with_frames_between(keys, step)
+    assert [key for key in found if key.name != "on the way"] == keys
+    ways = np.diff([0, *(key.frame for key in found)])
+    assert (ways >= 1).all()
+    assert (ways < 1.5 * step).all() if step > 1 else (ways == 1).all()
+
+
+def test_frames_between_are_one_apart_at_least() -> None:
+    with pytest.raises(ValueError, match="every 0 frames"):
+        with_frames_between([KeyFrame(3, "end")], 0)
+
+
+def embedded(*corners: float, frames: int = 20) -> np.ndarray:
+    """Return an embedding that goes evenly from corner to corner, with a little noise."""
+    line = np.concatenate([np.linspace(a, b, frames, endpoint=False) for a, b in pairwise(corners)])
+    return np.append(line, corners[-1]) + 0.002 * np.random.default_rng(0).standard_normal(len(line) + 1)
+
+
+def test_latents_that_turn_back_show_where_something_else_began() -> None:
+    """Reach out, come back a little, reach out again: farthest from each goal is where its approach began."""
+    values = embedded(0.0, 1.0, -0.5, 1.5)
+    found = latent_key_frames(len(values), lambda goal: np.abs(values - values[goal]), 8)
+    assert found[-1] == KeyFrame(len(values) - 1, "end")
+    assert [abs(key.frame - corner) <= 2 for key, corner in zip(found, (20, 40, 60), strict=True)] == [True] * 3
+
+
+def test_a_straight_way_has_one_goal() -> None:
+    values = embedded(0.0, 2.0, frames=50)
+    assert [key.frame for key in latent_key_frames(51, lambda goal: np.abs(values - values[goal]), 8)] == [50]
+
+
+@given(st.integers(0, 100), st.integers(1, 12), st.integers(2, 60))
+def test_goals_by_latents_are_so_far_apart(seed: int, least: int, frames: int) -> None:
+    values = np.random.default_rng(seed).standard_normal(frames).cumsum()
+    found = [key.frame for key in latent_key_frames(frames, lambda goal: np.abs(values - values[goal]), least)]
+    assert found[-1] == frames - 1
+    assert (np.diff(found) >= least).all()
+    assert len(found) == 1 or found[0] >= least
+
+
+def test_goals_have_the_durations_and_the_gripper_of_the_demonstration() -> None:
+    states = way((10, 0.2, 0), (5, 0, 0.5), (21, 0.2, 0))
+    keys = gripper_key_frames(states)
+    images = [np.full((16, 16, 3), place, np.uint8) for place in range(len(keys))]
+    goals = sub_goals_of(images, keys, Timing(stride=4, slack=2, share=0.5), states)
+    assert [(goal.at_least, goal.at_most) for goal in goals] == [(1, 5), (1, 4), (4, None)]
+    assert [goal.gripper for goal in goals] == ["held", "close", "held"]
+    assert [goal.share for goal in goals] == [0.5, 0.5, None]
+    assert [goal.name for goal in goals] == ["before closing", "closed", "end"]
+    assert [goal.gripper for goal in sub_goals_of(images, keys, Timing())] == [None] * 3
+
+
+def test_frames_between_which_the_arm_rests_are_found_in_pairs() -> None:
+    states = way((5, 0.2, 0), (4, 0, 0), (5, 0.2, 0), (3, 0, 0.4))
+    assert np.flatnonzero(resting(states)).tolist() == [5, 6, 7, 8]
+    assert resting_pairs(resting(states), 3).tolist() == [[5, 8], [6, 9]]
+    assert resting_pairs(resting(states), 9).tolist() == [[5, 9]], "as far apart as there are"
+    assert resting_pairs(resting(way((9, 0.3, 0))), 4).shape == (0, 2)

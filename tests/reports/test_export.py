@@ -1,0 +1,352 @@
+"""An exported model predicts like the run, and its card describes it."""
+
+import errno
+import json
+import re
+import shutil
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import peft
+import pytest
+import torch
+import yaml
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from run_fixtures import TINY, SilentReporter, one_thread, tiny_config
+from vjepa2_ac.cli import main
+from vjepa2_ac.config import ModelSizes
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.result import Row
+from vjepa2_ac.model.adapter.lora import base_only
+from vjepa2_ac.model.checkpoints.loading import load_official
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.reports import export
+from vjepa2_ac.reports.export import CARD, Exported, export_run
+from vjepa2_ac.reports.metrics_json import METRICS_FILE
+from vjepa2_ac.reports.write import PLOT
+from vjepa2_ac.runs.checkpoint import checkpoint_name, select_checkpoint, write_manifest
+from vjepa2_ac.runs.loading import load_run
+from vjepa2_ac.training.loop import train
+
+ROWS = [
+    Row("a table", "0.50 s ahead", "rollout.l1.over_persistence.1", "base", 0.9, 0.8, 0.95),
+    Row("a table", "0.50 s ahead", "rollout.l1.over_persistence.1", "adapter", 0.7),
+]
+EVALUATED = {
+    "format": 3,
+    "verdict": "The adapter predicts better.",
+    "trained": "adapter",
+    "base": "base",
+    "about": {
+        "subject": "somewhere/run", "checkpoint_path": "somewhere/run/checkpoints/step-00000002", "data": "data",
+        "cameras": ["exterior"], "split": "test", "frames": 2, "stride": 4, "seconds_per_step": 0.5,
+    },
+    "clips": {"count": 8, "episodes": 3, "fingerprint": "0", "named": []},
+    "rows": [{name: None if value != value else value for name, value in asdict(row).items()} for row in ROWS],
+    "by_clip": {"persistence": [], "models": {"base": [], "adapter": []}},
+}  # fmt: skip
+
+
+Trained = Callable[..., Path]
+QUICK = ["--clips", "4", "--sensitivity-clips", "2", "--samples", "4", "--landscapes", "1", "--nodes", "3"]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory, data_folder: Path, base_folder: Path) -> Trained:
+    """Train for two steps at a rate that moves the weights; return the folder of the run, to be read only.
+
+    Who asks for the same settings again gets the same folder.
+    """
+    runs: dict[str, Path] = {}
+
+    def make(**changes: object) -> Path:
+        settings = {"training__steps": 2, "training__accumulation": 1, "training__learning_rate": 0.05}
+        settings |= {"validation__every": 2, "checkpoint__keep_best": False, **changes}  # the base must not be selected
+        if (name := json.dumps(settings, sort_keys=True)) not in runs:
+            config = tiny_config(tmp_path_factory.mktemp("trained") / "run", data_folder, base_folder, **settings)
+            with one_thread():
+                runs[name] = train(config, SilentReporter())
+        return runs[name]
+
+    return make
+
+
+@pytest.fixture
+def copied(trained: Trained, tmp_path: Path) -> Trained:
+    """As `trained`, but a copy, which a test may change."""
+    return lambda **changes: shutil.copytree(trained(**changes), tmp_path / "run")
+
+
+def predictions(model: WorldModel) -> Tensor:
+    generator = torch.Generator().manual_seed(1)
+    frames, actions, states = (torch.randn(2, 3, *shape, generator=generator) for shape in ((3, 32, 32), (7,), (7,)))
+    with torch.no_grad():
+        latents = model.encode(frames)
+        return model.rollout(latents[:, :1], actions, states)
+
+
+def assert_predicts_as(found: WorldModel, run: Path) -> None:
+    model = load_run(run).world_model
+    expected = predictions(model)
+    assert (predictions(found) - expected).abs().max() <= 1e-5 * expected.abs().max()
+    with base_only(model):
+        assert (predictions(model) - expected).abs().max() > 1e-3, "training changed nothing: this compares nothing"
+
+
+def sizes_of(run: Path) -> ModelSizes:
+    return load_run(run).world_model.sizes
+
+
+@pytest.mark.parametrize("kind", ["lora", "none"])
+def test_the_official_checkpoint_predicts_as_the_run_does(trained, tmp_path: Path, kind: str) -> None:
+    run = trained(adapter__kind=kind)
+    written = export_run(run, tmp_path / "out.pt", "official").path
+    assert written == tmp_path / "out.pt"
+    assert_predicts_as(load_official(written, sizes_of(run)), run)
+
+
+@pytest.mark.parametrize(("name", "form"), [("x.pt", "merged"), ("x.pt", "hub")])
+def test_a_name_of_another_kind_of_file_makes_no_folder(tmp_path: Path, name: str, form: Any) -> None:
+    with pytest.raises(InputError, match=rf"{name}: the name of a \{Path(name).suffix} file"):
+        export_run(tmp_path / "run", tmp_path / name, form)
+    assert not (tmp_path / name).exists()
+
+
+def test_merged_is_a_folder_that_predicts_as_the_run_does(trained, tmp_path: Path) -> None:
+    run = trained()
+    assert export_run(run, tmp_path / "merged") == Exported(tmp_path / "merged", str(select_checkpoint(run)))
+    assert_predicts_as(WorldModel.from_pretrained(tmp_path / "merged"), run)
+
+
+def rewrite_adapter(run: Path, **changes: object) -> None:
+    """Change the newest checkpoint's adapter_config.json, and write its manifest anew."""
+    checkpoint = load_run(run).checkpoint
+    path = checkpoint / "adapter" / "adapter_config.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
+    write_manifest(checkpoint)
+
+
+def poison(path: Path) -> str:
+    """Put one NaN into a file of tensors; return the name of the tensor."""
+    tensors = load_file(path)
+    name = sorted(tensors)[-1]
+    tensors[name].flatten()[-1] = float("nan")
+    save_file(tensors, path)
+    return name
+
+
+@pytest.mark.parametrize("form", ["merged", "official", "hub"])
+def test_an_adapter_that_spoils_its_base_is_refused_and_leaves_nothing(copied, tmp_path: Path, form: Any) -> None:
+    run = copied()
+    rewrite_adapter(run, lora_alpha=1e300)
+    with pytest.raises(InputError, match=r"alpha: .*less than or equal"):
+        export_run(run, tmp_path / "out", form)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("kind", "file"),
+    [("lora", "adapter_model.safetensors"), ("none", "predictor.safetensors")],
+)
+def test_a_trained_weight_that_is_not_finite_is_named(copied, tmp_path: Path, kind: str, file: str) -> None:
+    run = copied(adapter__kind=kind)
+    checkpoint = load_run(run).checkpoint
+    name = poison(checkpoint / "adapter" / file)
+    write_manifest(checkpoint)
+    with pytest.raises(InputError, match=rf"{file}: {re.escape(name)} holds NaN or infinity"):
+        export_run(run, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_merging_into_a_bfloat16_base_keeps_its_type(trained, tmp_path: Path) -> None:
+    run = trained(model__dtype="bfloat16", training__precision="bf16")
+    written = export_run(run, tmp_path / "out.pt", "official").path
+    kinds = {value.dtype for part in ("encoder", "predictor") for value in torch.load(written)[part].values()}
+    assert kinds == {torch.bfloat16}
+
+
+def test_plain_peft_loads_what_goes_to_the_hub(trained, base_folder: Path, tmp_path: Path) -> None:
+    run = trained()
+    export_run(run, tmp_path / "hub", "hub")
+    model = WorldModel.from_pretrained(base_folder)
+    model.predictor = peft.PeftModel.from_pretrained(model.predictor, str(tmp_path / "hub"))
+    assert_predicts_as(model, run)
+
+
+def test_the_card_describes_base_data_and_training(
+    trained, base_folder: Path, data_folder: Path, tmp_path: Path
+) -> None:
+    run = trained()
+    export_run(run, tmp_path / "hub", "hub")
+    card = (tmp_path / "hub" / CARD).read_text()
+    front = yaml.safe_load(card.split("---")[1])
+    assert front["library_name"] == "peft"
+    assert "model-index" not in front, "nothing was measured"
+    base = WorldModel.from_pretrained(base_folder)
+    for words in (
+        str(base_folder), base.predictor_fingerprint(), base.encoder_fingerprint(), f"rlds, `{data_folder}`",
+        "`exterior_1_left`", "4 frames, one every 2 control steps", "2 of 2 planned", "rank 4, alpha 8",
+        "batch 2 x accumulation 1", "0.05", "rollout of 2 steps", "parameters are trained", "Not evaluated",
+    ):  # fmt: skip
+        assert words in card, words
+    weights = peft.PeftModel.from_pretrained(base.predictor, str(tmp_path / "hub")).state_dict()
+    assert f"{sum(value.numel() for name, value in weights.items() if '.lora_' in name):,} parameters" in card
+
+
+def test_the_card_describes_unusual_adapter_settings(trained, tmp_path: Path, data_folder: Path) -> None:
+    heads = {"adapter__modules_to_save": ["action_encoder"]}
+    loss = {"training__loss": "l2", "training__rollout_weight": 2}
+    second = {"path": str(data_folder), "frames": 4, "stride": 2}
+    given = {**heads, **loss, "replay": {"share": 0.5, "data": second}}
+    export_run(
+        trained(adapter__peft={"rank_pattern": {"fc1": 2}}, adapter__dora=True, **given), tmp_path / "hub", "hub"
+    )
+    card = (tmp_path / "hub" / CARD).read_text()
+    assert "rsLoRA, DoRA, `rank_pattern: {'fc1': 2}`\n" in card
+    assert "trained whole: `action_encoder`\n" in card
+    assert "loss: l2, 1 x teacher forcing + 2 x rollout of 2 steps" in card
+    assert f"replay: 50% of the training clips from rlds, `{data_folder}`" in card
+    assert "warm-up: 1 step\n" in card
+
+
+@pytest.mark.parametrize("sizes", [{}, {"model__sizes": TINY}], ids=["released sizes", "other sizes"])
+def test_the_code_of_the_card_runs(trained, tmp_path: Path, sizes: dict[str, Any]) -> None:
+    run = trained(**sizes)
+    export_run(run, tmp_path / "hub", "hub")
+    blocks = re.findall(r"```python\n(.*?)```", (tmp_path / "hub" / CARD).read_text(), flags=re.DOTALL)
+    assert len(blocks) == 2
+    names: dict[str, Any] = {}
+    for block in blocks:
+        exec(block.replace("FOLDER", str(tmp_path / "hub")), names)  # noqa: S102 - it is our own code, as a reader runs it
+    assert_predicts_as(names["model"], run)
+    assert isinstance(names["predictor"], peft.PeftModel)
+
+
+def test_the_card_shows_what_was_measured(copied, tmp_path: Path) -> None:
+    run = copied()
+    (run / METRICS_FILE).write_text(json.dumps(EVALUATED))
+    (run / PLOT).write_bytes(b"a picture")
+    export_run(run, tmp_path / "hub", "hub")
+    card = (tmp_path / "hub" / CARD).read_text()
+    assert "The adapter predicts better." in card
+    assert "| ahead | base | adapter |\n|---|---|---|\n| 0.50 s | 0.900 [0.800, 0.950] | 0.700 |" in card
+    assert "another checkpoint" not in card
+    assert "Not evaluated" not in card
+    assert f"]({PLOT})" in card
+    assert (tmp_path / "hub" / PLOT).read_bytes() == b"a picture"
+    assert "somewhere" not in (tmp_path / "hub" / METRICS_FILE).read_text(), "a path of this machine"
+
+
+def test_the_card_takes_what_evaluate_writes_and_says_of_which_checkpoint(copied, tmp_path: Path) -> None:
+    run = copied(checkpoint__every=1)
+    assert main(["evaluate", str(run), *QUICK]) == 0
+    measured = json.loads((run / METRICS_FILE).read_text())
+    about = measured["about"]
+    old = about["checkpoint_path"].replace("step-00000002", "step-00000001")
+    (run / METRICS_FILE).write_text(json.dumps({**measured, "about": {**about, "checkpoint_path": old}}))
+    assert main(["export", str(run), str(tmp_path / "hub"), "--to", "hub"]) == 0
+    card = (tmp_path / "hub" / CARD).read_text()
+    assert measured["verdict"] in card
+    assert "another checkpoint**: `step-00000001`, not `step-00000002`" in card
+    assert "model-index" not in card, "results of another checkpoint are not those of this adapter"
+
+
+def test_another_checkpoint_than_the_newest_is_measured_and_exported_where_it_is_asked_for(
+    copied, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = copied(training__steps=4, checkpoint__every=1, checkpoint__keep_best="ranking")
+    newest = load_run(run).checkpoint
+    state = json.loads((newest / "state.json").read_text())
+    (newest / "state.json").write_text(json.dumps({**state, "best_step": 2}))
+    write_manifest(newest)
+    for asked, step, words in [
+        ("best", 2, "step-00000002 (the best by action ranking)"),
+        ("1", 1, "step-00000001 (as asked for)"),
+    ]:
+        assert main(["evaluate", str(run), *QUICK, "--checkpoint", asked]) == 0
+        measured = json.loads((run / METRICS_FILE).read_text())
+        assert measured["about"]["checkpoint_path"] == str(run / "checkpoints" / f"step-{step:08d}")
+        assert measured["about"]["checkpoint"] == words
+        assert main(["export", str(run), str(tmp_path / asked), "--to", "hub", "--checkpoint", asked]) == 0
+        assert capsys.readouterr().out.count(f"checkpoint {words}") == 2, "both say which"
+        card = (tmp_path / asked / CARD).read_text()
+        assert f"from checkpoint {words} of the run" in card
+        assert "another checkpoint" not in card
+        found = load_file(tmp_path / asked / "adapter_model.safetensors")
+        assert all(torch.equal(found[name], value) for name, value in weights_of(run, step).items())
+        assert any(not torch.equal(found[name], value) for name, value in weights_of(run, 3).items())
+    assert main(["export", str(run), str(tmp_path / "x"), "--checkpoint", "7"]) == 2
+    needed = "needed: selected, newest, best or one of the steps 0, 1, 2, 3, 4"
+    assert f"no checkpoint of step 7. {needed}" in capsys.readouterr().err
+
+
+def weights_of(run: Path, step: int) -> dict[str, Tensor]:
+    return load_file(run / "checkpoints" / checkpoint_name(step) / "adapter" / "adapter_model.safetensors")
+
+
+@pytest.mark.parametrize("content", ["{", '{"format": 1, "verdict": 3}'])
+def test_a_damaged_evaluation_is_named_and_nothing_is_written(copied, tmp_path: Path, content: str) -> None:
+    run = copied()
+    (run / METRICS_FILE).write_text(content)
+    with pytest.raises(InputError, match=r"metrics\.json.*vjepa2-ac evaluate"):
+        export_run(run, tmp_path / "hub", "hub")
+    assert not (tmp_path / "hub").exists()
+
+
+def test_a_run_without_an_adapter_has_nothing_for_the_hub(trained, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"without an adapter.*--to merged or --to official"):
+        export_run(trained(adapter__kind="none"), tmp_path / "hub", "hub")
+
+
+@pytest.fixture
+def no_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is loaded."""
+
+    def refuse(folder: Path, checkpoint: str) -> None:
+        del checkpoint
+        pytest.fail(f"{folder} was loaded")
+
+    monkeypatch.setattr(export, "load_run", refuse)
+
+
+@pytest.mark.usefixtures("no_work")
+@pytest.mark.parametrize("form", ["merged", "official", "hub"])
+def test_an_occupied_place_is_refused_before_work_begins(tmp_path: Path, form: Any) -> None:
+    (tmp_path / "there.pt").write_text("precious")
+    for place in (tmp_path, tmp_path / "there.pt"):
+        with pytest.raises(InputError, match=r"something is there already|the name of a \.pt file"):
+            export_run(tmp_path / "run", place, form)
+    assert (tmp_path / "there.pt").read_text() == "precious"
+
+
+@pytest.mark.usefixtures("no_work")
+@pytest.mark.parametrize("form", ["merged", "official", "hub"])
+def test_a_place_that_cannot_be_written_is_refused_before_work_begins(tmp_path: Path, form: Any) -> None:
+    (tmp_path / "file").write_text("no folder")
+    with pytest.raises(InputError, match="cannot be written"):
+        export_run(tmp_path / "run", tmp_path / "file" / "below", form)
+
+
+def test_a_full_disk_leaves_nothing_behind(trained, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = trained()
+
+    class FullFile:
+        room = 20_000  # so that it is full on the way, which torch tells in its own words
+
+        def write(self, data: bytes) -> int:
+            self.room -= len(data)
+            if self.room >= 0:
+                return len(data)
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+        def flush(self) -> None: ...
+
+    save = torch.save
+    monkeypatch.setattr(torch, "save", lambda whole, _: save(whole, FullFile()))
+    with pytest.raises(InputError, match=r"out/vjepa2-ac\.pt: cannot be written: No space left.*Free some space"):
+        export_run(run, tmp_path / "out", "official")
+    assert not list((tmp_path / "out").iterdir())

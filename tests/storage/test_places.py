@@ -1,0 +1,149 @@
+"""Paths: each has one meaning everywhere, and none is mistaken for another kind."""
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from vjepa2_ac.cli.options import as_local, as_model, as_path, as_place, as_planner, as_subject
+from vjepa2_ac.cli.program import _parser, main
+from vjepa2_ac.config import DiskCacheConfig
+from vjepa2_ac.config.loading import all_keys, config_as_flat_dict, parse_config
+from vjepa2_ac.data.index import cache_folder
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.runs.folder import read_run_config
+from vjepa2_ac.storage import places
+
+ON_THIS_MACHINE = (
+    "run_dir",
+    "data.cache_dir",
+    "data.disk_cache.dir",
+    "model.base",
+    "model.encoder.path",
+    "decoder.folder",
+)
+ANYWHERE = ("data.path", "data.idle.ranges", "checkpoint.remote")
+LOOK_LIKE_PATHS = ("dir", "path", "folder", "base", "remote", "ranges")  # last part of a key
+
+
+def config_with(key: str, value: str) -> dict[str, Any]:
+    values: dict[str, Any] = {"run_dir": "run", "data": {"path": "set"}, "model": {"base": "base"}}
+    if key == "data.idle.ranges":
+        values["data"]["idle"] = {"rule": "published"}
+    *sections, name = key.split(".")
+    inside = values
+    for section in sections:
+        inside = inside.setdefault(section, {})
+    inside[name] = value
+    return values
+
+
+def read(key: str, value: str) -> str:
+    return config_as_flat_dict(parse_config(config_with(key, value), where="test"))[key]
+
+
+def test_no_path_knob_is_missing_here() -> None:
+    keys = {key for key in all_keys() if not key.startswith("replay.data.")}  # the same ones as of data
+    found = {key for key in keys if key.split(".")[-1].endswith(LOOK_LIKE_PATHS)}
+    found.remove("training.allow_weak_base")
+    assert found == {*ON_THIS_MACHINE, *ANYWHERE}
+
+
+@pytest.mark.parametrize("key", [*ON_THIS_MACHINE, *ANYWHERE])
+def test_every_path_knob_knows_the_users_home(key: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", "/home/of/mine")
+    assert read(key, "~/x/") == "/home/of/mine/x"
+    assert read(key, "./~/x") == "./~/x", "a folder may be called so"
+    for wrong in ("~nobody-at-all/x", " ", "gs:/bucket/x"):
+        with pytest.raises(InputError, match=rf"  {key}: "):
+            read(key, wrong)
+
+
+@pytest.mark.parametrize("key", ON_THIS_MACHINE)
+@pytest.mark.parametrize("url", ["gs://bucket/run", "file:///x", "S3://x"])
+def test_a_url_is_refused_where_only_this_machine_will_do(key: str, url: str) -> None:
+    with pytest.raises(InputError, match=rf"  {key}: is a URL .*{url}"):
+        read(key, url)
+
+
+@pytest.mark.parametrize("key", ANYWHERE)
+def test_a_url_stays_one_elsewhere(key: str) -> None:
+    assert read(key, "gs://bucket/~x/") == "gs://bucket/~x"
+
+
+def test_a_run_behind_a_url_is_told_the_way_out_at_a_check_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "config.yaml").write_text("run_dir: gs://bucket/run\ndata: {path: set}\nmodel: {base: base}\n")
+    for check in ([], ["--check"]):
+        assert main(["train", "config.yaml", *check]) == 2
+        assert "set checkpoint.remote to it" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"], "no folder called gs:"
+
+
+def test_a_model_of_the_package_is_no_path() -> None:
+    assert read("model.base", "builtin:sim-tiny") == "builtin:sim-tiny"
+
+
+def test_the_cache_of_the_environment_is_a_path_like_any_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", "/home/of/mine")
+    monkeypatch.setenv("VJEPA2_AC_CACHE", "~/cache")
+    assert cache_folder(DiskCacheConfig()) == Path("/home/of/mine/cache")
+    monkeypatch.setenv("VJEPA2_AC_CACHE", "gs://bucket/cache")
+    with pytest.raises(InputError, match="VJEPA2_AC_CACHE: 'gs://bucket/cache' is a URL"):
+        cache_folder(DiskCacheConfig())
+
+
+def actions_of(parser: argparse.ArgumentParser) -> Iterator[tuple[str, argparse.Action]]:
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for inner in action.choices.values():
+                yield from actions_of(inner)
+        else:
+            yield parser.prog, action
+
+
+def test_every_path_on_the_command_line_is_read_alike() -> None:
+    words = {"CONFIG", "FOLDER", "DIR", "PATH", "PNG", "IMAGE", "RUN", "MODEL", "RUN_OR_MODEL"}
+    found = 0
+    for command, action in actions_of(_parser()):
+        is_path = words & set(str(action.metavar).replace("|", " ").split())
+        if is_path and action.dest != "overrides":
+            found += 1
+            assert action.type in {as_path, as_local, as_model, as_place, as_planner, as_subject}, (
+                f"{command}: {action.dest}"
+            )
+    assert found > 20
+
+
+def test_what_plans_is_a_model_or_the_address_of_a_server(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", "/home/of/mine")
+    assert as_planner("ws://127.0.0.1:8000") == "ws://127.0.0.1:8000"
+    assert as_planner("~/run") == as_model("~/run") == "/home/of/mine/run"
+    with pytest.raises(argparse.ArgumentTypeError):
+        as_planner("http://127.0.0.1:8000")
+
+
+def test_an_option_knows_the_users_home_and_refuses_urls(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    monkeypatch.setenv("HOME", "/home/of/mine")
+    options = _parser().parse_args(["data", "inspect", "~/c.yaml", "--out=~/x"])
+    assert (options.config, options.out) == ("/home/of/mine/c.yaml", Path("/home/of/mine/x"))
+    for arguments in (["export", "run", "gs://b/x"], ["evaluate", "run", "--out=gs:/b"], ["train", "s3://b/run"]):
+        with pytest.raises(SystemExit, match="2"):
+            main(arguments)
+        assert "is a URL" in capsys.readouterr().err
+    assert main(["simulate", "record", "gs://b/x"]) == 2
+    assert "simulate record: 'gs://b/x' is a URL" in capsys.readouterr().err
+
+
+def test_a_run_in_a_folder_called_tilde_is_read_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Earlier versions made such folders."""
+    monkeypatch.chdir(tmp_path)
+    folder = Path("~") / "run"
+    folder.mkdir(parents=True)
+    (folder / "config.yaml").write_text("run_dir: ~/run\ndata: {path: set}\nmodel: {base: base}\n")
+    assert Path(read_run_config(folder).run_dir) == folder
+    assert places.literal(Path("a")) == "a"

@@ -1,0 +1,109 @@
+"""Poses and actions: equal to the official code, and laws of every trajectory (golden/DATA_ORIGIN.md)."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from paths import GOLDEN
+from synthetic import synthetic_states
+from vjepa2_ac.spaces import (
+    actions_from_states,
+    apply_action,
+    euler_from_matrices,
+    matrices_from_euler,
+    states_in_camera_frame,
+)
+
+
+@pytest.fixture(params=[0, 1], scope="module")
+def official(request: pytest.FixtureRequest) -> dict[str, np.ndarray]:
+    with np.load(GOLDEN / "poses.npz") as arrays:
+        return {
+            name.removesuffix(f"_{request.param}"): arrays[name]
+            for name in arrays.files
+            if name[-1] == str(request.param)
+        }
+
+
+def assert_same_pose(found: np.ndarray, expected: np.ndarray, tolerance: float = 1e-9) -> None:
+    """Compare positions and grippers as numbers, orientations as rotations."""
+    np.testing.assert_allclose(found[..., :3], expected[..., :3], atol=tolerance)
+    np.testing.assert_allclose(found[..., 6:], expected[..., 6:], atol=tolerance)
+    np.testing.assert_allclose(
+        matrices_from_euler(found[..., 3:6]), matrices_from_euler(expected[..., 3:6]), atol=tolerance
+    )
+
+
+def test_actions_equal_the_official_ones(official: dict[str, np.ndarray]) -> None:
+    np.testing.assert_allclose(actions_from_states(official["poses"]), official["deltas"], atol=1e-9)
+
+
+def test_camera_frame_equals_the_official_one(official: dict[str, np.ndarray]) -> None:
+    found = states_in_camera_frame(official["poses"], official["extrinsics"])
+    np.testing.assert_allclose(found, official["camera_frame"], atol=1e-9)
+
+
+def test_applied_actions_equal_the_official_ones(official: dict[str, np.ndarray]) -> None:
+    found = apply_action(official["poses"][:-1], official["deltas"])
+    assert_same_pose(found, official["composed"], 1e-6)
+
+
+@settings(max_examples=30)
+@given(seed=st.integers(0, 2**31), stride=st.integers(1, 15))
+def test_integrating_the_actions_of_a_trajectory_returns_its_states(seed: int, stride: int) -> None:
+    states = synthetic_states(60, seed=seed)[::stride]
+    pose = states[0]
+    for action, expected in zip(actions_from_states(states), states[1:], strict=True):
+        pose = apply_action(pose, action)
+        assert_same_pose(pose, expected)
+
+
+@settings(max_examples=30)
+@given(angle=st.floats(-0.2, 0.2), axis=st.sampled_from([3, 5]))
+def test_a_turn_across_pi_is_as_small_as_the_same_turn_elsewhere(angle: float, axis: int) -> None:
+    states = np.zeros((2, 7))
+    states[0, axis] = np.pi - 0.1
+    states[1, axis] = np.angle(np.exp(1j * (states[0, axis] + angle)))
+    assert abs(states).max() <= np.pi
+    np.testing.assert_allclose(actions_from_states(states)[0, axis], angle, atol=1e-9)
+
+
+def test_adding_whole_turns_to_the_angles_changes_no_action() -> None:
+    states = synthetic_states(20)
+    turned = states.copy()
+    turned[:, 3:6] += 2 * np.pi * np.random.default_rng(0).integers(-1, 2, (20, 3))
+    np.testing.assert_allclose(actions_from_states(turned), actions_from_states(states), atol=1e-9)
+
+
+def test_euler_angles_are_extrinsic_xyz() -> None:
+    roll, pitch, yaw = 0.3, -0.5, 2.0
+    expected = (
+        Rotation.from_rotvec([0, 0, yaw]) * Rotation.from_rotvec([0, pitch, 0]) * Rotation.from_rotvec([roll, 0, 0])
+    ).as_matrix()
+    np.testing.assert_allclose(matrices_from_euler(np.array([roll, pitch, yaw])), expected, atol=1e-12)
+    np.testing.assert_allclose(euler_from_matrices(expected), [roll, pitch, yaw], atol=1e-12)
+
+
+def test_a_camera_at_the_base_sees_the_base_frame() -> None:
+    states = synthetic_states(10)
+    assert_same_pose(states_in_camera_frame(states, np.zeros((10, 6))), states)
+
+
+def test_moving_robot_and_camera_together_changes_nothing_in_the_cameras_frame() -> None:
+    states, cameras = synthetic_states(10, seed=1), synthetic_states(10, seed=2)[:, :6]
+    shift = np.array([0.1, -0.2, 0.3, 0.4, 0.5, 0.6])
+    turn = matrices_from_euler(shift[3:])
+
+    def move(poses: np.ndarray) -> np.ndarray:
+        position = poses[:, :3] @ turn.T + shift[:3]
+        rotation = euler_from_matrices(turn @ matrices_from_euler(poses[:, 3:6]))
+        return np.concatenate([position, rotation, poses[:, 6:]], axis=1)
+
+    assert_same_pose(states_in_camera_frame(move(states), move(cameras)), states_in_camera_frame(states, cameras))
+
+
+def test_one_state_has_no_action() -> None:
+    with pytest.raises(ValueError, match="two states"):
+        actions_from_states(np.zeros((1, 7)))
