@@ -230,6 +230,9 @@ def test_a_folder_is_small_enough_to_be_read_at_a_glance() -> None:
 def test_the_house_has_few_rooms_on_few_floors() -> None:
     assert len({module.split(".", maxsplit=1)[0] for module in modules()}) <= MOST_AT_THE_TOP
     assert len(ORDERS[""]) <= MOST_FLOORS
+    notes = (ROOT / "docs/IMPLEMENTATION_NOTES.md").read_text().split("\n## The house\n")[1].split("\n## ")[0]
+    drawn = re.findall(r"^[ \d]\d  (.{37})", notes, re.MULTILINE)
+    assert [set(line.split()) for line in drawn[::-1]] == [set(line.split()) - {"__init__"} for line in ORDERS[""]]
 
 
 def test_a_function_has_few_parameters() -> None:

@@ -13,7 +13,7 @@ from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.encoding.encode_dataset import encode_config
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.reporter import SILENT
+from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.reports.export import export_run
 from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
 from vjepa2_ac.training.loop import train
