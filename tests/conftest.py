@@ -14,7 +14,9 @@ import missing
 # for what mypy proves already.
 CHECKED = [
     "vjepa2_ac.spaces",
-    "vjepa2_ac.media",
+    "vjepa2_ac.media.images",
+    "vjepa2_ac.media.image_similarity",
+    "vjepa2_ac.media.video",
     "vjepa2_ac.data.clips",
     "vjepa2_ac.data.transforms",
     "vjepa2_ac.planning",

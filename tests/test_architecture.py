@@ -50,7 +50,7 @@ ORDERS: dict[str, list[str]] = {
         "about server",
     ],
     "model": [
-        "base_model quiet_imports state_integration",
+        "base_model quiet_imports state_integration distances",
         "network",
         "adapter",
         "checkpoints",

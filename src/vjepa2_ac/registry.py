@@ -146,8 +146,8 @@ LOSSES = Registry(
     "loss",
     "vjepa2_ac.losses",
     {
-        "l1": "distances:absolute_difference",
-        "l2": "distances:squared_difference",
+        "l1": "model.distances:absolute_difference",
+        "l2": "model.distances:squared_difference",
         "smooth_l1": "training.loss:smooth_difference",
     },
 )

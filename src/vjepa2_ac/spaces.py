@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -16,9 +16,6 @@ from scipy.spatial.transform import Rotation
 
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 REACH_M = 5.0  # larger positions are not in metres
 ANGLE_RAD = 2 * math.pi + 0.1  # larger angles are not in radians
@@ -268,20 +265,3 @@ class Spaces:
 
 
 POSES = Spaces(POSE, POSE_CHANGE)
-
-
-# ---- distances of latents, in float32: the loss, the energy of a plan and the evaluation take means of them ----
-
-
-def absolute_difference(
-    predicted: Float[Tensor, "*predicted dim"], true: Float[Tensor, "*true dim"]
-) -> Float[Tensor, "*broadcast dim"]:
-    """Return the size of each difference: its mean is the L1 distance."""
-    return (predicted.float() - true.float()).abs()
-
-
-def squared_difference(
-    predicted: Float[Tensor, "*predicted dim"], true: Float[Tensor, "*true dim"]
-) -> Float[Tensor, "*broadcast dim"]:
-    """Return the square of each difference: its mean is the squared L2 distance."""
-    return (predicted.float() - true.float()).square()

@@ -17,7 +17,8 @@ from vjepa2_ac.evaluation.measure import Predictor
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import ActionRanking, Landscape, Landscapes, Ranking, Sensitivity
 from vjepa2_ac.intervals import Estimate, mean_of, ratio
-from vjepa2_ac.spaces import POSE, ActionSpace, absolute_difference, vector_states
+from vjepa2_ac.model.distances import absolute_difference
+from vjepa2_ac.spaces import POSE, ActionSpace, vector_states
 
 TOP = (1, 5, 10)
 _SAME = 1e-6  # relative difference below which energies are equal: rounding decides no rank

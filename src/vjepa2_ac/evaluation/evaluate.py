@@ -45,8 +45,9 @@ from vjepa2_ac.evaluation.result import (
     Way,
     registered_metrics,
 )
+from vjepa2_ac.model.distances import absolute_difference
 from vjepa2_ac.reporter import SILENT, Reporter
-from vjepa2_ac.spaces import ActionSpace, absolute_difference, matrices_from_euler
+from vjepa2_ac.spaces import ActionSpace, matrices_from_euler
 
 ClipName = tuple[str, int]  # id of the episode, first control step
 FramesOfRow = Callable[[int], UInt8[np.ndarray, "time height width 3"] | None]  # of a row of the current batch

@@ -18,8 +18,9 @@ from pydantic import BeforeValidator
 
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.intervals import Estimate
+from vjepa2_ac.model.distances import absolute_difference, squared_difference
 from vjepa2_ac.registry import METRICS
-from vjepa2_ac.spaces import ActionSpace, absolute_difference, squared_difference
+from vjepa2_ac.spaces import ActionSpace
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -16,6 +16,7 @@ from torch.utils.checkpoint import checkpoint
 
 from vjepa2_ac.config.planning import EnergyConfig
 from vjepa2_ac.episode import Progress, no_progress
+from vjepa2_ac.model.distances import absolute_difference, squared_difference
 from vjepa2_ac.model.network.predictor_network import KeyValueCache
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.model.state_integration import states_along
@@ -23,7 +24,7 @@ from vjepa2_ac.planning.model_setup import Axes
 from vjepa2_ac.planning.planner import Cost, reporting
 from vjepa2_ac.planning.search_space import SearchSpace
 from vjepa2_ac.registry import ENERGIES
-from vjepa2_ac.spaces import POSES, Spaces, absolute_difference, squared_difference
+from vjepa2_ac.spaces import POSES, Spaces
 
 
 @dataclass(frozen=True)

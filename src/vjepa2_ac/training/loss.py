@@ -13,9 +13,9 @@ from torch.nn.functional import smooth_l1_loss
 
 from vjepa2_ac.config import TrainingConfig
 from vjepa2_ac.episode import LatentBatch
+from vjepa2_ac.model.distances import absolute_difference
 from vjepa2_ac.model.network.predictor_network import KeyValueCache, LatentDynamics
 from vjepa2_ac.registry import LOSSES
-from vjepa2_ac.spaces import absolute_difference
 
 Distance = Callable[[Tensor, Tensor], Tensor]  # of predicted and true latents, number by number
 
