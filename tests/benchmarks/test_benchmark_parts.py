@@ -138,43 +138,6 @@ def test_a_time_in_which_the_allocator_gave_memory_back_does_not_count(
     assert timing.ratio(seen["never"], seen["warming up"]) > 0
 
 
-def test_the_profilers_own_wait_does_not_count(timing: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    def events(**counts: int) -> list[SimpleNamespace]:
-        return [SimpleNamespace(key=key, count=count) for key, count in counts.items()]
-
-    step = events(cudaLaunchKernel=500, cudaStreamSynchronize=2, cudaDeviceSynchronize=2)
-    own = events(cudaDeviceSynchronize=1, cudaStreamSynchronize=0)
-    assert timing.waits(step, own, "cuda:0") == {"cudaStreamSynchronize": 2, "cudaDeviceSynchronize": 1}
-    assert timing.waits(own, own, "cuda") == {}
-
-    class Profiler:
-        """As PyTorch's: it waits for the device when it ends, and the first time when it begins."""
-
-        first = True
-
-        def __init__(self, activities: object, **_: object) -> None:
-            assert len(activities) == 2  # type: ignore[arg-type]  # a list
-
-        def __enter__(self) -> "Profiler":
-            self.waits, Profiler.first = 1 + Profiler.first, False
-            doing.append(self)
-            return self
-
-        def __exit__(self, *_: object) -> None:
-            doing.pop()
-
-        def key_averages(self) -> list[SimpleNamespace]:
-            return events(cudaDeviceSynchronize=self.waits)
-
-    def work() -> None:
-        doing[-1].waits += 2
-
-    doing: list[Profiler] = []
-    monkeypatch.setattr(timing, "profile", Profiler)
-    assert timing.profiled(work, "cuda").waits == {"cudaDeviceSynchronize": 2}
-    assert timing.profiled(lambda: None, "cuda").waits == {}
-
-
 # ---- memory ----
 
 
@@ -192,24 +155,6 @@ def fake_cuda(monkeypatch: pytest.MonkeyPatch, **more: Any) -> list[str]:
     for name, answer in {**answers, **more}.items():
         monkeypatch.setattr(torch.cuda, name, answer)
     return called
-
-
-def test_on_cuda_a_peak_is_of_two_times_alone_in_this_process_and_under_the_cap(
-    memory: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    called = fake_cuda(monkeypatch)
-    monkeypatch.setattr("subprocess.run", None)
-
-    def measure() -> float:
-        called.append("built")
-        return float(memory.peak_gb(lambda: called.append("step"), "cuda"))
-
-    assert memory.peak_alone(measure, ["never"], "cuda", cap_gb=24.0) == {"peak_gb": 12.0, "problem": None}
-    measured = ["built", "empty", "reset", "step", "step"]
-    assert called == ["empty", "empty", "at most 0.25", *measured, "at most 1.0", "empty"]
-    called.clear()
-    assert memory.peak_alone(measure, ["never"], "cuda")["peak_gb"] == 12.0
-    assert called == ["empty", *measured, "empty"]
 
 
 def test_what_does_not_fit_under_the_cap_is_a_result_and_the_cap_ends(
@@ -243,20 +188,3 @@ def test_on_a_cpu_a_peak_is_of_a_process_of_its_own_whatever_becomes_of_it(
 ) -> None:
     found = memory.peak_alone([].pop, ["-c", program], "cpu")
     assert found == {"peak_gb": peak, "problem": problem and f"failed: {problem}"}
-
-
-@pytest.mark.parametrize("said", ["PYTORCH_ALLOC_CONF", "PYTORCH_CUDA_ALLOC_CONF", None])
-def test_the_allocator_grows_what_it_has_unless_the_environment_says_otherwise(
-    memory: Any, said: str | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    told: list[str] = []
-    monkeypatch.setattr(torch._C, "_accelerator_setAllocatorSettings", told.append)
-    for name in ("PYTORCH_ALLOC_CONF", "PYTORCH_CUDA_ALLOC_CONF"):
-        monkeypatch.delenv(name, raising=False)
-    if said:
-        monkeypatch.setenv(said, "max_split_size_mb:512")
-    else:
-        monkeypatch.setenv("PYTORCH_ALLOC_CONF", "")  # so that it is put back
-    memory.use_expandable_segments()
-    assert told == ([] if said else ["expandable_segments:True"])
-    assert os.environ[said or "PYTORCH_ALLOC_CONF"] == ("max_split_size_mb:512" if said else "expandable_segments:True")

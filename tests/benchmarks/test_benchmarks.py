@@ -7,15 +7,13 @@ import sys
 import weakref
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 
-from benches import ELSEWHERE, drawn_on, imported
+from benches import ELSEWHERE, imported
 
 
 @pytest.fixture
@@ -128,20 +126,6 @@ def test_what_ends_the_program_leaves_the_rows_that_were_there(
     ]  # fmt: skip
 
 
-def test_the_official_code_draws_its_weights_on_the_device_and_brings_its_mask_in_every_pass(
-    train_step: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class Predictor(torch.nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.layer, self.attn_mask = torch.nn.Linear(2, 2), torch.ones(3)
-
-    monkeypatch.setattr(torch.Tensor, "cpu", lambda value: torch.ones(value.shape, device="cpu"))  # what meta cannot
-    built = sys.modules[train_step.Bench._kind_of_official.__module__].built_on(torch.device("meta"), Predictor)
-    assert built.layer.weight.device.type == "meta"
-    assert built.attn_mask.device.type == "cpu"
-
-
 def test_an_official_code_that_fails_is_a_row_and_ours_is_measured_without_it(
     train_step: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -192,88 +176,6 @@ def test_memory_is_measured_after_all_times_and_a_process_that_fails_is_a_row(
     assert re.search(r"^ +4 +1 +yes +cache +auto +1\.25 +- +-$", printed, re.MULTILINE)
 
 
-def test_memory_alone_is_measured_where_no_time_is_asked_for(
-    train_step: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("memory.in_own_process", lambda _: 1.25)
-    monkeypatch.delattr(train_step, "matmul_speed")
-    train_step.main(["--quick", "--no-time", "--official", str(tmp_path)])
-    assert re.search(r"^ +4 +1 +no +cache +auto +1\.25 +- +-$", capsys.readouterr().out, re.MULTILINE)
-
-
-@pytest.fixture
-def step_memory(train_step: Any) -> Any:
-    """What measures the memory of a training step."""
-    return sys.modules[train_step.memory_row.__module__]
-
-
-def test_on_cuda_a_peak_stands_beside_doctors_estimate(
-    step_memory: Any, train_step: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    options = train_step.parse(["--device", "cuda", "--frames", "16", "--batch", "2", "--cap-gb", "24"])
-    (setting,) = step_memory.asked(options)
-    asked: list[tuple[list[str], str, float]] = []
-
-    def peak_alone(_: object, command: list[str], *given: Any) -> dict[str, Any]:
-        asked.append((command, *given))
-        return {"peak_gb": 10.0, "problem": None}
-
-    monkeypatch.setattr(step_memory, "peak_alone", peak_alone)
-    monkeypatch.setattr(step_memory.Bench, "estimated_gb", lambda *_: 11.5)
-    row = step_memory.memory_row(options, [], "bfloat16", setting, "auto")
-    assert asked[0][1:] == ("cuda", 24.0)
-    assert step_memory.memory_line(row).split() == ["16", "2", "no", "cache", "auto", "10.00", "11.50", "+15%"]
-    whole = step_memory.memory_row(options, [], "bfloat16", setting, "official_full")
-    assert step_memory.memory_line(whole).split()[-3:] == ["10.00", "-", "-"]
-
-
-def test_the_largest_batch_is_the_last_that_fits(step_memory: Any) -> None:
-    for fitting in (0, 1, 2, 19, 128, 500):
-        assert step_memory.largest_batch(lambda batch, fitting=fitting: batch <= fitting) == min(fitting, 128)
-
-
-def test_ways_are_crossed_as_asked(train_step: Any) -> None:
-    ours = train_step.our_ways
-    assert ours(["auto", "dense"], compiled=False) == ["auto", "dense"]
-    assert ours(["auto"], compiled=True) == ["auto", "auto+compile"]
-
-
-def test_the_largest_batch_is_looked_for_under_the_cap_and_what_fits_not_is_no_failure(
-    step_memory: Any, train_step: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    caps: list[float] = []
-
-    @contextmanager
-    def capped(gigabytes: float, device: str) -> Iterator[None]:
-        assert device == "cuda"
-        caps.append(gigabytes)
-        yield
-        caps.append(0.0)
-
-    class Bench:
-        at_six = "out of memory"
-
-        def __init__(self, *_: object) -> None:
-            pass
-
-        def start(self, setting: Any, way: str) -> Any:
-            assert caps == [24.0]
-            assert way == "auto+compile"
-            problem = None if setting.batch <= 5 else self.at_six if setting.batch == 6 else "out of memory"
-            return SimpleNamespace(problem=problem)
-
-    monkeypatch.setattr(step_memory, "capped", capped)
-    monkeypatch.setattr(step_memory, "Bench", Bench)
-    options = train_step.parse(["--device", "cuda", "--frames", "16", "--batch", "largest", "--cap-gb", "24"])
-    (asked,) = step_memory.asked(options)
-    assert step_memory.find_largest(options, "bfloat16", asked, "auto+compile", train_step.Rows(None)) == 5
-    assert caps == [24.0, 0.0]
-    caps.clear()
-    Bench.at_six = "failed: RuntimeError: nothing of the kind"
-    with pytest.raises(RuntimeError, match="batch 6: failed: RuntimeError: nothing of the kind"):
-        step_memory.find_largest(options, "bfloat16", asked, "auto+compile", train_step.Rows(None))
-
-
 def test_the_batch_that_was_found_is_a_row_and_is_timed(
     train_step: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -283,25 +185,6 @@ def test_the_batch_that_was_found_is_a_row_and_is_timed(
     assert re.search(r"^ +4 +2 +no +cache +auto +is the largest batch", capsys.readouterr().out, re.MULTILINE)
     found = [(row["measured"], row["batch"]) for row in json.loads(file.read_text())["rows"]]
     assert found == [("largest batch", 2), ("time", 2), ("time", 2)]
-
-
-def test_weights_are_drawn_on_the_device_and_nobody_takes_their_fingerprints(
-    train_step: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.delattr(sys.modules["vjepa2_ac.model.network.world_model"], "hashlib")
-    bench, given = sys.modules["train_step_variants"].Bench, ["--quick", "--official", str(tmp_path)]
-    assert bench(train_step.parse(given), "bfloat16").model.adaptation is not None
-    with drawn_on(monkeypatch) as devices:
-        _ = bench(train_step.parse([*given, "--device", "cuda"]), "bfloat16").model
-    assert devices == [torch.device("cuda")]
-
-
-def test_doctor_is_asked_about_the_setting_that_is_measured(train_step: Any, tmp_path: Path) -> None:
-    timed = sys.modules["train_step_variants"]
-    bench = timed.Bench(train_step.parse(["--quick", "--official", str(tmp_path)]), "bfloat16")
-    small, large = (bench.estimated_gb(timed.Setting(4, batch, False)) for batch in (1, 64))
-    again = bench.estimated_gb(timed.Setting(4, 64, True))
-    assert 0 < small < again < large
 
 
 def test_peak_memory_of_one_way_is_told_as_a_number_alone(

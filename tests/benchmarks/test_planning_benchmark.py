@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch._dynamo.utils import counters
 
-from benches import ELSEWHERE, drawn_on, imported
+from benches import ELSEWHERE, imported
 from tracing import tracing
 
 
@@ -85,17 +85,6 @@ def test_what_becomes_of_an_adapter_must_decide_as_the_others_do(
     printed = capsys.readouterr().out
     assert re.search(expected, printed)
     assert [way for _, way, *_ in DECISION.findall(printed)] == ["plain", "ours/4", "ours/2"]
-
-
-def test_an_adapter_is_float32_over_a_base_of_the_type_that_is_timed(planning: Any, tmp_path: Path) -> None:
-    decisions = sys.modules["planning_variants"]
-    bench = decisions.Bench(planning.parse(["--quick", "--official", str(tmp_path)]), "bfloat16")
-    way = decisions.Way.ours(4, adapter=True)
-    assert bench.difference(way, 2).is_none
-    bench.decision(way, 2)()
-    types = {".lora_" in name: one.dtype for name, one in bench.adapted.predictor.named_parameters()}
-    assert types == {True: torch.float32, False: torch.bfloat16}
-    assert not any(one.requires_grad for one in bench.adapted.parameters())
 
 
 def test_a_decision_that_fails_is_a_row_and_memory_of_the_others_follows(
@@ -191,23 +180,3 @@ def test_a_decision_is_counted_and_timed_in_the_type_and_towards_the_goal_that_w
     assert len(plan.actions) == 2
     assert plan.evaluations == bench.sequences
     assert bench.flops(2) == bench.sequences * decisions.plan_flops(bench.sizes, 2)
-
-
-def test_weights_are_drawn_on_the_device_and_nobody_takes_their_fingerprints(
-    planning: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.delattr(sys.modules["vjepa2_ac.model.network.world_model"], "hashlib")
-    bench, given = sys.modules["planning_variants"].Bench, ["--quick", "--official", str(tmp_path)]
-    assert bench(planning.parse(given), "bfloat16").adapted.adaptation is not None
-    with drawn_on(monkeypatch) as devices:
-        bench(planning.parse([*given, "--device", "cuda"]), "bfloat16")
-    assert devices == [torch.device("cuda")]
-
-
-def test_on_cuda_the_papers_setting_is_measured(planning: Any) -> None:
-    options = planning.parse(["--device", "cuda"])
-    assert (options.samples, options.iterations, options.horizon, options.layers) == (800, 10, [1, 2], 24)
-    assert (options.width, options.latent_dim, options.image_size, options.dtype) == (1024, 1408, 256, ["bfloat16"])
-    assert (options.repeats, options.warm_up) == (10, 3)
-    given = planning.parse(["--device", "cuda", "--samples", "9", "--repeats", "4", "--warm-up", "0"])
-    assert (given.samples, given.repeats, given.warm_up) == (9, 4, 0)

@@ -13,8 +13,6 @@ from vjepa2_ac.config import DiskCacheConfig
 from vjepa2_ac.config.loading import all_keys, config_as_flat_dict, parse_config
 from vjepa2_ac.data.index import cache_folder
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.runs.folder import read_run_config
-from vjepa2_ac.storage import places
 
 ON_THIS_MACHINE = (
     "run_dir",
@@ -137,13 +135,3 @@ def test_an_option_knows_the_users_home_and_refuses_urls(monkeypatch: pytest.Mon
         assert "is a URL" in capsys.readouterr().err
     assert main(["simulate", "record", "gs://b/x"]) == 2
     assert "simulate record: 'gs://b/x' is a URL" in capsys.readouterr().err
-
-
-def test_a_run_in_a_folder_called_tilde_is_read_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Earlier versions made such folders."""
-    monkeypatch.chdir(tmp_path)
-    folder = Path("~") / "run"
-    folder.mkdir(parents=True)
-    (folder / "config.yaml").write_text("run_dir: ~/run\ndata: {path: set}\nmodel: {base: base}\n")
-    assert Path(read_run_config(folder).run_dir) == folder
-    assert places.literal(Path("a")) == "a"

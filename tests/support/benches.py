@@ -2,7 +2,6 @@
 
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from importlib import import_module
 from typing import Any
 
@@ -69,17 +68,3 @@ def imported(name: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     for module in set(sys.modules) - before:
         if module.split(".")[0] in own:
             del sys.modules[module]
-
-
-@contextmanager
-def drawn_on(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[object]]:
-    """Note on which device weights are drawn in the block, which ends there: none needs to exist."""
-    devices: list[object] = []
-
-    def to_empty(_: object, device: object) -> None:
-        devices.append(device)
-        raise InterruptedError
-
-    with monkeypatch.context() as patched, suppress(InterruptedError):
-        patched.setattr(torch.nn.Module, "to_empty", to_empty)
-        yield devices

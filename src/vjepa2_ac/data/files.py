@@ -18,6 +18,7 @@ from vjepa2_ac.storage.block_file import BlockCachedFile, DiskCache
 from vjepa2_ac.storage.npz_reader import arrays_as_bytes, read_arrays
 
 DEEPEST = 8  # folders below the data set's
+_QUEUED = 4096  # results and tasks that wait at once: of a hundred thousand episodes not all
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -97,7 +98,8 @@ def in_parallel(function: Callable[[Item], Result], items: Sequence[Item], conne
         return
     pool = ThreadPoolExecutor(min(connections, len(items)))
     try:
-        yield from pool.map(function, items)
+        for start in range(0, len(items), _QUEUED):
+            yield from pool.map(function, items[start : start + _QUEUED])
     finally:
         pool.shutdown(cancel_futures=True)
 
