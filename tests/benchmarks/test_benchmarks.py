@@ -1,10 +1,8 @@
 """Benchmarks that nobody runs every day still run, and compare only what computes the same."""
 
 import json
-import math
 import re
 import sys
-import weakref
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -138,44 +136,6 @@ def test_an_official_code_that_fails_is_a_row_and_ours_is_measured_without_it(
     assert [way for way, _, _ in rows(printed)] == ["dense", "auto"]
 
 
-def test_memory_is_measured_after_all_times_and_a_process_that_fails_is_a_row(
-    train_step: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    models: list[weakref.ref[Any]] = []
-    draw = sys.modules["train_step_variants"].random_model
-
-    def drawn(*given: Any) -> Any:
-        model = draw(*given)
-        models.append(weakref.ref(model))
-        return model
-
-    def in_own_process(command: list[str]) -> float:
-        assert not any(model() for model in models)  # or the parent would hold memory meanwhile
-        assert Path(command[0]).name == "train_step.py"
-        way = command[command.index("--memory-of") + 1]
-        if way == "dense":
-            raise RuntimeError("a process of its own ended with -9: it says nothing")
-        return 1.25
-
-    monkeypatch.setattr("train_step_variants.random_model", drawn)
-    monkeypatch.setattr("memory.in_own_process", in_own_process)
-    file = tmp_path / "steps.json"
-    with pytest.raises(SystemExit, match="1 of 6 rows failed"):
-        train_step.main([
-            "--quick", "--official", str(tmp_path), "--checkpointing", "on", "--attention", "auto", "per_step",
-            "--json", str(file),
-        ])  # fmt: skip
-    assert len(models) == 1
-    found = json.loads(file.read_text())["rows"]
-    assert [(row["measured"], row["way"]) for row in found] == [
-        (measured, way) for measured in ("time", "memory") for way in ("dense", "auto", "per_step")
-    ]
-    assert [row.get("peak_gb") for row in found] == [None] * 4 + [1.25, 1.25]
-    printed = capsys.readouterr().out
-    assert re.search(r"^ +4 +1 +yes +cache +dense +failed: RuntimeError: .* -9", printed, re.MULTILINE)
-    assert re.search(r"^ +4 +1 +yes +cache +auto +1\.25 +- +-$", printed, re.MULTILINE)
-
-
 def test_the_batch_that_was_found_is_a_row_and_is_timed(
     train_step: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -185,13 +145,6 @@ def test_the_batch_that_was_found_is_a_row_and_is_timed(
     assert re.search(r"^ +4 +2 +no +cache +auto +is the largest batch", capsys.readouterr().out, re.MULTILINE)
     found = [(row["measured"], row["batch"]) for row in json.loads(file.read_text())["rows"]]
     assert found == [("largest batch", 2), ("time", 2), ("time", 2)]
-
-
-def test_peak_memory_of_one_way_is_told_as_a_number_alone(
-    train_step: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    train_step.main(["--quick", "--official", str(tmp_path), "--memory-of", "auto"])
-    assert 0.01 < float(capsys.readouterr().out) < 100
 
 
 def test_no_ratio_is_printed_to_a_predictor_that_computes_something_else(
@@ -224,24 +177,6 @@ def test_ways_learn_the_same_and_one_that_does_not_is_found(
     monkeypatch.setattr(attention, "_IMPLEMENTATIONS", wrong)
     with pytest.raises(SystemExit, match="beyond its tolerance"):
         numerics.main(["--quick"])
-
-
-def test_a_way_that_cannot_learn_is_a_row_and_a_loss_that_is_no_number_strays(
-    numerics: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from vjepa2_ac.model.network import attention
-
-    def fails(*_: object) -> None:
-        raise TypeError("no such thing")
-
-    monkeypatch.setattr(attention, "_IMPLEMENTATIONS", {**attention._IMPLEMENTATIONS, "flex": fails})
-    file = tmp_path / "curves.json"
-    with pytest.raises(SystemExit, match="1 of 4 rows failed"):
-        numerics.main(["--quick", "--ways", "flex", "per_step", "--json", str(file)])
-    found = json.loads(file.read_text())["rows"]
-    assert [row["way"] for row in found] == ["dense", "flex", "per_step", "bfloat16"]
-    assert [row.get("problem") for row in found] == [None, "failed: TypeError: no such thing", None, None]
-    assert numerics.strays([1.0, 1.0], [1.0, math.nan]) == math.inf
 
 
 @pytest.fixture

@@ -1,6 +1,5 @@
 """The benchmark of decisions times what decides alike, each in the type and with the goal that were asked for."""
 
-import json
 import re
 import sys
 from collections.abc import Iterator
@@ -55,65 +54,6 @@ def test_decisions_with_compiled_blocks_are_timed_beside_those_without(
         "plain", "ours/4", "ours/4+compiled", "ours/2", "ours/2+compiled", "ours/4+adapter", "ours/4+adapter+compiled",
     ]  # fmt: skip
     assert counters["stats"]["unique_graphs"]
-
-
-@pytest.mark.parametrize("changed", ["ready", "failing"])
-def test_what_becomes_of_an_adapter_must_decide_as_the_others_do(
-    planning: Any, changed: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    decisions = sys.modules["planning_variants"]
-    usual = decisions.prepare_for_planning
-
-    def prepare_for_planning(model: Any, config: Any) -> Any:
-        if model.adaptation is None:
-            return usual(model, config)
-        if changed == "failing":
-            raise NotImplementedError("adapters")
-        for layer in decisions.lora_layers(model).values():
-            layer.set_scale("default", 0.0)
-        return usual(model, config)
-
-    monkeypatch.setattr(decisions, "prepare_for_planning", prepare_for_planning)
-    given = ["--quick", "--no-memory", "--official", str(tmp_path)]
-    if changed == "failing":
-        with pytest.raises(SystemExit, match="1 of 7 rows failed"):
-            planning.main(given)
-        expected = r"ours/4\+adapter, failed: NotImplementedError: adapters"
-    else:
-        planning.main(given)
-        expected = r"ours/4\+adapter: actions differ by .*: NO RATIO"
-    printed = capsys.readouterr().out
-    assert re.search(expected, printed)
-    assert [way for _, way, *_ in DECISION.findall(printed)] == ["plain", "ours/4", "ours/2"]
-
-
-def test_a_decision_that_fails_is_a_row_and_memory_of_the_others_follows(
-    planning: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    decisions = sys.modules["planning_variants"]
-    usual = decisions.Bench.decision
-
-    def decision(self: Any, way: Any, horizon: int) -> Any:
-        return usual(self, way, horizon) if way.name != "plain" else [].pop
-
-    monkeypatch.setattr(decisions.Bench, "decision", decision)
-    monkeypatch.setattr("memory.in_own_process", lambda _: 1.25)
-    file = tmp_path / "decisions.json"
-    with pytest.raises(SystemExit, match="1 of 9 rows failed"):
-        planning.main(["--quick", "--official", str(tmp_path), "--no-adapter", "--json", str(file)])
-    printed = capsys.readouterr().out
-    assert re.search(r"^ +2  plain +failed: IndexError: pop from empty list$", printed, re.MULTILINE)
-    assert re.findall(r"^ +2  (\S+) +1\.25$", printed, re.MULTILINE) == ["plain", "ours/4", "ours/2"]
-    found = json.loads(file.read_text())["rows"]
-    assert [row["measured"] for row in found] == ["same actions"] * 3 + ["time"] * 3 + ["memory"] * 3
-    assert [row["ratio_to_plain"] for row in found[3:6]] == [None] * 3
-
-
-def test_peak_memory_of_a_decision_is_told_as_a_number_alone(
-    planning: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    planning.main(["--quick", "--official", str(tmp_path), "--memory-of", "ours/4", "4"])
-    assert 0.01 < float(capsys.readouterr().out) < 100
 
 
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])

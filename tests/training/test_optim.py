@@ -61,7 +61,7 @@ def test_constant_rises_to_the_peak_and_stays() -> None:
     training = TrainingConfig(steps=100, warmup_steps=10, learning_rate=1e-3, schedule="constant")
     assert learning_rate_at(5, training) == pytest.approx(5e-4)
     assert {learning_rate_at(step, training) for step in range(10, 101)} == {1e-3}
-    with pytest.raises(ValidationError, match="leave final_learning_rate out"):
+    with pytest.raises(ValidationError, match="no final_learning_rate: leave it out"):
         TrainingConfig(schedule="constant", final_learning_rate=1e-5)
 
 

@@ -226,7 +226,7 @@ class DataConfig(Section):
         splits, of_camera = self.validation_share + self.test_share, self.pose_frame == "camera"
         return self.refused(
             (not cameras, "camera: an empty list; name one or more, or null for the source's first"),
-            (unknown, f"camera {unknown[:1]} is none of source {self.source}: {', '.join(known or ())}"),
+            (unknown, f"camera: source {self.source} has no {unknown[:1]}; it has {', '.join(known or ())}"),
             (self.is_cache and self.stride == "auto", "stride auto: a latent cache has one stride; give its number"),
             (self.is_cache and is_url(self.path), "path: a latent cache is a folder on this machine"),
             (self.is_cache and self.cache != "off", f"source {self.source} is itself a cache: set cache: off"),
