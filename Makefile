@@ -42,7 +42,7 @@ evidence: $(SIMULATION)  ## does LoRA help? every method side by side; goes on w
 trap: $(SIMULATION)  ## does a lower error plan better? narrow and varied demonstrations, every checkpoint in closed loop
 	$(BIN)/python benchmarks/trap --picture docs/ranking.png
 
-encoders: $(SIMULATION)  ## what each published encoder costs, by doctor's arithmetic; replaces the table, docs/encoders.md copies it
+encoders: $(SIMULATION)  ## what each published encoder costs, by doctor's arithmetic; replaces the table
 	$(BIN)/python benchmarks/encoders.py
 
 test: $(INSTALLED)  ## the whole test suite, on all cores (8 at most), a thread each; a folder in one process: .venv/bin/pytest tests/data

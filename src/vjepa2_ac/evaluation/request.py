@@ -5,7 +5,7 @@ The protocol of the Action Score stands here, too. No option changes it, so that
 Source: facebookresearch/jepa-wms @ 6eafb14, configs/evals/simu_env_planning/droid/vj2ac,
 evals/simu_env_planning/planning (planner.py: CEMPlanner; objectives.py: ReprTargetDistMPCObjective; plan_evaluator.py:
 sample_traj_segment_from_dset), app/vjepa_wm/modelcustom/simu_env_planning/vit_enc_preds.py: EncPredWM.unroll.
-Where it differs: docs/evaluation.md.
+Where it differs: docs/evaluation_reference.md.
 """
 
 from __future__ import annotations

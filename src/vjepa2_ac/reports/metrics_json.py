@@ -1,6 +1,6 @@
 """metrics.json: the rows of an evaluation, and what they come from, as plain values. Images are in the report only.
 
-Its schema is in docs/evaluation.md.
+Its schema is in docs/evaluation_reference.md.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def read_metrics(folder: Path) -> Metrics:
 
 
 def metrics_as_dict(evaluation: Evaluation) -> dict[str, Any]:
-    """Return all metrics as plain values; see docs/evaluation.md for the meaning of each."""
+    """Return all metrics as plain values; see docs/evaluation_reference.md for the meaning of each."""
     from vjepa2_ac.evaluation.rows import rows_of  # reading needs no PyTorch
     from vjepa2_ac.evaluation.verdict import uses_actions, verdict
 

@@ -49,7 +49,7 @@ class PlanningClient:
             raise UnreachableError(where=url, found=found, needed="a server (`vjepa2-ac serve`)") from None
 
     def infer(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Return the answer to a request (docs/serving.md).
+        """Return the answer to a request (docs/serving_reference.md).
 
         Raises:
             InputError: The server refuses it.

@@ -63,7 +63,7 @@ def read_request(message: Mapping[str, Any], image_keys: Sequence[str] = IMAGE_K
     """Return what a message asks for. Other keys than these are another policy's, and do not matter here.
 
     Args:
-        message: From the wire: keys as in docs/serving.md.
+        message: From the wire: keys as in docs/serving_reference.md.
         image_keys: Where the camera's picture may be, in the order in which they are looked for.
 
     Raises:

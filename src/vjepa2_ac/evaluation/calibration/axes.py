@@ -265,7 +265,7 @@ def infer_axes(
     """Find the angle by which a model's axes are turned, infer the moves of the starts, and fit them to the executed.
 
     A move is inferred from the state turned by the angle: a model that is given the state in axes not its own takes it
-    for another place (docs/planning.md has what this changes).
+    for another place (docs/planning_reference.md has what this changes).
 
     Args:
         model: The predictor.
@@ -325,7 +325,7 @@ def calibrate_axes(
         reporter: Shows the progress of indexing, encoding and inferring.
 
     Returns:
-        The fit, and the content of axes.json, by the schema in docs/planning.md.
+        The fit, and the content of axes.json, by the schema in docs/planning_reference.md.
 
     Raises:
         InputError: The data or the model cannot be used; or the states have no axes.
