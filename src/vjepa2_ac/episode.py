@@ -14,7 +14,7 @@ State (7 numbers, a pose): x, y, z in metres; roll, pitch, yaw in radians, as ex
     source has, state_dim of them.
 
 Action (7 numbers, of poses): the change from a state to the state of the next *model* step: metres, extrinsic xyz Euler
-    angles of R[t+1] @ R[t].T, and the change of closedness. See `geometry.actions_from_states`. Of vectors:
+    angles of R[t+1] @ R[t].T, and the change of closedness. See `spaces.actions_from_states`. Of vectors:
     `data.actions`.
 
 Extrinsics (6 numbers): the camera in the robot base frame: x, y, z, roll, pitch, yaw.

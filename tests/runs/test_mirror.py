@@ -29,13 +29,6 @@ UPLOAD = "POST /upload/"
 
 
 @pytest.fixture
-def bucket(gcs: Gcs) -> Gcs:
-    gcs.put("bucket/other", b"1")
-    gcs.forget()
-    return gcs
-
-
-@pytest.fixture
 def run(tmp_path: Path) -> Path:
     folder = tmp_path / "run"
     folder.mkdir()

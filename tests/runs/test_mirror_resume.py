@@ -39,13 +39,6 @@ def there(place: str) -> list[str]:
 
 
 @pytest.fixture
-def bucket(gcs: Gcs) -> Gcs:
-    gcs.put("bucket/other", b"1")
-    gcs.forget()
-    return gcs
-
-
-@pytest.fixture
 def config(make_config: Callable[..., Config]) -> Config:
     return make_config(checkpoint__remote=PLACE)
 

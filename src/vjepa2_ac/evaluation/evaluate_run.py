@@ -157,8 +157,8 @@ def measure_subject(
         subject: The folder of a run; or a model, as in `model.base`.
         asked: The options.
         reporter: Shows the progress of each part of the work.
-        find_axes: `calibration.axes.infer_axes`; None: no axes.
-        calibrate: `calibration.variants.calibrate_model`, if the options ask for it; None: no strides.
+        find_axes: `evaluation.calibration.axes.infer_axes`; None: no axes.
+        calibrate: `evaluation.calibration.variants.calibrate_model`, if the options ask for it; None: no strides.
 
     Raises:
         InputError: The subject, the data, the decoder, a file of a metric, or a model to compare with cannot be used;

@@ -63,7 +63,7 @@ class ProbeOptions:
     at_once: int = 64  # samples per batch
     planning_clips: int = 0  # number of clips whose plans are compared with the demonstration; of poses only
     planning: PlanningConfig = field(default_factory=PlanningConfig)  # settings of one-step plans
-    find_axes: Callable[..., Any] | None = None  # `calibration.axes.infer_axes`; None: no axes
+    find_axes: Callable[..., Any] | None = None  # `evaluation.calibration.axes.infer_axes`; None: no axes
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """State integration: states after a sequence of changes, batched, on any device, and differentiable.
 
-Of poses the same as `geometry.apply_action` (NumPy, SciPy), except that the gripper is limited to between open and
+Of poses the same as `spaces.apply_action` (NumPy, SciPy), except that the gripper is limited to between open and
 closed. Vectors add.
 """
 

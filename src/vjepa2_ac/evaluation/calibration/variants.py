@@ -3,7 +3,7 @@
 A model's one-step error over persistence is lowest where frames, states and actions are those that it knows. So strides
 are calibrated: the step length of the released weights is unknown (see IMPLEMENTATION_NOTES), and robots differ in
 their control rate. At each candidate stride, the same clips begin at the same control steps of the same held-out
-episodes. Other readings of the data are in `calibration.data`.
+episodes. Other readings of the data are in `evaluation.calibration.data`.
 """
 
 from __future__ import annotations
