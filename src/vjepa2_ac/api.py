@@ -282,8 +282,8 @@ def evaluate(
             energy landscapes, examples.
 
     Returns:
-        `verdict`, a text; `error_over_persistence` of each model by horizon (below 1: better than copying the first
-        frame); `files` that were written; `evaluation`, all arrays.
+        `answer`, three questions, as lines by `str`; `error_over_persistence` of each model by horizon (below 1: better
+        than copying the first frame); `files` that were written; `evaluation`, all arrays.
 
     Raises:
         InputError: The subject or the data cannot be used, there are no test episodes, or the folder cannot be written.
@@ -326,8 +326,8 @@ class _Told(Reporter):
         from vjepa2_ac.evaluation.estimates import over_persistence
 
         by_horizon = ", ".join(f"{ratio.value:.3f}" for ratio in over_persistence(found.errors, "rollout"))
-        ranked = f"; mean rank of the true action {found.ranking.rank}" if found.ranking else ""
-        self._note(f"Validation at step {step}: error over persistence by horizon {by_horizon}{ranked}")
+        better = f"; other moves that look better {found.ranking.rank:.1%}" if found.ranking else ""
+        self._note(f"Validation at step {step}: error over persistence by horizon {by_horizon}{better}")
 
 
 def _device(device: Device) -> torch.device:

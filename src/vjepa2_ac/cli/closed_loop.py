@@ -19,9 +19,11 @@ if TYPE_CHECKING:
 
     import numpy as np
 
+    from vjepa2_ac.evaluation.answer import Answer
     from vjepa2_ac.serving.about import KeptGoals
     from vjepa2_ac.serving.server import Served
     from vjepa2_ac.simulation.closed_loop.agent import Agent
+    from vjepa2_ac.simulation.closed_loop.benchmark import ClosedLoopBenchmark
 
 _GB = 10**9
 _OF_RECORD = ("cameras", "workers")
@@ -74,6 +76,7 @@ def add_simulate(commands: cli.Commands) -> None:
     cli.add(parser, "--seed N", "which problems or demonstrations (0)", cli.whole_number(0, 2**31 - 1))
     text = "what is to be done (reach); record: push, pick or place, with a block on the table (none: reaching around)"
     cli.add(parser, "--task", text, choices=["reach", "push", "pick", "place"])
+    cli.add_all(parser)
     group = parser.add_argument_group("of a model that steers")
     cli.add_checkpoint(group, default=None)
     cli.add(group, "--config CONFIG", "of a model: a config whose `planning` is used", cli.as_local)
@@ -240,10 +243,44 @@ def _run_benchmark(options: argparse.Namespace) -> int:
     home = Path(options.subject) if is_run(options.subject) else Path()
     with _agent(options) as agent, cli.reporter() as reporter:
         benchmark, files = run_benchmark(agent, chosen, options.out or home / name, reporter)
-    if benchmark.agent.checkpoint:
-        cli.show(f"{options.subject}: checkpoint {benchmark.agent.checkpoint}")
-    cli.show(benchmark_table(benchmark), *benchmark_notes(benchmark), files=files)
+    checkpoint = benchmark.agent.checkpoint
+    if options.all:
+        name = f"{options.subject}: checkpoint {checkpoint}" if checkpoint else options.subject
+        cli.show(name, benchmark_table(benchmark), files=files)
+    answer = _answer(benchmark)
+    cli.show(*benchmark_notes(benchmark), str(answer), f"Next: {_next(answer, options)}")
+    cli.show(*(f"Film: {file}" for file in files[1:]))
     return int(any(set(result.why_counts) == {"no finite energy"} for result in benchmark.results))
+
+
+def _answer(benchmark: ClosedLoopBenchmark) -> Answer:
+    """Return the answer of the closed loop; the other two questions as `evaluate` answered them of this checkpoint."""
+    from vjepa2_ac.evaluation.answer import Answer, not_measured
+    from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics
+
+    agent, options = benchmark.agent, benchmark.options
+    how = f"vjepa2-ac evaluate {agent.subject}"
+    unknown = not_measured("predicts", how), not_measured("uses actions", how)
+    measured = (
+        f"{options.task}, domain {options.world.name}, {options.model_steps} steps of {options.seconds_per_step:.2f} s"
+    )
+    found = Answer(agent.subject, measured, "doing nothing", *unknown, benchmark.plans)
+    if agent.checkpoint and (Path(agent.subject) / METRICS_FILE).is_file():
+        evaluated = read_metrics(Path(agent.subject))
+        if evaluated.about.checkpoint == agent.checkpoint:
+            found = replace(evaluated.answer, measured=measured, plans=benchmark.plans)
+    return found
+
+
+def _next(answer: Answer, options: argparse.Namespace) -> str:
+    """Return the command that follows from the answer of a closed loop."""
+    if answer.plans.why:
+        return f"vjepa2-ac simulate {options.subject} --task {options.task or 'reach'} --episodes 50"
+    if answer.predicts.share is None:
+        return f"vjepa2-ac evaluate {options.subject}"
+    if answer.plans.word == "yes":
+        return f"vjepa2-ac serve {options.subject}"
+    return f"vjepa2-ac data calibrate {options.subject}/config.yaml --axes {options.subject}"
 
 
 @contextmanager

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from vjepa2_ac.decoding.imagine import Imagination
     from vjepa2_ac.evaluation.request import EvaluationOptions
     from vjepa2_ac.reporter import Reporter
+    from vjepa2_ac.reports.write import Evaluated
 
 
 def add_evaluate(commands: cli.Commands) -> None:
@@ -31,6 +32,7 @@ def add_evaluate(commands: cli.Commands) -> None:
     cli.add_decoder(parser, "the rollouts, which are measured as images, too")
     cli.add(parser, "--lpips FILE", "weights for LPIPS of the decoded images (docs/decoding.md)", cli.as_path)
     cli.add(parser, "--lpips-heads FILE", "its heads: alex.pth or vgg.pth of version 0.1", cli.as_path)
+    cli.add_all(parser)
     cli.add(parser, "--calibrate", "measure the one-step error at other strides, too", action="store_true")
     _add_probes(parser.add_argument_group("use of the actions"))
     group = parser.add_argument_group("plans (they take long: see docs/evaluation.md)")
@@ -45,6 +47,7 @@ def add_evaluate(commands: cli.Commands) -> None:
     parser = cli.command(commands, "compare", _compare)
     cli.add(parser, "runs RUN", "folders with a metrics.json, two or more", cli.as_path, nargs="+")
     cli.add(parser, "--out PNG", "the image (comparison.png)", cli.as_path, default=Path("comparison.png"))
+    cli.add_all(parser)
 
 
 def add_imagine(commands: cli.Commands) -> None:
@@ -96,8 +99,8 @@ def _evaluate(options: argparse.Namespace) -> None:
         cli.require_subject(subject)
 
     from vjepa2_ac.cli.console.tables import row_tables
+    from vjepa2_ac.evaluation.answer import spread
     from vjepa2_ac.evaluation.rows import rows_of
-    from vjepa2_ac.evaluation.verdict import spread, verdict
     from vjepa2_ac.reports.write import evaluate_subject
 
     evaluations = []
@@ -106,12 +109,34 @@ def _evaluate(options: argparse.Namespace) -> None:
         with cli.reporter() as reporter:
             measured = evaluate_subject(subject, how, reporter)
         evaluations.append(measured.evaluation)
-        checkpoint = measured.evaluation.about.checkpoint
-        name = f"{subject}: checkpoint {checkpoint}" if checkpoint else subject
-        tables = row_tables(rows_of(measured.evaluation), "Held-out episodes")
-        cli.show(name, *tables, verdict(measured.evaluation), files=measured.files)
+        if options.all:
+            checkpoint, notes = measured.evaluation.about.checkpoint, measured.evaluation.notes
+            name = f"{subject}: checkpoint {checkpoint}" if checkpoint else subject
+            tables = row_tables(rows_of(measured.evaluation), "Held-out episodes")
+            cli.show(name, *tables, *notes, files=measured.files)
+        cli.show(str(measured.answer), f"Next: {_next(measured, options.data)}")
+        cli.show(f"Report with all tables: {measured.report}")
     if len(evaluations) > 1:
         cli.show(spread(evaluations))
+
+
+def _next(measured: Evaluated, data: str | None) -> str:
+    """Return the command that follows from the answer."""
+    from vjepa2_ac.simulation.recording.record import SIMULATION_FILE, read_simulation
+    from vjepa2_ac.simulation.world.domains import Domain
+
+    about, answer = measured.evaluation.about, measured.answer
+    if not about.checkpoint:
+        return f"vjepa2-ac train {data}"
+    if answer.predicts.why:
+        return f"vjepa2-ac data check {about.subject}/config.yaml"
+    if "no" in {answer.predicts.word, answer.uses_actions.word}:
+        return f"vjepa2-ac data check {about.subject}/config.yaml --model {about.subject}"
+    if not (Path(about.data) / SIMULATION_FILE).is_file():
+        return f"vjepa2-ac serve {about.subject}"
+    recorded = read_simulation(about.data).spec
+    domain = f" --domain {recorded.worlds.name}" if isinstance(recorded.worlds, Domain) else ""
+    return f"vjepa2-ac simulate {about.subject} --task {recorded.task or 'reach'}{domain}"
 
 
 def _asked(options: argparse.Namespace) -> list[tuple[str, EvaluationOptions]]:
@@ -147,8 +172,8 @@ def _compare(options: argparse.Namespace) -> None:
     from vjepa2_ac.cli.console.tables import row_tables
     from vjepa2_ac.reports.figures.evaluation import plot_comparison
 
-    tables = row_tables(comparison.rows, comparison.title)
-    cli.show(*tables, *comparison.notes, files=[plot_comparison(comparison, options.out)])
+    tables = row_tables(comparison.rows, comparison.title) if options.all else []
+    cli.show(*tables, str(comparison), *comparison.notes, files=[plot_comparison(comparison, options.out)])
 
 
 def _imagine(options: argparse.Namespace) -> None:

@@ -97,6 +97,11 @@ def add_planner(parser: argparse.ArgumentParser, *, such_as: str) -> None:
     add(parser, "--extrinsics NUMBERS", text)
 
 
+def add_all(parser: argparse.ArgumentParser) -> None:
+    """Add the option that shows more than the answer."""
+    add(parser, "--all", "print every table, too, and the files that were written", action="store_true")
+
+
 def add_decoder(parser: argparse._ActionsContainer, shows: str) -> None:
     """Add `--decoder`, with which something is drawn."""
     text = f"shows {shows}: the folder that `vjepa2-ac decoder` made, or builtin:sim-tiny"

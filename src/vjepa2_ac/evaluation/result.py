@@ -422,6 +422,12 @@ class Evaluation:
     decoded: DecodedRollouts | None = None  # None: no decoder was given
 
     @property
+    def title(self) -> str:
+        """What was evaluated, for people: the name of a run with its step, or of a model."""
+        step = self.about.checkpoint_path.rpartition("-")[2]
+        return f"{self.about.subject}, step {int(step)}" if step.isdecimal() else self.about.subject
+
+    @property
     def trained(self) -> str:
         """The name of the evaluated model: adapter, or model."""
         return next(name for name, model in self.models.items() if model.role == "trained")

@@ -187,8 +187,8 @@ class _Rows(list[Row]):
         self.line(group, label, "sensitivity.change", change, better="higher", chance=0.0)
         for one in found.rankings:
             where = "others' actions" if one.drawn_from == "clips" else "actions in a box"
-            label, key = f"share of {where} that fit better", f"sensitivity.rank.{one.drawn_from}"
-            self.line(group, label, key, {model: one.mean_rank}, chance=0.5)
+            label, key = f"{where} that look better", f"sensitivity.rank.{one.drawn_from}"
+            self.line(group, label, key, {model: one.mean_rank}, form=".1%", chance=0.5)
             for k, share in one.top.items():
                 label, key = f"true action in the best {k} of {one.samples + 1}, {where}", f"top_{k}.{one.drawn_from}"
                 style: dict[str, Any] = {"better": "higher", "chance": one.chance_of_top(k), "detail": k != _TOP}
@@ -196,16 +196,17 @@ class _Rows(list[Row]):
 
     def add_ranking(self, model: str, found: ActionRanking) -> None:
         """Add the rank of the true action among those that a planner would try."""
-        group = "Moves as large as plans: rank of the true action"
-        self.line(group, "mean rank", "ranking.rank", {model: found.rank}, chance=0.5)
-        self.line(group, "among actions in a box", "ranking.box", {model: found.box}, chance=0.5)
-        self.line(group, "among other directions", "ranking.shell", {model: found.shell}, chance=0.5)
+        group = "Moves as large as plans: how many others look better than the true one"
+        share: dict[str, Any] = {"form": ".1%", "chance": 0.5}
+        self.line(group, "other moves that look better", "ranking.rank", {model: found.rank}, **share)
+        self.line(group, "of those in a box", "ranking.box", {model: found.box}, **share)
+        self.line(group, "of those in other directions", "ranking.shell", {model: found.shell}, **share)
         label, spread = "spread of the energy / energy now", {model: found.spread}
         self.line(group, label, "ranking.spread", spread, better="higher", chance=0.0)
         base = None if self.base is None else self.base.ranking
         if base is not None and base is not found:
-            label, difference = "mean rank minus the base's", {model: rank_difference(found, base)}
-            self.line(group, label, "ranking.difference_to_base", difference, form="+.3f", chance=0.0, detail=True)
+            label, difference = "the same minus the base's", {model: rank_difference(found, base)}
+            self.line(group, label, "ranking.difference_to_base", difference, form="+.1%", chance=0.0, detail=True)
 
     def add_landscapes(self, model: str, found: Landscapes) -> None:
         """Add where the energy is lowest."""

@@ -15,19 +15,21 @@ from pydantic import TypeAdapter, ValidationError
 from pydantic_core import to_jsonable_python
 
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.answer import Answer, answer
 from vjepa2_ac.evaluation.request import SCORED
 from vjepa2_ac.evaluation.result import L1, Evaluation, Row
 from vjepa2_ac.storage import write_atomically
 from vjepa2_ac.storage.structured import json_text
 
 METRICS_FILE = "metrics.json"
-FORMAT = 3  # incremented when a reader of the file would have to change
+FORMAT = 4  # incremented when a reader of the file would have to change
 
 
 @dataclass(frozen=True)
 class WrittenAbout:
     """What readers need of `about`."""
 
+    checkpoint: str
     checkpoint_path: str
     data: str
     cameras: tuple[str, ...]
@@ -59,8 +61,8 @@ class WrittenErrors:
 class Metrics:
     """The content of metrics.json that programs read, but for what the rows come from."""
 
-    format: Literal[3]
-    verdict: str
+    format: Literal[4]
+    answer: Answer
     trained: str
     base: str | None
     about: WrittenAbout
@@ -109,9 +111,8 @@ def read_metrics(folder: Path) -> Metrics:
 def metrics_as_dict(evaluation: Evaluation) -> dict[str, Any]:
     """Return all metrics as plain values; see docs/evaluation_reference.md for the meaning of each."""
     from vjepa2_ac.evaluation.rows import rows_of  # reading needs no PyTorch
-    from vjepa2_ac.evaluation.verdict import uses_actions, verdict
 
-    one, clips, study = evaluation, evaluation.clips, evaluation.planning
+    one, clips, study, rows = evaluation, evaluation.clips, evaluation.planning, rows_of(evaluation)
     named = list(zip(clips.episode_ids, clips.starts, strict=True))
     about = {name: value for name, value in vars(one.about).items() if name != "space"}
     decoded, planning = one.decoded, {"three_steps_settings": SCORED}
@@ -119,8 +120,7 @@ def metrics_as_dict(evaluation: Evaluation) -> dict[str, Any]:
     of_model = ("role", "sensitivity", "ranking", "landscapes", "plans")  # what rows come from, but for errors
     metrics = {
         "format": FORMAT,
-        "verdict": verdict(one),
-        "uses_actions": uses_actions(one),
+        "answer": answer(one, rows),
         "trained": one.trained,
         "base": one.base,
         "about": about | {"is_pose": one.about.space.position is not None},
@@ -131,7 +131,7 @@ def metrics_as_dict(evaluation: Evaluation) -> dict[str, Any]:
             "fingerprint": hashlib.sha256(json.dumps(named).encode()).hexdigest()[:16],
             "named": named,
         },
-        "rows": rows_of(one),
+        "rows": rows,
         "episodes": one.episodes,
         "by_clip": {
             "persistence": one.errors.of("rollout", L1, "persistence"),

@@ -17,6 +17,7 @@ from jaxtyping import UInt8
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from vjepa2_ac.evaluation.answer import Answer, answer, with_closed_loop
 from vjepa2_ac.evaluation.calibration.axes import infer_axes
 from vjepa2_ac.evaluation.calibration.variants import calibrate_model
 from vjepa2_ac.evaluation.estimates import Curve, gain_over, over_persistence
@@ -24,7 +25,6 @@ from vjepa2_ac.evaluation.evaluate_run import measure_subject
 from vjepa2_ac.evaluation.request import EvaluationOptions
 from vjepa2_ac.evaluation.result import L1, DecodedStrip, EpisodeScore, Evaluation, Example, Row, RowTable, sections
 from vjepa2_ac.evaluation.rows import rows_of
-from vjepa2_ac.evaluation.verdict import verdict
 from vjepa2_ac.media.figure import svg_of, visible
 from vjepa2_ac.media.film import draw_strip
 from vjepa2_ac.media.images import encode_jpeg
@@ -104,7 +104,7 @@ def report_page(evaluation: Evaluation) -> str:
     environment.filters["breakable"] = lambda name: Markup("/<wbr>").join(map(visible, name.split("/")))
     return environment.get_template("report.html.jinja").render(
         evaluation=evaluation,
-        verdict=verdict(evaluation),
+        answer=answer(evaluation, rows),
         side=side,
         outcome=outcome,
         tiles=_tiles(evaluation, rows),
@@ -207,9 +207,16 @@ class Evaluated:
     files: tuple[Path, ...]  # written files
 
     @property
-    def verdict(self) -> str:
-        """Whether training helped, how certain that is, and whether the actions are used, as text."""
-        return verdict(self.evaluation)
+    def answer(self) -> Answer:
+        """Does it predict better, does it use the actions, does it plan better; as text by `str`."""
+        found = answer(self.evaluation, rows_of(self.evaluation))
+        about = self.evaluation.about
+        return with_closed_loop(found, Path(about.subject), about.checkpoint) if about.checkpoint else found
+
+    @property
+    def report(self) -> Path:
+        """The page."""
+        return self.files[-1]
 
     @property
     def error_over_persistence(self) -> dict[str, Curve]:

@@ -123,9 +123,9 @@ class Watch:
         if _number(metrics, "action_rank_low") > _number(self._at_start, "action_rank_high"):  # intervals are apart
             words = "predicts better and plans worse than the base" if better else "plans worse than the base"
             rank, before = _number(metrics, "action_rank"), _number(self._at_start, "action_rank")
-            text = f"the model {words}: the mean rank of the true action among others is {rank:.3f}"
+            text = f"the model {words}: {rank:.1%} of other moves look better than the true one"
             hint = "`vjepa2-ac data check` says how varied the motion of the data is"
-            yield "rank", f"{text} (before training {before:.3f}; 0 is best, 0.5 chance). {hint}"
+            yield "rank", f"{text} (before training {before:.1%}, chance 50 %). {hint}"
 
     def _of_loss(self, loss: float) -> Iterator[tuple[str, str]]:
         if not math.isfinite(loss):  # a step without clips, or one that was refused

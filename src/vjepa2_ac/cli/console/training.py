@@ -48,6 +48,6 @@ class TrainingConsole(ConsoleReporter):
         if found.ranking is not None:
             ranking = found.ranking
             console.print(
-                f"  mean rank of the true action {ranking.rank} (0 best, 0.5 chance): in a box {ranking.box.value:.3f},"
-                f" among other directions {ranking.shell.value:.3f}; spread of the energy {ranking.spread.value:.3f}"
+                f"  other moves that look better than the true one: {ranking.rank:.1%} (chance 50 %), in a box"
+                f" {ranking.box.value:.1%}, in other directions {ranking.shell.value:.1%}"
             )

@@ -18,7 +18,6 @@ from matplotlib import colormaps
 from vjepa2_ac.evaluation.action_score import AXES, ways_of
 from vjepa2_ac.evaluation.estimates import Curve, gain_over, one_step_over_persistence, over_persistence
 from vjepa2_ac.evaluation.result import ACTIONS, DecodedStrip, Evaluation, Example, Landscapes, Mode, TrainingCurve
-from vjepa2_ac.evaluation.verdict import verdict
 from vjepa2_ac.media.figure import BLUE, GREEN, GREY, ORANGE, RED, headline, visible, written_figure
 from vjepa2_ac.media.film import FilmStrip, Kind, StripRow, draw_strip
 from vjepa2_ac.reports.comparison import Comparison
@@ -36,7 +35,7 @@ _DRAWN_FIRST = ("loss", "over_persistence", "learning_rate", "grad_norm")
 def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
     """Write the figure of an evaluation as PNG; it is written atomically."""
     with written_figure(path, 13.0, 6.2, dpi=110, size=9) as figure:
-        headline(figure, verdict(evaluation))
+        headline(figure, evaluation.title)
         left, right = figure.subfigures(1, 2, width_ratios=[5, 6], wspace=0.02)
         upper, lower = left.subfigures(2, 1, height_ratios=[3, 2])
         draw_errors(upper, evaluation)

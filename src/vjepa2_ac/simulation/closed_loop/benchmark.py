@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from vjepa2_ac import __version__
+from vjepa2_ac.evaluation.answer import CLOSED_LOOP_FILE, Question, closed_loop
 from vjepa2_ac.media.film import side_by_side
 from vjepa2_ac.media.video import video_library, write_video
 from vjepa2_ac.planning.goals import read_goal_folder
@@ -26,8 +27,8 @@ from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ
 from vjepa2_ac.storage import user_can_write, write_atomically
 from vjepa2_ac.storage.structured import utc_now
 
-FILE, FILM = "closed_loop.json", "closed_loop.mp4"
-FORMAT = 1  # incremented when a reader of the file would have to change
+FILM = "closed_loop.mp4"
+FORMAT = 2  # incremented when a reader of the file would have to change
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,13 @@ class ClosedLoopBenchmark:
     agent: Agent
     options: BenchmarkOptions  # with the model's stride
     results: tuple[ClosedLoopResult, ...]
+
+    @property
+    def plans(self) -> Question:
+        """Whether the model plans better than what looks at no image."""
+        shares = {result.policy: result.success_rate for result in self.results}
+        model, *_, oracle = shares
+        return closed_loop(shares, model, oracle, self.options.episodes, self.options.task)
 
 
 def run_benchmark(
@@ -78,7 +86,7 @@ def run_benchmark(
         spec = options if policy is model else replace(options, films=0)
         results.append(run_task(spec, policy, arm, reporter.task(f"{options.task}: {policy.name}")))
     benchmark = ClosedLoopBenchmark(agent, options, tuple(results))
-    files = [folder / FILE]
+    files = [folder / CLOSED_LOOP_FILE]
     write_atomically(files[0], json.dumps(benchmark_as_dict(benchmark), indent=1, allow_nan=False) + "\n")
     if options.films:
         rate_hz = CONTROL_RATE_HZ / options.stride
@@ -108,6 +116,7 @@ def benchmark_as_dict(benchmark: ClosedLoopBenchmark) -> dict[str, Any]:
             "version": __version__,
             "time": utc_now(),
         },
+        "plans": asdict(benchmark.plans),
         "policies": {result.policy: _metrics(result) for result in benchmark.results},
     }
 
