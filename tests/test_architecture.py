@@ -60,7 +60,7 @@ ORDERS: dict[str, list[str]] = {
         "estimates measure distribution",
         "action_use",
         "action_score",
-        "rows verdict evaluate",
+        "rows answer evaluate",
         "decoded",
         "evaluate_run",
         "imagined imagined_plan calibration",
@@ -72,7 +72,7 @@ ORDERS: dict[str, list[str]] = {
         "training",
     ],
     "evaluation.calibration": ["variants", "data axes"],
-    "reports": ["metrics_json", "comparison", "figures", "write imagined sheet", "export"],
+    "reports": ["metrics_json", "comparison paper", "figures", "write imagined sheet", "export"],
     "cli": ["console", "options", "train", "data", "evaluate plan closed_loop setup", "program", "__main__"],
     "simulation": [
         "world",

@@ -79,8 +79,7 @@ def test_a_run_that_was_killed_ends_in_the_same_bits(workshop: Path, nursery: Nu
 def test_it_is_evaluated_and_plans(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = workshop / "whole"
     assert main(["evaluate", str(run), "--clips", "4"]) == 0
-    verdict = json.loads((run / "metrics.json").read_text())["verdict"]
-    assert verdict in capsys.readouterr().out
+    assert json.loads((run / "metrics.json").read_text())["answer"]["subject"] in capsys.readouterr().out
     small = ["planning.samples=16", "planning.iterations=1", "planning.horizon=1"]
     out = ["--out", str(workshop / "simulated"), "--films", "0"]
     assert main(["simulate", str(run), "--episodes", "1", "--steps", "1", *out, *small]) == 0

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 RESAMPLES = 2000
+ENOUGH_EPISODES = 5  # with fewer, an interval over episodes means little
 _SHARE = 0.95  # probability that an interval covers the true value
 
 

@@ -132,7 +132,7 @@ def test_few_data_get_few_steps_and_larger_shares() -> None:
     small, large = of(), of(replace(FOUND, episodes=95_658, steps=27_600_000))
     assert small.config.training.steps == 600
     assert large.config.training.steps == 100_000
-    assert small.config.data.test_share == 0.15
+    assert (small.config.data.validation_share, small.config.data.test_share) == (0.15, 0.3)
     assert large.config.data.test_share == 0.02
     assert plain(small.knobs)["validation"]["every"] == 60
 

@@ -1,6 +1,8 @@
 """Runs that were measured on the same clips are compared pair by pair; others are refused."""
 
+import csv
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,7 @@ from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.reports.comparison import compare
 from vjepa2_ac.reports.figures.evaluation import plot_comparison
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics, write_metrics
+from vjepa2_ac.reports.paper import write_tables
 from worlds import Copier, Halfway, Oracle, about, again, clips_batch
 
 PROBES = ProbeOptions(sensitivity_clips=4, samples=10, landscape_clips=2, nodes=3, examples=0)
@@ -82,7 +85,7 @@ def test_a_run_that_was_not_evaluated_is_named_with_the_way_out(tmp_path: Path) 
     [
         ({"by_clip": {"persistence": 0.5, "models": {}}}, "by_clip.persistence"),
         ({"rows": [{"key": 1}]}, "metrics that cannot be used"),
-        ({"format": 99}, "format: Input should be 3"),
+        ({"format": 99}, "format: Input should be 4"),
     ],
 )
 def test_damaged_metrics_are_named(tmp_path: Path, changes: dict[str, object], words: str) -> None:
@@ -103,3 +106,17 @@ def test_what_is_written_is_what_is_read(tmp_path: Path) -> None:
     everything = json.loads((folder / METRICS_FILE).read_text())
     assert np.array(everything["by_clip"]["models"]["adapter"]).shape == (12, 4)
     assert np.array(everything["models"]["adapter"]["landscapes"]["maps"][0]["energy"]).shape == (3, 3, 3)
+
+
+def test_tables_for_a_paper_have_every_row_and_escape_names(tmp_path: Path) -> None:
+    found = compare([written(tmp_path / "half_1", Halfway()), written(tmp_path / "100%", Copier())])
+    table, paper = write_tables(found.rows, tmp_path / "comparison.png")
+    with table.open(newline="") as file:
+        again = [(row["key"], row["model"], float(row["value"])) for row in csv.DictReader(file)]
+    assert again == [(row.key, row.model, pytest.approx(row.value, nan_ok=True)) for row in found.rows]
+    text = paper.read_text()
+    assert r"half\_1" in text
+    assert r"100\%" in text
+    for one in text.split(r"\begin{tabular}")[1:]:
+        columns = one.partition("}")[0].count("r")
+        assert {len(re.findall(r"(?<!\\)&", line)) for line in one.splitlines() if "&" in line} == {columns}

@@ -20,6 +20,7 @@ from run_fixtures import TINY, SilentReporter, one_thread, tiny_config
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.answer import Answer, not_measured
 from vjepa2_ac.evaluation.result import Row
 from vjepa2_ac.model.adapter.lora import base_only
 from vjepa2_ac.model.checkpoints.loading import load_official
@@ -37,12 +38,13 @@ ROWS = [
     Row("a table", "0.50 s ahead", "rollout.l1.over_persistence.1", "adapter", 0.7),
 ]
 EVALUATED = {
-    "format": 3,
-    "verdict": "The adapter predicts better.",
+    "format": 4,
+    "answer": asdict(Answer("somewhere/run, step 2", "8 clips", "the base", *map(not_measured, ("a", "b", "c")))),
     "trained": "adapter",
     "base": "base",
     "about": {
-        "subject": "somewhere/run", "checkpoint_path": "somewhere/run/checkpoints/step-00000002", "data": "data",
+        "subject": "somewhere/run", "checkpoint": "step 2",
+        "checkpoint_path": "somewhere/run/checkpoints/step-00000002", "data": "data",
         "cameras": ["exterior"], "split": "test", "frames": 2, "stride": 4, "seconds_per_step": 0.5,
     },
     "clips": {"count": 8, "episodes": 3, "fingerprint": "0", "named": []},
@@ -232,7 +234,8 @@ def test_the_card_shows_what_was_measured(copied, tmp_path: Path) -> None:
     (run / PLOT).write_bytes(b"a picture")
     export_run(run, tmp_path / "hub", "hub")
     card = (tmp_path / "hub" / CARD).read_text()
-    assert "The adapter predicts better." in card
+    assert "run, step 2" not in card
+    assert "not measured" in card
     assert "| ahead | base | adapter |\n|---|---|---|\n| 0.50 s | 0.900 [0.800, 0.950] | 0.700 |" in card
     assert "another checkpoint" not in card
     assert "Not evaluated" not in card
@@ -250,7 +253,7 @@ def test_the_card_takes_what_evaluate_writes_and_says_of_which_checkpoint(copied
     (run / METRICS_FILE).write_text(json.dumps({**measured, "about": {**about, "checkpoint_path": old}}))
     assert main(["export", str(run), str(tmp_path / "hub"), "--to", "hub"]) == 0
     card = (tmp_path / "hub" / CARD).read_text()
-    assert measured["verdict"] in card
+    assert measured["answer"]["predicts"]["says"] in card
     assert "another checkpoint**: `step-00000001`, not `step-00000002`" in card
     assert "model-index" not in card, "results of another checkpoint are not those of this adapter"
 
@@ -267,7 +270,7 @@ def test_another_checkpoint_than_the_newest_is_measured_and_exported_where_it_is
         ("best", 2, "step-00000002 (the best by action ranking)"),
         ("1", 1, "step-00000001 (as asked for)"),
     ]:
-        assert main(["evaluate", str(run), *QUICK, "--checkpoint", asked]) == 0
+        assert main(["evaluate", str(run), *QUICK, "--all", "--checkpoint", asked]) == 0
         measured = json.loads((run / METRICS_FILE).read_text())
         assert measured["about"]["checkpoint_path"] == str(run / "checkpoints" / f"step-{step:08d}")
         assert measured["about"]["checkpoint"] == words
@@ -288,7 +291,7 @@ def weights_of(run: Path, step: int) -> dict[str, Tensor]:
     return load_file(run / "checkpoints" / checkpoint_name(step) / "adapter" / "adapter_model.safetensors")
 
 
-@pytest.mark.parametrize("content", ["{", '{"format": 1, "verdict": 3}'])
+@pytest.mark.parametrize("content", ["{", '{"format": 1, "answer": 3}'])
 def test_a_damaged_evaluation_is_named_and_nothing_is_written(copied, tmp_path: Path, content: str) -> None:
     run = copied()
     (run / METRICS_FILE).write_text(content)

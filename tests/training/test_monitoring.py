@@ -235,7 +235,7 @@ def test_a_model_that_predicts_better_and_plans_worse_is_warned_of_once(config: 
     found = warned(config, (0, start), (3, unsure), (6, sure), (9, sure))
     assert list(found) == [6]
     assert "the model predicts better and plans worse than the base" in found[6][0]
-    assert "rank of the true action among others is 0.060 (before training 0.030" in found[6][0]
+    assert "6.0% of other moves look better than the true one (before training 3.0%" in found[6][0]
     worse = validation(0.95) | ranking(0.06, 0.05, 0.07)
     assert any("the model plans worse than the base" in text for text in warned(config, (0, start), (3, worse))[3])
 

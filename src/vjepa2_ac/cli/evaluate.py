@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, UserError
 
 if TYPE_CHECKING:
     from vjepa2_ac.decoding.imagine import Imagination
@@ -122,7 +122,7 @@ def _evaluate(options: argparse.Namespace) -> None:
 
 def _next(measured: Evaluated, data: str | None) -> str:
     """Return the command that follows from the answer."""
-    from vjepa2_ac.simulation.recording.record import SIMULATION_FILE, read_simulation
+    from vjepa2_ac.simulation.recording.record import read_simulation
     from vjepa2_ac.simulation.world.domains import Domain
 
     about, answer = measured.evaluation.about, measured.answer
@@ -132,9 +132,10 @@ def _next(measured: Evaluated, data: str | None) -> str:
         return f"vjepa2-ac data check {about.subject}/config.yaml"
     if "no" in {answer.predicts.word, answer.uses_actions.word}:
         return f"vjepa2-ac data check {about.subject}/config.yaml --model {about.subject}"
-    if not (Path(about.data) / SIMULATION_FILE).is_file():
+    try:
+        recorded = read_simulation(Path(about.data).resolve(strict=True)).spec
+    except (OSError, UserError):
         return f"vjepa2-ac serve {about.subject}"
-    recorded = read_simulation(about.data).spec
     domain = f" --domain {recorded.worlds.name}" if isinstance(recorded.worlds, Domain) else ""
     return f"vjepa2-ac simulate {about.subject} --task {recorded.task or 'reach'}{domain}"
 
@@ -171,9 +172,11 @@ def _compare(options: argparse.Namespace) -> None:
 
     from vjepa2_ac.cli.console.tables import row_tables
     from vjepa2_ac.reports.figures.evaluation import plot_comparison
+    from vjepa2_ac.reports.paper import write_tables
 
     tables = row_tables(comparison.rows, comparison.title) if options.all else []
-    cli.show(*tables, str(comparison), *comparison.notes, files=[plot_comparison(comparison, options.out)])
+    files = [plot_comparison(comparison, options.out), *write_tables(comparison.rows, options.out)]
+    cli.show(*tables, str(comparison), *comparison.notes, files=files)
 
 
 def _imagine(options: argparse.Namespace) -> None:

@@ -256,7 +256,7 @@ def _doctor(options: argparse.Namespace) -> int:
 
 
 def _demo(_options: argparse.Namespace) -> int:
-    """Record a simulated arm, train a tiny world model with LoRA, say whether it helped, and film what it imagines.
+    """Record a simulated arm, train a tiny world model with LoRA, film what it imagines, and say whether it helped.
 
     All of it is in the folder demo, in 4 to 6 minutes on 2 cores, without a download. The same command goes on after a
     stop.
@@ -268,8 +268,8 @@ def _demo(_options: argparse.Namespace) -> int:
         _RECORD.format(path=_SIMULATED),
         f"train {BUILTIN}demo",
         f"decoder {BUILTIN}demo",
-        "evaluate demo/run",
         "imagine demo/run --decoder demo/decoder --actions true,left,close",
+        "evaluate demo/run --decoder demo/decoder",
     ]
     for words in commands[Path(_SIMULATED).exists() :]:
         print(f"$ vjepa2-ac {words}", flush=True)

@@ -16,11 +16,10 @@ import numpy as np
 
 from vjepa2_ac.evaluation.estimates import over_persistence
 from vjepa2_ac.evaluation.result import L1, Evaluation, Row
-from vjepa2_ac.intervals import Estimate
+from vjepa2_ac.intervals import ENOUGH_EPISODES, Estimate
 
 Word = Literal["yes", "no", "not known yet"]
 
-ENOUGH_EPISODES = 5  # with fewer, an interval over episodes means little: nothing is known yet
 SAME_ERROR = 0.01  # share: errors this close are the same, whatever their interval
 SAME_MOVES = 0.005  # share of moves: likewise
 _COLUMNS = 80
@@ -83,12 +82,11 @@ class Answer:
         yield f"{self.subject}{' ' * between if between > 1 else chr(10)}{self.measured}"
         wide = max(len(question.word) for question in self.questions)
         for question in self.questions:
-            before = f"  {question.name:<13} {question.word:<{wide}}  "
+            before = f"  {question.name:<12}  {question.word:<{wide}}  "
             room = _COLUMNS - len(before) - len(question.interval) - 1
-            says, *more = textwrap.wrap(question.says, room)
+            says, *more = textwrap.wrap(f"{question.says} {question.beside}", room)
             yield f"{before}{says:<{room}} {question.interval}".rstrip()
-            for text in (*more, *textwrap.wrap(question.beside, room)):
-                yield " " * len(before) + text
+            yield from (" " * len(before) + text for text in more)
         yield from textwrap.wrap(self.sentence, _COLUMNS)
 
 
@@ -194,9 +192,9 @@ def _lower(gain: Estimate) -> str:
 
 def _uses_actions(rows: Mapping[str, Row]) -> Question:
     """Answer by what another clip's actions cost; the true ones have to fit best among others, too, where measured."""
-    cost = rows["cost_of_actions.shuffled"].estimate
-    seems: Literal["yes", "no"] = "yes" if cost.value > SAME_ERROR else "no"
-    word = word_of(cost, SAME_ERROR, "yes" if cost.value > 0 else "no")
+    cost, gap = (rows[f"{name}.shuffled"].estimate for name in ("cost_of_actions", "gap_of_actions"))
+    seems: Literal["yes", "no"] = "yes" if gap.value > SAME_ERROR else "no"
+    word = word_of(gap, SAME_ERROR, "yes" if gap.value > 0 else "no")
     beside = ""
     for key in ("sensitivity.rank.clips", "sensitivity.rank.box"):
         if key in rows and word == "yes" and (rank := rows[key].estimate).side(of=CHANCE) != -1:
@@ -237,8 +235,8 @@ def closed_loop(shares: Mapping[str, Estimate], model: str, oracle: str, problem
         task: What is to be done.
     """
     own, reference = shares[model], shares[oracle]
-    best = max(one.value for name, one in shares.items() if name not in {model, oracle})
-    word: Word = "yes" if own.low > best else "no" if own.value <= best else "not known yet"
+    best = max((one for name, one in shares.items() if name not in {model, oracle}), key=lambda one: one.value)
+    word: Word = "yes" if own.low > best.high else "no" if own.value <= best.value else "not known yet"
     why = ""
     if reference.value < CHANCE:
         why = f"The oracle itself solves {percent(reference.value)} % of these problems: they show nothing."

@@ -12,6 +12,7 @@ from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.config.model import ModelSizes
 from vjepa2_ac.init.found import FoundData, Knob, Knobs, as_yaml, guesses, plain
 from vjepa2_ac.init.machine import Machine, duration
+from vjepa2_ac.intervals import ENOUGH_EPISODES
 from vjepa2_ac.model.checkpoints.loading import base_sizes
 from vjepa2_ac.model.checkpoints.published import OFFICIAL, PUBLISHED
 from vjepa2_ac.storage.places import BUILTIN
@@ -27,6 +28,7 @@ _CLIPS_A_STEP = 32  # of every model but the tiny one
 _MODEL_STEP_S = 4 / 15  # the shortest of those that the released weights may know: 0.27, 0.53 and 1 s
 _FEW_EPISODES = 500  # to which the advice for few demonstrations applies
 _NEAR_S = 0.005
+_MOST_TESTED = 0.35  # share of few episodes
 _SHARES = ((5_000, 0.02), (500, 0.05), (100, 0.1), (0, 0.15))  # held out, by the number of episodes
 _LEAST_FRAMES = 3  # two rollout steps and the frame before them
 _PASSES = 3  # over the starts of clips
@@ -207,7 +209,7 @@ def _data(found: FoundData, machine: Machine, model: ModelChoice) -> Knobs:
     """Return the section of the data."""
     stride = max(1, round(found.rate_hz.value * _MODEL_STEP_S))
     frames, why_frames = _frames(found, model, stride)
-    share, why_share = _share(found)
+    share, test_share, why_share = _shares(found)
     cached = _cache(found, machine, model)
     workers = max(1, min(4 if "cache" in cached else 8, machine.cores - 1))
     vector: dict[str, Knob] = {"states": Knob("vector", "the robot's own numbers: its actions are their differences")}
@@ -219,7 +221,7 @@ def _data(found: FoundData, machine: Machine, model: ModelChoice) -> Knobs:
         "frames": Knob(frames, why_frames),
         "stride": Knob(stride, _why_stride(found, model, stride), found.rate_hz.is_guess),
         "validation_share": Knob(share, why_share),
-        "test_share": Knob(share, "for `evaluate`; never seen in training"),
+        "test_share": Knob(test_share, "for `evaluate`; never seen in training"),
         **({"idle": found.idle} if found.idle and (found.usual_steps or _SHORT) >= _SHORT else {}),
         **cached,
         "workers": Knob(workers, f"of {machine.cores} cores"),
@@ -315,13 +317,14 @@ def _frames(found: FoundData, model: ModelChoice, stride: int) -> tuple[int, str
     return frames, f"a clip spans {(frames - 1) * stride + 1} steps; {lengths}"
 
 
-def _share(found: FoundData) -> tuple[float, str]:
+def _shares(found: FoundData) -> tuple[float, float, str]:
+    """Return the shares of validation and test; of few episodes test gets enough for an interval, if it can."""
     if found.episodes is None:
-        return 0.05, "of the episodes, drawn by a hash, at least one"
+        return 0.05, 0.05, "of the episodes, drawn by a hash, at least one"
     share = next(share for least, share in _SHARES if found.episodes > least or least == 0)
     count = max(1, round(share * found.episodes))
-    few = ": an interval over so few says little" if count < 5 else ""
-    return share, f"about {count:,} of {found.episodes:,} episodes, drawn by a hash{few}"
+    enough = min(_MOST_TESTED, math.ceil(100 * (ENOUGH_EPISODES + 1) / found.episodes) / 100)
+    return share, max(share, enough), f"about {count:,} of {found.episodes:,} episodes, drawn by a hash"
 
 
 def _cache(found: FoundData, machine: Machine, model: ModelChoice) -> dict[str, Knob]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
 from typing import Literal
 
@@ -110,6 +110,7 @@ def _write_hub(run: TrainedRun, folder: Path, destination: Path, card: str, metr
                 shutil.copyfile(folder / PLOT, fresh / PLOT)
             told = json.loads((folder / METRICS_FILE).read_bytes())  # without paths of this machine
             told["about"] |= {"subject": folder.resolve().name, "checkpoint_path": _measured(metrics)}
+            told["answer"] |= {"subject": folder.resolve().name}
             write_atomically(fresh / METRICS_FILE, json.dumps(told, indent=1))
         write_atomically(fresh / CARD, card)
 
@@ -138,6 +139,7 @@ def _card(run: TrainedRun, folder: Path, metrics: Metrics | None) -> str:
         run=run,
         name=name,
         evaluation=metrics,
+        answer=None if metrics is None else replace(metrics.answer, subject=folder.resolve().name),
         measured=measured,
         plot=PLOT if metrics is not None and (folder / PLOT).is_file() else None,
         base=model.adaptation,

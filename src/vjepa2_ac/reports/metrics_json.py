@@ -113,6 +113,7 @@ def metrics_as_dict(evaluation: Evaluation) -> dict[str, Any]:
     from vjepa2_ac.evaluation.rows import rows_of  # reading needs no PyTorch
 
     one, clips, study, rows = evaluation, evaluation.clips, evaluation.planning, rows_of(evaluation)
+    found = answer(one, rows)
     named = list(zip(clips.episode_ids, clips.starts, strict=True))
     about = {name: value for name, value in vars(one.about).items() if name != "space"}
     decoded, planning = one.decoded, {"three_steps_settings": SCORED}
@@ -120,7 +121,7 @@ def metrics_as_dict(evaluation: Evaluation) -> dict[str, Any]:
     of_model = ("role", "sensitivity", "ranking", "landscapes", "plans")  # what rows come from, but for errors
     metrics = {
         "format": FORMAT,
-        "answer": answer(one, rows),
+        "answer": {**vars(found), "sentence": found.sentence},
         "trained": one.trained,
         "base": one.base,
         "about": about | {"is_pose": one.about.space.position is not None},

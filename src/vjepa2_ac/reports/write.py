@@ -31,6 +31,7 @@ from vjepa2_ac.media.images import encode_jpeg
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.reports.figures.evaluation import decoded_strip, drawings, example_strip, plot_evaluation
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, write_metrics
+from vjepa2_ac.reports.paper import write_tables
 from vjepa2_ac.storage import write_atomically
 
 PLOT, REPORT = "evaluation.png", "report.html"
@@ -236,6 +237,7 @@ def evaluate_subject(subject: str, asked: EvaluationOptions | None = None, repor
     files = (
         plot_evaluation(evaluation, folder / PLOT),
         write_metrics(evaluation, folder / METRICS_FILE),
+        *write_tables(rows_of(evaluation), folder / METRICS_FILE),
         write_report(evaluation, folder / REPORT),
     )
     return Evaluated(evaluation, files)

@@ -55,7 +55,7 @@ def test_lines_have_loss_error_speed_and_time_left(monkeypatch: pytest.MonkeyPat
         reporter.stepped(step, FIGURES)
     validation, ranked, *lines = written.getvalue().splitlines()
     assert validation.startswith("validation at step 10: one-step error/persistence 0.250")
-    assert ranked.startswith("  mean rank of the true action 0.150 [")
+    assert ranked.startswith("  other moves that look better than the true one: 15.0% [")
     words = "loss 0.5123  error/persistence 0.250  1.50 clips/s"
     assert lines == [f"training 12/100  {words}  0:08:48 left"], "a line every 10 seconds"
 

@@ -1,11 +1,13 @@
 """Checks of batches: each kind of wrong numbers has its own finding."""
 
 import itertools
+import re
 from pathlib import Path
 
 import pytest
 import torch
 
+from vector_sets import write_vectors
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.inspection.check import check_data, findings_in
@@ -102,3 +104,15 @@ def test_an_auto_stride_is_looked_at_at_the_smallest_candidate(droid: Path) -> N
     findings = {finding.about: finding for finding in check_data(config, clips=2)}
     assert "smallest candidate, 2" in findings["stride"].text
     assert at_some_stride(open_dataset(config)).config.stride == 2
+
+
+def test_a_test_split_that_cannot_answer_is_told_the_share_that_can(tmp_path: Path) -> None:
+    texts = {}
+    for episodes in (30, 6):
+        folder = write_vectors(tmp_path / str(episodes), width=3, episodes=episodes)
+        config = knobs(folder, source="npz", states="vector", validation_share=0.1, test_share=0.05)
+        texts[episodes] = [one.text for one in check_data(config, clips=2) if "cannot tell whether" in one.text]
+    assert "no share of 6 leaves enough to train on" in texts[6][0]
+    share = float(re.search(r"data.test_share=([\d.]+)", texts[30][0])[1])
+    config = knobs(tmp_path / "30", source="npz", states="vector", test_share=share)
+    assert open_dataset(config).members("test").sum() >= 5

@@ -21,6 +21,7 @@ from vjepa2_ac.cli import main
 from vjepa2_ac.cli.console.tables import benchmark_notes
 from vjepa2_ac.decoding.decoder_folder import load_decoder
 from vjepa2_ac.errors import UserError
+from vjepa2_ac.evaluation.answer import CLOSED_LOOP_FILE
 from vjepa2_ac.media.video import count_frames
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.session import load_to_plan
@@ -28,7 +29,6 @@ from vjepa2_ac.serving.about import metadata_of
 from vjepa2_ac.serving.session import Session, SessionOptions
 from vjepa2_ac.simulation.closed_loop.agent import JOINT_FIELDS, Agent, agent_of_session
 from vjepa2_ac.simulation.closed_loop.benchmark import (
-    FILE,
     FILM,
     BenchmarkOptions,
     film_frames,
@@ -107,19 +107,24 @@ def test_a_decoder_adds_what_was_imagined_to_the_film_and_changes_no_metric(mode
 
 
 def metrics(folder: Path) -> dict:
-    return json.loads((folder / FILE).read_text())
+    return json.loads((folder / CLOSED_LOOP_FILE).read_text())
 
 
 def test_the_command_prints_a_row_for_each_and_writes_figures_and_a_film(
     model: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["simulate", model, "--task", "reach", "--domain", "B", *TWICE, "--out", str(tmp_path), *SMALL]) == 0
+    assert (
+        main(["simulate", model, "--task", "reach", "--domain", "B", *TWICE, "--all", "--out", str(tmp_path), *SMALL])
+        == 0
+    )
     shown = capsys.readouterr().out
     rows = {line.split("│")[1].strip(): line for line in shown.splitlines() if line.startswith("│")}
     assert list(rows) == ["tiny", "do nothing", "random", "oracle"]
     assert "reach in domain B: 2 problems of seed 0, 2 steps of 0.27 s" in shown
+    assert "show nothing" in shown or "cannot show anything" in shown
     reported = metrics(tmp_path)
     assert list(reported["policies"]) == list(rows)
+    assert reported["plans"]["word"] == "not known yet"
     assert reported["about"]["planning"]["samples"] == 6
     assert reported["about"]["success_below_cm"] == 5
     assert reported["about"]["success_also"] == ""
@@ -162,7 +167,7 @@ def test_a_broken_model_does_nothing_says_so_and_ends_with_status_1(
 def test_the_film_shows_what_the_model_saw_beside_the_goal(model: str, tmp_path: Path) -> None:
     asked = BenchmarkOptions(episodes=2, steps=1, films=1)
     benchmark, files = run_benchmark(agent_of(model), asked, tmp_path)
-    assert [file.name for file in files] == [FILE, FILM]
+    assert [file.name for file in files] == [CLOSED_LOOP_FILE, FILM]
     steered = benchmark.results[0]
     frames = list(film_frames(steered))
     episode = steered.episodes[0]
@@ -243,7 +248,20 @@ def test_a_problem_that_cannot_be_demonstrated_is_told_before_any_is_worked_on(
 def test_placing_is_filmed_and_its_criterion_is_told(
     model: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    given = ["simulate", model, "--task", "place", "--episodes", "1", "--films", "1", "--out", str(tmp_path), *SMALL]
+    given = [
+        "simulate",
+        model,
+        "--task",
+        "place",
+        "--episodes",
+        "1",
+        "--films",
+        "1",
+        "--all",
+        "--out",
+        str(tmp_path),
+        *SMALL,
+    ]
     assert main(given) == 0
     shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert "18 steps of 0.27 s" in shown

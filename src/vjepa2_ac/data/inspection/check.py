@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from itertools import islice
 
 import numpy as np
@@ -21,6 +22,7 @@ from vjepa2_ac.data.inspection.statistics import PERCENTILES, at_some_stride
 from vjepa2_ac.data.loader import training_loader
 from vjepa2_ac.episode import Batch, Progress
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.intervals import ENOUGH_EPISODES
 from vjepa2_ac.spaces import POSE, POSES, Spaces
 
 _MOVED_M, _MOVED_SHARE = 0.01, 0.05  # of the flange, or of the range of a number: it should be visible
@@ -96,11 +98,32 @@ def _what_takes_part(dataset: Dataset) -> Iterator[Finding]:
         short = f"; {len(windows.short):,} episodes are too short" if len(windows.short) else ""
         clip = f"clips of {config.frames} frames at stride {config.stride}"
         yield Finding("ok", split, f"{len(windows):,} {clip} in {episodes:,} episodes{short}")
+    yield from _split_that_can_answer(dataset)
     if config.split_by is not None:
         groups = len(np.unique(dataset.split_hash[dataset.taking_part]))
         yield Finding("ok", "groups", f"{groups:,} by {config.split_by}, each in one split")
     duplicates = find_duplicates(dataset)
     yield Finding("warning" if duplicates.episodes else "ok", "duplicates", str(duplicates))
+
+
+def _split_that_can_answer(dataset: Dataset) -> Iterator[Finding]:
+    """Say where the test split has too few episodes to know whether training helped, and which share has enough."""
+    config, among = dataset.config, dataset.table.num_steps >= dataset.config.clip_steps
+    count = int((dataset.members("test") & among).sum())
+    if not 0 < count < ENOUGH_EPISODES:
+        return
+    words = f"{count} episode{'s' * (count != 1)} cannot tell whether training helped, {ENOUGH_EPISODES} would"
+    for percent in range(5, 55, 5):
+        other = replace(dataset, config=config.model_copy(update={"test_share": percent / 100}))
+        test, train = (int((other.members(split) & among).sum()) for split in ("test", "train"))
+        if test >= ENOUGH_EPISODES and train > test:
+            yield Finding("warning", "test", f"{words}: with data.test_share={percent / 100:g} it has {test}")
+            return
+    yield Finding(
+        "warning",
+        "test",
+        f"{words}: no share of {(dataset.taking_part & among).sum()} leaves enough to train on. Record more",
+    )
 
 
 def _shortened(text: str) -> str:

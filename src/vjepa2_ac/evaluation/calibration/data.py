@@ -32,12 +32,12 @@ from vjepa2_ac.evaluation.calibration.variants import (
     measure_variants,
 )
 from vjepa2_ac.evaluation.measure import ClipSample, Predictor
+from vjepa2_ac.intervals import ENOUGH_EPISODES
 from vjepa2_ac.spaces import POSE, euler_from_matrices, matrices_from_euler
 
 SHIFTS = (1, 2, 4, 8)  # control steps
 AS_THEY_ARE = "as they are"
 _CANDIDATES_PER_CLIP = 8  # windows checked per clip, since shifts need room on both sides
-_EPISODES_TO_BE_SURE = 5
 _GAIN = 0.01  # of persistence: smaller gains are irrelevant
 
 
@@ -54,7 +54,7 @@ class VariantProbe:
         certain = [
             one
             for one in self.results
-            if one.is_certainly_better(needed=_EPISODES_TO_BE_SURE)
+            if one.is_certainly_better(needed=ENOUGH_EPISODES)
             and one.gain > _GAIN
             and one.ratio.high < 1  # else it only fails less
         ]
@@ -67,8 +67,8 @@ class VariantProbe:
         if better is not None and (found := better.difference) is not None:
             less = f"{-found.value:.3f} [{-found.high:.3f}, {-found.low:.3f}]"
             return f"{text}, and {less} less with {better.name}: {better.repair}"
-        if plain.episodes < _EPISODES_TO_BE_SURE:
-            return f"{text}: too few episodes to compare, {_EPISODES_TO_BE_SURE} are needed"
+        if plain.episodes < ENOUGH_EPISODES:
+            return f"{text}: too few episodes to compare, {ENOUGH_EPISODES} are needed"
         if plain.ratio.value >= 1:
             return f"{text}: the model predicts none of this better than persistence, so the result is unknown"
         return f"{text}; no variant certainly fits better"

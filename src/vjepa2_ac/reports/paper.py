@@ -1,0 +1,67 @@
+"""The rows of an evaluation for a paper: all of them as CSV, those of a screen as tables of LaTeX."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, fields
+from itertools import groupby
+from pathlib import Path
+
+from vjepa2_ac.evaluation.result import Row, RowTable, sections
+from vjepa2_ac.storage import write_atomically
+
+_ESCAPED = str.maketrans(
+    {character: f"\\{character}" for character in "&%$#_{}"}
+    | {"~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}"}
+)
+
+
+def write_tables(rows: Sequence[Row], stem: Path) -> tuple[Path, Path]:
+    """Write the rows beside each other as STEM.csv and STEM.tex; atomically."""
+    table, paper = stem.with_suffix(".csv"), stem.with_suffix(".tex")
+    write_atomically(table, rows_as_csv(rows))
+    write_atomically(paper, rows_as_latex(rows))
+    return table, paper
+
+
+def rows_as_csv(rows: Sequence[Row]) -> str:
+    """Return every row with its fields as columns; what there is none of is nan."""
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, [one.name for one in fields(Row)], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(asdict(row) for row in rows)
+    return text.getvalue()
+
+
+def rows_as_latex(rows: Sequence[Row]) -> str:
+    """Return the rows that are for a screen: a `tabular` (booktabs) for the groups of the same columns."""
+    shown = sections([row for row in rows if not row.detail])
+    parts = [_tabular(columns, list(group)) for columns, group in groupby(shown, lambda one: one.columns)]
+    return "% needs \\usepackage{booktabs}; [low, high] is a 95 % interval over episodes\n" + "\n\n".join(parts) + "\n"
+
+
+def _tabular(columns: Sequence[str], tables: Sequence[RowTable]) -> str:
+    return "\n".join(
+        [
+            rf"\begin{{tabular}}{{l{'r' * (1 + len(columns))}}}",
+            r"\toprule",
+            _line("", "by nothing or chance", *columns),
+            *_body(tables, 2 + len(columns)),
+            r"\bottomrule",
+            r"\end{tabular}",
+        ]
+    )
+
+
+def _body(tables: Sequence[RowTable], width: int) -> Iterator[str]:
+    for table in tables:
+        yield r"\midrule"
+        yield rf"\multicolumn{{{width}}}{{l}}{{{table.title.translate(_ESCAPED)}}} \\"
+        for label, chance, cells in table.lines:
+            yield r"\quad " + _line(label, chance, *cells)
+
+
+def _line(*cells: str) -> str:
+    return " & ".join(cell.translate(_ESCAPED) for cell in cells) + r" \\"
