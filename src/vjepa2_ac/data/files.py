@@ -54,19 +54,12 @@ class EpisodeFiles:
         """Return the content of a file.
 
         Raises:
-            InputError: There is no such file; an UnreachableError if a local one cannot be read.
-            OSError: A file behind a URL cannot be read.
+            InputError: There is no such file; an UnreachableError if it cannot be read.
         """
-        try:
+        with storage.user_can_read(path, fix="Copy the episode again"):
             if storage.is_url(path):
                 return self._cached(f"{path}@{version}", lambda: storage.read_bytes(path))
             return storage.read_bytes(path)
-        except FileNotFoundError:
-            raise InputError(where=path, found="no such file", fix="Copy the episode again") from None
-        except OSError as error:
-            if storage.is_url(path):
-                raise
-            raise storage.unreadable(path, error) from None
 
     def arrays(self, key: str) -> dict[str, np.ndarray] | None:
         """Return the arrays that were kept under a key; None if there are none, or they are damaged."""

@@ -18,7 +18,7 @@ from vjepa2_ac.data.selection import StepSelection, as_error, as_problem
 from vjepa2_ac.episode import Episode, EpisodeSource, Progress, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.spaces import POSE
-from vjepa2_ac.storage.structured import json_object, shown
+from vjepa2_ac.storage.structured import read_json_object, shown
 
 logger = logging.getLogger(__name__)
 
@@ -82,10 +82,7 @@ def published_ranges(path: str, table: EpisodeTable) -> StepSelection:
     where = f"data.idle.ranges: {path}"
     needed = 'a JSON object {"identity of an episode": [[start, end], ...], ...}'
     another = "Name the list of this version of the data set, or set data.idle.rule: commands or motion"
-    try:
-        lists = json_object(storage.read_bounded(path, _MOST_BYTES), where=where, needed=needed)
-    except OSError as error:
-        raise InputError(where=where, found=f"cannot be read ({error})", needed=needed) from None
+    lists = read_json_object(path, most_bytes=_MOST_BYTES, needed=needed)
     names = [table.identity(place) for place in range(len(table))]
     listed = sum(name in lists for name in names)
     if not listed:

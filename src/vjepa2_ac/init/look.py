@@ -124,13 +124,11 @@ def look_at(path: str, form: str | None = None) -> FoundData:
     if not storage.is_url(path) and not Path(path).is_dir():
         fix = f"For a data set of the Hugging Face Hub: hf://datasets/{path}" if _HUB_NAME.fullmatch(path) else ""
         raise InputError(where=path, found="no such folder", needed="a folder, or a URL", fix=fix)
-    try:
+    with storage.user_can_read(path):
         if form is None and (found := _of_plugins(path)):
             return found
         form, root = (form, _root_of(path, form)) if form else _recognized(path)
         return LOOKS[form](root)
-    except OSError as error:
-        raise storage.unreadable(path, error) from None
 
 
 def _of_plugins(path: str) -> FoundData | None:

@@ -9,7 +9,7 @@ from typing import Any
 
 from vjepa2_ac import storage
 from vjepa2_ac.data.sources.rlds.shards import dataset_name, find_shards
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, MissingFileError
 from vjepa2_ac.init.found import FoundData, Knob, Knobs, idle_rule
 from vjepa2_ac.init.names import Column, find_pose, pick_camera, short_name
 from vjepa2_ac.storage.structured import read_json_object
@@ -119,12 +119,10 @@ def _features(path: str) -> Iterator[tuple[str, _Feature]]:
     where = storage.join(path, "features.json")
     try:
         content = read_json_object(where, needed="a description as TFDS writes it")
-    except FileNotFoundError:
+    except MissingFileError:
         fix = "Name the features in the config by hand: `vjepa2-ac config text builtin:bridge` is an example"
         needed = "the features, as TFDS writes them"
         raise InputError(where=where, found="no such file", needed=needed, fix=fix) from None
-    except OSError as error:
-        raise storage.unreadable(where, error) from None
     yield from _inside(content, "")
 
 

@@ -23,6 +23,7 @@ from vjepa2_ac.storage.files import (
     sync,
     try_writing_at,
     unreadable,
+    user_can_read,
     user_can_write,
     write_atomically,
 )

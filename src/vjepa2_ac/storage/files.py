@@ -26,7 +26,7 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from vjepa2_ac.errors import InputError, UnreachableError, UserError
+from vjepa2_ac.errors import InputError, MissingFileError, UnreachableError, UserError
 from vjepa2_ac.storage import remote
 from vjepa2_ac.storage.block_file import RangedFile, open_remote
 from vjepa2_ac.storage.places import is_url
@@ -125,8 +125,8 @@ def open_to_read(path: str | Path) -> ByteReader:
 def unreadable(where: str, error: OSError, *, needed: str = "", fix: str = "") -> UserError:
     """Return the error of a file that is missing, truncated, or refused by the operating system.
 
-    The last (no permission, too many open files, a disk that went away) is temporary and says nothing about the file's
-    content: it is an UnreachableError, which is never stored.
+    The first is a MissingFileError, the second an InputError. The last (no permission, too many open files, a disk that
+    went away) is temporary and says nothing about the file's content: an UnreachableError, which is never stored.
 
     Args:
         where: The file, and its episode.
@@ -134,10 +134,26 @@ def unreadable(where: str, error: OSError, *, needed: str = "", fix: str = "") -
         needed: What should be there.
         fix: How to fix it where the file is wrong.
     """
+    if isinstance(error, FileNotFoundError | NotADirectoryError):  # of a URL it has no number
+        absent = os.strerror(errno.ENOENT)
+        return MissingFileError(where=where, found=f"cannot be read: {absent}", needed=needed, fix=fix)
     found = f"cannot be read: {error.strerror or error}"
-    if isinstance(error, ShortReadError) or error.errno in _ABSENT:
+    if isinstance(error, ShortReadError | IsADirectoryError) or error.errno in _ABSENT:
         return InputError(where=where, found=found, needed=needed, fix=fix)
     return UnreachableError(where=where, found=found, needed=needed, fix="Check its permissions, and the disk")
+
+
+@contextmanager
+def user_can_read(path: str | Path, *, needed: str = "", fix: str = "") -> Iterator[None]:
+    """Raise an error for the user if a file cannot be read.
+
+    Raises:
+        UserError: Instead of any OSError; see `unreadable`.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise unreadable(str(path), error, needed=needed, fix=fix) from None
 
 
 def read_bytes(path: str | Path) -> bytes:

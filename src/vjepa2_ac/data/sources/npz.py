@@ -157,13 +157,11 @@ def opened_npz(opened: str | BlockCachedFile, path: str) -> Iterator[NpzFile]:
     Raises:
         InputError: It is missing, or no .npz file; an UnreachableError if it cannot be read.
     """
-    try:
-        with closing(storage.open_to_read(opened) if isinstance(opened, str) else opened) as file:
-            yield NpzFile(file, path)
-    except FileNotFoundError:
-        raise InputError(where=path, found="no such file", fix="Put it back, or leave the episode out") from None
-    except OSError as error:
-        raise storage.unreadable(path, error) from None
+    with (
+        storage.user_can_read(path, fix="Put it back, or leave the episode out"),
+        closing(storage.open_to_read(opened) if isinstance(opened, str) else opened) as file,
+    ):
+        yield NpzFile(file, path)
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from vjepa2_ac.data.index import EpisodeTable, cache_folder, get_or_build, index
 from vjepa2_ac.data.sources.indexed_source import FramesByStep, IndexedSource
 from vjepa2_ac.data.sources.rlds.episode import STEP_FLAG, Record, episode_of, step_features
 from vjepa2_ac.data.sources.rlds.index import build_index, position_of
-from vjepa2_ac.data.sources.rlds.shards import Shard, find_shards, naming, open_shard
+from vjepa2_ac.data.sources.rlds.shards import NEEDED, Shard, find_shards, open_shard
 from vjepa2_ac.data.sources.rlds.tfrecord import (
     NotAnExampleError,
     Place,
@@ -176,7 +176,7 @@ class RemoteEpisode:
         located = self._located()
         places = [located[name] for name in names if name in located]
         key = f"{self._key} {' '.join(names)}"
-        with naming(self._shard):
+        with storage.user_can_read(self._shard.path, needed=NEEDED):
             data = self._contents.read(key)
             if data is None:
                 data = b"".join(storage.read_ranges(self._shard.path, places))
@@ -200,7 +200,7 @@ class RemoteEpisode:
         key = f"{self._key} {name}"
 
         def decode(steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
-            with naming(self._shard):
+            with storage.user_can_read(self._shard.path, needed=NEEDED):
                 stored = self._places.read(key)
                 if stored is None:
                     images = self._fetch_all(key, feature, num_steps, needed, where)
