@@ -110,7 +110,7 @@ def joined(
     return groups[:, -1]  # the only one at stride 1
 
 
-def collate(clips: Sequence[Clip], bytes_fetched: int = 0) -> Batch:
+def collate(clips: Sequence[Clip]) -> Batch:
     """Stack clips into a batch; it has camera poses if each of the clips has.
 
     Raises:
@@ -129,7 +129,6 @@ def collate(clips: Sequence[Clip], bytes_fetched: int = 0) -> Batch:
         episode_ids=tuple(clip.episode_id for clip in clips),
         starts=tuple(clip.start for clip in clips),
         augmentations=tuple(clip.augmentation for clip in clips if clip.augmentation is not None),
-        bytes_fetched=bytes_fetched,
         latents=joined_latents(latents, torch.stack) if latents else None,
         cameras=tuple(clip.camera for clip in clips),
     )
@@ -150,7 +149,7 @@ def joined_latents(latents: Sequence[StoredLatents], join: Callable[[list[Tensor
     return StoredLatents(join([one.values for one in latents]), join(scales) if scales else None)
 
 
-def no_clips(frames: int, widths: Widths, bytes_fetched: int) -> Batch:
+def no_clips(frames: int, widths: Widths) -> Batch:
     """Return an empty micro-batch, of which no clip could be read."""
     return Batch(
         frames=torch.zeros(0, frames, 1, 1, 3, dtype=torch.uint8),
@@ -159,7 +158,6 @@ def no_clips(frames: int, widths: Widths, bytes_fetched: int) -> Batch:
         extrinsics=None,
         episode_ids=(),
         starts=(),
-        bytes_fetched=bytes_fetched,
     )
 
 

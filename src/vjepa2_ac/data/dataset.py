@@ -6,7 +6,7 @@ import logging
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Int, UInt64
@@ -49,29 +49,12 @@ class Removed:
         return f"{self.episodes:,} episodes, {self.steps:,} steps{clips}"
 
 
-@runtime_checkable
-class EncodedSource(EpisodeSource, Protocol):
-    """A source of encoded episodes: its steps were selected when they were encoded."""
-
-    def kept_ranges(self) -> StepSelection:
-        """Return the ranges that `data.idle` keeps."""
-        ...
-
-    def settle(self, episodes: Int[np.ndarray, " episodes"]) -> DataConfig:
-        """Return the config with the cameras that there are.
-
-        Raises:
-            InputError: One of these episodes, that clips come from, was not encoded.
-        """
-        ...
-
-
 @dataclass(frozen=True, eq=False)
 class Dataset:
     """An open data set: its episodes, and the steps that the config selects. Can be pickled to a loader worker."""
 
     config: DataConfig
-    source: EpisodeSource
+    source: EpisodeSource  # of a cache: a LatentSource
     table: EpisodeTable
     kept: StepSelection
     broken: BrokenEpisodes  # grows in the process that opened the set
@@ -224,7 +207,7 @@ def open_dataset(config: DataConfig, *, progress: Progress | None = None) -> Dat
         InputError: There is no such data set; an episode is broken and `data.broken_episodes` does not skip it, or too
             many are; two episodes have one identity; a filter or `data.split_by` cannot be applied; or nothing remains.
     """
-    source = open_source(config)
+    source: Any = open_source(config)
     table = EpisodeTable.of(source.infos(progress))
     broken = BrokenEpisodes(config, len(table) + len(table.problems))
     chosen = included(table, config)
@@ -233,8 +216,7 @@ def open_dataset(config: DataConfig, *, progress: Progress | None = None) -> Dat
     chosen &= of_outcome(table, config)
     kept = StepSelection.whole(table, chosen)
     if config.idle.rule != "none":
-        found = None if not isinstance(source, EncodedSource) else source.kept_ranges()
-        found = found or find_ranges(source, table, config, progress)
+        found = source.kept_ranges() if config.is_cache else find_ranges(source, table, config, progress)
         broken.found([problem for place, problem in found.problems if chosen[place]])
         kept = found.only(chosen)
     dataset = Dataset(config, source, table, kept, broken)
@@ -258,9 +240,8 @@ def through_latents(dataset: Dataset, folder: Path) -> Dataset:
 
 def _settled(dataset: Dataset) -> Dataset:
     """Check that a latent cache has what the clips need, and set its cameras in the config."""
-    if not isinstance(dataset.source, EncodedSource):
-        return dataset
-    return replace(dataset, config=dataset.source.settle(dataset.starts.episode))
+    source: Any = dataset.source
+    return replace(dataset, config=source.settle(dataset.starts.episode)) if dataset.config.is_cache else dataset
 
 
 def _nothing_left(dataset: Dataset) -> InputError:

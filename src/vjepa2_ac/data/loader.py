@@ -159,19 +159,7 @@ def _chosen_clip(dataset: Dataset, windows: Sequence[tuple[int, int]], position:
 
 
 @dataclass(frozen=True)
-class MicroBatch:
-    """A worker's result for one micro-batch."""
-
-    batch: Batch
-    skipped: tuple[Skipped, ...] = ()
-
-    def pin_memory(self) -> MicroBatch:
-        """Return it in pinned memory; DataLoader calls a method of this name to pin."""
-        return replace(self, batch=self.batch.pin_memory())
-
-
-@dataclass(frozen=True)
-class _Clips(TorchDataset[MicroBatch]):
+class _Clips(TorchDataset[Batch]):
     """Clips by position, read a micro-batch at a time."""
 
     dataset: Dataset
@@ -179,17 +167,15 @@ class _Clips(TorchDataset[MicroBatch]):
     replayed: _Clips | None = None  # of the second data set
     share: Fraction = Fraction(0)  # of these
 
-    def __getitems__(self, positions: list[int]) -> MicroBatch | UserError:
+    def __getitems__(self, positions: list[int]) -> Batch | UserError:
         """Return a micro-batch, or its error: DataLoader would change an error that is raised."""
         before = storage.bytes_fetched()
         try:
             read = self._read(positions)
             clips = [one for one in read if isinstance(one, Clip)]
             skipped = tuple(one for one in read if isinstance(one, Skipped))
-            fetched = storage.bytes_fetched() - before
-            if not clips:
-                return MicroBatch(no_clips(self.dataset.config.frames, self.dataset.widths, fetched), skipped)
-            return MicroBatch(collate(clips, fetched), skipped)
+            batch = collate(clips) if clips else no_clips(self.dataset.config.frames, self.dataset.widths)
+            return replace(batch, bytes_fetched=storage.bytes_fetched() - before, skipped=skipped)
         except UserError as error:
             return error
 
@@ -232,14 +218,14 @@ class Batches(Iterator[Batch]):
 
     def __init__(
         self,
-        rows: Generator[MicroBatch | UserError, None, None],
+        rows: Generator[Batch | UserError, None, None],
         broken: BrokenEpisodes,
         copies: ToDevice | None = None,
         replayed: BrokenEpisodes | None = None,
     ) -> None:
         self._rows, self._broken, self._copies = rows, broken, copies
         self._replayed = broken if replayed is None else replayed
-        self._prefetched: Exception | MicroBatch | None = None
+        self._prefetched: Exception | Batch | None = None
 
     def __next__(self) -> Batch:
         """Return the next batch.
@@ -253,7 +239,7 @@ class Batches(Iterator[Batch]):
             raise fetched
         for one in fetched.skipped:
             (self._replayed if one.replayed else self._broken).met(one.episode_id, one.reason)
-        return fetched.batch
+        return fetched
 
     def prefetch_next(self) -> None:
         """Fetch the next batch and start its copy to the device."""
@@ -265,16 +251,16 @@ class Batches(Iterator[Batch]):
         self._prefetched = None
         self._rows.close()
 
-    def _fetched(self) -> Exception | MicroBatch:
+    def _fetched(self) -> Exception | Batch:
         try:
             row = next(self._rows)
             if isinstance(row, UserError) or self._copies is None:
                 return row
-            held = [self._copies.start(row.batch.mapped)]
+            held = [self._copies.start(row.mapped)]
         except Exception as error:  # also the end of the rows
             return error
         take_once = lambda: held.pop()() if held else None  # noqa: E731 - so that the copy is freed after use
-        return replace(row, batch=replace(row.batch, on_device=take_once))
+        return replace(row, on_device=take_once)
 
 
 def prefetch_next(batches: Iterator[Batch]) -> None:
@@ -285,7 +271,7 @@ def prefetch_next(batches: Iterator[Batch]) -> None:
 
 def _micro_batches(
     clips: _Clips, positions: Iterator[list[int]], workers: int, *, pinned: bool = False
-) -> Generator[MicroBatch | UserError, None, None]:
+) -> Generator[Batch | UserError, None, None]:
     # A fork server has no threads: a plain fork may hang in OpenMP or CUDA, and Python warns of it.
     context = multiprocessing.get_context("forkserver") if workers else None
     if context is not None:
