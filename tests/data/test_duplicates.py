@@ -15,8 +15,8 @@ from latent_sets import write_cache
 from memory_source import MemorySource
 from synthetic import synthetic_states
 from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.coverage import Duplicates, find_duplicates
 from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.data.duplicates import Duplicates, find_duplicates
 from vjepa2_ac.data.index import UNKNOWN, hash_of_states
 from vjepa2_ac.data.inspection.check import check_data
 from vjepa2_ac.data.inspection.statistics import inspect_dataset

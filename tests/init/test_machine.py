@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from vjepa2_ac.init.machine import this_machine
+from vjepa2_ac.init.draft import this_machine
 
 
 @pytest.mark.parametrize(

@@ -92,7 +92,7 @@ def _init(options: argparse.Namespace) -> int:
     with user_can_write(f"--out {out}"):
         try_writing_at(out.parent)
 
-    from vjepa2_ac.init.look import look_at, simulated
+    from vjepa2_ac.init.look import look_at, measured, simulated
     from vjepa2_ac.model.base_model import find_base, find_encoder_path
 
     if options.model is not None:
@@ -100,10 +100,8 @@ def _init(options: argparse.Namespace) -> int:
     is_missing = path == _SIMULATED and not Path(path).exists()
     found = simulated(path) if is_missing else look_at(path, _LOOKED_AT_AS.get(form or "", form))
 
-    from vjepa2_ac.init.draft import TINY, choose_model, make_draft
+    from vjepa2_ac.init.draft import TINY, choose_model, make_draft, this_machine
     from vjepa2_ac.init.found import guesses
-    from vjepa2_ac.init.look import measured
-    from vjepa2_ac.init.machine import this_machine
     from vjepa2_ac.reporter import INDEXING
 
     with cli.reporter() as reporter:

@@ -126,12 +126,12 @@ def list_folder(root: str, folder: str) -> tuple[list[FileInfo], list[str]]:
         InputError: A name is not UTF-8.
     """
     place = storage.join(root, folder) if folder else root
-    files, names = storage.list_files(place), storage.list_names(place)
-    for name in names:  # the identity of an episode must be text that can be encoded
-        if not name.isascii() and any("\ud800" <= letter <= "\udfff" for letter in name):
-            raise InputError(where=place, found=f"the name {name!r}", needed="names in UTF-8", fix="Rename it")
-    known = {file.name for file in files}
-    return files, [name for name in names if name not in known and not name.startswith(".")]
+    listed = storage.list_folder(place)
+    for one in listed:  # the identity of an episode must be text that can be encoded
+        if not one.name.isascii() and any("\ud800" <= letter <= "\udfff" for letter in one.name):
+            raise InputError(where=place, found=f"the name {one.name!r}", needed="names in UTF-8", fix="Rename it")
+    folders = [one.name for one in listed if not one.is_file and not one.name.startswith(".")]
+    return [one for one in listed if one.is_file], folders
 
 
 def within(folder: str, name: str) -> str:

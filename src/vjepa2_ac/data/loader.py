@@ -54,8 +54,8 @@ class Mixed:
     """A data set, and a second one that a share of the training clips comes from."""
 
     dataset: Dataset
-    replayed: Dataset
-    share: float
+    replayed: Dataset | None = None
+    share: float = 0.0
 
 
 def training_loader(
@@ -82,13 +82,11 @@ def training_loader(
     Raises:
         InputError: There is nothing to train on, or a clip cannot be read, also in a worker.
     """
-    replayed = None
-    if isinstance(dataset, Mixed):
-        replayed, of_clips = dataset.replayed, Fraction(str(dataset.share))
-        dataset = dataset.dataset
-        clips = replace(_training_clips(dataset, seed), replayed=_training_clips(replayed, seed), share=of_clips)
-    else:
-        clips = _training_clips(dataset, seed)
+    both = dataset if isinstance(dataset, Mixed) else Mixed(dataset)
+    dataset, replayed = both.dataset, both.replayed
+    clips = _training_clips(dataset, seed)
+    if replayed is not None:
+        clips = replace(clips, replayed=_training_clips(replayed, seed), share=Fraction(str(both.share)))
     firsts = itertools.count(start_position + share.rank * batch_size, batch_size * share.processes)
     rows = (list(range(first, first + batch_size)) for first in firsts)
     micro_batches = _micro_batches(clips, rows, dataset.config.workers, pinned=copies is not None)

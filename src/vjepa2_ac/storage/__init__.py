@@ -12,6 +12,7 @@ from vjepa2_ac.storage.files import (
     is_empty,
     join,
     list_files,
+    list_folder,
     list_names,
     open_to_read,
     read_bounded,

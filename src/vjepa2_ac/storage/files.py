@@ -91,24 +91,30 @@ def file_version(path: str | Path) -> str:
     return remote.file_version(str(path)) if is_url(path) else str(Path(path).stat().st_mtime_ns)
 
 
-def list_files(folder: str | Path) -> list[FileInfo]:
-    """Return the files of a folder, sorted by name; none where there is no such folder.
+def list_folder(folder: str | Path) -> list[FileInfo]:
+    """Return the files and folders in a folder, sorted by name; none where there is no such folder.
 
     Raises:
         OSError: The folder cannot be listed.
     """
     if is_url(folder):
-        return [file for file in remote.list_folder(str(folder)) if file.is_file]
-    files = [path for path in Path(folder).iterdir() if path.is_file()] if Path(folder).is_dir() else []
-    found = {path.name: path.stat() for path in files}
-    return [FileInfo(name, one.st_size, str(one.st_mtime_ns)) for name, one in sorted(found.items())]
+        return remote.list_folder(str(folder))
+    paths = sorted(Path(folder).iterdir()) if Path(folder).is_dir() else []
+    stats = {path.name: path.stat() if path.is_file() else None for path in paths}
+    return [
+        FileInfo(name, one.st_size, str(one.st_mtime_ns)) if one else FileInfo(name, 0, "", is_file=False)
+        for name, one in stats.items()
+    ]
+
+
+def list_files(folder: str | Path) -> list[FileInfo]:
+    """Return the files of `list_folder`."""
+    return [file for file in list_folder(folder) if file.is_file]
 
 
 def list_names(folder: str | Path) -> list[str]:
-    """Return the names of the files and folders in a folder, sorted; none where there is no such folder."""
-    if is_url(folder):
-        return [entry.name for entry in remote.list_folder(str(folder))]
-    return sorted(entry.name for entry in Path(folder).iterdir()) if Path(folder).is_dir() else []
+    """Return the names of `list_folder`."""
+    return [entry.name for entry in list_folder(folder)]
 
 
 def open_to_read(path: str | Path) -> ByteReader:

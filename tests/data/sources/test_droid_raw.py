@@ -153,12 +153,6 @@ def test_an_episode_is_parsed_and_its_video_walked_once_on_a_machine(
     assert len(walked) < STEPS
 
 
-def test_a_source_travels_to_a_worker(tree: Path) -> None:
-    raw, here = pickle.loads(pickle.dumps(source(tree))), source(tree)  # noqa: S301 - our own
-    reader = pickle.loads(pickle.dumps(raw.read(1).read_frames))  # noqa: S301
-    np.testing.assert_array_equal(reader([3]), here.read(1).read_frames([3]))
-
-
 def h5(change: Callable[[h5py.File], object]) -> Callable[[Path], object]:
     def apply(folder: Path) -> None:
         with h5py.File(folder / "trajectory.h5", "r+") as file:

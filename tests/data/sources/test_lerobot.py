@@ -193,12 +193,6 @@ def test_the_rate_is_the_configs_where_it_names_one(v30: Path) -> None:
     assert numbers_of(source.read(1).read_frames([9])[0]) == (1, 9, 0), "frames stay where info.json says"
 
 
-def test_the_index_is_kept_until_a_file_changes(copy: Path) -> None:
-    assert len(source_of(copy).infos()) == 5
-    spoiled(with_value(3, np.nan))(copy)
-    assert [problem.name for problem in source_of(copy).infos().problems] == ["episode_000000"]
-
-
 # --- conventions -------------------------------------------------------------------------------------------------
 
 

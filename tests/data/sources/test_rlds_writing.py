@@ -74,16 +74,6 @@ def test_what_was_given_is_written_and_flags_and_reward_follow_from_length_and_p
             assert values[f"steps/observation/{camera}"] == episode.images[camera]
 
 
-def test_a_writer_that_fails_leaves_nothing(tmp_path: Path) -> None:
-    def episodes() -> Iterator[DroidEpisode]:
-        yield synthetic_episode(0, steps=2, size=(16, 32))
-        raise RuntimeError("the simulator broke")
-
-    with pytest.raises(RuntimeError, match="broke"):
-        write_droid_rlds(tmp_path / "set", episodes(), shards=1)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_full_disk_is_the_users_error_and_an_episodes_own_error_is_not(tmp_path: Path) -> None:
     def episodes(number: int) -> Iterator[DroidEpisode]:
         yield synthetic_episode(0, steps=2, size=(16, 32))

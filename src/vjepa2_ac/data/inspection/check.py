@@ -13,9 +13,8 @@ from scipy.spatial.transform import Rotation
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.coverage import coverage_in
+from vjepa2_ac.data.coverage import coverage_in, find_duplicates
 from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.data.duplicates import find_duplicates
 from vjepa2_ac.data.inspection.excerpts import Finding, Level, excerpt_findings
 from vjepa2_ac.data.inspection.statistics import PERCENTILES, at_some_stride
 from vjepa2_ac.data.loader import training_loader

@@ -99,6 +99,7 @@ class NpzSource(IndexedSource[DataConfig, None]):
             fps_hz = float(arrays.numbers("fps_hz", ()))
             if fps_hz <= 0:
                 raise arrays.refused("fps_hz", f"{fps_hz:g}", "control steps per second")
+            joints = "joint_velocities"
             language = arrays.text("language") if "language" in names else None
             episode = Episode(
                 info=EpisodeInfo(identity, steps, bool(arrays.numbers("success", ())) if "success" in names else None),
@@ -106,7 +107,7 @@ class NpzSource(IndexedSource[DataConfig, None]):
                 read_frames=FramesByStep(steps, path, partial(self._frames, path, version, cameras[0], steps)),
                 control_rate_hz=fps_hz,
                 extrinsics=extrinsics[0],
-                joint_velocities=arrays.optional("joint_velocities", (steps, None)),
+                joint_velocities=arrays.numbers(joints, (steps, None)) if joints in names else None,
                 metadata={} if language is None else {"language": language},
                 commands=arrays.numbers("actions", (steps, None)) if config.actions == "recorded" else None,
             )
@@ -185,10 +186,6 @@ class _Arrays:
             step = np.argwhere(~np.isfinite(values))[0][:1].tolist()
             raise self.refused(name, f"NaN or infinity{f' at step {step[0]}' if step else ''}", "numbers")
         return values
-
-    def optional(self, name: str, shape: tuple[int | None, ...]) -> Float64[np.ndarray, ...] | None:
-        """Return numbers, or None if there are none of this name."""
-        return self.numbers(name, shape) if name in self.file.names else None
 
     def is_text(self, name: str) -> bool:
         """Return whether there is an array of this name with one text; a camera may have that name, too."""

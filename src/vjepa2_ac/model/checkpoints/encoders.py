@@ -34,8 +34,8 @@ from vjepa2_ac.model.checkpoints.meta_file import ENCODER_KEYS, FIX, MetaFile, R
 from vjepa2_ac.model.checkpoints.published import published_as
 from vjepa2_ac.model.network.blocks import mlp_ratio_of
 from vjepa2_ac.model.network.pretrained_folder import ENCODER, open_safetensors, read_encoder_origin
-from vjepa2_ac.storage.hub import from_hub
 from vjepa2_ac.storage.structured import read_json_object, record_of
+from vjepa2_ac.storage.transfer import from_hub
 
 logger = logging.getLogger(__name__)
 

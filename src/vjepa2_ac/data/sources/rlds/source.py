@@ -25,17 +25,9 @@ from vjepa2_ac.config.section import Affects, knobs_that_affect
 from vjepa2_ac.data.files import fetched_data
 from vjepa2_ac.data.index import EpisodeTable, cache_folder, get_or_build, index_key
 from vjepa2_ac.data.sources.indexed_source import FramesByStep, IndexedSource
-from vjepa2_ac.data.sources.rlds.episode import STEP_FLAG, Record, episode_of, step_features
-from vjepa2_ac.data.sources.rlds.index import build_index, position_of
+from vjepa2_ac.data.sources.rlds.episode import STEP_FLAG, Record, build_index, episode_of, position_of, step_features
 from vjepa2_ac.data.sources.rlds.shards import NEEDED, Shard, find_shards, open_shard
-from vjepa2_ac.data.sources.rlds.tfrecord import (
-    NotAnExampleError,
-    Place,
-    Read,
-    RecordSpan,
-    item_places,
-    require_intact,
-)
+from vjepa2_ac.data.sources.rlds.tfrecord import NotAnExampleError, Place, Read, RecordSpan, item_places, require_intact
 from vjepa2_ac.episode import Episode, Progress, StepRanges
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import decode_jpegs
