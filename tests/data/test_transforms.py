@@ -159,12 +159,6 @@ def test_factors_fill_their_range_and_are_one_where_it_is_empty() -> None:
     assert {one.box for one in drawn if one is not None} == {(0, 0, 18, 24)}
 
 
-def test_an_identity_changes_no_bit() -> None:
-    frames = clip()
-    whole = Augmentation((0, 0, 18, 24))
-    assert torch.equal(pixels_to_input(frames, 16, [whole, whole]), pixels_to_input(frames, 16))
-
-
 def test_a_box_gives_what_the_sliced_pixels_give_and_leaves_the_other_clip_alone() -> None:
     frames = clip()
     found = pixels_to_input(frames, 16, [Augmentation((2, 4, 12, 16)), Augmentation((0, 0, 18, 24))])

@@ -46,7 +46,8 @@ def of(found: FoundData = FOUND, machine: Machine = MACHINE, kind: str = "releas
 def test_the_batch_is_the_largest_that_fits(gigabytes: int, batch: int, checkpointing: bool, fits: bool) -> None:
     made = of(machine=replace(MACHINE, gpu_bytes=gigabytes * GB))
     training = made.config.training
-    assert (training.batch_size, training.gradient_checkpointing, made.fits) == (batch, checkpointing, fits)
+    assert (training.batch_size, training.gradient_checkpointing) == (batch, checkpointing)
+    assert ("fits on" in made.costs[0]) == fits
     assert training.batch_size * training.accumulation == 32
 
 

@@ -41,13 +41,11 @@ def add_init(commands: cli.Commands) -> None:
         " fresh predictor on V-JEPA 2.1's ViT-B, without Meta's action-conditioned model"
     )
     cli.add(parser, "form FORM", text, cli.as_place, nargs="?")
-    cli.add(
-        parser, "path PATH", "the data: a folder, or a URL (droid, lerobot, raw: DROID's own)", cli.as_place, nargs="?"
-    )
+    place = "the data: a folder, or a URL (droid, lerobot, raw: DROID's own)"
+    cli.add(parser, "path PATH", place, cli.as_place, nargs="?")
     cli.add(parser, "--out FILE", "the config (NAME.yaml, by the data's folder)", cli.as_path)
-    cli.add(
-        parser, "--model MODEL", "instead of the released: what model.base takes; scratch: an encoder", cli.as_model
-    )
+    model = "instead of the released: what model.base takes; scratch: an encoder"
+    cli.add(parser, "--model MODEL", model, cli.as_model)
     cli.add(parser, "--overwrite", "write over a config that is there", action="store_true")
 
 

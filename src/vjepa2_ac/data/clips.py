@@ -117,8 +117,12 @@ def collate(clips: Sequence[Clip]) -> Batch:
         InputError: The frames of two clips differ in size.
     """
     frames = [clip.frames for clip in clips if clip.frames is not None]
-    if len({one.shape for one in frames}) > 1:
-        raise _two_sizes(clips)
+    sizes = [("x".join(map(str, one.shape[1:3])), clip.episode_id) for one, clip in zip(frames, clips, strict=False)]
+    if other := next((pair for pair in sizes if pair[0] != sizes[0][0]), None):
+        (size, first), (another, name) = sizes[0], other
+        found = f"frames of {another} after the crop; those of episode {first} are {size}"
+        fix = "Train on episodes of one size, or set training.batch_size: 1"
+        raise with_way_out(InputError(where=f"episode {name}", found=found, fix=fix), [name], skippable=False)
     latents = [clip.latents for clip in clips if clip.latents is not None]
     extrinsics = [clip.extrinsics for clip in clips if clip.extrinsics is not None]
     return Batch(
@@ -132,15 +136,6 @@ def collate(clips: Sequence[Clip]) -> Batch:
         latents=joined_latents(latents, torch.stack) if latents else None,
         cameras=tuple(clip.camera for clip in clips),
     )
-
-
-def _two_sizes(clips: Sequence[Clip]) -> InputError:
-    sizes = [("x".join(map(str, one.frames.shape[1:3])), one.episode_id) for one in clips if one.frames is not None]
-    size, first = sizes[0]
-    other, name = next(pair for pair in sizes if pair[0] != size)
-    found = f"frames of {other} after the crop; those of episode {first} are {size}"
-    fix = "Train on episodes of one size, or set training.batch_size: 1"
-    return with_way_out(InputError(where=f"episode {name}", found=found, fix=fix), [name], skippable=False)
 
 
 def joined_latents(latents: Sequence[StoredLatents], join: Callable[[list[Tensor]], Tensor]) -> StoredLatents:

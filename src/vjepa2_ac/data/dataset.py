@@ -93,10 +93,8 @@ class Dataset:
         groups = None if config.split_by is None else len(np.unique(self.split_hash[taking_part]))
         together = "" if groups is None else f" in {groups} groups (data.split_by)"
         shares = f"validation_share {config.validation_share:g}, test_share {config.test_share:g}"
-        share = {"train": 1.0, "validation": config.validation_share, "test": config.test_share}[split]
-        always = f"above 0, three {'episodes' if groups is None else 'groups'} or more always have one"
-        always += ", unless it is broken or in data.exclude" if share else ""
-        fix = f"Raise data.{split}_share: {always}"
+        three = f"three {'episodes' if groups is None else 'groups'} or more"
+        fix = f"Raise data.{split}_share: above 0, {three} always have one, unless it is broken or in data.exclude"
         if split == "train":
             fix = "Lower data.validation_share or data.test_share"
         found = f"no {split} episodes among {taking_part.sum()}{together} ({shares})"
@@ -222,7 +220,11 @@ def open_dataset(config: DataConfig, *, progress: Progress | None = None) -> Dat
     dataset = Dataset(config, source, table, kept, broken)
     dataset = replace(dataset, groups=groups_of(table, dataset.taking_part, config))
     if not len(dataset.episodes):
-        raise _nothing_left(dataset)
+        filters = ", ".join(f"{one.name} {one.episodes}" for one in dataset.removed if one.episodes)
+        left_out = f" (left out: {filters})" if filters else ""
+        gone = f"none of {len(table) + len(table.problems)} episodes is left{left_out}"
+        fix = "Look at data.exclude, data.outcome and data.idle" if filters else ""
+        raise InputError(where=f"data.path: {config.path}", found=gone, fix=fix)
     logger.info("%s: %d episodes take part, %d steps of them", config.path, dataset.taking_part.sum(), kept.steps)
     return _settled(dataset)
 
@@ -242,14 +244,6 @@ def _settled(dataset: Dataset) -> Dataset:
     """Check that a latent cache has what the clips need, and set its cameras in the config."""
     source: Any = dataset.source
     return replace(dataset, config=source.settle(dataset.starts.episode)) if dataset.config.is_cache else dataset
-
-
-def _nothing_left(dataset: Dataset) -> InputError:
-    filters = ", ".join(f"{one.name} {one.episodes}" for one in dataset.removed if one.episodes)
-    found = f"none of {len(dataset.table) + len(dataset.table.problems)} episodes is left"
-    found += f" (left out: {filters})" if filters else ""
-    fix = "Look at data.exclude, data.outcome and data.idle" if filters else ""
-    return InputError(where=f"data.path: {dataset.config.path}", found=found, fix=fix)
 
 
 def widths_of(episode: Episode) -> Widths:

@@ -41,18 +41,12 @@ def find_ranges(
     make = partial(_computed, source, table, config, progress or no_progress)
     if config.idle.rule == "published":
         path = str(config.idle.ranges)
-        make, parts["list"] = partial(published_ranges, path, table), _version(path)
+        make = partial(published_ranges, path, table)
+        with storage.user_can_read(path):
+            parts["list"] = [storage.absolute(path), storage.file_size(path), storage.file_version(path)]
     return get_or_make(
         config.disk_cache, key_of(parts), make, to_bytes=StepSelection.to_bytes, from_bytes=StepSelection.from_bytes
     )
-
-
-def _version(path: str) -> list[object]:
-    """Return the version of a list, without reading it if possible."""
-    try:
-        return [storage.absolute(path), storage.file_size(path), storage.file_version(path)]
-    except OSError:
-        return [path]
 
 
 def _computed(source: EpisodeSource, table: EpisodeTable, config: DataConfig, progress: Progress) -> StepSelection:

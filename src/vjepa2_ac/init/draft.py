@@ -65,8 +65,7 @@ class Machine:
     @property
     def about(self) -> str:
         """It in a line."""
-        size = f"{self.gpu_bytes / GIGABYTE:.1f} GB"
-        gpu = f"{self.gpu}, {size}" if self.gpu else "no GPU"
+        gpu = f"{self.gpu}, {self.room}" if self.gpu else "no GPU"
         return f"{gpu}; {self.cores} cores; {self.free_bytes / GIGABYTE:.0f} GB of disk free"
 
 
@@ -146,7 +145,6 @@ class Draft:
     knobs: Knobs
     config: Config
     costs: list[str]  # a line each
-    fits: bool = True
     step_hours: float | None = None  # None: there is no GPU, or the model is the tiny one
     encoding_hours: float = 0.0  # before the first step
 
@@ -208,13 +206,13 @@ def make_draft(found: FoundData, machine: Machine, model: ModelChoice, *, run_di
     costs = [f"Memory, as `vjepa2-ac doctor` counts: {size}.", *costs]
     if machine.flops is None:
         unknown = "not known without the GPU; run `vjepa2-ac init` on the machine that has it: batch and precision are"
-        return Draft(knobs, config, [*costs, *[f"Time: {unknown} then its own."] * (machine.gpu is None)], fits)
+        return Draft(knobs, config, [*costs, *[f"Time: {unknown} then its own."] * (machine.gpu is None)])
     sizes = base_sizes(config.model)
     clip, an_hour = clip_flops(config, sizes), machine.flops * _UTILIZATION * 3600
     encoding = steps * frame_flops(sizes) / an_hour
     of_clip = (clip.predictor if config.data.takes_latents else clip.total) / an_hour
     step = of_clip * config.training.batch_size * config.training.accumulation
-    draft = Draft(knobs, config, costs, fits, step, encoding)
+    draft = Draft(knobs, config, costs, step, encoding)
     speed = f"{machine.flops / 1e12:.0f} TFLOP/s measured here for one product"
     time = draft.time_of(config.training.steps)
     costs.append(f"Time: {time}, if a step reaches {_UTILIZATION:.0%} (assumed) of {speed}.")

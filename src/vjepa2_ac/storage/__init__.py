@@ -18,7 +18,6 @@ from vjepa2_ac.storage.files import (
     read_bounded,
     read_bytes,
     read_range,
-    read_ranges,
     require_new_folder,
     sha256_of_file,
     sync,
@@ -29,5 +28,5 @@ from vjepa2_ac.storage.files import (
     write_atomically,
 )
 from vjepa2_ac.storage.places import is_url
-from vjepa2_ac.storage.remote import FileInfo, ShortReadError, bytes_fetched
+from vjepa2_ac.storage.remote import FileInfo, ShortReadError, bytes_fetched, read_ranges
 from vjepa2_ac.storage.transfer import download, file_sizes, remove, remove_folder, try_writing, upload

@@ -21,8 +21,8 @@ import shutil
 import stat
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -30,9 +30,8 @@ from vjepa2_ac.errors import InputError, MissingFileError, UnreachableError, Use
 from vjepa2_ac.storage import remote
 from vjepa2_ac.storage.block_file import RangedFile, open_remote
 from vjepa2_ac.storage.places import is_url
-from vjepa2_ac.storage.remote import FileInfo, ShortReadError, complete
+from vjepa2_ac.storage.remote import FileInfo, ShortReadError
 
-_HASH_CHUNK_BYTES = 1 << 20
 _ABSENT = frozenset({errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG})
 _FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 _UNWRITABLE = _FULL | _ABSENT | {errno.EACCES, errno.EPERM, errno.EROFS, errno.EEXIST, errno.EINVAL}
@@ -202,39 +201,14 @@ def read_range(path: str | Path, start: int, length: int) -> bytes:
         return file.read(length)
 
 
-def read_ranges(path: str | Path, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
-    """Return several (start, length) pieces of a file, each complete; those of a URL are fetched concurrently.
-
-    Raises:
-        OSError: There is no such file, it cannot be read, or it ends within a piece.
-    """
-    if is_url(path):
-        return remote.read_ranges(str(path), ranges)
-    pieces = []
-    with Path(path).open("rb") as file:
-        for start, length in ranges:
-            file.seek(start)
-            pieces.append(file.read(length))
-    return complete(path, ranges, pieces)
-
-
-def sha256_of_file(path: str | Path, *, progress: Callable[[int], None] = lambda _: None) -> str:
-    """Return the SHA-256 of a file as hexadecimal digits, read in chunks.
-
-    Args:
-        path: The file.
-        progress: Called after every chunk with the bytes read so far.
+def sha256_of_file(path: Path) -> str:
+    """Return the SHA-256 of a local file as hexadecimal digits.
 
     Raises:
         OSError: There is no such file, or it cannot be read.
     """
-    digest, done = hashlib.sha256(), 0
-    with closing(open_to_read(path)) as file:
-        while chunk := file.read(_HASH_CHUNK_BYTES):
-            digest.update(chunk)
-            done += len(chunk)
-            progress(done)
-    return digest.hexdigest()
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 # ---- write, on this machine ----

@@ -151,18 +151,10 @@ def read_ranges(url: str, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
         OSError: There is no such file, or it ends within a piece.
         UnreachableError: It cannot be reached.
     """
-    return complete(url, ranges, _concurrently(url, ranges))
-
-
-def complete(path: str | Path, ranges: Sequence[tuple[int, int]], pieces: list[bytes]) -> list[bytes]:
-    """Return pieces of a file, each as long as its range.
-
-    Raises:
-        ShortReadError: One is shorter.
-    """
+    pieces = _concurrently(url, ranges)
     for (start, length), piece in zip(ranges, pieces, strict=True):
         if len(piece) < length:
-            raise ShortReadError(f"{path}: {len(piece)} of {length} bytes at {start}")
+            raise ShortReadError(f"{url}: {len(piece)} of {length} bytes at {start}")
     return pieces
 
 

@@ -224,14 +224,6 @@ def test_two_episodes_of_one_identity_are_a_problem(tree: Path, tmp_path: Path) 
     assert [problem.name for problem in infos.problems] == [info.id for info in infos]
 
 
-def test_a_video_that_was_cut_after_indexing_is_named(tmp_path: Path) -> None:
-    raw = source(write(tmp_path).parents[3])
-    raw.infos()
-    cut(MP4, 0.4)(tmp_path / PLACE)
-    with pytest.raises(InputError, match=f"{LEFT}.mp4"):
-        raw.read(0).read_frames([3])
-
-
 def test_a_tree_in_the_cloud_reads_as_here(tree: Path, gcs: Gcs, tmp_path: Path) -> None:
     url, here = gcs.upload(tree, "bucket/droid_raw/1.0.1"), source(tree)
     raw = source(url, disk_cache={"dir": str(tmp_path)})

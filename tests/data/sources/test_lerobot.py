@@ -28,7 +28,6 @@ from lerobot_sets import (
     write_v21,
     write_v30,
 )
-from recordings import write_mp4
 from synthetic import synthetic_states
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.lerobot.source import LeRobotSource
@@ -439,14 +438,3 @@ def test_a_video_that_says_it_is_shorter_than_its_rows_is_a_problem(v30: Path, t
     ends = pq.read_table(path).column(name).to_pylist()
     change_table(path, **{name: pa.array([11 / FPS, *ends[1:]])})
     assert "0.733 s of video, says the data set, for 12 rows" in only_problem(root)
-
-
-def test_a_video_that_is_shorter_than_its_rows_is_found_when_it_is_read(
-    v21: Path, episodes: list[Recorded], tmp_path: Path
-) -> None:
-    root = Path(shutil.copytree(v21, tmp_path / "set"))
-    write_mp4(first_video(root), episodes[0].frames[KEY][:9], rate=FPS, gop=2)
-    episode = source_of(root).read(0)
-    assert numbers_of(episode.read_frames([8])[0]) == (0, 8, 0)
-    with pytest.raises(InputError, match=r"episode_000000\.mp4: episode_000000: no frame at 0\.600 s"):
-        episode.read_frames([3, 9])

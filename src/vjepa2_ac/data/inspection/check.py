@@ -33,12 +33,7 @@ _NUMBERED = 8  # numbers of a vector in a message
 
 
 def check_data(
-    config: DataConfig,
-    *,
-    seed: int = 0,
-    batch_size: int = 2,
-    clips: int = 32,
-    progress: Progress | None = None,
+    config: DataConfig, *, seed: int = 0, batch_size: int = 2, clips: int = 32, progress: Progress | None = None
 ) -> Iterator[Finding]:
     """Yield the findings, line by line, in the order in which training would meet them.
 

@@ -91,7 +91,7 @@ class Inspection:
     def values(self) -> dict[str, Any]:
         """All statistics as plain values, as in `inspect.json`."""
         config, table, rate = self.dataset.config, self.dataset.table, self.dataset.control_rate_hz
-        known = table.success[table.success >= 0]
+        known, lengths = table.success[table.success >= 0], np.percentile(table.num_steps, [0, 10, 50, 90, 100])
         about_states = {"ranges": self.ranges.tolist()}
         if self.has_poses:
             idle = [idle_runs(one.states, config) for one in self.sample]
@@ -111,9 +111,7 @@ class Inspection:
             "broken_episodes": len(table.problems),
             "steps": int(table.num_steps.sum()),
             "hours": float(table.num_steps.sum() / rate / 3600),
-            "length_percentiles_0_10_50_90_100": np.percentile(table.num_steps, [0, 10, 50, 90, 100])
-            .astype(int)
-            .tolist(),
+            "length_percentiles_0_10_50_90_100": lengths.astype(int).tolist(),
             "success_share": float(known.mean()) if len(known) else None,
             "success_known_of": len(known),
             "removed": [vars(one) for one in self.dataset.removed],

@@ -111,7 +111,9 @@ class NpzSource(IndexedSource[DataConfig, None]):
                 metadata={} if language is None else {"language": language},
                 commands=arrays.numbers("actions", (steps, None)) if config.actions == "recorded" else None,
             )
-            labels = {name: arrays.text(name) for name in _LABELS if arrays.is_text(name)}
+            headers = {name: file.header(name) for name in _LABELS if name in names}  # a camera may be called so, too
+            is_text = {name: one.shape == () and one.dtype.kind == "U" for name, one in headers.items()}
+            labels = {name: arrays.text(name) for name in headers if is_text[name]}
             return episode, {"task": language, **labels}
 
     def _frames(
@@ -186,11 +188,6 @@ class _Arrays:
             step = np.argwhere(~np.isfinite(values))[0][:1].tolist()
             raise self.refused(name, f"NaN or infinity{f' at step {step[0]}' if step else ''}", "numbers")
         return values
-
-    def is_text(self, name: str) -> bool:
-        """Return whether there is an array of this name with one text; a camera may have that name, too."""
-        header = self.file.header(name) if name in self.file.names else None
-        return header is not None and header.shape == () and header.dtype.kind == "U"
 
     def text(self, name: str) -> str:
         """Return a text."""

@@ -270,17 +270,12 @@ def _serial(serials: Mapping[str, str], camera: str, where: str) -> str:
 
 def _labels(metadata: Mapping[str, Any]) -> dict[str, str | None]:
     """Return the episode's labels, as far as known: scene, building, operator, task."""
-
-    def short(*keys: str) -> str | None:
-        values = (metadata.get(key) for key in keys)
-        return next((str(one) for one in values if isinstance(one, str | int) and not isinstance(one, bool)), None)
-
-    task = metadata.get("current_task")
+    texts = {key: str(value) for key, value in metadata.items() if isinstance(value, str | int)}
     return {
-        "scene": short("scene_id"),
-        "building": short("building"),
-        "operator": short("user_id", "user"),
-        "task": task if isinstance(task, str) else None,
+        "scene": texts.get("scene_id"),
+        "building": texts.get("building"),
+        "operator": texts.get("user_id", texts.get("user")),
+        "task": texts.get("current_task"),
     }
 
 

@@ -56,12 +56,9 @@ class LatentSource(IndexedSource[DataConfig, _Cache]):
 
         Raises:
             InputError: The file is missing or damaged, or the episode could not be read while encoding.
-            ValueError: A camera that the cache does not have.
         """
         table, opened = self._open()
         camera = camera or self.cameras[0]
-        if camera not in opened.key.cameras:
-            raise ValueError(f"camera {camera!r} is not one of {', '.join(opened.key.cameras)}")
         record = opened.files.open(index, camera)
         return Episode(
             info=table[index],

@@ -57,13 +57,10 @@ class RldsSource(IndexedSource[RldsData, tuple[Shard, ...]]):
         Raises:
             InputError: The record is damaged, has changed, lacks a feature, or has implausible states.
             UnreachableError: The network fails.
-            ValueError: A camera that the config does not know.
         """
         table, shards = self._open()
         config, fields = self._config, self._config.fields
         camera = camera or config.cameras[0]
-        if camera not in fields.cameras:
-            raise ValueError(f"camera {camera!r} is not one of {', '.join(fields.cameras)}")
         feature, info = fields.cameras[camera], table[index]
         shard, span = position_of(table, shards, index)
         where = f"{span} ({info.id})"
