@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from itertools import islice
+from textwrap import shorten
 
 import numpy as np
 from jaxtyping import Float
@@ -81,7 +82,7 @@ def _what_takes_part(dataset: Dataset) -> Iterator[Finding]:
             if split == "train":
                 raise
             level: Level = "error" if share else "ok"  # training opens validation, and test if it has a share
-            yield Finding(level, split, f"{_shortened(error.found)}. {error.fix}")
+            yield Finding(level, split, f"{shorten(error.found, _LONGEST, placeholder=' …')}. {error.fix}")
             continue
         episodes = len(np.unique(windows.episodes))
         short = f"; {len(windows.short):,} episodes are too short" if len(windows.short) else ""
@@ -92,10 +93,6 @@ def _what_takes_part(dataset: Dataset) -> Iterator[Finding]:
         yield Finding("ok", "groups", f"{groups:,} by {config.split_by}, each in one split")
     duplicates = find_duplicates(dataset)
     yield Finding("warning" if duplicates.episodes else "ok", "duplicates", str(duplicates))
-
-
-def _shortened(text: str) -> str:
-    return text if len(text) <= _LONGEST else f"{text[:_LONGEST].rsplit(' ', 1)[0]} …"
 
 
 def _read(dataset: Dataset, *, seed: int, batch_size: int, clips: int) -> Iterator[Finding]:

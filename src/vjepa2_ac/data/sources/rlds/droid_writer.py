@@ -65,11 +65,6 @@ class DroidEpisode:
     language_instruction: str = ""
 
     @property
-    def num_steps(self) -> int:
-        """Control steps."""
-        return len(self.action)
-
-    @property
     def arrays(self) -> dict[str, Float[np.ndarray, "steps width"]]:
         """Every array, by the name of its feature."""
         found = {"action": self.action}
@@ -149,7 +144,7 @@ def _write_shards(
 
 
 def _features_of(episode: DroidEpisode) -> dict[str, tuple[Kind, Sequence[Any] | np.ndarray]]:
-    steps = episode.num_steps
+    steps = len(episode.action)
     first, last = np.eye(1, steps, 0, dtype=int)[0], np.eye(1, steps, steps - 1, dtype=int)[0]
     texts = {"": episode.language_instruction.encode(), "_2": b"", "_3": b""}
     return {
