@@ -122,9 +122,9 @@ class IndexedSource(ABC, Generic[Config, More]):
         self._config = config
         self._known: tuple[EpisodeTable, More] | None = None
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __reduce__(self) -> tuple[Any, ...]:
         """Pickle for a loader worker, with the index."""
-        return {"_config": self._config, "_known": self._known}
+        return type(self), (self._config,), {"_known": self._known}
 
     def infos(self, progress: Progress | None = None) -> EpisodeTable:
         """Return identity, length and outcome of every usable episode, and the problems of the others.
