@@ -54,7 +54,7 @@ class Dataset:
     """An open data set: its episodes, and the steps that the config selects. Can be pickled to a loader worker."""
 
     config: DataConfig
-    source: EpisodeSource  # of a cache: a LatentSource
+    source: EpisodeSource  # a LatentSource, of a cache
     table: EpisodeTable
     kept: StepSelection
     broken: BrokenEpisodes  # grows in the process that opened the set
