@@ -31,7 +31,7 @@ import numpy as np
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DiskCacheConfig, RldsData
-from vjepa2_ac.data.sources.rlds import index as rlds_index
+from vjepa2_ac.data.sources.rlds import episode as rlds_index
 from vjepa2_ac.data.sources.rlds.droid_writer import dataset_info
 from vjepa2_ac.data.sources.rlds.source import RldsSource
 from vjepa2_ac.data.sources.rlds.tfrecord import Kind, encode_entry

@@ -150,6 +150,7 @@ class Batch:
     bytes_fetched: int = 0  # over the network, for these clips
     latents: StoredLatents | None = None
     cameras: tuple[str | None, ...] = ()  # one per clip; None: the config's first
+    skipped: tuple[Skipped, ...] = ()  # clips that could not be read
     on_device: Callable[[], Batch | None] | None = None  # returns, once, its copy that is being sent to the device
 
     def mapped(self, change: Callable[[Tensor], Tensor]) -> Batch:

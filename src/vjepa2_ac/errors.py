@@ -51,6 +51,10 @@ class InputError(UserError):
     """Input that cannot be used: a file, an episode, a config, a command line."""
 
 
+class MissingFileError(InputError):
+    """There is no such file."""
+
+
 class UnreachableError(UserError):
     """Data cannot be reached now. This says nothing about the data itself."""
 

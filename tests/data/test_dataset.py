@@ -130,13 +130,6 @@ def test_two_episodes_of_one_identity_are_refused() -> None:
     assert open_in_memory(source, exclude=("same",)).windows("train").episodes.tolist() == [1]
 
 
-def test_nothing_is_read_to_open_a_set() -> None:
-    source = MemorySource([10, 20])
-    dataset = open_in_memory(source)
-    _ = dataset.removed, dataset.windows("train")
-    assert source.reads == []
-
-
 def droid_sized() -> EpisodeTable:
     """Return a table of as many episodes as DROID 1.0.1 has, with identities as long as its own."""
     count, generator = 95_658, np.random.default_rng(0)

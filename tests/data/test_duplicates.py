@@ -11,12 +11,11 @@ import pytest
 from clips import dataset_in_memory
 from copied_sets import STEPS, WRITERS, write_lerobot, write_npz
 from gcs import Gcs
-from latent_sets import write_cache
 from memory_source import MemorySource
 from synthetic import synthetic_states
 from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.coverage import Duplicates, find_duplicates
 from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.data.duplicates import Duplicates, find_duplicates
 from vjepa2_ac.data.index import UNKNOWN, hash_of_states
 from vjepa2_ac.data.inspection.check import check_data
 from vjepa2_ac.data.inspection.statistics import inspect_dataset
@@ -90,13 +89,6 @@ def test_a_far_set_of_which_nothing_tells_the_states_is_said_to_be_not_known(gcs
     found = find_duplicates(open_dataset(config_of("lerobot", "gs://bucket/set", tmp_path)))
     assert found == Duplicates(is_known=False)
     assert "not known" in str(found)
-
-
-def test_a_latent_cache_passes_the_hashes_on(tmp_path: Path) -> None:
-    dataset = open_dataset(config_of("npz", write_npz(tmp_path / "set", RECORDINGS), tmp_path))
-    folder = write_cache(dataset)
-    cached = open_dataset(config_of("latents", folder, tmp_path, stride=2))
-    assert find_duplicates(cached) == find_duplicates(dataset)
 
 
 def test_those_across_splits_are_counted_and_two_of_them_are_named() -> None:

@@ -51,12 +51,6 @@ def groups_split(dataset: Dataset, group: Any) -> dict[str, set[str]]:
     return dict(found)
 
 
-def test_without_it_the_identity_decides_as_ever() -> None:
-    dataset = opened()
-    assert dataset.groups is None
-    assert splits_of(dataset) == {name: split_of(name, dataset.config) for name in NAMES}
-
-
 @pytest.mark.parametrize("by", ["day", r"/(\d{4}-\d\d-\d\d)/"])
 def test_episodes_of_a_group_share_the_split_of_its_name(by: str) -> None:
     dataset = opened(split_by=by)

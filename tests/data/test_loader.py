@@ -20,14 +20,13 @@ import torch
 from clips import clip_at, open_in_memory
 from memory_source import MemorySource
 from recording_cuda import Pinning, RecordingCuda
-from synthetic import write_synthetic_droid
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data import loader
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import ProcessShare, collate, training_loader, validation_batches
 from vjepa2_ac.data.streams import ToDevice, copies_for
 from vjepa2_ac.episode import Batch, Episode
-from vjepa2_ac.errors import InputError, UnreachableError
+from vjepa2_ac.errors import InputError
 from vjepa2_ac.spaces import actions_from_states, states_in_camera_frame
 
 Names = list[tuple[str, int]]
@@ -77,14 +76,6 @@ def test_another_layout_goes_on_where_the_run_stopped(droid: Path) -> None:
     alone = names(take(12, config))
     ranks = [take(2, config, start_position=5, batch_size=3, share=ProcessShare(rank, 2)) for rank in range(2)]
     assert names([ranks[rank][step] for step in range(2) for rank in range(2)]) == alone[5:17]
-
-
-def test_the_shards_change_neither_training_nor_validation(droid: Path, tmp_path: Path) -> None:
-    other = config_of(write_synthetic_droid(tmp_path / "set", steps=range(12, 18), size=(48, 96), shards=5))
-    config = config_of(droid)
-    assert_same(take(9, other), take(9, config))
-    chosen = [list(validation_batches(open_dataset(c), "validation", clips=5, batch_size=2)) for c in (config, other)]
-    assert_same(*chosen)
 
 
 def test_loading_does_not_draw_from_the_generator_of_dropout(droid: Path) -> None:
@@ -348,15 +339,6 @@ def test_a_batch_may_lose_all_its_clips() -> None:
 def test_the_default_is_to_stop_at_a_clip_that_cannot_be_read() -> None:
     with pytest.raises(InputError, match=r"pictures of episode \d+: damaged\..*broken_episodes: skip, or add to"):
         first(broken_set(set(range(300)), broken_episodes="error"), 1)
-
-
-def test_a_network_that_is_away_is_no_broken_episode() -> None:
-    source = MemorySource(
-        [30] * 300, unreadable=frozenset(range(300)), fault=lambda where: UnreachableError(where=where, found="503")
-    )
-    with pytest.raises(UnreachableError) as caught:
-        first(open_in_memory(source, broken_episodes="skip"), 1)
-    assert "data.exclude" not in str(caught.value)
 
 
 def test_a_validation_of_nothing_but_broken_clips_is_refused() -> None:

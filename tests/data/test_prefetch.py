@@ -1,13 +1,14 @@
 """Prefetching: a batch is being copied to the device, and not reported before its turn."""
 
 from collections.abc import Generator
+from dataclasses import replace
 
 import pytest
 import torch
 
 from recording_cuda import RecordingCuda
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.loader import Batches, MicroBatch, prefetch_next
+from vjepa2_ac.data.loader import Batches, prefetch_next
 from vjepa2_ac.data.selection import BrokenEpisodes
 from vjepa2_ac.data.streams import ToDevice
 from vjepa2_ac.episode import Batch, Skipped
@@ -27,11 +28,12 @@ class Rows:
         self.fetched, self.closed = 0, False
         self._count, self._skipped, self._error = count, skipped, error
 
-    def __call__(self) -> Generator[MicroBatch | InputError, None, None]:
+    def __call__(self) -> Generator[Batch | InputError, None, None]:
         try:
             for number in range(self._count):
                 self.fetched += 1
-                yield MicroBatch(batch(number), (Skipped(f"e{number}", "damaged"),) if number in self._skipped else ())
+                skipped = (Skipped(f"e{number}", "damaged"),) if number in self._skipped else ()
+                yield replace(batch(number), skipped=skipped)
             if isinstance(self._error, InputError):
                 yield self._error  # as a worker sends one home
             elif self._error is not None:

@@ -63,15 +63,3 @@ def test_on_a_cpu_nothing_is_copied() -> None:
 
 def test_a_batch_is_as_large_as_its_tensors() -> None:
     assert batch(3).nbytes == 3 * (2 * 6 + 4 * (2 * 7 + 7 + 2 * 6) + 2 * 3 * 4 + 4 * 2 * 3)
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-def test_tensors_reach_cuda_unharmed() -> None:
-    device, given = torch.device("cuda"), batch()
-    copies = copies_for(device)
-    assert copies is not None
-    assert copies_for(device) is copies
-    for taken in [copies.start(given.mapped) for _ in range(3)]:
-        found = taken()
-        assert all(tensor.is_cuda for tensor in tensors(found))
-        assert_equal(found.mapped(torch.Tensor.cpu), given)

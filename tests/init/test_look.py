@@ -11,10 +11,9 @@ from copied_sets import WRITERS, write_lerobot, write_npz
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.init.draft import choose_model, make_draft
+from vjepa2_ac.init.draft import Machine, choose_model, make_draft
 from vjepa2_ac.init.found import guesses, plain
 from vjepa2_ac.init.look import look_at, measured
-from vjepa2_ac.init.machine import Machine
 from vjepa2_ac.simulation.recording.record import SIMULATION_FILE
 
 LAPTOP = Machine(None, 24 * 10**9, has_bf16=False, cores=2, free_bytes=10**11)
@@ -117,21 +116,6 @@ def test_the_grippers_range_is_read_from_the_statistics(
     (folder / name).write_text("\n".join(map(json.dumps, lines)))
     knobs = plain(look_at(str(folder)).knobs)["lerobot"]
     assert (knobs["gripper_open"], knobs["gripper_closed"]) == expected
-
-
-def test_a_rate_that_nothing_says_is_a_guess(tmp_path: Path) -> None:
-    folder = WRITERS["rlds"](tmp_path / "mine", range(3))
-    features = json.loads((folder / "features.json").read_text())
-    inner = features["featuresDict"]["features"]["steps"]["sequence"]["feature"]["featuresDict"]["features"]
-    observed = inner["observation"]["featuresDict"]["features"]
-    observed["front"] = observed.pop("exterior_image_1_left")
-    (folder / "features.json").write_text(json.dumps(features))
-    found = look_at(str(folder))
-    knobs = {"data": found.knobs}
-    assert plain(found.knobs)["camera"] in {"front", "exterior_image_2_left"}
-    assert plain(found.knobs)["fields"]["state"][0] == "steps/observation/cartesian_position"
-    assert found.rate_hz.is_guess
-    assert "data.fields.control_rate_hz" in guesses(knobs)
 
 
 def test_a_set_is_known_by_its_own_name_and_not_by_its_folders(tmp_path: Path) -> None:

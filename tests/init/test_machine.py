@@ -5,12 +5,11 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from vjepa2_ac.init.machine import this_machine
+from vjepa2_ac.init.draft import this_machine
 
 
 @pytest.mark.parametrize(
-    ("capability", "precision"),
-    [((7, 5), "fp16"), ((8, 0), "bf16"), ((8, 9), "bf16"), ((12, 0), "bf16")],
+    ("capability", "precision"), [((7, 5), "fp16"), ((8, 0), "bf16"), ((8, 9), "bf16"), ((12, 0), "bf16")]
 )
 def test_a_card_has_bf16_from_ampere_on(
     capability: tuple[int, int], precision: str, monkeypatch: pytest.MonkeyPatch

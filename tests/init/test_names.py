@@ -2,7 +2,7 @@
 
 import pytest
 
-from vjepa2_ac.init.names import Column, find_pose, pick_camera, short_name
+from vjepa2_ac.init.found import Column, find_pose, pick_camera, short_name
 
 JOINTS = Column(
     7, ("shoulder_pan.pos", "shoulder_lift.pos", "elbow_flex.pos", "wrist_flex.pos", "a.pos", "b.pos", "g.pos")

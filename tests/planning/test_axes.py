@@ -123,7 +123,7 @@ def test_axes_of_other_weights_and_of_no_file_are_refused(tmp_path: Path) -> Non
         other.base_predictor.predictor_proj.weight.add_(0.1)
     with pytest.raises(InputError, match="fitted for another model, tiny"):
         controller(model, axes=write(tmp_path / "axes.json", other))
-    with pytest.raises(InputError, match=r"planning\.axes: no/axes\.json: cannot be read"):
+    with pytest.raises(InputError, match=r"no/axes\.json: cannot be read"):
         controller(model, axes="no/axes.json")
 
 

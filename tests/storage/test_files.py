@@ -205,9 +205,6 @@ def test_a_url_is_read_like_a_local_folder(folder: str) -> None:
         storage.read_bounded(file, 9)
     assert storage.read_range(file, 3, 4) == b"3456"
     assert storage.read_range(file, 8, 4) == b"89"
-    assert storage.read_ranges(file, [(3, 4), (0, 1)]) == [b"3456", b"0"]
-    with pytest.raises(storage.ShortReadError, match="2 of 4 bytes at 8"):
-        storage.read_ranges(file, [(0, 1), (8, 4)])
     assert [(info.name, info.size) for info in storage.list_files(folder)] == [("a", 0), ("b", 10)]
     with closing(storage.open_to_read(file)) as opened:
         opened.seek(4)

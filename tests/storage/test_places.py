@@ -71,17 +71,6 @@ def test_a_url_stays_one_elsewhere(key: str) -> None:
     assert read(key, "gs://bucket/~x/") == "gs://bucket/~x"
 
 
-def test_a_run_behind_a_url_is_told_the_way_out_at_a_check_too(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "config.yaml").write_text("run_dir: gs://bucket/run\ndata: {path: set}\nmodel: {base: base}\n")
-    for check in ([], ["--check"]):
-        assert main(["train", "config.yaml", *check]) == 2
-        assert "set checkpoint.remote to it" in capsys.readouterr().err
-    assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"], "no folder called gs:"
-
-
 def test_a_model_of_the_package_is_no_path() -> None:
     assert read("model.base", "builtin:sim-tiny") == "builtin:sim-tiny"
 

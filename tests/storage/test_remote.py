@@ -22,8 +22,6 @@ from vjepa2_ac.storage.retries import RetryPolicy, with_retries
 DATA = bytes(range(256)) * 400
 FILE = "gs://bucket/folder/file"
 
-PASSING: list[Failure] = [408, 429, 500, 502, 503, 504, "reset", "cut", "short"]
-
 
 @pytest.fixture
 def file(gcs: Gcs) -> str:
@@ -31,15 +29,7 @@ def file(gcs: Gcs) -> str:
     return gcs.put("bucket/folder/file", DATA)
 
 
-@pytest.mark.parametrize("failure", PASSING)
-def test_a_read_survives_what_passes(gcs: Gcs, file: str, failure: Failure) -> None:
-    gcs.fail_next(failure, times=2, match="/download/")
-    assert storage.read_range(file, 300, 4000) == DATA[300:4300]
-    assert gcs.faults_left == 0
-    assert len(gcs.reads()) == 3
-
-
-@pytest.mark.parametrize("failure", [429, 503, "reset", "cut"])
+@pytest.mark.parametrize("failure", [408, 502, "reset", "cut"])
 @pytest.mark.parametrize(
     ("action", "expected"),
     [
@@ -315,5 +305,7 @@ def test_a_network_that_stays_away_is_spoken_of_once(
 
     monkeypatch.setattr(retries, "_last_warning_s", [float("-inf")])
     assert spoken(attempts=3) == 0  # two failures are nothing
+    with retries.quietly():
+        assert spoken(attempts=6) == 0  # by whoever can do without
     assert spoken(attempts=6) == 1
     assert spoken(attempts=6) == 0  # said already

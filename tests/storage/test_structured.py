@@ -12,8 +12,9 @@ import pytest
 import yaml
 from pydantic import Field
 
+from gcs import Gcs
 from paths import ROOT
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, MissingFileError
 from vjepa2_ac.storage.structured import json_list, json_object, json_text, parse_yaml, read_json_object, record_of
 
 # ---- JSON ----
@@ -37,14 +38,16 @@ def test_what_python_writes_is_read_as_it_was(value: dict[str, Any]) -> None:
     assert json_list(json.dumps([value]).encode("utf-16"), where="") == [value]
 
 
-def test_no_more_of_a_file_is_read_than_its_reader_wants_and_the_systems_errors_stay_its_own(tmp_path: Path) -> None:
+def test_no_more_of_a_file_is_read_than_its_reader_wants_and_a_missing_one_is_named(tmp_path: Path, gcs: Gcs) -> None:
     (tmp_path / "a.json").write_text('{"a": "' + "x" * 100 + '"}')
     assert read_json_object(tmp_path / "a.json", most_bytes=200)
     with pytest.raises(InputError, match="more than 50 bytes"):
         read_json_object(tmp_path / "a.json", most_bytes=50)
-    for path, error in ((tmp_path / "none.json", FileNotFoundError), (tmp_path, IsADirectoryError)):
-        with pytest.raises(error):
+    for path in (tmp_path / "none.json", gcs.put("bucket/a.json", b"{}").replace("a.", "none.")):
+        with pytest.raises(MissingFileError, match=r"none\.json: cannot be read: No such"):
             read_json_object(path)
+    with pytest.raises(InputError, match="Is a directory"):
+        read_json_object(tmp_path)
 
 
 def test_lists_of_numbers_are_written_on_one_line_and_read_back() -> None:

@@ -188,19 +188,6 @@ def test_a_place_has_one_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     assert storage.absolute("gs://bucket/run/") == "gs://bucket/run"
 
 
-def test_failures_are_said_below_warnings_where_that_is_asked_for(
-    bucket: Gcs, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(retries, "_last_warning_s", [-1e9])
-    bucket.fail_next(503, times=4)
-    with retries.quietly():
-        assert storage.file_sizes("gs://bucket/run") == {}
-    assert not caplog.records
-    bucket.fail_next(503, times=4)
-    storage.file_sizes("gs://bucket/run")
-    assert "trying again" in caplog.text
-
-
 @pytest.mark.usefixtures("bucket")
 def test_reading_asks_for_no_right_to_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(remote, "_filesystems", {})

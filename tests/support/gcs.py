@@ -35,10 +35,7 @@ class Request:
 
     target: str  # "METHOD /address", unquoted
     object: str  # "bucket/name" of the object whose bytes were asked for; else ""
-    start: int  # of the bytes that were asked for
-    status: int  # 0: the connection was cut before
     sent: int  # bytes of the body
-    received: int = 0  # bytes of the request's body
 
 
 @dataclass
@@ -123,10 +120,6 @@ class Gcs:
     def uploads(self) -> list[Request]:
         """Return the requests that brought bytes of objects."""
         return [request for request in self.requests if request.target.startswith("POST /upload/")]
-
-    def bytes_received(self) -> int:
-        """Return how many bytes of objects came in, with what is around them."""
-        return sum(request.received for request in self.uploads())
 
     def names(self, bucket: str) -> list[str]:
         """Return the names of all objects, asked past the proxy."""
@@ -233,8 +226,8 @@ class _Proxy:
                 failure = 499  # as Google answers to whoever gives an upload up; the emulator does not know it
             if failure == "hang":
                 await reader.read()
-            status, answer, sent = await self._result(failure, head, body)
-            gcs.requests.append(Request(target, _object_of(address), _start_of(head), status, sent, len(body)))
+            answer, sent = await self._result(failure, head, body)
+            gcs.requests.append(Request(target, _object_of(address), sent))
         finally:
             gcs._count(-1)
         writer.write(answer)
@@ -243,26 +236,23 @@ class _Proxy:
             writer.transport.abort()
         return failure not in {"reset", "cut", "hang"}
 
-    async def _result(self, failure: Failure | None, head: bytes, body: bytes) -> tuple[int, bytes, int]:
-        """Return status, all bytes to send, and how many of them are body."""
+    async def _result(self, failure: Failure | None, head: bytes, body: bytes) -> tuple[bytes, int]:
+        """Return all bytes to send, and how many of them are body."""
         if failure in {"reset", "hang"}:
-            return 0, b"", 0
+            return b"", 0
         if isinstance(failure, int):
             message = json.dumps({"error": {"code": failure, "message": "made to fail by a test"}}).encode()
-            return (
-                failure,
-                _message(f"HTTP/1.1 {failure} Failed", {"Content-Type": "application/json"}, message),
-                len(message),
-            )
+            kind = {"Content-Type": "application/json"}
+            return _message(f"HTTP/1.1 {failure} Failed", kind, message), len(message)
         async with self._one_at_a_time:
             status_line, headers, data = await self._ask_emulator(head, body)
-        status, half = int(status_line.split()[1]), data[: len(data) // 2]
+        half = data[: len(data) // 2]
         if failure == "short":
-            return status, _message(status_line, headers, half), len(half)
+            return _message(status_line, headers, half), len(half)
         answer = _message(status_line, headers, data)
         if failure == "cut":
-            return status, answer[: len(answer) - len(data) + len(half)], len(half)
-        return status, answer, len(data)
+            return answer[: len(answer) - len(data) + len(half)], len(half)
+        return answer, len(data)
 
     async def _ask_emulator(self, head: bytes, body: bytes) -> tuple[str, dict[str, str], bytes]:
         reader, writer = await asyncio.open_connection(LOOPBACK, self._gcs._port, limit=1 << 20)
@@ -295,8 +285,3 @@ def _object_of(address: str) -> str:
     parts = urlsplit(address)
     found = re.search(r"/b/([^/]+)/o/([^/?]+)$", parts.path)
     return f"{found[1]}/{unquote(found[2])}" if found and parse_qs(parts.query).get("alt") == ["media"] else ""
-
-
-def _start_of(head: bytes) -> int:
-    found = re.match(r"bytes=(\d+)-", _header(head, "Range"))
-    return int(found[1]) if found else 0

@@ -32,13 +32,6 @@ class Hub:
     datasets: Mapping[str, Path]
     gated: Mapping[str, str] = field(default_factory=dict)  # name -> the token that opens it
     url: str = ""
-    faults: list[int] = field(default_factory=list)  # status codes of the next answers to reads of files …
-    faulty: str = ""  # … whose paths end so
-    ranges: list[tuple[str, int, int]] = field(default_factory=list)  # path, start and end of what was read
-
-    def bytes_read(self, suffix: str = "") -> int:
-        """Return how many bytes of files went out, of those with an ending."""
-        return sum(end - start for path, start, end in self.ranges if path.endswith(suffix))
 
 
 @contextmanager
@@ -124,12 +117,7 @@ class _Handler(BaseHTTPRequestHandler):
         if not file.is_file():
             self._json(404, {"error": "Entry not found"}, "EntryNotFound")
             return
-        if self.hub.faults and path.endswith(self.hub.faulty):
-            self._json(self.hub.faults.pop(0), {"error": "a passing fault"})
-            return
-        self._range(path, file.read_bytes())
-
-    def _range(self, path: str, data: bytes) -> None:
+        data = file.read_bytes()
         asked = re.fullmatch(r"bytes=(\d+)-(\d*)", self.headers.get("Range", ""))
         start = int(asked[1]) if asked else 0
         end = min(int(asked[2]) + 1, len(data)) if asked and asked[2] else len(data)
@@ -141,8 +129,6 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("ETag", f'"{hashlib.sha256(data).hexdigest()}"')
         self.send_header("X-Repo-Commit", _COMMIT)
         self._body(data[start:end])
-        if self.command == "GET":
-            self.hub.ranges.append((path, start, end))
 
     def _json(self, status: int, content: object, code: str = "") -> None:
         self.send_response(status)

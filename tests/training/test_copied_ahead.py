@@ -1,7 +1,6 @@
 """Asynchronous copies do not change a run, and the next batch is copied before the host waits."""
 
 import itertools
-from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from same_run import assert_same_run
 from vjepa2_ac.data import loader
 from vjepa2_ac.data.clips import ClipRequest
 from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.data.loader import Batches, MicroBatch, training_loader
+from vjepa2_ac.data.loader import Batches, training_loader
 from vjepa2_ac.data.streams import ToDevice
 from vjepa2_ac.episode import Clip
 from vjepa2_ac.errors import InputError
@@ -47,11 +46,8 @@ def cuda(monkeypatch: pytest.MonkeyPatch) -> RecordingCuda:
 
 def copied(run: Run, cuda: RecordingCuda) -> Batches:
     """Return the batches of a run, copied to a recording device."""
-
-    def rows() -> Generator[MicroBatch | InputError, None, None]:
-        yield from map(MicroBatch, training_loader(run.dataset, seed=0, batch_size=2))
-
-    return Batches(rows(), run.dataset.broken, ToDevice(cuda))
+    rows = (one for one in training_loader(run.dataset, seed=0, batch_size=2))
+    return Batches(rows, run.dataset.broken, ToDevice(cuda))
 
 
 def micro_batch(event: int) -> list[str]:

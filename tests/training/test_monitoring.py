@@ -113,7 +113,7 @@ class Loader(Iterator[Batch]):
 
     def __next__(self) -> Batch:
         self._passes(next(self._seconds))
-        return no_clips(2, POSE_WIDTHS, bytes_fetched=0)
+        return no_clips(2, POSE_WIDTHS)
 
     def prefetch_next(self) -> None:
         next(self)

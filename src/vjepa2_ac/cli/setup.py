@@ -41,13 +41,11 @@ def add_init(commands: cli.Commands) -> None:
         " fresh predictor on V-JEPA 2.1's ViT-B, without Meta's action-conditioned model"
     )
     cli.add(parser, "form FORM", text, cli.as_place, nargs="?")
-    cli.add(
-        parser, "path PATH", "the data: a folder, or a URL (droid, lerobot, raw: DROID's own)", cli.as_place, nargs="?"
-    )
+    place = "the data: a folder, or a URL (droid, lerobot, raw: DROID's own)"
+    cli.add(parser, "path PATH", place, cli.as_place, nargs="?")
     cli.add(parser, "--out FILE", "the config (NAME.yaml, by the data's folder)", cli.as_path)
-    cli.add(
-        parser, "--model MODEL", "instead of the released: what model.base takes; scratch: an encoder", cli.as_model
-    )
+    model = "instead of the released: what model.base takes; scratch: an encoder"
+    cli.add(parser, "--model MODEL", model, cli.as_model)
     cli.add(parser, "--overwrite", "write over a config that is there", action="store_true")
 
 
@@ -92,7 +90,7 @@ def _init(options: argparse.Namespace) -> int:
     with user_can_write(f"--out {out}"):
         try_writing_at(out.parent)
 
-    from vjepa2_ac.init.look import look_at, simulated
+    from vjepa2_ac.init.look import look_at, measured, simulated
     from vjepa2_ac.model.base_model import find_base, find_encoder_path
 
     if options.model is not None:
@@ -100,10 +98,8 @@ def _init(options: argparse.Namespace) -> int:
     is_missing = path == _SIMULATED and not Path(path).exists()
     found = simulated(path) if is_missing else look_at(path, _LOOKED_AT_AS.get(form or "", form))
 
-    from vjepa2_ac.init.draft import TINY, choose_model, make_draft
+    from vjepa2_ac.init.draft import TINY, choose_model, make_draft, this_machine
     from vjepa2_ac.init.found import guesses
-    from vjepa2_ac.init.look import measured
-    from vjepa2_ac.init.machine import this_machine
     from vjepa2_ac.reporter import INDEXING
 
     with cli.reporter() as reporter:

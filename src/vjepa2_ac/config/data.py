@@ -124,7 +124,7 @@ class DataConfig(Section):
 
     kinds: ClassVar[dict[str, type[DataConfig]]] = {}  # of the forms that there are, by the name of their source
     reader: ClassVar[str]  # the class that reads the episodes, as module:class; imported when the data are opened
-    is_cache: ClassVar[bool] = False  # of latents: no frames, one stride, on this machine
+    is_cache: ClassVar[bool] = False  # of latents, by a LatentSource; no frames, one stride, on this machine
     has_camera_poses: ClassVar[bool] = True
     has_vectors: ClassVar[bool] = True  # states may be other numbers than a pose
     same_identity_fix: ClassVar[str] = ""  # the way out where two episodes are named alike

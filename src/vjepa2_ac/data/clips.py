@@ -110,15 +110,19 @@ def joined(
     return groups[:, -1]  # the only one at stride 1
 
 
-def collate(clips: Sequence[Clip], bytes_fetched: int = 0) -> Batch:
+def collate(clips: Sequence[Clip]) -> Batch:
     """Stack clips into a batch; it has camera poses if each of the clips has.
 
     Raises:
         InputError: The frames of two clips differ in size.
     """
     frames = [clip.frames for clip in clips if clip.frames is not None]
-    if len({one.shape for one in frames}) > 1:
-        raise _two_sizes(clips)
+    sizes = [("x".join(map(str, one.shape[1:3])), clip.episode_id) for one, clip in zip(frames, clips, strict=False)]
+    if other := next((pair for pair in sizes if pair[0] != sizes[0][0]), None):
+        (size, first), (another, name) = sizes[0], other
+        found = f"frames of {another} after the crop; those of episode {first} are {size}"
+        fix = "Train on episodes of one size, or set training.batch_size: 1"
+        raise with_way_out(InputError(where=f"episode {name}", found=found, fix=fix), [name], skippable=False)
     latents = [clip.latents for clip in clips if clip.latents is not None]
     extrinsics = [clip.extrinsics for clip in clips if clip.extrinsics is not None]
     return Batch(
@@ -129,19 +133,9 @@ def collate(clips: Sequence[Clip], bytes_fetched: int = 0) -> Batch:
         episode_ids=tuple(clip.episode_id for clip in clips),
         starts=tuple(clip.start for clip in clips),
         augmentations=tuple(clip.augmentation for clip in clips if clip.augmentation is not None),
-        bytes_fetched=bytes_fetched,
         latents=joined_latents(latents, torch.stack) if latents else None,
         cameras=tuple(clip.camera for clip in clips),
     )
-
-
-def _two_sizes(clips: Sequence[Clip]) -> InputError:
-    sizes = [("x".join(map(str, one.frames.shape[1:3])), one.episode_id) for one in clips if one.frames is not None]
-    size, first = sizes[0]
-    other, name = next(pair for pair in sizes if pair[0] != size)
-    found = f"frames of {other} after the crop; those of episode {first} are {size}"
-    fix = "Train on episodes of one size, or set training.batch_size: 1"
-    return with_way_out(InputError(where=f"episode {name}", found=found, fix=fix), [name], skippable=False)
 
 
 def joined_latents(latents: Sequence[StoredLatents], join: Callable[[list[Tensor]], Tensor]) -> StoredLatents:
@@ -150,7 +144,7 @@ def joined_latents(latents: Sequence[StoredLatents], join: Callable[[list[Tensor
     return StoredLatents(join([one.values for one in latents]), join(scales) if scales else None)
 
 
-def no_clips(frames: int, widths: Widths, bytes_fetched: int) -> Batch:
+def no_clips(frames: int, widths: Widths) -> Batch:
     """Return an empty micro-batch, of which no clip could be read."""
     return Batch(
         frames=torch.zeros(0, frames, 1, 1, 3, dtype=torch.uint8),
@@ -159,7 +153,6 @@ def no_clips(frames: int, widths: Widths, bytes_fetched: int) -> Batch:
         extrinsics=None,
         episode_ids=(),
         starts=(),
-        bytes_fetched=bytes_fetched,
     )
 
 

@@ -6,7 +6,7 @@ import logging
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Int, UInt64
@@ -49,29 +49,12 @@ class Removed:
         return f"{self.episodes:,} episodes, {self.steps:,} steps{clips}"
 
 
-@runtime_checkable
-class EncodedSource(EpisodeSource, Protocol):
-    """A source of encoded episodes: its steps were selected when they were encoded."""
-
-    def kept_ranges(self) -> StepSelection:
-        """Return the ranges that `data.idle` keeps."""
-        ...
-
-    def settle(self, episodes: Int[np.ndarray, " episodes"]) -> DataConfig:
-        """Return the config with the cameras that there are.
-
-        Raises:
-            InputError: One of these episodes, that clips come from, was not encoded.
-        """
-        ...
-
-
 @dataclass(frozen=True, eq=False)
 class Dataset:
     """An open data set: its episodes, and the steps that the config selects. Can be pickled to a loader worker."""
 
     config: DataConfig
-    source: EpisodeSource
+    source: EpisodeSource  # a LatentSource, of a cache
     table: EpisodeTable
     kept: StepSelection
     broken: BrokenEpisodes  # grows in the process that opened the set
@@ -110,10 +93,8 @@ class Dataset:
         groups = None if config.split_by is None else len(np.unique(self.split_hash[taking_part]))
         together = "" if groups is None else f" in {groups} groups (data.split_by)"
         shares = f"validation_share {config.validation_share:g}, test_share {config.test_share:g}"
-        share = {"train": 1.0, "validation": config.validation_share, "test": config.test_share}[split]
-        always = f"above 0, three {'episodes' if groups is None else 'groups'} or more always have one"
-        always += ", unless it is broken or in data.exclude" if share else ""
-        fix = f"Raise data.{split}_share: {always}"
+        three = f"three {'episodes' if groups is None else 'groups'} or more"
+        fix = f"Raise data.{split}_share: above 0, {three} always have one, unless it is broken or in data.exclude"
         if split == "train":
             fix = "Lower data.validation_share or data.test_share"
         found = f"no {split} episodes among {taking_part.sum()}{together} ({shares})"
@@ -224,7 +205,7 @@ def open_dataset(config: DataConfig, *, progress: Progress | None = None) -> Dat
         InputError: There is no such data set; an episode is broken and `data.broken_episodes` does not skip it, or too
             many are; two episodes have one identity; a filter or `data.split_by` cannot be applied; or nothing remains.
     """
-    source = open_source(config)
+    source: Any = open_source(config)
     table = EpisodeTable.of(source.infos(progress))
     broken = BrokenEpisodes(config, len(table) + len(table.problems))
     chosen = included(table, config)
@@ -233,14 +214,17 @@ def open_dataset(config: DataConfig, *, progress: Progress | None = None) -> Dat
     chosen &= of_outcome(table, config)
     kept = StepSelection.whole(table, chosen)
     if config.idle.rule != "none":
-        found = None if not isinstance(source, EncodedSource) else source.kept_ranges()
-        found = found or find_ranges(source, table, config, progress)
+        found = source.kept_ranges() if config.is_cache else find_ranges(source, table, config, progress)
         broken.found([problem for place, problem in found.problems if chosen[place]])
         kept = found.only(chosen)
     dataset = Dataset(config, source, table, kept, broken)
     dataset = replace(dataset, groups=groups_of(table, dataset.taking_part, config))
     if not len(dataset.episodes):
-        raise _nothing_left(dataset)
+        filters = ", ".join(f"{one.name} {one.episodes}" for one in dataset.removed if one.episodes)
+        left_out = f" (left out: {filters})" if filters else ""
+        gone = f"none of {len(table) + len(table.problems)} episodes is left{left_out}"
+        fix = "Look at data.exclude, data.outcome and data.idle" if filters else ""
+        raise InputError(where=f"data.path: {config.path}", found=gone, fix=fix)
     logger.info("%s: %d episodes take part, %d steps of them", config.path, dataset.taking_part.sum(), kept.steps)
     return _settled(dataset)
 
@@ -258,17 +242,8 @@ def through_latents(dataset: Dataset, folder: Path) -> Dataset:
 
 def _settled(dataset: Dataset) -> Dataset:
     """Check that a latent cache has what the clips need, and set its cameras in the config."""
-    if not isinstance(dataset.source, EncodedSource):
-        return dataset
-    return replace(dataset, config=dataset.source.settle(dataset.starts.episode))
-
-
-def _nothing_left(dataset: Dataset) -> InputError:
-    filters = ", ".join(f"{one.name} {one.episodes}" for one in dataset.removed if one.episodes)
-    found = f"none of {len(dataset.table) + len(dataset.table.problems)} episodes is left"
-    found += f" (left out: {filters})" if filters else ""
-    fix = "Look at data.exclude, data.outcome and data.idle" if filters else ""
-    return InputError(where=f"data.path: {dataset.config.path}", found=found, fix=fix)
+    source: Any = dataset.source
+    return replace(dataset, config=source.settle(dataset.starts.episode)) if dataset.config.is_cache else dataset
 
 
 def widths_of(episode: Episode) -> Widths:

@@ -54,19 +54,12 @@ class EpisodeFiles:
         """Return the content of a file.
 
         Raises:
-            InputError: There is no such file; an UnreachableError if a local one cannot be read.
-            OSError: A file behind a URL cannot be read.
+            InputError: There is no such file; an UnreachableError if it cannot be read.
         """
-        try:
+        with storage.user_can_read(path, fix="Copy the episode again"):
             if storage.is_url(path):
                 return self._cached(f"{path}@{version}", lambda: storage.read_bytes(path))
             return storage.read_bytes(path)
-        except FileNotFoundError:
-            raise InputError(where=path, found="no such file", fix="Copy the episode again") from None
-        except OSError as error:
-            if storage.is_url(path):
-                raise
-            raise storage.unreadable(path, error) from None
 
     def arrays(self, key: str) -> dict[str, np.ndarray] | None:
         """Return the arrays that were kept under a key; None if there are none, or they are damaged."""
@@ -133,12 +126,12 @@ def list_folder(root: str, folder: str) -> tuple[list[FileInfo], list[str]]:
         InputError: A name is not UTF-8.
     """
     place = storage.join(root, folder) if folder else root
-    files, names = storage.list_files(place), storage.list_names(place)
-    for name in names:  # the identity of an episode must be text that can be encoded
-        if not name.isascii() and any("\ud800" <= letter <= "\udfff" for letter in name):
-            raise InputError(where=place, found=f"the name {name!r}", needed="names in UTF-8", fix="Rename it")
-    known = {file.name for file in files}
-    return files, [name for name in names if name not in known and not name.startswith(".")]
+    listed = storage.list_folder(place)
+    for one in listed:  # the identity of an episode must be text that can be encoded
+        if not one.name.isascii() and any("\ud800" <= letter <= "\udfff" for letter in one.name):
+            raise InputError(where=place, found=f"the name {one.name!r}", needed="names in UTF-8", fix="Rename it")
+    folders = [one.name for one in listed if not one.is_file and not one.name.startswith(".")]
+    return [one for one in listed if one.is_file], folders
 
 
 def within(folder: str, name: str) -> str:

@@ -18,7 +18,7 @@ from vjepa2_ac.data.selection import StepSelection, as_error, as_problem
 from vjepa2_ac.episode import Episode, EpisodeSource, Progress, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.spaces import POSE
-from vjepa2_ac.storage.structured import json_object, shown
+from vjepa2_ac.storage.structured import read_json_object, shown
 
 logger = logging.getLogger(__name__)
 
@@ -41,18 +41,12 @@ def find_ranges(
     make = partial(_computed, source, table, config, progress or no_progress)
     if config.idle.rule == "published":
         path = str(config.idle.ranges)
-        make, parts["list"] = partial(published_ranges, path, table), _version(path)
+        make = partial(published_ranges, path, table)
+        with storage.user_can_read(path):
+            parts["list"] = [storage.absolute(path), storage.file_size(path), storage.file_version(path)]
     return get_or_make(
         config.disk_cache, key_of(parts), make, to_bytes=StepSelection.to_bytes, from_bytes=StepSelection.from_bytes
     )
-
-
-def _version(path: str) -> list[object]:
-    """Return the version of a list, without reading it if possible."""
-    try:
-        return [storage.absolute(path), storage.file_size(path), storage.file_version(path)]
-    except OSError:
-        return [path]
 
 
 def _computed(source: EpisodeSource, table: EpisodeTable, config: DataConfig, progress: Progress) -> StepSelection:
@@ -82,10 +76,7 @@ def published_ranges(path: str, table: EpisodeTable) -> StepSelection:
     where = f"data.idle.ranges: {path}"
     needed = 'a JSON object {"identity of an episode": [[start, end], ...], ...}'
     another = "Name the list of this version of the data set, or set data.idle.rule: commands or motion"
-    try:
-        lists = json_object(storage.read_bounded(path, _MOST_BYTES), where=where, needed=needed)
-    except OSError as error:
-        raise InputError(where=where, found=f"cannot be read ({error})", needed=needed) from None
+    lists = read_json_object(path, most_bytes=_MOST_BYTES, needed=needed)
     names = [table.identity(place) for place in range(len(table))]
     listed = sum(name in lists for name in names)
     if not listed:

@@ -132,9 +132,6 @@ class EpisodeTable(Sequence[EpisodeInfo]):
 
     def __getitem__(self, index: int) -> EpisodeInfo:  # type: ignore[override] # no slices
         """Return the facts about one episode."""
-        if not -len(self) <= index < len(self):
-            raise IndexError(f"episode {index} of {len(self)}")
-        index %= len(self)
         success = int(self.success[index])
         return EpisodeInfo(
             id=self.identity(index),

@@ -54,8 +54,8 @@ class Mixed:
     """A data set, and a second one that a share of the training clips comes from."""
 
     dataset: Dataset
-    replayed: Dataset
-    share: float
+    replayed: Dataset | None = None
+    share: float = 0.0
 
 
 def training_loader(
@@ -82,13 +82,11 @@ def training_loader(
     Raises:
         InputError: There is nothing to train on, or a clip cannot be read, also in a worker.
     """
-    replayed = None
-    if isinstance(dataset, Mixed):
-        replayed, of_clips = dataset.replayed, Fraction(str(dataset.share))
-        dataset = dataset.dataset
-        clips = replace(_training_clips(dataset, seed), replayed=_training_clips(replayed, seed), share=of_clips)
-    else:
-        clips = _training_clips(dataset, seed)
+    both = dataset if isinstance(dataset, Mixed) else Mixed(dataset)
+    dataset, replayed = both.dataset, both.replayed
+    clips = _training_clips(dataset, seed)
+    if replayed is not None:
+        clips = replace(clips, replayed=_training_clips(replayed, seed), share=Fraction(str(both.share)))
     firsts = itertools.count(start_position + share.rank * batch_size, batch_size * share.processes)
     rows = (list(range(first, first + batch_size)) for first in firsts)
     micro_batches = _micro_batches(clips, rows, dataset.config.workers, pinned=copies is not None)
@@ -159,19 +157,7 @@ def _chosen_clip(dataset: Dataset, windows: Sequence[tuple[int, int]], position:
 
 
 @dataclass(frozen=True)
-class MicroBatch:
-    """A worker's result for one micro-batch."""
-
-    batch: Batch
-    skipped: tuple[Skipped, ...] = ()
-
-    def pin_memory(self) -> MicroBatch:
-        """Return it in pinned memory; DataLoader calls a method of this name to pin."""
-        return replace(self, batch=self.batch.pin_memory())
-
-
-@dataclass(frozen=True)
-class _Clips(TorchDataset[MicroBatch]):
+class _Clips(TorchDataset[Batch]):
     """Clips by position, read a micro-batch at a time."""
 
     dataset: Dataset
@@ -179,17 +165,15 @@ class _Clips(TorchDataset[MicroBatch]):
     replayed: _Clips | None = None  # of the second data set
     share: Fraction = Fraction(0)  # of these
 
-    def __getitems__(self, positions: list[int]) -> MicroBatch | UserError:
+    def __getitems__(self, positions: list[int]) -> Batch | UserError:
         """Return a micro-batch, or its error: DataLoader would change an error that is raised."""
         before = storage.bytes_fetched()
         try:
             read = self._read(positions)
             clips = [one for one in read if isinstance(one, Clip)]
             skipped = tuple(one for one in read if isinstance(one, Skipped))
-            fetched = storage.bytes_fetched() - before
-            if not clips:
-                return MicroBatch(no_clips(self.dataset.config.frames, self.dataset.widths, fetched), skipped)
-            return MicroBatch(collate(clips, fetched), skipped)
+            batch = collate(clips) if clips else no_clips(self.dataset.config.frames, self.dataset.widths)
+            return replace(batch, bytes_fetched=storage.bytes_fetched() - before, skipped=skipped)
         except UserError as error:
             return error
 
@@ -232,14 +216,14 @@ class Batches(Iterator[Batch]):
 
     def __init__(
         self,
-        rows: Generator[MicroBatch | UserError, None, None],
+        rows: Generator[Batch | UserError, None, None],
         broken: BrokenEpisodes,
         copies: ToDevice | None = None,
         replayed: BrokenEpisodes | None = None,
     ) -> None:
         self._rows, self._broken, self._copies = rows, broken, copies
         self._replayed = broken if replayed is None else replayed
-        self._prefetched: Exception | MicroBatch | None = None
+        self._prefetched: Exception | Batch | None = None
 
     def __next__(self) -> Batch:
         """Return the next batch.
@@ -253,7 +237,7 @@ class Batches(Iterator[Batch]):
             raise fetched
         for one in fetched.skipped:
             (self._replayed if one.replayed else self._broken).met(one.episode_id, one.reason)
-        return fetched.batch
+        return fetched
 
     def prefetch_next(self) -> None:
         """Fetch the next batch and start its copy to the device."""
@@ -265,16 +249,16 @@ class Batches(Iterator[Batch]):
         self._prefetched = None
         self._rows.close()
 
-    def _fetched(self) -> Exception | MicroBatch:
+    def _fetched(self) -> Exception | Batch:
         try:
             row = next(self._rows)
             if isinstance(row, UserError) or self._copies is None:
                 return row
-            held = [self._copies.start(row.batch.mapped)]
+            held = [self._copies.start(row.mapped)]
         except Exception as error:  # also the end of the rows
             return error
         take_once = lambda: held.pop()() if held else None  # noqa: E731 - so that the copy is freed after use
-        return replace(row, batch=replace(row.batch, on_device=take_once))
+        return replace(row, on_device=take_once)
 
 
 def prefetch_next(batches: Iterator[Batch]) -> None:
@@ -285,7 +269,7 @@ def prefetch_next(batches: Iterator[Batch]) -> None:
 
 def _micro_batches(
     clips: _Clips, positions: Iterator[list[int]], workers: int, *, pinned: bool = False
-) -> Generator[MicroBatch | UserError, None, None]:
+) -> Generator[Batch | UserError, None, None]:
     # A fork server has no threads: a plain fork may hang in OpenMP or CUDA, and Python warns of it.
     context = multiprocessing.get_context("forkserver") if workers else None
     if context is not None:

@@ -96,8 +96,12 @@ def pixels_to_input(
     if not augmentations:
         resized = _resized(frames.flatten(0, 1), image_size)
     elif len(augmentations) == batch:
-        pairs = zip(frames, augmentations, strict=True)
-        resized = torch.cat([_augmented(clip, image_size, augmentation) for clip, augmentation in pairs])
+        parts = []
+        for clip, augmentation in zip(frames, augmentations, strict=True):
+            top, left, height, width = augmentation.box
+            part = clip[:, top : top + height, left : left + width]
+            parts.append(jittered(_resized(part, image_size), augmentation))
+        resized = torch.cat(parts)
     else:
         raise ValueError(f"{len(augmentations)} augmentations for {batch} clips")
     normalised: Tensor = (resized - per_channel(_MEAN, frames.device)) / per_channel(_STD, frames.device)
@@ -134,11 +138,6 @@ def frame_of_seen(
     top, left = max(0, box.top), max(0, box.left)
     frame[top : top + len(pixels), left : left + pixels.shape[1]] = pixels
     return frame
-
-
-def _augmented(clip: Tensor, image_size: int, augmentation: Augmentation) -> Float[Tensor, "time 3 size size"]:
-    top, left, height, width = augmentation.box
-    return jittered(_resized(clip[:, top : top + height, left : left + width], image_size), augmentation)
 
 
 def _resized(frames: UInt8[Tensor, "count height width 3"], size: int) -> Float[Tensor, "count 3 size size"]:

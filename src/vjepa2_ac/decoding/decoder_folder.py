@@ -18,7 +18,7 @@ from torch import Tensor
 
 from vjepa2_ac import __version__
 from vjepa2_ac.decoding.network import Decoder, DecoderShape
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, MissingFileError
 from vjepa2_ac.model.base_model import ASSETS
 from vjepa2_ac.model.network.pretrained_folder import read_tensors
 from vjepa2_ac.model.network.world_model import WorldModel
@@ -134,9 +134,9 @@ def read_card(folder: Path, *, where: str = "--decoder") -> DecoderCard:
     path = folder / CARD
     try:
         values = read_json_object(path, needed=_NEEDED, fix=_FIX)
-    except OSError as error:
+    except MissingFileError:
         fix = "Train one with `vjepa2-ac decoder CONFIG`; one that is unfinished goes on with the same command"
-        found = f"no {CARD} there ({error.strerror})"
+        found = f"no {CARD} there"
         raise InputError(where=f"{where} {folder}", found=found, needed=_NEEDED, fix=fix) from None
     return record_of(DecoderCard, values, where=str(path), needed=_NEEDED, fix=_FIX)
 

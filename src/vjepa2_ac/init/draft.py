@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Literal
 
+from vjepa2_ac import storage
 from vjepa2_ac.config import Config, EncoderConfig, ModelConfig
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.config.model import ModelSizes
 from vjepa2_ac.init.found import FoundData, Knob, Knobs, as_yaml, guesses, plain
-from vjepa2_ac.init.machine import Machine, duration
 from vjepa2_ac.intervals import ENOUGH_EPISODES
 from vjepa2_ac.model.checkpoints.loading import base_sizes
 from vjepa2_ac.model.checkpoints.published import OFFICIAL, PUBLISHED
 from vjepa2_ac.storage.places import BUILTIN
 from vjepa2_ac.training.cost.flops import clip_flops, frame_flops
-from vjepa2_ac.training.cost.memory import GIGABYTE, estimate_memory
+from vjepa2_ac.training.cost.memory import GIGABYTE, USUAL_GPU, estimate_memory
 
 RELEASED = "checkpoints/vjepa2-ac-vitg.pt"
 SCRATCH_ENCODER = "checkpoints/vjepa2.1-vitb-384.pt"
@@ -37,6 +39,58 @@ _SHORT = 100  # control steps of an episode that has no pauses to spare
 _CACHE_SHARE = 1 / 3  # of the free disk
 _USUAL_BYTES_PER_S = 100e6 / 8  # 100 Mbit/s: assumed
 _IN_AND_OUT = ["predictor_embed", "predictor_proj", "action_encoder", "state_encoder"]
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What a run may use."""
+
+    gpu: str | None
+    gpu_bytes: int  # of a usual one, where there is none
+    has_bf16: bool  # the GPU
+    cores: int
+    free_bytes: int  # of the disk where runs and caches go
+    flops: float | None = None  # operations a second of the GPU's products, measured
+
+    @property
+    def precision(self) -> Literal["bf16", "fp16", "fp32"]:
+        """In what it computes best: on a CPU without instructions for it bf16 is many times slower than fp32."""
+        if self.gpu is None:
+            return "fp32"
+        return "bf16" if self.has_bf16 else "fp16"
+
+    @property
+    def room(self) -> str:
+        """The memory that a batch has to fit on."""
+        return f"{self.gpu_bytes / GIGABYTE:.1f} GB" + ("" if self.gpu else ", a usual GPU's")
+
+    @property
+    def about(self) -> str:
+        """It in a line."""
+        gpu = f"{self.gpu}, {self.room}" if self.gpu else "no GPU"
+        return f"{gpu}; {self.cores} cores; {self.free_bytes / GIGABYTE:.0f} GB of disk free"
+
+
+def duration(hours: float) -> str:
+    """Return a time for people: hours, or minutes."""
+    if hours >= 1:
+        return f"about {hours:,.1f} hours"
+    minutes = max(1, round(60 * hours))
+    return f"about {minutes} minute{'s' if minutes > 1 else ''}"
+
+
+def this_machine() -> Machine:
+    """Return what this machine has."""
+    import torch
+
+    from vjepa2_ac.distributed import cuda_index, has_bf16, matmul_speed
+
+    cores, free = len(os.sched_getaffinity(0)), storage.free_bytes(Path.cwd())
+    if not torch.cuda.is_available():
+        return Machine(None, USUAL_GPU, False, cores, free)
+    device = torch.device("cuda", cuda_index())
+    card, dtype = torch.cuda.get_device_properties(device), torch.bfloat16 if has_bf16() else torch.float16
+    return Machine(card.name, card.total_memory, has_bf16(), cores, free, matmul_speed(device, dtype))
 
 
 @dataclass(frozen=True)
@@ -93,7 +147,6 @@ class Draft:
     knobs: Knobs
     config: Config
     costs: list[str]  # a line each
-    fits: bool = True
     step_hours: float | None = None  # None: there is no GPU, or the model is the tiny one
     encoding_hours: float = 0.0  # before the first step
 
@@ -110,14 +163,9 @@ class Draft:
             head.append(f"Look at what is marked GUESSED: {', '.join(unsure)}.")
         return as_yaml(head, self.knobs)
 
-    def hours_of(self, steps: int) -> float | None:
-        """Return how long so many optimizer steps take, with encoding before the first; None: not known."""
-        return None if self.step_hours is None else self.encoding_hours + steps * self.step_hours
-
     def time_of(self, steps: int) -> str | None:
-        """Return the same for people."""
-        hours = self.hours_of(steps)
-        return None if hours is None else duration(hours)
+        """Return how long so many optimizer steps take, with encoding before the first; None: not known."""
+        return None if self.step_hours is None else duration(self.encoding_hours + steps * self.step_hours)
 
 
 def make_draft(found: FoundData, machine: Machine, model: ModelChoice, *, run_dir: str) -> Draft:
@@ -143,26 +191,30 @@ def make_draft(found: FoundData, machine: Machine, model: ModelChoice, *, run_di
         },
     }
     config = _config_of(knobs)
-    disk = []
-    if config.data.takes_latents:
-        disk = [f"Disk: at most {_gigabytes((found.steps or 0) * model.bytes_a_frame)} GB of cached latents."]
+    steps = found.steps or 0 if config.data.takes_latents else 0  # whose frames are encoded first
+    costs = [f"Disk: at most {_gigabytes(steps * model.bytes_a_frame)} GB of cached latents."] * (steps > 0)
     if model.is_tiny:
-        return Draft(knobs, config, disk)
+        return Draft(knobs, config, costs)
     batch, checkpointing, needed = _fit(config, machine)
-    fits = needed <= machine.gpu_bytes
-    knobs = {**knobs, "training": {**training, **_batch(batch, machine, checkpointing=checkpointing, fits=fits)}}
+    fits, on = needed <= machine.gpu_bytes, f"on {machine.room}"
+    found_to_fit = {
+        "batch_size": Knob(batch, f"the largest tried that fits {on}" if fits else f"does not fit {on}"),
+        "accumulation": Knob(max(1, _CLIPS_A_STEP // batch), f"{_CLIPS_A_STEP} clips a step"),
+        "gradient_checkpointing": Knob(checkpointing, f"{'does not fit' if checkpointing else 'fits'} without {on}"),
+    }
+    knobs = {**knobs, "training": {**training, **found_to_fit}}
     config = _config_of(knobs)
-    size = f"{needed / GIGABYTE:.1f} GB; {'fits on' if fits else 'does NOT fit on'} {machine.room}"
-    costs = [f"Memory, as `vjepa2-ac doctor` counts: {size}.", *disk]
+    size = f"{needed / GIGABYTE:.1f} GB; {'fits' if fits else 'does NOT fit'} {on}"
+    costs = [f"Memory, as `vjepa2-ac doctor` counts: {size}.", *costs]
     if machine.flops is None:
         unknown = "not known without the GPU; run `vjepa2-ac init` on the machine that has it: batch and precision are"
-        return Draft(knobs, config, [*costs, *[f"Time: {unknown} then its own."] * (machine.gpu is None)], fits)
+        return Draft(knobs, config, [*costs, *[f"Time: {unknown} then its own."] * (machine.gpu is None)])
     sizes = base_sizes(config.model)
     clip, an_hour = clip_flops(config, sizes), machine.flops * _UTILIZATION * 3600
-    encoding = (found.steps or 0) * frame_flops(sizes) / an_hour if config.data.takes_latents else 0.0
+    encoding = steps * frame_flops(sizes) / an_hour
     of_clip = (clip.predictor if config.data.takes_latents else clip.total) / an_hour
     step = of_clip * config.training.batch_size * config.training.accumulation
-    draft = Draft(knobs, config, costs, fits, step, encoding)
+    draft = Draft(knobs, config, costs, step, encoding)
     speed = f"{machine.flops / 1e12:.0f} TFLOP/s measured here for one product"
     time = draft.time_of(config.training.steps)
     costs.append(f"Time: {time}, if a step reaches {_UTILIZATION:.0%} (assumed) of {speed}.")
@@ -196,34 +248,27 @@ def _fit(config: Config, machine: Machine) -> tuple[int, bool, int]:
     return batch, True, needed(batch, True)
 
 
-def _batch(batch: int, machine: Machine, *, checkpointing: bool, fits: bool) -> Knobs:
-    on = f"on {machine.room}"
-    return {
-        "batch_size": Knob(batch, f"the largest tried that fits {on}" if fits else f"does not fit {on}"),
-        "accumulation": Knob(max(1, _CLIPS_A_STEP // batch), f"{_CLIPS_A_STEP} clips a step"),
-        "gradient_checkpointing": Knob(checkpointing, f"{'does not fit' if checkpointing else 'fits'} without {on}"),
-    }
-
-
 def _data(found: FoundData, machine: Machine, model: ModelChoice) -> Knobs:
     """Return the section of the data."""
     stride = max(1, round(found.rate_hz.value * _MODEL_STEP_S))
     frames, why_frames = _frames(found, model, stride)
     share, test_share, why_share = _shares(found)
-    cached = _cache(found, machine, model)
-    workers = max(1, min(4 if "cache" in cached else 8, machine.cores - 1))
-    vector: dict[str, Knob] = {"states": Knob("vector", "the robot's own numbers: its actions are their differences")}
+    size = (found.steps or math.inf) * model.bytes_a_frame
+    is_cached = size <= machine.free_bytes * _CACHE_SHARE
+    why_cached = f"each frame is encoded once: {_gigabytes(size)} GB at most; training then needs no encoder"
+    workers = max(1, min(4 if is_cached else 8, machine.cores - 1))
+    vector = Knob("vector", "the robot's own numbers: its actions are their differences")
     return {
         "source": Knob(found.source),
         "path": Knob(found.path),
-        **({} if found.states == "pose" else vector),
+        **({} if found.states == "pose" else {"states": vector}),
         **found.knobs,
         "frames": Knob(frames, why_frames),
         "stride": Knob(stride, _why_stride(found, model, stride), found.rate_hz.is_guess),
         "validation_share": Knob(share, why_share),
         "test_share": Knob(test_share, "for `evaluate`; never seen in training"),
         **({"idle": found.idle} if found.idle and (found.usual_steps or _SHORT) >= _SHORT else {}),
-        **cached,
+        **({"cache": Knob("auto", why_cached)} if is_cached else {}),
         "workers": Knob(workers, f"of {machine.cores} cores"),
     }
 
@@ -242,8 +287,7 @@ def _model(model: ModelChoice, machine: Machine) -> Knobs:
             "dtype": dtype,
         }
     tiny = "has seen a simulated arm only: to try the way, not a result"
-    why = tiny if model.is_tiny else ": ".join(model.download or ())
-    return {"base": Knob(model.path, why), "dtype": dtype}
+    return {"base": Knob(model.path, tiny if model.is_tiny else ": ".join(model.download or ())), "dtype": dtype}
 
 
 def _adapter(model: ModelChoice, found: FoundData) -> Knobs:
@@ -266,16 +310,21 @@ def _training(found: FoundData, machine: Machine, model: ModelChoice) -> Knobs:
     """Return the section of training; the batch is what `fit` changes."""
     batch, accumulation = (8, 1) if model.is_tiny else (4, _CLIPS_A_STEP // 4)
     steps, why = _steps(found, batch * accumulation)
+    kind = "tiny" if model.is_tiny else model.kind
+    scratch = "the released 4.25e-4, of 256 clips a step, times the root of 32 / 256: not measured"
+    rates = {"scratch": Knob(1.5e-4, scratch), "tiny": Knob(3e-3)}
     weak = "it is weak, knowingly: it has never seen a real image"
+    bf16 = "no GPU here; on one from Ampere on: bf16" + ("" if model.is_tiny else ", and model.dtype: bfloat16")
+    whys = {"fp32": bf16, "fp16": "this GPU has no bf16"}
     return {
         "steps": Knob(steps, why),
         "batch_size": Knob(batch),
         "accumulation": Knob(accumulation),
         "rollout_steps": Knob(2),
-        "learning_rate": _learning_rate(model),
-        "precision": Knob(machine.precision, _why_precision(machine, model)),
+        "learning_rate": rates.get(kind, Knob(1e-4, "3e-4 is the other one to try")),
+        "precision": Knob(machine.precision, whys.get(machine.precision, "")),
         "gradient_checkpointing": Knob(False),
-        **({"allow_weak_base": Knob(True, weak)} if model.is_tiny and model.kind == "tiny" else {}),
+        **({"allow_weak_base": Knob(True, weak)} if model.kind == "tiny" else {}),
     }
 
 
@@ -291,20 +340,6 @@ def _why_stride(found: FoundData, model: ModelChoice, stride: int) -> str:
     if model.kind == "released" and found.states == "pose":
         return f"{why}; whether the released weights know 0.27, 0.53 or 1 s is unsettled: data calibrate"
     return f"{why}; data inspect shows how far the robot goes in it, and in longer ones"
-
-
-def _learning_rate(model: ModelChoice) -> Knob:
-    if model.is_tiny:
-        return Knob(3e-3)
-    if model.kind == "scratch":
-        return Knob(1.5e-4, "the released 4.25e-4, of 256 clips a step, times the root of 32 / 256: not measured")
-    return Knob(1e-4, "3e-4 is the other one to try")
-
-
-def _why_precision(machine: Machine, model: ModelChoice) -> str:
-    if machine.precision == "fp32":
-        return "no GPU here; on one from Ampere on: bf16" + ("" if model.is_tiny else ", and model.dtype: bfloat16")
-    return "this GPU has no bf16" if machine.precision == "fp16" else ""
 
 
 def _frames(found: FoundData, model: ModelChoice, stride: int) -> tuple[int, str]:
@@ -325,18 +360,6 @@ def _shares(found: FoundData) -> tuple[float, float, str]:
     count = max(1, round(share * found.episodes))
     enough = min(_MOST_TESTED, math.ceil(100 * (ENOUGH_EPISODES + 1) / found.episodes) / 100)
     return share, max(share, enough), f"about {count:,} of {found.episodes:,} episodes, drawn by a hash"
-
-
-def _cache(found: FoundData, machine: Machine, model: ModelChoice) -> dict[str, Knob]:
-    """Return the knobs of the latent cache, where it fits on the disk."""
-    if found.steps is None:
-        return {}
-    room = machine.free_bytes * _CACHE_SHARE
-    size = found.steps * model.bytes_a_frame
-    if size > room:
-        return {}
-    why = f"each frame is encoded once: {_gigabytes(size)} GB at most; training then needs no encoder"
-    return {"cache": Knob("auto", why)}
 
 
 def _steps(found: FoundData, clips_a_step: int) -> tuple[int, str]:

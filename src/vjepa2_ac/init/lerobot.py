@@ -9,8 +9,7 @@ from typing import Any
 from vjepa2_ac import storage
 from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, read_info
 from vjepa2_ac.errors import InputError, UserError
-from vjepa2_ac.init.found import FoundData, Knob, Knobs, idle_rule
-from vjepa2_ac.init.names import Column, Pose, find_pose, pick_camera, short_name
+from vjepa2_ac.init.found import Column, FoundData, Knob, Knobs, Pose, find_pose, idle_rule, pick_camera, short_name
 from vjepa2_ac.storage.structured import json_object
 
 _STATISTICS = ("meta/stats.json", "meta/episodes_stats.jsonl")
@@ -44,9 +43,7 @@ def look_at_lerobot(path: str) -> FoundData:
     short = {name: short_name(name) for name in cameras}
     used = list(short.values())
     names = {name: one if used.count(one) == 1 else name for name, one in short.items()}
-    among = (
-        f"of {', '.join(names.values())}; the released weights saw DROID's exterior_1_left" if len(names) > 1 else ""
-    )
+    among = f"of {', '.join(names.values())}; the released weights saw DROID's exterior_1_left"
     fields = _pose_fields(info, pose) if pose else _vector_fields(info, columns)
     velocity = next((name for name in columns if "joint_vel" in name and name.startswith("action")), None)
     success = next((name for name in info.features if "success" in name), None)
@@ -69,7 +66,6 @@ def look_at_lerobot(path: str) -> FoundData:
         idle=idle_rule(has_velocities=velocity is not None) if pose else None,
         about=(f"LeRobot {info.version}, {info.episodes:,} episodes at {info.fps:g} a second",)
         + ((f"depth maps are not used: {', '.join(depth)}",) if depth else ()),
-        extra="lerobot",
     )
 
 

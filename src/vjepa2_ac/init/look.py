@@ -14,16 +14,15 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.loading import admit_forms_of_data, parse_config
 from vjepa2_ac.data.files import walk, within
 from vjepa2_ac.data.index import EpisodeTable
-from vjepa2_ac.data.sources.droid_raw.episode_folders import find_episodes
+from vjepa2_ac.data.sources.droid_raw.source import find_episodes
 from vjepa2_ac.data.sources.indexed_source import open_source
 from vjepa2_ac.data.sources.lerobot.info import INFO
 from vjepa2_ac.data.sources.npz import FORMAT_HELP, opened_npz
 from vjepa2_ac.episode import STATE_DIM, Progress
 from vjepa2_ac.errors import InputError, UserError
 from vjepa2_ac.init.converters import way_by
-from vjepa2_ac.init.found import FoundData, Knob, idle_rule, plain
+from vjepa2_ac.init.found import FoundData, Knob, idle_rule, pick_camera, plain
 from vjepa2_ac.init.lerobot import look_at_lerobot
-from vjepa2_ac.init.names import pick_camera
 from vjepa2_ac.init.rlds import droid, like_droid, look_at_rlds
 from vjepa2_ac.storage.places import BUILTIN
 
@@ -73,8 +72,7 @@ def look_at_raw(path: str) -> FoundData:
     is_remote = storage.is_url(path)
     episodes = None if is_remote else len(find_episodes(path, _CONNECTIONS))
     if episodes == 0:
-        found, needed = "no episode", "folders with trajectory.h5 and metadata_*.json below it"
-        raise InputError(where=path, found=found, needed=needed)
+        raise InputError(where=path, found="no episode", needed="folders with trajectory.h5 and metadata_*.json")
     return FoundData(
         source="droid_raw",
         path=path,
@@ -83,7 +81,6 @@ def look_at_raw(path: str) -> FoundData:
         episodes=episodes,
         idle={"rule": Knob("commands", "openpi's rule, on the commanded joint velocities")},
         about=(f"raw DROID, {'behind a URL' if is_remote else f'{episodes:,} episodes'}, 15 steps a second",),
-        extra="gcs,raw" if is_remote else "raw",
     )
 
 
@@ -93,6 +90,7 @@ LOOKS: dict[str, Callable[[str], FoundData]] = {
     "npz": look_at_npz,
     "raw": look_at_raw,
 }
+_MARKS = {"lerobot": INFO, "rlds": "dataset_info.json"}  # descriptions of forms
 _BY_HAND = "write one .npz for each episode (docs/data.md)"
 _WAYS = {  # to what is read, by the end of a file's name
     ".mcap": f"a ROS 2 bag. {way_by('ros2_bag')} makes .npz of it",
@@ -124,13 +122,14 @@ def look_at(path: str, form: str | None = None) -> FoundData:
     if not storage.is_url(path) and not Path(path).is_dir():
         fix = f"For a data set of the Hugging Face Hub: hf://datasets/{path}" if _HUB_NAME.fullmatch(path) else ""
         raise InputError(where=path, found="no such folder", needed="a folder, or a URL", fix=fix)
-    try:
+    with storage.user_can_read(path):
         if form is None and (found := _of_plugins(path)):
             return found
-        form, root = (form, _root_of(path, form)) if form else _recognized(path)
-        return LOOKS[form](root)
-    except OSError as error:
-        raise storage.unreadable(path, error) from None
+        if form is None:
+            form, path = _recognized(path)
+        elif form in _MARKS:
+            path = next(_with_file(path, _MARKS[form], _DEEPEST), path)
+        return LOOKS[form](path)
 
 
 def _of_plugins(path: str) -> FoundData | None:
@@ -158,12 +157,6 @@ def simulated(path: str) -> FoundData:
     )
 
 
-def _root_of(path: str, form: str) -> str:
-    """Return the folder with the description of a form, at or below a path; the path itself, where none is found."""
-    marks = {"rlds": "dataset_info.json", "lerobot": INFO}
-    return next(_with_file(path, marks[form], _DEEPEST), path) if form in marks else path
-
-
 def _with_file(folder: str, name: str, deepest: int) -> Iterator[str]:
     """Yield the folders, at a path and below it, that have a file."""
     if storage.exists(storage.join(folder, name)):
@@ -175,7 +168,7 @@ def _with_file(folder: str, name: str, deepest: int) -> Iterator[str]:
 
 
 def _recognized(path: str) -> tuple[str, str]:
-    for form, mark in (("lerobot", INFO), ("rlds", "dataset_info.json")):
+    for form, mark in _MARKS.items():
         if found := next(_with_file(path, mark, _DEEPEST), None):
             return form, found
     names = _names_below(path)

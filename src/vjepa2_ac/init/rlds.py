@@ -9,9 +9,8 @@ from typing import Any
 
 from vjepa2_ac import storage
 from vjepa2_ac.data.sources.rlds.shards import dataset_name, find_shards
-from vjepa2_ac.errors import InputError
-from vjepa2_ac.init.found import FoundData, Knob, Knobs, idle_rule
-from vjepa2_ac.init.names import Column, find_pose, pick_camera, short_name
+from vjepa2_ac.errors import InputError, MissingFileError
+from vjepa2_ac.init.found import Column, FoundData, Knob, Knobs, find_pose, idle_rule, pick_camera, short_name
 from vjepa2_ac.storage.structured import read_json_object
 
 DROID = "gs://gresearch/robotics/droid/1.0.1"
@@ -64,7 +63,7 @@ def look_at_rlds(path: str) -> FoundData:
     is_bridge = name in _BRIDGE_NAMES and _BRIDGE_FEATURE in features
     rate = _rate(features, is_bridge=is_bridge)
     has_velocities = _VELOCITIES in features
-    first = pick_camera(images)
+    first, texts = pick_camera(images), [name for name, one in features.items() if one.kind == "text"]
     return FoundData(
         source="rlds",
         path=path,
@@ -74,7 +73,7 @@ def look_at_rlds(path: str) -> FoundData:
                 **_state(path, features, is_bridge=is_bridge),
                 "identity": Knob(_identity(features), "what tells episodes apart", is_guess=True),
                 "cameras": Knob({short_name(name): name for name in images}),
-                "language": Knob(next((name for name, one in features.items() if _is_language(name, one)), None)),
+                "language": Knob(next((name for name in texts if "instruction" in name), None)),
                 "joint_velocity": Knob(_VELOCITIES if has_velocities else None),
                 "control_rate_hz": rate,
             },
@@ -83,7 +82,6 @@ def look_at_rlds(path: str) -> FoundData:
         episodes=episodes,
         idle=idle_rule(has_velocities=has_velocities),
         about=(f"RLDS {name}, {episodes:,} episodes, {rate.value:g} steps a second{' (guessed)' * rate.is_guess}",),
-        extra="gcs" if path.startswith("gs://") else "",
     )
 
 
@@ -100,7 +98,6 @@ def like_droid(path: str, episodes: int, *, is_simulated: bool) -> FoundData:
         episodes=episodes,
         idle={"rule": Knob("commands", rule)},
         about=(f"RLDS, {title}, {episodes:,} episodes, {_DROID_RATE_HZ:g} steps a second",),
-        extra="gcs" if path.startswith("gs://") else "",
     )
 
 
@@ -119,12 +116,10 @@ def _features(path: str) -> Iterator[tuple[str, _Feature]]:
     where = storage.join(path, "features.json")
     try:
         content = read_json_object(where, needed="a description as TFDS writes it")
-    except FileNotFoundError:
+    except MissingFileError:
         fix = "Name the features in the config by hand: `vjepa2-ac config text builtin:bridge` is an example"
         needed = "the features, as TFDS writes them"
         raise InputError(where=where, found="no such file", needed=needed, fix=fix) from None
-    except OSError as error:
-        raise storage.unreadable(where, error) from None
     yield from _inside(content, "")
 
 
@@ -167,7 +162,3 @@ def _identity(features: Mapping[str, _Feature]) -> list[str]:
     found = [name for name, one in features.items() if name.startswith("episode_metadata/") and one.kind != "image"]
     paths = [name for name in found if name.rsplit("/", 1)[-1] in {"file_path", "episode_id", "recording_folderpath"}]
     return paths or found or ["episode_metadata/file_path"]
-
-
-def _is_language(name: str, one: _Feature) -> bool:
-    return one.kind == "text" and "instruction" in name

@@ -15,7 +15,7 @@ from PIL import Image
 from PIL.PngImagePlugin import PngImageFile
 
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage import read_bytes, unreadable
+from vjepa2_ac.storage import read_bytes, user_can_read
 
 MOST_PIXELS = 100_000_000  # a robot's camera has a tenth; a file of 600 bytes may claim forty times as many
 _MOST_BYTES = 1 << 32  # of images that are decoded together
@@ -103,10 +103,8 @@ def read_image(path: str | Path) -> UInt8[np.ndarray, "height width 3"]:
     Raises:
         InputError: There is no such file, it cannot be read, or it is neither PNG nor JPEG.
     """
-    try:
+    with user_can_read(path, needed="an image: PNG or JPEG"):
         data = read_bytes(path)
-    except OSError as error:
-        raise unreadable(str(path), error, needed="an image: PNG or JPEG") from None
     return decode_image(data, str(path))
 
 

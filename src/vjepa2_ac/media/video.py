@@ -132,12 +132,8 @@ def _opened(file: str | Path | ByteReader, where: str) -> Iterator[_Video]:
     """Open a video for decoding in one thread: the loader's workers are the parallelism."""
     av = video_library(where)
     if isinstance(file, (str, Path)):
-        try:
+        with storage.user_can_read(where, needed="a whole, undamaged MP4", fix=_FIX):
             opened = storage.open_to_read(file)
-        except OSError as error:
-            if storage.is_url(file):
-                raise
-            raise storage.unreadable(where, error, needed="a whole, undamaged MP4", fix=_FIX) from None
         with closing(opened), _opened(opened, where) as video:
             yield video
         return

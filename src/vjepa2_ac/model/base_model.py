@@ -17,7 +17,6 @@ from typing import Any
 from vjepa2_ac.config import EncoderSizes, ModelConfig, ModelSizes
 from vjepa2_ac.config.model import Family, FramePath
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage import unreadable
 from vjepa2_ac.storage.places import BUILTIN, HUB
 from vjepa2_ac.storage.structured import read_json_object, record_of
 
@@ -27,7 +26,7 @@ CONFIG = "config.json"
 ENCODER_NEEDED = "an encoder of V-JEPA 2 or 2.1: Meta's .pt, a transformers folder, or a model of this project"
 
 _TINY = f"{BUILTIN}sim-tiny"
-_NEEDED = "a folder written by `vjepa2-ac export` or WorldModel.save_pretrained"
+NEEDED_MODEL = "a folder written by `vjepa2-ac export` or WorldModel.save_pretrained"
 _FIX = "Of a run, `vjepa2-ac export RUN FOLDER` makes one"
 
 
@@ -77,29 +76,16 @@ def _find(name: str, where: str, needed: str, fix: str) -> Path:
     return path
 
 
-def read_model_json(path: Path, *, needed: str = _NEEDED, fix: str = _FIX) -> dict[str, Any]:
-    """Return the JSON object beside a model's weights.
-
-    Raises:
-        InputError: There is none, or it is no JSON object.
-        UnreachableError: The system refuses to read it.
-    """
-    try:
-        return read_json_object(path, needed=needed, fix=fix)
-    except OSError as error:
-        raise unreadable(str(path), error, needed=needed, fix=fix) from None
-
-
 def read_sizes(folder: Path) -> ModelSizes:
     """Read the sizes of the model in a folder.
 
     Raises:
         InputError: The folder is not a world model.
     """
-    where, card = str(folder / CONFIG), read_model_json(folder / CONFIG)
+    where, card = str(folder / CONFIG), read_json_object(folder / CONFIG, needed=NEEDED_MODEL, fix=_FIX)
     if card.get("format") != FORMAT:
-        raise InputError(where=where, found="not the config of a world model", needed=_NEEDED, fix=_FIX)
-    return record_of(ModelSizes, card.get("sizes"), where=f"{where}: sizes", needed=_NEEDED, fix=_FIX)
+        raise InputError(where=where, found="not the config of a world model", needed=NEEDED_MODEL, fix=_FIX)
+    return record_of(ModelSizes, card.get("sizes"), where=f"{where}: sizes", needed=NEEDED_MODEL, fix=_FIX)
 
 
 def check_sizes(found: ModelSizes, given: ModelSizes, *, where: str) -> None:

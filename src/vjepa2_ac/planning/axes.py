@@ -53,10 +53,7 @@ def read_axes(path: str | Path) -> AxesFile:
         InputError: There is no such file, it is none of calibrated axes, or the fit is not good enough.
     """
     where, needed = f"planning.axes: {path}", f"calibrated axes of format {FORMAT}"
-    try:
-        values = read_json_object(Path(path), needed=needed, fix=_FIX)
-    except OSError as error:
-        raise InputError(where=where, found=f"cannot be read ({error.strerror})", needed=needed, fix=_FIX) from None
+    values = read_json_object(path, needed=needed, fix=_FIX)
     if values.get("format") != FORMAT:
         raise InputError(where=where, found=f"format {values.get('format')!r}", needed=needed, fix=_FIX)
     known = {one.name: values[one.name] for one in fields(AxesFile) if one.name in values}

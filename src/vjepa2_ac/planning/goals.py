@@ -19,7 +19,6 @@ from vjepa2_ac.config.planning import GoalsConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import encode_png, read_image
 from vjepa2_ac.planning.input_checks import require_image
-from vjepa2_ac.storage import unreadable
 from vjepa2_ac.storage.files import folder_writer
 from vjepa2_ac.storage.structured import json_text, read_json_object, record_of
 
@@ -224,11 +223,7 @@ def read_goal_folder(folder: Path) -> GoalFolder:
         InputError: There is no goals.json, it says something else, or a file is no image of the first one's size.
     """
     path, needed = folder / GOALS_FILE, f"the {GOALS_FILE} that `vjepa2-ac goals` writes"
-    try:
-        values = read_json_object(path, needed=needed)
-    except OSError as error:
-        raise unreadable(str(path), error, needed=needed) from None
-    found = record_of(_GoalsFile, values, where=str(path), needed=needed)
+    found = record_of(_GoalsFile, read_json_object(path, needed=needed), where=str(path), needed=needed)
     goals: list[SubGoal] = []
     for place, entry in enumerate(found.goals, start=1):
         image = read_image(folder / entry.file)

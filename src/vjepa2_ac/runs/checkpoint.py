@@ -234,10 +234,7 @@ def written_state(checkpoint: Path) -> RunState:
         InputError: The file is missing or damaged.
     """
     path = checkpoint / STATE
-    try:
-        values = read_json_object(path, needed=_NEEDED, fix=_FIX)  # a loss scale may be infinite
-    except OSError as error:
-        raise InputError(where=str(path), found=f"cannot be read ({error})", needed=_NEEDED, fix=_FIX) from None
+    values = read_json_object(path, needed=_NEEDED, fix=_FIX)  # a loss scale may be infinite
     return record_of(RunState, values, where=str(path), needed=_NEEDED, fix=_FIX)
 
 

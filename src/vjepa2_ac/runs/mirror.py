@@ -104,7 +104,7 @@ class RemoteCheckpoints:
         for name in sorted(listing, reverse=True):
             try:
                 owner = str(read_json_object(self._path(name, STATE)).get("run_id", ""))
-            except (FileNotFoundError, InputError):
+            except InputError:
                 continue
             run_id = owner if run_id is None else run_id
             if owner != run_id:

@@ -12,20 +12,21 @@ from vjepa2_ac.storage.files import (
     is_empty,
     join,
     list_files,
+    list_folder,
     list_names,
     open_to_read,
     read_bounded,
     read_bytes,
     read_range,
-    read_ranges,
     require_new_folder,
     sha256_of_file,
     sync,
     try_writing_at,
     unreadable,
+    user_can_read,
     user_can_write,
     write_atomically,
 )
 from vjepa2_ac.storage.places import is_url
-from vjepa2_ac.storage.remote import FileInfo, ShortReadError, bytes_fetched
+from vjepa2_ac.storage.remote import FileInfo, ShortReadError, bytes_fetched, read_ranges
 from vjepa2_ac.storage.transfer import download, file_sizes, remove, remove_folder, try_writing, upload

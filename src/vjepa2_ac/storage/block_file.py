@@ -154,9 +154,8 @@ class DiskCache:
             try:
                 partial.write_bytes(content)
                 partial.replace(path)
-            except OSError:
+            finally:
                 partial.unlink(missing_ok=True)
-                raise
             self._written += len(content)
             if self._written > self._limit * _CHECK_SHARE:
                 self._evict()

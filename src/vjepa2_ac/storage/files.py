@@ -21,18 +21,17 @@ import shutil
 import stat
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from vjepa2_ac.errors import InputError, UnreachableError, UserError
+from vjepa2_ac.errors import InputError, MissingFileError, UnreachableError, UserError
 from vjepa2_ac.storage import remote
 from vjepa2_ac.storage.block_file import RangedFile, open_remote
 from vjepa2_ac.storage.places import is_url
-from vjepa2_ac.storage.remote import FileInfo, ShortReadError, complete
+from vjepa2_ac.storage.remote import FileInfo, ShortReadError
 
-_HASH_CHUNK_BYTES = 1 << 20
 _ABSENT = frozenset({errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG})
 _FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 _UNWRITABLE = _FULL | _ABSENT | {errno.EACCES, errno.EPERM, errno.EROFS, errno.EEXIST, errno.EINVAL}
@@ -91,24 +90,30 @@ def file_version(path: str | Path) -> str:
     return remote.file_version(str(path)) if is_url(path) else str(Path(path).stat().st_mtime_ns)
 
 
-def list_files(folder: str | Path) -> list[FileInfo]:
-    """Return the files of a folder, sorted by name; none where there is no such folder.
+def list_folder(folder: str | Path) -> list[FileInfo]:
+    """Return the files and folders in a folder, sorted by name; none where there is no such folder.
 
     Raises:
         OSError: The folder cannot be listed.
     """
     if is_url(folder):
-        return [file for file in remote.list_folder(str(folder)) if file.is_file]
-    files = [path for path in Path(folder).iterdir() if path.is_file()] if Path(folder).is_dir() else []
-    found = {path.name: path.stat() for path in files}
-    return [FileInfo(name, one.st_size, str(one.st_mtime_ns)) for name, one in sorted(found.items())]
+        return remote.list_folder(str(folder))
+    paths = sorted(Path(folder).iterdir()) if Path(folder).is_dir() else []
+    stats = {path.name: path.stat() if path.is_file() else None for path in paths}
+    return [
+        FileInfo(name, one.st_size, str(one.st_mtime_ns)) if one else FileInfo(name, 0, "", is_file=False)
+        for name, one in stats.items()
+    ]
+
+
+def list_files(folder: str | Path) -> list[FileInfo]:
+    """Return the files of `list_folder`."""
+    return [file for file in list_folder(folder) if file.is_file]
 
 
 def list_names(folder: str | Path) -> list[str]:
-    """Return the names of the files and folders in a folder, sorted; none where there is no such folder."""
-    if is_url(folder):
-        return [entry.name for entry in remote.list_folder(str(folder))]
-    return sorted(entry.name for entry in Path(folder).iterdir()) if Path(folder).is_dir() else []
+    """Return the names of `list_folder`."""
+    return [entry.name for entry in list_folder(folder)]
 
 
 def open_to_read(path: str | Path) -> ByteReader:
@@ -125,8 +130,8 @@ def open_to_read(path: str | Path) -> ByteReader:
 def unreadable(where: str, error: OSError, *, needed: str = "", fix: str = "") -> UserError:
     """Return the error of a file that is missing, truncated, or refused by the operating system.
 
-    The last (no permission, too many open files, a disk that went away) is temporary and says nothing about the file's
-    content: it is an UnreachableError, which is never stored.
+    The first is a MissingFileError, the second an InputError. The last (no permission, too many open files, a disk that
+    went away) is temporary and says nothing about the file's content: an UnreachableError, which is never stored.
 
     Args:
         where: The file, and its episode.
@@ -134,10 +139,26 @@ def unreadable(where: str, error: OSError, *, needed: str = "", fix: str = "") -
         needed: What should be there.
         fix: How to fix it where the file is wrong.
     """
+    if isinstance(error, FileNotFoundError | NotADirectoryError):  # of a URL it has no number
+        absent = os.strerror(errno.ENOENT)
+        return MissingFileError(where=where, found=f"cannot be read: {absent}", needed=needed, fix=fix)
     found = f"cannot be read: {error.strerror or error}"
-    if isinstance(error, ShortReadError) or error.errno in _ABSENT:
+    if isinstance(error, ShortReadError | IsADirectoryError) or error.errno in _ABSENT:
         return InputError(where=where, found=found, needed=needed, fix=fix)
     return UnreachableError(where=where, found=found, needed=needed, fix="Check its permissions, and the disk")
+
+
+@contextmanager
+def user_can_read(path: str | Path, *, needed: str = "", fix: str = "") -> Iterator[None]:
+    """Raise an error for the user if a file cannot be read.
+
+    Raises:
+        UserError: Instead of any OSError; see `unreadable`.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise unreadable(str(path), error, needed=needed, fix=fix) from None
 
 
 def read_bytes(path: str | Path) -> bytes:
@@ -180,39 +201,14 @@ def read_range(path: str | Path, start: int, length: int) -> bytes:
         return file.read(length)
 
 
-def read_ranges(path: str | Path, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
-    """Return several (start, length) pieces of a file, each complete; those of a URL are fetched concurrently.
-
-    Raises:
-        OSError: There is no such file, it cannot be read, or it ends within a piece.
-    """
-    if is_url(path):
-        return remote.read_ranges(str(path), ranges)
-    pieces = []
-    with Path(path).open("rb") as file:
-        for start, length in ranges:
-            file.seek(start)
-            pieces.append(file.read(length))
-    return complete(path, ranges, pieces)
-
-
-def sha256_of_file(path: str | Path, *, progress: Callable[[int], None] = lambda _: None) -> str:
-    """Return the SHA-256 of a file as hexadecimal digits, read in chunks.
-
-    Args:
-        path: The file.
-        progress: Called after every chunk with the bytes read so far.
+def sha256_of_file(path: Path) -> str:
+    """Return the SHA-256 of a local file as hexadecimal digits.
 
     Raises:
         OSError: There is no such file, or it cannot be read.
     """
-    digest, done = hashlib.sha256(), 0
-    with closing(open_to_read(path)) as file:
-        while chunk := file.read(_HASH_CHUNK_BYTES):
-            digest.update(chunk)
-            done += len(chunk)
-            progress(done)
-    return digest.hexdigest()
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 # ---- write, on this machine ----

@@ -130,14 +130,14 @@ def arrays_as_bytes(arrays: Mapping[str, np.ndarray]) -> bytes:
     return file.getvalue()
 
 
-def read_arrays(data: bytes, where: str = "its arrays") -> dict[str, np.ndarray]:
+def read_arrays(data: bytes) -> dict[str, np.ndarray]:
     """Return the arrays that `numpy.savez` wrote; nothing is unpickled, and nothing expands beyond the file's size.
 
     Raises:
         InputError: It is another kind of file, damaged, compressed, or inconsistent.
     """
-    file = NpzFile(io.BytesIO(data), where)
+    file = NpzFile(io.BytesIO(data), "its arrays")
     if (total := sum(file.header(name).nbytes for name in file.names)) > len(data):
         found = f"arrays of {total:,} bytes in a file of {len(data):,}"
-        raise InputError(where=where, found=found, needed="arrays that are not compressed")
+        raise InputError(where="its arrays", found=found, needed="arrays that are not compressed")
     return {name: file.array(name).copy() for name in file.names}

@@ -11,7 +11,7 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -151,18 +151,10 @@ def read_ranges(url: str, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
         OSError: There is no such file, or it ends within a piece.
         UnreachableError: It cannot be reached.
     """
-    return complete(url, ranges, _concurrently(url, ranges))
-
-
-def complete(path: str | Path, ranges: Sequence[tuple[int, int]], pieces: list[bytes]) -> list[bytes]:
-    """Return pieces of a file, each as long as its range.
-
-    Raises:
-        ShortReadError: One is shorter.
-    """
+    pieces = _concurrently(url, ranges)
     for (start, length), piece in zip(ranges, pieces, strict=True):
         if len(piece) < length:
-            raise ShortReadError(f"{path}: {len(piece)} of {length} bytes at {start}")
+            raise ShortReadError(f"{url}: {len(piece)} of {length} bytes at {start}")
     return pieces
 
 
@@ -191,9 +183,7 @@ def _version_of(found: Mapping[str, Any]) -> str:
 
 def _read_once(url: str, start: int, length: int, timeout_s: float) -> bytes:
     """Read a range; accept a short answer only at the end of the file."""
-    bare: dict[str, Any] = (
-        {} if _filesystem(url).async_impl else {"cache_type": "none"}
-    )  # else megabytes are prefetched
+    bare: Any = {} if _filesystem(url).async_impl else {"cache_type": "none"}  # else megabytes are prefetched
     try:
         data: bytes = _ask(url, "cat_file", timeout_s, start=start, end=start + length, **bare)
     except Exception as error:
@@ -286,7 +276,11 @@ def _filesystem(url: str, *, writing: bool = False) -> Any:
             options["access"] = "read_write" if writing else "read_only"
         key = (os.getpid(), protocol, repr(sorted(options.items())), os.environ.get(_EMULATOR))
         if key not in _filesystems:
-            _filesystems[key] = _google(kind, options) if protocol == "gs" else _plain(kind, options, url)
+            try:
+                opened = _google(kind, options) if protocol == "gs" else kind(**options, skip_instance_cache=True)
+            except TypeError as error:  # it needs more than an address
+                raise InputError(where=url, found=f"an address alone does not do ({error})", needed=_KNOWN) from None
+            _filesystems[key] = opened
         return _filesystems[key]
 
 
@@ -312,22 +306,14 @@ def _kind(url: str, protocol: str) -> Any:
         raise InputError(where=url, found=f"nothing reads {protocol}://", needed=_KNOWN) from None
 
 
-def _plain(kind: Any, options: dict[str, Any], url: str) -> Any:
-    try:
-        return kind(**options, skip_instance_cache=True)
-    except TypeError as error:  # it needs more than an address
-        raise InputError(where=url, found=f"an address alone does not do ({error})", needed=_KNOWN) from None
-
-
 def _google(kind: Any, options: dict[str, Any]) -> Any:
     """Open Google's file system without its own retries: six for each of ours, up to half a minute in total."""
     once = getattr(kind._request, "__wrapped__", kind._request)
-    kind = type(kind.__name__, (kind,), {"_request": once})
-    options = {"use_listings_cache": False, **options}
+    open_as = partial(type(kind.__name__, (kind,), {"_request": once}), use_listings_cache=False, **options)
     who = google_token()
-    if who == "cloud":  # a machine may have no account of its own
-        try:
-            return kind(token=who, **options)
-        except (ValueError, OSError):
-            who = "anon"
-    return kind(token=who, **options)
+    try:
+        return open_as(token=who)
+    except (ValueError, OSError):
+        if who != "cloud":
+            raise
+        return open_as(token="anon")  # noqa: S106 - a machine may have no account of its own

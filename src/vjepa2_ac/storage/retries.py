@@ -84,10 +84,13 @@ def with_retries(
         except (*_ABSENT, UserError):
             raise
         except Exception as error:
-            if _is_a_bug(error):
-                raise
+            if type(error).__module__ == "builtins" and not isinstance(error, OSError | ValueError | EOFError):
+                raise  # an error of Python's own that no network causes, such as a TypeError
             if not _passes(error):
-                raise _refused(where, error, access, doing) from error
+                is_denied = status_of(error) in _NO_ACCESS or _is_of_login(error)
+                found = f"{'no permission' if is_denied else f'cannot be {doing}'} ({_summary(error)})"
+                fix = access if is_denied else "Check the address"
+                raise RefusedError(where=where, found=found, fix=fix) from error
             if progress() > before:
                 begin, failures = time.monotonic(), 0
             before, failures = progress(), failures + 1
@@ -134,11 +137,6 @@ def status_of(error: BaseException) -> int | None:
     return 403 if isinstance(error, PermissionError) or str(error).startswith("Forbidden") else None  # as gcsfs says
 
 
-def _is_a_bug(error: Exception) -> bool:
-    """Return whether it is an error of Python's own that no network causes, such as a TypeError."""
-    return type(error).__module__ == "builtins" and not isinstance(error, OSError | ValueError | EOFError)
-
-
 def _passes(error: Exception) -> bool:
     status = status_of(error)
     if status is not None:
@@ -151,12 +149,6 @@ def _passes(error: Exception) -> bool:
 
 def _is_of_login(error: Exception) -> bool:
     return type(error).__module__.startswith("google.auth") or "Credentials" in type(error).__name__
-
-
-def _refused(where: str, error: Exception, access: str, doing: str) -> RefusedError:
-    if status_of(error) in _NO_ACCESS or _is_of_login(error):
-        return RefusedError(where=where, found=f"no permission ({_summary(error)})", fix=access)
-    return RefusedError(where=where, found=f"cannot be {doing} ({_summary(error)})", fix="Check the address")
 
 
 def _summary(error: Exception) -> str:

@@ -1,7 +1,7 @@
 """JSON and YAML: values of a file, as a mapping or as a record of declared types; and JSON that this program writes.
 
 Both parsers execute nothing. A stranger's file is read up to a size; YAML has no aliases, so that none becomes larger.
-Invalid content is an InputError; a file that is missing or cannot be read stays the system's OSError.
+Invalid content is an InputError, a missing file a MissingFileError.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pydantic import TypeAdapter, ValidationError
 from yaml.nodes import MappingNode, Node, ScalarNode
 
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage import read_bounded
+from vjepa2_ac.storage import read_bounded, user_can_read
 
 T = TypeVar("T")
 
@@ -69,10 +69,12 @@ def read_json_object(
     """Return the keys and values of a JSON object in a file, on this machine or behind a URL.
 
     Raises:
-        InputError: As `json_object`; or the file is larger than `most_bytes`.
-        OSError: There is no such file, or it cannot be read.
+        InputError: As `json_object`; or the file is larger than `most_bytes`. A MissingFileError: there is none.
+        UnreachableError: It cannot be read now.
     """
-    return json_object(read_bounded(path, most_bytes), where=str(path), needed=needed, fix=fix)
+    with user_can_read(path, needed=needed, fix=fix):
+        data = read_bounded(path, most_bytes)
+    return json_object(data, where=str(path), needed=needed, fix=fix)
 
 
 def _parsed(data: bytes | str, kind: type[T], *, where: str, needed: str, fix: str) -> T:

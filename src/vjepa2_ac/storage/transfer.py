@@ -1,4 +1,4 @@
-"""File transfer to and from another place: a local folder, or a URL that can be written.
+"""File transfer to and from another place: a local folder, a URL that can be written; and models from the Hub.
 
 A permanent failure to write a file is a `RefusedError`, any other an `UnreachableError`. As when reading, temporary
 failures at a URL are retried. A file in an object store is either complete or absent.
@@ -10,14 +10,14 @@ import errno
 import secrets
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from vjepa2_ac.errors import RefusedError, UnreachableError
+from vjepa2_ac.errors import InputError, RefusedError, UnreachableError
 from vjepa2_ac.storage import remote
 from vjepa2_ac.storage.files import atomic_writer, join, try_writing_at
-from vjepa2_ac.storage.places import is_url
+from vjepa2_ac.storage.places import HUB, is_url
 
 _AWAY = frozenset({
     errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.ENOTCONN, errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.ENOSPC,
@@ -140,3 +140,33 @@ def _explained(path: str) -> Iterator[None]:
 def _no_bucket(url: str) -> RefusedError:
     bucket = url.partition("://")[2].split("/", 1)[0]
     return RefusedError(where=url, found=f"there is no bucket {bucket}", fix="Make it, or check its name")
+
+
+def from_hub(name: str, files: Sequence[str], *, where: str) -> Path:
+    """Return the folder of a model in the Hub's cache, after downloading what is missing; a part is gone on with.
+
+    Args:
+        name: hf://owner/name, with @revision if it is not the newest.
+        files: Patterns of the files that are wanted.
+        where: For messages.
+
+    Raises:
+        RefusedError: There is no such model, or not for this user.
+        UnreachableError: The Hub cannot be reached, and the model is not in the cache.
+        InputError: The Hub answers something else, or the disk is full.
+    """
+    from huggingface_hub import errors, snapshot_download
+
+    model, _, revision = name.removeprefix(HUB).partition("@")
+    try:
+        return Path(snapshot_download(model, revision=revision or None, allow_patterns=list(files)))
+    except (errors.RepositoryNotFoundError, errors.RevisionNotFoundError):  # or gated
+        fix = "Check the name (hf://owner/name@revision). A gated model must be asked for on its page; for one that is"
+        found = "no such model or revision, or none for you"
+        raise RefusedError(where=where, found=found, fix=f"{fix} not public, `hf auth login` or set HF_TOKEN") from None
+    except errors.LocalEntryNotFoundError:
+        fix = "Check the network, or name a folder of this machine"
+        raise UnreachableError(where=where, found="the Hub cannot be reached", fix=fix) from None
+    except (errors.HfHubHTTPError, OSError, ValueError) as error:
+        said = next(iter(str(error).strip().splitlines()), type(error).__name__)
+        raise InputError(where=where, found=said, needed="the files of a model", fix="Check name and disk") from None

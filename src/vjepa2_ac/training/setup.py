@@ -17,8 +17,8 @@ from torch import nn
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.data import Split
+from vjepa2_ac.data.coverage import find_duplicates
 from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.data.duplicates import find_duplicates
 from vjepa2_ac.data.loader import Batches, Mixed, ProcessShare, training_loader, validation_batches
 from vjepa2_ac.data.streams import ToDevice, copies_for
 from vjepa2_ac.distributed import PRECISIONS, broadcast_object, first_of_machine, make_accelerator
@@ -204,7 +204,7 @@ def batches_from(run: Run) -> Batches:
     """Yield the micro-batches of this process from the current step on."""
     replay = run.config.replay
     return training_loader(
-        run.dataset if run.replayed is None or replay is None else Mixed(run.dataset, run.replayed, replay.share),
+        Mixed(run.dataset, run.replayed, replay.share if replay else 0.0),
         seed=run.config.seed,
         batch_size=run.config.training.batch_size,
         start_position=run.state.clips_done,

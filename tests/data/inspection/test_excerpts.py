@@ -15,7 +15,6 @@ from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.inspection.check import check_data
 from vjepa2_ac.data.inspection.excerpts import Finding, excerpts_of, signs_in, small_grey
 from vjepa2_ac.data.selection import StepSelection
-from vjepa2_ac.errors import InputError
 from vjepa2_ac.spaces import POSE, StateSpace, vector_states
 
 Pair = tuple[np.ndarray, np.ndarray]
@@ -173,11 +172,3 @@ def test_the_middle_of_the_longest_kept_range_is_looked_at() -> None:
     source = dataset.source
     assert isinstance(source, MemorySource)
     assert source.decoded == [(4, step) for step in range(11, 17)]
-
-
-def test_an_episode_that_cannot_be_read_is_counted_or_named() -> None:
-    many = [30] * 300
-    found = list(excerpts_of(in_memory(many, broken_episodes="skip"), episodes=300, steps=4))
-    assert len(found) == 299
-    with pytest.raises(InputError, match=r"episode 3: damaged.*data\.exclude"):
-        list(excerpts_of(in_memory(many), episodes=300, steps=4))

@@ -10,7 +10,7 @@ from memory_source import MemorySource
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.coverage import sample_of
 from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.data.inspection.statistics import MOVED, RELEASED_STEP_CM, TURNED, idle_runs, inspect_dataset
+from vjepa2_ac.data.inspection.statistics import MOVED, TURNED, idle_runs, inspect_dataset
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.reports import sheet as figure
 from vjepa2_ac.reports.figures.contact_sheet import ContactSheet
@@ -103,9 +103,3 @@ def test_a_broken_frame_is_left_out_of_the_contact_sheet(monkeypatch: pytest.Mon
     dataset = hundred(frozenset(), "error", frozenset({7}))
     with pytest.raises(InputError, match=r"pictures of episode 7: damaged\..*add to data\.exclude"):
         plot_dataset(inspect_dataset(dataset), tmp_path / "sheet.png", rows=100)
-
-
-def test_the_example_of_upstream_moves_as_far_as_is_said(shared: Path) -> None:
-    with np.load(shared / "data" / "franka_example_traj.npz") as file:
-        states = np.squeeze(file["states"])
-    assert np.linalg.norm(states[1, :3] - states[0, :3]) * 100 == pytest.approx(RELEASED_STEP_CM, abs=0.05)

@@ -153,12 +153,6 @@ def test_an_episode_is_parsed_and_its_video_walked_once_on_a_machine(
     assert len(walked) < STEPS
 
 
-def test_a_source_travels_to_a_worker(tree: Path) -> None:
-    raw, here = pickle.loads(pickle.dumps(source(tree))), source(tree)  # noqa: S301 - our own
-    reader = pickle.loads(pickle.dumps(raw.read(1).read_frames))  # noqa: S301
-    np.testing.assert_array_equal(reader([3]), here.read(1).read_frames([3]))
-
-
 def h5(change: Callable[[h5py.File], object]) -> Callable[[Path], object]:
     def apply(folder: Path) -> None:
         with h5py.File(folder / "trajectory.h5", "r+") as file:
@@ -228,14 +222,6 @@ def test_two_episodes_of_one_identity_are_a_problem(tree: Path, tmp_path: Path) 
     infos = source(tmp_path).infos()
     assert len(infos) == 2
     assert [problem.name for problem in infos.problems] == [info.id for info in infos]
-
-
-def test_a_video_that_was_cut_after_indexing_is_named(tmp_path: Path) -> None:
-    raw = source(write(tmp_path).parents[3])
-    raw.infos()
-    cut(MP4, 0.4)(tmp_path / PLACE)
-    with pytest.raises(InputError, match=f"{LEFT}.mp4"):
-        raw.read(0).read_frames([3])
 
 
 def test_a_tree_in_the_cloud_reads_as_here(tree: Path, gcs: Gcs, tmp_path: Path) -> None:

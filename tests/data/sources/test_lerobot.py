@@ -28,7 +28,6 @@ from lerobot_sets import (
     write_v21,
     write_v30,
 )
-from recordings import write_mp4
 from synthetic import synthetic_states
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.lerobot.source import LeRobotSource
@@ -191,12 +190,6 @@ def test_the_rate_is_the_configs_where_it_names_one(v30: Path) -> None:
     source = source_of(v30, lerobot={"fps": 12.5})
     assert source.read(0).control_rate_hz == 12.5
     assert numbers_of(source.read(1).read_frames([9])[0]) == (1, 9, 0), "frames stay where info.json says"
-
-
-def test_the_index_is_kept_until_a_file_changes(copy: Path) -> None:
-    assert len(source_of(copy).infos()) == 5
-    spoiled(with_value(3, np.nan))(copy)
-    assert [problem.name for problem in source_of(copy).infos().problems] == ["episode_000000"]
 
 
 # --- conventions -------------------------------------------------------------------------------------------------
@@ -445,14 +438,3 @@ def test_a_video_that_says_it_is_shorter_than_its_rows_is_a_problem(v30: Path, t
     ends = pq.read_table(path).column(name).to_pylist()
     change_table(path, **{name: pa.array([11 / FPS, *ends[1:]])})
     assert "0.733 s of video, says the data set, for 12 rows" in only_problem(root)
-
-
-def test_a_video_that_is_shorter_than_its_rows_is_found_when_it_is_read(
-    v21: Path, episodes: list[Recorded], tmp_path: Path
-) -> None:
-    root = Path(shutil.copytree(v21, tmp_path / "set"))
-    write_mp4(first_video(root), episodes[0].frames[KEY][:9], rate=FPS, gop=2)
-    episode = source_of(root).read(0)
-    assert numbers_of(episode.read_frames([8])[0]) == (0, 8, 0)
-    with pytest.raises(InputError, match=r"episode_000000\.mp4: episode_000000: no frame at 0\.600 s"):
-        episode.read_frames([3, 9])

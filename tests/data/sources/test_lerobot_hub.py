@@ -1,7 +1,6 @@
 """Remote LeRobot data sets: at `hf://datasets/owner/name`, and in a bucket."""
 
 import json
-import pickle
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -85,17 +84,6 @@ def test_the_outcome_is_in_the_tables_or_in_the_rows(hub: Hub, tmp_path: Path) -
     assert [info.success for info in source_of("v30", tmp_path).infos()] == outcomes
     assert [info.success for info in source_of("v21", tmp_path).infos()] == [None] * 5
     assert [info.success for info in source_of("v21", tmp_path, outcome="success").infos()] == outcomes
-
-
-def test_what_was_fetched_once_is_not_fetched_again(hub: Hub, tmp_path: Path) -> None:
-    source = source_of("v30", tmp_path)
-    source.infos()
-    first = source.read(2).read_frames([1, 5])
-    assert hub.bytes_read(".mp4") > 0
-    hub.ranges.clear()
-    other_process = pickle.loads(pickle.dumps(source))  # noqa: S301 - our own bytes
-    np.testing.assert_array_equal(other_process.read(2).read_frames([1, 5]), first)
-    assert [path for path, _, _ in hub.ranges if path != "meta/info.json"] == []
 
 
 def test_a_data_set_that_is_not_there_says_how_to_log_in(hub: Hub, tmp_path: Path) -> None:

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from clips import clip_at
 from lerobot_sets import recorded, write_v21
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import Dataset, open_dataset
@@ -21,17 +20,6 @@ def dataset_of(folder: Path, progress: Progress | None = None) -> Dataset:
         "disk_cache": {"dir": str(folder.parent / "cache")},
     }  # fmt: skip
     return open_dataset(DataConfig.model_validate_json(json.dumps(values)), progress=progress)
-
-
-def test_without_its_decoder_no_episode_is_offered_for_exclusion(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    dataset = dataset_of(write_v21(tmp_path / "set", [recorded(0, 20)]))
-    monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(UnreachableError, match="PyAV, which decodes and writes video, is not installed") as raised:
-        clip_at(dataset, 0, 0)
-    assert "pip install" in raised.value.fix
-    assert "exclude" not in str(raised.value)
 
 
 def test_without_its_reader_no_episode_is_called_broken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -84,16 +84,6 @@ def test_a_source_travels_to_a_worker(tmp_path: Path) -> None:
         reader([STEPS])
 
 
-def test_what_was_found_out_is_kept_until_a_file_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write(tmp_path / "one.npz")
-    assert len(source(tmp_path).infos()) == 1
-    with monkeypatch.context() as patch:
-        patch.setattr(NpzSource, "_scan", lambda *_: pytest.fail("read again"))
-        assert len(source(tmp_path).infos()) == 1
-    write(tmp_path / "two.npz")
-    assert [info.id for info in source(tmp_path).infos()] == ["one", "two"]
-
-
 def test_a_file_that_changed_after_indexing_is_named(tmp_path: Path) -> None:
     path = write(tmp_path / "one.npz")
     plain = source(tmp_path)

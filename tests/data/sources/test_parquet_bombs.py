@@ -44,10 +44,7 @@ def test_texts_that_repeat_without_end_are_refused_before_python_has_them(
 
 @pytest.mark.parametrize(
     ("name", "message"),
-    [
-        ("contradicting_footer", "Definition level histogram"),
-        ("mistyped_footer", "ColumnMetaData type does not match"),
-    ],
+    [("contradicting_footer", "Definition level histogram"), ("mistyped_footer", "ColumnMetaData type does not match")],
 )
 def test_a_footer_that_contradicts_itself_is_damage_and_does_not_end_the_process(
     name: str, message: str, tmp_path: Path

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import google_crc32c
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -52,27 +51,6 @@ def test_framing_is_the_published_one(tmp_path: Path) -> None:
     written = (tmp_path / "file").read_bytes()
     assert written[:12] == bytes(8) + masked.to_bytes(4, "little")
     assert len(written) == 16
-
-
-def test_a_file_that_ends_within_a_record_is_truncated_wherever_it_ends(file: Path) -> None:
-    whole = file.read_bytes()
-    boundaries = {0, *(span.end for span in index_records(file))}
-    for size in set(range(0, len(whole), 7)) | {1, 11, 12, 15, len(whole) - 1}:
-        file.write_bytes(whole[:size])
-        if size in boundaries:
-            continue
-        with pytest.raises(InputError, match=r"record \d at byte \d+.*truncated"):
-            index_records(file)
-
-
-def test_every_flipped_bit_is_noticed(file: Path) -> None:
-    whole = bytearray(file.read_bytes())
-    for position in np.random.default_rng(0).integers(0, 8 * len(whole), 100):
-        whole[position // 8] ^= 1 << position % 8
-        file.write_bytes(whole)
-        with pytest.raises(InputError, match="CRC"):
-            read_all(file)
-        whole[position // 8] ^= 1 << position % 8
 
 
 @pytest.mark.parametrize("content", [b"not a TFRecord, but a text that is long enough", bytes(100), b"\x89PNG" * 20])

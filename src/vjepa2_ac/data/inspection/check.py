@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import islice
+from textwrap import shorten
 
 import numpy as np
 from jaxtyping import Float
@@ -14,9 +15,8 @@ from scipy.spatial.transform import Rotation
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.coverage import coverage_in
+from vjepa2_ac.data.coverage import coverage_in, find_duplicates
 from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.data.duplicates import find_duplicates
 from vjepa2_ac.data.inspection.excerpts import Finding, Level, excerpt_findings
 from vjepa2_ac.data.inspection.statistics import PERCENTILES, at_some_stride
 from vjepa2_ac.data.loader import training_loader
@@ -36,13 +36,7 @@ _NUMBERED = 8  # numbers of a vector in a message
 
 
 def check_data(
-    config: DataConfig,
-    *,
-    seed: int = 0,
-    batch_size: int = 2,
-    clips: int = 32,
-    progress: Progress | None = None,
-    clock: Callable[[], float] = time.perf_counter,
+    config: DataConfig, *, seed: int = 0, batch_size: int = 2, clips: int = 32, progress: Progress | None = None
 ) -> Iterator[Finding]:
     """Yield the findings, line by line, in the order in which training would meet them.
 
@@ -54,15 +48,13 @@ def check_data(
         batch_size: Clips in a batch.
         clips: About as many are read.
         progress: Called while the index is built.
-        clock: Returns seconds.
 
     Raises:
         InputError: The data cannot be opened, or a clip cannot be read.
     """
-    started = clock()
+    started = time.perf_counter()
     dataset = open_dataset(config, progress=progress)
-    config = dataset.config
-    seconds = clock() - started
+    config, seconds = dataset.config, time.perf_counter() - started
     steps = int(dataset.table.num_steps.sum())
     yield Finding("ok", "source", f"{config.source}, {config.path}, camera {', '.join(config.cameras)}")
     yield Finding("ok", "index", f"{len(dataset.table):,} episodes, {steps:,} steps; opened in {seconds:.1f} s")
@@ -70,7 +62,7 @@ def check_data(
         dataset = at_some_stride(dataset)
         yield Finding("ok", "stride", f"auto; looked at here at the smallest candidate, {dataset.config.stride}")
     yield from _what_takes_part(dataset)
-    yield from _read(dataset, seed=seed, batch_size=batch_size, clips=clips, clock=clock)
+    yield from _read(dataset, seed=seed, batch_size=batch_size, clips=clips)
     if coverage := coverage_in(dataset):
         yield from (Finding("ok", name, text) for name, text in coverage.lines.items())
         yield Finding("warning" if coverage.narrow else "ok", "coverage", coverage.verdict)
@@ -92,7 +84,7 @@ def _what_takes_part(dataset: Dataset) -> Iterator[Finding]:
             if split == "train":
                 raise
             level: Level = "error" if share else "ok"  # training opens validation, and test if it has a share
-            yield Finding(level, split, f"{_shortened(error.found)}. {error.fix}")
+            yield Finding(level, split, f"{shorten(error.found, _LONGEST, placeholder=' …')}. {error.fix}")
             continue
         episodes = len(np.unique(windows.episodes))
         short = f"; {len(windows.short):,} episodes are too short" if len(windows.short) else ""
@@ -119,25 +111,17 @@ def _split_that_can_answer(dataset: Dataset) -> Iterator[Finding]:
         if test >= ENOUGH_EPISODES and train > test:
             yield Finding("warning", "test", f"{words}: with data.test_share={percent / 100:g} it has {test}")
             return
-    yield Finding(
-        "warning",
-        "test",
-        f"{words}: no share of {(dataset.taking_part & among).sum()} leaves enough to train on. Record more",
-    )
+    whole = int((dataset.taking_part & among).sum())
+    yield Finding("warning", "test", f"{words}: no share of {whole} leaves enough to train on. Record more")
 
 
-def _shortened(text: str) -> str:
-    return text if len(text) <= _LONGEST else f"{text[:_LONGEST].rsplit(' ', 1)[0]} …"
-
-
-def _read(dataset: Dataset, *, seed: int, batch_size: int, clips: int, clock: Callable[[], float]) -> Iterator[Finding]:
-    started = clock()
+def _read(dataset: Dataset, *, seed: int, batch_size: int, clips: int) -> Iterator[Finding]:
+    started = time.perf_counter()
     loader = training_loader(dataset, seed=seed, batch_size=batch_size)
     batches = [next(loader)]
-    first_s = clock() - started
-    started = clock()
+    first_s = time.perf_counter() - started
     batches += islice(loader, max(1, -(-clips // batch_size) - 1))
-    rest_s = clock() - started
+    rest_s = time.perf_counter() - started - first_s
     read = [batch for batch in batches if batch.starts]
     if not read:
         yield Finding("error", "clips", f"none of {len(batches) * batch_size} could be read: see data.broken_episodes")
@@ -163,36 +147,22 @@ def findings_in(batches: Sequence[Batch], spaces: Spaces = POSES) -> Iterator[Fi
     states = np.concatenate([batch.states.flatten(0, 1).numpy() for batch in batches]).astype(np.float64)
     actions = np.concatenate([batch.actions.flatten(0, 1).numpy() for batch in batches]).astype(np.float64)
     if first.latents is None:
-        yield _pixels(batches)
-        yield _still_frames(batches, spaces, np.maximum(np.ptp(states, axis=0), 1e-12))
+        yield from _in_frames(batches, spaces, np.maximum(np.ptp(states, axis=0), 1e-12))
     if spaces.state.position is None:
         yield _numbers("states", states, "Check which fields the state is made of")
         yield _numbers("actions", actions, "There is nothing to learn from")
         return
-    yield _positions(states)
-    yield _rotations(states, actions)
-    yield _gripper(states[:, POSE.gripper], sum(len(batch.starts) for batch in batches))
-    yield _motion(actions)
+    yield from _in_poses(states, actions, sum(len(batch.starts) for batch in batches))
 
 
-def _pixels(batches: Sequence[Batch]) -> Finding:
-    frames = [batch.frames for batch in batches if batch.frames is not None]
-    low, high = min(int(one.min()) for one in frames), max(int(one.max()) for one in frames)
-    mean = float(np.mean([one.float().mean().item() for one in frames]))
-    return _first(
-        "pixels",
-        f"{low} to {high}, mean {mean:.0f}",
-        (low == high, "error", f"all are {low}: there is nothing to see. Check data.camera"),
-        (mean < _DARK, "warning", "the frames are nearly black. Check data.camera"),
-    )
-
-
-def _still_frames(batches: Sequence[Batch], spaces: Spaces, spans: Float[np.ndarray, " state_dim"]) -> Finding:
-    """Compare frames with the ones before them, where the robot has moved."""
-    same = moved = 0
+def _in_frames(batches: Sequence[Batch], spaces: Spaces, spans: Float[np.ndarray, " state_dim"]) -> Iterator[Finding]:
+    """Yield what is wrong with the frames; those where the robot has moved are compared with the ones before them."""
+    low, high, means, same, moved = 255, 0, [], 0, 0
     for batch in batches:
         if batch.frames is None:
             continue
+        low, high = min(low, int(batch.frames.min())), max(high, int(batch.frames.max()))
+        means.append(batch.frames.float().mean().item())
         if spaces.state.position is None:
             far = (abs(np.diff(batch.states.numpy(), axis=1)) > _MOVED_SHARE * spans).any(axis=-1)
         else:
@@ -200,21 +170,29 @@ def _still_frames(batches: Sequence[Batch], spaces: Spaces, spans: Float[np.ndar
         equal = (batch.frames[:, 1:] == batch.frames[:, :-1]).flatten(2).all(dim=-1).numpy()
         moved += int(far.sum())
         same += int((far & equal).sum())
-    text = f"{same} of {moved} frames equal the one before although the robot moved"
-    if same > moved / 2:
-        return Finding("error", "pictures", f"{text}: they do not show it. Check data.camera and the control rate")
-    return Finding("warning" if same > moved / 20 else "ok", "pictures", text)
+    mean = float(np.mean(means))
+    yield _first(
+        "pixels",
+        f"{low} to {high}, mean {mean:.0f}",
+        (low == high, "error", f"all are {low}: there is nothing to see. Check data.camera"),
+        (mean < _DARK, "warning", "the frames are nearly black. Check data.camera"),
+    )
+    yield _first(
+        "pictures",
+        f"{same} of {moved} frames equal the one before although the robot moved",
+        (same > moved / 2, "error", "they do not show it. Check data.camera and the control rate"),
+        (same > moved / 20, "warning", "check the control rate"),
+    )
 
 
 def _numbers(name: str, values: Float[np.ndarray, "rows width"], way_out: str) -> Finding:
     """Return the finding about numbers of unknown meaning."""
     low, high = values.min(axis=0), values.max(axis=0)
-    text = f"{values.shape[1]} numbers, {low.min():.3g} to {high.max():.3g}"
     fixed, large = low == high, abs(values).max(axis=0) > _LARGE
     why = f"large are {_numbered(large)} (from 0). Numbers go into the network as they are"
     return _first(
         name,
-        text,
+        f"{values.shape[1]} numbers, {low.min():.3g} to {high.max():.3g}",
         (fixed.all(), "error", f"none of them ever changes. {way_out}"),
         (large.any(), "warning", f"{why}: bring them to the order of 1, such as radians, metres, or 0 to 1"),
         (fixed.any(), "warning", f"{_numbered(fixed)} (from 0) never change"),
@@ -232,46 +210,35 @@ def _first(about: str, text: str, *cases: tuple[bool, Level, str]) -> Finding:
     return Finding(level, about, f"{text}: {words}" if words else text)
 
 
-def _positions(states: Float[np.ndarray, "rows 7"]) -> Finding:
-    places = states[:, POSE.position]
+def _in_poses(
+    states: Float[np.ndarray, "rows 7"], actions: Float[np.ndarray, "pairs 7"], clips: int
+) -> Iterator[Finding]:
+    """Yield a finding for each kind of number in poses."""
+    places, angles, closed = states[:, POSE.position], states[:, POSE.rotation], states[:, POSE.gripper]
     low, high = places.min(axis=0), places.max(axis=0)
-    return _first(
+    wide, reach = (high - low).max(), np.linalg.norm(places, axis=1).max()
+    yield _first(
         "position",
         ", ".join(f"{axis} {a:.3f} to {b:.3f}" for axis, a, b in zip("xyz", low, high, strict=True)) + " m",
-        ((high - low).max() == 0, "error", "it never changes. Check which fields the state is made of"),
-        (
-            np.linalg.norm(places, axis=1).max() > _REACH_M,
-            "warning",
-            "farther than most arms reach. Is it metres, from the base?",
-        ),
-        ((high - low).max() < 0.01, "warning", "all within 1 cm. Is it metres?"),
+        (wide == 0, "error", "it never changes. Check which fields the state is made of"),
+        (reach > _REACH_M, "warning", "farther than most arms reach. Is it metres, from the base?"),
+        (wide < 0.01, "warning", "all within 1 cm. Is it metres?"),
     )
-
-
-def _rotations(states: Float[np.ndarray, "rows 7"], actions: Float[np.ndarray, "pairs 7"]) -> Finding:
     turned = np.rad2deg(Rotation.from_euler("xyz", actions[:, POSE.rotation]).magnitude())
-    low, high = states[:, POSE.rotation].min(), states[:, POSE.rotation].max()
-    return _first(
+    yield _first(
         "rotation",
-        f"angles {low:.2f} to {high:.2f} rad; degrees per model step {_percentiles(turned, '.1f')}",
+        f"angles {angles.min():.2f} to {angles.max():.2f} rad; degrees per model step {_percentiles(turned, '.1f')}",
         (turned.max() == 0, "warning", "it never changes. Is it in the state?"),
         (np.percentile(turned, 90) > 90, "warning", "wild. Are these extrinsic xyz Euler angles in radians?"),
     )
-
-
-def _gripper(closedness: Float[np.ndarray, " rows"], clips: int) -> Finding:
-    low, high = closedness.min(), closedness.max()
-    return _first(
+    yield _first(
         "gripper",
-        f"{low:.2f} to {high:.2f} (0 open, 1 closed)",
-        (low == high, "warning", f"it never moves in {clips} clips. Is it in the state?"),
-        (high < _NARROW, "warning", "it never closes. Is it a width in metres? 0..1 is needed"),
+        f"{closed.min():.2f} to {closed.max():.2f} (0 open, 1 closed)",
+        (np.ptp(closed) == 0, "warning", f"it never moves in {clips} clips. Is it in the state?"),
+        (closed.max() < _NARROW, "warning", "it never closes. Is it a width in metres? 0..1 is needed"),
     )
-
-
-def _motion(actions: Float[np.ndarray, "pairs 7"]) -> Finding:
     moved = POSE.shown_size(actions)
-    return _first(
+    yield _first(
         "actions",
         f"cm per model step {_percentiles(moved, '.2f')}",
         (not np.any(actions), "error", "all are zero; there is nothing to learn from"),

@@ -12,9 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.coverage import Coverage, ReadEpisode, coverage_by, read_sample
+from vjepa2_ac.data.coverage import Coverage, Duplicates, ReadEpisode, coverage_by, find_duplicates, read_sample
 from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.data.duplicates import Duplicates, find_duplicates
 from vjepa2_ac.data.idle import idle_by_motion, long_idle_runs
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError
@@ -92,11 +91,12 @@ class Inspection:
     def values(self) -> dict[str, Any]:
         """All statistics as plain values, as in `inspect.json`."""
         config, table, rate = self.dataset.config, self.dataset.table, self.dataset.control_rate_hz
-        known = table.success[table.success >= 0]
+        known, lengths = table.success[table.success >= 0], np.percentile(table.num_steps, [0, 10, 50, 90, 100])
         about_states = {"ranges": self.ranges.tolist()}
         if self.has_poses:
+            idle = [idle_runs(one.states, config) for one in self.sample]
             about_states = {
-                "still_share": self._still_share(),
+                "still_share": float(np.concatenate(idle).mean()),
                 "xyz_m": self.ranges[:3].tolist(),
                 "gripper": self.ranges[-1].tolist(),
                 "released_weights": RELEASED,
@@ -111,9 +111,7 @@ class Inspection:
             "broken_episodes": len(table.problems),
             "steps": int(table.num_steps.sum()),
             "hours": float(table.num_steps.sum() / rate / 3600),
-            "length_percentiles_0_10_50_90_100": np.percentile(table.num_steps, [0, 10, 50, 90, 100])
-            .astype(int)
-            .tolist(),
+            "length_percentiles_0_10_50_90_100": lengths.astype(int).tolist(),
             "success_share": float(known.mean()) if len(known) else None,
             "success_known_of": len(known),
             "removed": [vars(one) for one in self.dataset.removed],
@@ -135,10 +133,6 @@ class Inspection:
             windows = 0
         return {"episodes": int(self.dataset.members(split).sum()), "windows": windows}
 
-    def _still_share(self) -> float:
-        """Return the share of the sample's steps in a run of idle ones, by the measured motion."""
-        return float(np.concatenate([idle_runs(one.states, self.dataset.config) for one in self.sample]).mean())
-
     @cached_property
     def summary(self) -> dict[str, str]:
         """What there is to say, by what it is about."""
@@ -151,6 +145,18 @@ class Inspection:
         )
         removed = ", ".join(f"{one.name} {one}" for one in self.dataset.removed if one.episodes or one.steps)
         known = f"of {values['success_known_of']:,} episodes of which it is known"
+        ranges = [f"{low:.2f} to {high:.2f}" for low, high in self.ranges]
+        how = f", joined by {config.join_actions}" if config.join_actions else ""
+        about_states = {
+            "states": f"{values['state_dim']} numbers: {', '.join(ranges)}",
+            "actions": f"{values['action_dim']} numbers, {config.actions}{how}",
+        }
+        if self.has_poses:
+            about_states = {
+                "standing still": f"{values['still_share']:.1%} of the steps, by the measured motion",
+                "position": f"{', '.join(f'{axis} {one}' for axis, one in zip('xyz', ranges, strict=False))} m",
+                "gripper": f"{ranges[-1]} (0 open, 1 closed)",
+            }
         return {
             "data set": f"{config.path} ({config.source})",
             "episodes": f"{values['episodes']:,} ({values['broken_episodes']:,} broken)",
@@ -162,21 +168,8 @@ class Inspection:
             "splits": f"{splits}; clips of {config.frames} frames at stride {config.model_stride}",
             "duplicates": f"{self.duplicates}{'; inspect.json lists the copies' if copies else ''}",
             "sample": f"{len(self.sample):,} episodes, for what follows",
-            **self._summary_of_states(),
+            **about_states,
             **({} if self.coverage is None else {**self.coverage.lines, "coverage": self.coverage.verdict}),
-        }
-
-    def _summary_of_states(self) -> dict[str, str]:
-        config, widths = self.dataset.config, self.dataset.widths
-        ranges = [f"{low:.2f} to {high:.2f}" for low, high in self.ranges]
-        if not self.has_poses:
-            how = f", joined by {config.join_actions}" if config.join_actions else ""
-            actions = f"{widths.action} numbers, {config.actions}{how}"
-            return {"states": f"{widths.state} numbers: {', '.join(ranges)}", "actions": actions}
-        return {
-            "standing still": f"{self.values['still_share']:.1%} of the steps, by the measured motion",
-            "position": f"{', '.join(f'{axis} {one}' for axis, one in zip('xyz', ranges, strict=False))} m",
-            "gripper": f"{ranges[-1]} (0 open, 1 closed)",
         }
 
 

@@ -116,14 +116,15 @@ class IndexedSource(ABC, Generic[Config, More]):
     to read an episode.
     """
 
+    _opening = threading.Lock()  # one source after the other
+
     def __init__(self, config: Config) -> None:
         self._config = config
         self._known: tuple[EpisodeTable, More] | None = None
-        self._opening = threading.Lock()
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle for a loader worker, with the index."""
-        return _reopened, (type(self), self._config, self._known)
+        return type(self), (self._config,), {"_known": self._known}
 
     def infos(self, progress: Progress | None = None) -> EpisodeTable:
         """Return identity, length and outcome of every usable episode, and the problems of the others.
@@ -171,14 +172,6 @@ class IndexedSource(ABC, Generic[Config, More]):
     @abstractmethod
     def _look(self, progress: Progress) -> tuple[EpisodeTable, More]:
         """Open the data set: read its index from the cache, or scan it."""
-
-
-def _reopened(
-    kind: type[IndexedSource[Any, Any]], config: DataConfig, known: tuple[EpisodeTable, Any] | None
-) -> object:
-    source = kind(config)
-    source._known = known
-    return source
 
 
 @dataclass(frozen=True)

@@ -99,6 +99,7 @@ class NpzSource(IndexedSource[DataConfig, None]):
             fps_hz = float(arrays.numbers("fps_hz", ()))
             if fps_hz <= 0:
                 raise arrays.refused("fps_hz", f"{fps_hz:g}", "control steps per second")
+            joints = "joint_velocities"
             language = arrays.text("language") if "language" in names else None
             episode = Episode(
                 info=EpisodeInfo(identity, steps, bool(arrays.numbers("success", ())) if "success" in names else None),
@@ -106,11 +107,13 @@ class NpzSource(IndexedSource[DataConfig, None]):
                 read_frames=FramesByStep(steps, path, partial(self._frames, path, version, cameras[0], steps)),
                 control_rate_hz=fps_hz,
                 extrinsics=extrinsics[0],
-                joint_velocities=arrays.optional("joint_velocities", (steps, None)),
+                joint_velocities=arrays.numbers(joints, (steps, None)) if joints in names else None,
                 metadata={} if language is None else {"language": language},
                 commands=arrays.numbers("actions", (steps, None)) if config.actions == "recorded" else None,
             )
-            labels = {name: arrays.text(name) for name in _LABELS if arrays.is_text(name)}
+            headers = {name: file.header(name) for name in _LABELS if name in names}  # a camera may be called so, too
+            is_text = {name: one.shape == () and one.dtype.kind == "U" for name, one in headers.items()}
+            labels = {name: arrays.text(name) for name in headers if is_text[name]}
             return episode, {"task": language, **labels}
 
     def _frames(
@@ -157,13 +160,11 @@ def opened_npz(opened: str | BlockCachedFile, path: str) -> Iterator[NpzFile]:
     Raises:
         InputError: It is missing, or no .npz file; an UnreachableError if it cannot be read.
     """
-    try:
-        with closing(storage.open_to_read(opened) if isinstance(opened, str) else opened) as file:
-            yield NpzFile(file, path)
-    except FileNotFoundError:
-        raise InputError(where=path, found="no such file", fix="Put it back, or leave the episode out") from None
-    except OSError as error:
-        raise storage.unreadable(path, error) from None
+    with (
+        storage.user_can_read(path, fix="Put it back, or leave the episode out"),
+        closing(storage.open_to_read(opened) if isinstance(opened, str) else opened) as file,
+    ):
+        yield NpzFile(file, path)
 
 
 @dataclass(frozen=True)
@@ -187,15 +188,6 @@ class _Arrays:
             step = np.argwhere(~np.isfinite(values))[0][:1].tolist()
             raise self.refused(name, f"NaN or infinity{f' at step {step[0]}' if step else ''}", "numbers")
         return values
-
-    def optional(self, name: str, shape: tuple[int | None, ...]) -> Float64[np.ndarray, ...] | None:
-        """Return numbers, or None if there are none of this name."""
-        return self.numbers(name, shape) if name in self.file.names else None
-
-    def is_text(self, name: str) -> bool:
-        """Return whether there is an array of this name with one text; a camera may have that name, too."""
-        header = self.file.header(name) if name in self.file.names else None
-        return header is not None and header.shape == () and header.dtype.kind == "U"
 
     def text(self, name: str) -> str:
         """Return a text."""

@@ -27,10 +27,9 @@ from vjepa2_ac.model.adapter.lora import (
     train_everything,
     wrap,
 )
-from vjepa2_ac.model.base_model import read_model_json
 from vjepa2_ac.model.network.pretrained_folder import read_tensors, save_tensors
 from vjepa2_ac.model.network.world_model import WorldModel, fit_heads
-from vjepa2_ac.storage.structured import record_of
+from vjepa2_ac.storage.structured import read_json_object, record_of
 
 CARD = "vjepa2_ac.json"
 ADAPTER_FILE = "adapter_config.json"  # PEFT's name
@@ -113,7 +112,7 @@ def load_trained(model: WorldModel, folder: str | Path, trainable: bool | None =
 
 def _load_lora(model: WorldModel, folder: Path) -> None:
     path = folder / ADAPTER_FILE
-    knobs = knobs_of(read_model_json(path, needed=NEEDED, fix=FIX), where=str(path))
+    knobs = knobs_of(read_json_object(path, needed=NEEDED, fix=FIX), where=str(path))
     if model.adaptation is None:
         try:
             wrap(model, knobs)
@@ -136,7 +135,7 @@ def _read_card(folder: Path, model: WorldModel) -> Card:
         InputError: The folder is of another kind or damaged, or its weights belong to another base.
     """
     path, needed = folder / CARD, "the card of an adapter, as save_trained writes it"
-    card = record_of(Card, read_model_json(path, needed=needed, fix=""), where=str(path), needed=needed)
+    card = record_of(Card, read_json_object(path, needed=needed), where=str(path), needed=needed)
     own = model.adaptation.base if model.adaptation else model.predictor_fingerprint()
     encoder = model.adaptation.encoder if model.adaptation else model.encoder_fingerprint()
     for part, found, needed, trained_on, this in (

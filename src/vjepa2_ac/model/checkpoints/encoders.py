@@ -28,15 +28,14 @@ from vjepa2_ac.model.base_model import (
     EncoderOrigin,
     check_sizes,
     find_encoder_path,
-    read_model_json,
     read_sizes,
 )
 from vjepa2_ac.model.checkpoints.meta_file import ENCODER_KEYS, FIX, MetaFile, Rename, depth_of, official_name, part_of
 from vjepa2_ac.model.checkpoints.published import published_as
 from vjepa2_ac.model.network.blocks import mlp_ratio_of
 from vjepa2_ac.model.network.pretrained_folder import ENCODER, open_safetensors, read_encoder_origin
-from vjepa2_ac.storage.hub import from_hub
-from vjepa2_ac.storage.structured import record_of
+from vjepa2_ac.storage.structured import read_json_object, record_of
+from vjepa2_ac.storage.transfer import from_hub
 
 logger = logging.getLogger(__name__)
 
@@ -183,7 +182,7 @@ class _Told(BaseModel):
 
 def _in_folder(folder: Path, config: EncoderConfig, *, name: str) -> FoundEncoder:
     """Return the encoder in a folder of transformers or of this project; `name` is what the user called it."""
-    card = read_model_json(folder / CONFIG, needed=ENCODER_NEEDED, fix=FIX)
+    card = read_json_object(folder / CONFIG, needed=ENCODER_NEEDED, fix=FIX)
     if config.key is not None:
         raise InputError(
             where=f"model.encoder.key: {config.key}",

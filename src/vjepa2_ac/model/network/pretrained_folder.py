@@ -20,8 +20,8 @@ from torch import Tensor, nn
 
 from vjepa2_ac import storage
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.base_model import CONFIG, FORMAT, EncoderOrigin, read_model_json
-from vjepa2_ac.storage.structured import record_of
+from vjepa2_ac.model.base_model import CONFIG, FORMAT, NEEDED_MODEL, EncoderOrigin
+from vjepa2_ac.storage.structured import read_json_object, record_of
 
 ENCODER, PREDICTOR = "encoder.safetensors", "predictor/model.safetensors"
 
@@ -67,7 +67,7 @@ def read_encoder_origin(folder: Path) -> EncoderOrigin | None:
     Raises:
         InputError: The folder says it in a way that nobody understands.
     """
-    told = read_model_json(folder / CONFIG).get("encoder_origin")
+    told = read_json_object(folder / CONFIG, needed=NEEDED_MODEL).get("encoder_origin")
     where, needed = f"{folder / CONFIG}: encoder_origin", "file, key and licence of an encoder"
     return None if told is None else record_of(EncoderOrigin, told, where=where, needed=needed)
 

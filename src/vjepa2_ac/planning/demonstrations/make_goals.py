@@ -39,7 +39,6 @@ from vjepa2_ac.planning.energy import distance
 from vjepa2_ac.planning.goals import NoiseFloor, SubGoal, write_goals
 from vjepa2_ac.planning.session import PlanningSession
 from vjepa2_ac.reporter import SILENT, Reporter
-from vjepa2_ac.storage import unreadable
 from vjepa2_ac.storage.structured import utc_now
 
 By = Literal["gripper", "latent", "every"]
@@ -102,10 +101,7 @@ def recording_of_film(path: Path) -> Recording:
         InputError: PyAV is not installed, or it is no MP4 of two frames or more.
     """
     where = str(path)
-    try:
-        frames = count_frames(path, where=where)
-    except OSError as error:
-        raise unreadable(where, error, needed="an MP4") from None
+    frames = count_frames(path, where=where)
     return Recording(path.name, frames, partial(read_frames, path, where=where), None, {"film": where})
 
 

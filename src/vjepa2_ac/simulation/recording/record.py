@@ -28,7 +28,7 @@ from vjepa2_ac.data.sources.rlds.droid_writer import (
     write_droid_rlds,
 )
 from vjepa2_ac.episode import Progress, no_progress
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, MissingFileError
 from vjepa2_ac.media.images import encode_jpeg
 from vjepa2_ac.simulation.closed_loop.tasks import arm_for
 from vjepa2_ac.simulation.world.arm import SimulatedArm
@@ -331,7 +331,7 @@ def read_simulation(folder: str | Path) -> RecordedSimulation:
     where = storage.join(str(folder), SIMULATION_FILE)
     try:
         values = read_json_object(where, needed=_NEEDED, fix=_AGAIN)
-    except (FileNotFoundError, NotADirectoryError):
+    except MissingFileError:
         raise InputError(
             where=where,
             found="no such file: these are not simulated episodes, or an older version recorded them",

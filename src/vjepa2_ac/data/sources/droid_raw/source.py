@@ -1,4 +1,7 @@
-"""Source of DROID's raw recordings: states from HDF5, frames from MP4, names from JSON."""
+"""Source of DROID's raw recordings: states from HDF5, frames from MP4, names from JSON.
+
+The tree is LAB/success|failure/DATE/TIME/{trajectory.h5, metadata_*.json, recordings/MP4/*.mp4}.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -16,28 +19,20 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import RawDroidData
 from vjepa2_ac.config.section import Affects, knobs_that_affect
 from vjepa2_ac.config.sources import RAW_CAMERAS
+from vjepa2_ac.data.files import DEEPEST, in_parallel, list_folder, within
 from vjepa2_ac.data.index import EpisodeTable, get_or_build, hash_of_states, index_key, key_of
-from vjepa2_ac.data.sources.droid_raw.episode_folders import (
-    TRAJECTORY,
-    VIDEOS,
-    EpisodeFolder,
-    find_episodes,
-    identity_of,
-    list_episode,
-    success_of,
-)
-from vjepa2_ac.data.sources.indexed_source import (
-    FramesByStep,
-    IndexedSource,
-    Scanned,
-    require_as_indexed,
-)
+from vjepa2_ac.data.sources.indexed_source import FramesByStep, IndexedSource, Scanned, require_as_indexed
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError, require_library
 from vjepa2_ac.media.video import count_frames, frame_times, read_frames
 from vjepa2_ac.spaces import POSE, zero_steps
+from vjepa2_ac.storage import FileInfo
 from vjepa2_ac.storage.structured import json_object
 
+TRAJECTORY = "trajectory.h5"
+VIDEOS = "recordings/MP4"
+
+_OUTCOMES = ("success", "failure")
 _FIX = "Copy the episode again"
 _MOST_STEPS = 1_000_000  # a damaged header may claim any number
 _REQUIRED = {
@@ -67,7 +62,7 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
 
     `infos` reads every trajectory and the headers of the MP4s of the config's cameras, once; data behind a URL is not
     checked again until folders are added or removed. An episode's identity is LAB/outcome/DATE/TIME
-    (`episode_folders.identity_of`). The numbers of a trajectory and the times of a video's frames are kept in the disk
+    (`identity_of`). The numbers of a trajectory and the times of a video's frames are kept in the disk
     cache, so that HDF5 is parsed, and the packets of a video with B-frames are read, once on a machine.
 
     An MP4 holds one frame per control step, in order, whatever rate its header states, and may lack the last step's.
@@ -141,8 +136,9 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
     def _scan(self, folder: str) -> Scanned:
         identity = identity_of(self._config.path, folder)
         listed = list_episode(self._config.path, folder)
-        if not listed.has_trajectory or listed.metadata is None:
-            found = f"episode {identity} has no {'metadata_*.json' if listed.has_trajectory else TRAJECTORY}"
+        has_trajectory = any(file.name == TRAJECTORY for file in listed.files)
+        if not has_trajectory or listed.metadata is None:
+            found = f"episode {identity} has no {'metadata_*.json' if has_trajectory else TRAJECTORY}"
             raise InputError(where=self._path(folder, ""), found=found, needed="one", fix=_FIX)
         version, path = key_of({"files": listed}), self._path(folder, listed.metadata)
         metadata = json_object(self._files.read(path, version=version), where=path, needed="the metadata of an episode")
@@ -274,15 +270,94 @@ def _serial(serials: Mapping[str, str], camera: str, where: str) -> str:
 
 def _labels(metadata: Mapping[str, Any]) -> dict[str, str | None]:
     """Return the episode's labels, as far as known: scene, building, operator, task."""
-
-    def short(*keys: str) -> str | None:
-        values = (metadata.get(key) for key in keys)
-        return next((str(one) for one in values if isinstance(one, str | int) and not isinstance(one, bool)), None)
-
-    task = metadata.get("current_task")
+    texts = {key: str(value) for key, value in metadata.items() if isinstance(value, str | int)}
     return {
-        "scene": short("scene_id"),
-        "building": short("building"),
-        "operator": short("user_id", "user"),
-        "task": task if isinstance(task, str) else None,
+        "scene": texts.get("scene_id"),
+        "building": texts.get("building"),
+        "operator": texts.get("user_id", texts.get("user")),
+        "task": texts.get("current_task"),
     }
+
+
+# ---- the folders of episodes ----
+
+
+@dataclass(frozen=True)
+class EpisodeFolder:
+    """The listing of an episode's folder."""
+
+    path: str  # relative to the data set's; "" is the data set's folder itself
+    files: tuple[FileInfo, ...]
+    videos: tuple[FileInfo, ...]
+
+    @property
+    def metadata(self) -> str | None:
+        """The name of its metadata file, or None; DROID's uploaders wrote it last, for complete episodes only."""
+        return next((file.name for file in self.files if _is_metadata(file.name)), None)
+
+
+def find_episodes(root: str, connections: int) -> list[str]:
+    """Return the folders of all episodes, relative to `root`, sorted; "" if `root` is an episode's.
+
+    Raises:
+        OSError: A folder cannot be listed.
+    """
+    if _is_episode(root, ""):
+        return [""]
+    found: list[str] = []
+    folders = [""]
+    for _ in range(DEEPEST):
+        children = in_parallel(lambda folder: _children(root, folder), folders, connections)
+        together = [child for group in children for child in group]
+        found += [path for path, is_episode in together if is_episode]
+        folders = [path for path, is_episode in together if not is_episode]
+    return sorted(found)
+
+
+def list_episode(root: str, folder: str) -> EpisodeFolder:
+    """List the files of one episode.
+
+    Raises:
+        OSError: A folder cannot be listed.
+    """
+    path = storage.join(root, folder) if folder else root
+    videos = storage.list_files(storage.join(path, VIDEOS))
+    return EpisodeFolder(folder, tuple(storage.list_files(path)), tuple(videos))
+
+
+def identity_of(root: str, folder: str) -> str:
+    """Return LAB/outcome/DATE/TIME if the path ends so, for any part of the tree as `root`.
+
+    Otherwise it is the path relative to `root`: it depends on `root`.
+    """
+    base = root.split("://", 1)[1] if storage.is_url(root) else str(Path(root).resolve())
+    parts = [part for part in f"{base}/{folder}".split("/") if part]
+    return "/".join(parts[-4:]) if _ends_as_in_droid(parts) else folder or parts[-1]
+
+
+def success_of(identity: str) -> bool | None:
+    """Return the outcome in an identity, or None."""
+    parts = identity.split("/")
+    return parts[-3] == "success" if _ends_as_in_droid(parts) else None
+
+
+def _children(root: str, folder: str) -> list[tuple[str, bool]]:
+    """Return the folders in a folder, and whether each is an episode.
+
+    In DROID's own layout the depth shows that, without listing every episode.
+    """
+    children = [within(folder, name) for name in list_folder(root, folder)[1]]
+    return [(path, success_of(identity_of(root, path)) is not None or _is_episode(root, path)) for path in children]
+
+
+def _ends_as_in_droid(parts: Sequence[str]) -> bool:
+    return len(parts) >= 4 and parts[-3] in _OUTCOMES
+
+
+def _is_episode(root: str, folder: str) -> bool:
+    names = storage.list_names(storage.join(root, folder) if folder else root)
+    return any(name == TRAJECTORY or _is_metadata(name) for name in names)
+
+
+def _is_metadata(name: str) -> bool:
+    return name.startswith("metadata") and name.endswith(".json")

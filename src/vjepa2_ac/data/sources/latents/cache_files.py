@@ -43,7 +43,7 @@ from vjepa2_ac.data.index import EpisodeTable, NotATableError
 from vjepa2_ac.data.selection import StepSelection
 from vjepa2_ac.data.sources.latents.cache_key import FORMAT, CacheKey
 from vjepa2_ac.episode import Episode, StoredLatents
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, MissingFileError
 from vjepa2_ac.media.images import decode_jpegs, encode_jpeg
 from vjepa2_ac.storage.structured import json_object, read_json_object
 
@@ -95,11 +95,9 @@ def read_key(folder: Path) -> CacheKey:
     where, needed = str(folder / CACHE), f"a folder with the {CACHE} of a latent cache, format {FORMAT}"
     try:
         key = read_json_object(folder / CACHE, fix=_ENCODE).get("key")
-    except (FileNotFoundError, NotADirectoryError):
+    except MissingFileError:
         found = "no latent cache" if folder.is_dir() else f"no such folder, seen from {Path.cwd()}"
         raise InputError(where=str(folder), found=found, needed=needed, fix=_ENCODE) from None
-    except OSError as error:
-        raise InputError(where=where, found=f"cannot be read ({error})", fix=_ENCODE) from None
     if not isinstance(key, dict) or key.get("format") != FORMAT or not isinstance(key.get("data.camera"), list):
         raise InputError(where=where, found="another file, or another format", needed=needed, fix=_ENCODE)
     return CacheKey(key)

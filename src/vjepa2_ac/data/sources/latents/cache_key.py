@@ -11,7 +11,7 @@ from typing import Any
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.section import Affects, knobs_that_affect
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, MissingFileError
 from vjepa2_ac.storage.structured import read_json_object
 
 FORMAT = 2  # of the files of a cache
@@ -123,7 +123,7 @@ def require_own_folder(path: Path, key: CacheKey, *, where: str) -> None:
     folder, fix = path.parent, "Name another folder, or delete this one"
     try:
         there = read_json_object(path, fix=fix)
-    except (FileNotFoundError, NotADirectoryError):
+    except MissingFileError:
         others = sorted(one.name for one in folder.iterdir() if one.name[0] != ".") if folder.is_dir() else []
         if others:
             found = f"a folder with other things in it, such as {others[0]}"

@@ -43,28 +43,22 @@ class LatentSource(IndexedSource[DataConfig, _Cache]):
         """The cameras that clips are drawn from: the config's, or all of the cache."""
         return self.key.cameras if self._config.camera is None else self._config.cameras
 
-    def kept_ranges(self) -> StepSelection:
-        """Return the ranges that `data.idle` keeps, from the cache.
+    def kept_ranges(self) -> StepSelection | None:
+        """Return the ranges that `data.idle` keeps, from the cache; None: the rule is none.
 
         Raises:
             InputError: No cache, or one of other clips than the config's.
-            ValueError: The rule is none.
         """
-        if (kept := self._open()[1].kept) is None:
-            raise ValueError("no idle rule")
-        return kept
+        return self._open()[1].kept
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:  # noqa: ARG002 - nothing is fetched
         """Return one episode; only requested latents are read.
 
         Raises:
             InputError: The file is missing or damaged, or the episode could not be read while encoding.
-            ValueError: A camera that the cache does not have.
         """
         table, opened = self._open()
         camera = camera or self.cameras[0]
-        if camera not in opened.key.cameras:
-            raise ValueError(f"camera {camera!r} is not one of {', '.join(opened.key.cameras)}")
         record = opened.files.open(index, camera)
         return Episode(
             info=table[index],

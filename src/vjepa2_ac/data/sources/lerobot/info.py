@@ -14,7 +14,7 @@ from typing import Any
 from vjepa2_ac import storage
 from vjepa2_ac.config import LeRobotData, LeRobotFields
 from vjepa2_ac.data.files import in_parallel
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, MissingFileError
 from vjepa2_ac.media.video import is_deep_grey
 from vjepa2_ac.storage import FileInfo
 from vjepa2_ac.storage.structured import read_json_object
@@ -148,12 +148,10 @@ def read_info(root: str) -> DatasetInfo:
     where = storage.join(root, INFO)
     try:
         content = read_json_object(where, needed="a description of a data set", fix=_FIX)
-    except (FileNotFoundError, NotADirectoryError):
+    except MissingFileError:
         fix = _WAY_TO_HUB if root.startswith("hf://") else "Set data.path to the folder with meta, data and videos"
         found = f"no {INFO} in {root}"
         raise InputError(where="data.path", found=found, needed="a LeRobot data set", fix=fix) from None
-    except OSError as error:
-        raise storage.unreadable(where, error) from None
     if (version := content.get("codebase_version")) not in VERSIONS:
         found = f"codebase_version {version!r}"
         raise InputError(where=where, found=found, needed=" or ".join(VERSIONS), fix=_FIX_VERSION)

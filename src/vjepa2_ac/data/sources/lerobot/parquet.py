@@ -170,8 +170,6 @@ def _opened(opened: str | BlockCachedFile, path: str) -> Iterator[parquet.Parque
             opened, page_checksum_verification=True, pre_buffer=not isinstance(opened, str), memory_map=False
         ) as file:
             yield file
-    except FileNotFoundError:
-        raise InputError(where=path, found="no such file", needed="one, says the data set", fix=_FIX) from None
     except (pa.ArrowException, OSError, ValueError, KeyError, MemoryError, OverflowError) as error:
         if isinstance(opened, BlockCachedFile) and opened.failure is not None:
             raise opened.failure from None

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence, Set
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, cached_property, partial
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Shaped, UInt8
@@ -35,14 +36,8 @@ _FIX_VECTORS = "Leave the episode out, check data.lerobot: state, action, or set
 _UNIT_TOLERANCE = 1e-2
 
 
-@dataclass(frozen=True)
-class EpisodeContent:
-    """The data of an episode except its frames."""
-
-    states: Float[np.ndarray, "steps state_dim"]
-    joint_velocities: Float[np.ndarray, "steps joints"] | None
-    success: bool | None
-    commands: Float[np.ndarray, "steps action_dim"] | None = None
+Content = dict[str, Any]
+"""The data of an episode except its frames, by the names of `Episode`: states, commands, joint_velocities."""
 
 
 class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
@@ -62,18 +57,16 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
         """
         table = self.infos()
         info, row = table[index], row_of(table, index)
-        content = self._content(row)
+        content, _ = self._content(row)
         tasks = table.labels.get("task")
         task = None if tasks is None else tasks.of_episode(index)
         key = self._info.camera_key(self._config.lerobot, camera or self._config.cameras[0])
         return Episode(
             info=info,
-            states=content.states,
             read_frames=self._frames(row, key),
             control_rate_hz=self._control_rate_hz,
-            joint_velocities=content.joint_velocities,
             metadata={"language": task} if task else {},
-            commands=content.commands,
+            **content,
         )
 
     @cached_property
@@ -124,7 +117,7 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
 
     def _built(self, tables: list[str], files: Set[str], keys: list[str], progress: Progress) -> EpisodeTable:
         info, config, fields = self._info, self._config, self._config.lerobot
-        is_far = storage.is_url(config.path)
+        is_far, connections = storage.is_url(config.path), connections_to(config)
         of_config = [key for key in dict.fromkeys(fields.cameras.values()) if key in info.features]
         videos = [key for key in of_config if info.features[key].dtype == "video"]
         states = fields.state if is_far else ()  # of local rows the states themselves are hashed
@@ -139,27 +132,25 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
             try:
                 require_files(info, row, files, keys)
                 if reads_rows:
-                    content = self._content(row)
-                    success = success if content.success is None else content.success
-                    state_hash = hash_of_states(content.states)
+                    content, outcome = self._content(row)
+                    success = success if outcome is None else outcome
+                    state_hash = hash_of_states(content["states"])
             except InputError as error:
                 return as_problem(error, row.id)
             facts, labels = EpisodeInfo(row.id, row.length, success), {"task": row.task}
             return Scanned(facts, self._where(row), row.place, state_hash, labels, self._control_rate_hz)
 
-        def look_at_all(some: list[EpisodeRow]) -> dict[str, Found]:
-            return {row.id: look(row) for row in some}
-
         by_file: dict[str, list[EpisodeRow]] = {}  # so that a row group is decoded once
         for row in rows:
             by_file.setdefault(row.data_file(info), []).append(row)
         found: dict[str, Found] = {}
-        for some in in_parallel(look_at_all, [*by_file.values()], connections_to(config)):
-            found |= some
+        seen = in_parallel(lambda some: [(row.id, look(row)) for row in some], [*by_file.values()], connections)
+        for of_file in seen:
+            found.update(of_file)
             progress(len(found), len(rows))
         return table_of([found[row.id] for row in rows], config, len(rows))
 
-    def _content(self, row: EpisodeRow) -> EpisodeContent:
+    def _content(self, row: EpisodeRow) -> tuple[Content, bool | None]:
         rows = self._parquet.rows(storage.join(self._info.root, row.data_file(self._info)), row.index)
         return content_of(rows, row.length, self._info, self._config, self._where(row))
 
@@ -210,8 +201,10 @@ def wanted_columns(config: LeRobotData) -> list[str]:
     return [EPISODE, FRAME, TIME, *fields.state, *commands, *optional]
 
 
-def content_of(rows: Columns, length: int, info: DatasetInfo, config: LeRobotData, where: str) -> EpisodeContent:
-    """Return the data in the rows of an episode.
+def content_of(
+    rows: Columns, length: int, info: DatasetInfo, config: LeRobotData, where: str
+) -> tuple[Content, bool | None]:
+    """Return the data in the rows of an episode, and whether it succeeded; None: they do not say.
 
     Args:
         rows: As `ParquetRows.rows` returns them.
@@ -239,12 +232,12 @@ def content_of(rows: Columns, length: int, info: DatasetInfo, config: LeRobotDat
     states = joined(fields.state)
     if fields.select is not None:
         states = states[:, list(fields.select)]
-    return EpisodeContent(
-        states=_poses(states, fields, where) if config.states == "pose" else states,
-        commands=joined(fields.action) if config.actions == "recorded" else None,
-        joint_velocities=joined([str(fields.joint_velocity)]) if has(fields.joint_velocity) else None,
-        success=bool(rows[str(fields.success)].any()) if has(fields.success) else None,
-    )
+    content = {
+        "states": _poses(states, fields, where) if config.states == "pose" else states,
+        "commands": joined(fields.action) if config.actions == "recorded" else None,
+        "joint_velocities": joined([str(fields.joint_velocity)]) if has(fields.joint_velocity) else None,
+    }
+    return content, bool(rows[str(fields.success)].any()) if has(fields.success) else None
 
 
 def _poses(numbers: Float[np.ndarray, "steps _"], fields: LeRobotFields, where: str) -> Float[np.ndarray, "steps 7"]:

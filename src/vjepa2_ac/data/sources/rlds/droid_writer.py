@@ -65,11 +65,6 @@ class DroidEpisode:
     language_instruction: str = ""
 
     @property
-    def num_steps(self) -> int:
-        """Control steps."""
-        return len(self.action)
-
-    @property
     def arrays(self) -> dict[str, Float[np.ndarray, "steps width"]]:
         """Every array, by the name of its feature."""
         found = {"action": self.action}
@@ -79,11 +74,7 @@ class DroidEpisode:
 
 
 def write_droid_rlds(
-    folder: str | Path,
-    episodes: Iterable[DroidEpisode],
-    *,
-    shards: int,
-    notes: Mapping[str, str] | None = None,
+    folder: str | Path, episodes: Iterable[DroidEpisode], *, shards: int, notes: Mapping[str, str] | None = None
 ) -> Path:
     """Write episodes as a data set in DROID's RLDS schema and return its folder; one episode is in memory at a time.
 
@@ -97,7 +88,6 @@ def write_droid_rlds(
 
     Raises:
         InputError: The folder exists and is not empty, or cannot be written, or there are fewer episodes than shards.
-        ValueError: An episode's arrays and images are inconsistent.
     """
     folder = Path(folder)
     storage.require_new_folder(folder)
@@ -145,7 +135,7 @@ def _write_shards(
         names = [f"{_NAME}-train.tfrecord-{shard:05d}-of-{shards:05d}" for shard in range(shards)]
         files = [stack.enter_context(storage.atomic_writer(folder / name)) for name in names]
         for number, episode in enumerate(episodes):
-            _check(episode, sizes)
+            sizes |= {name: simplejpeg.decode_jpeg_header(jpegs[0])[:2] for name, jpegs in episode.images.items()}
             record = encode_example(_features_of(episode))
             write_record(files[number % shards], record)
             counts[number % shards] += 1
@@ -153,21 +143,8 @@ def _write_shards(
     return counts, num_bytes, sizes
 
 
-def _check(episode: DroidEpisode, sizes: dict[str, tuple[int, int]]) -> None:
-    """Refuse an episode whose parts differ in length; the images of a camera share one size."""
-    lengths = {len(part) for part in (*episode.arrays.values(), *episode.images.values())}
-    is_finite = all(np.isfinite(array).all() for array in episode.arrays.values())
-    if lengths != {episode.num_steps} or 0 in lengths or not is_finite or sorted(episode.images) != sorted(CAMERAS):
-        found = f"parts of {sorted(lengths)} steps, cameras {sorted(episode.images)}"
-        raise ValueError(f"{episode.file_path}: {found}; needed: finite numbers of as many steps, cameras {CAMERAS}")
-    for camera, images in episode.images.items():
-        size = simplejpeg.decode_jpeg_header(images[0])[:2]
-        if sizes.setdefault(camera, size) != size:
-            raise ValueError(f"{episode.file_path}: images of {camera} of {size}; needed: {sizes[camera]}")
-
-
 def _features_of(episode: DroidEpisode) -> dict[str, tuple[Kind, Sequence[Any] | np.ndarray]]:
-    steps = episode.num_steps
+    steps = len(episode.action)
     first, last = np.eye(1, steps, 0, dtype=int)[0], np.eye(1, steps, steps - 1, dtype=int)[0]
     texts = {"": episode.language_instruction.encode(), "_2": b"", "_3": b""}
     return {

@@ -12,9 +12,10 @@ from typing import Any
 
 from vjepa2_ac import storage
 from vjepa2_ac.data.sources.rlds.tfrecord import Read
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, MissingFileError
 from vjepa2_ac.storage.structured import read_json_object
 
+NEEDED = "a TFRecord file"
 _INFO = "dataset_info.json"
 _DEFAULT_TEMPLATE = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"
 _MOST_NAMES = 5
@@ -79,12 +80,10 @@ def dataset_name(folder: str) -> str:
 def _read_info(folder: str, where: str) -> dict[str, Any]:
     try:
         return read_json_object(where, needed="a description as TFDS writes it")
-    except FileNotFoundError:
+    except MissingFileError:
         fix = "Set data.path to the data set; docs/QUICKSTART.md says how to get DROID"
         found, needed = _nothing_in(folder), f"a folder with {_INFO}"
         raise InputError(where="data.path", found=found, needed=needed, fix=fix) from None
-    except OSError as error:
-        raise storage.unreadable(where, error) from None
 
 
 def _nothing_in(folder: str) -> str:
@@ -132,7 +131,7 @@ def open_shard(shard: Shard) -> Iterator[Read]:
         InputError: The file cannot be read, or a local one has changed since the data set was opened.
         UnreachableError: The network fails.
     """
-    with naming(shard):
+    with storage.user_can_read(shard.path, needed=NEEDED):
         if storage.is_url(shard.path):
             yield _RemoteWindows(shard)
             return
@@ -146,15 +145,6 @@ def open_shard(shard: Shard) -> Iterator[Read]:
             yield lambda offset, length: os.pread(handle, length, offset)
         finally:
             os.close(handle)
-
-
-@contextmanager
-def naming(shard: Shard) -> Iterator[None]:
-    """Turn the errors of the system and of servers into ones that name the shard."""
-    try:
-        yield
-    except OSError as error:
-        raise storage.unreadable(shard.path, error, needed="a TFRecord file") from None
 
 
 class _RemoteWindows:

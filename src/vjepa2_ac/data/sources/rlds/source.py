@@ -25,17 +25,9 @@ from vjepa2_ac.config.section import Affects, knobs_that_affect
 from vjepa2_ac.data.files import fetched_data
 from vjepa2_ac.data.index import EpisodeTable, cache_folder, get_or_build, index_key
 from vjepa2_ac.data.sources.indexed_source import FramesByStep, IndexedSource
-from vjepa2_ac.data.sources.rlds.episode import STEP_FLAG, Record, episode_of, step_features
-from vjepa2_ac.data.sources.rlds.index import build_index, position_of
-from vjepa2_ac.data.sources.rlds.shards import Shard, find_shards, naming, open_shard
-from vjepa2_ac.data.sources.rlds.tfrecord import (
-    NotAnExampleError,
-    Place,
-    Read,
-    RecordSpan,
-    item_places,
-    require_intact,
-)
+from vjepa2_ac.data.sources.rlds.episode import STEP_FLAG, Record, build_index, episode_of, position_of, step_features
+from vjepa2_ac.data.sources.rlds.shards import NEEDED, Shard, find_shards, open_shard
+from vjepa2_ac.data.sources.rlds.tfrecord import NotAnExampleError, Place, Read, RecordSpan, item_places, require_intact
 from vjepa2_ac.episode import Episode, Progress, StepRanges
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import decode_jpegs
@@ -65,13 +57,10 @@ class RldsSource(IndexedSource[RldsData, tuple[Shard, ...]]):
         Raises:
             InputError: The record is damaged, has changed, lacks a feature, or has implausible states.
             UnreachableError: The network fails.
-            ValueError: A camera that the config does not know.
         """
         table, shards = self._open()
         config, fields = self._config, self._config.fields
         camera = camera or config.cameras[0]
-        if camera not in fields.cameras:
-            raise ValueError(f"camera {camera!r} is not one of {', '.join(fields.cameras)}")
         feature, info = fields.cameras[camera], table[index]
         shard, span = position_of(table, shards, index)
         where = f"{span} ({info.id})"
@@ -176,7 +165,7 @@ class RemoteEpisode:
         located = self._located()
         places = [located[name] for name in names if name in located]
         key = f"{self._key} {' '.join(names)}"
-        with naming(self._shard):
+        with storage.user_can_read(self._shard.path, needed=NEEDED):
             data = self._contents.read(key)
             if data is None:
                 data = b"".join(storage.read_ranges(self._shard.path, places))
@@ -200,7 +189,7 @@ class RemoteEpisode:
         key = f"{self._key} {name}"
 
         def decode(steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
-            with naming(self._shard):
+            with storage.user_can_read(self._shard.path, needed=NEEDED):
                 stored = self._places.read(key)
                 if stored is None:
                     images = self._fetch_all(key, feature, num_steps, needed, where)
