@@ -14,7 +14,6 @@ from vjepa2_ac.cli import main
 from vjepa2_ac.config import AdapterConfig, CheckpointConfig, DataConfig, IdleConfig
 from vjepa2_ac.config.loading import (
     all_keys,
-    changed_keys,
     config_as_yaml,
     config_path,
     config_schema,
@@ -138,12 +137,6 @@ def test_another_form_of_data_takes_the_place_of_that_in_the_file_with_its_knobs
     assert ported.data.lerobot.gripper_open == 2
     with pytest.raises(InputError, match=r"data\.lerobot: a section of source lerobot, and this is source rlds"):
         load_config(write(tmp_path, resolved), ["data.lerobot.gripper_open=2"])
-
-
-def test_changed_keys_names_the_dotted_keys() -> None:
-    old = parse_config(MINIMAL, where="")
-    new = parse_config({**MINIMAL, "seed": 3, "training": {"steps": 50_000}}, where="")
-    assert changed_keys(old, new) == ["seed", "training.steps"]
 
 
 def test_schema_documents_every_knob() -> None:
