@@ -1,8 +1,6 @@
 """Config loading: every knob once, all errors at once."""
 
-import os
 import re
-import threading
 from operator import attrgetter
 from pathlib import Path
 
@@ -117,15 +115,6 @@ def test_what_is_not_a_config_is_refused(tmp_path: Path, text: str) -> None:
         load_config(write(tmp_path, text))
     with pytest.raises(InputError, match=r"nowhere\.yaml"):
         load_config(tmp_path / "nowhere.yaml")
-
-
-def test_a_config_may_come_through_a_pipe(tmp_path: Path) -> None:
-    pipe = tmp_path / "pipe"
-    os.mkfifo(pipe)
-    writer = threading.Thread(target=pipe.write_text, args=(yaml.safe_dump(MINIMAL),))
-    writer.start()
-    assert load_config(pipe) == parse_config(MINIMAL, where="")
-    writer.join()
 
 
 def test_another_form_of_data_takes_the_place_of_that_in_the_file_with_its_knobs(tmp_path: Path) -> None:

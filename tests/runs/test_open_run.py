@@ -9,7 +9,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.runs.checkpoint import RunState
-from vjepa2_ac.runs.folder import RunLock, with_stride
+from vjepa2_ac.runs.folder import RunLock
 from vjepa2_ac.runs.open_run import open_run
 
 OPEN_REMOTE = "vjepa2_ac.runs.open_run.open_remote"
@@ -61,6 +61,6 @@ def test_the_stride_that_a_run_has_chosen_is_the_one_of_its_next_start(make_conf
     config = make_config(data__stride="auto")
     with open_run(config, reporter) as opened:
         assert opened.config.data.stride == "auto"
-        opened.begin(with_stride(config, 3), RunState(step=0))
+        opened.begin(config.with_stride(3), RunState(step=0))
     with open_run(config, reporter) as opened:
         assert opened.config.data.stride == 3

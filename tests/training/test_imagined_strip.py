@@ -108,8 +108,3 @@ def test_a_decoder_that_will_not_do_is_told_before_what_is_expensive(
         train(make_config(validation__decoder="nowhere"), reporter)
     assert load_decoder(decoder).where == "--decoder"
     assert not (tmp_path / "run").exists()
-
-
-def test_a_check_loads_the_decoder_and_writes_nothing(make_config, reporter, decoder, tmp_path) -> None:
-    train(make_config(validation__decoder=decoder), reporter, check_only=True)
-    assert not (tmp_path / "run").exists()

@@ -87,17 +87,6 @@ def moments_of(optimizer: torch.optim.Optimizer) -> dict[str, Any]:
     return dict(torch.load(kept, weights_only=True, map_location="cpu"))
 
 
-def test_the_count_of_steps_of_a_fused_optimizer_is_on_the_device() -> None:
-    module = torch.nn.Linear(128, 4)
-    plain = make_optimizer(module, TrainingConfig())
-    take_steps(module, plain, range(2))
-    with FakeTensorMode(allow_non_fake_inputs=True):
-        there = on_imagined_cuda(module)
-        fused = make_optimizer(there, TrainingConfig())
-        load_moments(fused, moments_of(plain))
-        assert {value.device.type for state in fused.state.values() for value in state.values()} == {"cuda"}
-
-
 @pytest.mark.parametrize("kinds", [(False, True), (True, False), (True, True)])
 def test_a_run_resumes_with_the_moments_of_a_fused_and_of_a_plain_optimizer(
     fuse: Callable[[bool], None], kinds: tuple[bool, bool]

@@ -106,6 +106,10 @@ class Config(Section):
         """The data set, and that of `replay` where there is one."""
         return (self.data,) if self.replay is None else (self.data, self.replay.data)
 
+    def with_stride(self, stride: int) -> Config:
+        """Return the config with a stride that was found out."""
+        return self.model_copy(update={"data": self.data.with_stride(stride)})
+
     def for_replay(self) -> Config:
         """Return the config of a run on the data set of `replay` alone.
 

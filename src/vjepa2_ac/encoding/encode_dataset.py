@@ -72,7 +72,18 @@ def encode_config(config: Config, reporter: Reporter = SILENT, *, out: Path | No
     else:
         cache.begin()
         reporter.note(f"Everything is encoded already, in {cache.folder}")
-    return _result(cache)
+    table, broken = cache.dataset.table, cache.broken
+    sizes = [(one, cache.files.size(one.episode, one.camera)) for one in cache.wanted]
+    absent = {one.episode for one, size in sizes if not size}
+    return EncodedSet(
+        folder=cache.folder,
+        episodes=len(table),
+        encoded=len({one.episode for one in cache.wanted} - absent),
+        frames=sum(len(one.steps) for one, size in sizes if size),
+        bytes=sum(size for _, size in sizes),
+        broken={table.identity(number): reason for number, reason in broken.items()},
+        is_finished=absent <= broken.keys(),
+    )
 
 
 def require_encodable(config: Config) -> None:
@@ -197,21 +208,6 @@ def _require_shared(cache: LatentCache, sees: Callable[[], bool]) -> None:
             fix = "Set it to one that all machines of the run share; or run `vjepa2-ac encode` once on every machine"
             raise InputError(where=f"data.cache_dir: {cache.folder.parent}", found=found, fix=fix)
         time.sleep(_LOOKS_EVERY_S)
-
-
-def _result(cache: LatentCache) -> EncodedSet:
-    table, broken = cache.dataset.table, cache.broken
-    sizes = [(one, cache.files.size(one.episode, one.camera)) for one in cache.wanted]
-    absent = {one.episode for one, size in sizes if not size}
-    return EncodedSet(
-        folder=cache.folder,
-        episodes=len(table),
-        encoded=len({one.episode for one in cache.wanted} - absent),
-        frames=sum(len(one.steps) for one, size in sizes if size),
-        bytes=sum(size for _, size in sizes),
-        broken={table.identity(number): reason for number, reason in broken.items()},
-        is_finished=absent <= broken.keys(),
-    )
 
 
 def _forecast(cache: LatentCache, left: Sequence[FramesToEncode], encoder: EncoderOnDevice, processes: int) -> str:

@@ -231,12 +231,7 @@ def with_settled_stride(config: Config) -> Config:
     if config.data.stride != "auto" or not (folder / CONFIG).is_file():
         return config
     stride = read_run_config(folder).data.stride
-    return config if stride == "auto" else with_stride(config, stride)
-
-
-def with_stride(config: Config, stride: int) -> Config:
-    """Return the config with a stride that was found out."""
-    return config.model_copy(update={"data": config.data.with_stride(stride)})
+    return config if stride == "auto" else config.with_stride(stride)
 
 
 class RunLock:

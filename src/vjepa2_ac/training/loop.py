@@ -145,8 +145,7 @@ def _save(run: Run, metrics_log: MetricsLog | None) -> None:
 def _loop(run: Run, metrics_log: MetricsLog | None, mirror: Mirror | None, reporter: Reporter) -> None:
     training = run.config.training
     device, processes = run.accelerator.device, run.accelerator.num_processes
-    encodes = not run.dataset.config.is_cache
-    throughput = Throughput.of(run.config, run.world_model.sizes, device, processes, encodes=encodes)
+    throughput = Throughput.of(run.config, run.world_model.sizes, device, processes)
     reporter.note(str(throughput))
     reporter.started(run.state.step, training.steps)
     checkpoint, saved_s = run.config.checkpoint, time.monotonic()

@@ -204,22 +204,19 @@ class Throughput:
     device: torch.device
 
     @classmethod
-    def of(
-        cls, config: Config, sizes: ModelSizes, device: torch.device, processes: int, *, encodes: bool = True
-    ) -> Throughput:
+    def of(cls, config: Config, sizes: ModelSizes, device: torch.device, processes: int) -> Throughput:
         """Measure the ceiling, once per device, precision and program.
 
         Args:
-            config: The run.
+            config: The run; the encoder's work counts unless latents are cached.
             sizes: Of its model.
             device: Of this process.
             processes: Of the run.
-            encodes: Whether the encoder's work counts; cached latents need none.
         """
         tokens = config.data.frames * sizes.tokens_per_frame
         ceiling = processes * matmul_speed(device, PRECISIONS[config.training.precision])
         flops = clip_flops(config, sizes)
-        return cls(flops.total if encodes else flops.predictor, tokens, ceiling, device)
+        return cls(flops.predictor if config.data.takes_latents else flops.total, tokens, ceiling, device)
 
     def metrics(self, clips: float, seconds: float, waited_s: float) -> dict[str, float]:
         """Return the metrics of one step.

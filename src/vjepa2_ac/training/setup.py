@@ -32,7 +32,6 @@ from vjepa2_ac.model.network.compilation import require_compiler
 from vjepa2_ac.model.network.world_model import WorldModel, fit_heads, heads_to_replace, require_trained
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import RunState
-from vjepa2_ac.runs.folder import with_stride
 from vjepa2_ac.training.data_sets import first_clip, open_data_sets, require_fitting_clips, require_same_data
 from vjepa2_ac.training.loss import Objective
 from vjepa2_ac.training.optim import make_optimizer, trained_parameters
@@ -128,7 +127,7 @@ def set_up(
     if is_auto:
         chooser = load_base(config.model, seed=config.seed).to(accelerator.device)
         calibration = broadcast_object(accelerator, choose_stride(chooser, dataset, config, accelerator, reporter))
-        config, dataset = with_stride(config, calibration.stride), dataset.with_stride(calibration.stride)
+        config, dataset = config.with_stride(calibration.stride), dataset.with_stride(calibration.stride)
     splits: tuple[Split, ...] = ("train", "validation", "test") if config.data.test_share else ("train", "validation")
     clip, *_ = [first_clip(dataset, split) for split in splits]  # fails early: an empty split, a broken clip
     require_fitting_clips(dataset, others)

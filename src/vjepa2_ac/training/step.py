@@ -69,16 +69,22 @@ def training_step(run: Run, batches: Iterator[Batch], step: int, *, measure_upda
         run.scaler.step(run.optimizer)  # with fp16 and an overflow nothing moves either
         run.scaler.update()
     run.optimizer.zero_grad(set_to_none=True)
-    return {
+    metrics = {
         "loss": taken.forced_loss + taken.rollout_loss,
         "loss_teacher_forcing": taken.forced_loss,
         "loss_rollout": taken.rollout_loss,
         "grad_norm": taken.norm,
         "learning_rate": learning_rate,
-        **({"update_to_weight": update.to_weight()} if update else {}),
-        **_about_the_data(run, taken),
-        **({"loss_scale": run.scaler.get_scale()} if run.scaler.is_enabled() else {}),
     }
+    if update is not None:
+        metrics["update_to_weight"] = update.to_weight()
+    if any(data.broken_episodes == "skip" for data in run.config.data_sets):
+        metrics["clips_left_out"] = float(run.clips_per_step - taken.clips)
+    if any(is_url(data.path) for data in run.config.data_sets):
+        metrics["bytes_per_clip"] = taken.bytes_fetched / max(1, taken.clips)
+    if run.scaler.is_enabled():
+        metrics["loss_scale"] = run.scaler.get_scale()
+    return metrics
 
 
 def gradients(
@@ -170,15 +176,6 @@ def _finish_gradients(run: Run, factor: float) -> float:
     limit = run.config.training.max_grad_norm
     norm = nn.utils.clip_grad_norm_(run.trained, math.inf if limit is None else limit)
     return float(norm)
-
-
-def _about_the_data(run: Run, taken: Gradients) -> dict[str, float]:
-    metrics: dict[str, float] = {}
-    if any(data.broken_episodes == "skip" for data in run.config.data_sets):
-        metrics["clips_left_out"] = float(run.clips_per_step - taken.clips)
-    if any(is_url(data.path) for data in run.config.data_sets):
-        metrics["bytes_per_clip"] = taken.bytes_fetched / max(1, taken.clips)
-    return metrics
 
 
 def step_seed(seed: int, step: int, rank: int) -> int:
