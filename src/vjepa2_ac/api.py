@@ -43,7 +43,6 @@ logger = logging.getLogger(__name__)
 Device = str | torch.device
 WeightType = Literal["auto", "float32", "bfloat16"]
 
-_AUTO = "auto"
 _REST = {  # of a config
     "run_dir": "none",
     "data": {"source": "npz", "path": "none"},
@@ -156,7 +155,7 @@ def load_model(
     name: str | Path,
     *,
     adapter: str | Path | None = None,
-    device: Device = _AUTO,
+    device: Device = "auto",
     dtype: WeightType = "auto",
     sizes: ModelSizes | None = None,
     encoder: str | Path | EncoderConfig | None = None,
@@ -184,7 +183,7 @@ def load_model(
     has_bfloat16 = place.type == "cuda" and has_bf16()
     model_values = {
         "base": str(name),
-        "dtype": ("bfloat16" if has_bfloat16 else "float32") if dtype == _AUTO else dtype,
+        "dtype": ("bfloat16" if has_bfloat16 else "float32") if dtype == "auto" else dtype,
         "sizes": (sizes or ModelSizes()).model_dump(),
         "encoder": encoder.model_dump() if isinstance(encoder, EncoderConfig) else encoder and {"path": str(encoder)},
     }
@@ -196,7 +195,7 @@ def load_model(
     return model.to(place).eval()
 
 
-def load_run(folder: str | Path, checkpoint: str | int = "selected", *, device: Device = _AUTO) -> loading.TrainedRun:
+def load_run(folder: str | Path, checkpoint: str | int = "selected", *, device: Device = "auto") -> loading.TrainedRun:
     """Load the model of a trained run, in eval mode: its base with the adapter of a complete checkpoint.
 
     Args:
@@ -330,7 +329,7 @@ class _Told(Reporter):
 
 def _device(device: Device) -> torch.device:
     has_cuda = torch.cuda.is_available()
-    if device == _AUTO:
+    if device == "auto":
         return torch.device("cuda" if has_cuda else "cpu")
     try:
         found = torch.device(device)

@@ -126,7 +126,6 @@ def _plain(name: str) -> str:
 
 CHUNK_BYTES = 2**20
 _POLICY = RetryPolicy(attempts=5, first_wait_s=2.0, total_s=math.inf)
-_MEGABYTE = 10**6
 _PROXY = "Check the URL, and whether a proxy answers in the server's place"
 
 
@@ -211,7 +210,7 @@ def _fetch(url: str, part: Path, known: Published | None, reporter: Reporter, ti
         with storage.user_can_write(part), part.open("ab" if start else "wb") as file:
             while block := answer.read(CHUNK_BYTES):
                 file.write(block)
-                show(file.tell() // _MEGABYTE, whole // _MEGABYTE)
+                show(file.tell() // 10**6, whole // 10**6)
         if _size(part) < whole:
             raise http.client.IncompleteRead(b"", whole - _size(part))
 
