@@ -155,7 +155,8 @@ def curve(options: argparse.Namespace, clips: Sequence[LatentBatch], way: str, n
     optimizer = torch.optim.AdamW(trained, lr=_LEARNING_RATE)
     losses = []
     for step in range(options.steps):
-        loss = prediction_losses(model, clips[step % len(clips)], rollout_steps=2).total
+        forced, rollout = prediction_losses(model, clips[step % len(clips)], rollout_steps=2)
+        loss = forced + rollout
         loss.backward()
         optimizer.step()
         optimizer.zero_grad()

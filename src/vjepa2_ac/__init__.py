@@ -30,18 +30,12 @@ A thread that looks for work holds its core. On cores that other programs use to
 that (`benchmarks/two_at_once.py`). OpenMP reads it when PyTorch is imported; a value of the user's stays.
 """
 
-_MODULES = {  # the same as above, for the time of use
-    "Controller": "vjepa2_ac.planning.controller",
-    "UserError": "vjepa2_ac.errors",
-    "WorldModel": "vjepa2_ac.model.network.world_model",
-    "encode": "vjepa2_ac.api",
-    "evaluate": "vjepa2_ac.api",
-    "load_config": "vjepa2_ac.config.loading",
-    "load_model": "vjepa2_ac.api",
-    "load_run": "vjepa2_ac.api",
-    "open_dataset": "vjepa2_ac.api",
-    "read_clips": "vjepa2_ac.api",
-    "train": "vjepa2_ac.api",
+_NAMES = {  # the same as above, for the time of use
+    "vjepa2_ac.api": ("encode", "evaluate", "load_model", "load_run", "open_dataset", "read_clips", "train"),
+    "vjepa2_ac.config.loading": ("load_config",),
+    "vjepa2_ac.errors": ("UserError",),
+    "vjepa2_ac.model.network.world_model": ("WorldModel",),
+    "vjepa2_ac.planning.controller": ("Controller",),
 }
 
 
@@ -53,8 +47,8 @@ if not TYPE_CHECKING:  # else a type checker would accept any name
 
     def __getattr__(name: str) -> Any:
         """Import a public name."""
-        if name not in _MODULES:
-            raise AttributeError(f"vjepa2_ac has no {name!r}; its public names are {', '.join(__all__)}")
-        found = getattr(import_module(_MODULES[name]), name)
-        globals()[name] = found
-        return found
+        for module, names in _NAMES.items():
+            if name in names:
+                globals()[name] = found = getattr(import_module(module), name)
+                return found
+        raise AttributeError(f"vjepa2_ac has no {name!r}; its public names are {', '.join(__all__)}")

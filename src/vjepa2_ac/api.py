@@ -13,10 +13,9 @@ from typing import TYPE_CHECKING, Any, Literal, get_args, overload
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from pydantic import ValidationError
 from torch import Tensor
 
-from vjepa2_ac.config import Config, EncoderConfig, ModelConfig, ModelSizes
+from vjepa2_ac.config import Config, EncoderConfig, ModelSizes
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.loading import config_as_dict, parse_config
 from vjepa2_ac.data import dataset as datasets
@@ -34,7 +33,6 @@ from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs import loading
 from vjepa2_ac.runs.folder import is_run
-from vjepa2_ac.storage.structured import message_of
 
 if TYPE_CHECKING:
     from vjepa2_ac.evaluation.result import Validation
@@ -45,8 +43,12 @@ logger = logging.getLogger(__name__)
 Device = str | torch.device
 WeightType = Literal["auto", "float32", "bfloat16"]
 
-_AUTO = "auto"
-_REST = {"run_dir": "none", "model": {"base": "builtin:sim-tiny"}, "training": {"rollout_steps": 1}}  # of a config
+_REST = {  # of a config
+    "run_dir": "none",
+    "data": {"source": "npz", "path": "none"},
+    "model": {"base": "builtin:sim-tiny"},
+    "training": {"rollout_steps": 1},
+}
 
 
 def open_dataset(data: str | Path | Config, **knobs: Any) -> Dataset:
@@ -153,7 +155,7 @@ def load_model(
     name: str | Path,
     *,
     adapter: str | Path | None = None,
-    device: Device = _AUTO,
+    device: Device = "auto",
     dtype: WeightType = "auto",
     sizes: ModelSizes | None = None,
     encoder: str | Path | EncoderConfig | None = None,
@@ -179,18 +181,13 @@ def load_model(
     """
     place = _device(device)
     has_bfloat16 = place.type == "cuda" and has_bf16()
-    values = {
+    model_values = {
         "base": str(name),
-        "dtype": ("bfloat16" if has_bfloat16 else "float32") if dtype == _AUTO else dtype,
-        "sizes": sizes or ModelSizes(),
-        "encoder": encoder if encoder is None or isinstance(encoder, EncoderConfig) else {"path": str(encoder)},
+        "dtype": ("bfloat16" if has_bfloat16 else "float32") if dtype == "auto" else dtype,
+        "sizes": (sizes or ModelSizes()).model_dump(),
+        "encoder": encoder.model_dump() if isinstance(encoder, EncoderConfig) else encoder and {"path": str(encoder)},
     }
-    try:
-        config = ModelConfig.model_validate(values)
-    except ValidationError as error:
-        (detail, *_) = error.errors()
-        where = f"load_model, {'.'.join(map(str, detail['loc']))}"
-        raise InputError(where=where, found=message_of(detail), needed="what `model:` in a config takes") from None
+    config = parse_config(_REST | {"model": model_values}, where="load_model").model
     require_type_of_weights(config, place)
     model = load_base(config, seed=0)
     if adapter is not None:
@@ -198,7 +195,7 @@ def load_model(
     return model.to(place).eval()
 
 
-def load_run(folder: str | Path, checkpoint: str | int = "selected", *, device: Device = _AUTO) -> loading.TrainedRun:
+def load_run(folder: str | Path, checkpoint: str | int = "selected", *, device: Device = "auto") -> loading.TrainedRun:
     """Load the model of a trained run, in eval mode: its base with the adapter of a complete checkpoint.
 
     Args:
@@ -332,7 +329,7 @@ class _Told(Reporter):
 
 def _device(device: Device) -> torch.device:
     has_cuda = torch.cuda.is_available()
-    if device == _AUTO:
+    if device == "auto":
         return torch.device("cuda" if has_cuda else "cpu")
     try:
         found = torch.device(device)

@@ -14,8 +14,7 @@ import logging
 import math
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Sequence
 from datetime import timedelta
 from functools import cache, lru_cache
 from typing import Any, TypeVar
@@ -28,7 +27,7 @@ from accelerate.utils import InitProcessGroupKwargs
 from torch import Tensor, nn
 
 from vjepa2_ac.config import Config, ModelConfig, TrainingConfig
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, UserError
 
 _log = logging.getLogger(__name__)
 
@@ -173,20 +172,6 @@ def _wait_for(device: torch.device) -> None:
         torch.cuda.synchronize(device)
 
 
-@contextmanager
-def out_of_memory_explained(where: str, fix: str) -> Iterator[None]:
-    """Turn the error of a GPU whose memory was too small into one that says which knobs to change.
-
-    Raises:
-        InputError: The memory was not enough.
-    """
-    try:
-        yield
-    except torch.OutOfMemoryError as error:
-        found = f"the GPU's memory is not enough ({str(error).splitlines()[0]})"
-        raise InputError(where=where, found=found, fix=fix) from error
-
-
 # ---- processes ----
 
 
@@ -249,12 +234,12 @@ def agreed(accelerator: Accelerator, work: Callable[[], _T]) -> _T:
 
 def raise_first(accelerator: Accelerator, error: Exception | None) -> None:
     """Raise, in all processes, the error of the first of them that has one. All have to call."""
-    told = error if error is None or isinstance(error, InputError) else RuntimeError(f"{type(error).__name__}: {error}")
+    told = error if error is None or isinstance(error, UserError) else RuntimeError(f"{type(error).__name__}: {error}")
     for rank, first in enumerate(all_gather_object(accelerator, told)):
         if first is not None and error is not None and rank == accelerator.process_index:
             raise error
         if first is not None:
-            if isinstance(first, InputError):
+            if isinstance(first, UserError):
                 first.is_told = True
             raise first
 

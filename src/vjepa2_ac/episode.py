@@ -174,14 +174,9 @@ class Batch:
     @property
     def nbytes(self) -> int:
         """The bytes of all its tensors."""
-        sizes: list[int] = []
-
-        def count(tensor: Tensor) -> Tensor:
-            sizes.append(tensor.nbytes)
-            return tensor
-
-        self.mapped(count)
-        return sum(sizes)
+        latents = () if self.latents is None else (self.latents.values, self.latents.scales)
+        tensors = (self.frames, self.states, self.actions, self.extrinsics, *latents)
+        return sum(one.nbytes for one in tensors if one is not None)
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,11 @@ from typing import Any
 from urllib.parse import unquote, urlsplit
 
 _PACKAGE = "vjepa2-ac"
+_GPU_IS_FULL = "OutOfMemoryError"  # PyTorch's, which is not imported here
+_LESS_MEMORY = (
+    "Set training.gradient_checkpointing=true, or lower training.batch_size (and raise training.accumulation),"
+    " model.encode_chunk, validation.batch_size, planning.energy.samples_at_once or decoder.batch_size"
+)
 _MOST_CHARACTERS = 8_000  # of a part of a message: quoted input may have any length
 _CONTROL = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})  # some control terminals; lone surrogates cannot be encoded
 
@@ -77,13 +82,9 @@ def printable(text: str) -> str:
     """
     if text.isprintable():
         return text
-    return "".join(_written_out(character) for character in text)
-
-
-def _written_out(character: str) -> str:
-    if character in "\n\t" or unicodedata.category(character) not in _CONTROL:
-        return character
-    return character.encode("unicode_escape").decode()
+    is_shown = [one in "\n\t" or unicodedata.category(one) not in _CONTROL for one in text]
+    shown = zip(text, is_shown, strict=True)
+    return "".join(one if is_safe else one.encode("unicode_escape").decode() for one, is_safe in shown)
 
 
 def _short(text: str) -> str:
@@ -96,10 +97,16 @@ def _short(text: str) -> str:
 def in_words(error: BaseException) -> str:
     """Return the message of an error; for a lack of files or memory, with a fix."""
     if isinstance(error, OSError) and error.errno in {errno.EMFILE, errno.ENFILE}:
-        return str(too_few_files(str(error.filename or "")))
-    if is_out_of_memory(error):
-        return f"this machine's memory is not enough ({str(error).splitlines()[0] if str(error) else 'MemoryError'})"
-    return str(error)
+        limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+        found = f"too many open files: this process may have {limit} of them at once (ulimit -n)"
+        fix = "Raise that where it is started, as with `ulimit -n 4096`, or lower data.workers and data.connections"
+        return str(InputError(where=str(error.filename or "ulimit -n"), found=found, fix=fix))
+    if not is_out_of_memory(error):
+        return str(error)
+    said = str(error).splitlines()[0] if str(error) else "MemoryError"
+    if type(error).__name__ == _GPU_IS_FULL:
+        return f"the GPU's memory is not enough ({said}). {_LESS_MEMORY}"
+    return f"this machine's memory is not enough ({said})"
 
 
 def pip_install(extra: str = "") -> str:
@@ -160,14 +167,7 @@ def extra_of(library: str) -> str:
     return next((match[1] for match in found if match), "")
 
 
-def too_few_files(where: str = "") -> InputError:
-    """Return the error of a process that has reached its limit of open files."""
-    limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
-    found = f"too many open files: this process may have {limit} of them at once (ulimit -n)"
-    fix = "Raise that where it is started, as with `ulimit -n 4096`, or lower data.workers and data.connections"
-    return InputError(where=where or "ulimit -n", found=found, fix=fix)
-
-
 def is_out_of_memory(error: BaseException) -> bool:
-    """Return whether the machine's memory, not the GPU's, was too small: PyTorch has no error type for that."""
-    return isinstance(error, MemoryError) or "DefaultCPUAllocator: can't allocate memory" in str(error)
+    """Return whether memory was too small: the GPU's, or the machine's, for which PyTorch has no error type."""
+    is_gpus = type(error).__name__ == _GPU_IS_FULL
+    return is_gpus or isinstance(error, MemoryError) or "DefaultCPUAllocator: can't allocate memory" in str(error)

@@ -65,8 +65,10 @@ def own_streams() -> Iterator[Callable[[], str]]:
     Streams that are not the process's own, such as those of a test or a notebook, are not changed. Yields a function
     that returns why some of the standard output was lost; empty where none was, or its reader has left.
     """
-    if None in (sys.stdout, sys.stderr):
-        _occupy_closed_numbers()
+    if None in (sys.stdout, sys.stderr):  # or the next file gets the number of one, and libraries write into it
+        while (handle := os.open(os.devnull, os.O_RDWR)) <= 2:
+            pass
+        os.close(handle)
     before, ours = {name: getattr(sys, name) for name in _NAMES}, dict[str, _Stream]()
     for number, (name, stream) in enumerate(before.items(), start=1):
         if stream is getattr(sys, f"__{name}__"):  # None: it was closed when the process started
@@ -88,13 +90,6 @@ def own_streams() -> Iterator[Callable[[], str]]:
     finally:
         for name in ours:
             setattr(sys, name, before[name])
-
-
-def _occupy_closed_numbers() -> None:
-    """Open /dev/null as 0, 1 and 2 where free: else the next file gets that number, and libraries write into it."""
-    while (handle := os.open(os.devnull, os.O_RDWR)) <= 2:
-        pass
-    os.close(handle)
 
 
 # ---- signals ----

@@ -109,11 +109,7 @@ class Registry:
     @property
     def name_in_schema(self) -> Any:
         """The names, as a JSON schema has them: for a knob that names one of these things."""
-
-        def add(schema: dict[str, Any]) -> None:
-            schema["enum"] = self.names()
-
-        return Field(json_schema_extra=add)
+        return Field(json_schema_extra=lambda schema: schema.update(enum=list[Any](self.names())))
 
     @property
     def things_in_schema(self) -> Any:

@@ -50,10 +50,7 @@ def actions_from_states(states: Float[np.ndarray, "time 7"]) -> Float[np.ndarray
 
     Source: facebookresearch/vjepa2 @ c2963a4, app/vjepa_droid/droid.py, poses_to_diffs.
     """
-    if len(states) < 2:
-        raise ValueError(f"an action needs two states; got {len(states)}")
-    delta = rotation_differences(states[:, 3:6])
-    return np.concatenate([np.diff(states[:, :3], axis=0), delta, np.diff(states[:, 6:], axis=0)], axis=-1)
+    return POSE.differences(states)
 
 
 def rotation_differences(angles: Float[np.ndarray, "time 3"]) -> Float[np.ndarray, "time-1 3"]:

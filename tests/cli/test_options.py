@@ -9,6 +9,7 @@ from dataclasses import MISSING, fields
 from pathlib import Path
 
 import pytest
+import torch
 
 from vjepa2_ac.cli import main, program, setup
 from vjepa2_ac.cli.options import parsed
@@ -162,6 +163,10 @@ def raising(error: BaseException) -> Callable[..., int]:
         (OSError(errno.EMFILE, "Too many open files"), r"error: ulimit -n: too many open files: this process may have"),
         (MemoryError("Unable to allocate 9 TiB"), r"memory is not enough \(Unable to allocate 9 TiB\)"),
         (RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: 9 bytes"), "memory is not enough"),
+        (
+            torch.OutOfMemoryError("CUDA out of memory. Tried\nto"),
+            r"GPU's .*\(CUDA out of memory. Tried\). Set training",
+        ),
         (OSError(errno.ENOSPC, "No space left on device", "run"), r"No space left on device: 'run'"),
     ],
 )

@@ -4,7 +4,7 @@ import shutil
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args, get_origin
+from typing import Annotated, Any, ClassVar, Literal, get_args, get_origin
 
 import pytest
 from pydantic import BaseModel
@@ -160,7 +160,24 @@ def test_a_knob_that_does_not_say_what_it_affects_is_an_error() -> None:
         workers: int = 1
 
     with pytest.raises(TypeError, match=r"workers: say what it affects"):
-        marks_of(Forgotten)
+        knobs_that_affect(Affects.RUN, Forgotten())
+
+
+def test_the_mark_of_a_plug_ins_section_holds_for_its_knobs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(DataConfig, "kinds", dict(DataConfig.kinds))
+
+    class WallOptions(Section):
+        size: int = 32
+
+    class WallData(DataConfig):
+        source: Annotated[Literal["wall"], Affects.EPISODES] = "wall"
+        wall: Annotated[WallOptions, Affects.EPISODES] = WallOptions()
+        first_camera: ClassVar[str] = "front"
+
+    encoding = encoding_of(world_model(), config_of("rlds", "x", Path()))
+    options = (WallOptions(size=size) for size in (32, 64))
+    keys = [key_of_cache(WallData(path="x", wall=wall), "its episodes", encoding) for wall in options]
+    assert keys[0].digest != keys[1].digest
 
 
 @pytest.mark.parametrize("states", ["pose", "vector"])
@@ -171,7 +188,7 @@ def test_a_knob_that_changes_makes_strangers_of_what_it_affects_and_of_nothing_e
     if (source, states) == ("droid_raw", "vector"):
         pytest.skip("raw DROID has poses")
     config = config_of(source, sets[source], tmp_path, **(recorded_by(source) if states == "vector" else {}))
-    usual, own = keys_of(config), tuple(f"data.{name}." for name in config.data.own_section)
+    usual, own = keys_of(config), tuple(f"data.{name}." for name in config.data.own_sections())
     assert None not in usual.values()
     marks, changed = marks_of(Config), {}
     for key in knobs_of(config) - {"data.source", "data.path"} - ONLY_REMOTE:

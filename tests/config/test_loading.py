@@ -1,8 +1,6 @@
 """Config loading: every knob once, all errors at once."""
 
-import os
 import re
-import threading
 from operator import attrgetter
 from pathlib import Path
 
@@ -14,7 +12,6 @@ from vjepa2_ac.cli import main
 from vjepa2_ac.config import AdapterConfig, CheckpointConfig, DataConfig, IdleConfig
 from vjepa2_ac.config.loading import (
     all_keys,
-    changed_keys,
     config_as_yaml,
     config_path,
     config_schema,
@@ -120,15 +117,6 @@ def test_what_is_not_a_config_is_refused(tmp_path: Path, text: str) -> None:
         load_config(tmp_path / "nowhere.yaml")
 
 
-def test_a_config_may_come_through_a_pipe(tmp_path: Path) -> None:
-    pipe = tmp_path / "pipe"
-    os.mkfifo(pipe)
-    writer = threading.Thread(target=pipe.write_text, args=(yaml.safe_dump(MINIMAL),))
-    writer.start()
-    assert load_config(pipe) == parse_config(MINIMAL, where="")
-    writer.join()
-
-
 def test_another_form_of_data_takes_the_place_of_that_in_the_file_with_its_knobs(tmp_path: Path) -> None:
     resolved = config_as_yaml(parse_config(MINIMAL, where=""))
     assert "fields:" in resolved
@@ -138,12 +126,6 @@ def test_another_form_of_data_takes_the_place_of_that_in_the_file_with_its_knobs
     assert ported.data.lerobot.gripper_open == 2
     with pytest.raises(InputError, match=r"data\.lerobot: a section of source lerobot, and this is source rlds"):
         load_config(write(tmp_path, resolved), ["data.lerobot.gripper_open=2"])
-
-
-def test_changed_keys_names_the_dotted_keys() -> None:
-    old = parse_config(MINIMAL, where="")
-    new = parse_config({**MINIMAL, "seed": 3, "training": {"steps": 50_000}}, where="")
-    assert changed_keys(old, new) == ["seed", "training.steps"]
 
 
 def test_schema_documents_every_knob() -> None:

@@ -18,7 +18,7 @@ from vjepa2_ac import distributed
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import parse_config
-from vjepa2_ac.distributed import computing_device, require_type_of_weights
+from vjepa2_ac.distributed import computing_device
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.session import load_to_plan
 
@@ -102,14 +102,6 @@ def test_bfloat16_that_is_only_emulated_is_refused(
 )
 def test_what_an_old_gpu_computes_is_not_refused(training: dict[str, str]) -> None:
     assert computing_device(parsed(**training).training).type == training.get("device", "cuda")
-
-
-@pytest.mark.usefixtures("gpu")
-@pytest.mark.parametrize("gpu", [(8, 0), (8, 9), (9, 0), (12, 0)], indirect=True)
-def test_since_ampere_there_is_bfloat16() -> None:
-    config = parsed(precision="bf16")
-    assert computing_device(config.training) == torch.device("cuda", 0)
-    require_type_of_weights(config.model, torch.device("cuda"))
 
 
 @pytest.mark.usefixtures("gpu")

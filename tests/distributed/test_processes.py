@@ -117,7 +117,7 @@ def test_a_step_has_the_clips_that_it_had_on_any_number_of_processes(
     make_config, reporter, before: int, now: int, micro_batches: int
 ) -> None:
     config = make_config(training__batch_size=2, training__accumulation=4)
-    state = RunState(step=3, processes=before, clips_per_step=8 * before)
+    state = RunState(step=3, processes=before, clips_per_step=8 * before, clips_asked=8)
     assert micro_batches_of(config, state, now, reporter) == micro_batches
     assert micro_batches * now * 2 == state.clips_per_step
     assert bool(reporter.notes) == (before != now)
@@ -135,14 +135,13 @@ def test_a_step_keeps_its_clips_however_often_the_run_goes_on(make_config, start
 
 def test_processes_that_cannot_share_a_step_are_refused(make_config, reporter) -> None:
     config = make_config(training__batch_size=2, training__accumulation=4)
-    with pytest.raises(InputError, match="3 processes of 2 clips for a run with 8 clips per step"):
-        micro_batches_of(config, RunState(step=3, clips_per_step=8), 3, reporter)
+    with pytest.raises(InputError, match="3 processes of 2 clips do not divide the 8 clips"):
+        micro_batches_of(config, RunState(step=3, clips_per_step=8, clips_asked=8), 3, reporter)
 
 
 def test_accumulation_changed_on_purpose_counts_as_it_is_written(make_config, reporter) -> None:
     config = make_config(training__batch_size=2, training__accumulation=3)
-    for state in (RunState(step=3, clips_per_step=8), RunState(step=3, clips_per_step=8, clips_asked=4, processes=1)):
-        assert micro_batches_of(config, state, 2, reporter) == 3
+    assert micro_batches_of(config, RunState(step=3, clips_per_step=8, clips_asked=4), 2, reporter) == 3
 
 
 def test_a_run_whose_step_changes_goes_on_in_the_row_of_clips_where_it_stood(make_config, reporter) -> None:

@@ -2,8 +2,6 @@
 
 import errno
 import shutil
-import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,14 +17,13 @@ from latent_sets import NUMBERS, write_cache
 from ranks import finish, free_port, start_rank
 from run_fixtures import MakeConfig, SilentReporter, as_yaml, set_up
 from same_run import assert_same_run
-from vjepa2_ac import distributed as collectives
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.loader import validation_batches
 from vjepa2_ac.encoding import encode_dataset, latent_cache
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.encoding.encode_dataset import EncodedSet, encode_config
-from vjepa2_ac.encoding.latent_cache import LatentCache, needed_frames
+from vjepa2_ac.encoding.latent_cache import needed_frames
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.checkpoints.loading import load_base
@@ -144,23 +141,6 @@ def test_processes_share_the_episodes_without_waiting_for_one_another(
         assert encode(config, tmp_path / "out").is_finished == is_last
         assert sum(encoded_frames) == 12 * episodes
     assert contents(tmp_path / "out") == contents(tmp_path / "whole")
-
-
-def test_ctrl_c_keeps_what_is_done(make_config: MakeConfig, tmp_path: Path, encoded_frames: list[int]) -> None:
-    config, out = make_config(data__start_every=2), tmp_path / "out"
-
-    def pressed(done: int, _total: int) -> None:
-        if done >= 24:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        encode(config, out, pressed)
-    done = len(latents_in(out))
-    assert done >= 2
-    assert not list(out.rglob("*.partial"))
-    encoded_frames.clear()
-    assert encode(config, out).is_finished
-    assert sum(encoded_frames) == (8 - done) * 12
 
 
 def test_a_disk_that_fills_up_is_named_and_nothing_half_written_counts(
@@ -360,13 +340,11 @@ def test_a_run_mends_the_cache_that_it_finds_damaged(
     assert contents(folder) == sound
 
 
-def test_a_run_on_latents_has_no_encoder_on_its_device_and_does_not_count_its_work(
+def test_a_run_on_latents_has_no_encoder_on_its_device(
     make_config: MakeConfig, cache: Path, reporter: SilentReporter
 ) -> None:
     run = set_up(make_config(data__cache="auto", data__cache_dir=str(cache)), reporter)
     assert not list(run.world_model.encoder.parameters())
-    assert not run.encodes
-    assert set_up(make_config(), reporter).encodes
 
 
 def test_two_processes_of_a_run_share_the_encoding_before_the_first_step(
@@ -378,7 +356,6 @@ def test_two_processes_of_a_run_share_the_encoding_before_the_first_step(
     reported = finish([start_rank(words, rank, 2, port) for rank in range(2)])
     (folder,) = cache.iterdir()
     assert len(latents_in(folder)) == 8
-    assert not list(folder.glob(".attempt*"))
     assert "encoding frames 96/96" in reported[0][0]
     assert "Latents come from" in reported[0][0]
     assert not reported[1][0]
@@ -404,110 +381,15 @@ def test_no_latents_are_encoded_of_data_that_a_run_refuses(
 # ---- processes that wait for one another ---------------------------------------------------------------------------
 
 
-class Process(SimpleNamespace):
-    """What is used of an Accelerator: the first of two processes, whose collectives never end."""
-
-    process_index, num_processes, is_main_process, device = 0, 2, True, torch.device("cpu")
-
-
-@pytest.fixture
-def together(make_config: MakeConfig, cache: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[LatentCache, Callable]:
-    """A cache, and a function by which the first of two processes encodes its share and waits for the other one's."""
-    monkeypatch.setattr(encode_dataset, "broadcast_object", lambda _, value: value)
-    monkeypatch.setattr(encode_dataset, "first_only", lambda _, work: work())
-    monkeypatch.setattr(encode_dataset, "_LOOKS_EVERY_S", 0.01)
-    config = make_config(data__cache="auto", data__cache_dir=str(cache))
-    dataset, model = open_dataset(config.data), load_base(config.model, seed=config.seed)
-    encoding = encode_dataset.encoding_of(model, config)
-
-    def run() -> object:
-        return encode_dataset.with_latents(config, dataset, model, Process(), SilentReporter())  # type: ignore[arg-type]
-
-    return LatentCache.of(dataset, encoding), run
-
-
-def other_process(cache: LatentCache, act: Callable[[Path], None]) -> threading.Thread:
-    """Act as the second process, once the first one has done its share."""
-
-    def acting() -> None:
-        while len(latents_in(cache.folder)) < 4:
-            time.sleep(0.01)
-        act(next(cache.folder.glob(".attempt-*")))
-
-    thread = threading.Thread(target=acting, daemon=True)
-    thread.start()
-    return thread
-
-
-def test_a_process_waits_for_the_files_of_the_others_as_long_as_it_takes(
-    together: tuple[LatentCache, Callable], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A barrier would give up after two hours, whatever the others had done by then."""
-    cache, run = together
-    monkeypatch.setattr(encode_dataset, "_LONGEST_WITHOUT_A_FILE_S", 0.5)
-
-    def encode_slowly(_attempt: Path) -> None:
-        for number in (1, 3, 5, 7):
-            time.sleep(0.3)
-            path = cache.files.path(number, CAMERA)
-            shutil.copy(cache.files.path(number - 1, CAMERA), path.with_suffix(".partial"))
-            path.with_suffix(".partial").rename(path)
-
-    thread = other_process(cache, encode_slowly)
-    run()
-    thread.join()
-    assert len(latents_in(cache.folder)) == 8
-    assert not list(cache.folder.glob(".attempt-*"))
-
-
-def test_what_stops_another_process_stops_this_one_at_once(together: tuple[LatentCache, Callable]) -> None:
-    cache, run = together
-    other_process(cache, lambda attempt: attempt.write_text("process 1: the disk is full") and None)
-    with pytest.raises(InputError, match="stopped in process 1: the disk is full"):
-        run()
-
-
-def test_what_stops_this_process_is_told_to_the_others(
-    together: tuple[LatentCache, Callable], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    cache, run = together
-
-    def full(*_: object, **__: object) -> None:
-        raise InputError(where="here", found="no space left")
-
-    monkeypatch.setattr(encode_dataset, "encode_files", full)
-    with pytest.raises(InputError, match="no space left"):
-        run()
-    assert "process 0: here: no space left" in next(cache.folder.glob(".attempt-*")).read_text()
-
-
-def test_a_process_that_is_gone_without_a_word_is_missed(
-    together: tuple[LatentCache, Callable], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(encode_dataset, "_LONGEST_WITHOUT_A_FILE_S", 0.1)
-    with pytest.raises(InputError, match=r"no latents of episode .* which another process"):
-        together[1]()
-
-
-def test_an_error_that_only_the_first_process_can_meet_is_told_to_all(
-    together: tuple[LatentCache, Callable], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    cache, run = together
-    told: list[object] = []
-    monkeypatch.setattr(collectives, "all_gather_object", lambda _, value: told.append(value) or [value, None])
-    monkeypatch.setattr(encode_dataset, "first_only", collectives.first_only)
-    cache.folder.mkdir(parents=True)
-    (cache.folder / "thesis.tex").touch()
-    with pytest.raises(InputError, match="other things in it"):
-        run()
-    assert [type(one) for one in told] == [InputError], "sent to all, so that each process raises it"
-
-
 def test_a_folder_that_processes_do_not_share_is_refused_before_the_work(
-    together: tuple[LatentCache, Callable], monkeypatch: pytest.MonkeyPatch, encoded_frames: list[int]
+    make_config: MakeConfig, cache: Path, monkeypatch: pytest.MonkeyPatch, encoded_frames: list[int]
 ) -> None:
+    second = SimpleNamespace(process_index=1, num_processes=2, device=torch.device("cpu"))
     monkeypatch.setattr(encode_dataset, "_LONGEST_UNSEEN_S", 0.0)
     monkeypatch.setattr(encode_dataset, "first_only", lambda _accelerator, _work: None)  # it writes elsewhere
+    monkeypatch.setattr(encode_dataset, "agreed", lambda _accelerator, work: work())
+    config = make_config(data__cache="auto", data__cache_dir=str(cache))
+    model = load_base(config.model, seed=config.seed)
     with pytest.raises(InputError, match="all machines of the run share"):
-        together[1]()
+        encode_dataset.with_latents(config, open_dataset(config.data), model, second, SilentReporter())  # type: ignore[arg-type]
     assert not encoded_frames

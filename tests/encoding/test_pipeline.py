@@ -64,14 +64,6 @@ def test_each_episode_gets_its_own_frames_which_are_read_once(run: Run, kind: Ca
         np.testing.assert_allclose(found[:, :2], expected, atol={"fp32": 1e-3, "bf16": 0.6, "int8": 0.6}[kind])
 
 
-def test_unreadable_episodes_are_noted_and_the_others_are_whole(run: Run) -> None:
-    long = 3 * FRAMES_AT_ONCE
-    files = run(MemorySource([long, long, 2], unreadable=frozenset({0}), pictureless=frozenset({1})))
-    assert [files.has(number, "left") for number in range(3)] == [False, False, True]
-    assert ["memory: episode 0" in files.broken[0], "pictures of episode 1" in files.broken[1]] == [True, True]
-    assert all(files.is_done(number, "left") for number in range(3))
-
-
 def test_a_network_that_is_gone_is_no_fault_of_an_episode(run: Run, tmp_path: Path) -> None:
     unreachable = MemorySource(
         [2], unreadable=frozenset({0}), fault=lambda where: UnreachableError(where=where, found="gone")

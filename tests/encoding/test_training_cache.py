@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from latent_sets import encode_for
-from same_run import assert_same_run, metrics, trained_weights
+from same_run import assert_same_run, metrics
 from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.errors import InputError
@@ -110,12 +110,6 @@ def test_encoding_more_frames_at_once_changes_no_bit(make_config) -> None:
         frames = torch.randn(1, 19, 3, 32, 32, generator=torch.Generator().manual_seed(0))
         whole = model.encode(frames, chunk=19)
         assert all(torch.equal(whole, model.encode(frames, chunk=chunk)) for chunk in (1, 2, 3, 8, 16))
-
-
-def test_the_weights_move(make_config, reporter, tmp_path) -> None:
-    """What is compared above is not nothing."""
-    train(make_config(training__steps=1), reporter)
-    assert any(weight.abs().max() > 0 for name, weight in trained_weights(tmp_path / "run").items() if "lora_B" in name)
 
 
 def test_a_run_is_evaluated_from_its_cache_as_from_its_data(make_config, reporter, tmp_path) -> None:

@@ -18,11 +18,9 @@ import torch
 from safetensors.torch import load_file
 
 from run_fixtures import set_up
-from vjepa2_ac.config import CheckpointConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.runs.checkpoint import (
-    CheckpointClock,
     DataState,
     RunState,
     checkpoint_name,
@@ -118,20 +116,6 @@ def test_a_best_checkpoint_that_is_gone_is_not_what_others_must_beat(tmp_path: P
     assert read_state(newest) == RunState(20, best_step=10, best_error=0.5)
     shutil.rmtree(best)
     assert read_state(newest) == RunState(20)
-
-
-def test_a_checkpoint_is_due_by_steps_and_by_minutes_since_the_last() -> None:
-    now = [0.0]
-    clock = CheckpointClock(CheckpointConfig(every=10, every_minutes=2.0), lambda: now[0])
-    assert [step for step in range(1, 21) if clock.is_due(step)] == [10, 20]
-    now[0] = 119.0
-    assert not clock.is_due(3)
-    now[0] = 120.0
-    assert clock.is_due(3)
-    clock.restart()
-    assert not clock.is_due(4)
-    now[0] = 1e9
-    assert not CheckpointClock(CheckpointConfig(every_minutes=None), lambda: now[0]).is_due(1)
 
 
 def manifest_of(files: dict[str, str]) -> str:
@@ -326,20 +310,6 @@ def test_every_field_of_a_state_comes_back(tmp_path: Path) -> None:
     found = read_state(write_checkpoint(tmp_path, state, lambda _: None, keep=1))
     assert found == state
     assert type((found.loss_scale or {})["growth_interval"]) is int
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [{"step": "10"}, {"step": -1}, {"clips_done": None}, {"processes": 0}, {"data": [{"broken": {"a": 3}}]},
-     {"best_error": "low"}, {"loss_scale": [1]}, {"run_id": 3}, {"unheard_of": 3}],
-    ids=str,
-)  # fmt: skip
-def test_a_state_of_other_types_is_refused_by_name(tmp_path: Path, changes: dict[str, object]) -> None:
-    checkpoint = write(tmp_path, 10)
-    (checkpoint / "state.json").write_text(json.dumps({"step": 10, "clips_done": 40} | changes))
-    write_manifest(checkpoint)  # whoever can write the file can write the manifest
-    with pytest.raises(InputError, match=f"state.json: .*{next(iter(changes))}.*older one"):
-        read_state(newest_checkpoint(tmp_path))
 
 
 @pytest.mark.parametrize("text", ["[]", DEEP, "{", "\x00"])

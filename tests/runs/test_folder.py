@@ -118,12 +118,6 @@ def test_a_folder_in_use_is_refused_until_its_process_is_killed(tmp_path: Path) 
             other.take()
 
 
-def test_a_lock_that_nobody_took_leaves_no_trace(tmp_path: Path) -> None:
-    with RunLock(tmp_path / "run"):
-        pass
-    assert not (tmp_path / "run").exists()
-
-
 def test_a_file_system_without_locks_costs_a_warning(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

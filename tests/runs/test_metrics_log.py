@@ -116,23 +116,6 @@ def test_where_a_checkpoint_makes_room_the_run_goes_on_and_its_record_is_whole(
     assert_same_run(whole_run, tmp_path / "run")
 
 
-def test_where_neither_record_nor_checkpoint_can_be_written_both_are_named(tmp_path: Path, monkeypatch) -> None:
-    disk = FullDisk(monkeypatch)
-
-    def no_checkpoint() -> None:
-        with log.before_a_checkpoint():
-            raise InputError(where="step-00000001", found="it cannot be written")
-
-    with MetricsLog(tmp_path, first_step=0) as log:
-        with pytest.raises(InputError, match=r"^step-00000001: it cannot be written"):
-            no_checkpoint()
-        disk.is_full = True
-        log.write("train", 1, {"loss": 0.5})
-        assert log.is_behind
-        with pytest.raises(InputError, match=r"metrics\.jsonl: .*No space left.*step-00000001: it cannot be written"):
-            no_checkpoint()
-
-
 def test_a_flush_that_failed_is_not_taken_for_done_when_the_next_one_is(tmp_path: Path, monkeypatch) -> None:
     """The system may have forgotten what it was to write."""
     real, failures = os.fsync, [OSError(errno.EIO, "Input/output error")]

@@ -5,10 +5,11 @@ from pathlib import Path
 
 import pytest
 
+from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.runs.checkpoint import RunState
-from vjepa2_ac.runs.folder import RunLock, with_stride
+from vjepa2_ac.runs.folder import RunLock
 from vjepa2_ac.runs.open_run import open_run
 
 OPEN_REMOTE = "vjepa2_ac.runs.open_run.open_remote"
@@ -37,15 +38,16 @@ def test_a_folder_is_locked_before_the_remote_is_asked_and_a_check_locks_nothing
     with open_run(make_config(), reporter) as opened:
         opened.begin(opened.config, RunState(step=0))
 
-    def remote(*_: object, **options: object) -> None:
+    def remote(config: Config, *_: object, **options: object) -> Config:
         with RunLock(folder) as lock:
             if check_only:
-                options["claim"]()
+                assert options["lock"] is None
                 lock.take()
             else:
                 with pytest.raises(InputError, match="trained right now"):
                     lock.take()
         asked.append(options["into"])
+        return config
 
     monkeypatch.setattr(OPEN_REMOTE, remote)
     with open_run(config, reporter, check_only=check_only):
@@ -59,6 +61,6 @@ def test_the_stride_that_a_run_has_chosen_is_the_one_of_its_next_start(make_conf
     config = make_config(data__stride="auto")
     with open_run(config, reporter) as opened:
         assert opened.config.data.stride == "auto"
-        opened.begin(with_stride(config, 3), RunState(step=0))
+        opened.begin(config.with_stride(3), RunState(step=0))
     with open_run(config, reporter) as opened:
         assert opened.config.data.stride == 3

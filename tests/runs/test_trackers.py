@@ -14,10 +14,7 @@ import pytest
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.runs import trackers as tracker_threads
-from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.runs.trackers import Trackers, open_trackers
-from vjepa2_ac.training import loop
-from vjepa2_ac.training.loop import train
 
 
 @pytest.fixture(autouse=True)
@@ -128,7 +125,8 @@ def test_one_that_hangs_is_left_behind(caplog, monkeypatch) -> None:
         wait(thread, *limits)
 
     monkeypatch.setattr(tracker_threads._Thread, "wait", wait_when_all_hang)
-    trackers = Trackers({"stuck": lambda: never.wait(120), "slow": lambda: slow}, closing_s=0.05)  # type: ignore[dict-item, return-value]
+    monkeypatch.setattr(tracker_threads, "CLOSING_S", 0.05)
+    trackers = Trackers({"stuck": lambda: never.wait(120), "slow": lambda: slow})  # type: ignore[dict-item, return-value]
     trackers.log("train", 1, {"loss": 0.5})
     trackers.close()
     assert not never.is_set()
@@ -145,8 +143,11 @@ def now_s(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return now
 
 
-def test_one_that_takes_minutes_holds_up_nothing_and_gets_all_in_the_end(caplog, now_s: list[float]) -> None:
+def test_one_that_takes_minutes_holds_up_nothing_and_gets_all_in_the_end(
+    caplog, monkeypatch, now_s: list[float]
+) -> None:
     slow, is_asked, goes_on = Kept(), threading.Event(), threading.Event()
+    monkeypatch.setattr(tracker_threads, "CLOSING_S", 120.0)
     taken = slow.log
 
     def log(metrics: Mapping[str, float], step: int) -> None:
@@ -155,7 +156,7 @@ def test_one_that_takes_minutes_holds_up_nothing_and_gets_all_in_the_end(caplog,
         taken(metrics, step)
 
     slow.log = log  # type: ignore[method-assign]
-    trackers = Trackers({"slow": lambda: slow}, opening_s=60.0, closing_s=120.0)
+    trackers = Trackers({"slow": lambda: slow})
     for step in range(100):
         trackers.log("train", step, {"loss": 0.5})
     assert is_asked.wait(120)
@@ -167,19 +168,6 @@ def test_one_that_takes_minutes_holds_up_nothing_and_gets_all_in_the_end(caplog,
     trackers.close()
     assert [step for step, _ in slow.rows] == list(range(102))
     assert slow.closed == 1
-
-
-def test_a_run_does_not_wait_for_a_tracker_that_never_opens(make_config, reporter, monkeypatch, caplog) -> None:
-    never = threading.Event()
-
-    def stuck(*_: object, **__: object) -> Trackers:
-        return Trackers({"stuck": lambda: never.wait(120)}, closing_s=0.05)  # type: ignore[dict-item, return-value]
-
-    monkeypatch.setattr(loop, "open_trackers", stuck)
-    folder = train(make_config(training__steps=2), reporter)
-    never.set()
-    assert [row["step"] for row in read_metrics_log(folder / "metrics.jsonl") if row["kind"] == "train"] == [1, 2]
-    assert [text.split(" (")[0] for text in warnings_in(caplog)] == ["stuck cannot be opened"]
 
 
 def test_tensorboard_gets_the_numbers_and_forgets_steps_that_are_done_again(tmp_path: Path) -> None:

@@ -16,9 +16,10 @@ import torch
 
 from vjepa2_ac.config.loading import load_config
 from vjepa2_ac.data.loader import training_loader
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.encoding import encode_dataset
+from vjepa2_ac.errors import InputError, UnreachableError
 from vjepa2_ac.reporter import SILENT
-from vjepa2_ac.training import loop, resume, setup, validation
+from vjepa2_ac.training import data_sets, loop, resume, setup, validation
 from vjepa2_ac.training.loop import train
 
 RANK = int(os.environ["RANK"])
@@ -58,14 +59,19 @@ def checkpoint_cannot_be_read() -> None:
 
 def index_cannot_be_made() -> None:
     if RANK == 0:
-        setup.open_dataset = mock.Mock(side_effect=InputError(where="data.path", found="no data set"))
+        data_sets.open_dataset = mock.Mock(side_effect=InputError(where="data.path", found="no data set"))
+
+
+def encoding_loses_its_connection() -> None:
+    if RANK == 1:
+        encode_dataset.encode_files = mock.Mock(side_effect=UnreachableError(where="gs://data", found="no answer"))
 
 
 def indexing_takes_longer_than_the_time_out() -> None:
     torch.distributed.init_process_group("gloo", timeout=timedelta(seconds=6))
     if RANK == 0:
-        make = setup.open_dataset
-        setup.open_dataset = lambda *given, **named: (time.sleep(9), make(*given, **named))[1]
+        make = data_sets.open_dataset
+        data_sets.open_dataset = lambda *given, **named: (time.sleep(9), make(*given, **named))[1]
 
 
 def each_meets_another_broken_episode() -> None:

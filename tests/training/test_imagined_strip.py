@@ -17,7 +17,7 @@ from vjepa2_ac.media.images import read_image
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.runs.metrics_log import MetricsLog
-from vjepa2_ac.training import imagined_strip, setup
+from vjepa2_ac.training import imagined_strip
 from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.validation import validate
 
@@ -99,17 +99,12 @@ def test_a_decoder_that_will_not_do_is_told_before_what_is_expensive(
     make_config, reporter, decoder, tmp_path, monkeypatch
 ) -> None:
     other = write_decoder(tmp_path / "other", load_base(make_config().model, seed=0), encoder="other")
-    monkeypatch.setattr("vjepa2_ac.encoding.encode_dataset.with_latents", lambda *_, **__: pytest.fail("encodes"))
+    monkeypatch.setattr("vjepa2_ac.training.setup.with_latents", lambda *_, **__: pytest.fail("encodes"))
     for check_only in (False, True):
         with pytest.raises(InputError, match=r"validation\.decoder: .*other: the decoder of another encoder"):
             train(make_config(validation__decoder=str(other)), reporter, check_only=check_only)
-    monkeypatch.setattr(setup, "open_dataset", lambda *_, **__: pytest.fail("opens the data"))
+    monkeypatch.setattr("vjepa2_ac.training.data_sets.open_dataset", lambda *_, **__: pytest.fail("opens the data"))
     with pytest.raises(InputError, match=r"validation\.decoder: nowhere: no decoder\.json"):
         train(make_config(validation__decoder="nowhere"), reporter)
     assert load_decoder(decoder).where == "--decoder"
-    assert not (tmp_path / "run").exists()
-
-
-def test_a_check_loads_the_decoder_and_writes_nothing(make_config, reporter, decoder, tmp_path) -> None:
-    train(make_config(validation__decoder=decoder), reporter, check_only=True)
     assert not (tmp_path / "run").exists()

@@ -2,16 +2,8 @@
 
 from vjepa2_ac.config.data import AugmentConfig, DataConfig, DiskCacheConfig, IdleConfig
 from vjepa2_ac.config.model import AdapterConfig, EncoderConfig, EncoderSizes, ModelConfig, ModelSizes, PredictorSizes
-from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig, PlanningConfig
+from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
 from vjepa2_ac.config.run import Config, ReplayConfig
 from vjepa2_ac.config.section import Section
-from vjepa2_ac.config.sources import (
-    LatentsData,
-    LeRobotData,
-    LeRobotFields,
-    NpzData,
-    RawDroidData,
-    RldsData,
-    RldsFields,
-)
+from vjepa2_ac.config.sources import LeRobotData, LeRobotFields, RawDroidData, RldsData, RldsFields
 from vjepa2_ac.config.training import CheckpointConfig, DecoderConfig, TrackingConfig, TrainingConfig, ValidationConfig

@@ -305,11 +305,6 @@ class DataConfig(Section):
         return {name: kind for name, kind in own if isinstance(kind, type) and issubclass(kind, Section)}
 
     @property
-    def own_section(self) -> dict[str, Section]:
-        """The knobs of this form of data, by the name of their section."""
-        return {name: getattr(self, name) for name in self.own_sections()}
-
-    @property
     def takes_latents(self) -> bool:
         """Whether clips come from a latent cache, so that the encoder is not needed beside the predictor."""
         return self.is_cache or self.cache != "off"

@@ -234,6 +234,7 @@ def admit_forms_of_data(*, all_installed: bool = False) -> None:
     if (count := len(DataConfig.kinds)) != _admitted[0]:
         for section in (DataConfig, ReplayConfig, Config):
             section.model_rebuild(force=True)
+        marks_of.cache_clear()
         _admitted[0] = count
 
 

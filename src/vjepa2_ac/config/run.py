@@ -36,13 +36,6 @@ class ReplayConfig(Section):
     """The second data set, with the knobs of `data`: as many frames, the same kind of states and actions, and latents
     of a cache if the first one's clips are. Only its training split is used; `workers` and `prefetch` are not."""
 
-    @model_validator(mode="after")
-    def _stride_is_known(self) -> ReplayConfig:
-        is_auto = self.data.stride == "auto"
-        return self.refused(
-            (is_auto, "data.stride auto: give its number; the model chooses for the first data set only")
-        )
-
     def misfits(self, first: DataConfig) -> list[str]:
         """Return why clips of both cannot be in one micro-batch, as far as their configs say."""
         same = ("frames", "states", "actions", "join_actions", "pose_frame")
@@ -50,8 +43,8 @@ class ReplayConfig(Section):
         lines = [f"replay.data.{name} {one} is not data.{name} {other}" for name, one, other in pairs if one != other]
         if self.data.takes_latents != first.takes_latents:
             lines.append("replay.data or data takes latents from a cache, and the other does not: set cache alike")
-        if first.stride == "auto":
-            lines.append("data.stride auto with replay: give its number, so that steps of both last equally long")
+        if "auto" in (first.stride, self.data.stride):
+            lines.append("stride auto with replay: give the numbers, so that steps of both last equally long")
         return lines
 
 
@@ -112,6 +105,10 @@ class Config(Section):
     def data_sets(self) -> tuple[DataConfig, ...]:
         """The data set, and that of `replay` where there is one."""
         return (self.data,) if self.replay is None else (self.data, self.replay.data)
+
+    def with_stride(self, stride: int) -> Config:
+        """Return the config with a stride that was found out."""
+        return self.model_copy(update={"data": self.data.with_stride(stride)})
 
     def for_replay(self) -> Config:
         """Return the config of a run on the data set of `replay` alone.

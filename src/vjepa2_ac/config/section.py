@@ -100,24 +100,23 @@ def mark_of(key: str, knobs: type[BaseModel]) -> Affects:
     return reduce(or_, found)
 
 
-def knobs_that_affect(
-    what: Affects, section: BaseModel, outer: Affects | None = None, most: Affects = ~Affects.NOTHING
-) -> dict[str, Any]:
-    """Return the knobs of a section, and of those in it, that affect something, as plain values.
+def knobs_that_affect(what: Affects, section: BaseModel) -> dict[str, Any]:
+    """Return the knobs of a section, and of those in it, that affect any of these, as plain values.
 
-    Args:
-        what: Any of these.
-        section: The values.
-        outer: The mark of the knobs that have none of their own.
-        most: What they affect at most.
+    Raises:
+        TypeError: As `marks_of`.
     """
+    return _that_affect(what, section, type(section), "")
+
+
+def _that_affect(what: Affects, section: BaseModel, knobs: type[BaseModel], prefix: str) -> dict[str, Any]:
     found: dict[str, Any] = {}
-    for name, field in type(section).model_fields.items():
-        value, mark = getattr(section, name), _noted(field, Affects, outer)
+    for name in type(section).model_fields:
+        value = getattr(section, name)
         if isinstance(value, BaseModel):
-            if inner := knobs_that_affect(what, value, mark, most & _noted(field, AtMost, _ALL).mark):
+            if inner := _that_affect(what, value, knobs, f"{prefix}{name}."):
                 found[name] = inner
-        elif mark is not None and what & mark & most:
+        elif what & mark_of(prefix + name, knobs):
             found[name] = section.model_dump(mode="json", include={name})[name]
     return found
 

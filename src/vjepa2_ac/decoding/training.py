@@ -28,9 +28,9 @@ from vjepa2_ac.decoding.decoder_folder import CARD, DecoderCard, read_card, save
 from vjepa2_ac.decoding.frame_pairs import FramePairs, Pairs, fit_linear, mean_image, measure_decoders, wanted_frames
 from vjepa2_ac.decoding.network import UPSAMPLED, Decoder, DecoderShape
 from vjepa2_ac.decoding.steps import SMALLEST, DecoderSteps
-from vjepa2_ac.distributed import autocast, computing_device, out_of_memory_explained
+from vjepa2_ac.distributed import autocast, computing_device
 from vjepa2_ac.encoding.batch import encoding_of
-from vjepa2_ac.encoding.latent_cache import frames_in, key_for, require_space
+from vjepa2_ac.encoding.latent_cache import LatentCache, frames_in, require_space
 from vjepa2_ac.encoding.pipeline import EncoderOnDevice, FramesToEncode, encode_files
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.checkpoints.loading import load_base
@@ -44,7 +44,6 @@ from vjepa2_ac.storage import atomic_writer, try_writing_at, user_can_write, wri
 from vjepa2_ac.storage.structured import utc_now
 
 KEY, PAIRS, STATE = "key.json", "pairs", "training.pt"
-_LESS_MEMORY = "Lower decoder.batch_size or model.encode_chunk, or set decoder.size: tiny"
 _LOG_EVERY = 50  # steps
 
 
@@ -77,9 +76,8 @@ def train_decoder(config: Config, reporter: Reporter = SILENT, *, check_only: bo
             lock.take()
             with user_can_write(folder):
                 write_atomically(folder / KEY, json.dumps({"key": dict(ready.key.parts)}, indent=1) + "\n")
-            with out_of_memory_explained("decoder", _LESS_MEMORY):
-                _try_one_step(ready)
-                _make(ready, reporter)
+            _try_one_step(ready)
+            _make(ready, reporter)
             reporter.note(f"The decoder is in {folder}: {folder / CARD} says how good it is")
         shutil.rmtree(ready.files.folder, ignore_errors=True)  # also after a start that was killed by then
         (folder / STATE).unlink(missing_ok=True)
@@ -175,7 +173,7 @@ def _setup(config: Config, reporter: Reporter) -> Setup:
     key = CacheKey({
         "decoder": decoder.model_dump(mode="json", exclude={"folder", "checkpoint_every"}),
         "seed": config.seed,
-        "latents": dict(key_for(dataset, encoding).parts),
+        "latents": dict(LatentCache.of(dataset, encoding).key.parts),
         "data": config.data.model_dump(mode="json", include={"validation_share", "test_share", "split_by"}),
     })  # fmt: skip
     require_own_folder(folder / KEY, key, where=f"decoder.folder {folder}")

@@ -41,8 +41,16 @@ def encode_batch(world_model: WorldModel, batch: Batch, *, device: torch.device,
     """
     arrived = batch.on_device() if batch.on_device else None  # None, too, if it was used before
     batch = (arrived or batch).mapped(lambda tensor: tensor.to(device, non_blocking=True))
+    if batch.latents is not None:
+        latents = unpack_latents(batch.latents)
+    elif batch.frames is not None:
+        latents = world_model.encode(
+            pixels_to_input(batch.frames, world_model.image_size, batch.augmentations), chunk=chunk
+        )
+    else:
+        raise ValueError("a batch with neither frames nor latents")
     return LatentBatch(
-        latents=_latents_of(world_model, batch, chunk),
+        latents=latents,
         states=batch.states,
         actions=batch.actions,
         extrinsics=extrinsics_for(world_model, batch),
@@ -96,15 +104,6 @@ def require_same_encoder(world_model: WorldModel, dataset: Dataset, config: Conf
             raise another_cache(Path(dataset.config.path), differing)
 
 
-def _latents_of(world_model: WorldModel, batch: Batch, chunk: int) -> Float[Tensor, "batch time tokens dim"]:
-    if batch.latents is None:
-        if batch.frames is None:
-            raise ValueError("a batch with neither frames nor latents")
-        inputs = pixels_to_input(batch.frames, world_model.image_size, batch.augmentations)
-        return world_model.encode(inputs, chunk=chunk)
-    return unpack_latents(batch.latents)
-
-
 def require_widths(world_model: WorldModel, widths: Widths, *, where: str) -> None:
     """Refuse data whose states or actions do not have the width that the model takes.
 
@@ -117,12 +116,10 @@ def require_widths(world_model: WorldModel, widths: Widths, *, where: str) -> No
         InputError: Names both.
     """
     if heads_to_replace(world_model.sizes, widths):
-        raise InputError(
-            where=where,
-            found=f"data with states of {widths.state} and actions of {widths.action} numbers",
-            needed=f"{widths_as_text(world_model.sizes)}, which this model takes",
-            fix="Choose other data, or train on these: `train` then replaces the model's input heads",
-        )
+        found = f"data with states of {widths.state} and actions of {widths.action} numbers"
+        needed = f"{widths_as_text(world_model.sizes)}, which this model takes"
+        fix = "Choose other data, or train on these: `train` then replaces the model's input heads"
+        raise InputError(where=where, found=found, needed=needed, fix=fix)
 
 
 def extrinsics_for(world_model: WorldModel, batch: Batch) -> Float32[Tensor, "batch time 6"] | None:
@@ -134,10 +131,7 @@ def extrinsics_for(world_model: WorldModel, batch: Batch) -> Float32[Tensor, "ba
     if not world_model.sizes.predictor.use_extrinsics:
         return None
     if batch.extrinsics is None:
-        raise InputError(
-            where="model: predictor.use_extrinsics",
-            found=f"no pose of the camera in some of these episodes: {', '.join(dict.fromkeys(batch.episode_ids))}",
-            needed="one at every step of every episode",
-            fix="Choose a data.source and data.camera that have them, or a model without use_extrinsics",
-        )
+        found = f"no pose of the camera in some of these episodes: {', '.join(dict.fromkeys(batch.episode_ids))}"
+        fix = "Choose a data.source and data.camera that have them, or a model without use_extrinsics"
+        raise InputError(where="model: predictor.use_extrinsics", found=found, fix=fix)
     return batch.extrinsics

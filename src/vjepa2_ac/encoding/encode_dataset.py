@@ -1,17 +1,14 @@
 """Encoding of a whole data set, as a command or at the start of a run.
 
 As a command, processes do not communicate: each encodes its share of the episodes and marks each finished one by a
-file. Those of a run wait for one another's files.
+file. Those of a run wait for one another.
 """
 
 from __future__ import annotations
 
-import contextlib
 import os
 import time
-import uuid
-from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
 from functools import partial
@@ -23,18 +20,17 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import ProcessShare
 from vjepa2_ac.data.windows import require_stride
-from vjepa2_ac.distributed import broadcast_object, computing_device, first_only
+from vjepa2_ac.distributed import agreed, computing_device, first_only
 from vjepa2_ac.encoding.batch import encoding_of, require_same_encoder
-from vjepa2_ac.encoding.latent_cache import LatentCache, frames_in, through_cache
+from vjepa2_ac.encoding.latent_cache import LatentCache, frames_in
 from vjepa2_ac.encoding.pipeline import EncoderOnDevice, FramesToEncode, encode_files
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
-from vjepa2_ac.storage import free_bytes, user_can_write, write_atomically
+from vjepa2_ac.storage import free_bytes
 
 _LOOKS_EVERY_S = 1.0  # for the files of other processes
-_LONGEST_WITHOUT_A_FILE_S = 2 * 3600.0
 _LONGEST_UNSEEN_S = 60.0  # of a new file in a folder of the network
 
 
@@ -76,7 +72,18 @@ def encode_config(config: Config, reporter: Reporter = SILENT, *, out: Path | No
     else:
         cache.begin()
         reporter.note(f"Everything is encoded already, in {cache.folder}")
-    return _result(cache)
+    table, broken = cache.dataset.table, cache.broken
+    sizes = [(one, cache.files.size(one.episode, one.camera)) for one in cache.wanted]
+    absent = {one.episode for one, size in sizes if not size}
+    return EncodedSet(
+        folder=cache.folder,
+        episodes=len(table),
+        encoded=len({one.episode for one in cache.wanted} - absent),
+        frames=sum(len(one.steps) for one, size in sizes if size),
+        bytes=sum(size for _, size in sizes),
+        broken={table.identity(number): reason for number, reason in broken.items()},
+        is_finished=absent <= broken.keys(),
+    )
 
 
 def require_encodable(config: Config) -> None:
@@ -91,12 +98,8 @@ def require_encodable(config: Config) -> None:
     fix = "`vjepa2-ac data calibrate CONFIG` finds one; or let the run encode by itself, with data.cache: auto"
     require_stride(data, to="know which frames are needed", fix=fix)
     if data.augment.is_on:
-        raise InputError(
-            where="data.augment",
-            found="clips that look different every time",
-            needed="none, for a cache: it holds one latent of each frame",
-            fix="Leave data.augment out",
-        )
+        found = "clips that look different every time, and a cache holds one latent of each frame"
+        raise InputError(where="data.augment", found=found, fix="Leave data.augment out")
 
 
 def encode_share(
@@ -156,7 +159,7 @@ def with_latents(
         elif left := cache.missing():
             reporter.note(_forecast(cache, left, make_encoder(), accelerator.num_processes))
             return dataset
-    found = through_cache(dataset, cache.encoding)
+    found = cache.opened()
     reporter.note(f"Latents come from {cache.folder}: the encoder is not needed")
     return found
 
@@ -171,95 +174,40 @@ def with_latents_if_there(config: Config, dataset: Dataset, model: WorldModel) -
         require_same_encoder(model, dataset, config)
         return dataset
     cache = LatentCache.of(dataset, encoding_of(model, config))
-    return dataset if cache.missing() else through_cache(dataset, cache.encoding)
+    return dataset if cache.missing() else cache.opened()
 
 
 def _encode_together(
     cache: LatentCache, make_encoder: partial[EncoderOnDevice], accelerator: Accelerator, reporter: Reporter
 ) -> None:
-    """Encode what is missing, by all processes of a run.
-
-    None of them waits for another one's encoding in a collective, which would give up after some time: they look for
-    its files. What stops one of them is written into a file of this attempt, and stops the others.
-    """
+    """Encode what is missing, each process of a run its share; what stops one of them stops all."""
     share = ProcessShare(accelerator.process_index, accelerator.num_processes)
-    if share.processes == 1:
+    if share.processes > 1:
+        first_only(accelerator, cache.begin)
+        agreed(accelerator, lambda: _require_shared(cache, lambda: cache.is_begun))
+
+    def encode() -> None:
         if left := cache.missing():
             encode_share(cache, left, make_encoder(), share, reporter)
-        return
-    attempt = cache.folder / f".attempt-{broadcast_object(accelerator, uuid.uuid4().hex)}"
-    first_only(accelerator, partial(_begin, cache, attempt))
-    try:
-        _require_seen(attempt, share)
-        if left := cache.missing():
-            encode_share(cache, left, make_encoder(), share, reporter)
-    except BaseException as error:
-        with contextlib.suppress(OSError):
-            write_atomically(attempt, f"process {share.rank}: {str(error) or type(error).__name__}")
-        raise
-    _wait_for_others(cache, left, attempt)
-    if accelerator.is_main_process:
-        attempt.unlink(missing_ok=True)
+
+    agreed(accelerator, encode)
+    if share.processes > 1:
+        agreed(accelerator, lambda: _require_shared(cache, lambda: not cache.missing()))
 
 
-def _begin(cache: LatentCache, attempt: Path) -> None:
-    cache.require_own()
-    with user_can_write(cache.folder):
-        write_atomically(attempt, "")
-
-
-def _require_seen(attempt: Path, share: ProcessShare) -> None:
-    """Refuse a folder that the processes do not share, before each of them waits for the others' files."""
-    end = time.monotonic() + _LONGEST_UNSEEN_S
-    while not attempt.is_file():
-        if time.monotonic() > end:
-            raise InputError(
-                where=f"data.cache_dir: {attempt.parent.parent}",
-                found=f"a folder in which process {share.rank} does not see what process 0 wrote",
-                needed="one that all machines of the run share",
-                fix="Set data.cache_dir to a shared folder; or run `vjepa2-ac encode` once on every machine",
-            )
-        time.sleep(_LOOKS_EVERY_S)
-
-
-def _wait_for_others(cache: LatentCache, left: Sequence[FramesToEncode], attempt: Path) -> None:
-    """Wait until nothing is missing.
+def _require_shared(cache: LatentCache, sees: Callable[[], bool]) -> None:
+    """Wait until this process sees what another one has written, and refuse a folder in which it does not.
 
     Raises:
-        InputError: Another process was stopped, and why; or there was no new file for two hours.
+        InputError: It does not within a minute: longer than a folder of the network takes.
     """
-    waiting, last_change = deque(left), time.monotonic()
-    while waiting:
-        if cache.files.is_done(waiting[0].episode, waiting[0].camera):
-            waiting.popleft()
-            last_change = time.monotonic()
-            continue
-        with contextlib.suppress(FileNotFoundError):  # process 0 has seen everything, and removed it
-            if stopped := attempt.read_text(encoding="utf-8"):
-                raise InputError(where=str(cache.folder), found=f"the encoding was stopped in {stopped}")
-        if time.monotonic() - last_change > _LONGEST_WITHOUT_A_FILE_S:
-            name = cache.dataset.table.identity(waiting[0].episode)
-            raise InputError(
-                where=str(cache.folder),
-                found=f"for two hours no latents of episode {name}, which another process of the run is to encode",
-                fix="Look whether all processes are at work, and start the run again: it goes on where it was",
-            )
+    end = time.monotonic() + _LONGEST_UNSEEN_S
+    while not sees():
+        if time.monotonic() > end:
+            found = "a folder in which a process of the run does not see what another one wrote"
+            fix = "Set it to one that all machines of the run share; or run `vjepa2-ac encode` once on every machine"
+            raise InputError(where=f"data.cache_dir: {cache.folder.parent}", found=found, fix=fix)
         time.sleep(_LOOKS_EVERY_S)
-
-
-def _result(cache: LatentCache) -> EncodedSet:
-    table, broken = cache.dataset.table, cache.broken
-    sizes = [(one, cache.files.size(one.episode, one.camera)) for one in cache.wanted]
-    absent = {one.episode for one, size in sizes if not size}
-    return EncodedSet(
-        folder=cache.folder,
-        episodes=len(table),
-        encoded=len({one.episode for one in cache.wanted} - absent),
-        frames=sum(len(one.steps) for one, size in sizes if size),
-        bytes=sum(size for _, size in sizes),
-        broken={table.identity(number): reason for number, reason in broken.items()},
-        is_finished=absent <= broken.keys(),
-    )
 
 
 def _forecast(cache: LatentCache, left: Sequence[FramesToEncode], encoder: EncoderOnDevice, processes: int) -> str:

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import Dataset, through_latents
 from vjepa2_ac.data.idle import find_ranges
 from vjepa2_ac.data.index import cache_folder, fingerprint_of
@@ -40,11 +39,6 @@ def needed_frames(dataset: Dataset) -> Iterator[FramesToEncode]:
             yield FramesToEncode(int(starts.episode[runs[0]]), camera, steps)
 
 
-def key_for(dataset: Dataset, encoding: Encoding) -> CacheKey:
-    """Return the cache key of an open data set that is not itself a cache."""
-    return key_of_cache(dataset.config, fingerprint_of(dataset.table), encoding)
-
-
 @dataclass(frozen=True, eq=False)
 class LatentCache:
     """The cache of an open data set, finished or not. Several processes may write into its folder.
@@ -67,7 +61,8 @@ class LatentCache:
             encoding: How they become latents.
             folder: Its folder; None: in `data.cache_dir`, or with the other caches of this machine.
         """
-        key, config = key_for(dataset, encoding), dataset.config
+        config = dataset.config
+        key = key_of_cache(config, fingerprint_of(dataset.table), encoding)
         parent = cache_folder(config.disk_cache) / "latents" if config.cache_dir is None else Path(config.cache_dir)
         return cls(dataset, encoding, key, parent / key.digest if folder is None else folder)
 
@@ -152,6 +147,25 @@ class LatentCache:
         )
         require_space(self.folder, frames_in(left), self.bytes_per_frame, fix=fix)
 
+    def opened(self) -> Dataset:
+        """Return the same data set, with the same clips in the same order, read as latents from this cache.
+
+        Raises:
+            InputError: It is not finished; if it was not even begun, says how the others there differ.
+        """
+        if self.is_begun:
+            return through_latents(self.dataset, self.folder)
+        parent, others = self.folder.parent, []
+        for other in sorted(parent.iterdir()) if parent.is_dir() else ():
+            if (other / CACHE).is_file():
+                differing = read_key(other).differences(self.key.parts)
+                others.append((len(differing), f"{other.name} was made otherwise: {'; '.join(differing)}"))
+        nearest = f". Other caches there: {len(others)}; {min(others)[1]}" if others else ""
+        where = f"data.cache: {self.dataset.config.cache}: {self.folder}"
+        found = f"no latent cache of this model and these settings{nearest}"
+        fix = "Run `vjepa2-ac encode` with this config, or set data.cache: auto"
+        raise InputError(where=where, found=found, fix=fix)
+
 
 def frames_in(wanted: Sequence[FramesToEncode]) -> int:
     """Return how many frames these are."""
@@ -171,35 +185,6 @@ def require_space(folder: Path, frames: int, per_frame: int, *, fix: str) -> Non
     """
     needed, free = frames * per_frame, free_bytes(folder)
     if needed > free:
-        raise InputError(
-            where=str(folder),
-            found=f"{free / _GIGABYTE:.4g} GB free on its disk",
-            needed=f"{needed / _GIGABYTE:.4g} GB for the latents of {frames:,} frames ({per_frame / 1e6:.3g} MB each)",
-            fix=fix,
-        )
-
-
-def through_cache(dataset: Dataset, encoding: Encoding) -> Dataset:
-    """Return the same data set, with the same clips in the same order, read as latents from its cache.
-
-    Raises:
-        InputError: There is no finished cache of this encoder and these settings; says how the others differ.
-    """
-    cache = LatentCache.of(dataset, encoding)
-    if not cache.is_begun:
-        raise _no_cache(dataset.config, cache)
-    return through_latents(dataset, cache.folder)
-
-
-def _no_cache(config: DataConfig, cache: LatentCache) -> InputError:
-    parent, others = cache.folder.parent, []
-    for other in sorted(parent.iterdir()) if parent.is_dir() else ():
-        if (other / CACHE).is_file():
-            differing = read_key(other).differences(cache.key.parts)
-            others.append((len(differing), f"{other.name} was made otherwise: {'; '.join(differing)}"))
-    nearest = f". Other caches there: {len(others)}; {min(others)[1]}" if others else ""
-    return InputError(
-        where=f"data.cache: {config.cache}: {cache.folder}",
-        found=f"no latent cache of this model and these settings{nearest}",
-        fix="Run `vjepa2-ac encode` with this config, or set data.cache: auto",
-    )
+        size = f"{needed / _GIGABYTE:.4g} GB for the latents of {frames:,} frames ({per_frame / 1e6:.3g} MB each)"
+        found = f"{free / _GIGABYTE:.4g} GB free on its disk"
+        raise InputError(where=str(folder), found=found, needed=size, fix=fix)

@@ -12,9 +12,9 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from vjepa2_ac.config import EncoderSizes, ModelConfig, ModelSizes
+from vjepa2_ac.config.loading import flat
 from vjepa2_ac.config.model import Family, FramePath
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage.places import BUILTIN, HUB
@@ -96,21 +96,11 @@ def check_sizes(found: ModelSizes, given: ModelSizes, *, where: str) -> None:
     Raises:
         InputError: Names what differs.
     """
-    actual, wanted, standard = _flat(found), _flat(given), _flat(ModelSizes())
+    actual, wanted, standard = (flat(sizes.model_dump()) for sizes in (found, given, ModelSizes()))
     wrong = [key for key in actual if wanted[key] not in (actual[key], standard[key])]
     if wrong:
-        raise InputError(
-            where=where,
-            found=", ".join(f"{key} {actual[key]}" for key in wrong),
-            needed=", ".join(f"{key} {wanted[key]}" for key in wrong) + ", as model.sizes says",
-            fix="Leave them out of model.sizes: the model tells",
-        )
-
-
-def _flat(sizes: ModelSizes) -> dict[str, Any]:
-    nested = sizes.model_dump()
-    flat = {f"{part}.{key}": value for part in ("encoder", "predictor") for key, value in nested.pop(part).items()}
-    return nested | flat
+        said = ", ".join(f"{key} {actual[key]}, and model.sizes says {wanted[key]}" for key in wrong)
+        raise InputError(where=where, found=said, fix="Leave them out of model.sizes: the model tells")
 
 
 @dataclass(frozen=True)

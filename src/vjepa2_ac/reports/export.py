@@ -18,7 +18,7 @@ from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.result import Row
 from vjepa2_ac.model.adapter.adapter_folder import ADAPTER_FILE
-from vjepa2_ac.model.adapter.lora import adapted_report, merge_adapter
+from vjepa2_ac.model.adapter.lora import merge_adapter, trainable_report
 from vjepa2_ac.model.checkpoints.loading import to_official
 from vjepa2_ac.model.network.pretrained_folder import require_finite
 from vjepa2_ac.model.network.world_model import widths_as_text, widths_of_model
@@ -146,7 +146,7 @@ def _card(run: TrainedRun, folder: Path, metrics: Metrics | None) -> str:
         heads=None if model.fresh_heads is None else widths_of_model(model.sizes),
         takes=widths_as_text(model.sizes),
         steps=read_state(run.checkpoint).step,
-        trained=adapted_report(model),
+        trained=trainable_report(model),
         version=__version__,
         front=str(front.to_yaml()),
         base_arguments=_base_arguments(config),

@@ -13,7 +13,6 @@ import math
 import pickle
 import re
 import shutil
-import time
 import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
@@ -22,7 +21,6 @@ from typing import Annotated, Any, BinaryIO
 
 from pydantic import Field
 
-from vjepa2_ac.config import CheckpointConfig
 from vjepa2_ac.config.section import PositiveInt
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage import read_bounded, sha256_of_file, sync
@@ -98,28 +96,6 @@ class RunState:
         if is_beaten or (has_lower_error and rank <= lowest + SAME_RANK):
             return replace(self, best_step=self.step, best_error=error, best_rank=rank, lowest_rank=lowest)
         return replace(self, lowest_rank=lowest)
-
-
-class CheckpointClock:
-    """Schedule of checkpoints: by optimizer steps, and by minutes since the last one.
-
-    Args:
-        config: How often.
-        now_s: Returns the time in seconds, from any origin.
-    """
-
-    def __init__(self, config: CheckpointConfig, now_s: Callable[[], float] = time.monotonic) -> None:
-        self._config, self._now_s, self._last_s = config, now_s, now_s()
-
-    def is_due(self, step: int) -> bool:
-        """Return whether a checkpoint is due after a step."""
-        minutes = self._config.every_minutes
-        by_time = minutes is not None and self._now_s() - self._last_s >= 60.0 * minutes
-        return by_time or step % self._config.every == 0
-
-    def restart(self) -> None:
-        """Record that a checkpoint was written now."""
-        self._last_s = self._now_s()
 
 
 def checkpoint_name(step: int) -> str:
@@ -363,23 +339,20 @@ def select_checkpoint(run: Path, by: str = SELECTED) -> SelectedCheckpoint:
     state = written_state(newest)
     if by == NEWEST or (by == SELECTED and state.best_step is None):
         return SelectedCheckpoint(newest, "the newest" if by == NEWEST else "the newest: none was selected")
-    step = state.best_step if by in {SELECTED, BEST} else step_of(f"step-{by.zfill(8)}")
+    is_best = by in {SELECTED, BEST}
+    step = state.best_step if is_best else step_of(f"step-{by.zfill(8)}")
     path = folder / checkpoint_name(step or 0)
-    if step is None and by == BEST:
-        problem: str | None = (
-            "no best checkpoint: checkpoint.keep_best was off, there was no validation yet, what it measures was"
-            " changed since, or it was deleted"
-        )
-    elif step is None or not path.is_dir():
-        problem = f"--checkpoint {by}" if step is None else f"no checkpoint of step {step:,}"
+    problem: str | None
+    if step is None:
+        why = "no validation yet, it measured something else since, checkpoint.keep_best was off, or it was deleted"
+        problem = f"no best checkpoint ({why})" if is_best else f"--checkpoint {by}"
+    elif not path.is_dir():
+        problem = f"no checkpoint of step {step:,}"
     else:
         problem = (damage := find_damage(path)) and f"{path.name} is damaged: {damage}"
     if problem:
         steps = ", ".join(str(step_of(path.name)) for path in listed(folder) if find_damage(path) is None)
         raise InputError(where=str(folder), found=problem, needed=f"selected, newest, best or one of the steps {steps}")
-    if by not in {SELECTED, BEST}:
-        return SelectedCheckpoint(path, "as asked for")
     measure = "error" if state.best_rank is None else "action ranking"
-    return SelectedCheckpoint(
-        path, f"the best by {measure}" if step else f"the base: none of its checkpoints is better by {measure}"
-    )
+    best = f"the best by {measure}" if step else f"the base: none of its checkpoints is better by {measure}"
+    return SelectedCheckpoint(path, best if is_best else "as asked for")

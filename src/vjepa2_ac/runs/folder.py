@@ -82,8 +82,12 @@ def check_run_folder(config: Config, *, allow_config_change: bool = False) -> No
     if folder.exists() and not folder.is_dir():
         raise InputError(where=str(folder), found="a file", needed="a folder for the run", fix="Set another run_dir")
     if (folder / CONFIG).exists():
-        if not allow_config_change:
-            _refuse_another_config(folder, config)
+        changed = [] if allow_config_change else changed_keys(read_run_config(folder), config)
+        if differing := [key for key in changed if Affects.RUN in mark_of(key, Config)]:
+            found = f"a run of another config; it differs in {', '.join(differing)}"
+            same = f"Set another run_dir for a new run, or go on with `vjepa2-ac train {folder} --resume`"
+            fix = f"{same}; where the change is meant, add --allow-config-change"
+            raise InputError(where=str(folder), found=found, needed="the same config, to go on with it", fix=fix)
     elif folder.exists() and not all(_is_without_config(path) for path in folder.iterdir()):
         found = "a folder with other things in it, and no config.yaml"
         needed = "an empty or new folder, or one of a run"
@@ -109,7 +113,8 @@ def open_run_folder(config: Config, run_name: str, *, allow_config_change: bool 
     if (changes := config_changes(config)) and allow_config_change:
         start["config_changes"] = changes
     is_new = not (folder / CONFIG).exists()
-    if is_new or allow_config_change or _moved(config):
+    before = [] if is_new else [data.path for data in read_run_config(folder).data_sets]
+    if allow_config_change or before != [data.path for data in config.data_sets]:  # new, or the data were moved
         # First of all files: it makes the folder a run's.
         write_atomically(folder / CONFIG, config_as_yaml(config).encode())
     path = folder / ENVIRONMENT
@@ -220,36 +225,13 @@ def _earlier_starts(path: str | Path) -> list[dict[str, Any]]:
     return [start for start in starts if isinstance(start, dict)]
 
 
-def _moved(config: Config) -> bool:
-    """Return whether the data are elsewhere than the config in the run's folder says."""
-    before = read_run_config(Path(config.run_dir)).data_sets
-    return [data.path for data in before] != [data.path for data in config.data_sets]
-
-
-def _refuse_another_config(folder: Path, config: Config) -> None:
-    changed = changed_keys(read_run_config(folder), config)
-    differing = [key for key in changed if Affects.RUN in mark_of(key, Config)]
-    if differing:
-        found = f"a run of another config; it differs in {', '.join(differing)}"
-        fix = (
-            f"Set another run_dir for a new run, or go on with `vjepa2-ac train {folder} --resume`; where the change is"
-            " meant, add --allow-config-change"
-        )
-        raise InputError(where=str(folder), found=found, needed="the same config, to go on with it", fix=fix)
-
-
 def with_settled_stride(config: Config) -> Config:
     """Return a config whose stride is a number where the run in its folder has chosen one: it is chosen once."""
     folder = Path(config.run_dir)
     if config.data.stride != "auto" or not (folder / CONFIG).is_file():
         return config
     stride = read_run_config(folder).data.stride
-    return config if stride == "auto" else with_stride(config, stride)
-
-
-def with_stride(config: Config, stride: int) -> Config:
-    """Return the config with a stride that was found out."""
-    return config.model_copy(update={"data": config.data.with_stride(stride)})
+    return config if stride == "auto" else config.with_stride(stride)
 
 
 class RunLock:

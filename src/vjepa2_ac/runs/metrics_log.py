@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from vjepa2_ac.errors import InputError, UserError
+from vjepa2_ac.errors import InputError
 from vjepa2_ac.runs.folder import METRICS
 from vjepa2_ac.runs.trackers import Image, Trackers
 from vjepa2_ac.storage import read_bounded, user_can_write, write_atomically
@@ -76,19 +76,16 @@ class MetricsLog:
         the space that a row needs.
 
         Raises:
-            InputError: Rows can be written neither before nor after the block, or its own error.
+            InputError: Rows can be written neither before nor after the block.
         """
         error = self._write(sync=True)
-        try:
-            yield
-        except UserError as other:
-            if error is None:
-                raise
-            raise _unwritable(self.path, error, f"{other.where}: {other.found}") from other
+        yield
         if error and self._waiting:
             error = self._write(sync=True)
         if error:  # also of a flush, after which the system may have discarded the data
-            raise _unwritable(self.path, error, "The checkpoint of this step is written")
+            found = f"the latest metrics cannot be written ({error.strerror or error}), and are lost"
+            fix = "Make room on the disk of the run, then resume: the same command goes on"
+            raise InputError(where=str(self.path), found=found, fix=f"The checkpoint of this step is written. {fix}")
 
     def _write(self, *, sync: bool = False) -> OSError | None:
         """Write the rows that wait, and with `sync` wait until the disk has them; return what prevents it."""
@@ -132,12 +129,6 @@ def read_metrics_log(path: Path) -> Iterator[dict[str, Any]]:
             yield row
         else:
             logger.warning("%s: a line is not a row of metrics, or was left by halves; it is dropped", path)
-
-
-def _unwritable(path: Path, error: OSError, checkpoint: str) -> InputError:
-    found = f"the latest metrics cannot be written ({error.strerror or error}), and are lost"
-    fix = f"{checkpoint}. Make room on the disk of the run, then resume: the same command goes on"
-    return InputError(where=str(path), found=found, fix=fix)
 
 
 def warnings_of(path: Path) -> list[str]:

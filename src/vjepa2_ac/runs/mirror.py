@@ -20,7 +20,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from vjepa2_ac import storage
@@ -45,6 +45,7 @@ from vjepa2_ac.runs.folder import (
     ENVIRONMENT,
     HELD,
     SMALL_FILES,
+    RunLock,
     check_run_folder,
     last_start,
     with_settled_stride,
@@ -167,87 +168,91 @@ class RemoteCheckpoints:
 # ---- before the first step ----
 
 
-@dataclass(frozen=True)
-class Remote:
-    """State of `checkpoint.remote` before the first step."""
-
-    place: str
-    config: Config  # its run_dir has the run to resume
-    is_reachable: bool = True
-    damaged: tuple[str, ...] = ()  # checkpoints there
-
-
 def open_remote(
     config: Config,
     reporter: Reporter,
     *,
-    claim: Callable[[], None] = lambda: None,
+    lock: RunLock | None = None,
     allow_config_change: bool = False,
     into: Path | None = None,
-) -> Remote | None:
-    """Test `checkpoint.remote`, and fetch a newer checkpoint from there; None if it is not set.
+) -> Config:
+    """Test `checkpoint.remote` if it is set, and fetch a newer checkpoint from there; return the config to go on with.
 
     A small file is written there and removed again. Fetched is the newest checkpoint there whose every file matches
-    its manifest, the best one, and the run's small files; damaged ones are named and skipped.
+    its manifest, the best one, and the run's small files; damaged ones are named and skipped, and removed there once a
+    whole one is here.
 
     Args:
         config: The run.
         reporter: Receives messages for the user.
-        claim: Called before the first file is fetched; raises if the folder belongs to another run.
+        lock: Taken before the first file is fetched.
         allow_config_change: The run there may have another config.
-        into: The folder to fetch into, new or empty, if not the run's own.
+        into: The folder to fetch into, new or empty, if not the run's own: for a trial, which removes nothing there.
+
+    Returns:
+        The config, whose run_dir has the run to resume.
 
     Raises:
-        InputError: It can never be written, it has another run's checkpoints or another config, or its checkpoints are
-            damaged or cannot be fetched and this machine has none to resume from.
+        InputError: It can never be written, it has another run's checkpoints or another config, its checkpoints are
+            damaged or cannot be fetched and this machine has none to resume from, or another process has the lock.
     """
     if config.checkpoint.remote is None:
-        return None
-    remote = Remote(storage.absolute(config.checkpoint.remote), config)
-    checkpoints, own = RemoteCheckpoints(remote.place), Path(config.run_dir).resolve()
-    if not storage.is_url(remote.place) and Path(remote.place).is_relative_to(own):
-        found, needed = f"{remote.place}, and run_dir is {own}", "a place outside the run's folder"
+        return config
+    place, run_dir = storage.absolute(config.checkpoint.remote), Path(config.run_dir).resolve()
+    if not storage.is_url(place) and Path(place).is_relative_to(run_dir):
+        found, needed = f"{place}, and run_dir is {run_dir}", "a place outside the run's folder"
         fix = "Set checkpoint.remote to a folder on another disk, or a URL such as gs://bucket/run"
         raise InputError(where=_KNOB, found=found, needed=needed, fix=fix)
-    step, run_id = _where_this_machine_stands(own)
+    remote, (step, run_id) = RemoteCheckpoints(place), _where_this_machine_stands(run_dir)
     try:
-        with quietly():
-            storage.try_writing(remote.place)
-            listing = checkpoints.listing()
-            owner = checkpoints.owner(listing, run_id)
-    except RefusedError as error:
-        found, needed = f"{remote.place}: {error.found}", "a place where files can be written and removed"
-        fix = f"{error.fix.rstrip('.')}. Or name another place, or leave checkpoint.remote out"
-        raise InputError(where=_KNOB, found=found, needed=needed, fix=fix) from error
+        listing = _tried(remote)
+        owner = remote.owner(listing, run_id)
     except UnreachableError as error:
         stand = "without a checkpoint" if step is None else f"after step {step}"
         text = "%s: %s. Training begins with what is on this machine, %s, and tries again later"
         logger.warning(text, _KNOB, _reason_of(error), stand)
-        return replace(remote, is_reachable=False)
+        return config
     minutes = config.checkpoint.remote_every_minutes
-    reporter.note(f"{remote.place} can be written: it is brought up to date every {minutes:g} minutes, and in the end.")
+    reporter.note(f"{place} can be written: it is brought up to date every {minutes:g} minutes, and in the end.")
     further = [name for name in complete(listing) if step is None or _step(name) > step]
     is_begun_there = step is None and owner is not None  # a machine was killed during its first upload or before
     if not further and not is_begun_there:
-        return remote
+        return config
     target = config if into is None else config.model_copy(update={"run_dir": str(into)})
     try:
-        _require_this_config(target, remote.place, allow_config_change=allow_config_change)
-        claim()
-        damaged = tuple(_fetch_newest(checkpoints, further, Path(target.run_dir), reporter))
+        _require_this_config(target, place, allow_config_change=allow_config_change)
+        if lock is not None:
+            lock.take()
+        is_fetched = _fetch_newest(remote, further, target, reporter, removes_damaged=into is None)
     except UnreachableError as error:
         if step is None:
             raise
         text = "%s: %s. Training goes on after step %d, though %s is there"
         logger.warning(text, _KNOB, _reason_of(error), step, further[0])
-        return remote
-    if len(damaged) < len(further) or not further:
-        return replace(remote, config=target, damaged=damaged)
-    if step is None:
-        found = f"{remote.place}: none of {len(damaged)} checkpoints is whole"
-        fix = "To start the run anew, remove them, or set another checkpoint.remote"
-        raise InputError(where=_KNOB, found=found, fix=fix)
-    return replace(remote, damaged=damaged)
+        return config
+    if is_fetched or not further:
+        return target
+    if step is not None:
+        return config
+    found = f"{place}: none of {len(further)} checkpoints is whole"
+    fix = "To start the run anew, remove them, or set another checkpoint.remote"
+    raise InputError(where=_KNOB, found=found, fix=fix)
+
+
+def _tried(remote: RemoteCheckpoints) -> Listing:
+    """Return the checkpoints at a place where a file can be written and removed.
+
+    Raises:
+        InputError: It never can.
+        UnreachableError: It cannot now.
+    """
+    try:
+        with quietly():
+            storage.try_writing(remote.place)
+            return remote.listing()
+    except RefusedError as error:
+        fix = f"{error.fix.rstrip('.')}. Or name another place, or leave checkpoint.remote out"
+        raise InputError(where=_KNOB, found=f"{remote.place}: {error.found}", fix=fix) from error
 
 
 def _where_this_machine_stands(run_dir: Path) -> tuple[int | None, str | None]:
@@ -272,14 +277,14 @@ def _require_this_config(config: Config, place: str, *, allow_config_change: boo
             raise InputError(where=f"{_KNOB} {place}", found=error.found, needed=error.needed, fix=fix) from None
 
 
-def _fetch_newest(remote: RemoteCheckpoints, names: Sequence[str], folder: Path, reporter: Reporter) -> list[str]:
-    """Download a run into its folder, with the first of these checkpoints (the newest first) that is complete.
+def _fetch_newest(
+    remote: RemoteCheckpoints, names: Sequence[str], config: Config, reporter: Reporter, *, removes_damaged: bool
+) -> bool:
+    """Download a run into its folder, with the first of these checkpoints (the newest first) that is whole, if any.
 
     Of all it fetches, the checkpoint comes last, so that an interrupted download starts again.
-
-    Returns:
-        The damaged checkpoints; all of `names` if none is complete.
     """
+    folder = Path(config.run_dir)
     for name in SMALL_FILES:  # config.yaml first: without it the folder would be no run's
         with suppress(FileNotFoundError):
             storage.download(storage.join(remote.place, name), folder / name)
@@ -287,8 +292,11 @@ def _fetch_newest(remote: RemoteCheckpoints, names: Sequence[str], folder: Path,
     for number, name in enumerate(names):
         if _fetch(remote, name, folder / CHECKPOINTS):
             reporter.note(f"Fetched {name} from {remote.place}.")
-            return list(names[:number])
-    return list(names)
+            with suppress(UnreachableError):
+                for damaged in names[:number] if removes_damaged else ():
+                    remote.remove(damaged)
+            return True
+    return False
 
 
 def _fetch(remote: RemoteCheckpoints, name: str, checkpoints: Path) -> bool:
@@ -317,17 +325,17 @@ class Mirror:
     An outage is warned of once, however long it is; and files that are only on this machine in the end, once more.
 
     Args:
-        remote: The place, as it was opened.
+        place: `checkpoint.remote`.
+        config: The run.
         run_id: The run whose checkpoints may be there.
     """
 
-    def __init__(self, remote: Remote, run_id: str) -> None:
-        self._remote, self._run_id = RemoteCheckpoints(remote.place), run_id
-        self._folder, self._config = Path(remote.config.run_dir), remote.config.checkpoint
-        self._outage_reported, self._damaged = not remote.is_reachable, set(remote.damaged)
+    def __init__(self, place: str, config: Config, run_id: str) -> None:
+        self._remote, self._run_id = RemoteCheckpoints(storage.absolute(place)), run_id
+        self._folder, self._config, self._outage_reported = Path(config.run_dir), config.checkpoint, False
         self._thread: threading.Thread | None = None
-        self._is_ending, self._has_ended = threading.Event(), threading.Event()
-        self._begun_s, self._is_lost = -float("inf"), False
+        self._is_ending = self._has_ended = self._is_lost = False
+        self._begun_s = -float("inf")
         self._aim: str | None = None  # the newest local checkpoint when the thread started
         self._sent: str | None = None  # the newest remote one
         self._starts: bytes | None = None  # the list of starts as uploaded: a different one there is a later start's
@@ -354,7 +362,7 @@ class Mirror:
             is_asked_to_stop: Whether the machine is about to stop: then the wait is `checkpoint.remote_wait_seconds`,
                 else an hour.
         """
-        self._is_ending.set()
+        self._is_ending = True
         is_short, until_s = False, time.monotonic() + LONGEST_WAIT_S
         for is_last in (False, True):  # the current pass ends, or breaks off if there is a newer checkpoint
             if is_last and not self.is_sending:
@@ -364,7 +372,7 @@ class Mirror:
                     is_short, until_s = True, time.monotonic() + self._config.remote_wait_seconds
                 self._thread.join(_LOOK_EVERY_S)
         in_time = not self.is_sending
-        self._has_ended.set()
+        self._has_ended = True
         if not self._is_lost and not (in_time and self._sent == self._newest_here()):
             logger.warning(
                 "%s has checkpoints up to %s; what %s has after that is on this machine only%s. A next start sends it",
@@ -378,9 +386,9 @@ class Mirror:
 
     def __exit__(self, _kind: object, error: object, _traceback: object) -> None:
         """Stop uploading; if the run ends with an error, upload what exists first."""
-        if isinstance(error, Exception) and not self._has_ended.is_set():
+        if isinstance(error, Exception) and not self._has_ended:
             self.finish(lambda: True)
-        self._has_ended.set()
+        self._has_ended = True
 
     def _begin(self) -> None:
         self._begun_s, self._aim = time.monotonic(), self._newest_here()
@@ -410,7 +418,7 @@ class Mirror:
 
     def _go_on(self) -> None:
         """Cancel the pass if the run has ended, or is ending and has a newer checkpoint."""
-        if self._has_ended.is_set() or (self._is_ending.is_set() and self._newest_here() != self._aim):
+        if self._has_ended or (self._is_ending and self._newest_here() != self._aim):
             raise _BrokenOffError
 
     def _bring_up_to_date(self) -> None:
@@ -424,13 +432,9 @@ class Mirror:
             UnreachableError: It cannot be reached.
             OSError: The run's folder cannot be read, or written for the links.
         """
-        listing = dict(self._remote.listing())
+        listing = self._remote.listing()
         self._remote.owner(listing, self._run_id)
         self._require_not_overtaken()
-        for name in self._damaged & listing.keys():
-            self._remote.remove(name)
-            del listing[name]
-        self._damaged.clear()
         names = [path.name for path in reversed(listed(self._folder / CHECKPOINTS))]
         newest = next(filter(None, map(self._hold, names)), None)
         if newest is None:

@@ -12,8 +12,8 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.checkpoint import CHECKPOINTS, RunState, find_damage, listed, step_of
-from vjepa2_ac.runs.folder import RunLock, check_run_folder, config_changes, open_run_folder, with_settled_stride
-from vjepa2_ac.runs.mirror import Mirror, Remote, open_remote
+from vjepa2_ac.runs.folder import RunLock, check_run_folder, open_run_folder, with_settled_stride
+from vjepa2_ac.runs.mirror import Mirror, open_remote
 
 
 @dataclass(frozen=True)
@@ -22,12 +22,7 @@ class OpenRun:
 
     config: Config  # with the stride that the run has chosen; its run_dir has the checkpoints to resume from
     lock: RunLock
-    remote: Remote | None
     allow_config_change: bool
-
-    def changes(self, config: Config) -> list[str]:
-        """Return a line per setting in which a config differs from the run's, where that is allowed."""
-        return config_changes(config) if self.allow_config_change else []
 
     def begin(self, config: Config, state: RunState) -> None:
         """Lock the folder, and record this start in it; a new folder is only created now.
@@ -52,7 +47,8 @@ class OpenRun:
 
     def mirror(self, run_id: str) -> Mirror | None:
         """Return what keeps `checkpoint.remote` up to date."""
-        return None if self.remote is None else Mirror(self.remote, run_id)
+        place = self.config.checkpoint.remote
+        return None if place is None else Mirror(place, self.config, run_id)
 
 
 @contextlib.contextmanager
@@ -70,18 +66,15 @@ def open_run(
     Raises:
         InputError: The folder is not this run's, is in use or cannot be written; or as `open_remote`.
     """
-    folder, remote, trial = Path(config.run_dir), None, None
-    config = with_settled_stride(config)
+    config, trial = with_settled_stride(config), None
     check_run_folder(config, allow_config_change=allow_config_change)
     with contextlib.ExitStack() as until_the_end:
-        lock = until_the_end.enter_context(RunLock(folder))
+        lock = until_the_end.enter_context(RunLock(Path(config.run_dir)))
         if check_only:
             trial = Path(until_the_end.enter_context(tempfile.TemporaryDirectory()), "run")
-        elif folder.is_dir():  # a new one is created, and locked, after all checks
+        elif Path(config.run_dir).is_dir():  # a new one is created, and locked, after all checks
             lock.take()
-        if config.checkpoint.remote is not None:
-            # Locked before anything is downloaded into the run's folder: another process could still be writing there.
-            claim = lock.take if trial is None else lambda: None
-            remote = open_remote(config, reporter, claim=claim, allow_config_change=allow_config_change, into=trial)
-            config = with_settled_stride(remote.config if remote else config)
-        yield OpenRun(config, lock, remote, allow_config_change)
+        # Locked before anything is downloaded into the run's folder: another process could still be writing there.
+        first = None if check_only else lock
+        config = open_remote(config, reporter, lock=first, allow_config_change=allow_config_change, into=trial)
+        yield OpenRun(with_settled_stride(config), lock, allow_config_change)

@@ -46,15 +46,10 @@ class Trackers:
 
     Args:
         openings: Functions that make a tracker, by its display name.
-        opening_s: After which a warning says that one does not answer; training does not wait for it.
-        closing_s: Longest wait at the end, for all of them.
     """
 
-    def __init__(
-        self, openings: Mapping[str, Opening], *, opening_s: float = PATIENCE_S, closing_s: float = CLOSING_S
-    ) -> None:
-        self._closing_s = closing_s
-        self._threads = [_Thread(name, opening, patience_s=opening_s) for name, opening in openings.items()]
+    def __init__(self, openings: Mapping[str, Opening]) -> None:
+        self._threads = [_Thread(name, opening) for name, opening in openings.items()]
 
     def log(self, kind: str, step: int, metrics: Mapping[str, Any]) -> None:
         """Log the numbers of a row; lists, such as errors by horizon, number by number from 1."""
@@ -70,19 +65,19 @@ class Trackers:
     def close(self) -> None:
         """Close all; a second call does nothing."""
         threads, self._threads = self._threads, []
-        until_s = time.monotonic() + self._closing_s
+        until_s = time.monotonic() + CLOSING_S
         for thread in threads:
-            thread.end()
+            thread.rows.put(None)
         for thread in threads:
-            thread.wait(max(0.0, until_s - time.monotonic()), self._closing_s)
+            thread.wait(max(0.0, until_s - time.monotonic()))
 
 
 class _Thread:
     """A tracker in a thread, which makes it, sends it rows and closes it; problems are warned of once."""
 
-    def __init__(self, name: str, opening: Opening, *, patience_s: float) -> None:
-        self._name, self._opening, self._patience_s = name, opening, patience_s
-        self._rows: queue.SimpleQueue[Callable[[Any], None] | None] = queue.SimpleQueue()
+    def __init__(self, name: str, opening: Opening) -> None:
+        self._name, self._opening = name, opening
+        self.rows: queue.SimpleQueue[Callable[[Any], None] | None] = queue.SimpleQueue()  # None: the end
         self._doing, self._since_s = "cannot be opened", time.monotonic()  # the current call, if it does not end
         self._warned, self._dropped = False, 0
         self._thread = threading.Thread(target=self._work, name=name, daemon=True)
@@ -92,22 +87,18 @@ class _Thread:
         """Queue what is to be sent, unless so many rows wait already."""
         if not self._thread.is_alive():
             return
-        if self._rows.qsize() < most:
-            self._rows.put(send)
+        if self.rows.qsize() < most:
+            self.rows.put(send)
         else:
             self._dropped += 1
-        if time.monotonic() - self._since_s > self._patience_s:
-            self._warn(f"no answer within {self._patience_s:g} s", "its metrics wait")
+        if time.monotonic() - self._since_s > PATIENCE_S:
+            self._warn(f"no answer within {PATIENCE_S:g} s", "its metrics wait")
 
-    def end(self) -> None:
-        """Close it after the last row; does not wait."""
-        self._rows.put(None)
-
-    def wait(self, within_s: float, limit_s: float) -> None:
-        """Wait until it is closed, at most `within_s`: the rest of `limit_s`."""
+    def wait(self, within_s: float) -> None:
+        """Wait until it is closed, at most for the rest of `CLOSING_S`."""
         self._thread.join(within_s)
         if self._thread.is_alive():
-            self._warn(f"no answer within {limit_s:g} s", "its last metrics may be missing there")
+            self._warn(f"no answer within {CLOSING_S:g} s", "its last metrics may be missing there")
         if self._dropped:
             logger.warning("%s was too slow for %d rows, which are missing there", self._name, self._dropped)
 
@@ -117,7 +108,7 @@ class _Thread:
             tracker = self._opening()
             tracker.start()
             self._since_s = math.inf
-            while (send := self._rows.get()) is not None:
+            while (send := self.rows.get()) is not None:
                 self._doing, self._since_s = "failed", time.monotonic()
                 send(tracker)
                 self._since_s = math.inf
@@ -169,12 +160,8 @@ def open_trackers(config: Config, folder: Path, *, run_id: str, first_step: int)
     if tracking.trackio:
         openings["trackio"] = lambda: _trackio(config, run_id)
     for name, given in tracking.others.items():
-        openings[name] = partial(_of_others, name, given, folder, run_id)
+        openings[name] = partial(TRACKERS.find(name), folder, run_id, **TRACKERS.options(name, given))
     return Trackers(openings)
-
-
-def _of_others(name: str, given: Mapping[str, Any], folder: Path, run_id: str) -> Any:
-    return TRACKERS.find(name)(folder, run_id, **TRACKERS.options(name, given))
 
 
 def _tensorboard(folder: Path, first_step: int) -> Any:

@@ -109,7 +109,8 @@ def warm_up(controller: Controller) -> float:
 
 def _control_rate(config: Config) -> float | None:
     """Return the control steps a second; None: only the data set knows."""
-    rates = (getattr(one, "control_rate_hz", None) for one in config.data.own_section.values())
+    sections = (getattr(config.data, name) for name in config.data.own_sections())
+    rates = (getattr(section, "control_rate_hz", None) for section in sections)
     return next((rate for rate in rates if rate is not None), None)
 
 

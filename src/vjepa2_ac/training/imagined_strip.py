@@ -81,10 +81,9 @@ class ImaginedStrip:
         batch, row, clip = self._clip
         if self._frames is None:
             self._frames = frames_as_seen(frames_of(self._dataset, batch, row), self._size)
-        decoder, latents = self._decoder.to(device).decoder, clip.latents[0].to(device)
+        decoder, latents = self._decoder.to(device).decoder, clip.latents.to(device)
         actions, states = (values[0].double().cpu().numpy() for values in (clip.actions, clip.states))
-        extrinsics = None if clip.extrinsics is None else clip.extrinsics[0, 0].to(device)
-        start = Start(latents[0], states[0], self._dataset.spaces.state, extrinsics)
+        start = Start.of(replace(clip, latents=latents), self._dataset.spaces.state)
         world_model.eval()
 
         def rollout(name: str) -> Imagined:
@@ -95,7 +94,7 @@ class ImaginedStrip:
         if adaptation is not None and adaptation.kind == "lora" and world_model.fresh_heads is None:
             with base_only(world_model):
                 rollouts.insert(0, rollout("base"))
-        decoded = shown(decoder, latents)
+        decoded = shown(decoder, latents[0])
         return Imagination(
             subject=subject,
             episode_id=batch.episode_ids[row],

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import signal
 import time
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,24 +23,22 @@ from vjepa2_ac.distributed import (
     broadcast_object,
     first_only,
     make_accelerator,
-    out_of_memory_explained,
     require_same,
 )
 from vjepa2_ac.process import StoppedError, stop_on_signals
 from vjepa2_ac.reporter import SILENT, Reporter
-from vjepa2_ac.runs.checkpoint import CheckpointClock
-from vjepa2_ac.runs.folder import CALIBRATION, CHANGES
+from vjepa2_ac.runs.folder import CALIBRATION, CHANGES, config_changes
 from vjepa2_ac.runs.metrics_log import MetricsLog
 from vjepa2_ac.runs.open_run import OpenRun, open_run
 from vjepa2_ac.runs.trackers import open_trackers, require_installed
 from vjepa2_ac.storage import write_atomically
 from vjepa2_ac.training.monitoring import Throughput, TimedBatches, WatchedMetricsLog
 from vjepa2_ac.training.optim import require_optimizer
-from vjepa2_ac.training.resume import require_same_data, restore, save_checkpoint
+from vjepa2_ac.training.resume import restore, save_checkpoint
 from vjepa2_ac.training.setup import Run, batches_from, set_up
 from vjepa2_ac.training.step import gradients, training_step
 from vjepa2_ac.training.validation import (
-    is_out_of_patience,
+    is_done,
     record,
     validate_base,
     validate_if_due,
@@ -48,14 +46,9 @@ from vjepa2_ac.training.validation import (
 )
 
 if TYPE_CHECKING:
-    from vjepa2_ac.data.dataset import Dataset
     from vjepa2_ac.evaluation.result import Validation
     from vjepa2_ac.runs.mirror import Mirror
 
-_LESS_MEMORY = (
-    "Set training.gradient_checkpointing=true, or lower training.batch_size (and raise training.accumulation),"
-    " model.encode_chunk or validation.batch_size"
-)
 _IN_PLACE = "Everything is in place: data, model, validation and gradients were checked; nothing was written."
 
 
@@ -80,7 +73,7 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow
     require_optimizer(config.training)
     reporter = reporter if accelerator.is_main_process else SILENT
 
-    with contextlib.ExitStack() as until_the_end, out_of_memory_explained("training", _LESS_MEMORY):
+    with contextlib.ExitStack() as until_the_end:
 
         def opening() -> OpenRun:
             require_installed(config.tracking)
@@ -90,14 +83,10 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow
         # The first process is the only one that reports, has trackers and needs to see the run's folder.
         opened = first_only(accelerator, opening)
         config = broadcast_object(accelerator, opened.config if opened else config)
-
-        def same_data(config: Config, datasets: Sequence[Dataset]) -> None:
-            if not allow_config_change:
-                first_only(accelerator, lambda: require_same_data(config, datasets))
-
-        run = restore(set_up(config, reporter, accelerator, require_same=same_data, check_only=check_only), reporter)
+        changes = {"check_only": check_only, "allow_config_change": allow_config_change}
+        run = restore(set_up(config, reporter, accelerator, **changes), reporter)
         first = validate_base(run, reporter)
-        for line in opened.changes(run.config) if opened else ():
+        for line in config_changes(run.config) if opened and allow_config_change else ():
             reporter.note(f"The config changes: {line}")
         if check_only:
             gradients(run, batches_from(run))
@@ -115,8 +104,10 @@ def _train(run: Run, opened: OpenRun | None, first: Validation | None, reporter:
                 return None
             opened.begin(run.config, run.state)
             _write_measured(run)
-            metrics_log = until_the_end.enter_context(_open_metrics_log(run, reporter))
-            mirror = opened.mirror(run.state.run_id)
+            done, run_id = run.state.step, run.state.run_id
+            trackers = open_trackers(run.config, run.folder, run_id=run_id, first_step=done)
+            watched = WatchedMetricsLog(run.config, reporter, first_step=done, trackers=trackers)
+            metrics_log, mirror = until_the_end.enter_context(watched), opened.mirror(run_id)
             return metrics_log, mirror and until_the_end.enter_context(mirror)
 
         metrics_log, mirror = agreed(run.accelerator, beginning) or (None, None)
@@ -141,12 +132,6 @@ def _write_measured(run: Run) -> None:
         write_atomically(folder / CHANGES, json.dumps(coverage.noted()).encode())
 
 
-def _open_metrics_log(run: Run, reporter: Reporter) -> MetricsLog:
-    done = run.state.step
-    trackers = open_trackers(run.config, run.folder, run_id=run.state.run_id, first_step=done)
-    return WatchedMetricsLog(run.folder, config=run.config, reporter=reporter, first_step=done, trackers=trackers)
-
-
 def _save(run: Run, metrics_log: MetricsLog | None) -> None:
     """Write a checkpoint, after the metrics that lead to it."""
 
@@ -160,13 +145,14 @@ def _save(run: Run, metrics_log: MetricsLog | None) -> None:
 def _loop(run: Run, metrics_log: MetricsLog | None, mirror: Mirror | None, reporter: Reporter) -> None:
     training = run.config.training
     device, processes = run.accelerator.device, run.accelerator.num_processes
-    throughput = Throughput.of(run.config, run.world_model.sizes, device, processes, encodes=run.encodes)
+    throughput = Throughput.of(run.config, run.world_model.sizes, device, processes)
     reporter.note(str(throughput))
     reporter.started(run.state.step, training.steps)
-    clock = CheckpointClock(run.config.checkpoint)
+    checkpoint, saved_s = run.config.checkpoint, time.monotonic()
+    every_s = math.inf if checkpoint.every_minutes is None else 60.0 * checkpoint.every_minutes
     with stop_on_signals() as stop, contextlib.closing(batches_from(run)) as batches:
         timed, stopped_by = TimedBatches(batches, device), 0
-        while not (stopped_by or _is_done(run)):
+        while not (stopped_by or is_done(run)):
             step = run.state.step + 1
             is_logged = step % training.log_every == 0 or step == training.steps
             metrics = _timed_step(run, timed, step, throughput, measure_update=is_logged)
@@ -176,32 +162,24 @@ def _loop(run: Run, metrics_log: MetricsLog | None, mirror: Mirror | None, repor
             run.state = replace(run.state, step=step, clips_done=run.state.clips_done + run.clips_per_step)
             is_best = validate_if_due(run, metrics_log, reporter)
             # Agreed among all processes, and read once: a signal after this takes effect at the next step.
-            is_due = clock.is_due(step) or is_best or _is_done(run) or bool(metrics_log and metrics_log.is_behind)
+            is_due = step % checkpoint.every == 0 or time.monotonic() - saved_s >= every_s or is_best or is_done(run)
+            is_due = is_due or bool(metrics_log and metrics_log.is_behind)
             stopped_by, due = all_reduce_max(run.accelerator, [stop.number, is_due])
             if due or stopped_by:
                 _save(run, metrics_log)
-                clock.restart()
+                saved_s = time.monotonic()
             if mirror:
                 mirror.tick()
-        is_done = _is_done(run)
-        if is_done and run.state.step < training.steps:
-            reporter.note(_out_of_patience(run))
+        has_ended = is_done(run)
+        if has_ended and run.state.step < training.steps:
+            reporter.note(
+                f"Training ends at step {run.state.step:,}: step {run.state.best_step:,} is the best, and"
+                f" {training.patience} validations after it were no better (training.patience)."
+            )
         # All wait: the launcher ends all processes once one has ended.
-        agreed(run.accelerator, lambda: mirror.finish(lambda: not is_done or bool(stop.number)) if mirror else None)
-    if not is_done:
+        agreed(run.accelerator, lambda: mirror.finish(lambda: not has_ended or bool(stop.number)) if mirror else None)
+    if not has_ended:
         raise StoppedError(run.folder, run.state.step, signal.Signals(stopped_by).name)
-
-
-def _is_done(run: Run) -> bool:
-    return run.state.step >= run.config.training.steps or is_out_of_patience(run)
-
-
-def _out_of_patience(run: Run) -> str:
-    best, patience = run.state.best_step, run.config.training.patience
-    return (
-        f"Training ends at step {run.state.step:,}: step {best:,} is the best, and {patience} validations after it were"
-        " no better (training.patience)."
-    )
 
 
 def _timed_step(

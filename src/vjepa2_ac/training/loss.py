@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 
 import torch
@@ -18,19 +17,6 @@ from vjepa2_ac.model.network.predictor_network import KeyValueCache, LatentDynam
 from vjepa2_ac.registry import LOSSES
 
 Distance = Callable[[Tensor, Tensor], Tensor]  # of predicted and true latents, number by number
-
-
-@dataclass(frozen=True)
-class Losses:
-    """The two parts of the loss; each is a mean over all elements."""
-
-    teacher_forcing: Float[Tensor, ""]
-    rollout: Float[Tensor, ""]
-
-    @property
-    def total(self) -> Float[Tensor, ""]:
-        """The plain sum, as released."""
-        return self.teacher_forcing + self.rollout
 
 
 class Objective(nn.Module):
@@ -48,22 +34,24 @@ class Objective(nn.Module):
         self.world_model = world_model
         self.weights = (training.teacher_forcing_weight, training.rollout_weight)
         self.rollout_steps = training.rollout_steps if training.rollout_weight else 1  # weight 0: no cost
-        self.distance = distance_of(training)
+        distance: Callable[..., Tensor] = LOSSES.function(training.loss, training.loss_options)
+        is_smooth = training.loss == "smooth_l1"
+        self.distance = partial(distance, beta=training.smooth_l1_beta) if is_smooth else distance
 
     def forward(self, batch: LatentBatch) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
         """Return (teacher forcing, rollout), each times its weight, so that the loss is their sum.
 
         They are plain tensors, which DDP and Accelerate pass through.
         """
-        losses = prediction_losses(self.world_model, batch, self.rollout_steps, self.distance)
+        forced, rollout = prediction_losses(self.world_model, batch, self.rollout_steps, self.distance)
         forced_weight, rollout_weight = self.weights
-        return losses.teacher_forcing * forced_weight, losses.rollout * rollout_weight
+        return forced * forced_weight, rollout * rollout_weight
 
 
 def prediction_losses(
     world_model: LatentDynamics, batch: LatentBatch, rollout_steps: int, distance: Distance = absolute_difference
-) -> Losses:
-    """Return both parts of the loss of one batch, without weights; the distance is L1 unless given.
+) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
+    """Return (teacher forcing, rollout) of one batch, without weights, each a mean over all elements.
 
     Both parts begin with the first step: the rollout reuses the keys and values that teacher forcing computed for it,
     and computes one new step for each further prediction. Loss and gradient equal those of recomputing everything.
@@ -85,16 +73,7 @@ def prediction_losses(
         camera = None if extrinsics is None else extrinsics[:, rest]
         further = world_model.rollout(rolled, actions[:, rest], states[:, rest], camera, cache)
         rolled = torch.cat([rolled, further], dim=1)
-    return Losses(
-        teacher_forcing=distance(forced, latents[:, 1:]).mean(),
-        rollout=distance(rolled, latents[:, 1 : rollout_steps + 1]).mean(),
-    )
-
-
-def distance_of(training: TrainingConfig) -> Distance:
-    """Return what `training.loss` names."""
-    distance = LOSSES.function(training.loss, training.loss_options)
-    return partial(distance, beta=training.smooth_l1_beta) if training.loss == "smooth_l1" else distance
+    return distance(forced, latents[:, 1:]).mean(), distance(rolled, latents[:, 1 : rollout_steps + 1]).mean()
 
 
 def smooth_difference(

@@ -59,17 +59,14 @@ class WatchedMetricsLog(MetricsLog):
     Only the rows are used, so that a resumed run neither loses nor repeats a warning.
 
     Args:
-        run_dir: The run's folder.
-        config: Its config, for the knobs to change.
+        config: Of the run, for its folder and the knobs to change.
         reporter: Receives messages for the user.
         first_step: As of `MetricsLog`.
         trackers: As of `MetricsLog`.
     """
 
-    def __init__(
-        self, run_dir: Path, *, config: Config, reporter: Reporter, first_step: int, trackers: Trackers | None = None
-    ) -> None:
-        super().__init__(run_dir, first_step=first_step, trackers=trackers)
+    def __init__(self, config: Config, reporter: Reporter, *, first_step: int, trackers: Trackers) -> None:
+        super().__init__(Path(config.run_dir), first_step=first_step, trackers=trackers)
         self._watch, self._reporter = Watch(config), reporter
         for row in read_metrics_log(self.path):
             self._watch(str(row.get("kind")), row["step"], row)
@@ -152,7 +149,7 @@ def advice(config: Config) -> str:
     return f"If it stays so: {', '.join(knobs)}{best}"
 
 
-class TimedBatches:
+class TimedBatches(Iterator[Batch]):
     """Passes on batches, and measures how long the loader was waited for, also for prefetched ones.
 
     On CUDA only the idle time of the device counts: from the end of its queued work to the next work.
@@ -174,10 +171,6 @@ class TimedBatches:
             began, ended = self._spans.popleft()
             self._waited_s += began.elapsed_time(ended) / 1000
         return self._waited_s
-
-    def __iter__(self) -> TimedBatches:
-        """Return itself."""
-        return self
 
     def __next__(self) -> Batch:
         """Return the next batch."""
@@ -211,22 +204,19 @@ class Throughput:
     device: torch.device
 
     @classmethod
-    def of(
-        cls, config: Config, sizes: ModelSizes, device: torch.device, processes: int, *, encodes: bool = True
-    ) -> Throughput:
+    def of(cls, config: Config, sizes: ModelSizes, device: torch.device, processes: int) -> Throughput:
         """Measure the ceiling, once per device, precision and program.
 
         Args:
-            config: The run.
+            config: The run; the encoder's work counts unless latents are cached.
             sizes: Of its model.
             device: Of this process.
             processes: Of the run.
-            encodes: Whether the encoder's work counts; cached latents need none.
         """
         tokens = config.data.frames * sizes.tokens_per_frame
         ceiling = processes * matmul_speed(device, PRECISIONS[config.training.precision])
         flops = clip_flops(config, sizes)
-        return cls(flops.total if encodes else flops.predictor, tokens, ceiling, device)
+        return cls(flops.predictor if config.data.takes_latents else flops.total, tokens, ceiling, device)
 
     def metrics(self, clips: float, seconds: float, waited_s: float) -> dict[str, float]:
         """Return the metrics of one step.
@@ -236,12 +226,16 @@ class Throughput:
             seconds: The step's wall time.
             waited_s: The part of it spent waiting for the loader.
         """
+        if self.device.type == "cuda":
+            peak_bytes = torch.cuda.max_memory_allocated(self.device)
+        else:
+            peak_bytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024  # Linux counts in KiB
         return {
             "samples_per_second": clips / seconds,
             "tokens_per_second": clips * self.tokens_per_clip / seconds,
             "data_wait_share": min(1.0, waited_s / seconds),
             "mfu": clips * self.flops_per_clip / seconds / self.ceiling,
-            "memory_gb": peak_memory_gb(self.device),
+            "memory_gb": peak_bytes / 1e9,
         }
 
     def __str__(self) -> str:
@@ -268,13 +262,6 @@ class Update:
         for before, parameter in zip(self._before, self._parameters, strict=True):
             before -= parameter.detach()  # in the copy's own memory
         return float(torch.nn.utils.get_total_norm(self._before)) / weight if weight else math.nan
-
-
-def peak_memory_gb(device: torch.device) -> float:
-    """Return the peak so far: of PyTorch's allocator on CUDA, of this process's resident memory elsewhere."""
-    if device.type == "cuda":
-        return torch.cuda.max_memory_allocated(device) / 1e9
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9  # Linux counts in KiB
 
 
 def _number(metrics: Mapping[str, Any], key: str) -> float:

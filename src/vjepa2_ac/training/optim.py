@@ -79,13 +79,8 @@ def load_moments(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> Non
 def learning_rate_at(step: int, training: TrainingConfig) -> float:
     """Return the learning rate of optimizer step 1..steps: a pure function, so there is no scheduler to save.
 
-    Raises:
-        ValueError: A step before 1.
-
     Source: warmup_stable_decay is facebookresearch/vjepa2 @ c2963a4, src/utils/schedulers.py, WSDSchedule.
     """
-    if step < 1:
-        raise ValueError(f"optimizer steps count from 1, got {step}")
     start, peak, final = training.start_learning_rate, training.learning_rate, training.final_learning_rate
     if step <= training.warmup_steps:
         return start + (peak - start) * step / training.warmup_steps
@@ -100,12 +95,6 @@ def learning_rate_at(step: int, training: TrainingConfig) -> float:
     if step <= first_decay:
         return peak
     return peak + (final - peak) * min(1.0, (step - first_decay) / training.decay_steps)
-
-
-def set_learning_rate(optimizer: torch.optim.Optimizer, learning_rate: float) -> None:
-    """Set the learning rate of every group."""
-    for group in optimizer.param_groups:
-        group["lr"] = learning_rate
 
 
 def trained_parameters(module: nn.Module) -> Iterable[nn.Parameter]:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-
-import torch
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import flat
@@ -20,7 +18,6 @@ from vjepa2_ac.data.loader import validation_windows
 from vjepa2_ac.distributed import broadcast_object, broadcast_tensors, first_only, require_same
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.adapter_folder import load_trained, save_trained
-from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.checkpoint import (
     ADAPTER,
@@ -34,9 +31,8 @@ from vjepa2_ac.runs.checkpoint import (
     read_torch,
     write_checkpoint,
     write_torch,
-    written_state,
 )
-from vjepa2_ac.runs.folder import CONFIG, read_run_config, run_id
+from vjepa2_ac.runs.folder import run_id
 from vjepa2_ac.runs.metrics_log import warn_if_stalled
 from vjepa2_ac.training.optim import load_moments
 from vjepa2_ac.training.setup import Run
@@ -107,27 +103,16 @@ def _read_newest(run: Run, reporter: Reporter) -> tuple[RunState, dict[str, Any]
     checkpoint = newest_checkpoint(run.folder / CHECKPOINTS)
     if checkpoint is None:
         return RunState(step=0, run_id=run_id(run.folder)), None
-    state, moments = read_checkpoint(checkpoint, run.world_model, run.optimizer)
-    reporter.note(f"Going on from {checkpoint} ({state.step} of {run.config.training.steps} steps are done).")
-    return replace(state, run_id=state.run_id or run_id(run.folder)), moments
-
-
-def read_checkpoint(
-    checkpoint: Path, world_model: WorldModel, optimizer: torch.optim.Optimizer
-) -> tuple[RunState, dict[str, Any]]:
-    """Load the weights and moments of a checkpoint; return the progress of the run there, and the moments.
-
-    Raises:
-        InputError: It is not the state of such a run.
-    """
-    load_trained(world_model, checkpoint / ADAPTER, trainable=True)
+    load_trained(run.world_model, checkpoint / ADAPTER, trainable=True)
     try:
         moments = read_torch(checkpoint / OPTIMIZER)
-        load_moments(optimizer, moments)
-        return read_state(checkpoint), moments
+        load_moments(run.optimizer, moments)
+        state = read_state(checkpoint)
     except (OSError, ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:
         fix = "Set back what was changed in the config; or delete this checkpoint, to use an older one"
         raise InputError(where=str(checkpoint), found=f"not the state of this run ({error})", fix=fix) from None
+    reporter.note(f"Going on from {checkpoint} ({state.step} of {run.config.training.steps} steps are done).")
+    return replace(state, run_id=state.run_id or run_id(run.folder)), moments
 
 
 def measured_on(config: Config, dataset: Dataset) -> Mapping[str, str]:
@@ -168,40 +153,16 @@ def micro_batches_of(config: Config, state: RunState, processes: int, reporter: 
     batch_size, accumulation = config.training.batch_size, config.training.accumulation
     if state.clips_per_step is None:
         return accumulation
-    asked_before = state.clips_asked or state.clips_per_step // state.processes
-    if asked_before != batch_size * accumulation or state.clips_per_step == batch_size * accumulation * processes:
+    if state.clips_asked != batch_size * accumulation or state.clips_per_step == batch_size * accumulation * processes:
         return accumulation
     micro_batches, rest = divmod(state.clips_per_step, batch_size * processes)
     if rest or not micro_batches:
-        raise InputError(
-            where="training.batch_size",
-            found=f"{processes} processes of {batch_size} clips for a run with {state.clips_per_step} clips per step",
-            needed="a number of processes and a batch_size whose product divides the clips of a step",
-            fix="Start another number of processes; or set training.batch_size and training.accumulation to what each"
-            " is to do, with --allow-config-change",
-        )
+        found = f"{processes} processes of {batch_size} clips do not divide the {state.clips_per_step} clips of a step"
+        fix = "Start another number of processes; or set training.batch_size and training.accumulation to what each"
+        fix += " is to do, with --allow-config-change"
+        raise InputError(where="training.batch_size", found=found, fix=fix)
     reporter.note(
         f"{processes} processes, before {state.processes}: {micro_batches} micro-batches of {batch_size} in each, so"
         f" that a step has the same {state.clips_per_step} clips."
     )
     return micro_batches
-
-
-def require_same_data(config: Config, datasets: Sequence[Dataset]) -> None:
-    """Refuse to go on with other data sets than those that the run in its folder began with.
-
-    At the place where it began the data may have changed, which is reported; elsewhere they must be the same.
-
-    Raises:
-        InputError: They are others.
-    """
-    folder = Path(config.run_dir)
-    if not (folder / CONFIG).is_file() or (checkpoint := newest_checkpoint(folder / CHECKPOINTS)) is None:
-        return
-    keys, seen = ("data.path", "replay.data.path"), written_state(checkpoint).data
-    began = read_run_config(folder).data_sets
-    for key, dataset, old, now, before in zip(keys, datasets, began, config.data_sets, seen, strict=False):
-        if old.path != now.path and before.fingerprint != fingerprint_of(dataset.table):
-            found, needed = "other episodes or files than the run has seen", f"the data set that was at {old.path}"
-            fix = f"Set {key} to where that is now; where the change is meant, add --allow-config-change"
-            raise InputError(where=f"{key}: {now.path}", found=found, needed=needed, fix=fix)

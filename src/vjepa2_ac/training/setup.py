@@ -1,13 +1,12 @@
 """Setup of a run before the first step: device, data, model, adapter and optimizer, with checks.
 
-What only some runs use is imported where they use it: a stride chosen by the model, replay, a latent cache, strips.
+What only some runs use is imported where they use it: a stride chosen by the model, strips.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,11 +17,12 @@ from torch import nn
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.coverage import find_duplicates
-from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.data.loader import Batches, Mixed, ProcessShare, training_loader, validation_batches
-from vjepa2_ac.data.streams import ToDevice, copies_for
-from vjepa2_ac.distributed import PRECISIONS, broadcast_object, first_of_machine, make_accelerator
-from vjepa2_ac.encoding.batch import encode_batch, extrinsics_for, require_same_encoder
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.loader import Batches, Mixed, ProcessShare, training_loader
+from vjepa2_ac.data.streams import copies_for
+from vjepa2_ac.distributed import PRECISIONS, broadcast_object, first_of_machine, first_only, make_accelerator
+from vjepa2_ac.encoding.batch import encode_batch, extrinsics_for
+from vjepa2_ac.encoding.encode_dataset import with_latents
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.lora import add_adapter, trainable_report
@@ -30,18 +30,15 @@ from vjepa2_ac.model.adapter.low_rank import CastMatrices
 from vjepa2_ac.model.checkpoints.loading import base_sizes, load_base
 from vjepa2_ac.model.network.compilation import require_compiler
 from vjepa2_ac.model.network.world_model import WorldModel, fit_heads, heads_to_replace, require_trained
-from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
+from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import RunState
-from vjepa2_ac.runs.folder import with_stride
+from vjepa2_ac.training.data_sets import first_clip, open_data_sets, require_fitting_clips, require_same_data
 from vjepa2_ac.training.loss import Objective
 from vjepa2_ac.training.optim import make_optimizer, trained_parameters
 
 if TYPE_CHECKING:
-    from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
     from vjepa2_ac.evaluation.calibration.variants import Calibration
     from vjepa2_ac.training.imagined_strip import ImaginedStrip
-
-_CLIPS_TRIED = 8  # one is read; the others are for clips skipped by data.broken_episodes
 
 
 @dataclass
@@ -71,11 +68,6 @@ class Run:
         """Its data set, and the replayed one."""
         return [one for one in (self.dataset, self.replayed) if one is not None]
 
-    @property
-    def encodes(self) -> bool:
-        """Whether clips are frames that go through the encoder, not latents of a cache."""
-        return not self.dataset.config.is_cache
-
     @cached_property
     def trained(self) -> list[nn.Parameter]:
         """The parameters of the optimizer."""
@@ -85,11 +77,6 @@ class Run:
     def cast_matrices(self) -> CastMatrices:
         """The adapter in the type of the computation."""
         return CastMatrices(self.world_model.predictor, PRECISIONS[self.config.training.precision])
-
-    @property
-    def copies(self) -> ToDevice | None:
-        """The copies of batches to the run's device; None: none that overlap."""
-        return copies_for(self.accelerator.device)
 
     @property
     def clips_per_step(self) -> int:
@@ -102,8 +89,8 @@ def set_up(
     reporter: Reporter = SILENT,
     accelerator: Accelerator | None = None,
     *,
-    require_same: Callable[[Config, Sequence[Dataset]], None] = lambda _config, _datasets: None,
     check_only: bool = False,
+    allow_config_change: bool = False,
 ) -> Run:
     """Return a run before step 1: its data, and its model with an adapter; data are encoded if `data.cache` says so.
 
@@ -113,8 +100,8 @@ def set_up(
         config: The run.
         reporter: Receives messages, and the progress of indexing and encoding.
         accelerator: The result of `make_accelerator` for this config; None: it is created here.
-        require_same: Refuses open data sets, before the model is loaded.
         check_only: Encode nothing, and report how much that would be.
+        allow_config_change: The run in the folder may have begun with other data sets.
 
     Raises:
         InputError: Something cannot be used.
@@ -126,9 +113,13 @@ def set_up(
         from vjepa2_ac.evaluation.calibration.variants import require_learned
 
         require_learned(config.model)
-    decoder = _decoder_of(config)
+    decoder = None
+    if config.validation.decoder is not None:
+        from vjepa2_ac.decoding.decoder_folder import load_decoder
+
+        decoder = load_decoder(config.validation.decoder, where="validation.decoder:")
     # The others find the index of the first one on this machine, however long it takes.
-    dataset, *others = first_of_machine(accelerator, lambda: _open_data_sets(config, reporter))
+    dataset, *others = first_of_machine(accelerator, lambda: open_data_sets(config, reporter))
     if (duplicates := find_duplicates(dataset)).episodes:
         reporter.note(f"Warning: {duplicates}.")
     _check_heads(config, dataset)
@@ -136,30 +127,24 @@ def set_up(
     if is_auto:
         chooser = load_base(config.model, seed=config.seed).to(accelerator.device)
         calibration = broadcast_object(accelerator, choose_stride(chooser, dataset, config, accelerator, reporter))
-        config, dataset = with_stride(config, calibration.stride), dataset.with_stride(calibration.stride)
+        config, dataset = config.with_stride(calibration.stride), dataset.with_stride(calibration.stride)
     splits: tuple[Split, ...] = ("train", "validation", "test") if config.data.test_share else ("train", "validation")
-    clip, *_ = [_first_of(dataset, split) for split in splits]  # fails early: an empty split, a broken clip
-    _require_fitting_clips(dataset, others, clip)
-    require_same(config, (dataset, *others))
+    clip, *_ = [first_clip(dataset, split) for split in splits]  # fails early: an empty split, a broken clip
+    require_fitting_clips(dataset, others)
+    if not allow_config_change:
+        first_only(accelerator, lambda: require_same_data(config, (dataset, *others)))
 
     world_model = chooser or load_base(config.model, seed=config.seed)
     extrinsics_for(world_model, clip)
     if decoder is not None:
         decoder.require_fit(world_model, config.data.crop, subject=str(config.model.base or "the random model"))
 
-    def encoded(config: Config, dataset: Dataset) -> Dataset:
-        if config.data.is_cache or config.data.cache == "off":
-            require_same_encoder(world_model, dataset, config)
-            return dataset
-        from vjepa2_ac.encoding.encode_dataset import with_latents
-
-        return with_latents(config, dataset, world_model, accelerator, reporter, check_only=check_only)
-
-    dataset = encoded(config, dataset)
     for replayed in others:
-        extrinsics_for(world_model, _first_of(replayed))
-    others = [encoded(config.for_replay(), replayed) for replayed in others]
-    _require_fitting_clips(dataset, others, _first_of(dataset))
+        extrinsics_for(world_model, first_clip(replayed))
+    use = partial(with_latents, model=world_model, accelerator=accelerator, reporter=reporter, check_only=check_only)
+    dataset = use(config, dataset)
+    others = [use(config.for_replay(), replayed) for replayed in others]
+    require_fitting_clips(dataset, others)
     _make_trainable(world_model, config, dataset, reporter)
     strip = None
     if decoder is not None:
@@ -209,7 +194,7 @@ def batches_from(run: Run) -> Batches:
         batch_size=run.config.training.batch_size,
         start_position=run.state.clips_done,
         share=ProcessShare(run.accelerator.process_index, run.accelerator.num_processes),
-        copies=run.copies,
+        copies=copies_for(run.accelerator.device),
     )
 
 
@@ -217,15 +202,6 @@ def encode(run: Run, batch: Batch) -> LatentBatch:
     """Return the latents of a batch on the run's device, in its precision."""
     with run.accelerator.autocast():
         return encode_batch(run.world_model, batch, device=run.accelerator.device, chunk=run.config.model.encode_chunk)
-
-
-def _open_data_sets(config: Config, reporter: Reporter) -> list[Dataset]:
-    dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
-    if config.replay is None:
-        return [dataset]
-    from vjepa2_ac.training.replay import open_replay
-
-    return [dataset, open_replay(config.replay, dataset, reporter)]
 
 
 def _check_heads(config: Config, dataset: Dataset) -> None:
@@ -290,24 +266,3 @@ def choose_stride(
         reporter.note(f"  {row.name}: error/persistence {row}")
     reporter.note(calibration.verdict())
     return calibration
-
-
-def _first_of(dataset: Dataset, split: Split = "train") -> Batch:
-    return next(validation_batches(dataset, split, clips=_CLIPS_TRIED, batch_size=1))
-
-
-def _require_fitting_clips(dataset: Dataset, others: Sequence[Dataset], first_clip: Batch) -> None:
-    """Refuse a second data set whose clips differ in form; frames that are still to be encoded may."""
-    for replayed in others:
-        if all(one.config.is_cache or not one.config.takes_latents for one in (dataset, replayed)):
-            from vjepa2_ac.training.replay import require_same_form
-
-            require_same_form(first_clip, _first_of(replayed))
-
-
-def _decoder_of(config: Config) -> TrainedDecoder | None:
-    if config.validation.decoder is None:
-        return None
-    from vjepa2_ac.decoding.decoder_folder import load_decoder
-
-    return load_decoder(config.validation.decoder, where="validation.decoder:")

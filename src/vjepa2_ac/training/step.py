@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ from vjepa2_ac.runs.checkpoint import checkpoint_name
 from vjepa2_ac.runs.folder import NOT_FINITE
 from vjepa2_ac.storage import atomic_writer, is_url, write_atomically
 from vjepa2_ac.training.monitoring import Update
-from vjepa2_ac.training.optim import learning_rate_at, set_learning_rate
+from vjepa2_ac.training.optim import learning_rate_at
 from vjepa2_ac.training.setup import Run, encode
 
 SMALLEST_LOSS_SCALE = 1.0  # fp16: if gradients still overflow, they are not finite for another reason
@@ -47,15 +47,6 @@ class Gradients:
     bytes_fetched: int
 
 
-@dataclass
-class _Taken:
-    """What this process has accumulated."""
-
-    totals: Float[Tensor, 2]  # its part of the step's losses
-    clips: list[str] = field(default_factory=list)
-    bytes_fetched: int = 0
-
-
 def training_step(run: Run, batches: Iterator[Batch], step: int, *, measure_update: bool = False) -> dict[str, float]:
     """Do one optimizer step: accumulate gradients over micro-batches and processes, clip, update.
 
@@ -70,23 +61,30 @@ def training_step(run: Run, batches: Iterator[Batch], step: int, *, measure_upda
     """
     torch.manual_seed(step_seed(run.config.seed, step, run.accelerator.process_index))
     learning_rate = learning_rate_at(step, run.config.training)
-    set_learning_rate(run.optimizer, learning_rate)
+    for group in run.optimizer.param_groups:
+        group["lr"] = learning_rate
     taken = gradients(run, batches, ClipRecorder(), more=step < run.config.training.steps)
     update = Update(run.trained) if measure_update else None
     if taken.clips:  # without a clip there are no gradients, and nothing moves
         run.scaler.step(run.optimizer)  # with fp16 and an overflow nothing moves either
         run.scaler.update()
     run.optimizer.zero_grad(set_to_none=True)
-    return {
+    metrics = {
         "loss": taken.forced_loss + taken.rollout_loss,
         "loss_teacher_forcing": taken.forced_loss,
         "loss_rollout": taken.rollout_loss,
         "grad_norm": taken.norm,
         "learning_rate": learning_rate,
-        **({"update_to_weight": update.to_weight()} if update else {}),
-        **_about_the_data(run, taken),
-        **({"loss_scale": run.scaler.get_scale()} if run.scaler.is_enabled() else {}),
     }
+    if update is not None:
+        metrics["update_to_weight"] = update.to_weight()
+    if any(data.broken_episodes == "skip" for data in run.config.data_sets):
+        metrics["clips_left_out"] = float(run.clips_per_step - taken.clips)
+    if any(is_url(data.path) for data in run.config.data_sets):
+        metrics["bytes_per_clip"] = taken.bytes_fetched / max(1, taken.clips)
+    if run.scaler.is_enabled():
+        metrics["loss_scale"] = run.scaler.get_scale()
+    return metrics
 
 
 def gradients(
@@ -109,16 +107,15 @@ def gradients(
     """
     if not run.world_model.training:  # after a validation
         run.world_model.train()
-    taken, error = _Taken(torch.zeros(2, device=run.accelerator.device)), None
+    totals, names, fetched, error = torch.zeros(2), list[str](), 0, None
     try:
         with run.cast_matrices.current():
-            _accumulate(run, batches, look_back, taken)
+            totals, names, fetched = _accumulate(run, batches, look_back)
         if more:
             prefetch_next(batches)
     except UserError as own:
         error = own
-    totals = taken.totals.tolist()
-    own_part = [*totals, len(taken.clips), taken.bytes_fetched, error is not None]
+    own_part = [*totals.tolist(), len(names), fetched, error is not None]  # waits for the device
     *losses, clips, bytes_fetched, failed = all_reduce_sum(run.accelerator, own_part)
     if failed:
         raise_first(run.accelerator, error)
@@ -129,28 +126,31 @@ def gradients(
         return Gradients(math.nan, math.nan, 0.0, clips=0, bytes_fetched=int(bytes_fetched))
     forced_loss, rollout_loss = (loss * (expected / clips) for loss in losses)
     norm = _finish_gradients(run, factor=expected / clips)
-    _refuse_not_finite(run, forced_loss + rollout_loss, norm, taken.clips, look_back)
+    _refuse_not_finite(run, forced_loss + rollout_loss, norm, names, look_back)
     return Gradients(forced_loss, rollout_loss, norm, int(clips), int(bytes_fetched))
 
 
-def _accumulate(run: Run, batches: Iterator[Batch], look_back: ClipRecorder | None, taken: _Taken) -> None:
+def _accumulate(
+    run: Run, batches: Iterator[Batch], look_back: ClipRecorder | None
+) -> tuple[Float[Tensor, 2], list[str], int]:
+    """Return this process's part of both losses, the names of its clips, and the bytes fetched for them."""
+    totals, names, fetched = torch.zeros(2, device=run.accelerator.device), list[str](), 0
     for _ in range(run.micro_batches):
         batch = next(batches)
-        taken.bytes_fetched += batch.bytes_fetched
+        fetched += batch.bytes_fetched
         if not batch.starts:
             continue
-        taken.clips += [
-            f"{name} from step {start}" for name, start in zip(batch.episode_ids, batch.starts, strict=True)
-        ]
+        names += [f"{name} from step {start}" for name, start in zip(batch.episode_ids, batch.starts, strict=True)]
         parts = run.clips_per_step / len(batch.starts)
         latents = encode(run, batch)
         with run.accelerator.autocast():
             forced, rollout = run.objective(latents)
         run.scaler.scale((forced + rollout) / parts).backward()
         losses = torch.stack([forced.detach(), rollout.detach()])
-        taken.totals += losses / parts
+        totals += losses / parts
         if look_back is not None:
             look_back.add(batch, losses.sum())
+    return totals, names, fetched
 
 
 def _tell_of_broken_episodes(run: Run) -> None:
@@ -178,15 +178,6 @@ def _finish_gradients(run: Run, factor: float) -> float:
     return float(norm)
 
 
-def _about_the_data(run: Run, taken: Gradients) -> dict[str, float]:
-    metrics: dict[str, float] = {}
-    if any(data.broken_episodes == "skip" for data in run.config.data_sets):
-        metrics["clips_left_out"] = float(run.clips_per_step - taken.clips)
-    if any(is_url(data.path) for data in run.config.data_sets):
-        metrics["bytes_per_clip"] = taken.bytes_fetched / max(1, taken.clips)
-    return metrics
-
-
 def step_seed(seed: int, step: int, rank: int) -> int:
     """Return the seed of a step's random numbers (dropout): no generator state needs to be saved."""
     digest = hashlib.blake2b(f"{seed}/{step}/{rank}".encode(), digest_size=8).digest()
@@ -202,11 +193,9 @@ def _refuse_not_finite(run: Run, loss: float, norm: float, clips: list[str], loo
         folder = Path(run.config.run_dir) / NOT_FINITE / checkpoint_name(run.state.step + 1)
         saved = f" ({look_back.save(folder, run.accelerator.process_index)})"
     fp16 = ", or set training.precision to bf16 or fp32" if run.scaler.is_enabled() else ""
-    raise InputError(
-        where="training",
-        found=f"a loss or gradient that is not finite; the clips were {'; '.join(clips)}",
-        fix=f"The weights have not moved. Look at these clips{saved}, or lower training.learning_rate{fp16}",
-    )
+    found = f"a loss or gradient that is not finite; the clips were {'; '.join(clips)}"
+    fix = f"The weights have not moved. Look at these clips{saved}, or lower training.learning_rate{fp16}"
+    raise InputError(where="training", found=found, fix=fix)
 
 
 class ClipRecorder:

@@ -14,7 +14,7 @@ from vjepa2_ac.evaluation.action_use import RolloutStart, moves_of, rank_actions
 from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persistence
 from vjepa2_ac.evaluation.measure import prediction_errors
 from vjepa2_ac.evaluation.request import ProbeOptions
-from vjepa2_ac.evaluation.result import ActionRanking, Validation
+from vjepa2_ac.evaluation.result import Validation
 from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.metrics_log import MetricsLog
 from vjepa2_ac.training.setup import Run, encode
@@ -40,29 +40,25 @@ def record(run: Run, metrics: dict[str, Any], metrics_log: MetricsLog | None) ->
     """Log a validation's metrics; return whether it is the best so far, by `checkpoint.keep_best`."""
     if metrics_log is not None:
         metrics_log.write("validation", run.state.step, metrics)
-        _draw_strip(run, metrics_log)
+        if run.strip is not None:
+            with run.accelerator.autocast():
+                image = run.strip.draw(run.world_model, run.accelerator.device, run.folder, run.state.step)
+            if image is not None:
+                metrics_log.show("validation", "imagined", run.state.step, image)
     by, before = run.config.checkpoint.keep_best, run.state
     if by != "off":
         run.state = before.measured(metrics[BEST_BY], metrics[RANK] if by == "ranking" else None)
     return run.state.best_step != before.best_step
 
 
-def _draw_strip(run: Run, metrics_log: MetricsLog) -> None:
-    """Show what the model imagines now, if `validation.decoder` is set."""
-    if run.strip is None:
-        return
-    with run.accelerator.autocast():
-        image = run.strip.draw(run.world_model, run.accelerator.device, run.folder, run.state.step)
-    if image is not None:
-        metrics_log.show("validation", "imagined", run.state.step, image)
-
-
-def is_out_of_patience(run: Run) -> bool:
-    """Return whether training ends early: too many validations without a better one."""
-    patience, state = run.config.training.patience, run.state
-    if patience is None or state.best_step is None:
+def is_done(run: Run) -> bool:
+    """Return whether training ends: all steps are done, or there were too many validations without a better one."""
+    training, state = run.config.training, run.state
+    if state.step >= training.steps:
+        return True
+    if training.patience is None or state.best_step is None:
         return False
-    return state.step - state.best_step >= patience * run.config.validation.every
+    return state.step - state.best_step >= training.patience * run.config.validation.every
 
 
 def validation_metrics(found: Validation) -> dict[str, Any]:
@@ -101,7 +97,11 @@ def _measured(run: Run) -> Validation:
     moves: list[RolloutStart] = []
     encoded = (run.strip.seen(batch, encode(run, batch)) if run.strip else encode(run, batch) for batch in batches)
     errors = prediction_errors(run.world_model, _moves_kept(run, encoded, len(windows), moves))
-    return Validation(errors, _ranking(run, moves) if moves else None)
+    if not moves:
+        return Validation(errors, None)
+    config, space = run.config.validation, run.dataset.spaces.action
+    probes = ProbeOptions(samples=config.ranking_samples, reach_cm=config.ranking_reach_cm, at_once=_AT_ONCE)
+    return Validation(errors, rank_actions(run.world_model, moves, space, probes, seed=0))
 
 
 def _moves_kept(
@@ -116,12 +116,6 @@ def _moves_kept(
                 moves += moves_of(batch, row, first + row, space, config.ranking_reach_cm / 100)
         first += len(batch.starts)
         yield batch
-
-
-def _ranking(run: Run, moves: list[RolloutStart]) -> ActionRanking:
-    config = run.config.validation
-    probes = ProbeOptions(samples=config.ranking_samples, reach_cm=config.ranking_reach_cm, at_once=_AT_ONCE)
-    return rank_actions(run.world_model, moves, run.dataset.spaces.action, probes, seed=0)
 
 
 def validate_base(run: Run, reporter: Reporter) -> Validation | None:
@@ -141,10 +135,8 @@ def validate_base(run: Run, reporter: Reporter) -> Validation | None:
     if run.world_model.fresh_heads is not None:
         reporter.note(_NOT_ASKED)
         return found
-    raise InputError(
-        where="model.base",
-        found=f"on the validation clips its one-step error is {error:.2f} times that of copying the last frame",
-        needed="a base that is better than doing nothing (below 1)",
-        fix="Check the checkpoint, data.stride, data.camera, the order of the state and the gripper's direction;"
-        " to adapt it anyway, set training.allow_weak_base=true",
-    )
+    said = f"on the validation clips its one-step error is {error:.2f} times that of copying the last frame"
+    needed = "a base that is better than doing nothing (below 1)"
+    fix = "Check the checkpoint, data.stride, data.camera, the order of the state and the gripper's direction;"
+    fix += " to adapt it anyway, set training.allow_weak_base=true"
+    raise InputError(where="model.base", found=said, needed=needed, fix=fix)

@@ -280,7 +280,7 @@ def test_a_file_that_is_not_a_whole_encoder_is_refused(rewritten, change: Any, m
 @pytest.mark.parametrize(
     ("path", "encoder", "message"),
     [
-        (V21, {"heads": None}, "width 64, whose attention heads the tensors do not show.*Set model.encoder.heads"),
+        (V21, {"heads": None}, "width 64, .*the tensors do not show its heads.*Set model.encoder.heads"),
         (V21, {"heads": 5}, "64 is not a multiple of encoder.heads 5"),
         (V2, {"frame": "image"}, "V-JEPA 2 has no path for images"),
         (V2, {"key": "ema_encoder"}, r"no ema_encoder .*Set model.encoder.key"),
@@ -323,7 +323,7 @@ def test_a_folder_that_is_damaged_is_refused(tmp_path: Path) -> None:
     shard.unlink()
     with pytest.raises(InputError, match=r"tensors do not fit \(missing: "):
         model_of(folder)
-    with pytest.raises(InputError, match="Leave it out"):
+    with pytest.raises(InputError, match="Leave the key out"):
         model_of(folder, key="encoder")
 
 

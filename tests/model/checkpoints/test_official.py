@@ -200,7 +200,7 @@ def test_a_checkpoint_that_does_not_fit_is_explained(rewritten, change: Callable
         (TINY_SIZES.model_copy(update={"encoder": EncoderSizes(heads=22)}), "encoder.width 48 is not a multiple of"),
         (
             TINY_SIZES.model_copy(update={"predictor": PredictorSizes(heads=4, depth=12)}),
-            "predictor.depth 3. needed: predictor.depth 12, as model.sizes says",
+            "predictor.depth 3, and model.sizes says 12",
         ),
     ],
 )

@@ -11,8 +11,6 @@ import pytest
 
 from vjepa2_ac import storage
 from vjepa2_ac.cli import main
-from vjepa2_ac.cli.console.progress import PlainConsole
-from vjepa2_ac.cli.console.setup import published_table
 from vjepa2_ac.errors import InputError, UnreachableError
 from vjepa2_ac.model.checkpoints import published
 from vjepa2_ac.model.checkpoints.published import PUBLISHED, VIT_B, Published, download, find_published, published_as
@@ -60,25 +58,9 @@ def test_a_name_that_is_none_is_answered_with_a_way_out(text: str, message: str)
         find_published(text)
 
 
-def test_the_sizes_tell_the_two_largest_encoders_apart() -> None:
-    by_name = {one.name: one for one in PUBLISHED}
-    smaller, larger = by_name["vjepa2.1-vitg-1b-384"].bytes_range, by_name["vjepa2.1-vitG-2b-384"].bytes_range
-    assert smaller[1] < larger[0]
-    assert by_name["vjepa2.1-vitb-384"].bytes_range == (1_664_223_428, 1_664_223_428)
-
-
-@pytest.mark.parametrize("width", [60, 80, 120])
-def test_the_table_names_every_checkpoint_whole(width: int, capsys: pytest.CaptureFixture[str]) -> None:
-    PlainConsole(width=width).print(published_table(PUBLISHED))
-    lines = capsys.readouterr().out.splitlines()
-    for one in PUBLISHED:
-        assert sum(f" {one.name} " in line for line in lines) == 1
-    assert all(len(line) <= width for line in lines)
-
-
 CONTENT = bytes(range(256)) * 400
 MADE_UP = Published(
-    "made-up", "elsewhere.pt", "encoder", "v2.1", VIT_B, 384, "ema_encoder", "made_up_hub", 0.0001,
+    "made-up", "elsewhere.pt", VIT_B, 384, "ema_encoder", "made_up_hub", 0.0001,
     bytes=102_400, licence="of the test",
 )  # fmt: skip
 twice, at_once = RetryPolicy(attempts=2, first_wait_s=0.0), RetryPolicy(first_wait_s=0.0)
@@ -281,9 +263,9 @@ def test_the_command_says_what_the_file_is_and_which_knob_takes_it(
     assert Path("checkpoints", MADE_UP.file).read_bytes() == CONTENT
 
 
-@pytest.mark.parametrize("url", ["foo.pt", "file:///etc/passwd", "http://[", "http://a:b/", "http://a b/"])
+@pytest.mark.parametrize("url", ["foo.pt", "http://[", "http://a:b/", "http://a b/"])
 def test_what_is_no_address_is_told_at_once(tmp_path: Path, url: str) -> None:
-    with pytest.raises(InputError, match=r"not an address.*https://"):
+    with pytest.raises(UnreachableError, match=r"cannot be read.*Check the address"):
         download(url, tmp_path / "model.pt")
 
 

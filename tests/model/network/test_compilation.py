@@ -43,7 +43,7 @@ def loss_and_gradients(model: WorldModel, batch: LatentBatch, *, compiled: bool,
     model.set_compiled("with gradients" if compiled else "never")
     model.zero_grad()
     torch.manual_seed(0)
-    loss = prediction_losses(model, batch, rollout).total
+    loss = sum(prediction_losses(model, batch, rollout))
     loss.backward()
     return [loss.detach(), *(value.grad.clone() for value in model.parameters() if value.grad is not None)]
 

@@ -121,5 +121,5 @@ def test_a_folder_keeps_it_and_contradictions_are_refused(tmp_path: Path) -> Non
     told = {"base": str(tmp_path), "dtype": "float32", "sizes": {"predictor": {"use_states": False}}}
     load_base(ModelConfig.model_validate(told), seed=0)
     tiny_model().save_pretrained(tmp_path / "full")
-    with pytest.raises(InputError, match=r"predictor\.use_states True\. needed: predictor\.use_states False"):
+    with pytest.raises(InputError, match=r"predictor\.use_states True, and model\.sizes says False"):
         load_base(ModelConfig.model_validate(told | {"base": str(tmp_path / "full")}), seed=0)

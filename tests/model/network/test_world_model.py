@@ -180,13 +180,6 @@ def test_each_frame_is_encoded_by_itself(model: WorldModel, inputs) -> None:
         torch.testing.assert_close(together[:, time : time + 1], alone, rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize("chunk", [1, 3, 100])
-def test_chunks_change_nothing(model: WorldModel, inputs, chunk: int) -> None:
-    torch.testing.assert_close(
-        model.encode(inputs.frames, chunk=chunk), model.encode(inputs.frames), rtol=1e-5, atol=1e-5
-    )
-
-
 def test_latents_are_normalised(model: WorldModel, inputs) -> None:
     latents = model.encode(inputs.frames)
     torch.testing.assert_close(latents.mean(dim=-1), torch.zeros(2, 4, 9), rtol=0, atol=1e-5)

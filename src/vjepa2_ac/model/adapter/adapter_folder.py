@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
+from peft import set_peft_model_state_dict
 from pydantic import Field
 from torch import Tensor
 
@@ -22,7 +23,6 @@ from vjepa2_ac.model.adapter.lora import (
     knobs_of,
     lora_config,
     lora_weights,
-    set_lora_weights,
     set_trainable,
     train_everything,
     wrap,
@@ -125,7 +125,7 @@ def _load_lora(model: WorldModel, folder: Path) -> None:
             if (found := getattr(knobs, name)) != (needed := getattr(own, name)):
                 found, needed = f"an adapter with {name} {found}", f"{needed}, as the model has"
                 raise InputError(where=str(folder), found=found, needed=needed)
-    set_lora_weights(model, _read_weights(folder / LORA_WEIGHTS, lora_weights(model)))
+    set_peft_model_state_dict(model.predictor, _read_weights(folder / LORA_WEIGHTS, lora_weights(model)))
 
 
 def _read_card(folder: Path, model: WorldModel) -> Card:
@@ -143,19 +143,13 @@ def _read_card(folder: Path, model: WorldModel) -> Card:
         ("encoder", encoder, card.encoder, f": {card.encoder_in_words}", f": {model.encoder_in_words}"),
     ):
         if found != needed:
-            raise InputError(
-                where=str(path),
-                found=f"an adapter trained on another {part} ({needed[:12]}{trained_on})",
-                needed=f"one trained on this model's {part} ({found[:12]}{this})",
-                fix="Set model.base (or model.encoder) to what it was trained on",
-            )
+            own, others = f"{found[:12]}{this}", f"{needed[:12]}{trained_on}"
+            said = f"an adapter trained on another {part} ({others}) than this model's ({own})"
+            fix = "Set model.base (or model.encoder) to what it was trained on"
+            raise InputError(where=str(path), found=said, fix=fix)
     if model.adaptation is not None and model.adaptation.kind != card.kind:
-        raise InputError(
-            where=str(folder),
-            found=f"an adapter of kind {card.kind}",
-            needed=f"one of kind {model.adaptation.kind}, as the model has",
-            fix="Set adapter.kind to the one it was trained with",
-        )
+        said = f"an adapter of kind {card.kind}, and the model has one of kind {model.adaptation.kind}"
+        raise InputError(where=str(folder), found=said, fix="Set adapter.kind to the one it was trained with")
     return card
 
 

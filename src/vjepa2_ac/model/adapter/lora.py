@@ -27,7 +27,7 @@ from vjepa2_ac.model.quiet_imports import quiet_imports
 from vjepa2_ac.storage.structured import record_of, shown
 
 with quiet_imports():
-    from peft import LoraConfig, PeftModel, get_peft_model, get_peft_model_state_dict, set_peft_model_state_dict
+    from peft import LoraConfig, PeftModel, get_peft_model, get_peft_model_state_dict
     from peft.tuners.lora import Linear, LoraLayer
 
 _SETS = {"attention": ("q", "k", "v", "o"), "mlp": ("fc1", "fc2")}
@@ -90,16 +90,9 @@ class TrainableReport(NamedTuple):
     predictor: int
     total: int
 
-    @property
-    def share(self) -> float:
-        """Trained parameters over the predictor's own."""
-        return self.trained / self.predictor
-
     def __str__(self) -> str:
-        return (
-            f"{self.trained:,} parameters are trained: {self.share:.2%} of the predictor's {self.predictor:,};"
-            f" the model has {self.total:,}"
-        )
+        share = f"{self.trained / self.predictor:.2%} of the predictor's {self.predictor:,}"
+        return f"{self.trained:,} parameters are trained: {share}; the model has {self.total:,}"
 
 
 def add_adapter(model: WorldModel, config: AdapterConfig, seed: int) -> None:
@@ -164,16 +157,11 @@ def with_adapter(predictor: PredictorNetwork, config: AdapterConfig, start: bool
 
 
 def trainable_report(model: WorldModel) -> TrainableReport:
-    """Return the number of trained parameters, of the predictor's own, and of the model's without an adapter."""
+    """Return the number of trained parameters (also if they are frozen now), of the predictor's own, and of all."""
+    trained = 0 if model.adaptation is None else sum(value.numel() for value in _added(model))
     own = sum(value.numel() for value in base_weights(model.base_predictor).values())
     encoder = sum(value.numel() for value in model.encoder.parameters())
-    return TrainableReport(sum(p.numel() for p in model.parameters() if p.requires_grad), own, own + encoder)
-
-
-def adapted_report(model: WorldModel) -> TrainableReport:
-    """Return the report of a model with an adapter as it was when it was trained, also if it is frozen now."""
-    trained = (value.numel() for name, value in model.predictor.named_parameters() if _is_trained(name))
-    return trainable_report(model)._replace(trained=sum(trained))
+    return TrainableReport(trained, own, own + encoder)
 
 
 def lora_layers(model: WorldModel) -> dict[str, Any]:
@@ -237,11 +225,6 @@ def lora_weights(model: WorldModel) -> dict[str, Tensor]:
     return dict(get_peft_model_state_dict(model.predictor, save_embedding_layers=False))
 
 
-def set_lora_weights(model: WorldModel, weights: dict[str, Tensor]) -> None:
-    """Load what `lora_weights` returned."""
-    set_peft_model_state_dict(model.predictor, weights)
-
-
 def lora_config(model: WorldModel) -> Any:
     """Return the config that is written: it names its layers, and so holds no regular expression of the user's."""
     predictor: Any = model.predictor
@@ -270,10 +253,17 @@ def lora_config(model: WorldModel) -> Any:
 
 def set_trainable(model: WorldModel, trainable: bool) -> None:
     """Thaw or freeze what was added."""
+    model.predictor.requires_grad_(False)
+    for value in _added(model):
+        value.requires_grad_(trainable)
+
+
+def _added(model: WorldModel) -> Iterator[nn.Parameter]:
+    """Yield what is trained: an adapter and whole heads, or every weight of the predictor that has an input."""
     lora = isinstance(model.predictor, PeftModel)
     for name, value in model.predictor.named_parameters():
-        chosen = _is_trained(name) if lora else name.split(".", 1)[0] not in model.base_predictor.unused_layers
-        value.requires_grad_(trainable and chosen)
+        if _is_trained(name) if lora else name.split(".", 1)[0] not in model.base_predictor.unused_layers:
+            yield value
 
 
 def knobs_of(values: Mapping[str, Any], *, where: str) -> AdapterConfig:
@@ -325,11 +315,8 @@ def _peft_arguments(predictor: PredictorNetwork, config: AdapterConfig) -> dict[
     """
     whole = config.modules_to_save
     if missing := [name for name in whole if not hasattr(predictor, name)]:
-        raise InputError(
-            where="adapter.modules_to_save",
-            found=f"{', '.join(missing)}, which this predictor does not have: it was made without states",
-            fix="Leave it out, and set model.sizes.predictor.use_states=false: both are then checked before loading",
-        )
+        found = f"{', '.join(missing)}, which this predictor does not have: it was made without states"
+        raise InputError(where="adapter.modules_to_save", found=found, fix="Leave it out")
     layers = {name for name, layer in predictor.named_modules() if isinstance(layer, nn.Linear)}
     layers -= set(predictor.unused_layers)
     kinds = {name.rpartition(".")[2] for name in layers}
@@ -337,17 +324,12 @@ def _peft_arguments(predictor: PredictorNetwork, config: AdapterConfig) -> dict[
     targets = list(dict.fromkeys(layer for target in config.targets for layer in sets.get(target, (target,))))
     unknown = [target for target in targets if target not in kinds | layers]
     if unknown or not targets:
-        raise InputError(
-            where="adapter.targets",
-            found=", ".join(unknown) + " matches no layer of the predictor" if unknown else "no target",
-            needed=f"some of {', '.join(sorted(kinds))}; or {', '.join(sets)}",
-        )
+        found = ", ".join(unknown) + " matches no layer of the predictor" if unknown else "no target"
+        needed = f"some of {', '.join(sorted(kinds))}; or {', '.join(sets)}"
+        raise InputError(where="adapter.targets", found=found, needed=needed)
     if twice := sorted(set(targets) & set(whole)):
-        raise InputError(
-            where="adapter.modules_to_save",
-            found=f"{', '.join(twice)}, which adapter.targets names too",
-            needed="each layer once: trained whole, or with an adapter",
-        )
+        found = f"{', '.join(twice)}, which adapter.targets names too: a layer is trained whole, or with an adapter"
+        raise InputError(where="adapter.modules_to_save", found=found)
     arguments = {peft: getattr(config, ours) for peft, ours in PEFT_NAMES.items()}
     return arguments | {"target_modules": targets, "modules_to_save": list(whole) or None} | config.peft
 

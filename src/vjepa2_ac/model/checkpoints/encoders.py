@@ -71,12 +71,8 @@ def find_encoder(config: EncoderConfig) -> FoundEncoder:
         folder = path or from_hub(config.path, _ON_THE_HUB, where=f"model.encoder.path: {config.path}")
         found = _in_folder(folder, config, name=config.path if path is None else path.name)
     if config.heads not in {None, found.sizes.heads}:
-        raise InputError(
-            where=found.where,
-            found=f"{found.sizes.heads} attention heads",
-            needed=f"{config.heads}, as model.encoder.heads says",
-            fix="Leave out model.encoder.heads",
-        )
+        said = f"{found.sizes.heads} attention heads, and model.encoder.heads says {config.heads}"
+        raise InputError(where=found.where, found=said, fix="Leave out model.encoder.heads")
     return found
 
 
@@ -138,12 +134,9 @@ def encoder_in_file(file: MetaFile, key: str | None, frame: FramePath, heads: in
         raise file.lacks(f"tensor {missing} in {key}") from None
     heads = HEADS.get(width, heads)
     if heads is None:
-        raise InputError(
-            where=str(file.path),
-            found=f"an encoder of width {width}, whose attention heads the tensors do not show",
-            needed=f"a published width ({', '.join(map(str, HEADS))}), or the heads",
-            fix="Set model.encoder.heads to those it was trained with: other ones give other latents without an error",
-        )
+        said = f"an encoder of width {width}, which is none of the published ones: the tensors do not show its heads"
+        fix = "Set model.encoder.heads to those it was trained with: other ones give other latents without an error"
+        raise InputError(where=str(file.path), found=said, fix=fix)
     known = published_as(file.path.name)
     return FoundEncoder(
         where=f"{file.path}: {key}",
@@ -184,12 +177,8 @@ def _in_folder(folder: Path, config: EncoderConfig, *, name: str) -> FoundEncode
     """Return the encoder in a folder of transformers or of this project; `name` is what the user called it."""
     card = read_json_object(folder / CONFIG, needed=ENCODER_NEEDED, fix=FIX)
     if config.key is not None:
-        raise InputError(
-            where=f"model.encoder.key: {config.key}",
-            found=f"{name}, a folder, which holds one encoder",
-            needed="no key: keys are of Meta's .pt files",
-            fix="Leave it out",
-        )
+        found = f"{name}, a folder, which holds one encoder"
+        raise InputError(where=f"model.encoder.key: {config.key}", found=found, fix="Leave the key out")
     if card.get("format") != FORMAT:
         return _of_transformers(folder, card, config.frame, name)
     model = read_sizes(folder)

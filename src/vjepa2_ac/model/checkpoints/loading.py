@@ -71,12 +71,9 @@ def load_base(config: ModelConfig, *, seed: int) -> WorldModel:
         return load_official(path, config.sizes, dtype)
     file = None if path.is_dir() else MetaFile.open(path)
     if found is not None and (file is None or any(key in file.parts for key in ENCODER_KEYS)):
-        raise InputError(
-            where=f"model.base: {config.base}",
-            found=f"an encoder of its own, and model.encoder names another ({found.where})",
-            needed="the encoder that the predictor was trained on: on other latents it predicts noise",
-            fix="Leave out model.encoder; or train a fresh predictor on it, with model.random in place of model.base",
-        )
+        said = f"an encoder of its own, and model.encoder names another ({found.where}), on which it predicts noise"
+        fix = "Leave out model.encoder; or train a fresh predictor on it, with model.random in place of model.base"
+        raise InputError(where=f"model.base: {config.base}", found=said, fix=fix)
     if file is not None and found is not None:
         return _load_predictor(file, found, config.sizes, dtype)
     check_sizes(read_sizes(path), config.sizes, where=f"model.base: {config.base}")
@@ -131,14 +128,10 @@ def to_official(model: WorldModel) -> dict[str, Any]:
     if model.predictor is not model.base_predictor:
         raise ValueError("an adapter is on: merge_adapter first")
     if not model.sizes.predictor.use_states or widths_of_model(model.sizes) != POSE_WIDTHS:
-        raise InputError(
-            where="the official format",
-            found=f"a model that takes {widths_as_text(model.sizes)}"
-            if model.sizes.predictor.use_states
-            else "a predictor without states",
-            needed=f"states and actions of {POSE_WIDTHS.state} numbers: Meta's code has no other predictor",
-            fix="Export it with --to merged (WorldModel.save_pretrained), which `model.base` takes",
-        )
+        found = f"a model that takes {widths_as_text(model.sizes)}"
+        needed = f"states and actions of {POSE_WIDTHS.state} numbers: Meta's code has no other predictor"
+        fix = "Export it with --to merged (WorldModel.save_pretrained), which `model.base` takes"
+        raise InputError(where="the official format", found=found, needed=needed, fix=fix)
     encoder = to_official_names(model.present_encoder.state_dict(), part_of(model.sizes.encoder.family))
     return {
         "encoder": encoder,
@@ -167,13 +160,10 @@ def _with_predictor(file: MetaFile, found: FoundEncoder, given: ModelSizes, dtyp
     """Return the model of the predictor in a file and an encoder."""
     predictor = file.tensors("predictor")
     if "mask_tokens" in {name.partition(".")[0] for name in predictor} and "action_encoder.weight" not in predictor:
-        raise InputError(
-            where=f"model.base: {file.path}",
-            found="a checkpoint of pretraining: its predictor fills in masked patches, and knows no actions",
-            needed="a checkpoint of V-JEPA 2-AC (`vjepa2-ac download`)",
-            fix="Its encoder can be used: set model.encoder.path to this file, and model.random in place of model.base"
-            " for a fresh predictor (configs/scratch_vitb.yaml)",
-        )
+        said = "a checkpoint of pretraining: its predictor fills in masked patches, and knows no actions"
+        fix = "Its encoder can be used: set model.encoder.path to this file, and model.random in place of model.base"
+        fix += " for a fresh predictor (configs/scratch_vitb.yaml)"
+        raise InputError(where=f"model.base: {file.path}", found=said, fix=fix)
     model = _on_encoder(found, _sizes(file, predictor, found, given), dtype)
     model.encoder_origin = None  # the file is the model's own
     fill(

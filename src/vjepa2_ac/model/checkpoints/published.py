@@ -14,7 +14,6 @@ import urllib.error
 import urllib.request
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from vjepa2_ac import storage
 from vjepa2_ac.config.model import Family
@@ -35,8 +34,6 @@ class Published:
 
     name: str  # for `vjepa2-ac download`; names differ by more than the case of a letter
     remote: str  # Meta's name of the file
-    holds: Literal["world model", "encoder"]
-    family: Family
     encoder: EncoderShape
     image_size: int  # at which it was trained last, in pixels
     key: str  # of the encoder's weights in the file
@@ -44,6 +41,16 @@ class Published:
     gigabytes: float  # about: encoder, its average, predictor and the optimizer's moments, in float32
     bytes: int | None = None  # exactly, where known
     licence: str = "MIT"  # of Meta's repository; Meta's server sends none with the file
+
+    @property
+    def holds(self) -> str:
+        """What it is."""
+        return "world model" if self.name == OFFICIAL else "encoder"
+
+    @property
+    def family(self) -> Family:
+        """The family of its encoder."""
+        return "v2.1" if self.name.startswith("vjepa2.1") else "v2"
 
     @property
     def url(self) -> str:
@@ -61,57 +68,29 @@ class Published:
         return f"about {self.gigabytes:g} GB" if self.bytes is None else f"{self.bytes:,} bytes"
 
     @property
-    def bytes_range(self) -> tuple[int, int]:
-        """The least and the largest size that is taken for this file, in bytes; equal where it is known exactly.
-
-        The range around an estimate excludes what a proxy answers, and the file of the next encoder.
-        """
-        if self.bytes is not None:
-            return self.bytes, self.bytes
-        return round(self.gigabytes * (1 - _TOLERANCE) * 10**9), round(self.gigabytes * (1 + _TOLERANCE) * 10**9)
-
-    @property
     def knob(self) -> str:
         """The knob of a config that takes the file."""
-        return "model.base" if self.holds == "world model" else "model.encoder.path"
+        return "model.base" if self.name == OFFICIAL else "model.encoder.path"
 
 
 PUBLISHED: tuple[Published, ...] = (
+    Published(OFFICIAL, "vjepa2-ac-vitg.pt", VIT_g, 256, "encoder", "vjepa2_ac_vit_giant", 11.7),
+    Published("vjepa2-vitl", "vitl.pt", VIT_L, 256, "target_encoder", "vjepa2_vit_large", 5.1),
+    Published("vjepa2-vith", "vith.pt", VIT_H, 256, "target_encoder", "vjepa2_vit_huge", 10.4),
+    Published("vjepa2-vitg", "vitg.pt", VIT_g, 256, "target_encoder", "vjepa2_vit_giant", 16.5),
+    Published("vjepa2-vitg-384", "vitg-384.pt", VIT_g, 384, "target_encoder", "vjepa2_vit_giant_384", 16.5),
     Published(
-        "vjepa2-ac-vitg", "vjepa2-ac-vitg.pt", "world model", "v2", VIT_g, 256, "encoder",
-        "vjepa2_ac_vit_giant", 11.7,
+        "vjepa2.1-vitb-384", "vjepa2_1_vitb_dist_vitG_384.pt", VIT_B, 384, "ema_encoder", "vjepa2_1_vit_base_384",
+        1.66, 1_664_223_428,
     ),
     Published(
-        "vjepa2-vitl", "vitl.pt", "encoder", "v2", VIT_L, 256, "target_encoder",
-        "vjepa2_vit_large", 5.1,
+        "vjepa2.1-vitl-384", "vjepa2_1_vitl_dist_vitG_384.pt", VIT_L, 384, "ema_encoder", "vjepa2_1_vit_large_384", 5.1
     ),
     Published(
-        "vjepa2-vith", "vith.pt", "encoder", "v2", VIT_H, 256, "target_encoder",
-        "vjepa2_vit_huge", 10.4,
+        "vjepa2.1-vitg-1b-384", "vjepa2_1_vitg_384.pt", VIT_g, 384, "target_encoder", "vjepa2_1_vit_giant_384", 16.5
     ),
     Published(
-        "vjepa2-vitg", "vitg.pt", "encoder", "v2", VIT_g, 256, "target_encoder",
-        "vjepa2_vit_giant", 16.5,
-    ),
-    Published(
-        "vjepa2-vitg-384", "vitg-384.pt", "encoder", "v2", VIT_g, 384, "target_encoder",
-        "vjepa2_vit_giant_384", 16.5,
-    ),
-    Published(
-        "vjepa2.1-vitb-384", "vjepa2_1_vitb_dist_vitG_384.pt", "encoder", "v2.1", VIT_B, 384, "ema_encoder",
-        "vjepa2_1_vit_base_384", 1.66, 1_664_223_428,
-    ),
-    Published(
-        "vjepa2.1-vitl-384", "vjepa2_1_vitl_dist_vitG_384.pt", "encoder", "v2.1", VIT_L, 384, "ema_encoder",
-        "vjepa2_1_vit_large_384", 5.1,
-    ),
-    Published(
-        "vjepa2.1-vitg-1b-384", "vjepa2_1_vitg_384.pt", "encoder", "v2.1", VIT_g, 384, "target_encoder",
-        "vjepa2_1_vit_giant_384", 16.5,
-    ),
-    Published(
-        "vjepa2.1-vitG-2b-384", "vjepa2_1_vitG_384.pt", "encoder", "v2.1", VIT_G, 384, "target_encoder",
-        "vjepa2_1_vit_gigantic_384", 29.8,
+        "vjepa2.1-vitG-2b-384", "vjepa2_1_vitG_384.pt", VIT_G, 384, "target_encoder", "vjepa2_1_vit_gigantic_384", 29.8
     ),
 )  # fmt: skip
 
@@ -136,12 +115,9 @@ def find_published(text: str) -> Published:
     folded = [name.casefold() for name in names]
     near = difflib.get_close_matches(_plain(text.rpartition("/")[2]).casefold(), folded, n=3)
     close = " or ".join(dict.fromkeys(one.name for name, one in names.items() if name.casefold() in near))
-    raise InputError(
-        where=f"download {text}",
-        found="no published checkpoint of this name",
-        fix=f"{f'Did you mean {close}? ' if close else ''}`vjepa2-ac download --list` shows all; where the file goes is"
-        " said by --to",
-    )
+    hint = f"Did you mean {close}? " if close else ""
+    fix = f"{hint}`vjepa2-ac download --list` shows all; where the file goes is said by --to"
+    raise InputError(where=f"download {text}", found="no published checkpoint of this name", fix=fix)
 
 
 def _plain(name: str) -> str:
@@ -150,7 +126,6 @@ def _plain(name: str) -> str:
 
 CHUNK_BYTES = 2**20
 _POLICY = RetryPolicy(attempts=5, first_wait_s=2.0, total_s=math.inf)
-_MEGABYTE = 10**6
 _PROXY = "Check the URL, and whether a proxy answers in the server's place"
 
 
@@ -174,12 +149,10 @@ def download(
 
     Raises:
         InputError: The server does not say how large the file is, or sends another size than the published file can
-            have; the disk has too little space; the address is none; the path cannot be written.
+            have; the disk has too little space; the path cannot be written.
         UnreachableError: The server refuses, or cannot be reached.
     """
     path = Path(path)
-    if not url.lower().startswith(("http://", "https://")):
-        raise _no_address(url)
     with storage.user_can_write(path):
         if path.is_dir():
             raise InputError(where=str(path), found="a folder", needed="the name of a file", fix="Name a file in it")
@@ -210,9 +183,9 @@ def _fetch(url: str, part: Path, known: Published | None, reporter: Reporter, ti
     start = _size(part)
     try:
         request = urllib.request.Request(url, headers={"Range": f"bytes={start}-"} if start else {})  # noqa: S310  # the user's
-        answer = urllib.request.urlopen(request, timeout=timeout_s)  # noqa: S310  # of http or https
-    except (http.client.InvalidURL, ValueError):
-        raise _no_address(url) from None
+        answer = urllib.request.urlopen(request, timeout=timeout_s)  # noqa: S310  # the user's
+    except http.client.InvalidURL as error:
+        raise ValueError(error) from None  # it does not pass
     except urllib.error.HTTPError as error:
         if error.code != 416:
             raise
@@ -230,33 +203,28 @@ def _fetch(url: str, part: Path, known: Published | None, reporter: Reporter, ti
         _require_size(known, whole, where=url)
         free = storage.free_bytes(part.parent.absolute()) + _size(part)
         if whole > free:
-            raise InputError(
-                where=str(part),
-                found=f"{free / 1e9:.4g} GB free on its disk",
-                needed=f"{whole / 1e9:.4g} GB, of which {start / 1e9:.4g} GB are here",
-                fix="Free some space, or name a file on a larger disk with --to",
-            )
+            needed = f"{whole / 1e9:.4g} GB, of which {start / 1e9:.4g} GB are here"
+            fix = "Free some space, or name a file on a larger disk with --to"
+            raise InputError(where=str(part), found=f"{free / 1e9:.4g} GB free on its disk", needed=needed, fix=fix)
         show = reporter.task(f"{part.name.removesuffix('.part')} (MB)")
         with storage.user_can_write(part), part.open("ab" if start else "wb") as file:
             while block := answer.read(CHUNK_BYTES):
                 file.write(block)
-                show(file.tell() // _MEGABYTE, whole // _MEGABYTE)
+                show(file.tell() // 10**6, whole // 10**6)
         if _size(part) < whole:
             raise http.client.IncompleteRead(b"", whole - _size(part))
 
 
 def _require_size(known: Published | None, size: int, *, where: str) -> None:
+    """Refuse another size than the known one; the range around an estimate excludes a proxy's answer."""
     if known is None:
         return
-    least, most = known.bytes_range
+    around = [round(known.gigabytes * share * 10**9) for share in (1 - _TOLERANCE, 1 + _TOLERANCE)]
+    least, most = around if known.bytes is None else (known.bytes, known.bytes)
     if not least <= size <= most:
         needed = f"{known.name}, of {least:,} to {most:,} bytes"
         fix = f"{_PROXY}; or delete the file, or name another with --to"
         raise InputError(where=where, found=f"a file of {size:,} bytes", needed=needed, fix=fix)
-
-
-def _no_address(url: str) -> InputError:
-    return InputError(where=f"URL {url!r}", found="not an address", needed="one such as https://host/model.pt")
 
 
 def _size(path: Path) -> int:

@@ -57,14 +57,9 @@ def rotary_tables(layout: TokenLayout, head_dim: int, device: torch.device) -> R
     predictor the frequencies are tiled ([w0..w9, w0..w9]): the released weights were trained so. In V-JEPA 2.1 they are
     interleaved ([w0, w0, w1, w1, ..]).
 
-    Raises:
-        ValueError: The head has no pairs to rotate: its size is odd.
-
     Source: facebookresearch/vjepa2 @ c2963a4, src/models/utils/modules.py, rotate_queries_or_keys and ACRoPEAttention;
     of V-JEPA 2.1 @ 204698b, app/vjepa_2_1/models/utils/modules.py.
     """
-    if head_dim % 2:
-        raise ValueError(f"a head of {head_dim} cannot be rotated in pairs: width / heads must be even")
     part = 2 * ((head_dim // 3) // 2)
     # Tables made in inference mode or under FakeTensor must not end up in the cache of a training run.
     with torch.inference_mode(False), torch.no_grad():

@@ -90,11 +90,8 @@ def _compiled(function: Callable[..., Any], backend: str, way_out: str, dynamic:
         try:
             return whole(*args, **kwargs)
         except FailOnRecompileLimitHit as error:
-            raise InputError(
-                where=way_out.partition("=")[0],
-                found=f"more than {config.recompile_limit} sizes of batches and clips, each of which is compiled anew",
-                needed="fewer: without compilation this would be slow, or hold all attention scores in memory",
-                fix=f"Set {way_out}, or use fewer sizes",
-            ) from error
+            found = f"more than {config.recompile_limit} sizes of batches and clips, each of which is compiled anew"
+            fix = f"Set {way_out}, or use fewer sizes"
+            raise InputError(where=way_out.partition("=")[0], found=found, fix=fix) from error
 
     return call

@@ -185,18 +185,13 @@ class PredictorNetwork(nn.Module):
 
 def predictor_fields(sizes: ModelSizes) -> dict[str, Any]:
     """Return the sizes of the predictor of a world model, by the names of `predictor.PredictorConfig`."""
+    own = sizes.predictor.model_dump()
+    renamed = {"width": "hidden_size", "depth": "num_hidden_layers", "heads": "num_attention_heads"}
     return {
         "image_size": sizes.image_size,
         "patch_size": sizes.patch_size,
         "latent_dim": sizes.encoder.width,
-        "hidden_size": sizes.predictor.width,
-        "num_hidden_layers": sizes.predictor.depth,
-        "num_attention_heads": sizes.predictor.heads,
-        "mlp_ratio": sizes.predictor.mlp_ratio,
-        "use_extrinsics": sizes.predictor.use_extrinsics,
-        "use_states": sizes.predictor.use_states,
-        "action_dim": sizes.predictor.action_dim,
-        "state_dim": sizes.predictor.state_dim,
+        **{renamed.get(name, name): value for name, value in own.items()},
     }
 
 
@@ -236,8 +231,6 @@ class LatentDynamics(nn.Module):
 
         With a cache the steps come after those in it; the first `keep` of them are added to it (None: all).
         """
-        if cache is None:
-            return normalise_latents(self.predictor(latents, actions, states, extrinsics))
         return normalise_latents(self.predictor(latents, actions, states, extrinsics, cache=cache, keep=keep))
 
     def rollout(

@@ -258,12 +258,8 @@ def require_trained(heads: tuple[str, ...], config: AdapterConfig) -> None:
     if config.kind == "none" or not missing:
         return
     whole = ", ".join([*config.modules_to_save, *missing])
-    raise InputError(
-        where="adapter.modules_to_save",
-        found=f"nothing that trains the {_as_text(missing)}, fresh because the data has other widths than the base",
-        needed="fresh heads are trained whole, beside the adapter",
-        fix=f"Set adapter.modules_to_save=[{whole}]",
-    )
+    found = f"nothing that trains the {_as_text(missing)}, fresh because the data has other widths than the base"
+    raise InputError(where="adapter.modules_to_save", found=found, fix=f"Set adapter.modules_to_save=[{whole}]")
 
 
 def fit_heads(model: WorldModel, widths: Widths, seed: int) -> list[str]:

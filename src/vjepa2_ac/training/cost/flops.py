@@ -119,34 +119,19 @@ class _Passes:
             work += self._linear(name, steps, into=False)
         flowing = fed_back or any(self._changes(name) for name in ("predictor_embed", *self._conditions))
         per_step = self._sizes.tokens_per_frame + len(self._conditions)
-        pairs = per_step**2 * sum(keys)
-        for index in range(self._sizes.predictor.depth):
-            block, flowing = self._block(f"blocks.{index}", steps * per_step, pairs, flowing=flowing)
-            work += block
+        product = 2 * per_step**2 * sum(keys) * self._sizes.predictor.width  # of queries and keys, or of values
+        for block in (f"blocks.{index}" for index in range(self._sizes.predictor.depth)):
+            projections = [f"{block}.attn.{name}" for name in ("q", "k", "v")]
+            for name in projections:
+                work += self._linear(name, steps * per_step, into=flowing)
+            query, key, value = (flowing or self._changes(name) for name in projections)
+            # Forward: scores, values by weights. Backward: of values, of weights, and through them of queries and keys.
+            work += _Work(2 * product, (value + (query or key) + query + key) * product)
+            flowing = query or key or value
+            for name in (f"{block}.attn.o", f"{block}.mlp.fc1", f"{block}.mlp.fc2"):
+                work += self._linear(name, steps * per_step, into=flowing)
+                flowing = flowing or self._changes(name)
         return work + self._linear("predictor_proj", patches, into=flowing)
-
-    def _block(self, block: str, tokens: int, pairs: int, *, flowing: bool) -> tuple[_Work, bool]:
-        """Return the work of a block, and whether its output needs a gradient.
-
-        Args:
-            block: Its name.
-            tokens: Whose queries are computed.
-            pairs: Pairs of queries and keys.
-            flowing: Whether its input needs a gradient.
-        """
-        work = _Work()
-        projections = [f"{block}.attn.{name}" for name in ("q", "k", "v")]
-        for name in projections:
-            work += self._linear(name, tokens, into=flowing)
-        query, key, value = (flowing or self._changes(name) for name in projections)
-        product = 2 * pairs * self._sizes.predictor.width
-        # Forward: scores, and values by weights. Backward: of values, of weights, and through them of queries and keys.
-        work += _Work(2 * product, (value + (query or key) + query + key) * product)
-        flowing = query or key or value
-        for name in (f"{block}.attn.o", f"{block}.mlp.fc1", f"{block}.mlp.fc2"):
-            work += self._linear(name, tokens, into=flowing)
-            flowing = flowing or self._changes(name)
-        return work, flowing
 
     def _linear(self, name: str, tokens: int, *, into: bool) -> _Work:
         """Return the work of a linear layer with its adapter; `into`: its input needs a gradient."""

@@ -8,13 +8,13 @@ GPU measures.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
 from typing import Any
 
 from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.encoding.pipeline import FRAMES_AT_ONCE
-from vjepa2_ac.training.cost.step import Kind, StepBytes, measure_step, meta_predictor
+from vjepa2_ac.training.cost.step import StepBytes, measure_step, meta_predictor
 
 GIGABYTE = 10**9
 ALLOWANCE = 3 * GIGABYTE // 2  # CUDA context 0.5, cuBLAS workspaces, fragmentation: not computed but assumed
@@ -62,7 +62,6 @@ class MemoryEstimate:
     latents: int = _part("latents", "of training.batch_size clips, float32")
     encoding: int = _part("encoder, at work", "on model.encode_chunk frames at once; before the predictor")
     step: StepBytes  # the predictor's
-    optimizer_temporaries: int  # AdamW is fused; but on logged steps `update_to_weight` needs the old weights
     validating: int = _part("validation", "instead of all that: clips, keys and values of their rollout")
     caching: int = _part("encoding the cache", "before all that: the encoder alone")
 
@@ -88,7 +87,8 @@ class MemoryEstimate:
         """Return the peak with or without gradient checkpointing."""
         passes = self.step.checkpointed if checkpointing else self.step.stored
         predicting = self.latents + self.step.casts + passes
-        training = self.gradients + max(self.latents + self.encoding, predicting, self.optimizer_temporaries)
+        old_weights = self.trained  # `update_to_weight` needs them on logged steps
+        training = self.gradients + max(self.latents + self.encoding, predicting, old_weights)
         return max(self.standing + max(training, self.validating), self.caching)
 
 
@@ -116,18 +116,17 @@ def _encoder_parameters(sizes: ModelSizes) -> int:
     return total + (of_a_frame + 1) * width + _LEVELS * 2 * width
 
 
-def estimate_memory(config: Config, sizes: ModelSizes, device: Kind = "cuda") -> MemoryEstimate:
+def estimate_memory(config: Config, sizes: ModelSizes) -> MemoryEstimate:
     """Return the memory that a run needs.
 
     Args:
         config: The run.
         sizes: Sizes of its model, such as `model.checkpoints.loading.base_sizes` gives.
-        device: The device type whose rules for saved tensors apply.
 
     Raises:
         InputError: A knob of the adapter does not fit the predictor.
     """
-    parameters, step = count_parameters(config, sizes), measure_step(config, sizes, device)
+    parameters, step = count_parameters(config, sizes), measure_step(config, sizes)
     number = HALF if config.model.dtype == "bfloat16" else FLOAT32
     return MemoryEstimate(
         parameters=parameters,
@@ -141,7 +140,6 @@ def estimate_memory(config: Config, sizes: ModelSizes, device: Kind = "cuda") ->
         latents=_latents(config, sizes, config.training.batch_size),
         encoding=_encoding(config, sizes, config.training.batch_size),
         step=step,
-        optimizer_temporaries=parameters.trained * FLOAT32,
         validating=_validating(config, sizes, step),
         caching=parameters.encoder * number + _caching(config, sizes) if config.data.cache != "off" else 0,
     )
@@ -150,10 +148,11 @@ def estimate_memory(config: Config, sizes: ModelSizes, device: Kind = "cuda") ->
 def ways_to_fit(config: Config, sizes: ModelSizes, available: int) -> list[str] | None:
     """Return the knobs to change, one after the other, until the run fits; None if all of them do not suffice."""
     turned, total = list[str](), _total(config, sizes)
-    for knob, turn in _KNOBS:
+    for knob, changes in _knobs(config):
         if total <= available:
             break
-        lighter = turn(config)
+        sections = {name: getattr(config, name).model_copy(update=values) for name, values in changes.items()}
+        lighter = config.model_copy(update=sections)
         if (less := _total(lighter, sizes)) < total:
             turned.append(f"{knob} replay.{knob}" if config.replay and knob.startswith("data.") else knob)
             config, total = lighter, less
@@ -164,32 +163,20 @@ def _total(config: Config, sizes: ModelSizes) -> int:
     return estimate_memory(config, sizes).total(checkpointing=config.training.gradient_checkpointing)
 
 
-def _with(config: Config, section: str, **changes: object) -> Config:
-    return config.model_copy(update={section: getattr(config, section).model_copy(update=changes)})
-
-
-_KNOBS: tuple[tuple[str, Callable[[Config], Config]], ...] = (
-    ("training.gradient_checkpointing=true", lambda run: _with(run, "training", gradient_checkpointing=True)),
-    (
-        "training.batch_size=1 (and as much more accumulation)",
-        lambda run: _with(run, "training", batch_size=1),
-    ),
-    (
-        "model.dtype=bfloat16 with training.precision=bf16",
-        lambda run: _with(_with(run, "model", dtype="bfloat16"), "training", precision="bf16"),
-    ),
-    ("model.encode_chunk=4", lambda run: _with(run, "model", encode_chunk=min(4, run.model.encode_chunk))),
-    (
-        "data.cache=auto",
-        lambda run: run if run.data.augment.is_on or run.data.takes_latents else _with(run, "data", cache="auto"),
-    ),
-    (
-        "data.frames=8",
-        lambda run: _with(run, "data", frames=min(run.data.frames, max(8, run.training.rollout_steps + 1))),
-    ),
-    ("training.optimizer=adamw_8bit", lambda run: _with(run, "training", optimizer="adamw_8bit")),
-    ("adapter.kind=lora", lambda run: run if run.model.random else _with(run, "adapter", kind="lora")),
-)
+def _knobs(config: Config) -> Iterator[tuple[str, dict[str, dict[str, Any]]]]:
+    """Yield what makes a run lighter, in this order: the knob, for people, and its value by section."""
+    yield "training.gradient_checkpointing=true", {"training": {"gradient_checkpointing": True}}
+    yield "training.batch_size=1 (and as much more accumulation)", {"training": {"batch_size": 1}}
+    bf16 = {"model": {"dtype": "bfloat16"}, "training": {"precision": "bf16"}}
+    yield "model.dtype=bfloat16 with training.precision=bf16", bf16
+    yield "model.encode_chunk=4", {"model": {"encode_chunk": min(4, config.model.encode_chunk)}}
+    if not (config.data.augment.is_on or config.data.takes_latents):
+        yield "data.cache=auto", {"data": {"cache": "auto"}}
+    fewest = max(8, config.training.rollout_steps + 1)
+    yield "data.frames=8", {"data": {"frames": min(config.data.frames, fewest)}}
+    yield "training.optimizer=adamw_8bit", {"training": {"optimizer": "adamw_8bit"}}
+    if not config.model.random:
+        yield "adapter.kind=lora", {"adapter": {"kind": "lora"}}
 
 
 def _moments(config: Config, elements: int) -> int:

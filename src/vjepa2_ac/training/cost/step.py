@@ -12,7 +12,6 @@ Blocks after the first are alike: models of two and of three tell what each furt
 from __future__ import annotations
 
 import weakref
-from contextlib import AbstractContextManager, nullcontext
 from types import SimpleNamespace
 from typing import Any, Literal, NamedTuple
 
@@ -24,7 +23,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
 from vjepa2_ac.config import Config, ModelSizes
-from vjepa2_ac.distributed import PRECISIONS
+from vjepa2_ac.distributed import PRECISIONS, autocast
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.model.adapter.low_rank import CastMatrices
 from vjepa2_ac.model.network.attention import rotary_tables
@@ -65,7 +64,9 @@ def measure_step(config: Config, sizes: ModelSizes, device: Kind = "cuda") -> St
         if depth <= _BLOCKS[1] or config.adapter.peft:  # whose options may make blocks differ
             found = _measure(config, sizes, device)
         else:
-            fewer, more = (_measure(config, _with_depth(sizes, blocks), device) for blocks in _BLOCKS)
+            predictors = (sizes.predictor.model_copy(update={"depth": blocks}) for blocks in _BLOCKS)
+            models = (sizes.model_copy(update={"predictor": predictor}) for predictor in predictors)
+            fewer, more = (_measure(config, model, device) for model in models)
             further = depth - _BLOCKS[0]
             found = tree_map(lambda two, three: two + further * (three - two), fewer, more)
         _measured[key] = StepBytes(*map(max, found))
@@ -213,7 +214,7 @@ def _pass(model: _FakeModel, config: Config, sizes: ModelSizes, storages: LiveSt
     batch = _batch(config, sizes, config.training.batch_size)
     storages.forget()
     model.peaks.clear()
-    with _autocast(config):
+    with autocast(config.training, torch.device("cpu")):
         loss = torch.stack(Objective(model, config.training)(batch)).sum()
     model.end_phase()
     loss.backward()  # type: ignore[no-untyped-call]  # torch
@@ -226,7 +227,7 @@ def _prediction(model: _FakeModel, config: Config, sizes: ModelSizes, storages: 
     states, cameras = batch.states[:, :-1], None if batch.extrinsics is None else batch.extrinsics[:, :-1]
     storages.forget()
     model.eval()
-    with torch.no_grad(), _autocast(config):
+    with torch.no_grad(), autocast(config.training, torch.device("cpu")):
         model.predict(batch.latents[:, :-1], batch.actions, states, cameras)
     return (model.peaks[-1],)
 
@@ -238,15 +239,6 @@ def _batch(config: Config, sizes: ModelSizes, clips: int) -> LatentBatch:
     actions = torch.empty(clips, frames - 1, predictor.action_dim)
     extrinsics = torch.empty(clips, frames, 6) if predictor.use_extrinsics else None
     return LatentBatch(latents, states, actions, extrinsics, ("",) * clips, (0,) * clips)
-
-
-def _autocast(config: Config) -> AbstractContextManager[object]:
-    dtype = PRECISIONS[config.training.precision]
-    return nullcontext() if dtype == torch.float32 else torch.autocast("cpu", dtype)
-
-
-def _with_depth(sizes: ModelSizes, depth: int) -> ModelSizes:
-    return sizes.model_copy(update={"predictor": sizes.predictor.model_copy(update={"depth": depth})})
 
 
 class _CudaNorm(nn.LayerNorm):

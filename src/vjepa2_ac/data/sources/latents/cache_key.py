@@ -88,6 +88,7 @@ def key_of_cache(config: DataConfig, fingerprint: str, encoding: Encoding) -> Ca
         fingerprint: Of its episodes.
         encoding: How frames become latents.
     """
+    knobs = knobs_that_affect(Affects.LATENTS, config)
     return CacheKey({
         "format": FORMAT,
         **encoding.parts,
@@ -98,7 +99,7 @@ def key_of_cache(config: DataConfig, fingerprint: str, encoding: Encoding) -> Ca
         "data set": {
             "source": config.source,
             "episodes": fingerprint,
-            **{name: knobs_that_affect(Affects.LATENTS, section) for name, section in config.own_section.items()},
+            **{name: knobs.get(name, {}) for name in config.own_sections()},
         },
     })  # fmt: skip
 
@@ -106,7 +107,9 @@ def key_of_cache(config: DataConfig, fingerprint: str, encoding: Encoding) -> Ca
 def clip_parts(config: DataConfig) -> dict[str, Any]:
     """Return the parts that determine which frames and other data clips need: checked when a cache is used alone."""
     knobs = knobs_that_affect(Affects.LATENTS, config) | {"stride": config.model_stride}
-    return {f"data.{name}": knobs[name] for name in sorted(knobs.keys() - _OF_THE_FRAMES - config.own_section.keys())}
+    return {
+        f"data.{name}": knobs[name] for name in sorted(knobs.keys() - _OF_THE_FRAMES - config.own_sections().keys())
+    }
 
 
 def require_own_folder(path: Path, key: CacheKey, *, where: str) -> None:
