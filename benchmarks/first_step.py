@@ -62,19 +62,19 @@ def main() -> None:
 
 def choices(controller: Controller, arm: SimulatedArm, problem: TaskProblem) -> Iterator[Float[np.ndarray, " 3"]]:
     """Yield the way to a goal, and the step of lowest energy by true images and by the model: of far and near goal."""
-    shown = demonstrate(problem, arm, DemonstrationSpec(LimitsConfig(xyz=(STEP_M,) * 3)))
-    start, grasp = shown.states[0], gripper_key_frames(shown.states, OF_MODEL_STEPS)[0].frame
+    frames, states = demonstrate(problem, arm, DemonstrationSpec(LimitsConfig(xyz=(STEP_M,) * 3)))
+    start, grasp = states[0], gripper_key_frames(states, OF_MODEL_STEPS)[0].frame
     latents = []
     for step in STEPS:
         put(arm, start + np.append(step, np.zeros(4)), problem.block_start)
         latents.append(controller.encoded(arm.image()))
     actions = torch.from_numpy(np.concatenate([STEPS, np.zeros((len(STEPS), 4))], axis=1)).float()[:, None]
     for frame in (grasp, 1):
-        yield shown.states[frame, :3] - start[:3]
-        goal = controller.encoded(shown.frames[frame])
+        yield states[frame, :3] - start[:3]
+        goal = controller.encoded(frames[frame])
         yield STEPS[int(distance(torch.stack(latents), goal, EnergyConfig()).argmin())]
-        controller.reset(shown.frames[frame])
-        controller.act(shown.frames[0], start)
+        controller.reset(frames[frame])
+        controller.act(frames[0], start)
         assert controller.decision is not None
         assert controller.decision.cost is not None
         with torch.no_grad():

@@ -152,7 +152,8 @@ def _no_password() -> str:
 
 def _loaded(options: argparse.Namespace, goals: KeptGoals | None, extrinsics: np.ndarray | None) -> Served:
     """Load the model, and make a first decision; runs in the planning thread."""
-    from vjepa2_ac.serving.about import in_words, metadata_of, require_steps, roboarena_metadata, warm_up
+    from vjepa2_ac.data.windows import require_stride
+    from vjepa2_ac.serving.about import in_words, metadata_of, roboarena_metadata, warm_up
     from vjepa2_ac.serving.recording import Recorder
     from vjepa2_ac.serving.request import IMAGE_KEYS
     from vjepa2_ac.serving.server import Served
@@ -161,7 +162,9 @@ def _loaded(options: argparse.Namespace, goals: KeptGoals | None, extrinsics: np
     loaded = cli.load_planning_session(options)
     how = SessionOptions(
         options.actions,
-        control_steps=require_steps(loaded.config),
+        control_steps=require_stride(
+            loaded.config.data, to="say how long an action lasts", fix="Say which, as data.stride=4"
+        ),
         image_keys=IMAGE_KEYS if options.image_key is None else (options.image_key,),
         deadline_s=options.deadline,
         dry_run=options.dry_run,

@@ -12,7 +12,6 @@ from vjepa2_ac.errors import InputError
 if TYPE_CHECKING:
     import numpy as np
 
-    from vjepa2_ac.config import Config
     from vjepa2_ac.config.planning import PlanningConfig
     from vjepa2_ac.planning.demonstrations.make_goals import Recording
     from vjepa2_ac.planning.goals import GoalFolder
@@ -79,12 +78,15 @@ def _plan(options: argparse.Namespace) -> int:
 
     Status 1 where the model gives no finite energy.
     """
+    from vjepa2_ac.data.sources.indexed_source import measured_space
+
     state, extrinsics = cli.as_numbers(options.state, "--state"), cli.camera_pose(options.extrinsics)
-    durations = _durations(options)
     cli.require_goals(options.goals)
-    _require_state(state, cli.require_to_plan(options))
+    config = cli.require_to_plan(options)
+    measured_space(config.data, len(state)).require_state(state, "--state")  # how wide, only the model knows
     cli.make_folder(options.out)
-    start, goals, mask = _images(options)
+    goals = _goals_of(options, config.planning.horizon)
+    start, mask = _images(options, goals.goals[0].image)
 
     from vjepa2_ac.cli.console.tables import plan_table
     from vjepa2_ac.evaluation.imagined_plan import imagine_plan
@@ -96,19 +98,13 @@ def _plan(options: argparse.Namespace) -> int:
     session = cli.load_planning_session(options)
     if decoder is not None:
         decoder.require_fit(session.world_model, session.config.data.crop, subject=options.subject)
-    if isinstance(goals, tuple):
-        request = PlanRequest(start, state, goals, durations, mask)
-        names = options.goal
-    else:
-        request = PlanRequest.of_sub_goals(start, state, session.goals_of(goals), mask)
-        names = [str(options.goals)]
-    if not options.durations and isinstance(goals, tuple):
-        request = request.with_equal_durations(session.config.planning.horizon)
+    request = PlanRequest(start, state, session.goals_of(goals), mask)
     with cli.reporter() as reporter:
         reporter.note(_search_line(session.config.planning, on_cpu=session.world_model.device.type == "cpu"))
         progress = reporter.task("planning", "action sequences")
         controller = session.controller(seed=options.seed, extrinsics=extrinsics, progress=progress)
         found = decide(controller, request, nodes=options.nodes, reporter=reporter)
+    names = options.goal or [str(options.goals)]
     about = session.as_dict() | {"start": options.start, "goals": names, "mask": options.mask}
     about["decoder"] = None if decoder is None else decoder.as_dict()
     imagined = None if decoder is None else imagine_plan(found, decoder)
@@ -132,52 +128,37 @@ def _search_line(config: PlanningConfig, *, on_cpu: bool) -> str:
     return text + f". Quick, for a CPU: {_QUICK}" * is_long
 
 
-def _require_state(state: np.ndarray, config: Config) -> None:
-    """Refuse a state that is none of the config's space; how wide a vector is, only the model knows."""
-    from vjepa2_ac.data.sources.indexed_source import measured_space
-    from vjepa2_ac.planning.input_checks import require_numbers
+def _images(options: argparse.Namespace, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return start and mask; refuse what does not fit the goal, before a model is loaded."""
+    from vjepa2_ac.media.images import read_image, require_image, require_mask
 
-    require_numbers(state, measured_space(config.data, len(state)), where="--state")
-
-
-def _images(
-    options: argparse.Namespace,
-) -> tuple[np.ndarray, tuple[np.ndarray, ...] | GoalFolder, np.ndarray | None]:
-    """Return start, goals and mask; refuse what cannot be planned with, before a model is loaded."""
-    from vjepa2_ac.media.images import read_image
-    from vjepa2_ac.planning.input_checks import require_image, require_mask
-
-    folder = None
-    if options.goals is not None:
-        from vjepa2_ac.planning.goals import read_goal_folder
-
-        folder = read_goal_folder(options.goals)
-        images = tuple(goal.image for goal in folder.goals)
-    else:
-        images = tuple(read_image(path) for path in options.goal)
-        for path, image in zip(options.goal, images, strict=True):
-            require_image(image, where=f"--goal {path}", like=images[0])
     start = read_image(options.start)
-    require_image(start, where=f"--start {options.start}", like=images[0])
+    require_image(start, where=f"--start {options.start}", like=goal)
     mask = None if options.mask is None else read_image(options.mask).max(axis=-1)
     if mask is not None:
-        require_mask(mask, where=f"--mask {options.mask}", like=images[0])
-    return start, images if folder is None else folder, mask
+        require_mask(mask, where=f"--mask {options.mask}", like=goal)
+    return start, mask
 
 
-def _durations(options: argparse.Namespace) -> tuple[int, ...]:
-    if not options.durations:
-        return ()
+def _goals_of(options: argparse.Namespace, horizon: int) -> GoalFolder:
+    """Return the goals of a folder; or images with the durations that were given, else with equal ones."""
+    from vjepa2_ac.media.images import read_image, require_image
+    from vjepa2_ac.planning.goals import GoalFolder, equal_durations, read_goal_folder, timed
+
     if options.goals is not None:
-        found, needed = f"--goals {options.goals}", "--goal: a folder says how long its goals apply"
+        if options.durations:
+            found, needed = f"--goals {options.goals}", "--goal: a folder says how long its goals apply"
+            raise InputError(where="--durations", found=found, needed=needed)
+        return read_goal_folder(options.goals)
+    images, count = [read_image(path) for path in options.goal], len(options.goal)
+    for path, image in zip(options.goal, images, strict=True):
+        require_image(image, where=f"--goal {path}", like=images[0])
+    words = (options.durations or "").replace(",", " ").split()
+    if words and (len(words) != count - 1 or not all(word.isdecimal() and int(word) for word in words)):
+        found = f"{options.durations!r} for {count} goal{'s' * (count > 1)}"
+        needed = f"{count - 1} whole numbers from 1, with commas between them: of each goal but the last"
         raise InputError(where="--durations", found=found, needed=needed)
-    text, goals = options.durations, len(options.goal)
-    words = text.replace(",", " ").split()
-    if len(words) != goals - 1 or not all(word.isdecimal() and int(word) for word in words):
-        found = f"{text!r} for {goals} goal{'s' * (goals > 1)}"
-        needed = f"{goals - 1} whole numbers from 1, with commas between them: of each goal but the last"
-        raise InputError(where="--durations", found=found, needed=needed)
-    return tuple(int(word) for word in words)
+    return GoalFolder(timed(images, [int(word) for word in words] or equal_durations(horizon, count)))
 
 
 def _goals(options: argparse.Namespace) -> None:

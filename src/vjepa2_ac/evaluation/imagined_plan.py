@@ -35,7 +35,7 @@ def imagine_plan(answer: PlanResult, decoder: TrainedDecoder) -> ImaginedPlan:
         answer: The decision.
         decoder: Of the model's encoder; it is moved to the model's device.
     """
-    controller, goal = answer.controller, answer.question.goals[answer.decision.goals[-1]]
+    controller, goal = answer.controller, answer.question.goals[answer.decision.goals[-1]].image
     decoder.to(controller.device)
     given = torch.stack([controller.encoded(image) for image in (answer.question.start, goal)])
     start, decoded_goal = shown(decoder.decoder, given)

@@ -19,6 +19,7 @@ from vjepa2_ac.storage import read_bytes, unreadable
 
 MOST_PIXELS = 100_000_000  # a robot's camera has a tenth; a file of 600 bytes may claim forty times as many
 _MOST_BYTES = 1 << 32  # of images that are decoded together
+_LEAST_SIDE = 16  # pixels of an image of a robot's scene
 
 
 def require_bounded(height: int, width: int, where: str, *, count: int = 1) -> None:
@@ -40,6 +41,38 @@ def require_bounded(height: int, width: int, where: str, *, count: int = 1) -> N
             needed=f"at most {MOST_PIXELS // 10**6} megapixels each, and {_MOST_BYTES // 10**9} GB together",
             fix="Make the images smaller, leave the episode out, or set data.frames lower",
         )
+
+
+def require_image(image: np.ndarray, *, where: str, like: np.ndarray | None = None) -> None:
+    """Refuse an array that is no RGB image, or of another size than a given one.
+
+    Args:
+        image: The array.
+        where: Its name in errors.
+        like: An image of the same camera, of the required size.
+
+    Raises:
+        InputError: Says what was found.
+    """
+    found = f"an array of shape {image.shape} and type {image.dtype}"
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or min(image.shape[:2]) < _LEAST_SIDE:
+        needed = f"an RGB image: height x width x 3, uint8, {_LEAST_SIDE} pixels or more"
+        raise InputError(where=where, found=found, needed=needed)
+    if like is not None and image.shape != like.shape:
+        found = f"{image.shape[1]} x {image.shape[0]} pixels (width x height)"
+        needed = f"{like.shape[1]} x {like.shape[0]}, as the goal image: same camera, place and resolution"
+        raise InputError(where=where, found=found, needed=needed)
+
+
+def require_mask(mask: np.ndarray, *, where: str, like: np.ndarray) -> None:
+    """Refuse a mask that is not of an image's size.
+
+    Raises:
+        InputError: Says what was found.
+    """
+    if mask.shape != like.shape[:2]:
+        found, needed = f"shape {mask.shape} (height, width)", f"{like.shape[:2]}, as the goal image"
+        raise InputError(where=where, found=found, needed=needed)
 
 
 def decode_jpegs(images: Sequence[bytes], steps: Sequence[int], where: str) -> UInt8[np.ndarray, "time height width 3"]:

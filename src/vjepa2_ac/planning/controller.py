@@ -18,12 +18,12 @@ from vjepa2_ac.data.sources.indexed_source import spaces_of
 from vjepa2_ac.data.transforms import Crop, view
 from vjepa2_ac.encoding.batch import encode_frames
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.media.images import require_image, require_mask
 from vjepa2_ac.model.network.world_model import WorldModel, heads_to_replace, widths_as_text, widths_of_model
 from vjepa2_ac.model.state_integration import states_along
 from vjepa2_ac.planning.axes import require_base_frame
 from vjepa2_ac.planning.energy import Goal, Scene, WorldModelCost, distance, patch_weights
 from vjepa2_ac.planning.goals import REACHED, GoalProgress, GripperMode, SubGoal, timed, with_shares
-from vjepa2_ac.planning.input_checks import require_image, require_mask, require_numbers
 from vjepa2_ac.planning.model_setup import Axes, Fingerprints, prepare_for_planning
 from vjepa2_ac.planning.planner import Cancelled, Plan, Planner
 from vjepa2_ac.planning.search_space import SearchSpace, Workspace, search_space
@@ -114,7 +114,7 @@ class Controller:
         """
         _require_spaces(world_model, spaces)
         if extrinsics is not None:
-            require_numbers(extrinsics, EXTRINSICS, where="extrinsics")
+            EXTRINSICS.require_state(extrinsics, "extrinsics")
         if (uses := world_model.sizes.predictor.use_extrinsics) != (extrinsics is not None):
             found, needed = f"{uses}, camera pose given: {not uses}", "a camera pose exactly where the model uses it"
             raise InputError(where="model: predictor.use_extrinsics", found=found, needed=needed)
@@ -255,7 +255,7 @@ class Controller:
             raise ValueError("no goal: call reset first")
         require_image(frame, where="frame", like=self._goal.goals[0].image)
         state = self._known(np.asarray(state, dtype=np.float64))
-        require_numbers(state, self.spaces.state, where="state")
+        self.spaces.state.require_state(state, "state")
         seen = [*self._seen, (self.encoded(frame), state)][-self.config.context :]
         decision = self._decided(self._goal, seen, cancelled)
         self._seen, self._done, self.decision = seen, self._done + 1, decision  # after an error nothing has changed

@@ -11,12 +11,10 @@ import numpy as np
 
 from vjepa2_ac import __version__
 from vjepa2_ac.config import Config
-from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.images import read_image
+from vjepa2_ac.media.images import read_image, require_image
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.goals import GOALS_FILE, GoalFolder, SubGoal, read_goal_folder
-from vjepa2_ac.planning.input_checks import require_image
 from vjepa2_ac.planning.session import PlanningSession
 from vjepa2_ac.serving.session import Session
 
@@ -24,15 +22,6 @@ PROTOCOL = 1  # incremented when a client would have to change
 _MOST_NAMES = 60  # of goals that are told
 _SIZE = 180, 320  # of the picture of the first decision
 _SOMEWHERE = np.array([0.4, 0.0, 0.4, np.pi, 0.0, 0.0, 0.0])
-
-
-def require_steps(config: Config) -> int:
-    """Return the control steps of a model step.
-
-    Raises:
-        InputError: Nobody knows.
-    """
-    return require_stride(config.data, to="say how long an action lasts", fix="Say which, as data.stride=4")
 
 
 def metadata_of(loaded: PlanningSession, session: Session) -> dict[str, Any]:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import ExitStack
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -14,8 +13,8 @@ from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.serving.wire import MOST_BYTES, pack, require_msgpack, unpack
 
 
-class PlanningClient:
-    """A connection to a server.
+class PlanningClient(ExitStack):
+    """A connection to a server; `close` ends it.
 
     Example:
         >>> with PlanningClient("ws://127.0.0.1:8000") as client:
@@ -32,18 +31,18 @@ class PlanningClient:
         Raises:
             UnreachableError: There is no server, or it refuses; or a library of the extra `serve` is missing.
         """
+        super().__init__()
         self.url = url
         require_msgpack(url)
         library = require_library("websockets.sync.client", where=url, called="websockets", extra="serve")
         headers = {} if key is None else {"Authorization": f"Api-Key {key}"}
-        self._open = ExitStack()
         try:
-            self._connection = self._open.enter_context(
+            self._connection = self.enter_context(
                 library.connect(url, compression=None, max_size=MOST_BYTES, additional_headers=headers, proxy=None)
             )
             self.metadata = unpack(self._connection.recv())
         except Exception as error:
-            self._open.close()
+            self.close()
             body = getattr(getattr(error, "response", None), "body", None)  # the server's words, where it refuses
             found = f"{_reason(error)}: {body.decode(errors='replace').strip()}" if body else _reason(error)
             raise UnreachableError(where=url, found=found, needed="a server (`vjepa2-ac serve`)") from None
@@ -63,16 +62,6 @@ class PlanningClient:
         if isinstance(answer, str):
             raise InputError(where=self.url, found=answer)
         return unpack(answer)
-
-    def close(self) -> None:
-        """End the connection."""
-        self._open.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self.close()
 
 
 def goal_keys(goals: Sequence[SubGoal]) -> dict[str, Any]:

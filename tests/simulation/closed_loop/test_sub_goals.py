@@ -34,9 +34,9 @@ def test_the_grasp_is_among_the_goals_of_a_pick(domain) -> None:
         goals = DemonstratedGoals("pick", domain, size=SMALL)(problem)
         assert [goal.name for goal in goals] == ["before closing", "closed", "end"]
         assert [goal.gripper for goal in goals] == ["held", "close", "held"]
-        shown = demonstrate(problem, arm, DemonstrationSpec())
-        frames = [int(np.argmax([np.array_equal(goal.image, frame) for frame in shown.frames])) for goal in goals]
-        at_block, closed, lifted = shown.states[frames]
+        seen, states = demonstrate(problem, arm, DemonstrationSpec())
+        frames = [int(np.argmax([np.array_equal(goal.image, frame) for frame in seen])) for goal in goals]
+        at_block, closed, lifted = states[frames]
         np.testing.assert_allclose(at_block[:3], problem.block_start[:3] + np.array([0, 0, GRASP_M]), atol=0.015)
         assert at_block[6] < 0.02
         assert closed[6] == pytest.approx(HOLDING, abs=0.05)
@@ -66,14 +66,14 @@ def test_every_step_of_a_demonstration_is_a_goal_up_to_where_it_rests() -> None:
     key_goals, goals = (
         DemonstratedGoals("pick", DOMAIN_A, one, SMALL)(problem) for one in (None, every_step(DemonstrationSpec()))
     )
-    shown = demonstrate(problem, arm, DemonstrationSpec())
-    for goal, frame in zip(goals, shown.frames[1:], strict=False):
+    frames, states = demonstrate(problem, arm, DemonstrationSpec())
+    for goal, frame in zip(goals, frames[1:], strict=False):
         np.testing.assert_array_equal(goal.image, frame)
     np.testing.assert_array_equal(goals[-1].image, key_goals[-1].image)
     assert [goal.name for goal in goals if goal.name != "on the way"] == [goal.name for goal in key_goals]
     assert [goal.gripper for goal in goals].count("close") == 1
     assert [goal.at_most for goal in goals] == [*[2] * (len(goals) - 1), None]
-    hand = np.linalg.norm(np.diff(shown.states[: len(goals) + 1, :3], axis=0), axis=1)
+    hand = np.linalg.norm(np.diff(states[: len(goals) + 1, :3], axis=0), axis=1)
     assert hand.max() < 0.08, "each goal is within a step of the one before"
 
 

@@ -59,7 +59,7 @@ def plot_plan(answer: PlanResult, path: Path, imagined: ImaginedPlan | None = No
 
 
 def _pictures(part: Any, answer: PlanResult) -> None:
-    goals = answer.question.goals
+    goals = [goal.image for goal in answer.question.goals]
     shown = sorted({*range(len(goals))[: _MOST_GOALS - 1], len(goals) - 1})
     named = {"start": answer.question.start}
     named |= {f"goal {place + 1} of {len(goals)}" if len(goals) > 1 else "goal": goals[place] for place in shown}

@@ -40,14 +40,6 @@ class DemonstrationSpec:
     every: int | None = None  # model steps between goals on the way to a key frame; None: only key frames are goals
 
 
-@dataclass(frozen=True, eq=False)
-class Demonstration:
-    """What was seen and measured: before the first model step, then after each."""
-
-    frames: UInt8[np.ndarray, "time height width 3"]
-    states: Float[np.ndarray, "time 7"]
-
-
 def every_step(spec: DemonstrationSpec) -> DemonstrationSpec:
     """Return a spec with a goal for each model step of the demonstration, each for one step more than it took there."""
     return replace(spec, every=1, slack=1)
@@ -85,12 +77,12 @@ class DemonstratedGoals:
         Raises:
             InputError: As `demonstrate`.
         """
-        shown = demonstrate(problem, self._arm, self.spec)
-        keys = gripper_key_frames(shown.states, OF_MODEL_STEPS)
+        frames, states = demonstrate(problem, self._arm, self.spec)
+        keys = gripper_key_frames(states, OF_MODEL_STEPS)
         if self.spec.every is not None:
             keys = with_frames_between(keys, self.spec.every)
-        images = [shown.frames[key.frame] for key in keys]
-        return sub_goals_of(images, keys, Timing(1, self.spec.slack, self.spec.share), shown.states)
+        images = [frames[key.frame] for key in keys]
+        return sub_goals_of(images, keys, Timing(1, self.spec.slack, self.spec.share), states)
 
     def require(self, problems: Iterable[TaskProblem]) -> None:
         """Refuse problems of which one cannot be demonstrated, before any of them is worked on.
@@ -102,8 +94,10 @@ class DemonstratedGoals:
             demonstrate(problem, self._unseen, self.spec)
 
 
-def demonstrate(problem: TaskProblem, arm: SimulatedArm, spec: DemonstrationSpec) -> Demonstration:
-    """Let the oracle solve a problem.
+def demonstrate(
+    problem: TaskProblem, arm: SimulatedArm, spec: DemonstrationSpec
+) -> tuple[UInt8[np.ndarray, "time height width 3"], Float[np.ndarray, "time 7"]]:
+    """Let the oracle solve a problem; return what was seen and measured before the first model step and after each.
 
     Args:
         problem: The problem.
@@ -123,4 +117,4 @@ def demonstrate(problem: TaskProblem, arm: SimulatedArm, spec: DemonstrationSpec
             needed="a demonstration that succeeds",
             fix="Allow it longer steps along each axis (planning.limits.xyz, planning.limits.ball), or more of them",
         )
-    return Demonstration(shown.frames, shown.states)
+    return shown.frames, shown.states

@@ -9,11 +9,11 @@ import multiprocessing
 import re
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -63,10 +63,10 @@ class RecordingSpec:
     """What an episode of a simulated data set is."""
 
     domain: str | Domain | DomainRanges  # or its name; ranges, or `random`: another world in every episode
-    steps: int = 41  # control steps (15 per second); see `default_steps`
-    seed: int = 0  # determines motion, outcome and worlds
+    steps: Annotated[int, Field(ge=2, le=1_000_000)] = 41  # control steps (15 per second); see `default_steps`
+    seed: Annotated[int, Field(ge=0)] = 0  # determines motion, outcome and worlds
     cameras: Literal[1, 3] = 1  # 1: the three images of a step are the same one; 3: one image per camera
-    recipe: MotionRecipe | None = None  # ranges of the motion, without a task
+    recipe: MotionRecipe = field(default_factory=MotionRecipe)  # ranges of the motion, without a task
     task: RecordedTask | None = None  # with a block: half of the episodes by script, half at random
 
     @property
@@ -81,16 +81,6 @@ class RecordingSpec:
         return DomainRanges() if self.domain == "random" else named_domain(self.domain)
 
 
-def world_of(index: int, spec: RecordingSpec) -> Domain:
-    """Return the world of an episode.
-
-    Raises:
-        InputError: No domain has this name.
-    """
-    worlds = spec.worlds
-    return worlds if isinstance(worlds, Domain) else sample_domain(_stream(index, spec, _WORLD), worlds)
-
-
 def arm_of(index: int, spec: RecordingSpec) -> SimulatedArm:
     """Return an arm in the world of an episode; with a task it has contacts.
 
@@ -98,7 +88,9 @@ def arm_of(index: int, spec: RecordingSpec) -> SimulatedArm:
         InputError: An unknown domain.
         UnreachableError: MuJoCo is not installed.
     """
-    return arm_for(spec.task or "reach", world_of(index, spec))
+    worlds = spec.worlds
+    world = worlds if isinstance(worlds, Domain) else sample_domain(_stream(index, spec, _WORLD), worlds)
+    return arm_for(spec.task or "reach", world)
 
 
 def carry_out(
@@ -189,7 +181,7 @@ def record_dataset(
             yield episode
             progress(done, episodes)
 
-    notes = {SIMULATION_FILE: json_text(asdict(RecordedSimulation.of(spec, episodes)))}
+    notes = {SIMULATION_FILE: json_text(RecordedSimulation.of(spec, episodes).as_dict())}
     return write_droid_rlds(folder, watched(), shards=shards or -(-episodes // 32), notes=notes)
 
 
@@ -263,34 +255,24 @@ _AGAIN = "Record it again: the same options give the same episodes"
 _NUMBER = re.compile(r"_(\d{6,})/")  # as `episode_folder` writes it
 
 
-@dataclass(frozen=True)
-class RecordedSimulation:
-    """Everything that determines the episodes of a data set; exactly one of domain and ranges is given."""
+@dataclass(frozen=True, kw_only=True)
+class RecordedSimulation(RecordingSpec):
+    """Everything that determines the episodes of a data set; the worlds are no name."""
 
     version: str  # of this program
     libraries: dict[str, str]  # and of those that determine last digits
     episodes: Annotated[int, Field(ge=1)]
-    steps: Annotated[int, Field(ge=2, le=1_000_000)]
-    seed: Annotated[int, Field(ge=0)]
-    cameras: Literal[1, 3]
-    recipe: MotionRecipe
-    task: RecordedTask | None
-    domain: Domain | None = None
-    ranges: DomainRanges | None = None
 
     @classmethod
     def of(cls, spec: RecordingSpec, episodes: int) -> RecordedSimulation:
         """Return the record of a data set, worlds and recipe written out, whatever names and defaults mean later."""
-        worlds, recipe = spec.worlds, spec.recipe or MotionRecipe()
-        domain, ranges = (worlds, None) if isinstance(worlds, Domain) else (None, worlds)
-        how = (spec.steps, spec.seed, spec.cameras, recipe, spec.task, domain, ranges)
-        return cls(version(_PROGRAM), {name: version(name) for name in _LIBRARIES}, episodes, *how)
+        libraries, how = {name: version(name) for name in _LIBRARIES}, vars(spec) | {"domain": spec.worlds}
+        return cls(version=version(_PROGRAM), libraries=libraries, episodes=episodes, **how)
 
-    @property
-    def spec(self) -> RecordingSpec:
-        """What an episode is."""
-        worlds = self.domain or self.ranges or DomainRanges()
-        return RecordingSpec(worlds, self.steps, self.seed, self.cameras, self.recipe, self.task)
+    def as_dict(self) -> dict[str, Any]:
+        """Return the content of the file: one of its keys `domain` and `ranges` has the world or worlds."""
+        values, key = asdict(self), "domain" if isinstance(self.domain, Domain) else "ranges"
+        return values | {"domain": None, "ranges": None} | {key: values["domain"]}
 
     @property
     def other_versions(self) -> str:
@@ -307,7 +289,7 @@ class RecordedSimulation:
         """
         found = _NUMBER.search(episode_id)
         number = int(found[1]) if found else self.episodes
-        name = "random" if self.domain is None else self.domain.name
+        name = self.domain.name if isinstance(self.domain, Domain) else "random"
         if number < self.episodes and f"{episode_folder(number, self.seed, name)}/" in episode_id:
             return number
         raise InputError(
@@ -338,7 +320,7 @@ def read_simulation(folder: str | Path) -> RecordedSimulation:
             needed=_NEEDED,
             fix=f"What happens under other actions can only be simulated. {_AGAIN}",
         ) from None
-    simulation = record_of(RecordedSimulation, values, where=where, needed=_NEEDED, fix=_AGAIN)
-    if (simulation.domain is None) == (simulation.ranges is None):
+    worlds = [one for key in ("domain", "ranges") if (one := values.pop(key, None)) is not None]
+    if len(worlds) != 1:
         raise InputError(where=where, found="not one of the keys domain and ranges", needed=_NEEDED, fix=_AGAIN)
-    return simulation
+    return record_of(RecordedSimulation, values | {"domain": worlds[0]}, where=where, needed=_NEEDED, fix=_AGAIN)

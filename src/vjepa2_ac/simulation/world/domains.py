@@ -30,7 +30,8 @@ class CameraPlace:
 
     def pose(self) -> Float[np.ndarray, "4 4"]:
         """Return the camera's frame in the world: x right, y down, z into the image (OpenCV's convention)."""
-        azimuth, outward = np.deg2rad(self.azimuth_deg), direction(self.azimuth_deg, self.elevation_deg)
+        azimuth, up = np.deg2rad(self.azimuth_deg), np.deg2rad(self.elevation_deg)
+        outward = np.array([np.cos(up) * np.cos(azimuth), np.cos(up) * np.sin(azimuth), np.sin(up)])
         right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
         pose = np.eye(4)
         pose[:3, :3] = np.stack([right, np.cross(-outward, right), -outward], axis=1)
@@ -40,12 +41,6 @@ class CameraPlace:
     def turned(self, angle_deg: float) -> CameraPlace:
         """Return the same position, rotated further on the circle."""
         return replace(self, azimuth_deg=self.azimuth_deg + angle_deg)
-
-
-def direction(azimuth_deg: float, elevation_deg: float) -> Float[np.ndarray, " 3"]:
-    """Return the unit vector from the origin in a direction."""
-    azimuth, elevation = np.deg2rad(azimuth_deg), np.deg2rad(elevation_deg)
-    return np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
 
 
 @dataclass(frozen=True)

@@ -167,12 +167,13 @@ class Motion:
         return forward_kinematics(self.joints)
 
 
-def random_reaching(domain: Domain, steps: int, rng: np.random.Generator, recipe: MotionRecipe | None = None) -> Motion:
+def random_reaching(
+    domain: Domain, steps: int, rng: np.random.Generator, recipe: MotionRecipe = MotionRecipe()
+) -> Motion:
     """Return a random demonstration of `steps` control steps.
 
     The same generator gives the same motion in the *world*, whatever the mounting of the robot.
     """
-    recipe = recipe or MotionRecipe()
     ways = -(-steps // recipe.stride) + 1
     times = np.arange(ways + 1) * recipe.stride
     positions, turns, closed = _waypoints(ways, rng, recipe)
@@ -243,7 +244,7 @@ def _waypoints(
 
 def _joints_along(poses: Float[np.ndarray, "steps 6"], domain: Domain) -> Float[np.ndarray, "steps 7"]:
     rest = rest_joints(domain)
-    joints = [inverse_kinematics(poses[0], rest, rest=rest)]
-    for pose in poses[1:]:
+    joints = [rest]
+    for pose in poses:
         joints.append(inverse_kinematics(pose, joints[-1], rest=rest))
-    return np.array(joints)
+    return np.array(joints[1:])
