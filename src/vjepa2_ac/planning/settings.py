@@ -127,8 +127,8 @@ def with_taught_limits(config: Config, folder: Path) -> Config:
     return config.model_copy(update={"planning": planning})
 
 
-def beyond_taught(config: Config, folder: Path) -> tuple[str, ...]:
-    """Return why plans may leave what a run was taught, a sentence each: its data are narrow, or limits go beyond them.
+def warn_beyond_taught(config: Config, folder: Path) -> tuple[str, ...]:
+    """Log and return why plans may leave what a run was taught, a sentence each: narrow data, or limits beyond them.
 
     Limits are compared with the 99th percentile of each number's change, which they may exceed by a tenth.
 
@@ -158,6 +158,8 @@ def beyond_taught(config: Config, folder: Path) -> tuple[str, ...]:
                 f"{name} leaves what {folder} was taught: {', '.join(beyond)}. In brackets: how far 99 % of its steps"
                 f" go. Beyond that the model guesses; {way_out}"
             )
+    for text in found:
+        logger.warning(text)
     return tuple(found)
 
 
@@ -178,11 +180,3 @@ def _reach(limits: LimitsConfig, taught: Taught, *, poses: bool) -> Sequence[flo
     ball = math.inf if limits.ball == "none" else limits.radius
     gripper = limits.gripper if limits.gripper_mode in {"rounded", "free"} else 0.0
     return [*(min(one, ball) for one in limits.xyz_m), *[limits.rotation] * 3, gripper]
-
-
-def warn_beyond_taught(config: Config, folder: Path) -> tuple[str, ...]:
-    """Log what `beyond_taught` returns as warnings, and return it."""
-    found = beyond_taught(config, folder)
-    for text in found:
-        logger.warning(text)
-    return found

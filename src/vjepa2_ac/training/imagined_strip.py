@@ -88,7 +88,7 @@ class ImaginedStrip:
         world_model.eval()
 
         def rollout(name: str) -> Imagined:
-            rolled = rolled_out(world_model, start, actions, states[:-1])
+            rolled = rolled_out(world_model.rollout, start, actions, states[:-1])
             return Imagined(name, AS_RECORDED, actions, shown(decoder, rolled))
 
         rollouts, adaptation = [rollout("model now")], world_model.adaptation

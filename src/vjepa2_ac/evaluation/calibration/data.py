@@ -130,27 +130,22 @@ def probe_variants(
     clips = SameClips(dataset, windows, sample.batch_size)
     plain, *measured = measure_variants(model, encode, clips, variants, progress)
     space = dataset.spaces.action
-    results = [
-        found.result(one.name, space, beside=plain, repair=one.repair)
-        for one, found in zip(variants[1:], measured, strict=True)
-    ]
-    return VariantProbe(plain.result(AS_THEY_ARE, space), tuple(results))
+    return VariantProbe(plain.result(space), tuple(found.result(space, beside=plain) for found in measured))
 
 
 def _with_room(
     dataset: Dataset, candidates: list[tuple[int, int]], clips: int
-) -> tuple[list[tuple[int, int]], tuple[int, ...]]:
+) -> tuple[list[tuple[int, int]], list[int]]:
     """Return the starts of clips, and the shifts for which each has states before and after it."""
     steps, length = dataset.table.num_steps, dataset.config.clip_steps
     enough = max(1, min(clips, len(candidates) // 4))
-    fitting: list[tuple[int, int]] = candidates
-    shifts: tuple[int, ...] = ()
-    for count in range(1, len(SHIFTS) + 1):
-        room = SHIFTS[count - 1]
+    fitting, shifts = candidates, list[int]()
+    for room in SHIFTS:
         wider = [(episode, start) for episode, start in fitting if room <= start <= steps[episode] - length - room]
         if len(wider) < enough:
             break
-        fitting, shifts = wider, SHIFTS[:count]
+        fitting = wider
+        shifts.append(room)
     return [fitting[place] for place in spread(len(fitting), clips)], shifts
 
 
@@ -171,7 +166,13 @@ def variants_of(config: DataConfig, shifts: Sequence[int]) -> list[Variant]:
         for shift in (size, -size)
     ]
     if config.actions == "difference":  # a command has no opposite
-        found.append(_variant("the states backwards", "reverse the order of the frames", _of_states(_backwards)))
+        found.append(
+            _variant(
+                "the states backwards",
+                "reverse the order of the frames",
+                _of_states(lambda states: np.ascontiguousarray(states[::-1])),
+            )
+        )
     if config.states == "pose":
         for axis, name in enumerate("xy"):
             repair = f"negate {name}, with the rotation (as of a mirror)"
@@ -227,10 +228,6 @@ def shifted(episode: Episode, *, late: int) -> Episode:
 
 def _of_states(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Episode], Episode]:
     return lambda episode: replace(episode, states=change(episode.states))
-
-
-def _backwards(states: np.ndarray) -> np.ndarray:
-    return np.ascontiguousarray(states[::-1])
 
 
 def _with_gripper_inverted(states: np.ndarray) -> np.ndarray:

@@ -220,7 +220,9 @@ def run_episode(
         measured = states[-1] if policy.moves == Moves.FLANGE else np.append(arm.joints, arm.closedness)
         action = np.asarray(policy.act(frames[-1], measured), dtype=np.float64)
         seconds.append(time.perf_counter() - began)
-        actions.append(_checked(action, policy))
+        if action.shape != (policy.moves.value,) or not np.isfinite(action).all():
+            raise ValueError(f"{policy.name}: {action.tolist()} is no action of {policy.moves.value} finite numbers")
+        actions.append(action)
         whys.append(policy.why)
         if keep_frames and isinstance(policy, Planning):
             imagined.append(policy.imagined())
@@ -289,12 +291,6 @@ def ways_along(state: Float[np.ndarray, " 7"], action: Float[np.ndarray, " 7"]) 
     """Return equally spaced states on the straight line of an action, the nearest first."""
     shares = np.arange(1, _PARTS + 1)[:, None] / _PARTS
     return list(apply_action(np.tile(state, (_PARTS, 1)), shares * action))
-
-
-def _checked(action: Float[np.ndarray, " dim"], policy: Policy) -> Float[np.ndarray, " dim"]:
-    if action.shape != (policy.moves.value,) or not np.isfinite(action).all():
-        raise ValueError(f"{policy.name}: {action.tolist()} is no action of {policy.moves.value} finite numbers")
-    return action
 
 
 def _send_joints(arm: SimulatedArm, action: Float[np.ndarray, " 8"], stride: int) -> bool:

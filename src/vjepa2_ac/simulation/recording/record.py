@@ -177,9 +177,11 @@ def record_dataset(
     record = partial(record_episode, spec=replace(spec, domain=spec.worlds))
 
     def watched() -> Iterator[DroidEpisode]:
-        for done, episode in enumerate(_recorded(record, episodes, workers), start=1):
-            yield episode
-            progress(done, episodes)
+        with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:  # starts none before its work
+            recorded = (map if workers == 1 else pool.map)(record, range(episodes))
+            for done, episode in enumerate(recorded, start=1):
+                yield episode
+                progress(done, episodes)
 
     notes = {SIMULATION_FILE: json_text(RecordedSimulation.of(spec, episodes).as_dict())}
     return write_droid_rlds(folder, watched(), shards=shards or -(-episodes // 32), notes=notes)
@@ -233,16 +235,6 @@ def _velocity(positions: Float[np.ndarray, "steps dim"]) -> Float[np.ndarray, "s
     """Return the velocity that led to each position; the first equals the second."""
     ways = np.diff(positions, axis=0)
     return np.concatenate([ways[:1], ways]) * CONTROL_RATE_HZ
-
-
-def _recorded(record: Callable[[int], DroidEpisode], episodes: int, workers: int) -> Iterator[DroidEpisode]:
-    """Yield the episodes in order; in parallel, if so many processes are wanted."""
-    if workers == 1:
-        yield from map(record, range(episodes))
-        return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context) as pool:
-        yield from pool.map(record, range(episodes))
 
 
 # ---- simulation.json ----
@@ -314,12 +306,9 @@ def read_simulation(folder: str | Path) -> RecordedSimulation:
     try:
         values = read_json_object(where, needed=_NEEDED, fix=_AGAIN)
     except (FileNotFoundError, NotADirectoryError):
-        raise InputError(
-            where=where,
-            found="no such file: these are not simulated episodes, or an older version recorded them",
-            needed=_NEEDED,
-            fix=f"What happens under other actions can only be simulated. {_AGAIN}",
-        ) from None
+        found = "no such file: these are not simulated episodes, or an older version recorded them"
+        fix = f"What happens under other actions can only be simulated. {_AGAIN}"
+        raise InputError(where=where, found=found, needed=_NEEDED, fix=fix) from None
     worlds = [one for key in ("domain", "ranges") if (one := values.pop(key, None)) is not None]
     if len(worlds) != 1:
         raise InputError(where=where, found="not one of the keys domain and ranges", needed=_NEEDED, fix=_AGAIN)
