@@ -51,36 +51,28 @@ def add_serve(commands: cli.Commands) -> None:
     cli.add(group, "--certificate-key FILE", "its private key, PEM (in the same file)", cli.as_path)
     group = parser.add_argument_group("record")
     cli.add(group, "--record FOLDER", "every decision with its pictures, in a new folder", cli.as_path)
-    cli.add(
-        group, "--record-gb GB", "where the record ends (2)", cli.number_between(0, 10_000, "gigabytes"), default=2.0
-    )
+    size = cli.number_between(0, 10_000, "gigabytes")
+    cli.add(group, "--record-gb GB", "where the record ends (2)", size, default=2.0)
 
 
 def add_simulate(commands: cli.Commands) -> None:
     """Add `simulate` to a parser: it records if its first word is `record`, else it tests a model in closed loop."""
     parser = cli.command(commands, "simulate", _simulate)
-    text = (
-        "who steers: the folder of a run, or what model.base takes, such as builtin:sim-tiny; or a server of one, as"
-        " ws://127.0.0.1:8000; or: record"
-    )
+    text = "who steers: the folder of a run, what model.base takes, or a server, as ws://127.0.0.1:8000; or: record"
     cli.add(parser, "subject RUN_OR_MODEL|ws://SERVER|record", text, cli.as_planner)
     cli.add(parser, "overrides key=value|FOLDER", "such as planning.samples=64; record: where the data go", nargs="*")
     text = "A or B; record: or random, another world in every episode (A)"
     cli.add(parser, "--domain", text, choices=["A", "B", "random"], default="A")
     cli.add(parser, "--episodes N", "how many (50; record: 40)", cli.count)
-    cli.add(
-        parser, "--steps N", "model steps (8; pick: 12, place: 18); record: control steps (41; place: 81)", cli.count
-    )
+    text = "model steps (8; pick: 12, place: 18); record: control steps (41; place: 81)"
+    cli.add(parser, "--steps N", text, cli.count)
     cli.add(parser, "--seed N", "which problems or demonstrations (0)", cli.whole_number(0, 2**31 - 1))
     text = "what is to be done (reach); record: push, pick or place, with a block on the table (none: reaching around)"
     cli.add(parser, "--task", text, choices=["reach", "push", "pick", "place"])
     group = parser.add_argument_group("of a model that steers")
     cli.add_checkpoint(group, default=None)
     cli.add(group, "--config CONFIG", "of a model: a config whose `planning` is used", cli.as_local)
-    text = (
-        "goals on the way: demonstration takes them from the oracle's solution of the same problem, where the gripper"
-        " changes or the arm stops; every-step: each model step of it (none)"
-    )
+    text = "goals on the way, of the oracle's solution: demonstration: its key frames; every-step: all of it (none)"
     cli.add(group, "--sub-goals", text, choices=["none", "demonstration", "every-step"])
     text = "a folder of goals on the way, that `vjepa2-ac goals` made: the same in every problem, of a fixed scene"
     cli.add(group, "--goals FOLDER", text, cli.as_local)
@@ -110,11 +102,10 @@ def _serve(options: argparse.Namespace) -> int:
     cli.require_to_plan(options)
 
     from vjepa2_ac.serving.about import read_kept_goals
-    from vjepa2_ac.serving.recording import require_new_record
     from vjepa2_ac.serving.server import ServerOptions, serve
 
     if options.record is not None:
-        require_new_record(options.record)
+        cli.require_new_place(options.record)
     goals = None if options.goals is None else read_kept_goals(options.goals)
     ended = serve(lambda: _loaded(options, goals, extrinsics), ServerOptions(access, options.port, tls), cli.show)
     if not ended:  # a search or a loading that takes longer than anybody waits: nothing of it is to be kept

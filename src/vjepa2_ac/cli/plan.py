@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from vjepa2_ac.config.planning import PlanningConfig
     from vjepa2_ac.planning.demonstrations.make_goals import Recording
     from vjepa2_ac.planning.goals import GoalFolder
-    from vjepa2_ac.planning.session import PlanningSession
 
 _QUICK, _QUICK_SEQUENCES = "planning.samples=64 planning.iterations=4", 256  # docs/planning.md says how good it is
 _FILMS = (".mp4", ".m4v", ".mov")
@@ -27,8 +26,7 @@ def add_plan(commands: cli.Commands) -> None:
     cli.add_planner(parser, such_as=f"such as planning.horizon=2; quick, for a CPU: {_QUICK}")
     cli.add(parser, "--start IMAGE", "what the camera sees: PNG or JPEG", cli.as_local, required=True)
     text = (
-        "measured x,y,z (m), roll,pitch,yaw (radians, extrinsic xyz), gripper (0 open .. 1 closed); or the numbers of a"
-        " vector, as the data had them"
+        "measured x,y,z (m), roll,pitch,yaw (rad, extrinsic xyz), gripper (0 open .. 1 closed); or a vector's numbers"
     )
     cli.add(parser, "--state NUMBERS", text, required=True)
     text = "what it shall see; again for goals that follow one another"
@@ -36,14 +34,10 @@ def add_plan(commands: cli.Commands) -> None:
     cli.add(goals, "--goal IMAGE", text, cli.as_local, action="append")
     cli.add(goals, "--goals FOLDER", "goals with rules of their own, that `vjepa2-ac goals` made", cli.as_path)
     cli.add(parser, "--durations STEPS", "model steps of all goals but the last, as 2,1 (equal shares)")
-    cli.add(
-        parser, "--mask IMAGE", "what of the image counts: of the goal's size, black where it does not", cli.as_local
-    )
+    text = "what of the image counts: of the goal's size, black where it does not"
+    cli.add(parser, "--mask IMAGE", text, cli.as_local)
     cli.add(parser, "--seed N", "default: the config's", cli.whole_number(0, 2**31 - 1))
-    text = (
-        "of the image's energy maps along each axis; 0: no maps; default: 13, or as many as evaluate no more action"
-        " sequences than the search"
-    )
+    text = "of the image's energy maps along each axis; 0: no maps (13, or as many as cost no more than the search)"
     cli.add(parser, "--nodes N", text, cli.whole_number(0, 101))
     cli.add_decoder(parser, "what the planner imagined, beside the goal, in the image")
     cli.add(parser, "--out FOLDER", "for both files (plan)", cli.as_path, default=Path("plan"))
@@ -56,10 +50,7 @@ def add_goals(commands: cli.Commands) -> None:
     cli.add(parser, "overrides key=value", "of the config, such as data.camera=wrist_left", nargs="*")
     cli.add(parser, "--out FOLDER", "where goals.json and the images go: new or empty", cli.as_path, required=True)
     cli.add(parser, "--episode ID|NUMBER", "which one: its name in the data, or its number, from 0 (0)")
-    text = (
-        "gripper: where it changes, the arm stops, and the end, from the states; latent: where images stop becoming"
-        " more like the next goal, with --model; every N: every N-th frame (gripper; of a film latent)"
-    )
+    text = "gripper: where it changes or the arm stops; latent: by images, with --model; every N frames (film: latent)"
     cli.add(parser, "--by gripper|latent|every", text, nargs="+")
     text = "that will plan: for latents, energies and the noise floor; the folder of a run, or what model.base takes"
     cli.add(parser, "--model RUN_OR_MODEL", text, cli.as_model)
@@ -172,11 +163,15 @@ def _goals(options: argparse.Namespace) -> None:
 
     from vjepa2_ac.cli.console.tables import goals_notes, goals_table
     from vjepa2_ac.planning.demonstrations.make_goals import KeyFrameOptions, make_goals, recording_of_film
+    from vjepa2_ac.planning.session import load_to_plan
     from vjepa2_ac.reports.figures.planning import GOALS_IMAGE, plot_goals
     from vjepa2_ac.storage import user_can_write
 
     still = None if options.still is None else recording_of_film(options.still)
-    session = _session(options)
+    session = None
+    if options.model is not None:
+        cli.say_places_elsewhere(options.model)
+        session = load_to_plan(options.model, checkpoint=options.checkpoint or "selected")
     chosen = cli.record_of_options(KeyFrameOptions, options, by=by, every=every, stride=stride)
     with cli.reporter() as reporter:
         made = make_goals(recording, chosen, session, still=still, reporter=reporter)
@@ -231,12 +226,3 @@ def _recording(options: argparse.Namespace) -> tuple[Recording, int]:
 
     with cli.reporter() as reporter:
         return recording_of_episode(config.data, options.episode or "0", reporter.task(INDEXING)), stride
-
-
-def _session(options: argparse.Namespace) -> PlanningSession | None:
-    if options.model is None:
-        return None
-    from vjepa2_ac.planning.session import load_to_plan
-
-    cli.say_places_elsewhere(options.model)
-    return load_to_plan(options.model, checkpoint=options.checkpoint or "selected")

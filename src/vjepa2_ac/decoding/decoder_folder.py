@@ -87,12 +87,10 @@ class TrainedDecoder:
             ("data.crop", card.crop, crop),
         )
         if differing := [f"{name} {ours}, not {theirs}" for name, ours, theirs in compared if ours != theirs]:
-            raise InputError(
-                where=f"{self.where} {self.name}",
-                found=f"the decoder of another encoder or crop than that of {subject} ({'; '.join(differing)})",
-                needed="one that was trained on the latents of both: others would be read wrongly",
-                fix="Train one with `vjepa2-ac decoder CONFIG`, on the config of this model",
-            )
+            found = f"the decoder of another encoder or crop than that of {subject} ({'; '.join(differing)})"
+            needed = "one that was trained on the latents of both: others would be read wrongly"
+            fix = "Train one with `vjepa2-ac decoder CONFIG`, on the config of this model"
+            raise InputError(where=f"{self.where} {self.name}", found=found, needed=needed, fix=fix)
 
 
 def save_decoder(folder: Path, card: DecoderCard, decoder: Mapping[str, Tensor], linear: Mapping[str, Tensor]) -> None:

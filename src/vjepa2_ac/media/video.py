@@ -161,12 +161,8 @@ def _stream_of(container: Any, where: str) -> VideoStream:
     if stream is None:
         raise _unusable(where, "no video in the file", "an MP4 with frames")
     if stream.codec_context is None:
-        raise InputError(
-            where=where,
-            found="a video of a codec that this build of PyAV cannot decode",
-            needed="H.264, H.265 or AV1",
-            fix="Install PyAV from PyPI, or convert the video",
-        )
+        found, fix = "a codec that this build of PyAV cannot decode", "Install PyAV from PyPI, or convert the video"
+        raise InputError(where=where, found=found, needed="H.264, H.265 or AV1", fix=fix)
     if is_deep_grey(str(stream.pix_fmt)):
         found = f"frames of {stream.pix_fmt}: one channel of more than 8 bits, as depth is stored"
         raise InputError(where=where, found=found, needed="what a camera saw", fix="Name another camera")

@@ -106,12 +106,9 @@ def resimulate(folder: str | Path, episode: Episode, start: int, camera: str = "
     off[3:6] = np.minimum(off[3:6], np.abs(2 * np.pi - off[3:6]))  # -pi and pi are one angle
     if off.max() > _STATE_TOLERANCE:
         versions = simulation.other_versions
-        raise InputError(
-            where=f"{where}: control step {start}",
-            found=f"simulated again, the state differs by up to {off.max():.2g}",
-            needed="what was recorded",
-            fix="Record it again with this version" + f"; it was recorded with {versions}" * bool(versions),
-        )
+        found = f"simulated again, the state differs by up to {off.max():.2g}"
+        fix = "Record it again with this version" + f"; it was recorded with {versions}" * bool(versions)
+        raise InputError(where=f"{where}: control step {start}", found=found, needed="what was recorded", fix=fix)
     return again
 
 

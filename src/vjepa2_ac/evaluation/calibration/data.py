@@ -130,7 +130,11 @@ def probe_variants(
     clips = SameClips(dataset, windows, sample.batch_size)
     plain, *measured = measure_variants(model, encode, clips, variants, progress)
     space = dataset.spaces.action
-    return VariantProbe(plain.result(space), tuple(found.result(space, beside=plain) for found in measured))
+    results = [
+        found.result(one.name, space, beside=plain, repair=one.repair)
+        for one, found in zip(variants[1:], measured, strict=True)
+    ]
+    return VariantProbe(plain.result(AS_THEY_ARE, space), tuple(results))
 
 
 def _with_room(
@@ -166,23 +170,15 @@ def variants_of(config: DataConfig, shifts: Sequence[int]) -> list[Variant]:
         for shift in (size, -size)
     ]
     if config.actions == "difference":  # a command has no opposite
-        found.append(
-            _variant(
-                "the states backwards",
-                "reverse the order of the frames",
-                _of_states(lambda states: np.ascontiguousarray(states[::-1])),
-            )
-        )
+        turned = _of_states(lambda states: np.ascontiguousarray(states[::-1]))
+        found.append(_variant("the states backwards", "reverse the order of the frames", turned))
     if config.states == "pose":
         for axis, name in enumerate("xy"):
             repair = f"negate {name}, with the rotation (as of a mirror)"
             found.append(_variant(f"{name} negated", repair, _of_states(partial(mirrored, axis=axis))))
         found.append(_variant("the gripper inverted", config.gripper_fix, _of_states(_with_gripper_inverted)))
     if not config.is_cache:
-        exchanged, flipped = (
-            partial(_with_changed_frames, change=change)
-            for change in (lambda frames: frames[..., ::-1], lambda frames: frames[:, :, ::-1])
-        )
+        exchanged, flipped = _of_frames(lambda frames: frames[..., ::-1]), _of_frames(lambda frames: frames[:, :, ::-1])
         repair = "exchange red and blue (OpenCV reads and writes BGR) where the data is written"
         found.append(_variant("red and blue exchanged", repair, exchanged, has_frames=True))
         repair = "flip the frames, left to right, where the data is written"
@@ -234,8 +230,8 @@ def _with_gripper_inverted(states: np.ndarray) -> np.ndarray:
     return np.concatenate([states[:, : POSE.gripper], 1 - states[:, POSE.gripper :]], axis=1)
 
 
-def _with_changed_frames(episode: Episode, change: Callable[[np.ndarray], np.ndarray]) -> Episode:
-    def read(steps: Sequence[int]) -> np.ndarray:
-        return np.ascontiguousarray(change(episode.read_frames(steps)))
+def _of_frames(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Episode], Episode]:
+    def changed(episode: Episode) -> Episode:
+        return replace(episode, read_frames=lambda steps: np.ascontiguousarray(change(episode.read_frames(steps))))
 
-    return replace(episode, read_frames=read)
+    return changed

@@ -87,28 +87,24 @@ class VariantResult:
 class VariantErrors:
     """What was measured of one variant, clip by clip."""
 
-    variant: Variant
     errors: Float[np.ndarray, "2 clips"]  # one-step, teacher-forced L1 of the model and of persistence
     actions: Float[np.ndarray, "clips steps action_dim"]
     clips: tuple[tuple[str, int], ...]  # episode and first control step
 
-    def result(self, space: ActionSpace, *, beside: VariantErrors | None = None) -> VariantResult:
+    def result(
+        self, name: str, space: ActionSpace, *, beside: VariantErrors | None = None, repair: str = ""
+    ) -> VariantResult:
         """Return what it comes to, compared with another variant."""
         ids, moved_cm = [episode for episode, _ in self.clips], None
         if space.position is not None:
             moved_cm = float(np.median(space.shown_size(self.actions.reshape(-1, self.actions.shape[-1]))))
+        error, persistence = (float(one.mean()) for one in self.errors)
+        difference = None if beside is None else self._minus(beside)
         of_model, of_nothing = self.errors
         return VariantResult(
-            name=self.variant.name,
-            ratio=ratio(of_model, of_nothing, ids),
-            error=float(of_model.mean()),
-            persistence=float(of_nothing.mean()),
-            moved_cm=moved_cm,
-            clips=len(ids),
-            episodes=len(set(ids)),
-            difference=None if beside is None else self._minus(beside),
-            repair=self.variant.repair,
-        )
+            name, ratio(of_model, of_nothing, ids), error, persistence, moved_cm, len(ids), len(set(ids)), difference,
+            repair,
+        )  # fmt: skip
 
     def _minus(self, other: VariantErrors) -> Estimate:
         """Return the ratio minus another variant's, paired by clip."""
@@ -157,17 +153,16 @@ def measure_variants(
         here = [(place, start) for place, start in zip(places, batch.starts, strict=True) if place is not None]
         for variant, found in zip(variants, parts, strict=True):
             seen = [latents] if variant is first else _read(variant, read, here, encode, latents)
-            found += [_measured(model, variant, each) for each in seen]
+            found += [_measured(model, each) for each in seen]
             done += len(batch.starts)
             progress(done, len(windows) * len(variants))
     return [
         VariantErrors(
-            variant,
             np.concatenate([one.errors for one in found], axis=1),
             np.concatenate([one.actions for one in found]),
             tuple(clip for one in found for clip in one.clips),
         )
-        for variant, found in zip(variants, parts, strict=True)
+        for found in parts
     ]
 
 
@@ -187,11 +182,11 @@ def _read(
             yield replace(latents, states=batch.states.to(device), actions=batch.actions.to(device))
 
 
-def _measured(model: Predictor, variant: Variant, latents: LatentBatch) -> VariantErrors:
+def _measured(model: Predictor, latents: LatentBatch) -> VariantErrors:
     found = measured(model, latents, ONE_STEP, (L1,))
     errors = np.stack([found.of("teacher_forced", L1, way).mean(axis=1) for way, _ in ONE_STEP])
     clips = tuple(zip(latents.episode_ids, latents.starts, strict=True))
-    return VariantErrors(variant, errors, latents.actions.cpu().numpy().astype(np.float64), clips)
+    return VariantErrors(errors, latents.actions.cpu().numpy().astype(np.float64), clips)
 
 
 @dataclass(frozen=True)
@@ -243,12 +238,9 @@ def require_learned(model: ModelConfig) -> None:
         InputError: It is.
     """
     if model.base is None:
-        raise InputError(
-            where="model.random",
-            found="a model that has learned nothing",
-            needed="one that can say which stride it was trained at",
-            fix="Set data.stride to a number, or name another model with model.base (data calibrate: --model)",
-        )
+        found, needed = "a model that has learned nothing", "one that can say which stride it was trained at"
+        fix = "Set data.stride to a number, or name another model with model.base (data calibrate: --model)"
+        raise InputError(where="model.random", found=found, needed=needed, fix=fix)
 
 
 @dataclass(frozen=True)
@@ -369,12 +361,9 @@ def calibrate_model(
         InputError: As `calibrate`; or the data is a latent cache.
     """
     if dataset.config.is_cache:
-        raise InputError(
-            where=f"data.path: {dataset.config.path}",
-            found=f"latents that were encoded for clips at stride {dataset.config.stride}",
-            needed="frames at every candidate stride",
-            fix="Calibrate on the data set itself, with data.cache: off",
-        )
+        found = f"latents that were encoded for clips at stride {dataset.config.stride}"
+        needed, fix = "frames at every candidate stride", "Calibrate on the data set itself, with data.cache: off"
+        raise InputError(where=f"data.path: {dataset.config.path}", found=found, needed=needed, fix=fix)
     world_model.eval()
     sample = replace(sample, batch_size=config.validation.batch_size)
     encode = partial(encode_batch, world_model, device=accelerator.device, chunk=config.model.encode_chunk)
@@ -411,17 +400,15 @@ def calibrate(
     views = {stride: replace(dataset, config=settings.with_stride(stride)) for stride in strides}
     possible, impossible = _possible(views, split)
     windows = validation_windows(views[possible[-1]], split, clips=sample.clips)
-    widest_first, space = possible[::-1], dataset.spaces.action
-    names = [f"stride {stride} ({stride / rate:.2f} s)" for stride in widest_first]
-    variants = [
-        Variant(name, partial(_at_stride, views[stride])) for name, stride in zip(names, widest_first, strict=True)
-    ]
+    widest_first = possible[::-1]
+    variants = [Variant(str(stride), partial(_at_stride, views[stride])) for stride in widest_first]
     clips = SameClips(dataset, windows, sample.batch_size)
-    errors = dict(zip(widest_first, measure_variants(model, encode, clips, variants, progress), strict=True))
-    results = {stride: errors[stride].result(space) for stride in possible}
+    found = measure_variants(model, encode, clips, variants, progress)
+    errors, space = dict(zip(widest_first, found, strict=True)), dataset.spaces.action
+    results = {stride: errors[stride].result(f"stride {stride} ({stride / rate:.2f} s)", space) for stride in possible}
     if len(results) > 1:
         best, second, *_ = _by_ratio(results)
-        results[best] = errors[best].result(space, beside=errors[second])
+        results[best] = errors[best].result(results[best].name, space, beside=errors[second])
     return Calibration(results, impossible, frames, split, rate)
 
 

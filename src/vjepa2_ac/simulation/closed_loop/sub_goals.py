@@ -111,10 +111,8 @@ def demonstrate(
     steps = spec.steps or STEPS[problem.task]
     shown = run_episode(arm, Oracle(limits, arm), problem, steps, spec.stride, keep_frames=True)
     if not shown.success or shown.frames is None:
-        raise InputError(
-            where=f"demonstration of problem {problem.index} ({problem.task})",
-            found=f"the oracle ends {100 * shown.distances_m[-1]:.1f} cm from the goal after {steps} model steps",
-            needed="a demonstration that succeeds",
-            fix="Allow it longer steps along each axis (planning.limits.xyz, planning.limits.ball), or more of them",
-        )
+        where = f"demonstration of problem {problem.index} ({problem.task})"
+        found = f"the oracle ends {100 * shown.distances_m[-1]:.1f} cm from the goal after {steps} model steps"
+        fix = "Allow it longer steps along each axis (planning.limits.xyz, planning.limits.ball), or more of them"
+        raise InputError(where=where, found=found, needed="a demonstration that succeeds", fix=fix)
     return shown.frames, shown.states

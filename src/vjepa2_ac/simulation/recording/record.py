@@ -169,11 +169,9 @@ def record_dataset(
     """
     load_mujoco()
     if min(episodes, spec.steps - 1, workers, 1 if shards is None else shards, spec.seed + 1) < 1:
-        raise InputError(
-            where="simulate record",
-            found=f"episodes {episodes}, steps {spec.steps}, shards {shards}, workers {workers}, seed {spec.seed}",
-            needed="at least 1 episode, 2 steps, 1 shard, 1 worker, seed 0",
-        )
+        found = f"episodes {episodes}, steps {spec.steps}, shards {shards}, workers {workers}, seed {spec.seed}"
+        needed = "at least 1 episode, 2 steps, 1 shard, 1 worker, seed 0"
+        raise InputError(where="simulate record", found=found, needed=needed)
     record = partial(record_episode, spec=replace(spec, domain=spec.worlds))
 
     def watched() -> Iterator[DroidEpisode]:
@@ -284,12 +282,9 @@ class RecordedSimulation(RecordingSpec):
         name = self.domain.name if isinstance(self.domain, Domain) else "random"
         if number < self.episodes and f"{episode_folder(number, self.seed, name)}/" in episode_id:
             return number
-        raise InputError(
-            where=SIMULATION_FILE,
-            found=f"not the episode {episode_id!r}",
-            needed=f"one of the {self.episodes} simulated with seed {self.seed}",
-            fix="Episodes are told apart by the folder in their identity; keep data.fields.identity as it is",
-        )
+        found, needed = f"not the episode {episode_id!r}", f"one of {self.episodes} simulated with seed {self.seed}"
+        fix = "Episodes are told apart by the folder in their identity; keep data.fields.identity as it is"
+        raise InputError(where=SIMULATION_FILE, found=found, needed=needed, fix=fix)
 
 
 def read_simulation(folder: str | Path) -> RecordedSimulation:
