@@ -44,7 +44,7 @@ ORDERS: dict[str, list[str]] = {
     ],
     "data.sources": ["indexed_source", "rlds droid_raw lerobot npz latents"],
     "serving": [
-        "wire access motion",
+        "wire access",
         "client request recording",
         "session",
         "about server",

@@ -225,7 +225,7 @@ def _run_benchmark(options: argparse.Namespace) -> int:
 
     from vjepa2_ac.cli.console.tables import benchmark_notes, benchmark_table
     from vjepa2_ac.simulation.closed_loop.benchmark import BenchmarkOptions, run_benchmark
-    from vjepa2_ac.simulation.world.scene import load_mujoco
+    from vjepa2_ac.simulation.world.domains import load_mujoco
 
     load_mujoco()
     chosen = cli.record_of_options(BenchmarkOptions, options)

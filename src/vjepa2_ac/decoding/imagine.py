@@ -17,7 +17,7 @@ from torch import Tensor
 from vjepa2_ac.decoding.decoder_folder import DecoderCard
 from vjepa2_ac.decoding.network import Decoder, as_pixels
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.media.film import FilmStrip, StripRow
+from vjepa2_ac.media.figure import FilmStrip, StripRow
 from vjepa2_ac.model.state_integration import counterfactual_states, feasible_actions
 from vjepa2_ac.spaces import StateSpace
 

@@ -21,13 +21,12 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import require_image, require_mask
 from vjepa2_ac.model.network.world_model import WorldModel, heads_to_replace, widths_as_text, widths_of_model
 from vjepa2_ac.model.state_integration import states_along
-from vjepa2_ac.planning.axes import require_base_frame
 from vjepa2_ac.planning.energy import Goal, Scene, WorldModelCost, distance, patch_weights
 from vjepa2_ac.planning.goals import REACHED, GoalProgress, GripperMode, SubGoal, timed, with_shares
 from vjepa2_ac.planning.model_setup import Axes, Fingerprints, prepare_for_planning
 from vjepa2_ac.planning.planner import Cancelled, Plan, Planner
 from vjepa2_ac.planning.search_space import SearchSpace, Workspace, search_space
-from vjepa2_ac.planning.settings import warn_beyond_taught, with_taught_limits
+from vjepa2_ac.planning.settings import require_base_frame, warn_beyond_taught, with_taught_limits
 from vjepa2_ac.runs.loading import TrainedRun
 from vjepa2_ac.spaces import EXTRINSICS, POSES, Spaces
 

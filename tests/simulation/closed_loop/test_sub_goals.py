@@ -11,14 +11,9 @@ from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.demonstrations.key_frames import gripper_key_frames
+from vjepa2_ac.simulation.closed_loop.benchmark import DemonstratedGoals, DemonstrationSpec, demonstrate, every_step
 from vjepa2_ac.simulation.closed_loop.policies import Planning
 from vjepa2_ac.simulation.closed_loop.rollout import put, run_episode
-from vjepa2_ac.simulation.closed_loop.sub_goals import (
-    DemonstratedGoals,
-    DemonstrationSpec,
-    demonstrate,
-    every_step,
-)
 from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, HOLDING, arm_for, make_problem
 from vjepa2_ac.simulation.recording.record import RecordingSpec, arm_of, carry_out
 from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B

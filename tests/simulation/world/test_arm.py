@@ -7,16 +7,10 @@ import pytest
 
 from projections import hand_pixel
 from vjepa2_ac.errors import InputError, UnreachableError
-from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B, Domain, DomainRanges, named_domain, sample_domain
-from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ, HIGH, HOME, LOW, forward_kinematics, rest_joints
-from vjepa2_ac.spaces import matrices_from_euler
-
-mujoco = pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
-
-from vjepa2_ac.simulation.world.arm import SimulatedArm  # noqa: E402
-from vjepa2_ac.simulation.world.camera import View  # noqa: E402
-from vjepa2_ac.simulation.world.scene import (  # noqa: E402
+from vjepa2_ac.simulation.world.domains import (
     BLOCK_M,
+    DOMAIN_A,
+    DOMAIN_B,
     FINGER_HALF_M,
     FINGER_INSIDE_M,
     FINGER_OUTSIDE_M,
@@ -24,9 +18,20 @@ from vjepa2_ac.simulation.world.scene import (  # noqa: E402
     FINGERTIP_M,
     MARK_M,
     SUBSTEPS,
+    Domain,
+    DomainRanges,
     compile_scene,
     load_mujoco,
+    named_domain,
+    sample_domain,
 )
+from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ, HIGH, HOME, LOW, forward_kinematics, rest_joints
+from vjepa2_ac.spaces import matrices_from_euler
+
+mujoco = pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
+
+from vjepa2_ac.simulation.world.arm import SimulatedArm  # noqa: E402
+from vjepa2_ac.simulation.world.camera import View  # noqa: E402
 
 REACHES = HOME + np.array([[0] * 7, [0.4, 0.3, 0.0, 0.4, 0.1, 0.2, 0.5], [-0.6, 0.2, 0.3, -0.2, 0.0, -0.3, 0.0]])
 

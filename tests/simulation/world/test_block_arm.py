@@ -5,9 +5,8 @@ import pytest
 
 from projections import pixel_of
 from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, HOLDING
-from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B, Domain
+from vjepa2_ac.simulation.world.domains import BLOCK_M, DOMAIN_A, DOMAIN_B, FINGERTIP_M, Domain
 from vjepa2_ac.simulation.world.motion import downward_poses, poses_in_base
-from vjepa2_ac.simulation.world.scene import BLOCK_M, FINGERTIP_M
 from vjepa2_ac.spaces import matrices_from_euler
 
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")

@@ -14,16 +14,16 @@ from jaxtyping import Float
 
 from vjepa2_ac.simulation.world.arm import ContactArm, SimulatedArm
 from vjepa2_ac.simulation.world.camera import FRAME_SIZE
-from vjepa2_ac.simulation.world.domains import Domain
-from vjepa2_ac.simulation.world.motion import MotionRecipe, downward_poses, poses_in_base
-from vjepa2_ac.simulation.world.scene import (
+from vjepa2_ac.simulation.world.domains import (
     BLOCK_M,
     FINGER_HALF_M,
     FINGER_INSIDE_M,
     FINGER_OUTSIDE_M,
     FINGER_TRAVEL_M,
     FINGERTIP_M,
+    Domain,
 )
+from vjepa2_ac.simulation.world.motion import MotionRecipe, downward_poses, poses_in_base
 
 TaskName = Literal["reach", "push", "pick", "place"]
 

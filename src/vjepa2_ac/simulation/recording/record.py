@@ -32,9 +32,8 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import encode_jpeg
 from vjepa2_ac.simulation.closed_loop.tasks import arm_for
 from vjepa2_ac.simulation.world.arm import SimulatedArm
-from vjepa2_ac.simulation.world.domains import Domain, DomainRanges, named_domain, sample_domain
+from vjepa2_ac.simulation.world.domains import Domain, DomainRanges, load_mujoco, named_domain, sample_domain
 from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ, Motion, MotionRecipe, random_reaching
-from vjepa2_ac.simulation.world.scene import load_mujoco
 from vjepa2_ac.storage.structured import json_text, read_json_object, record_of
 
 RecordedTask = Literal["push", "pick", "place"]

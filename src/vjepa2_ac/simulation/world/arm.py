@@ -9,7 +9,7 @@ from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
 from vjepa2_ac.simulation.world.camera import FRAME_SIZE, RayCamera
-from vjepa2_ac.simulation.world.domains import Domain
+from vjepa2_ac.simulation.world.domains import FINGER_TRAVEL_M, SUBSTEPS, Domain, compile_scene, load_mujoco
 from vjepa2_ac.simulation.world.motion import (
     GRIPPER_LAG_S,
     Joints,
@@ -19,7 +19,6 @@ from vjepa2_ac.simulation.world.motion import (
     rest_joints,
     tracking_share,
 )
-from vjepa2_ac.simulation.world.scene import FINGER_TRAVEL_M, SUBSTEPS, compile_scene, load_mujoco
 from vjepa2_ac.spaces import euler_from_matrices
 
 State = Float[np.ndarray, " 7"]  # or an action; legend: episode.py
