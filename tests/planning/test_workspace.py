@@ -109,15 +109,6 @@ def test_the_energy_of_a_plan_that_was_kept_inside_is_that_of_its_own_actions() 
     assert plan.energy == pytest.approx(float(run.decision.cost(plan.actions[None]).detach()), rel=1e-6)
 
 
-def test_without_a_model_that_answers_nobody_moves_even_outside() -> None:
-    run = controller(workspace=CORNERS)
-    with torch.no_grad():
-        for weight in run._model.predictor.parameters():
-            weight.fill_(torch.nan)
-    assert not run.act(image(0), position(0.63, 0.0, 0.3)).any()
-    assert run.decision.why == "no finite energy"
-
-
 @pytest.mark.parametrize("space", [CAMERA_POSE, vector_states(8)])
 def test_a_box_is_of_poses_in_the_base_frame(space) -> None:
     with pytest.raises(InputError, match="workspace: a model whose states are not poses"):

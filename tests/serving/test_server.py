@@ -100,14 +100,6 @@ def test_it_is_alive_at_once_and_ready_when_it_is_loaded() -> None:
         assert get(running, "/readyz") == (200, "ready\n")
 
 
-def test_what_cannot_be_loaded_ends_the_server() -> None:
-    def load() -> Session:
-        raise InputError(where="here", found="nothing to load")
-
-    with pytest.raises(InputError, match="here: nothing to load"), serving(load):
-        pass
-
-
 def test_a_second_robot_is_refused_by_the_name_of_the_first_until_that_leaves() -> None:
     with serving(session) as running:
         first = PlanningClient(running.url)

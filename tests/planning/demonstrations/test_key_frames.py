@@ -116,11 +116,6 @@ def test_frames_between_keep_the_key_frames_and_are_so_far_apart(gaps: list[int]
     assert (ways < 1.5 * step).all() if step > 1 else (ways == 1).all()
 
 
-def test_frames_between_are_one_apart_at_least() -> None:
-    with pytest.raises(ValueError, match="every 0 frames"):
-        with_frames_between([KeyFrame(3, "end")], 0)
-
-
 def embedded(*corners: float, frames: int = 20) -> np.ndarray:
     """Return an embedding that goes evenly from corner to corner, with a little noise."""
     line = np.concatenate([np.linspace(a, b, frames, endpoint=False) for a, b in pairwise(corners)])

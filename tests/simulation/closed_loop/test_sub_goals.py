@@ -10,12 +10,10 @@ from tiny_models import tiny_model
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.demonstrations.key_frames import gripper_key_frames
 from vjepa2_ac.simulation.closed_loop.benchmark import DemonstratedGoals, DemonstrationSpec, demonstrate, every_step
 from vjepa2_ac.simulation.closed_loop.policies import Planning
 from vjepa2_ac.simulation.closed_loop.rollout import put, run_episode
 from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, HOLDING, arm_for, make_problem
-from vjepa2_ac.simulation.recording.record import RecordingSpec, arm_of, carry_out
 from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B
 
 SMALL = (36, 64)
@@ -88,24 +86,3 @@ def test_a_planner_is_given_the_goals_of_the_problem() -> None:
     assert [bool(action) for action in episode.actions[:, 6]] == [False, False, False, True, False]
     assert controller.decision is not None
     assert (controller.decision.goal, controller.decision.progress.since) == (2, 4)
-
-
-def test_recorded_demonstrations_have_their_grasp_among_their_key_frames() -> None:
-    """At every control step, with noise on the way and fingers that take some frames to close."""
-    spec = RecordingSpec("A", steps=41, seed=3, task="pick")
-    for index in (0, 2):
-        motion = carry_out(arm_of(index, spec), index, spec)
-        states = np.concatenate([motion.poses, motion.gripper[:, None]], axis=1)
-        keys = gripper_key_frames(states)
-        names = [key.name for key in keys]
-        assert names.index("closed") == names.index("before closing") + 1
-        frames = {key.name: key.frame for key in keys}
-        assert states[frames["before closing"], 6] < 0.05
-        assert states[frames["closed"], 6] == pytest.approx(HOLDING, abs=0.05)
-        assert frames["closed"] - frames["before closing"] <= 6
-        assert names[-1] == "end"
-        assert len(keys) <= 6
-    motion = carry_out(arm_of(4, spec), 4, spec)  # its first grasp fails, so it opens and closes again
-    names = [key.name for key in gripper_key_frames(np.concatenate([motion.poses, motion.gripper[:, None]], axis=1))]
-    assert names.count("closed") == 2
-    assert names.count("opened") == 1

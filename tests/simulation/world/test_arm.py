@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from projections import hand_pixel
-from vjepa2_ac.errors import InputError, UnreachableError
+from vjepa2_ac.errors import UnreachableError
 from vjepa2_ac.simulation.world.domains import (
     BLOCK_M,
     DOMAIN_A,
@@ -22,7 +22,6 @@ from vjepa2_ac.simulation.world.domains import (
     DomainRanges,
     compile_scene,
     load_mujoco,
-    named_domain,
     sample_domain,
 )
 from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ, HIGH, HOME, LOW, forward_kinematics, rest_joints
@@ -140,11 +139,6 @@ def test_domain_b_is_outside_the_training_domains_of_the_base() -> None:
     ranges = DomainRanges()
     assert ranges.azimuth_deg[0] <= DOMAIN_A.camera.azimuth_deg <= ranges.azimuth_deg[1] < DOMAIN_B.camera.azimuth_deg
     assert ranges.base_yaw_deg[1] < DOMAIN_B.base_yaw_deg
-
-
-def test_an_unknown_domain_is_refused_by_name() -> None:
-    with pytest.raises(InputError, match=r"'C'.*A, B"):
-        named_domain("C")
 
 
 def test_missing_mujoco_is_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
