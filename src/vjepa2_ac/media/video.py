@@ -313,7 +313,7 @@ def video_library(where: str = "video") -> Any:
     return require_library("av", where=where, called="PyAV, which decodes and writes video", extra="video")
 
 
-def write_video(path: str | Path, frames: Iterable[UInt8[np.ndarray, "height width 3"]], *, rate_hz: float) -> Path:
+def write_video(path: str | Path, frames: Iterable[Frame], *, rate_hz: float) -> Path:
     """Write RGB frames as a video and return its path; an odd last row or column of pixels is dropped.
 
     Args:
@@ -347,9 +347,7 @@ def write_video(path: str | Path, frames: Iterable[UInt8[np.ndarray, "height wid
     return Path(path)
 
 
-def write_gif(
-    path: str | Path, frames: Sequence[UInt8[np.ndarray, "height width 3"]], *, seconds: Sequence[float]
-) -> Path:
+def write_gif(path: str | Path, frames: Sequence[Frame], *, seconds: Sequence[float]) -> Path:
     """Write RGB frames as an endless GIF, and return its path.
 
     Colours are rounded to 255 without dithering, which would flicker and take several times the room.

@@ -21,9 +21,10 @@ from vjepa2_ac.data.loader import validation_windows
 from vjepa2_ac.data.windows import spread
 from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch
-from vjepa2_ac.episode import Batch, Episode, LatentBatch, Progress, no_progress
+from vjepa2_ac.episode import Episode, Progress, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.calibration.variants import (
+    Encode,
     ReadOnce,
     SameClips,
     Variant,
@@ -103,17 +104,13 @@ def probe_config(
 
 
 def probe_variants(
-    model: Predictor,
-    encode: Callable[[Batch], LatentBatch],
-    dataset: Dataset,
-    sample: ClipSample,
-    progress: Progress = no_progress,
+    model: Predictor, encode: Encode, dataset: Dataset, sample: ClipSample, progress: Progress = no_progress
 ) -> VariantProbe:
     """Measure a model's one-step error on unchanged clips, and under each variant.
 
     Args:
         model: The predictor.
-        encode: Turns a batch of pixels into latents on the model's device.
+        encode: Makes the latents.
         dataset: The source of clips, at a fixed stride.
         sample: The clips.
         progress: Called with (clips done, clips in total).

@@ -38,6 +38,8 @@ from vjepa2_ac.runs.folder import is_run
 from vjepa2_ac.runs.loading import load_run
 from vjepa2_ac.spaces import ActionSpace
 
+Encode = Callable[[Batch], LatentBatch]  # pixels into latents, on the model's device
+
 _MARGIN = 2.0  # half-widths of the 95 % interval: the best of several is easily better by chance
 _EPISODES_NEEDED = 2  # for an interval
 _EPISODES_TO_BE_SURE = 10  # an interval from fewer is too narrow
@@ -126,17 +128,13 @@ class SameClips:
 
 
 def measure_variants(
-    model: Predictor,
-    encode: Callable[[Batch], LatentBatch],
-    clips: SameClips,
-    variants: Sequence[Variant],
-    progress: Progress = no_progress,
+    model: Predictor, encode: Encode, clips: SameClips, variants: Sequence[Variant], progress: Progress = no_progress
 ) -> list[VariantErrors]:
     """Measure a model's one-step error on the same clips under each variant; each episode is read once for all.
 
     Args:
         model: The predictor.
-        encode: Turns a batch of pixels into latents on the model's device.
+        encode: Makes the latents.
         clips: What to measure on.
         variants: The first one decides which clips can be read.
         progress: Called with (clips done, clips in total), of all variants.
@@ -167,11 +165,7 @@ def measure_variants(
 
 
 def _read(
-    variant: Variant,
-    dataset: Dataset,
-    windows: Sequence[tuple[int, int]],
-    encode: Callable[[Batch], LatentBatch],
-    latents: LatentBatch,
+    variant: Variant, dataset: Dataset, windows: Sequence[tuple[int, int]], encode: Encode, latents: LatentBatch
 ) -> Iterable[LatentBatch]:
     """Yield a batch of clips under a variant; frames are encoded only if it has some of its own."""
     for batch in batches_of(variant.view(dataset), windows, batch_size=len(windows)):
@@ -372,12 +366,7 @@ def calibrate_model(
 
 
 def calibrate(
-    model: Predictor,
-    encode: Callable[[Batch], LatentBatch],
-    dataset: Dataset,
-    sample: ClipSample,
-    *,
-    progress: Progress = no_progress,
+    model: Predictor, encode: Encode, dataset: Dataset, sample: ClipSample, *, progress: Progress = no_progress
 ) -> Calibration:
     """Measure a model's one-step error over persistence at each stride.
 
@@ -386,7 +375,7 @@ def calibrate(
 
     Args:
         model: The predictor.
-        encode: Turns a batch of pixels into latents on the model's device.
+        encode: Makes the latents.
         dataset: The source of clips; its config has the candidates, its own stride does not matter.
         sample: The clips at each stride.
         progress: Called with (clips done, clips in total).

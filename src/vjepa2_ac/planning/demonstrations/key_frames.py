@@ -17,6 +17,8 @@ from vjepa2_ac.planning.goals import GripperMode, SubGoal
 from vjepa2_ac.planning.search_space import GRIPPER
 from vjepa2_ac.spaces import actions_from_states
 
+States = Float[np.ndarray, "frames 7"]
+
 GRIPS = 0.15  # of closedness: less is no change of the gripper
 _MOVES = 0.02  # of closedness, from one frame to the next: less is no motion of the fingers
 _PAUSE = 2  # frames that the fingers may rest within one change
@@ -46,7 +48,7 @@ OF_MODEL_STEPS = StillRule(lasts=1, apart=1)
 """Where a frame is a model step."""
 
 
-def gripper_key_frames(states: Float[np.ndarray, "frames 7"], rule: StillRule | None = None) -> tuple[KeyFrame, ...]:
+def gripper_key_frames(states: States, rule: StillRule | None = None) -> tuple[KeyFrame, ...]:
     """Return where the gripper begins to change and where it has changed, where the arm stops, and the end.
 
     Where the arm leaves before the fingers have come to rest, the gripper has changed at the last frame before that, if
@@ -97,7 +99,7 @@ def _gripper_changes(closedness: Float[np.ndarray, " frames"]) -> list[tuple[int
     return [(begin, end) for begin, end, _ in found if abs(closedness[end] - closedness[begin]) >= GRIPS]
 
 
-def _before_leaving(states: Float[np.ndarray, "frames 7"], begin: int, end: int) -> int:
+def _before_leaving(states: States, begin: int, end: int) -> int:
     """Return the last frame of a change of the gripper at which the arm is where it began, or the end of the change."""
     changed = np.abs(states[begin : end + 1, GRIPPER] - states[begin, GRIPPER])
     moved = np.linalg.norm(states[begin : end + 1, :3] - states[begin, :3], axis=1)
@@ -105,14 +107,14 @@ def _before_leaving(states: Float[np.ndarray, "frames 7"], begin: int, end: int)
     return begin + int(there[-1]) if len(there) else end
 
 
-def _stops(states: Float[np.ndarray, "frames 7"], lasts: int) -> list[int]:
+def _stops(states: States, lasts: int) -> list[int]:
     """Return where the arm comes to rest for at least so many frames; at the start it has not come to rest."""
     still = _are_below(actions_from_states(states), _STILL_M, _STILL_RAD, _MOVES)
     begins = [frame for frame in range(1, len(still)) if still[frame] and not still[frame - 1]]
     return [begin for begin in begins if still[begin : begin + lasts].all() and begin + lasts <= len(still)]
 
 
-def resting(states: Float[np.ndarray, "frames 7"]) -> Bool[np.ndarray, " neighbours"]:
+def resting(states: States) -> Bool[np.ndarray, " neighbours"]:
     """Return of each frame but the last whether arm and fingers rest until the next one, up to what sensors measure."""
     return _are_below(actions_from_states(states), *_REST)
 
@@ -235,10 +237,7 @@ class Timing:
 
 
 def sub_goals_of(
-    images: Sequence[np.ndarray],
-    keys: Sequence[KeyFrame],
-    timing: Timing,
-    states: Float[np.ndarray, "frames 7"] | None = None,
+    images: Sequence[np.ndarray], keys: Sequence[KeyFrame], timing: Timing, states: States | None = None
 ) -> tuple[SubGoal, ...]:
     """Return key frames as goals, with the demonstration's durations and, if states are known, gripper modes.
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import multiprocessing
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -31,7 +31,7 @@ from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import encode_jpeg
 from vjepa2_ac.simulation.closed_loop.tasks import arm_for
-from vjepa2_ac.simulation.world.arm import SimulatedArm
+from vjepa2_ac.simulation.world.arm import Look, SimulatedArm
 from vjepa2_ac.simulation.world.domains import Domain, DomainRanges, load_mujoco, named_domain, sample_domain
 from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ, Motion, MotionRecipe, random_reaching
 from vjepa2_ac.storage.structured import json_text, read_json_object, record_of
@@ -93,12 +93,7 @@ def arm_of(index: int, spec: RecordingSpec) -> SimulatedArm:
 
 
 def carry_out(
-    arm: SimulatedArm,
-    index: int,
-    spec: RecordingSpec,
-    *,
-    until: int | None = None,
-    look: Callable[[SimulatedArm], None] | None = None,
+    arm: SimulatedArm, index: int, spec: RecordingSpec, *, until: int | None = None, look: Look | None = None
 ) -> Motion:
     """Carry out an episode, and return its motion.
 
@@ -107,7 +102,7 @@ def carry_out(
         index: Number of the episode.
         spec: What an episode is.
         until: Control step at which arm and block are left, as they were when it was measured; None: after the last.
-        look: Called at every control step, at the time of its measurements.
+        look: Called with the arm.
     """
     rng = _stream(index, spec, _MOTION)
     if spec.task is not None:  # contacts depend on all that happened before
