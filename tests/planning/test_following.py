@@ -32,7 +32,12 @@ def noisy(seed: int, most: int = 6) -> np.ndarray:
 def decided(run: Controller, seen: np.ndarray) -> tuple[int, int, bool, bool]:
     """Return which goal applies, since when, whether it changed, and whether all is done."""
     run.act(seen, STATE)
-    return run.decision.goal, run.decision.progress.since, bool(run.decision.progress.changed), run.decision.done
+    return (
+        run.decision.progress.place,
+        run.decision.progress.since,
+        bool(run.decision.progress.changed),
+        run.decision.done,
+    )
 
 
 def test_the_next_goal_follows_once_an_image_is_near_the_present_one() -> None:

@@ -130,15 +130,13 @@ def _tls(options: argparse.Namespace) -> ssl.SSLContext | None:
         return None
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     try:
-        context.load_cert_chain(options.certificate, options.certificate_key, password=_no_password)
+        context.load_cert_chain(
+            options.certificate, options.certificate_key, password=""
+        )  # else OpenSSL asks at the terminal
     except (OSError, ValueError) as error:
         needed = "a certificate and its private key without a password, in PEM"
         raise InputError(where=f"--certificate {options.certificate}", found=str(error), needed=needed) from None
     return context
-
-
-def _no_password() -> str:
-    raise ValueError("the private key has a password")
 
 
 def _loaded(options: argparse.Namespace, goals: KeptGoals | None, extrinsics: np.ndarray | None) -> Served:

@@ -126,7 +126,7 @@ def _convolved(shape: DecoderShape) -> nn.Sequential:
         *(_Block(width, heads) for _ in range(blocks)),
         nn.LayerNorm(width),
         Rearrange("n (rows columns) width -> n width rows columns", rows=shape.grid),
-        nn.Conv2d(widths.width, 4 * first, 3, padding=1),
+        nn.Conv2d(width, 4 * first, 3, padding=1),
         nn.PixelShuffle(2),
         nn.GELU(),
         nn.Conv2d(first, 4 * second, 3, padding=1),

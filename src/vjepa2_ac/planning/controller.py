@@ -25,7 +25,7 @@ from vjepa2_ac.planning.energy import Goal, Scene, WorldModelCost, distance, pat
 from vjepa2_ac.planning.goals import REACHED, GoalProgress, GripperMode, SubGoal, timed, with_shares
 from vjepa2_ac.planning.model_setup import Axes, Fingerprints, prepare_for_planning
 from vjepa2_ac.planning.planner import Cancelled, Plan, Planner
-from vjepa2_ac.planning.search_space import SearchSpace, Workspace, search_space
+from vjepa2_ac.planning.search_space import SearchSpace, Workspace, is_allowed, search_space
 from vjepa2_ac.planning.settings import require_base_frame, warn_beyond_taught, with_taught_limits
 from vjepa2_ac.runs.loading import TrainedRun
 from vjepa2_ac.spaces import EXTRINSICS, POSES, Spaces
@@ -47,11 +47,6 @@ class Decision:
     states: Float[np.ndarray, "time dim"] | None = None  # states predicted along the plan, the current state first
     cost: WorldModelCost | None = None  # to evaluate other actions
     done: bool = False  # the last goal is reached: no motion
-
-    @property
-    def goal(self) -> int:
-        """The index of the goal that applies now."""
-        return self.progress.place
 
 
 class Controller:
@@ -283,7 +278,8 @@ class Controller:
         nothing = Decision(self._command(state, np.zeros(len(state))), "at the goal", energy, places, progress)
         if progress.done or float(still.max()) <= REACHED:
             return replace(nothing, done=progress.place == len(self._goals) - 1)
-        if self._workspace is not None and not self._workspace.is_near(state, self.config.limits):
+        box, limits = self._workspace, self.config.limits
+        if box is not None and not is_allowed(box.way_back(state[:3]), limits):  # one action does not lead back
             return replace(nothing, why="outside the workspace")
         self.space = self._searched[self._goals[progress.place].gripper]
         cost = WorldModelCost(self._model, self._scene(seen), goal, self.config.energy, done=done, spaces=self.spaces)

@@ -181,14 +181,10 @@ class Workspace:
         upper[0, :3] = torch.minimum(upper[0, :3], room_up)
         return replace(space, lower=lower, upper=upper)
 
-    def is_near(self, state: Float[np.ndarray, " 7"], limits: LimitsConfig) -> bool:
-        """Return whether one action leads back inside; true of a robot that is inside."""
-        return is_allowed(self.way_back(state[:3]), limits)
-
     def kept(
         self, state: Float[np.ndarray, " 7"], actions: Float[np.ndarray, "steps 7"], limits: LimitsConfig
     ) -> Float[np.ndarray, "steps 7"]:
-        """Return actions whose targets are all inside, of a robot that is near.
+        """Return actions whose targets are all inside, of a robot whom one action leads back.
 
         A target is moved to the nearest place inside; where that is more than an action may be, towards the way back.
 

@@ -76,6 +76,11 @@ class Solver:
         """Return the current result; None: the best evaluated decisions."""
         return None
 
+    def _around_mean(self, *, try_mean: bool) -> Samples:
+        noise = white_noise(self._space, self._config.samples, self._generator)
+        noise[: int(try_mean)] = 0.0
+        return self._space.allowed(self.mean + self.std * noise)
+
     def _fit(self, best: Float[Tensor, "elites decisions dim"], keep_mean: Momentum, keep_std: Momentum) -> None:
         """Move the distribution to its elites; a single one does not change the standard deviation."""
         if len(best):
@@ -113,10 +118,7 @@ class CemSolver(Solver):
 
     def sample(self) -> Samples:
         """Return samples of the distribution, clipped to the allowed set."""
-        noise = white_noise(self._space, self._config.samples, self._generator)
-        if self._config.cem.try_mean:
-            noise[0] = 0.0
-        return self._space.allowed(self.mean + self.std * noise)
+        return self._around_mean(try_mean=self._config.cem.try_mean)
 
     def update(self, evaluated: EvaluatedPlans) -> None:
         """Fit the distribution to the elites."""
@@ -201,9 +203,7 @@ class MppiSolver(Solver):
 
     def sample(self) -> Samples:
         """Return the mean and samples around it."""
-        noise = white_noise(self._space, self._config.samples, self._generator)
-        noise[0] = 0.0
-        return self._space.allowed(self.mean + self.std * noise)
+        return self._around_mean(try_mean=True)
 
     def update(self, evaluated: EvaluatedPlans) -> None:
         """Move the mean to the weighted mean of the samples."""

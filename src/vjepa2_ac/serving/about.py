@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from vjepa2_ac import __version__
-from vjepa2_ac.config import Config
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import read_image, require_image
 from vjepa2_ac.planning.controller import Controller
@@ -27,7 +26,8 @@ _SOMEWHERE = np.array([0.4, 0.0, 0.4, np.pi, 0.0, 0.0, 0.0])
 def metadata_of(loaded: PlanningSession, session: Session) -> dict[str, Any]:
     """Return what a client may know of the server: plain values, without a path of this machine."""
     planning, options, model = loaded.config.planning, session.options, loaded.as_dict()["model"]
-    rate = _control_rate(loaded.config)
+    rates = (getattr(one, "control_rate_hz", None) for one in loaded.config.data.own_section.values())
+    rate = next((rate for rate in rates if rate is not None), None)  # None: only the data set knows
     return {
         "policy": "vjepa2-ac",
         "protocol": PROTOCOL,
@@ -96,12 +96,6 @@ def warm_up(controller: Controller) -> float:
     return time.perf_counter() - began
 
 
-def _control_rate(config: Config) -> float | None:
-    """Return the control steps a second; None: only the data set knows."""
-    rates = (getattr(one, "control_rate_hz", None) for one in config.data.own_section.values())
-    return next((rate for rate in rates if rate is not None), None)
-
-
 KeptGoals = Mapping[str, GoalFolder]
 
 _PICTURES = {".png", ".jpg", ".jpeg"}
@@ -127,14 +121,12 @@ def read_kept_goals(folder: Path) -> KeptGoals:
             continue
         if path.stem in kept:
             raise InputError(where=str(path), found=f"two goals named {path.stem!r}", fix="Rename one of them")
-        kept[path.stem] = read_goal_folder(path) if is_order else _picture(path)
+        if is_order:
+            kept[path.stem] = read_goal_folder(path)
+        else:
+            require_image(image := read_image(path), where=str(path))
+            kept[path.stem] = GoalFolder((SubGoal(image, name=path.stem),))
     if not kept:
         needed = f"pictures (PNG or JPEG), or folders with a {GOALS_FILE} (`vjepa2-ac goals` makes them)"
         raise InputError(where=f"--goals {folder}", found="no goal", needed=needed)
     return kept
-
-
-def _picture(path: Path) -> GoalFolder:
-    image = read_image(path)
-    require_image(image, where=str(path))
-    return GoalFolder((SubGoal(image, name=path.stem),))

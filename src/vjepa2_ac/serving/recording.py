@@ -95,7 +95,7 @@ class Recorder:
             raise ValueError("nothing was decided")
         if decision.why == "out of time" or (number and (config.context > 1 or config.warm_start)):
             return None  # it depends on the clock, or on decisions before it
-        goals, durations, left = self._goals[decision.goal :], [], number - decision.progress.since
+        goals, durations, left = self._goals[decision.progress.place :], [], number - decision.progress.since
         words = ["--start", self._image(frame), "--state=" + ",".join(repr(float(one)) for one in state)]
         for goal in goals:
             words += ["--goal", self._image(goal.image)]

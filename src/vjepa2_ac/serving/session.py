@@ -191,30 +191,21 @@ class Session:
 
         Without a decision, or a plan in it, nobody moves.
         """
-        still, space = np.atleast_2d(state), self.controller.space
-        plan = None if decision is None else decision.plan
-        planned = still if decision is None or decision.states is None else decision.states[1:]
-        changes = np.zeros((space.steps, space.dim))
-        if plan is not None and not self.options.dry_run:
-            changes = plan.actions.double().numpy()
-        goal = None
+        planned, changes = np.atleast_2d(state), np.zeros((self.controller.space.steps, self.controller.space.dim))
+        found: dict[str, Any] = {
+            "target": planned, "why": why, "goal": None, "done": False, "energy": {"now": None, "plan": None},
+            "notes": self._notes,
+        }  # fmt: skip
         if decision is not None:
-            progress = decision.progress
+            progress, plan = decision.progress, decision.plan
             name = self._names[progress.place]
             goal = {"index": progress.place, "name": name, "since": progress.since, "changed": progress.changed}
-        found = {
-            "target": still if self.options.dry_run else planned,
-            "why": why,
-            "goal": goal,
-            "done": decision is not None and decision.done,
-            "energy": {
-                "now": None if decision is None else decision.energy_now,
-                "plan": None if plan is None else plan.energy,
-            },
-            "notes": self._notes,
-        }
-        if self.options.dry_run:
-            found |= {"dry_run": True, "planned": planned}
+            energy = {"now": decision.energy_now, "plan": None if plan is None else plan.energy}
+            found |= {"goal": goal, "done": decision.done, "energy": energy}
+            planned = planned if decision.states is None else decision.states[1:]
+            if plan is not None and not self.options.dry_run:
+                changes = plan.actions.double().numpy()
+        found |= {"dry_run": True, "planned": planned} if self.options.dry_run else {"target": planned}
         return {"actions": self._actions(state, changes), **plain(found)}
 
     def _actions(self, state: np.ndarray, changes: Float[np.ndarray, "steps dim"]) -> Float[np.ndarray, "rows dim"]:

@@ -85,4 +85,4 @@ def test_a_planner_is_given_the_goals_of_the_problem() -> None:
     episode = run_episode(arm, policy, problem, steps=5)
     assert [bool(action) for action in episode.actions[:, 6]] == [False, False, False, True, False]
     assert controller.decision is not None
-    assert (controller.decision.goal, controller.decision.progress.since) == (2, 4)
+    assert (controller.decision.progress.place, controller.decision.progress.since) == (2, 4)

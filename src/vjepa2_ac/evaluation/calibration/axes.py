@@ -172,7 +172,8 @@ def fit_axes(
     def of_sums(sums: Float[np.ndarray, "1 *batch 18"]) -> Float[np.ndarray, "*batch 3"]:
         fitted = _matrix(sums[0])
         flat = np.sqrt(np.abs(np.linalg.det(fitted[..., :2, :2])))
-        return np.stack([nearby + _wrapped(_yaw(fitted) - nearby), flat, _condition(fitted)], axis=-1)
+        sizes = np.linalg.svd(fitted, compute_uv=False)
+        return np.stack([nearby + _wrapped(_yaw(fitted) - nearby), flat, sizes[..., 0] / sizes[..., -1]], axis=-1)
 
     fitted_yaw, gain, condition = bootstrapped(of_sums, products[None], episode_ids)
     yaw = _yaw_of_least_error(errors, episode_ids)
@@ -219,11 +220,6 @@ def _yaw(matrix: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch"]
     """Return the angle in degrees of the rotation nearest to the horizontal block (its polar decomposition)."""
     sine, cosine = matrix[..., 1, 0] - matrix[..., 0, 1], matrix[..., 0, 0] + matrix[..., 1, 1]
     return np.asarray(np.degrees(np.arctan2(sine, cosine)))
-
-
-def _condition(matrix: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch"]:
-    sizes = np.linalg.svd(matrix, compute_uv=False)
-    return np.asarray(sizes[..., 0] / sizes[..., -1])
 
 
 def _turned(start: RolloutStart, axes: Axes) -> RolloutStart:

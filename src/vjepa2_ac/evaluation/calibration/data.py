@@ -186,9 +186,12 @@ def variants_of(config: DataConfig, shifts: Sequence[int]) -> list[Variant]:
 def _variant(name: str, repair: str, change: Callable[[Episode], Episode], *, has_frames: bool = False) -> Variant:
     """Return a variant of changed episodes; without frames where they are the same."""
 
+    def no_frames(steps: Sequence[int]) -> np.ndarray:
+        return np.zeros((len(steps), 1, 1, 3), np.uint8)
+
     def changed(episode: Episode) -> Episode:
         found = change(episode)
-        return found if has_frames else replace(found, read_frames=_no_frames, read_latents=None)
+        return found if has_frames else replace(found, read_frames=no_frames, read_latents=None)
 
     def view(dataset: Dataset) -> Dataset:
         return replace(dataset, source=ReadOnce(dataset.source, changed))
@@ -202,10 +205,6 @@ def mirrored(states: Float[np.ndarray, "steps 7"], axis: int) -> Float[np.ndarra
     mirror[axis] = -1
     rotations = matrices_from_euler(states[:, POSE.rotation]) * mirror[:, None] * mirror
     return np.concatenate([states[:, POSE.position] * mirror, euler_from_matrices(rotations), states[:, -1:]], axis=1)
-
-
-def _no_frames(steps: Sequence[int]) -> np.ndarray:
-    return np.zeros((len(steps), 1, 1, 3), np.uint8)
 
 
 def _steps(shift: int) -> str:

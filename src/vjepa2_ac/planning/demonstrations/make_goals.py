@@ -200,9 +200,7 @@ def _keys(recording: Recording, options: KeyFrameOptions, seen: _Encoded | None)
     if recording.states is None:
         found, fix = f"{recording.name}: no measured poses", "Take --by latent with --model, or --by every N"
         raise InputError(where="--by gripper", found=found, needed="an episode with poses and gripper", fix=fix)
-    return gripper_key_frames(
-        recording.states, StillRule() if options.apart is None else StillRule(apart=options.apart)
-    )
+    return gripper_key_frames(recording.states, StillRule(apart=options.apart or StillRule.apart))
 
 
 @dataclass(frozen=True, eq=False)

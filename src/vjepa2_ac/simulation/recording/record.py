@@ -271,8 +271,8 @@ class RecordedSimulation(RecordingSpec):
         Raises:
             InputError: It is no episode of this data set.
         """
-        found = _NUMBER.search(episode_id)
-        number = int(found[1]) if found else self.episodes
+        match = _NUMBER.search(episode_id)
+        number = int(match[1]) if match else self.episodes
         name = self.domain.name if isinstance(self.domain, Domain) else "random"
         if number < self.episodes and f"{episode_folder(number, self.seed, name)}/" in episode_id:
             return number

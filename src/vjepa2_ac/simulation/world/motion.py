@@ -179,7 +179,10 @@ def random_reaching(
     positions, turns, closed = _waypoints(ways, rng, recipe)
     path = PchipInterpolator(times, np.concatenate([positions, turns[:, None]], axis=1))(np.arange(steps + 1))
     gripper = closed[np.arange(steps + 1) // recipe.stride]
-    commanded = _joints_along(poses_in_base(downward_poses(path), domain), domain)
+    joints = [rest := rest_joints(domain)]
+    for pose in poses_in_base(downward_poses(path), domain):
+        joints.append(inverse_kinematics(pose, joints[-1], rest=rest))
+    commanded = np.array(joints[1:])
     return Motion(
         commanded_joints=commanded[1:],
         commanded_gripper=gripper[1:],
@@ -240,11 +243,3 @@ def _waypoints(
         closed.append(1.0 - closed[-1] if rng.uniform() < recipe.gripper_share else closed[-1])
     path = np.array(points)
     return path[:, :3], path[:, 3], np.array(closed)
-
-
-def _joints_along(poses: Float[np.ndarray, "steps 6"], domain: Domain) -> Float[np.ndarray, "steps 7"]:
-    rest = rest_joints(domain)
-    joints = [rest]
-    for pose in poses:
-        joints.append(inverse_kinematics(pose, joints[-1], rest=rest))
-    return np.array(joints[1:])
