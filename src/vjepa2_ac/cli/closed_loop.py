@@ -149,11 +149,10 @@ def _loaded(options: argparse.Namespace, goals: KeptGoals | None, extrinsics: np
     from vjepa2_ac.serving.session import Session, SessionOptions
 
     loaded = cli.load_planning_session(options)
+    steps = require_stride(loaded.config.data, to="say how long an action lasts", fix="Say which, as data.stride=4")
     how = SessionOptions(
         options.actions,
-        control_steps=require_stride(
-            loaded.config.data, to="say how long an action lasts", fix="Say which, as data.stride=4"
-        ),
+        control_steps=steps,
         image_keys=IMAGE_KEYS if options.image_key is None else (options.image_key,),
         deadline_s=options.deadline,
         dry_run=options.dry_run,

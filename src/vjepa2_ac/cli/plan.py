@@ -92,19 +92,17 @@ def _plan(options: argparse.Namespace) -> int:
     request = PlanRequest(start, state, session.goals_of(goals), mask)
     with cli.reporter() as reporter:
         reporter.note(_search_line(session.config.planning, on_cpu=session.world_model.device.type == "cpu"))
-        progress = reporter.task("planning", "action sequences")
-        controller = session.controller(seed=options.seed, extrinsics=extrinsics, progress=progress)
+        controller = session.controller(seed=options.seed, extrinsics=extrinsics)
+        controller.planner.progress = reporter.task("planning", "action sequences")
         found = decide(controller, request, nodes=options.nodes, reporter=reporter)
     names = options.goal or [str(options.goals)]
     about = session.as_dict() | {"start": options.start, "goals": names, "mask": options.mask}
     about["decoder"] = None if decoder is None else decoder.as_dict()
     imagined = None if decoder is None else imagine_plan(found, decoder)
     with user_can_write(options.out):
-        written = [
-            write_plan(found, about, options.out / PLAN_FILE),
-            plot_plan(found, options.out / PLAN_IMAGE, imagined),
-        ]
-    cli.show(plan_table(found), summarize(found), files=written)
+        file = write_plan(found, about, options.out / PLAN_FILE)
+        image = plot_plan(found, options.out / PLAN_IMAGE, imagined)
+    cli.show(plan_table(found), summarize(found), files=[file, image])
     return int(found.decision.why == "no finite energy")
 
 

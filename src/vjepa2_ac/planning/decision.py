@@ -15,7 +15,7 @@ from jaxtyping import Float, UInt8
 from vjepa2_ac.planning.controller import Controller, Decision
 from vjepa2_ac.planning.energy import FEWEST_NODES, EnergySlice, energy_slices, fitting_nodes, sequences_of_slices
 from vjepa2_ac.planning.goals import SubGoal
-from vjepa2_ac.planning.planner import Cost, Iteration, Plan
+from vjepa2_ac.planning.planner import Cost, Plan
 from vjepa2_ac.planning.search_space import SearchSpace
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.spaces import StateSpace
@@ -61,11 +61,6 @@ class PlanResult:
     def state_space(self) -> StateSpace:
         """What the numbers of a state are."""
         return self.controller.spaces.state
-
-    @property
-    def shown_axes(self) -> tuple[int, ...]:
-        """The numbers of an action that figures show."""
-        return self.controller.shown_axes
 
     @property
     def unused_goals(self) -> tuple[int, ...]:
@@ -157,6 +152,8 @@ def plan_as_dict(answer: PlanResult, about: Mapping[str, Any]) -> dict[str, Any]
     decision, question, controller = answer.decision, answer.question, answer.controller
     plan, progress, names = decision.plan, decision.progress, answer.state_space.change_names
     rules = ("name", "at_least", "at_most", "share", "gripper", "floor")
+    recorded = ("samples", "finite", "lowest", "mean", "std", "seconds")
+    energy = {"now": decision.energy_now, "began": progress.began, "doing_nothing": answer.doing_nothing}
     found = {
         "format": FORMAT,
         "in_words": summarize(answer),
@@ -174,30 +171,16 @@ def plan_as_dict(answer: PlanResult, about: Mapping[str, Any]) -> dict[str, Any]
         "since": progress.since,
         "changed": progress.changed,
         "done": decision.done,
-        "energy": {
-            "now": decision.energy_now,
-            "began": progress.began,
-            "doing_nothing": answer.doing_nothing,
-            "plan": None if plan is None else plan.energy,
-        },
+        "energy": energy | {"plan": None if plan is None else plan.energy},
         "evaluations": 0 if plan is None else plan.evaluations,
-        "iterations": [_iteration(one) for one in (() if plan is None else plan.iterations)],
+        "iterations": [
+            {name: getattr(one, name) for name in recorded} | {"elites_mean": one.elite_energy}
+            for one in (() if plan is None else plan.iterations)
+        ],
         "slices": [_slice(one, names[one.axes[0]], names[one.axes[1]]) for one in answer.slices],
         "seconds": {**answer.seconds, "search": 0.0 if plan is None else plan.seconds},
     }
     return {name: plain(value) for name, value in found.items()}
-
-
-def _iteration(one: Iteration) -> dict[str, Any]:
-    return {
-        "samples": one.samples,
-        "finite": one.finite,
-        "lowest": one.lowest,
-        "elites_mean": one.elite_energy,
-        "mean": one.mean,
-        "std": one.std,
-        "seconds": one.seconds,
-    }
 
 
 def _slice(one: EnergySlice, across: str, up: str) -> dict[str, Any]:
@@ -244,8 +227,8 @@ def summarize(answer: PlanResult) -> str:
 
 def _motion(answer: PlanResult) -> str:
     space, change, steps = answer.state_space, answer.states[-1] - answer.states[0], len(answer.actions)
-    shown = change[list(answer.shown_axes)] * (space.shown_factor if space.is_pose else 1.0)
-    names = [space.change_names[axis] for axis in answer.shown_axes]
+    shown = change[list(answer.controller.shown_axes)] * (space.shown_factor if space.is_pose else 1.0)
+    names = [space.change_names[axis] for axis in answer.controller.shown_axes]
     lasting = f"in {steps} model step{'s' * (steps > 1)}"
     if not space.is_pose:
         parts = ", ".join(f"{name} by {value:+.3g}" for name, value in zip(names, shown, strict=True))
@@ -260,7 +243,7 @@ def _motion(answer: PlanResult) -> str:
 def axes_at_limit(answer: PlanResult) -> list[str]:
     """Return the numbers, of a position or of a vector, whose first change is at its limit."""
     upper, space = answer.space.upper[0].numpy(), answer.state_space
-    numbers = answer.shown_axes if space.is_pose else range(len(space))
+    numbers = answer.controller.shown_axes if space.is_pose else range(len(space))
     return [
         space.change_names[number] for number in numbers
         if upper[number] > 0 and abs(answer.actions[0, number]) >= _AT_LIMIT * upper[number]

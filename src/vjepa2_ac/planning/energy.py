@@ -29,6 +29,7 @@ from vjepa2_ac.spaces import POSES, Spaces
 Latents = Float[Tensor, "*batch tokens dim"]
 Wanted = Float[Tensor, "*wanted tokens dim"]
 OfTokens = Float[Tensor, "*batch tokens"]
+OfEach = Float[Tensor, "*batch"]
 Weights = Float[Tensor, " tokens"]  # of each patch
 
 
@@ -191,9 +192,7 @@ class WorldModelCost:
         return cache
 
 
-def distance(
-    predicted: Latents, wanted: Wanted, energy: EnergyConfig, weights: Weights | None = None
-) -> Float[Tensor, "*batch"]:
+def distance(predicted: Latents, wanted: Wanted, energy: EnergyConfig, weights: Weights | None = None) -> OfEach:
     """Return the distance between latents that a config names, over patches by weight (None: equal weights)."""
     by_token: Tensor = ENERGIES.function(energy.distance, energy.options)(predicted, wanted)
     return by_token.mean(dim=-1) if weights is None else (by_token * (weights / weights.sum())).sum(dim=-1)

@@ -263,14 +263,8 @@ def waypoints(
     shares = np.arange(1, steps + 1)[:, None] / steps
     turn = Rotation.from_matrix(matrices_from_euler(action[3:6])).as_rotvec()
     turns = Rotation.from_rotvec(shares * turn).as_matrix()
-    poses = np.concatenate(
-        [
-            state[:3] + shares * action[:3],
-            euler_from_matrices(turns @ matrices_from_euler(state[3:6])),
-            state[6:] + shares * action[6:],
-        ],
-        axis=1,
-    )
+    positions, gripper = (state[part] + shares * action[part] for part in (slice(0, 3), slice(6, 7)))
+    poses = np.concatenate([positions, euler_from_matrices(turns @ matrices_from_euler(state[3:6])), gripper], axis=1)
     poses[-1] = apply_action(state, action)  # to the last bit
     poses[:, 6] = poses[:, 6].clip(0.0, 1.0)
     return poses

@@ -126,9 +126,7 @@ class AxisFit:
             **{name: getattr(self, name).as_dict() for name in _ESTIMATES},
             "centre_m": list(self.centre_m),
             "matrix": self.matrix.tolist(),
-            "pairs": self.pairs,
-            "episodes": self.episodes,
-            "problem": self.problem,
+            **{name: getattr(self, name) for name in ("pairs", "episodes", "problem")},
         }
 
 
@@ -280,9 +278,8 @@ def infer_axes(
     axes = Axes(math.radians(_yaw_of_least_error(errors, names).value), centre_m)
     executed = np.stack([start.true[_MOVE] for start in starts])
     reach = min(1.0, max(_LEAST_M, _ROOM * float(np.linalg.norm(executed, axis=1).max())))
-    planner = Planner(
-        _SEARCH.model_copy(update={"limits": LimitsConfig(xyz=(reach, reach, reach), gripper_mode="held")})
-    )
+    limits = LimitsConfig(xyz=(reach, reach, reach), gripper_mode="held")
+    planner = Planner(_SEARCH.model_copy(update={"limits": limits}))
     inferred = []
     for done, start in enumerate(starts, start=1):
         inferred.append(_inferred(model, _turned(start, axes), planner, at_once))
@@ -342,18 +339,13 @@ def calibrate_axes(
             latents = encode(batch)
             starts += [start_of(latents, row, 0, len(starts) + row) for row in range(len(batch.starts))]
     fit = infer_axes(world_model, starts, config.planning.energy.samples_at_once, reporter.task("inferring moves"))
-    data = {
-        "path": config.data.path,
-        "cameras": list(config.data.cameras),
-        "stride": config.data.model_stride,
-        "split": split,
-    }
+    data = config.data
     return fit, {
         "format": FORMAT,
         "verdict": fit.words(),
         **fit.as_dict(),
         "model": {"subject": model, **known._asdict()},
-        "data": data,
+        "data": {"path": data.path, "cameras": list(data.cameras), "stride": data.model_stride, "split": split},
         "version": __version__,
         "time": utc_now(),
     }

@@ -52,14 +52,9 @@ class VariantProbe:
     @property
     def better(self) -> VariantResult | None:
         """The variant that fits best, if it certainly fits better than the unchanged data."""
-        certain = [
-            one
-            for one in self.results
-            if one.is_certainly_better(needed=_EPISODES_TO_BE_SURE)
-            and one.gain > _GAIN
-            and one.ratio.high < 1  # else it only fails less
-        ]
-        return max(certain, key=lambda one: one.gain, default=None)
+        certain = [one for one in self.results if one.is_certainly_better(needed=_EPISODES_TO_BE_SURE)]
+        better = [one for one in certain if one.gain > _GAIN and one.ratio.high < 1]  # else it only fails less
+        return max(better, key=lambda one: one.gain, default=None)
 
     def verdict(self) -> str:
         """Return as text whether the unchanged data fit the model best."""

@@ -100,12 +100,11 @@ class VariantErrors:
         ids, moved_cm = [episode for episode, _ in self.clips], None
         if space.position is not None:
             moved_cm = float(np.median(space.shown_size(self.actions.reshape(-1, self.actions.shape[-1]))))
-        error, persistence = (float(one.mean()) for one in self.errors)
         difference = None if beside is None else self._minus(beside)
         of_model, of_nothing = self.errors
         return VariantResult(
-            name, ratio(of_model, of_nothing, ids), error, persistence, moved_cm, len(ids), len(set(ids)), difference,
-            repair,
+            name, ratio(of_model, of_nothing, ids), float(of_model.mean()), float(of_nothing.mean()), moved_cm,
+            len(ids), len(set(ids)), difference, repair,
         )  # fmt: skip
 
     def _minus(self, other: VariantErrors) -> Estimate:

@@ -93,7 +93,7 @@ def _search(part: Any, answer: PlanResult, plan: Plan) -> None:
     colours = mpl.colormaps["viridis"](np.linspace(0.9, 0.0, len(plan.iterations)))
     factor = answer.state_space.shown_factor
     first, upper = answer.actions[0] * factor, answer.space.upper[0].double().numpy() * factor
-    shown = answer.shown_axes  # one again where there are fewer than three numbers
+    shown = answer.controller.shown_axes  # one again where there are fewer than three numbers
     across, up, third = shown[0], shown[min(1, len(shown) - 1)], shown[-1]
     for number, (one, colour) in enumerate(zip(plan.iterations, colours, strict=True), start=1):
         tried = one.elites[:, 0].double().numpy() * factor

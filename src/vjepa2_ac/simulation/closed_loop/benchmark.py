@@ -197,8 +197,7 @@ def benchmark_as_dict(benchmark: ClosedLoopBenchmark) -> dict[str, Any]:
     return {
         "format": FORMAT,
         "about": {
-            "subject": agent.subject,
-            "checkpoint": agent.checkpoint,
+            **{name: getattr(agent, name) for name in ("subject", "checkpoint", "decoder")},
             **asked,
             "domain": options.world.name,
             "steps": options.model_steps,
@@ -208,7 +207,6 @@ def benchmark_as_dict(benchmark: ClosedLoopBenchmark) -> dict[str, Any]:
             "planning": agent.planning.model_dump(mode="json"),
             "warnings": list(agent.warnings),
             "planning_seed": agent.seed,
-            "decoder": agent.decoder,
             "version": __version__,
             "time": utc_now(),
         },
