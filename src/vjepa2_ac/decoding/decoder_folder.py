@@ -119,8 +119,8 @@ def load_decoder(name: str | Path, *, where: str = "--decoder") -> TrainedDecode
     folder = ASSETS / str(name).removeprefix(BUILTIN) / BUILTIN_DECODER if is_ours else Path(name)
     card = read_card(folder, where=where)
     linear_shape = DecoderShape("linear", card.shape.dim, card.shape.grid, card.shape.patch_size)
-    decoder = _filled(card.shape, folder / WEIGHTS)
-    return TrainedDecoder(card, decoder, _filled(linear_shape, folder / LINEAR), str(name), where)
+    decoder, linear = _filled(card.shape, folder / WEIGHTS), _filled(linear_shape, folder / LINEAR)
+    return TrainedDecoder(card, decoder, linear, str(name), where)
 
 
 def read_card(folder: Path, *, where: str = "--decoder") -> DecoderCard:

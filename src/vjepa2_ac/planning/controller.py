@@ -278,8 +278,7 @@ class Controller:
         nothing = Decision(self._command(state, np.zeros(len(state))), "at the goal", energy, places, progress)
         if progress.done or float(still.max()) <= REACHED:
             return replace(nothing, done=progress.place == len(self._goals) - 1)
-        box, limits = self._workspace, self.config.limits
-        if box is not None and not is_allowed(box.way_back(state[:3]), limits):  # one action does not lead back
+        if self._workspace is not None and not is_allowed(self._workspace.way_back(state[:3]), self.config.limits):
             return replace(nothing, why="outside the workspace")
         self.space = self._searched[self._goals[progress.place].gripper]
         cost = WorldModelCost(self._model, self._scene(seen), goal, self.config.energy, done=done, spaces=self.spaces)

@@ -131,9 +131,8 @@ class WorldModelCost:
             raise ValueError("a model in training mode: dropout would change energies; call eval() first")
         device = world_model.device
         self._model, self._config, self._spaces, self._done = world_model, config, spaces, done
-        self._goal = Goal(
-            goal.latents.to(device), goal.durations, None if goal.weights is None else goal.weights.to(device)
-        )
+        weights = None if goal.weights is None else goal.weights.to(device)
+        self._goal = Goal(goal.latents.to(device), goal.durations, weights)
         self._frame, self._state = scene.latents[-1].to(device), scene.states[-1].to(device)
         self._camera = None if scene.camera is None else scene.camera.to(device)
         self._seen = scene.seen

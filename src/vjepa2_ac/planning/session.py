@@ -68,7 +68,6 @@ class PlanningSession:
     def as_dict(self) -> dict[str, Any]:
         """Return the identity of the model as plain values: its name, and hashes of the weights."""
         model = self.world_model
-        dtype = next(model.parameters()).dtype
         return {
             "version": __version__,
             "time": utc_now(),
@@ -76,7 +75,7 @@ class PlanningSession:
                 "subject": self.subject,
                 "checkpoint": self.checkpoint or None,
                 **Fingerprints.of(model)._asdict(),
-                "dtype": str(dtype).removeprefix("torch."),
+                "dtype": str(next(model.parameters()).dtype).removeprefix("torch."),
                 "device": model.device.type,
                 "image_size": model.image_size,
             },

@@ -186,14 +186,12 @@ AXES_FILE = "axes.json"
 FORMAT = 1  # incremented when a reader of the file would have to change
 _FIX = "Fit them with `vjepa2-ac data calibrate CONFIG --axes MODEL`, and name the axes.json that it writes"
 
-_Number = Annotated[float, Field(allow_inf_nan=False)]
-
 
 @dataclass(frozen=True)
 class FittedNumber:
     """A number; its interval is there for people."""
 
-    value: _Number
+    value: Annotated[float, Field(allow_inf_nan=False)]
 
 
 @dataclass(frozen=True)
@@ -212,7 +210,7 @@ class AxesFile:
     yaw_degrees: FittedNumber  # about z, counterclockwise from above: what the model infers, from what was executed
     model: FittedModel
     problem: str | None  # why nothing can be planned by it
-    centre_m: tuple[_Number, _Number] = (0.0, 0.0)  # x, y about which is turned
+    centre_m: tuple[float, float] = (0.0, 0.0)  # x, y about which is turned
 
 
 def read_axes(path: str | Path) -> AxesFile:

@@ -90,13 +90,6 @@ def test_key_frames_ascend_leave_out_the_start_and_are_few(parts: list) -> None:
         assert 0 < frames[0] <= frames[-1] < len(states)
 
 
-def test_one_frame_is_no_demonstration() -> None:
-    for make in (lambda: gripper_key_frames(way()), lambda: every_key_frame(1, 3), lambda: every_key_frame(9, 0),
-                 lambda: latent_key_frames(1, lambda _: np.zeros(1), 3)):  # fmt: skip
-        with pytest.raises(ValueError, match="frame"):
-            make()
-
-
 @given(st.integers(2, 60), st.integers(1, 20))
 def test_every_so_many_frames_end_with_the_last(frames: int, step: int) -> None:
     found = [key.frame for key in every_key_frame(frames, step)]

@@ -168,7 +168,8 @@ def variants_of(config: DataConfig, shifts: Sequence[int]) -> list[Variant]:
         for axis, name in enumerate("xy"):
             repair = f"negate {name}, with the rotation (as of a mirror)"
             found.append(_variant(f"{name} negated", repair, _of_states(partial(mirrored, axis=axis))))
-        found.append(_variant("the gripper inverted", config.gripper_fix, _of_states(_with_gripper_inverted)))
+        inverted = _of_states(lambda states: np.append(states[:, :-1], 1 - states[:, -1:], axis=1))
+        found.append(_variant("the gripper inverted", config.gripper_fix, inverted))
     if not config.is_cache:
         exchanged, flipped = _of_frames(lambda frames: frames[..., ::-1]), _of_frames(lambda frames: frames[:, :, ::-1])
         repair = "exchange red and blue (OpenCV reads and writes BGR) where the data is written"
@@ -215,10 +216,6 @@ def shifted(episode: Episode, *, late: int) -> Episode:
 
 def _of_states(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Episode], Episode]:
     return lambda episode: replace(episode, states=change(episode.states))
-
-
-def _with_gripper_inverted(states: np.ndarray) -> np.ndarray:
-    return np.concatenate([states[:, : POSE.gripper], 1 - states[:, POSE.gripper :]], axis=1)
 
 
 def _of_frames(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Episode], Episode]:

@@ -66,8 +66,6 @@ def gripper_key_frames(states: States, rule: StillRule | None = None) -> tuple[K
     after a binary gripper has changed, and stops by joint velocities; here a change has a beginning and an end.
     """
     rule, last = rule or StillRule(), len(states) - 1
-    if last < 1:
-        raise ValueError(f"{len(states)} frames are no demonstration")
     found: dict[int, str] = {}
     changes = _gripper_changes(states[:, GRIPPER])
     for begin, end in changes:
@@ -154,12 +152,7 @@ def with_frames_between(keys: Sequence[KeyFrame], step: int, name: str = "on the
         keys: In order.
         step: Frames from one goal to the next.
         name: Of the further ones, `{}` in it their number.
-
-    Raises:
-        ValueError: A step below 1.
     """
-    if step < 1:
-        raise ValueError(f"every {step} frames")
     found: list[KeyFrame] = []
     for before, key in itertools.pairwise((KeyFrame(0, "start"), *keys)):
         ways = [one for one in range(before.frame + step, key.frame, step) if 2 * (key.frame - one) >= step]
@@ -171,14 +164,9 @@ def every_key_frame(frames: int, step: int) -> tuple[KeyFrame, ...]:
     """Return every `step`-th frame but the first, and the last; one less than half a step before the last is left out.
 
     Args:
-        frames: Of the demonstration.
-        step: From one key frame to the next.
-
-    Raises:
-        ValueError: Fewer than two frames, or a step below 1.
+        frames: Of the demonstration, two or more.
+        step: From one key frame to the next, one or more.
     """
-    if frames < 2:
-        raise ValueError(f"{frames} frames are no demonstration")
     return with_frames_between([KeyFrame(frames - 1, "end")], step, "frame {}")
 
 
@@ -192,17 +180,12 @@ def latent_key_frames(
     was being done: this is the goal before.
 
     Args:
-        frames: Of the demonstration.
+        frames: Of the demonstration, two or more.
         distances: Of all frames to the one of an index, in latents.
-        least: Frames from one goal to the next, and from the start to the first.
-
-    Raises:
-        ValueError: Fewer than two frames, or `least` below 1.
+        least: Frames from one goal to the next, and from the start to the first; one or more.
 
     Source of the rule: zcczhang/UVD @ e7d657a, uvd/decomp/decomp.py, embedding_decomp.
     """
-    if frames < 2 or least < 1:
-        raise ValueError(f"{frames} frames, goals {least} apart")
     found = [frames - 1]
     while (before := _maximum_before(_smoothed(distances(found[-1])[: found[-1] + 1], least), least)) is not None:
         found.append(before)
