@@ -45,7 +45,7 @@ ORDERS: dict[str, list[str]] = {
     "data.sources": ["indexed_source", "rlds droid_raw lerobot npz latents"],
     "serving": [
         "wire access",
-        "client request recording",
+        "request recording",
         "session",
         "about server",
     ],

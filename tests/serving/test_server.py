@@ -17,9 +17,8 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from served import STATE, Running, controller, image, request, serving, session
 from vjepa2_ac.errors import InputError, UnreachableError
 from vjepa2_ac.serving.access import Access
-from vjepa2_ac.serving.client import PlanningClient
 from vjepa2_ac.serving.session import Session
-from vjepa2_ac.serving.wire import pack, unpack
+from vjepa2_ac.serving.wire import PlanningClient, pack, unpack
 
 KEY = "correct-horse-battery-staple"
 

@@ -241,7 +241,7 @@ def _run_benchmark(options: argparse.Namespace) -> int:
 def _agent(options: argparse.Namespace) -> Iterator[Agent]:
     """Return who acts; a server as long as the context lasts."""
     from vjepa2_ac.serving.access import read_key
-    from vjepa2_ac.serving.client import PlanningClient
+    from vjepa2_ac.serving.wire import PlanningClient
     from vjepa2_ac.simulation.closed_loop.agent import agent_of_server, agent_of_session
 
     if not cli.is_server(options.subject):
