@@ -61,8 +61,9 @@ class PlanningSession:
         Raises:
             InputError: A goal would never end, or the last one has a bound.
         """
-        goals = folder.for_model(self.encoder, self.config.planning.energy.distance)
-        with_shares(goals, self.config.planning.goals, first=1)
+        planning, has_noise = self.config.planning, folder.noise is not None  # else no weights need to be hashed
+        goals = folder.for_model(self.encoder, planning.energy.distance) if has_noise else folder.goals
+        with_shares(goals, planning.goals, first=1)
         return goals
 
     def as_dict(self) -> dict[str, Any]:
