@@ -183,7 +183,7 @@ def _reach(limits: LimitsConfig, taught: Taught, *, poses: bool) -> Sequence[flo
 
 
 AXES_FILE = "axes.json"
-FORMAT = 1  # incremented when a reader of the file would have to change
+AXES_FORMAT = 1  # incremented when a reader of the file would have to change
 _FIX = "Fit them with `vjepa2-ac data calibrate CONFIG --axes MODEL`, and name the axes.json that it writes"
 
 
@@ -219,12 +219,12 @@ def read_axes(path: str | Path) -> AxesFile:
     Raises:
         InputError: There is no such file, it is none of calibrated axes, or the fit is not good enough.
     """
-    where, needed = f"planning.axes: {path}", f"calibrated axes of format {FORMAT}"
+    where, needed = f"planning.axes: {path}", f"calibrated axes of format {AXES_FORMAT}"
     try:
         values = read_json_object(Path(path), needed=needed, fix=_FIX)
     except OSError as error:
         raise InputError(where=where, found=f"cannot be read ({error.strerror})", needed=needed, fix=_FIX) from None
-    if values.get("format") != FORMAT:
+    if values.get("format") != AXES_FORMAT:
         raise InputError(where=where, found=f"format {values.get('format')!r}", needed=needed, fix=_FIX)
     known = {one.name: values[one.name] for one in fields(AxesFile) if one.name in values}
     axes = record_of(AxesFile, known, where=where, needed=needed, fix=_FIX)

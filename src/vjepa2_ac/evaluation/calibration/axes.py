@@ -37,7 +37,7 @@ from vjepa2_ac.model.adapter.lora import merge_adapter
 from vjepa2_ac.model.distances import squared_difference
 from vjepa2_ac.planning.model_setup import Axes, Fingerprints
 from vjepa2_ac.planning.planner import Planner
-from vjepa2_ac.planning.settings import FORMAT, require_axes_in
+from vjepa2_ac.planning.settings import AXES_FORMAT, require_axes_in
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
 from vjepa2_ac.storage.structured import utc_now
 
@@ -341,7 +341,7 @@ def calibrate_axes(
     fit = infer_axes(world_model, starts, config.planning.energy.samples_at_once, reporter.task("inferring moves"))
     data = config.data
     return fit, {
-        "format": FORMAT,
+        "format": AXES_FORMAT,
         "verdict": fit.words(),
         **fit.as_dict(),
         "model": {"subject": model, **known._asdict()},
