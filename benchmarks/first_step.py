@@ -24,8 +24,8 @@ from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.demonstrations.key_frames import OF_MODEL_STEPS, gripper_key_frames
 from vjepa2_ac.planning.energy import distance
 from vjepa2_ac.planning.session import load_to_plan
+from vjepa2_ac.simulation.closed_loop.benchmark import DemonstrationSpec, demonstrate
 from vjepa2_ac.simulation.closed_loop.rollout import put
-from vjepa2_ac.simulation.closed_loop.sub_goals import DemonstrationSpec, demonstrate
 from vjepa2_ac.simulation.closed_loop.tasks import TaskProblem, arm_for, make_problem
 from vjepa2_ac.simulation.world.arm import SimulatedArm
 from vjepa2_ac.simulation.world.domains import named_domain
@@ -62,19 +62,19 @@ def main() -> None:
 
 def choices(controller: Controller, arm: SimulatedArm, problem: TaskProblem) -> Iterator[Float[np.ndarray, " 3"]]:
     """Yield the way to a goal, and the step of lowest energy by true images and by the model: of far and near goal."""
-    shown = demonstrate(problem, arm, DemonstrationSpec(LimitsConfig(xyz=(STEP_M,) * 3)))
-    start, grasp = shown.states[0], gripper_key_frames(shown.states, OF_MODEL_STEPS)[0].frame
+    frames, states = demonstrate(problem, arm, DemonstrationSpec(LimitsConfig(xyz=(STEP_M,) * 3)))
+    start, grasp = states[0], gripper_key_frames(states, OF_MODEL_STEPS)[0].frame
     latents = []
     for step in STEPS:
         put(arm, start + np.append(step, np.zeros(4)), problem.block_start)
         latents.append(controller.encoded(arm.image()))
     actions = torch.from_numpy(np.concatenate([STEPS, np.zeros((len(STEPS), 4))], axis=1)).float()[:, None]
     for frame in (grasp, 1):
-        yield shown.states[frame, :3] - start[:3]
-        goal = controller.encoded(shown.frames[frame])
+        yield states[frame, :3] - start[:3]
+        goal = controller.encoded(frames[frame])
         yield STEPS[int(distance(torch.stack(latents), goal, EnergyConfig()).argmin())]
-        controller.reset(shown.frames[frame])
-        controller.act(shown.frames[0], start)
+        controller.reset(frames[frame])
+        controller.act(frames[0], start)
         assert controller.decision is not None
         assert controller.decision.cost is not None
         with torch.no_grad():

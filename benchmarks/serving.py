@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from rows import Rows
 
-from vjepa2_ac.serving.client import PlanningClient
+from vjepa2_ac.serving.wire import PlanningClient
 
 STATE = np.array([0.45, 0.0, 0.3, np.pi, 0.0, 0.0, 0.0])
 SETTINGS = ("planning.samples=10", "planning.iterations=1", "planning.limits.gripper_mode=held")

@@ -30,9 +30,9 @@ from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.planning.session import load_to_plan
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.simulation.closed_loop.agent import Agent, agent_of_session
+from vjepa2_ac.simulation.closed_loop.benchmark import DemonstratedGoals, DemonstrationSpec, every_step
 from vjepa2_ac.simulation.closed_loop.policies import GoalsOf, Oracle, Policy
 from vjepa2_ac.simulation.closed_loop.rollout import ClosedLoopResult, RolloutSpec, run_task
-from vjepa2_ac.simulation.closed_loop.sub_goals import DemonstratedGoals, DemonstrationSpec, every_step
 from vjepa2_ac.simulation.closed_loop.tasks import STEPS, TaskProblem, arm_for
 from vjepa2_ac.simulation.world.domains import named_domain
 from vjepa2_ac.storage import write_atomically

@@ -44,8 +44,8 @@ ORDERS: dict[str, list[str]] = {
     ],
     "data.sources": ["indexed_source", "rlds droid_raw lerobot npz latents"],
     "serving": [
-        "wire access motion",
-        "client request recording",
+        "wire access",
+        "request recording",
         "session",
         "about server",
     ],

@@ -13,9 +13,8 @@ from openpi_client.websocket_client_policy import WebsocketClientPolicy
 
 from vjepa2_ac.media.video import write_gif
 from vjepa2_ac.simulation.closed_loop.agent import ServedPlanner
-from vjepa2_ac.simulation.closed_loop.benchmark import film_frames
+from vjepa2_ac.simulation.closed_loop.benchmark import DemonstratedGoals, DemonstrationSpec, every_step, film_frames
 from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, run_task
-from vjepa2_ac.simulation.closed_loop.sub_goals import DemonstratedGoals, DemonstrationSpec, every_step
 from vjepa2_ac.simulation.world.domains import named_domain
 
 

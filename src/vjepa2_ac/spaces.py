@@ -179,6 +179,18 @@ class StateSpace(Space):
                 found = f"the numbers {np.array2string(states[step], precision=4, max_line_width=200)}"
                 raise InputError(where=place, found=found, needed=needed, fix=fix or looks)
 
+    def require_state(self, numbers: np.ndarray, where: str) -> None:
+        """Refuse an array that is no state, or one that no robot has.
+
+        Raises:
+            InputError: Says what was found.
+        """
+        if numbers.shape != (len(self),):
+            names = (f"{name} ({unit})" if unit else name for name, unit in zip(self.names, self.units, strict=True))
+            found = f"{numbers.size} numbers in the shape {numbers.shape}"
+            raise InputError(where=where, found=found, needed=f"{len(self)}: {', '.join(names)}")
+        self.require_plausible(numbers[None], where)
+
     def _checks(self, states: Float[np.ndarray, "steps dim"]) -> list[tuple[np.ndarray, str, str]]:
         """Return, for each rule: where it is broken, what is needed, and what the numbers look like."""
         checks = [(~np.isfinite(states).all(axis=1), "finite numbers", "")]

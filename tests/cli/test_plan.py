@@ -8,21 +8,17 @@ import pytest
 import torch
 from PIL import Image
 
-from adapted_run import write_adapted_run
 from random_decoder import write_decoder
 from tiny_models import tiny_model
 from vjepa2_ac.cli import main
-from vjepa2_ac.config import Config
-from vjepa2_ac.config.loading import config_as_yaml, parse_config
 
 STATE = "0.4,0.0,0.3,3.1,0.0,0.1,0.2"
 QUICK = ["planning.samples=8", "planning.iterations=2", "planning.cem.elites=4", "--nodes", "0"]
-PLANNING = {"samples": 8, "iterations": 2, "horizon": 2, "cem": {"elites": 4}}
 
 
 @pytest.fixture(scope="module")
 def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with images, a model, a broken one, one that needs a camera's pose, and a run."""
+    """Return a folder with images, a model, a broken one, and one that needs a camera's pose."""
     here = tmp_path_factory.mktemp("workshop")
     for name, seed, size in (
         ("start", 0, (60, 48)),
@@ -43,8 +39,6 @@ def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with torch.no_grad():
         broken.base_predictor.predictor_proj.weight.fill_(1e38)  # finite, and nothing that comes of it is
     broken.save_pretrained(here / "broken")
-    write_adapted_run(config(here))
-    (here / "config.yaml").write_text(config_as_yaml(config(here)))
     return here
 
 
@@ -52,15 +46,6 @@ def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def no_figure(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave out the image, which takes most of the time."""
     monkeypatch.setattr("vjepa2_ac.reports.figures.planning.plot_plan", lambda _, path, *__: path)
-
-
-def config(here: Path) -> Config:
-    values = {
-        "run_dir": str(here / "run"), "seed": 4, "data": {"path": "none", "crop": "square", "stride": 5},
-        "model": {"base": str(here / "model"), "dtype": "float32"}, "adapter": {"rank": 4, "targets": ["q", "v"]},
-        "planning": PLANNING,
-    }  # fmt: skip
-    return parse_config(values, where="test")
 
 
 def plan(here: Path, *more: str, subject: str = "model", state: str = STATE, goal: str = "goal") -> tuple[int, dict]:
@@ -84,25 +69,6 @@ def test_a_plan_its_image_a_table_and_words_come_out(workshop: Path, capsys: pyt
     assert (file["seed"], file["goals"], len(file["slices"])) == (9, [str(workshop / "goal.png")], 3)
     assert len(file["model"]["predictor"]) == 64
     assert plan(workshop, *QUICK, "--seed", "9")[1]["actions"] == file["actions"]
-
-
-@pytest.mark.usefixtures("no_figure")
-def test_a_run_plans_by_its_config_with_the_checkpoint_that_is_named(workshop: Path) -> None:
-    newest = plan(workshop, "--nodes", "0", "--checkpoint", "newest", subject="run")[1]
-    assert (newest["seed"], newest["crop"], newest["settings"]["horizon"]) == (4, "square", 2)
-    assert newest["control_steps_of_a_model_step"] == 5
-    assert newest["model"]["checkpoint"] == "step-00000020 (the newest)"
-    best = plan(workshop, "--nodes", "0", "planning.horizon=1", subject="run")[1]
-    assert best["model"]["checkpoint"] == "step-00000010 (the best by error)"
-    assert len(best["actions"]) == 1
-    assert best["model"]["base"] == newest["model"]["base"]
-    assert best["model"]["predictor"] != newest["model"]["predictor"]
-
-
-@pytest.mark.usefixtures("no_figure")
-def test_a_model_takes_the_settings_of_a_config(workshop: Path) -> None:
-    file = plan(workshop, "--nodes", "0", "--config", str(workshop / "config.yaml"))[1]
-    assert (len(file["actions"]), file["seed"], file["crop"]) == (2, 4, "square")
 
 
 @pytest.mark.usefixtures("no_figure")
@@ -136,40 +102,10 @@ def test_a_state_may_begin_with_a_minus(workshop: Path) -> None:
 
 
 @pytest.mark.usefixtures("no_figure")
-def test_the_goal_itself_leads_to_no_motion(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    status, file = plan(workshop, *QUICK, goal="start")
-    assert (status, file["why"]) == (0, "at the goal")
-    assert not np.any(file["actions"])
-    assert "Does nothing" in capsys.readouterr().out
-
-
-@pytest.mark.usefixtures("no_figure")
 def test_a_broken_model_leads_to_no_motion_and_to_status_1(workshop: Path) -> None:
     status, file = plan(workshop, *QUICK, subject="broken")
     assert (status, file["why"]) == (1, "no finite energy")
     assert not np.any(file["actions"])
-
-
-@pytest.mark.usefixtures("no_figure")
-def test_limits_that_leave_what_the_run_was_taught_are_warned_of(
-    workshop: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    noted = workshop / "run" / "changes.json"
-    noted.write_text(json.dumps({"changes": [0.02, 0.05, 0.05, 0.0, 0.0, 0.0, 1.0], "narrow": ""}))
-    try:
-        status, file = plan(workshop, *QUICK, subject="run")
-        (warned,) = [one for one in capsys.readouterr().err.splitlines() if one.startswith("warning")]
-        status_of_data, within = plan(workshop, *QUICK, "planning.limits.xyz=data", subject="run")
-    finally:
-        noted.unlink()
-    assert (status, status_of_data) == (0, 0)
-    assert "planning.limits.xyz leaves what" in warned
-    assert "was taught: dx 5 (2) cm. In brackets" in warned
-    assert [f"warning: {one}" for one in file["warnings"]] == [warned]
-    assert within["warnings"] == []
-    assert within["settings"]["limits"]["xyz"] == [0.02, 0.05, 0.05]
-    assert max(abs(action[0]) for action in within["actions"]) <= 0.02
-    assert "warning" not in capsys.readouterr().err
 
 
 WRONG = {

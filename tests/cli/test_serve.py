@@ -12,7 +12,7 @@ from served import STATE, ended, image, started
 from tiny_models import tiny_model
 from vjepa2_ac.cli import main
 from vjepa2_ac.errors import UnreachableError, pip_install
-from vjepa2_ac.serving.client import PlanningClient
+from vjepa2_ac.serving.wire import PlanningClient
 
 QUICK = ["planning.samples=8", "planning.iterations=2", "planning.horizon=2", "planning.cem.elites=4"]
 KEY = "correct-horse-battery-staple"

@@ -38,7 +38,7 @@ def start_of(latents: Tensor, **more: Tensor) -> Start:
 
 def test_states_under_other_actions_are_integrated_from_the_first_one() -> None:
     latents, model = truth(), Remembering()
-    rolled_out(model, start_of(latents), named_actions("left", STEPS, size_m=0.03))
+    rolled_out(model.rollout, start_of(latents), named_actions("left", STEPS, size_m=0.03))
     context, actions, states, extrinsics = model.given
     assert torch.equal(context, latents[None, :1]), "one frame"
     assert states.shape == actions.shape == (1, STEPS, 7)
@@ -49,7 +49,7 @@ def test_states_under_other_actions_are_integrated_from_the_first_one() -> None:
 
 def test_a_gripper_changes_as_far_as_it_can() -> None:
     model = Remembering()
-    rolled_out(model, start_of(truth()), named_actions("close", STEPS))
+    rolled_out(model.rollout, start_of(truth()), named_actions("close", STEPS))
     _, actions, states, _ = model.given
     np.testing.assert_allclose(actions[0, :, 6].numpy(), [0.1, 0, 0, 0], atol=1e-6)
     np.testing.assert_allclose(states[0, :, 6].numpy(), [0.9, 1, 1, 1], atol=1e-6)
@@ -57,14 +57,14 @@ def test_a_gripper_changes_as_far_as_it_can() -> None:
 
 def test_the_camera_of_the_first_frame_holds_for_all_steps() -> None:
     model, camera = Remembering(), torch.arange(6.0)
-    rolled_out(model, start_of(truth(), extrinsics=camera), named_actions("none", STEPS))
+    rolled_out(model.rollout, start_of(truth(), extrinsics=camera), named_actions("none", STEPS))
     assert torch.equal(model.given[3], camera.expand(1, STEPS, 6))
 
 
 def test_known_states_are_given_as_they_are() -> None:
     model, actions = Remembering(), named_actions("up", STEPS)
     states = counterfactual_states(STATE, actions)[:-1] + 0.5
-    rolled_out(model, start_of(truth()), actions, states)
+    rolled_out(model.rollout, start_of(truth()), actions, states)
     np.testing.assert_allclose(model.given[2][0].numpy(), states, atol=1e-6)
 
 

@@ -180,17 +180,6 @@ def test_what_a_killed_start_left_in_a_finished_folder_is_removed_and_a_check_wr
 # ---- what is refused -----------------------------------------------------------------------------------------------
 
 
-def test_a_finished_folder_is_left_as_it_is(
-    make_decoder: MakeConfig, whole_decoder: Path, tmp_path: Path, reporter: SilentReporter
-) -> None:
-    shutil.copytree(whole_decoder, tmp_path / "decoder")
-    before = {path.name: path.read_bytes() for path in (tmp_path / "decoder").iterdir()}
-    assert train_decoder(make_decoder(), reporter) == tmp_path / "decoder"
-    assert any("there already" in note for note in reporter.notes)
-    assert "training the decoder" not in reporter.tasks
-    assert {path.name: path.read_bytes() for path in (tmp_path / "decoder").iterdir()} == before
-
-
 @pytest.mark.parametrize(
     ("changes", "name"),
     [
@@ -208,15 +197,6 @@ def test_the_folder_of_another_decoder_is_refused_and_what_differs_is_named(
         with pytest.raises(InputError, match=name):
             train_decoder(make_decoder(**changes))
         (tmp_path / "decoder" / CARD).unlink(missing_ok=True)
-
-
-@pytest.mark.parametrize("there", ["thesis.tex", CARD])
-def test_a_folder_with_other_things_is_refused(make_decoder: MakeConfig, tmp_path: Path, there: str) -> None:
-    (tmp_path / "decoder").mkdir()
-    (tmp_path / "decoder" / there).write_text("{}")
-    with pytest.raises(InputError, match=rf"other things in it, such as {there}"):
-        train_decoder(make_decoder())
-    assert [path.name for path in (tmp_path / "decoder").iterdir()] == [there]
 
 
 @pytest.mark.parametrize(

@@ -58,11 +58,6 @@ def test_what_is_no_image_is_refused(data: bytes, complaint: str, tmp_path: Path
         read_image(tmp_path / "goal.png")
 
 
-def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"goal\.png: cannot be read: No such file"):
-        read_image(tmp_path / "goal.png")
-
-
 def claimed_png(height: int, width: int) -> bytes:
     """Return a PNG of a few hundred bytes that says to be of a size."""
     data = png(Image.fromarray(PIXELS))

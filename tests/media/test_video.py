@@ -14,7 +14,7 @@ import pytest
 from paths import GOLDEN
 from recordings import write_mp4
 from synthetic import draw_frame, synthetic_states
-from vjepa2_ac.errors import InputError, UnreachableError
+from vjepa2_ac.errors import InputError
 from vjepa2_ac.media import video as video_reader
 from vjepa2_ac.media.video import Clock, count_frames, frame_times, read_frames, write_video
 from vjepa2_ac.reports import imagined
@@ -197,12 +197,6 @@ def test_a_frame_past_the_end_is_named(tmp_path: Path, clock: Clock | None) -> N
     path = write_mp4(tmp_path / "a.mp4", FRAMES)
     with pytest.raises(InputError, match=r"40 frames. needed: at least 43|no frame at 2.800 s"):
         read_frames(path, [3, 42], where="a", clock=clock)
-
-
-def test_without_pyav_the_way_to_install_it_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(UnreachableError, match=r"pip install .*\[video\]"):
-        read_frames(tmp_path / "a.mp4", [0], where="a")
 
 
 def test_frames_that_are_moved_without_a_word_in_the_header_are_found_by_time(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from vjepa2_ac.config.planning import EnergyConfig, GradientConfig, LimitsConfig
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.decision import PlanRequest, PlanResult, axes_at_limit, decide, summarize, write_plan
 from vjepa2_ac.planning.energy import WorldModelCost
+from vjepa2_ac.planning.goals import equal_durations, timed
 
 
 def read(found: PlanResult, folder: Path) -> dict:
@@ -121,9 +122,8 @@ def test_goals_without_a_part_in_the_plan_are_named() -> None:
 
 
 def test_goals_share_the_horizon_by_default() -> None:
-    one = PlanRequest(image(0), STATE, (image(1), image(2), image(3)))
-    assert one.with_equal_durations(6).durations == (2, 2)
-    assert one.with_equal_durations(1).durations == (1, 1)
+    assert equal_durations(6, 3) == (2, 2)
+    assert equal_durations(1, 3) == (1, 1)
 
 
 def test_what_a_person_should_know_of_a_plan_is_said() -> None:
@@ -137,4 +137,4 @@ def test_what_a_person_should_know_of_a_plan_is_said() -> None:
     ticks = iter(range(1000))
     controller = Controller(tiny_model(), QUICK.model_copy(update={"budget_s": 4.0}))
     controller.planner.clock = lambda: float(next(ticks))
-    assert "Time was up after" in summarize(decide(controller, PlanRequest(image(0), STATE, (image(100),))))
+    assert "Time was up after" in summarize(decide(controller, PlanRequest(image(0), STATE, timed([image(100)], ()))))

@@ -32,7 +32,12 @@ def noisy(seed: int, most: int = 6) -> np.ndarray:
 def decided(run: Controller, seen: np.ndarray) -> tuple[int, int, bool, bool]:
     """Return which goal applies, since when, whether it changed, and whether all is done."""
     run.act(seen, STATE)
-    return run.decision.goal, run.decision.progress.since, bool(run.decision.progress.changed), run.decision.done
+    return (
+        run.decision.progress.place,
+        run.decision.progress.since,
+        bool(run.decision.progress.changed),
+        run.decision.done,
+    )
 
 
 def test_the_next_goal_follows_once_an_image_is_near_the_present_one() -> None:
@@ -154,7 +159,7 @@ def test_numbers_that_contradict_each_other_are_refused(numbers: dict, wrong: st
 
 def test_the_pages_example_runs(tmp_path: Path) -> None:
     examples = re.findall(r"```py\n(.*?)```", (ROOT / "docs/planning.md").read_text(), flags=re.DOTALL)
-    (example,) = (one for one in examples if "read_goals" in one)
+    (example,) = (one for one in examples if "read_goal_folder" in one)
     write_goals(tmp_path, [SubGoal(image(100), "grasped", at_most=3), SubGoal(image(101))])
     run = controller()
     exec(  # noqa: S102 - our own page
@@ -179,7 +184,7 @@ def test_a_gripper_mode_needs_a_gripper_and_something_to_plan() -> None:
 
 def test_a_request_of_goals_with_rules_says_in_its_file_which_applies() -> None:
     goals = [SubGoal(image(100), "grasp", at_most=4, share=0.4, gripper="held"), SubGoal(image(101))]
-    found = decide(controller(), PlanRequest.of_sub_goals(image(0), STATE, goals))
+    found = decide(controller(), PlanRequest(image(0), STATE, tuple(goals)))
     assert not found.actions[:, 6].any()
     written = plan_as_dict(found, {})
     assert written["sub_goals"][0] == {
@@ -187,5 +192,4 @@ def test_a_request_of_goals_with_rules_says_in_its_file_which_applies() -> None:
     }  # fmt: skip
     assert (written["since"], written["changed"], written["done"]) == (0, "", False)
     assert written["energy"]["began"] == pytest.approx(written["energy"]["now"], rel=1e-6)
-    plain = plan_as_dict(asked(), {})
-    assert (plain["sub_goals"], plain["done"]) == ([], False)
+    assert (written["durations"], plan_as_dict(asked(100, 101), {})["durations"]) == ([], [1])

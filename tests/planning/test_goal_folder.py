@@ -11,7 +11,7 @@ import pytest
 from decisions import image
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import encode_png
-from vjepa2_ac.planning.goals import GOALS_FILE, NoiseFloor, SubGoal, read_goal_folder, read_goals, write_goals
+from vjepa2_ac.planning.goals import GOALS_FILE, NoiseFloor, SubGoal, read_goal_folder, write_goals
 
 NOISE = NoiseFloor(0.08, 12, "a" * 64, "l1")
 GOALS = (
@@ -40,7 +40,7 @@ def test_what_is_written_is_read_again(folder: Path) -> None:
     written = json.loads((folder / GOALS_FILE).read_text())
     assert written["origin"] == {"by": "me"}
     assert [goal["frame"] for goal in written["goals"]] == [8, 12, 30]
-    assert len(read_goals(folder)) == 3
+    assert len(read_goal_folder(folder).goals) == 3
     assert sorted(path.name for path in folder.iterdir()) == ["goal_1.png", "goal_2.png", "goal_3.png", GOALS_FILE]
 
 
@@ -49,7 +49,7 @@ def test_a_folder_written_by_hand_needs_no_more_than_files(tmp_path: Path) -> No
         (tmp_path / name).write_bytes(encode_png(image(1)))
     written = {"format": 1, "goals": [{"file": "grasped.png", "at_most": 4, "at_least": 4}, {"file": "placed.png"}]}
     (tmp_path / GOALS_FILE).write_text(json.dumps(written))
-    first, last = read_goals(tmp_path)
+    first, last = read_goal_folder(tmp_path).goals
     assert settings(first) == ("", 4, 4, None, None, 0.0)
     assert settings(last) == ("", 1, None, None, None, 0.0)
     assert len(read_goal_folder(tmp_path).for_model("b", "l1")) == 2
@@ -95,28 +95,28 @@ def first(**changes: object) -> Any:
 def test_a_broken_goal_is_refused_by_name(change: Any, wrong: str, folder: Path) -> None:
     edit(folder, change)
     with pytest.raises(InputError, match=wrong):
-        read_goals(folder)
+        read_goal_folder(folder)
 
 
 @pytest.mark.parametrize("text", ["[]", "{", '{"goals": []}', '{"format": 2, "goals": []}', '{"format": 1}'])
 def test_a_file_that_says_something_else_is_refused(text: str, folder: Path) -> None:
     (folder / GOALS_FILE).write_text(text)
     with pytest.raises(InputError, match=r"goals\.json: "):
-        read_goals(folder)
+        read_goal_folder(folder)
 
 
 def test_images_that_are_none_or_of_another_size_are_refused(folder: Path) -> None:
     (folder / "goal_2.png").write_bytes(encode_png(image(2)[:40]))
     with pytest.raises(InputError, match=r"goal_2\.png: 48 x 40 pixels"):
-        read_goals(folder)
+        read_goal_folder(folder)
     (folder / "goal_2.png").write_bytes(b"GIF89a")
     with pytest.raises(InputError, match=r"goal_2\.png: 6 bytes that are no image"):
-        read_goals(folder)
+        read_goal_folder(folder)
 
 
 def test_a_folder_without_goals_says_what_makes_one(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"goals\.json: cannot be read.*`vjepa2-ac goals` writes"):
-        read_goals(tmp_path)
+        read_goal_folder(tmp_path)
     with pytest.raises(ValueError, match="no goals"):
         write_goals(tmp_path / "new", [])
     assert not (tmp_path / "new").exists()

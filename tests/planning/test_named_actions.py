@@ -9,7 +9,7 @@ from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.state_integration import counterfactual_states, feasible_actions
 from vjepa2_ac.planning.counterfactual import ACTION_NAMES, named_actions, read_actions
-from vjepa2_ac.spaces import actions_from_states, vector_states
+from vjepa2_ac.spaces import actions_from_states
 
 START = np.array([0.4, 0.1, 0.3, np.pi - 0.01, 0.02, -0.7, 0.4])
 ROWS = np.array([[0.05, 0.0, 0.0, 0.0, 0.0, 0.1, 0.0], [0.0, -0.02, 0.01, 0.0, 0.0, 0.0, -0.75]])
@@ -63,15 +63,6 @@ def test_steps_are_as_long_as_asked_and_never_beyond_the_limits() -> None:
         named_actions("up", 0)
 
 
-def test_states_are_integrated_from_the_first_alone() -> None:
-    actions = np.random.default_rng(0).uniform(-0.05, 0.05, (5, 7))
-    states = counterfactual_states(START, actions)
-    np.testing.assert_allclose(states[0], START, atol=0)
-    np.testing.assert_allclose(actions_from_states(states), actions, atol=1e-9)
-    vector = counterfactual_states(np.zeros(3), np.ones((2, 3)), vector_states(3))
-    np.testing.assert_array_equal(vector, [[0] * 3, [1] * 3, [2] * 3])
-
-
 def test_actions_are_read_from_arrays_and_tables(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", ROWS.astype(np.float32))
     lines = "\n".join(",".join(map(str, row)) for row in ROWS)
@@ -107,8 +98,3 @@ def test_files_of_something_else_are_refused(
         path.write_bytes(content.encode() if isinstance(content, str) else content)
     with pytest.raises(InputError, match=message):
         read_actions(path)
-
-
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"b\.npy: cannot be read \(.*No such file"):
-        read_actions(tmp_path / "b.npy")

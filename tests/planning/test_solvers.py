@@ -232,21 +232,6 @@ def test_when_time_is_up_no_mean_worse_than_an_evaluated_sample_is_returned(plan
 
 
 @pytest.mark.parametrize("planner", PLANNERS)
-def test_a_plan_records_its_search(planner: str) -> None:
-    cost = parabola(torch.tensor([[0.3, -0.2]]))
-    plan = solve(planner, cost, space(), iterations=15)
-    for one in plan.iterations:
-        torch.testing.assert_close(one.elite_energies, cost(one.elites))
-        assert one.lowest == one.elite_energies[0] == one.elite_energies.min()
-        assert one.elite_energy == pytest.approx(float(one.elite_energies.mean()))
-        assert one.mean.shape == one.std.shape == (1, 2)
-    assert plan.evaluations >= sum(one.samples for one in plan.iterations)
-    assert plan.iterations[-1].elite_energy < 0.1 * plan.iterations[0].elite_energy
-    assert plan.iterations[-1].std.norm() < 0.5 * plan.iterations[0].std.norm()
-    assert plan.planner == planner
-
-
-@pytest.mark.parametrize("planner", PLANNERS)
 def test_a_warm_start_begins_where_the_last_plan_led(planner: str) -> None:
     target = torch.tensor([[0.2, 0.1], [0.8, -0.9], [-0.7, 0.6]])
     before = solve(planner, parabola(target), space(3), iterations=40)

@@ -16,7 +16,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions, settle
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.session import load_to_plan
-from vjepa2_ac.planning.settings import beyond_taught, planning_settings
+from vjepa2_ac.planning.settings import planning_settings, warn_beyond_taught
 from vjepa2_ac.runs.folder import read_run_config
 from vjepa2_ac.runs.loading import load_run
 from vjepa2_ac.spaces import actions_from_states
@@ -39,7 +39,7 @@ def note(folder: Path, **changes: object) -> None:
 
 
 def warnings_of(folder: Path, *overrides: str) -> tuple[str, ...]:
-    return beyond_taught(planning_settings(str(folder), overrides=list(overrides)), folder)
+    return warn_beyond_taught(planning_settings(str(folder), overrides=list(overrides)), folder)
 
 
 def test_a_run_of_poses_keeps_what_it_was_taught_and_plans_within_it(make_config, reporter) -> None:
@@ -154,7 +154,7 @@ def test_vectors_are_compared_number_by_number(make_config) -> None:
     def found(axes: tuple[float, ...]) -> tuple[str, ...]:
         limits = config.planning.limits.model_copy(update={"axes": axes})
         planning = config.planning.model_copy(update={"limits": limits})
-        return beyond_taught(config.model_copy(update={"planning": planning}), folder)
+        return warn_beyond_taught(config.model_copy(update={"planning": planning}), folder)
 
     assert found((0.1, 0.02)) == (f"{folder} learned from narrow data: 1 of 2 numbers hardly move, 0 only one way",)
     assert "planning.limits.axes leaves" in found((0.1,))[1]

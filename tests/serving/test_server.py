@@ -17,9 +17,8 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from served import STATE, Running, controller, image, request, serving, session
 from vjepa2_ac.errors import InputError, UnreachableError
 from vjepa2_ac.serving.access import Access
-from vjepa2_ac.serving.client import PlanningClient
 from vjepa2_ac.serving.session import Session
-from vjepa2_ac.serving.wire import pack, unpack
+from vjepa2_ac.serving.wire import PlanningClient, pack, unpack
 
 KEY = "correct-horse-battery-staple"
 
@@ -98,14 +97,6 @@ def test_it_is_alive_at_once_and_ready_when_it_is_loaded() -> None:
             go.set()
             assert unpack(early.recv(timeout=120))["needs_session_id"] is True
         assert get(running, "/readyz") == (200, "ready\n")
-
-
-def test_what_cannot_be_loaded_ends_the_server() -> None:
-    def load() -> Session:
-        raise InputError(where="here", found="nothing to load")
-
-    with pytest.raises(InputError, match="here: nothing to load"), serving(load):
-        pass
 
 
 def test_a_second_robot_is_refused_by_the_name_of_the_first_until_that_leaves() -> None:

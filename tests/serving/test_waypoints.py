@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from vjepa2_ac.serving.motion import waypoints
+from vjepa2_ac.serving.session import waypoints
 from vjepa2_ac.spaces import actions_from_states, apply_action
 
 STATE = np.array([0.4, 0.1, 0.3, np.pi - 0.02, 0.1, -1.2, 0.5])

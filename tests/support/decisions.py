@@ -7,6 +7,7 @@ from tiny_models import tiny_model
 from vjepa2_ac.config.planning import CemConfig, PlanningConfig
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.decision import PlanRequest, PlanResult, decide
+from vjepa2_ac.planning.goals import equal_durations, timed
 
 STATE = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2])
 QUICK = PlanningConfig(samples=12, iterations=3, horizon=2, cem=CemConfig(elites=4))
@@ -22,5 +23,6 @@ def asked(*goals: int, nodes: int | None = 3, broken: bool = False, start: int =
         with torch.no_grad():
             model.base_predictor.predictor_proj.weight.fill_(float("nan"))
     config = QUICK.model_copy(update=changes)
-    question = PlanRequest(image(start), STATE, tuple(image(goal) for goal in goals or (100,)))
-    return decide(Controller(model, config, seed=5), question.with_equal_durations(config.horizon), nodes=nodes)
+    images = [image(goal) for goal in goals or (100,)]
+    question = PlanRequest(image(start), STATE, timed(images, equal_durations(config.horizon, len(images))))
+    return decide(Controller(model, config, seed=5), question, nodes=nodes)

@@ -53,26 +53,21 @@ def add_serve(commands: cli.Commands) -> None:
     cli.add(group, "--certificate-key FILE", "its private key, PEM (in the same file)", cli.as_path)
     group = parser.add_argument_group("record")
     cli.add(group, "--record FOLDER", "every decision with its pictures, in a new folder", cli.as_path)
-    cli.add(
-        group, "--record-gb GB", "where the record ends (2)", cli.number_between(0, 10_000, "gigabytes"), default=2.0
-    )
+    size = cli.number_between(0, 10_000, "gigabytes")
+    cli.add(group, "--record-gb GB", "where the record ends (2)", size, default=2.0)
 
 
 def add_simulate(commands: cli.Commands) -> None:
     """Add `simulate` to a parser: it records if its first word is `record`, else it tests a model in closed loop."""
     parser = cli.command(commands, "simulate", _simulate)
-    text = (
-        "who steers: the folder of a run, or what model.base takes, such as builtin:sim-tiny; or a server of one, as"
-        " ws://127.0.0.1:8000; or: record"
-    )
+    text = "who steers: the folder of a run, what model.base takes, or a server, as ws://127.0.0.1:8000; or: record"
     cli.add(parser, "subject RUN_OR_MODEL|ws://SERVER|record", text, cli.as_planner)
     cli.add(parser, "overrides key=value|FOLDER", "such as planning.samples=64; record: where the data go", nargs="*")
     text = "A or B; record: or random, another world in every episode (A)"
     cli.add(parser, "--domain", text, choices=["A", "B", "random"], default="A")
     cli.add(parser, "--episodes N", "how many (50; record: 40)", cli.count)
-    cli.add(
-        parser, "--steps N", "model steps (8; pick: 12, place: 18); record: control steps (41; place: 81)", cli.count
-    )
+    text = "model steps (8; pick: 12, place: 18); record: control steps (41; place: 81)"
+    cli.add(parser, "--steps N", text, cli.count)
     cli.add(parser, "--seed N", "which problems or demonstrations (0)", cli.whole_number(0, 2**31 - 1))
     text = "what is to be done (reach); record: push, pick or place, with a block on the table (none: reaching around)"
     cli.add(parser, "--task", text, choices=["reach", "push", "pick", "place"])
@@ -80,10 +75,7 @@ def add_simulate(commands: cli.Commands) -> None:
     group = parser.add_argument_group("of a model that steers")
     cli.add_checkpoint(group, default=None)
     cli.add(group, "--config CONFIG", "of a model: a config whose `planning` is used", cli.as_local)
-    text = (
-        "goals on the way: demonstration takes them from the oracle's solution of the same problem, where the gripper"
-        " changes or the arm stops; every-step: each model step of it (none)"
-    )
+    text = "goals on the way, of the oracle's solution: demonstration: its key frames; every-step: all of it (none)"
     cli.add(group, "--sub-goals", text, choices=["none", "demonstration", "every-step"])
     text = "a folder of goals on the way, that `vjepa2-ac goals` made: the same in every problem, of a fixed scene"
     cli.add(group, "--goals FOLDER", text, cli.as_local)
@@ -113,11 +105,10 @@ def _serve(options: argparse.Namespace) -> int:
     cli.require_to_plan(options)
 
     from vjepa2_ac.serving.about import read_kept_goals
-    from vjepa2_ac.serving.recording import require_new_record
     from vjepa2_ac.serving.server import ServerOptions, serve
 
     if options.record is not None:
-        require_new_record(options.record)
+        cli.require_new_place(options.record)
     goals = None if options.goals is None else read_kept_goals(options.goals)
     ended = serve(lambda: _loaded(options, goals, extrinsics), ServerOptions(access, options.port, tls), cli.show)
     if not ended:  # a search or a loading that takes longer than anybody waits: nothing of it is to be kept
@@ -142,29 +133,29 @@ def _tls(options: argparse.Namespace) -> ssl.SSLContext | None:
         return None
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     try:
-        context.load_cert_chain(options.certificate, options.certificate_key, password=_no_password)
+        context.load_cert_chain(
+            options.certificate, options.certificate_key, password=""
+        )  # else OpenSSL asks at the terminal
     except (OSError, ValueError) as error:
         needed = "a certificate and its private key without a password, in PEM"
         raise InputError(where=f"--certificate {options.certificate}", found=str(error), needed=needed) from None
     return context
 
 
-def _no_password() -> str:
-    raise ValueError("the private key has a password")
-
-
 def _loaded(options: argparse.Namespace, goals: KeptGoals | None, extrinsics: np.ndarray | None) -> Served:
     """Load the model, and make a first decision; runs in the planning thread."""
-    from vjepa2_ac.serving.about import in_words, metadata_of, require_steps, roboarena_metadata, warm_up
+    from vjepa2_ac.data.windows import require_stride
+    from vjepa2_ac.serving.about import in_words, metadata_of, roboarena_metadata, warm_up
     from vjepa2_ac.serving.recording import Recorder
     from vjepa2_ac.serving.request import IMAGE_KEYS
     from vjepa2_ac.serving.server import Served
     from vjepa2_ac.serving.session import Session, SessionOptions
 
     loaded = cli.load_planning_session(options)
+    steps = require_stride(loaded.config.data, to="say how long an action lasts", fix="Say which, as data.stride=4")
     how = SessionOptions(
         options.actions,
-        control_steps=require_steps(loaded.config),
+        control_steps=steps,
         image_keys=IMAGE_KEYS if options.image_key is None else (options.image_key,),
         deadline_s=options.deadline,
         dry_run=options.dry_run,
@@ -234,7 +225,7 @@ def _run_benchmark(options: argparse.Namespace) -> int:
 
     from vjepa2_ac.cli.console.tables import benchmark_notes, benchmark_table
     from vjepa2_ac.simulation.closed_loop.benchmark import BenchmarkOptions, run_benchmark
-    from vjepa2_ac.simulation.world.scene import load_mujoco
+    from vjepa2_ac.simulation.world.domains import load_mujoco
 
     load_mujoco()
     chosen = cli.record_of_options(BenchmarkOptions, options)
@@ -287,7 +278,7 @@ def _next(answer: Answer, options: argparse.Namespace) -> str:
 def _agent(options: argparse.Namespace) -> Iterator[Agent]:
     """Return who acts; a server as long as the context lasts."""
     from vjepa2_ac.serving.access import read_key
-    from vjepa2_ac.serving.client import PlanningClient
+    from vjepa2_ac.serving.wire import PlanningClient
     from vjepa2_ac.simulation.closed_loop.agent import agent_of_server, agent_of_session
 
     if not cli.is_server(options.subject):

@@ -133,7 +133,7 @@ def _next(measured: Evaluated, data: str | None) -> str:
     if "no" in {answer.predicts.word, answer.uses_actions.word}:
         return f"vjepa2-ac data check {about.subject}/config.yaml --model {about.subject}"
     try:
-        recorded = read_simulation(Path(about.data).resolve(strict=True)).spec
+        recorded = read_simulation(Path(about.data).resolve(strict=True))
     except (OSError, UserError):
         return f"vjepa2-ac serve {about.subject}"
     domain = f" --domain {recorded.worlds.name}" if isinstance(recorded.worlds, Domain) else ""

@@ -358,11 +358,10 @@ def camera_pose(text: str | None) -> np.ndarray | None:
     Raises:
         InputError: It is no pose.
     """
-    from vjepa2_ac.planning.input_checks import require_numbers
     from vjepa2_ac.spaces import EXTRINSICS
 
     if text is None:
         return None
     extrinsics = as_numbers(text, "--extrinsics")
-    require_numbers(extrinsics, EXTRINSICS, where="--extrinsics")
+    EXTRINSICS.require_state(extrinsics, "--extrinsics")
     return extrinsics

@@ -12,11 +12,9 @@ from vjepa2_ac.errors import InputError
 if TYPE_CHECKING:
     import numpy as np
 
-    from vjepa2_ac.config import Config
     from vjepa2_ac.config.planning import PlanningConfig
     from vjepa2_ac.planning.demonstrations.make_goals import Recording
     from vjepa2_ac.planning.goals import GoalFolder
-    from vjepa2_ac.planning.session import PlanningSession
 
 _QUICK, _QUICK_SEQUENCES = "planning.samples=64 planning.iterations=4", 256  # docs/planning.md says how good it is
 _FILMS = (".mp4", ".m4v", ".mov")
@@ -28,8 +26,7 @@ def add_plan(commands: cli.Commands) -> None:
     cli.add_planner(parser, such_as=f"such as planning.horizon=2; quick, for a CPU: {_QUICK}")
     cli.add(parser, "--start IMAGE", "what the camera sees: PNG or JPEG", cli.as_local, required=True)
     text = (
-        "measured x,y,z (m), roll,pitch,yaw (radians, extrinsic xyz), gripper (0 open .. 1 closed); or the numbers of a"
-        " vector, as the data had them"
+        "measured x,y,z (m), roll,pitch,yaw (rad, extrinsic xyz), gripper (0 open .. 1 closed); or a vector's numbers"
     )
     cli.add(parser, "--state NUMBERS", text, required=True)
     text = "what it shall see; again for goals that follow one another"
@@ -37,14 +34,10 @@ def add_plan(commands: cli.Commands) -> None:
     cli.add(goals, "--goal IMAGE", text, cli.as_local, action="append")
     cli.add(goals, "--goals FOLDER", "goals with rules of their own, that `vjepa2-ac goals` made", cli.as_path)
     cli.add(parser, "--durations STEPS", "model steps of all goals but the last, as 2,1 (equal shares)")
-    cli.add(
-        parser, "--mask IMAGE", "what of the image counts: of the goal's size, black where it does not", cli.as_local
-    )
+    text = "what of the image counts: of the goal's size, black where it does not"
+    cli.add(parser, "--mask IMAGE", text, cli.as_local)
     cli.add(parser, "--seed N", "default: the config's", cli.whole_number(0, 2**31 - 1))
-    text = (
-        "of the image's energy maps along each axis; 0: no maps; default: 13, or as many as evaluate no more action"
-        " sequences than the search"
-    )
+    text = "of the image's energy maps along each axis; 0: no maps (13, or as many as cost no more than the search)"
     cli.add(parser, "--nodes N", text, cli.whole_number(0, 101))
     cli.add_decoder(parser, "what the planner imagined, beside the goal, in the image")
     cli.add(parser, "--out FOLDER", "for both files (plan)", cli.as_path, default=Path("plan"))
@@ -57,10 +50,7 @@ def add_goals(commands: cli.Commands) -> None:
     cli.add(parser, "overrides key=value", "of the config, such as data.camera=wrist_left", nargs="*")
     cli.add(parser, "--out FOLDER", "where goals.json and the images go: new or empty", cli.as_path, required=True)
     cli.add(parser, "--episode ID|NUMBER", "which one: its name in the data, or its number, from 0 (0)")
-    text = (
-        "gripper: where it changes, the arm stops, and the end, from the states; latent: where images stop becoming"
-        " more like the next goal, with --model; every N: every N-th frame (gripper; of a film latent)"
-    )
+    text = "gripper: where it changes or the arm stops; latent: by images, with --model; every N frames (film: latent)"
     cli.add(parser, "--by gripper|latent|every", text, nargs="+")
     text = "that will plan: for latents, energies and the noise floor; the folder of a run, or what model.base takes"
     cli.add(parser, "--model RUN_OR_MODEL", text, cli.as_model)
@@ -79,12 +69,15 @@ def _plan(options: argparse.Namespace) -> int:
 
     Status 1 where the model gives no finite energy.
     """
+    from vjepa2_ac.data.sources.indexed_source import measured_space
+
     state, extrinsics = cli.as_numbers(options.state, "--state"), cli.camera_pose(options.extrinsics)
-    durations = _durations(options)
     cli.require_goals(options.goals)
-    _require_state(state, cli.require_to_plan(options))
+    config = cli.require_to_plan(options)
+    measured_space(config.data, len(state)).require_state(state, "--state")  # how wide, only the model knows
     cli.make_folder(options.out)
-    start, goals, mask = _images(options)
+    goals = _goals_of(options, config.planning.horizon)
+    start, mask = _images(options, goals.goals[0].image)
 
     from vjepa2_ac.cli.console.tables import plan_table
     from vjepa2_ac.evaluation.imagined_plan import imagine_plan
@@ -96,28 +89,20 @@ def _plan(options: argparse.Namespace) -> int:
     session = cli.load_planning_session(options)
     if decoder is not None:
         decoder.require_fit(session.world_model, session.config.data.crop, subject=options.subject)
-    if isinstance(goals, tuple):
-        request = PlanRequest(start, state, goals, durations, mask)
-        names = options.goal
-    else:
-        request = PlanRequest.of_sub_goals(start, state, session.goals_of(goals), mask)
-        names = [str(options.goals)]
-    if not options.durations and isinstance(goals, tuple):
-        request = request.with_equal_durations(session.config.planning.horizon)
+    request = PlanRequest(start, state, session.goals_of(goals), mask)
     with cli.reporter() as reporter:
         reporter.note(_search_line(session.config.planning, on_cpu=session.world_model.device.type == "cpu"))
-        progress = reporter.task("planning", "action sequences")
-        controller = session.controller(seed=options.seed, extrinsics=extrinsics, progress=progress)
+        controller = session.controller(seed=options.seed, extrinsics=extrinsics)
+        controller.planner.progress = reporter.task("planning", "action sequences")
         found = decide(controller, request, nodes=options.nodes, reporter=reporter)
+    names = options.goal or [str(options.goals)]
     about = session.as_dict() | {"start": options.start, "goals": names, "mask": options.mask}
     about["decoder"] = None if decoder is None else decoder.as_dict()
     imagined = None if decoder is None else imagine_plan(found, decoder)
     with user_can_write(options.out):
-        written = [
-            write_plan(found, about, options.out / PLAN_FILE),
-            plot_plan(found, options.out / PLAN_IMAGE, imagined),
-        ]
-    cli.show(plan_table(found), summarize(found), files=written)
+        file = write_plan(found, about, options.out / PLAN_FILE)
+        image = plot_plan(found, options.out / PLAN_IMAGE, imagined)
+    cli.show(plan_table(found), summarize(found), files=[file, image])
     return int(found.decision.why == "no finite energy")
 
 
@@ -132,52 +117,37 @@ def _search_line(config: PlanningConfig, *, on_cpu: bool) -> str:
     return text + f". Quick, for a CPU: {_QUICK}" * is_long
 
 
-def _require_state(state: np.ndarray, config: Config) -> None:
-    """Refuse a state that is none of the config's space; how wide a vector is, only the model knows."""
-    from vjepa2_ac.data.sources.indexed_source import measured_space
-    from vjepa2_ac.planning.input_checks import require_numbers
+def _images(options: argparse.Namespace, goal: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return start and mask; refuse what does not fit the goal, before a model is loaded."""
+    from vjepa2_ac.media.images import read_image, require_image, require_mask
 
-    require_numbers(state, measured_space(config.data, len(state)), where="--state")
-
-
-def _images(
-    options: argparse.Namespace,
-) -> tuple[np.ndarray, tuple[np.ndarray, ...] | GoalFolder, np.ndarray | None]:
-    """Return start, goals and mask; refuse what cannot be planned with, before a model is loaded."""
-    from vjepa2_ac.media.images import read_image
-    from vjepa2_ac.planning.input_checks import require_image, require_mask
-
-    folder = None
-    if options.goals is not None:
-        from vjepa2_ac.planning.goals import read_goal_folder
-
-        folder = read_goal_folder(options.goals)
-        images = tuple(goal.image for goal in folder.goals)
-    else:
-        images = tuple(read_image(path) for path in options.goal)
-        for path, image in zip(options.goal, images, strict=True):
-            require_image(image, where=f"--goal {path}", like=images[0])
     start = read_image(options.start)
-    require_image(start, where=f"--start {options.start}", like=images[0])
+    require_image(start, where=f"--start {options.start}", like=goal)
     mask = None if options.mask is None else read_image(options.mask).max(axis=-1)
     if mask is not None:
-        require_mask(mask, where=f"--mask {options.mask}", like=images[0])
-    return start, images if folder is None else folder, mask
+        require_mask(mask, where=f"--mask {options.mask}", like=goal)
+    return start, mask
 
 
-def _durations(options: argparse.Namespace) -> tuple[int, ...]:
-    if not options.durations:
-        return ()
+def _goals_of(options: argparse.Namespace, horizon: int) -> GoalFolder:
+    """Return the goals of a folder; or images with the durations that were given, else with equal ones."""
+    from vjepa2_ac.media.images import read_image, require_image
+    from vjepa2_ac.planning.goals import GoalFolder, equal_durations, read_goal_folder, timed
+
     if options.goals is not None:
-        found, needed = f"--goals {options.goals}", "--goal: a folder says how long its goals apply"
+        if options.durations:
+            found, needed = f"--goals {options.goals}", "--goal: a folder says how long its goals apply"
+            raise InputError(where="--durations", found=found, needed=needed)
+        return read_goal_folder(options.goals)
+    images, count = [read_image(path) for path in options.goal], len(options.goal)
+    for path, image in zip(options.goal, images, strict=True):
+        require_image(image, where=f"--goal {path}", like=images[0])
+    words = (options.durations or "").replace(",", " ").split()
+    if words and (len(words) != count - 1 or not all(word.isdecimal() and int(word) for word in words)):
+        found = f"{options.durations!r} for {count} goal{'s' * (count > 1)}"
+        needed = f"{count - 1} whole numbers from 1, with commas between them: of each goal but the last"
         raise InputError(where="--durations", found=found, needed=needed)
-    text, goals = options.durations, len(options.goal)
-    words = text.replace(",", " ").split()
-    if len(words) != goals - 1 or not all(word.isdecimal() and int(word) for word in words):
-        found = f"{text!r} for {goals} goal{'s' * (goals > 1)}"
-        needed = f"{goals - 1} whole numbers from 1, with commas between them: of each goal but the last"
-        raise InputError(where="--durations", found=found, needed=needed)
-    return tuple(int(word) for word in words)
+    return GoalFolder(timed(images, [int(word) for word in words] or equal_durations(horizon, count)))
 
 
 def _goals(options: argparse.Namespace) -> None:
@@ -191,11 +161,15 @@ def _goals(options: argparse.Namespace) -> None:
 
     from vjepa2_ac.cli.console.tables import goals_notes, goals_table
     from vjepa2_ac.planning.demonstrations.make_goals import KeyFrameOptions, make_goals, recording_of_film
+    from vjepa2_ac.planning.session import load_to_plan
     from vjepa2_ac.reports.figures.planning import GOALS_IMAGE, plot_goals
     from vjepa2_ac.storage import user_can_write
 
     still = None if options.still is None else recording_of_film(options.still)
-    session = _session(options)
+    session = None
+    if options.model is not None:
+        cli.say_places_elsewhere(options.model)
+        session = load_to_plan(options.model, checkpoint=options.checkpoint or "selected")
     chosen = cli.record_of_options(KeyFrameOptions, options, by=by, every=every, stride=stride)
     with cli.reporter() as reporter:
         made = make_goals(recording, chosen, session, still=still, reporter=reporter)
@@ -250,12 +224,3 @@ def _recording(options: argparse.Namespace) -> tuple[Recording, int]:
 
     with cli.reporter() as reporter:
         return recording_of_episode(config.data, options.episode or "0", reporter.task(INDEXING)), stride
-
-
-def _session(options: argparse.Namespace) -> PlanningSession | None:
-    if options.model is None:
-        return None
-    from vjepa2_ac.planning.session import load_to_plan
-
-    cli.say_places_elsewhere(options.model)
-    return load_to_plan(options.model, checkpoint=options.checkpoint or "selected")

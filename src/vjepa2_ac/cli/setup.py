@@ -257,7 +257,7 @@ def _demo(_options: argparse.Namespace) -> int:
     All of it is in the folder demo, in 4 to 6 minutes on 2 cores, without a download. The same command goes on after a
     stop.
     """
-    from vjepa2_ac.simulation.world.scene import load_mujoco
+    from vjepa2_ac.simulation.world.domains import load_mujoco
 
     load_mujoco()
     commands = [

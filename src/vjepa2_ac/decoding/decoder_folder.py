@@ -87,12 +87,10 @@ class TrainedDecoder:
             ("data.crop", card.crop, crop),
         )
         if differing := [f"{name} {ours}, not {theirs}" for name, ours, theirs in compared if ours != theirs]:
-            raise InputError(
-                where=f"{self.where} {self.name}",
-                found=f"the decoder of another encoder or crop than that of {subject} ({'; '.join(differing)})",
-                needed="one that was trained on the latents of both: others would be read wrongly",
-                fix="Train one with `vjepa2-ac decoder CONFIG`, on the config of this model",
-            )
+            found = f"the decoder of another encoder or crop than that of {subject} ({'; '.join(differing)})"
+            needed = "one that was trained on the latents of both: others would be read wrongly"
+            fix = "Train one with `vjepa2-ac decoder CONFIG`, on the config of this model"
+            raise InputError(where=f"{self.where} {self.name}", found=found, needed=needed, fix=fix)
 
 
 def save_decoder(folder: Path, card: DecoderCard, decoder: Mapping[str, Tensor], linear: Mapping[str, Tensor]) -> None:
@@ -121,8 +119,8 @@ def load_decoder(name: str | Path, *, where: str = "--decoder") -> TrainedDecode
     folder = ASSETS / str(name).removeprefix(BUILTIN) / BUILTIN_DECODER if is_ours else Path(name)
     card = read_card(folder, where=where)
     linear_shape = DecoderShape("linear", card.shape.dim, card.shape.grid, card.shape.patch_size)
-    decoder = _filled(card.shape, folder / WEIGHTS)
-    return TrainedDecoder(card, decoder, _filled(linear_shape, folder / LINEAR), str(name), where)
+    decoder, linear = _filled(card.shape, folder / WEIGHTS), _filled(linear_shape, folder / LINEAR)
+    return TrainedDecoder(card, decoder, linear, str(name), where)
 
 
 def read_card(folder: Path, *, where: str = "--decoder") -> DecoderCard:

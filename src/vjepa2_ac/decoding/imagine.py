@@ -6,8 +6,8 @@ one: those of a recording would tell a model what did happen.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Protocol
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ from torch import Tensor
 from vjepa2_ac.decoding.decoder_folder import DecoderCard
 from vjepa2_ac.decoding.network import Decoder, as_pixels
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.media.film import FilmStrip, StripRow
+from vjepa2_ac.media.figure import FilmStrip, StripRow
 from vjepa2_ac.model.state_integration import counterfactual_states, feasible_actions
 from vjepa2_ac.spaces import StateSpace
 
@@ -31,16 +31,6 @@ _LONGEST_NAME = 44  # characters
 _LEAST_CM, _LEAST_GRIP = 0.15, 0.05  # smaller parts of an action are not named
 _POSE = 7  # numbers
 _WAYS = (("forward", "back"), ("left", "right"), ("up", "down"))  # of x, y, z in the robot base frame
-
-
-class Rolls(Protocol):
-    """What a rollout needs of a model: `WorldModel`, or an oracle in a test."""
-
-    def rollout(
-        self, context: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None, /
-    ) -> Float[Tensor, "batch horizon tokens dim"]:
-        """Return the frames after the context, each prediction fed back."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,17 +73,20 @@ class Imagination:
     rollouts: tuple[Imagined, ...]
     truth: Film | None = None  # under the recorded actions
     decoded_truth: Film | None = None
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()
 
 
 @torch.no_grad()
 def rolled_out(
-    model: Rolls, start: Start, actions: Actions, states: Float[np.ndarray, "steps state_dim"] | None = None
+    rollout: Callable[..., Tensor],
+    start: Start,
+    actions: Actions,
+    states: Float[np.ndarray, "steps state_dim"] | None = None,
 ) -> Float[Tensor, "steps tokens dim"]:
     """Return the latents after each action, each prediction fed back.
 
     Args:
-        model: What predicts.
+        rollout: Of what predicts: as `WorldModel.rollout`.
         start: The first frame and its state.
         actions: One for each step.
         states: Those that are known: the recorded ones of recorded actions. None: integrated from the first; a gripper
@@ -105,7 +98,7 @@ def rolled_out(
     device = start.latents.device
     taken, known = (torch.as_tensor(one, dtype=torch.float32, device=device)[None] for one in (actions, states))
     extrinsics = None if start.extrinsics is None else start.extrinsics.expand(1, len(actions), -1)
-    return model.rollout(start.latents[None, None], taken, known, extrinsics)[0]
+    return rollout(start.latents[None, None], taken, known, extrinsics)[0]
 
 
 def worth_knowing(card: DecoderCard, first: Image, decoded_first: Image) -> tuple[str, ...]:

@@ -46,19 +46,8 @@ class DecoderShape:
         return self.grid * self.patch_size
 
 
-@dataclass(frozen=True)
-class _Widths:
-    blocks: int
-    width: int
-    heads: int
-    head: tuple[int, int]  # channels after the first and the second doubling of the resolution
-
-
-_SIZES: dict[str, _Widths] = {
-    "tiny": _Widths(blocks=2, width=128, heads=4, head=(64, 32)),
-    "small": _Widths(blocks=6, width=512, heads=8, head=(256, 128)),
-    "medium": _Widths(blocks=12, width=768, heads=12, head=(256, 128)),
-}
+# Blocks, their width and heads, and the channels after the first and the second doubling of the resolution.
+_SIZES = {"tiny": (2, 128, 4, 64, 32), "small": (6, 512, 8, 256, 128), "medium": (12, 768, 12, 256, 128)}
 
 
 class Decoder(nn.Module):
@@ -75,7 +64,7 @@ class Decoder(nn.Module):
         self.linear = nn.Linear(shape.dim, 3 * shape.patch_size**2)
         patches = "n (rows columns) (c p q) -> n c (rows p) (columns q)"
         self.unfold = Rearrange(patches, rows=shape.grid, c=3, p=shape.patch_size)
-        self.further = None if shape.size == "linear" else _convolved(shape, _SIZES[shape.size])
+        self.further = None if shape.size == "linear" else _convolved(shape)
 
     def initialise(self, generator: Generator) -> None:
         """Draw fresh weights; the generator determines them."""
@@ -128,16 +117,16 @@ class Decoder(nn.Module):
         return images.reshape(*latents.shape[:-2], *images.shape[-3:])
 
 
-def _convolved(shape: DecoderShape, widths: _Widths) -> nn.Sequential:
-    first, second = widths.head
+def _convolved(shape: DecoderShape) -> nn.Sequential:
+    blocks, width, heads, first, second = _SIZES[shape.size]
     last = shape.patch_size // UPSAMPLED
     return nn.Sequential(
-        nn.Linear(shape.dim, widths.width),
-        _Positions(shape.grid, widths.width),
-        *(_Block(widths.width, widths.heads) for _ in range(widths.blocks)),
-        nn.LayerNorm(widths.width),
+        nn.Linear(shape.dim, width),
+        _Positions(shape.grid, width),
+        *(_Block(width, heads) for _ in range(blocks)),
+        nn.LayerNorm(width),
         Rearrange("n (rows columns) width -> n width rows columns", rows=shape.grid),
-        nn.Conv2d(widths.width, 4 * first, 3, padding=1),
+        nn.Conv2d(width, 4 * first, 3, padding=1),
         nn.PixelShuffle(2),
         nn.GELU(),
         nn.Conv2d(first, 4 * second, 3, padding=1),

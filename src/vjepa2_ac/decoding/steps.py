@@ -105,11 +105,9 @@ class DecoderSteps:
         read = torch.stack([value.detach().float() for value in numbers.values()]).tolist()  # waits for the device once
         metrics = dict(zip(numbers, read, strict=True))
         if not math.isfinite(metrics["gradient_norm"]):
-            raise InputError(
-                where="decoder.learning_rate",
-                found=f"{self._config.learning_rate:g}: loss or gradients of step {step} are not finite",
-                fix="Lower it, delete the newest checkpoint if it was written by then, and start again",
-            )
+            found = f"{self._config.learning_rate:g}: loss or gradients of step {step} are not finite"
+            fix = "Lower it, delete the newest checkpoint if it was written by then, and start again"
+            raise InputError(where="decoder.learning_rate", found=found, fix=fix)
         self.optimizer.step()
         self._add_to_average(step)
         return metrics | {"learning_rate": learning_rate}

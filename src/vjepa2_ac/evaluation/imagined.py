@@ -96,7 +96,7 @@ def imagine_image(
         first=first,
         decoded_first=decoded_first,
         rollouts=tuple(
-            Imagined("model", word, taken, shown(decoder.decoder, rolled_out(model, start, taken)))
+            Imagined("model", word, taken, shown(decoder.decoder, rolled_out(model.rollout, start, taken)))
             for word, taken in chosen.items()
         ),
         notes=(
@@ -188,7 +188,7 @@ def imagine_clip(subject: str, asked: ImagineOptions, *, reporter: Reporter = SI
                 if name != AS_RECORDED and one.role != "trained":
                     continue  # others by the one that is looked at
                 with one.switched():
-                    rolled = rolled_out(one.model, start, actions, states if name == AS_RECORDED else None)
+                    rolled = rolled_out(one.model.rollout, start, actions, states if name == AS_RECORDED else None)
                 rollouts.append(Imagined(one.name, name, actions, shown(decoder.decoder, rolled)))
         decoded = shown(decoder.decoder, latents.latents[0])
     assert batch.frames is not None  # noqa: S101  # refused above: a cache

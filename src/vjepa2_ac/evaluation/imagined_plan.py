@@ -11,7 +11,7 @@ from jaxtyping import Float
 from vjepa2_ac.data.transforms import frames_as_seen, view
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
 from vjepa2_ac.decoding.imagine import Film, Image, shown
-from vjepa2_ac.media.film import spread_with_ends
+from vjepa2_ac.media.figure import spread_with_ends
 from vjepa2_ac.planning.controller import Decision
 from vjepa2_ac.planning.decision import PlanResult
 
@@ -35,7 +35,7 @@ def imagine_plan(answer: PlanResult, decoder: TrainedDecoder) -> ImaginedPlan:
         answer: The decision.
         decoder: Of the model's encoder; it is moved to the model's device.
     """
-    controller, goal = answer.controller, answer.question.goals[answer.decision.goals[-1]]
+    controller, goal = answer.controller, answer.question.goals[answer.decision.goals[-1]].image
     decoder.to(controller.device)
     given = torch.stack([controller.encoded(image) for image in (answer.question.start, goal)])
     start, decoded_goal = shown(decoder.decoder, given)

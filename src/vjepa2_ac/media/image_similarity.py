@@ -14,6 +14,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+Images = Float[Tensor, "*batch 3 height width"]
+Pixels = Float[Tensor, "*batch height width"]  # a number for each
+Where = Bool[Tensor, "*batch height width"]
+OfEach = Float[Tensor, "*batch"]  # a number for each image
+Channels = Float[Tensor, "*batch channel height width"]
+
 MOVES_BY = 8 / 255  # in any channel
 DILATED_BY = 8  # pixels
 _SIGMA, _RADIUS = 1.5, 5  # of the Gaussian window, 11 x 11
@@ -22,11 +28,7 @@ _SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 _ROUNDING = 1e-5  # so that a difference of exactly 8 levels of 255 does not count, whatever float32 makes of it
 
 
-def psnr(
-    predicted: Float[Tensor, "*batch 3 height width"],
-    true: Float[Tensor, "*batch 3 height width"],
-    where: Bool[Tensor, "*batch height width"] | None = None,
-) -> Float[Tensor, "*batch"]:
+def psnr(predicted: Images, true: Images, where: Where | None = None) -> OfEach:
     """Return the peak signal-to-noise ratio of each image in dB: 10 log10(1 / mean squared error).
 
     Identical images have infinity: leave them out of a mean and say how many there were.
@@ -40,16 +42,12 @@ def psnr(
     return -10 * torch.log10(mean_where(squared, where))
 
 
-def ssim(
-    predicted: Float[Tensor, "*batch 3 height width"], true: Float[Tensor, "*batch 3 height width"]
-) -> Float[Tensor, "*batch"]:
+def ssim(predicted: Images, true: Images) -> OfEach:
     """Return the structural similarity of each image: the mean of `ssim_map`; 1 is identical."""
     return ssim_map(predicted, true).mean(dim=(-2, -1))
 
 
-def ssim_map(
-    predicted: Float[Tensor, "*batch 3 height width"], true: Float[Tensor, "*batch 3 height width"]
-) -> Float[Tensor, "*batch height width"]:
+def ssim_map(predicted: Images, true: Images) -> Pixels:
     """Return the structural similarity at each pixel, as the mean over R, G and B.
 
     Average it over a region with `mean_where`.
@@ -63,9 +61,7 @@ def ssim_map(
     return _terms(predicted, true)[0].mean(dim=-3)
 
 
-def ms_ssim(
-    predicted: Float[Tensor, "*batch 3 height width"], true: Float[Tensor, "*batch 3 height width"], scales: int
-) -> Float[Tensor, "*batch"]:
+def ms_ssim(predicted: Images, true: Images, scales: int) -> OfEach:
     """Return the multi-scale structural similarity of each image, for a loss.
 
     It is the product over scales of mean contrast (of the coarsest one: of mean similarity) to the power of a weight,
@@ -103,18 +99,14 @@ def moving_region(true: Float[Tensor, "*batch time 3 height width"]) -> Bool[Ten
     return (dilated > 0).reshape(moved.shape)
 
 
-def mean_where(
-    values: Float[Tensor, "*batch height width"], where: Bool[Tensor, "*batch height width"] | None
-) -> Float[Tensor, "*batch"]:
+def mean_where(values: Pixels, where: Where | None) -> OfEach:
     """Return the mean over the pixels that count, all of them if `where` is None; NaN where none does."""
     if where is None:
         return values.mean(dim=(-2, -1))
     return torch.where(where, values, 0).sum(dim=(-2, -1)) / where.sum(dim=(-2, -1))
 
 
-def _terms(
-    predicted: Float[Tensor, "*batch channel height width"], true: Float[Tensor, "*batch channel height width"]
-) -> tuple[Float[Tensor, "*batch channel height width"], Float[Tensor, "*batch channel height width"]]:
+def _terms(predicted: Channels, true: Channels) -> tuple[Channels, Channels]:
     """Return similarity and contrast at each pixel, for each channel."""
     height, width = predicted.shape[-2:]
     with torch.autocast(predicted.device.type, enabled=False):
@@ -148,13 +140,13 @@ def _window(side: int, device: torch.device) -> Float[Tensor, "side side"]:
         return matrix.to(device, torch.float32)
 
 
-def _halved(images: Float[Tensor, "*batch channel height width"]) -> Float[Tensor, "*batch channel rows columns"]:
+def _halved(images: Channels) -> Float[Tensor, "*batch channel rows columns"]:
     flat = images.float().reshape(-1, *images.shape[-3:])
     halved = torch.nn.functional.avg_pool2d(flat, 2)
     return halved.reshape(*images.shape[:-2], *halved.shape[-2:])
 
 
-def _power(factor: Float[Tensor, "*batch"], weight: float) -> Float[Tensor, "*batch"]:
+def _power(factor: OfEach, weight: float) -> OfEach:
     """Return the power of what is above 0, else 0, with a finite gradient in either case; of NaN NaN."""
     positive = ~(factor <= 0)
     return torch.where(positive, torch.where(positive, factor, 1) ** weight, 0)

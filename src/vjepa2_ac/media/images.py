@@ -19,6 +19,7 @@ from vjepa2_ac.storage import read_bytes, user_can_read
 
 MOST_PIXELS = 100_000_000  # a robot's camera has a tenth; a file of 600 bytes may claim forty times as many
 _MOST_BYTES = 1 << 32  # of images that are decoded together
+_LEAST_SIDE = 16  # pixels of an image of a robot's scene
 
 
 def require_bounded(height: int, width: int, where: str, *, count: int = 1) -> None:
@@ -34,12 +35,42 @@ def require_bounded(height: int, width: int, where: str, *, count: int = 1) -> N
         InputError: They are.
     """
     if not 0 < height * width <= MOST_PIXELS or count * height * width * 3 > _MOST_BYTES:
-        raise InputError(
-            where=where,
-            found=f"{count} images of {height} x {width} pixels at once",
-            needed=f"at most {MOST_PIXELS // 10**6} megapixels each, and {_MOST_BYTES // 10**9} GB together",
-            fix="Make the images smaller, leave the episode out, or set data.frames lower",
-        )
+        found = f"{count} images of {height} x {width} pixels at once"
+        needed = f"at most {MOST_PIXELS // 10**6} megapixels each, and {_MOST_BYTES // 10**9} GB together"
+        fix = "Make the images smaller, leave the episode out, or set data.frames lower"
+        raise InputError(where=where, found=found, needed=needed, fix=fix)
+
+
+def require_image(image: np.ndarray, *, where: str, like: np.ndarray | None = None) -> None:
+    """Refuse an array that is no RGB image, or of another size than a given one.
+
+    Args:
+        image: The array.
+        where: Its name in errors.
+        like: An image of the same camera, of the required size.
+
+    Raises:
+        InputError: Says what was found.
+    """
+    found = f"an array of shape {image.shape} and type {image.dtype}"
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or min(image.shape[:2]) < _LEAST_SIDE:
+        needed = f"an RGB image: height x width x 3, uint8, {_LEAST_SIDE} pixels or more"
+        raise InputError(where=where, found=found, needed=needed)
+    if like is not None and image.shape != like.shape:
+        found = f"{image.shape[1]} x {image.shape[0]} pixels (width x height)"
+        needed = f"{like.shape[1]} x {like.shape[0]}, as the goal image: same camera, place and resolution"
+        raise InputError(where=where, found=found, needed=needed)
+
+
+def require_mask(mask: np.ndarray, *, where: str, like: np.ndarray) -> None:
+    """Refuse a mask that is not of an image's size.
+
+    Raises:
+        InputError: Says what was found.
+    """
+    if mask.shape != like.shape[:2]:
+        found, needed = f"shape {mask.shape} (height, width)", f"{like.shape[:2]}, as the goal image"
+        raise InputError(where=where, found=found, needed=needed)
 
 
 def decode_jpegs(images: Sequence[bytes], steps: Sequence[int], where: str) -> UInt8[np.ndarray, "time height width 3"]:
@@ -59,11 +90,8 @@ def decode_jpegs(images: Sequence[bytes], steps: Sequence[int], where: str) -> U
     for frame, image, step in zip(frames, images, steps, strict=True):
         size = _size_of(image, step, where)
         if size != (height, width):
-            raise InputError(
-                where=f"{where}: step {step}",
-                found=f"an image of {size[0]}x{size[1]}",
-                needed=f"{height}x{width} as at step {steps[0]}",
-            )
+            found, needed = f"an image of {size[0]}x{size[1]}", f"{height}x{width} as at step {steps[0]}"
+            raise InputError(where=f"{where}: step {step}", found=found, needed=needed)
         try:
             simplejpeg.decode_jpeg(image, colorspace="RGB", fastdct=True, buffer=frame)
         except ValueError as error:
@@ -80,11 +108,8 @@ def _size_of(image: bytes, step: int, where: str) -> tuple[int, int]:
 
 
 def _no_jpeg(image: bytes, step: int, where: str, error: ValueError) -> InputError:
-    return InputError(
-        where=f"{where}: step {step}",
-        found=f"{len(image)} bytes that are not a JPEG, starting with {bytes(image[:4])!r} ({error})",
-        needed="a JPEG image",
-    )
+    found = f"{len(image)} bytes that are not a JPEG, starting with {bytes(image[:4])!r} ({error})"
+    return InputError(where=f"{where}: step {step}", found=found, needed="a JPEG image")
 
 
 def encode_jpeg(frame: UInt8[np.ndarray, "height width 3"], *, quality: int = 95) -> bytes:
@@ -123,11 +148,9 @@ def decode_image(data: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]
             require_bounded(image.height, image.width, where)
             return _as_rgb(image)
     except (OSError, ValueError, SyntaxError, struct.error, zlib.error, EOFError, IndexError) as error:
-        raise InputError(
-            where=where,
-            found=f"{len(data)} bytes that are no image, starting with {data[:4]!r} ({error})",
-            needed="PNG or JPEG, as a camera's images are stored; depth, as TIFF, is not used",
-        ) from None
+        found = f"{len(data)} bytes that are no image, starting with {data[:4]!r} ({error})"
+        needed = "PNG or JPEG, as a camera's images are stored; depth, as TIFF, is not used"
+        raise InputError(where=where, found=found, needed=needed) from None
 
 
 def _as_rgb(image: Image.Image) -> UInt8[np.ndarray, "height width 3"]:

@@ -157,12 +157,8 @@ def _stream_of(container: Any, where: str) -> VideoStream:
     if stream is None:
         raise _unusable(where, "no video in the file", "an MP4 with frames")
     if stream.codec_context is None:
-        raise InputError(
-            where=where,
-            found="a video of a codec that this build of PyAV cannot decode",
-            needed="H.264, H.265 or AV1",
-            fix="Install PyAV from PyPI, or convert the video",
-        )
+        found, fix = "a codec that this build of PyAV cannot decode", "Install PyAV from PyPI, or convert the video"
+        raise InputError(where=where, found=found, needed="H.264, H.265 or AV1", fix=fix)
     if is_deep_grey(str(stream.pix_fmt)):
         found = f"frames of {stream.pix_fmt}: one channel of more than 8 bits, as depth is stored"
         raise InputError(where=where, found=found, needed="what a camera saw", fix="Name another camera")
@@ -313,7 +309,7 @@ def video_library(where: str = "video") -> Any:
     return require_library("av", where=where, called="PyAV, which decodes and writes video", extra="video")
 
 
-def write_video(path: str | Path, frames: Iterable[UInt8[np.ndarray, "height width 3"]], *, rate_hz: float) -> Path:
+def write_video(path: str | Path, frames: Iterable[Frame], *, rate_hz: float) -> Path:
     """Write RGB frames as a video and return its path; an odd last row or column of pixels is dropped.
 
     Args:
@@ -347,9 +343,7 @@ def write_video(path: str | Path, frames: Iterable[UInt8[np.ndarray, "height wid
     return Path(path)
 
 
-def write_gif(
-    path: str | Path, frames: Sequence[UInt8[np.ndarray, "height width 3"]], *, seconds: Sequence[float]
-) -> Path:
+def write_gif(path: str | Path, frames: Sequence[Frame], *, seconds: Sequence[float]) -> Path:
     """Write RGB frames as an endless GIF, and return its path.
 
     Colours are rounded to 255 without dithering, which would flicker and take several times the room.

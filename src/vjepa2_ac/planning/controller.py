@@ -18,16 +18,15 @@ from vjepa2_ac.data.sources.indexed_source import spaces_of
 from vjepa2_ac.data.transforms import Crop, view
 from vjepa2_ac.encoding.batch import encode_frames
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.media.images import require_image, require_mask
 from vjepa2_ac.model.network.world_model import WorldModel, heads_to_replace, widths_as_text, widths_of_model
 from vjepa2_ac.model.state_integration import states_along
-from vjepa2_ac.planning.axes import require_base_frame
 from vjepa2_ac.planning.energy import Goal, Scene, WorldModelCost, distance, patch_weights
 from vjepa2_ac.planning.goals import REACHED, GoalProgress, GripperMode, SubGoal, timed, with_shares
-from vjepa2_ac.planning.input_checks import require_image, require_mask, require_numbers
 from vjepa2_ac.planning.model_setup import Axes, Fingerprints, prepare_for_planning
 from vjepa2_ac.planning.planner import Cancelled, Plan, Planner
-from vjepa2_ac.planning.search_space import SearchSpace, Workspace, search_space
-from vjepa2_ac.planning.settings import warn_beyond_taught, with_taught_limits
+from vjepa2_ac.planning.search_space import SearchSpace, Workspace, is_allowed, search_space
+from vjepa2_ac.planning.settings import require_base_frame, warn_beyond_taught, with_taught_limits
 from vjepa2_ac.runs.loading import TrainedRun
 from vjepa2_ac.spaces import EXTRINSICS, POSES, Spaces
 
@@ -48,29 +47,6 @@ class Decision:
     states: Float[np.ndarray, "time dim"] | None = None  # states predicted along the plan, the current state first
     cost: WorldModelCost | None = None  # to evaluate other actions
     done: bool = False  # the last goal is reached: no motion
-
-    @property
-    def goal(self) -> int:
-        """The index of the goal that applies now."""
-        return self.progress.place
-
-
-@dataclass(frozen=True)
-class _Goals:
-    """Goals in order, as they are compared with."""
-
-    goals: tuple[SubGoal, ...]
-    latents: Float[Tensor, "goals tokens dim"]
-    weights: Float[Tensor, " tokens"] | None = None  # as of `Goal`
-
-    def rest(self, place: int) -> Goal:
-        """Return a goal and what follows it by count at the latest, for plans of several steps."""
-        durations: list[int] = []
-        for goal in self.goals[place:-1]:
-            if goal.at_most is None:
-                break
-            durations.append(goal.at_most)
-        return Goal(self.latents[place : place + len(durations) + 1], tuple(durations), self.weights)
 
 
 class Controller:
@@ -114,7 +90,7 @@ class Controller:
         """
         _require_spaces(world_model, spaces)
         if extrinsics is not None:
-            require_numbers(extrinsics, EXTRINSICS, where="extrinsics")
+            EXTRINSICS.require_state(extrinsics, "extrinsics")
         if (uses := world_model.sizes.predictor.use_extrinsics) != (extrinsics is not None):
             found, needed = f"{uses}, camera pose given: {not uses}", "a camera pose exactly where the model uses it"
             raise InputError(where="model: predictor.use_extrinsics", found=found, needed=needed)
@@ -129,7 +105,7 @@ class Controller:
         self.planner = Planner(self.config, self.space)
         self._workspace = Workspace.of(self.config.limits, spaces.state)
         self._searched: dict[GripperMode | None, SearchSpace] = {None: self.space}
-        self._goal: _Goals | None = None
+        self._goals: tuple[SubGoal, ...] = ()
         self._seen: list[Seen] = []  # the newest `planning.context`
         self._done = 0
         self.decision: Decision | None = None  # the last one
@@ -226,7 +202,8 @@ class Controller:
         ruled = with_shares(goals, self.config.goals)
         searched = {goal.gripper: self._space_with(goal.gripper) for goal in goals} | {None: self._searched[None]}
         latents = torch.stack([self.encoded(goal.image) for goal in goals])
-        self._goal = _Goals(ruled, latents, self._weights(mask, goals[0].image))
+        weights = self._weights(mask, goals[0].image)
+        self._goals, self._goal_latents, self._patch_weights = ruled, latents, weights
         self._searched, self.space = searched, searched[None]
         self._seen, self._done, self.decision = [], 0, None
 
@@ -251,13 +228,13 @@ class Controller:
             SearchCancelledError: It was cancelled. After any error nothing has changed.
             ValueError: No goal was set.
         """
-        if self._goal is None:
+        if not self._goals:
             raise ValueError("no goal: call reset first")
-        require_image(frame, where="frame", like=self._goal.goals[0].image)
+        require_image(frame, where="frame", like=self._goals[0].image)
         state = self._known(np.asarray(state, dtype=np.float64))
-        require_numbers(state, self.spaces.state, where="state")
+        self.spaces.state.require_state(state, "state")
         seen = [*self._seen, (self.encoded(frame), state)][-self.config.context :]
-        decision = self._decided(self._goal, seen, cancelled)
+        decision = self._decided(seen, cancelled)
         self._seen, self._done, self.decision = seen, self._done + 1, decision  # after an error nothing has changed
         return decision.action
 
@@ -271,30 +248,39 @@ class Controller:
         """Return the latents of what the model sees of an image, on its device."""
         return encode_frames(self._model, image[None], self.crop)[0]
 
-    def _progressed(self, goal: _Goals, latents: Float[Tensor, "tokens dim"]) -> GoalProgress:
+    def _progressed(self, latents: Float[Tensor, "tokens dim"]) -> GoalProgress:
         """Return which goal applies to the current image."""
 
         def energy(place: int) -> float:
-            return float(distance(latents, goal.latents[place], self.config.energy, goal.weights))
+            return float(distance(latents, self._goal_latents[place], self.config.energy, self._patch_weights))
 
         if self.decision is None:
             return GoalProgress(0, 0, energy(0))
-        return self.decision.progress.after(goal.goals, self._done, energy)
+        return self.decision.progress.after(self._goals, self._done, energy)
 
-    def _decided(self, goals: _Goals, seen: Sequence[Seen], cancelled: Cancelled) -> Decision:
+    def _goal_from(self, place: int) -> Goal:
+        """Return a goal and what follows it by count at the latest, for plans of several steps."""
+        durations: list[int] = []
+        for goal in self._goals[place:-1]:
+            if goal.at_most is None:
+                break
+            durations.append(goal.at_most)
+        return Goal(self._goal_latents[place : place + len(durations) + 1], tuple(durations), self._patch_weights)
+
+    def _decided(self, seen: Sequence[Seen], cancelled: Cancelled) -> Decision:
         latents, state = seen[-1]
-        progress = self._progressed(goals, latents)
-        goal, done = goals.rest(progress.place), self._done - progress.since
+        progress = self._progressed(latents)
+        goal, done = self._goal_from(progress.place), self._done - progress.since
         places = tuple(progress.place + goal.place(done + step) for step in range(self.config.horizon))
         wanted = goal.ahead(done, self.config.horizon)
         still = distance(latents.expand_as(wanted), wanted, self.config.energy, goal.weights)
         energy = float(still[-1] if self.config.energy.steps == "last" else still.sum())
         nothing = Decision(self._command(state, np.zeros(len(state))), "at the goal", energy, places, progress)
         if progress.done or float(still.max()) <= REACHED:
-            return replace(nothing, done=progress.place == len(goals.goals) - 1)
-        if self._workspace is not None and not self._workspace.is_near(state, self.config.limits):
+            return replace(nothing, done=progress.place == len(self._goals) - 1)
+        if self._workspace is not None and not is_allowed(self._workspace.way_back(state[:3]), self.config.limits):
             return replace(nothing, why="outside the workspace")
-        self.space = self._searched[goals.goals[progress.place].gripper]
+        self.space = self._searched[self._goals[progress.place].gripper]
         cost = WorldModelCost(self._model, self._scene(seen), goal, self.config.energy, done=done, spaces=self.spaces)
         plan = self._planned(state, cost, cancelled)
         return replace(

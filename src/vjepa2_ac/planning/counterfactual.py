@@ -22,15 +22,11 @@ STEP_M, GRIPPER_STEP = 0.05, 0.75
 have been taught less; what a model predicts for longer steps than it was taught means nothing."""
 
 _DIRECTIONS: dict[str, tuple[int, float]] = {  # in the robot base frame: x to the front, y to the left, z up
-    "up": (2, 1.0),
-    "down": (2, -1.0),
-    "left": (1, 1.0),
-    "right": (1, -1.0),
-    "forward": (0, 1.0),
-    "back": (0, -1.0),
-    "open": (6, -1.0),
-    "close": (6, 1.0),
-}
+    "up": (2, 1.0), "down": (2, -1.0),
+    "left": (1, 1.0), "right": (1, -1.0),
+    "forward": (0, 1.0), "back": (0, -1.0),
+    "open": (6, -1.0), "close": (6, 1.0),
+}  # fmt: skip
 ACTION_NAMES = ("none", *_DIRECTIONS)
 _LARGEST = np.array([1.0] * 3 + [np.pi] * 3 + [1.0])  # metres, radians, closedness in one step: more are other units
 

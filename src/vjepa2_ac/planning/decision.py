@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,8 @@ from jaxtyping import Float, UInt8
 
 from vjepa2_ac.planning.controller import Controller, Decision
 from vjepa2_ac.planning.energy import FEWEST_NODES, EnergySlice, energy_slices, fitting_nodes, sequences_of_slices
-from vjepa2_ac.planning.goals import SubGoal, timed
-from vjepa2_ac.planning.planner import Cost, Iteration, Plan
+from vjepa2_ac.planning.goals import SubGoal
+from vjepa2_ac.planning.planner import Cost, Plan
 from vjepa2_ac.planning.search_space import SearchSpace
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.spaces import StateSpace
@@ -29,21 +29,14 @@ class PlanRequest:
 
     start: UInt8[np.ndarray, "height width 3"]
     state: Float[np.ndarray, " numbers"]  # measured; a pose is refused or taken by the controller
-    goals: tuple[np.ndarray, ...]
-    durations: tuple[int, ...] = ()  # model steps of each goal but the last
+    goals: tuple[SubGoal, ...]  # in order; the first one applies
     mask: np.ndarray | None = None  # region of the image that counts: height x width
-    sub_goals: tuple[SubGoal, ...] = ()  # of these images, with rules instead of durations; empty: durations apply
 
-    @classmethod
-    def of_sub_goals(
-        cls, start: np.ndarray, state: np.ndarray, goals: Sequence[SubGoal], mask: np.ndarray | None = None
-    ) -> PlanRequest:
-        """Return the request to plan towards goals with rules of their own; the first one applies."""
-        return cls(start, state, tuple(goal.image for goal in goals), mask=mask, sub_goals=tuple(goals))
-
-    def with_equal_durations(self, horizon: int) -> PlanRequest:
-        """Return the same request with the steps divided equally among the goals, the last one taking the rest."""
-        return replace(self, durations=(max(1, horizon // len(self.goals)),) * (len(self.goals) - 1))
+    @property
+    def durations(self) -> list[int]:
+        """Model steps of each goal but the last, if they are fixed; else none."""
+        first = self.goals[:-1]
+        return [goal.at_least for goal in first] if all(goal.at_least == goal.at_most for goal in first) else []
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,11 +63,6 @@ class PlanResult:
         return self.controller.spaces.state
 
     @property
-    def shown_axes(self) -> tuple[int, ...]:
-        """The numbers of an action that figures show."""
-        return self.controller.shown_axes
-
-    @property
     def unused_goals(self) -> tuple[int, ...]:
         """Goals that do not affect the plan: they begin after its end, or only its last step counts."""
         ahead = self.decision.goals
@@ -96,10 +84,10 @@ def decide(
 
     Raises:
         InputError: An image, the state or the mask is invalid.
-        ValueError: The number of durations is not the number of goals minus one.
+        ValueError: No goals.
     """
     times = [time.perf_counter()]
-    controller.follow(question.sub_goals or timed(question.goals, question.durations), mask=question.mask)
+    controller.follow(question.goals, mask=question.mask)
     times.append(time.perf_counter())
     controller.act(question.start, question.state)
     times.append(time.perf_counter())
@@ -164,6 +152,8 @@ def plan_as_dict(answer: PlanResult, about: Mapping[str, Any]) -> dict[str, Any]
     decision, question, controller = answer.decision, answer.question, answer.controller
     plan, progress, names = decision.plan, decision.progress, answer.state_space.change_names
     rules = ("name", "at_least", "at_most", "share", "gripper", "floor")
+    recorded = ("samples", "finite", "lowest", "mean", "std", "seconds")
+    energy = {"now": decision.energy_now, "began": progress.began, "doing_nothing": answer.doing_nothing}
     found = {
         "format": FORMAT,
         "in_words": summarize(answer),
@@ -177,34 +167,20 @@ def plan_as_dict(answer: PlanResult, about: Mapping[str, Any]) -> dict[str, Any]
         "actions": answer.actions,
         "states": answer.states,
         "goal_of_each_step": decision.goals,
-        "sub_goals": [{name: getattr(one, name) for name in rules} for one in question.sub_goals],
+        "sub_goals": [{name: getattr(one, name) for name in rules} for one in question.goals],
         "since": progress.since,
         "changed": progress.changed,
         "done": decision.done,
-        "energy": {
-            "now": decision.energy_now,
-            "began": progress.began,
-            "doing_nothing": answer.doing_nothing,
-            "plan": None if plan is None else plan.energy,
-        },
+        "energy": energy | {"plan": None if plan is None else plan.energy},
         "evaluations": 0 if plan is None else plan.evaluations,
-        "iterations": [_iteration(one) for one in (() if plan is None else plan.iterations)],
+        "iterations": [
+            {name: getattr(one, name) for name in recorded} | {"elites_mean": one.elite_energy}
+            for one in (() if plan is None else plan.iterations)
+        ],
         "slices": [_slice(one, names[one.axes[0]], names[one.axes[1]]) for one in answer.slices],
         "seconds": {**answer.seconds, "search": 0.0 if plan is None else plan.seconds},
     }
     return {name: plain(value) for name, value in found.items()}
-
-
-def _iteration(one: Iteration) -> dict[str, Any]:
-    return {
-        "samples": one.samples,
-        "finite": one.finite,
-        "lowest": one.lowest,
-        "elites_mean": one.elite_energy,
-        "mean": one.mean,
-        "std": one.std,
-        "seconds": one.seconds,
-    }
 
 
 def _slice(one: EnergySlice, across: str, up: str) -> dict[str, Any]:
@@ -243,7 +219,7 @@ def summarize(answer: PlanResult) -> str:
     if at_limit := axes_at_limit(answer):
         knob = f"planning.limits.{'xyz' if answer.state_space.is_pose else 'axes'}"
         found.append(f"The first action is at its limit along {', '.join(at_limit)} ({knob}).")
-    if answer.unused_goals and not answer.question.sub_goals:  # of these everybody knows that the others come later
+    if answer.unused_goals and answer.question.durations:  # of others everybody knows that they come later
         unused = ", ".join(str(place + 1) for place in answer.unused_goals)
         found.append(f"No part in this plan has goal {unused}: see durations, planning.horizon, planning.energy.steps.")
     return " ".join(found)
@@ -251,8 +227,8 @@ def summarize(answer: PlanResult) -> str:
 
 def _motion(answer: PlanResult) -> str:
     space, change, steps = answer.state_space, answer.states[-1] - answer.states[0], len(answer.actions)
-    shown = change[list(answer.shown_axes)] * (space.shown_factor if space.is_pose else 1.0)
-    names = [space.change_names[axis] for axis in answer.shown_axes]
+    shown = change[list(answer.controller.shown_axes)] * (space.shown_factor if space.is_pose else 1.0)
+    names = [space.change_names[axis] for axis in answer.controller.shown_axes]
     lasting = f"in {steps} model step{'s' * (steps > 1)}"
     if not space.is_pose:
         parts = ", ".join(f"{name} by {value:+.3g}" for name, value in zip(names, shown, strict=True))
@@ -267,7 +243,7 @@ def _motion(answer: PlanResult) -> str:
 def axes_at_limit(answer: PlanResult) -> list[str]:
     """Return the numbers, of a position or of a vector, whose first change is at its limit."""
     upper, space = answer.space.upper[0].numpy(), answer.state_space
-    numbers = answer.shown_axes if space.is_pose else range(len(space))
+    numbers = answer.controller.shown_axes if space.is_pose else range(len(space))
     return [
         space.change_names[number] for number in numbers
         if upper[number] > 0 and abs(answer.actions[0, number]) >= _AT_LIMIT * upper[number]

@@ -26,6 +26,12 @@ from vjepa2_ac.planning.search_space import SearchSpace
 from vjepa2_ac.registry import ENERGIES
 from vjepa2_ac.spaces import POSES, Spaces
 
+Latents = Float[Tensor, "*batch tokens dim"]
+Wanted = Float[Tensor, "*wanted tokens dim"]
+OfTokens = Float[Tensor, "*batch tokens"]
+OfEach = Float[Tensor, "*batch"]
+Weights = Float[Tensor, " tokens"]  # of each patch
+
 
 @dataclass(frozen=True)
 class Goal:
@@ -33,7 +39,7 @@ class Goal:
 
     latents: Float[Tensor, "goals tokens dim"]
     durations: tuple[int, ...] = ()  # model steps of each goal but the last
-    weights: Float[Tensor, " tokens"] | None = None  # weight of each patch; None: equal weights
+    weights: Weights | None = None  # None: equal ones
 
     def place(self, step: int) -> int:
         """Return the index of the goal that applies after this many model steps since the start."""
@@ -52,9 +58,7 @@ class Goal:
         return torch.stack([self.latents[place] for place in places])  # a list as an index would wait for the device
 
 
-def patch_weights(
-    mask: Bool[Tensor, "height width"] | Float[Tensor, "height width"], grid: int
-) -> Float[Tensor, " tokens"]:
+def patch_weights(mask: Bool[Tensor, "height width"] | Float[Tensor, "height width"], grid: int) -> Weights:
     """Return the weight of each patch: the mean of a mask over the patch, patches row by row.
 
     Args:
@@ -127,9 +131,8 @@ class WorldModelCost:
             raise ValueError("a model in training mode: dropout would change energies; call eval() first")
         device = world_model.device
         self._model, self._config, self._spaces, self._done = world_model, config, spaces, done
-        self._goal = Goal(
-            goal.latents.to(device), goal.durations, None if goal.weights is None else goal.weights.to(device)
-        )
+        weights = None if goal.weights is None else goal.weights.to(device)
+        self._goal = Goal(goal.latents.to(device), goal.durations, weights)
         self._frame, self._state = scene.latents[-1].to(device), scene.states[-1].to(device)
         self._camera = None if scene.camera is None else scene.camera.to(device)
         self._seen = scene.seen
@@ -188,20 +191,13 @@ class WorldModelCost:
         return cache
 
 
-def distance(
-    predicted: Float[Tensor, "*batch tokens dim"],
-    wanted: Float[Tensor, "*wanted tokens dim"],
-    energy: EnergyConfig,
-    weights: Float[Tensor, " tokens"] | None = None,
-) -> Float[Tensor, "*batch"]:
+def distance(predicted: Latents, wanted: Wanted, energy: EnergyConfig, weights: Weights | None = None) -> OfEach:
     """Return the distance between latents that a config names, over patches by weight (None: equal weights)."""
     by_token: Tensor = ENERGIES.function(energy.distance, energy.options)(predicted, wanted)
     return by_token.mean(dim=-1) if weights is None else (by_token * (weights / weights.sum())).sum(dim=-1)
 
 
-def mean_difference(
-    predicted: Float[Tensor, "*batch tokens dim"], wanted: Float[Tensor, "*wanted tokens dim"]
-) -> Float[Tensor, "*batch tokens"]:
+def mean_difference(predicted: Latents, wanted: Wanted) -> OfTokens:
     """Return the mean absolute difference of each token.
 
     Source: facebookresearch/vjepa2 @ c2963a4, notebooks/utils/mpc_utils.py, l1.
@@ -209,16 +205,12 @@ def mean_difference(
     return absolute_difference(predicted, wanted).mean(dim=-1)
 
 
-def mean_square(
-    predicted: Float[Tensor, "*batch tokens dim"], wanted: Float[Tensor, "*wanted tokens dim"]
-) -> Float[Tensor, "*batch tokens"]:
+def mean_square(predicted: Latents, wanted: Wanted) -> OfTokens:
     """Return the mean squared difference of each token."""
     return squared_difference(predicted, wanted).mean(dim=-1)
 
 
-def one_minus_cosine(
-    predicted: Float[Tensor, "*batch tokens dim"], wanted: Float[Tensor, "*wanted tokens dim"]
-) -> Float[Tensor, "*batch tokens"]:
+def one_minus_cosine(predicted: Latents, wanted: Wanted) -> OfTokens:
     """Return 1 - cosine of each token."""
     return 1 - cosine_similarity(predicted, wanted, dim=-1)
 

@@ -17,8 +17,7 @@ from pydantic import ConfigDict, Field
 
 from vjepa2_ac.config.planning import GoalsConfig
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.images import encode_png, read_image
-from vjepa2_ac.planning.input_checks import require_image
+from vjepa2_ac.media.images import encode_png, read_image, require_image
 from vjepa2_ac.storage.files import folder_writer
 from vjepa2_ac.storage.structured import json_text, read_json_object, record_of
 
@@ -66,6 +65,11 @@ class SubGoal:
         if energy < self.floor:
             return f"energy {energy:.4g} is within the noise of {self.floor:.4g}"
         return "the image equals the goal's" if energy <= REACHED else ""
+
+
+def equal_durations(horizon: int, goals: int) -> tuple[int, ...]:
+    """Return the steps of each goal but the last, if a plan's are divided equally; the last one takes the rest."""
+    return (max(1, horizon // goals),) * (goals - 1)
 
 
 def timed(images: Sequence[np.ndarray], durations: Sequence[int]) -> tuple[SubGoal, ...]:
@@ -209,11 +213,6 @@ class GoalFolder:
                     place, 100 * goal.share, began, noise.energy,
                 )  # fmt: skip
         return tuple(replace(goal, floor=noise.energy) for goal in self.goals)
-
-
-def read_goals(folder: Path) -> tuple[SubGoal, ...]:
-    """Return the goals of a folder, in order; errors as of `read_goal_folder`."""
-    return read_goal_folder(folder).goals
 
 
 def read_goal_folder(folder: Path) -> GoalFolder:

@@ -16,7 +16,7 @@ from vjepa2_ac.model.adapter.lora import unadapted_copy
 from vjepa2_ac.model.network.compilation import require_compiler
 from vjepa2_ac.model.network.world_model import WorldModel, fingerprint
 from vjepa2_ac.model.state_integration import euler_from_matrices, matrices_from_euler
-from vjepa2_ac.planning.axes import read_axes
+from vjepa2_ac.planning.settings import read_axes
 
 _POSITION, _ROTATION = slice(0, 3), slice(3, 6)
 

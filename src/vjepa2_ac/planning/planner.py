@@ -21,7 +21,7 @@ from torch import Generator, Tensor
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.planning.search_space import SearchSpace, pose_space
-from vjepa2_ac.planning.solvers import EvaluatedPlans, PlanStart, Solver
+from vjepa2_ac.planning.solvers import EvaluatedPlans, PlanStart, Samples, Solver
 from vjepa2_ac.registry import PLANNERS
 
 Clock = Callable[[], float]  # seconds, from anywhere
@@ -125,9 +125,7 @@ class Plan:
         return PlanStart(_later(self.mean[None], done, self.repeat)[0], _later(elites, done, self.repeat))
 
 
-def _later(
-    decisions: Float[Tensor, "samples decisions dim"], by: int, repeat: int
-) -> Float[Tensor, "samples decisions dim"]:
+def _later(decisions: Samples, by: int, repeat: int) -> Samples:
     steps = decisions.shape[1] * repeat
     places = (torch.arange(steps) + by).clamp(max=steps - 1) // repeat
     at_steps = decisions[:, places]
@@ -219,9 +217,7 @@ class Planner:
         return Iteration(*counts, best.decisions, best.energies, search.mean, search.std, self.clock() - began)
 
 
-def _evaluated(
-    cost: Cost, decisions: Float[Tensor, "samples decisions dim"], space: SearchSpace, *, gradients: bool
-) -> EvaluatedPlans:
+def _evaluated(cost: Cost, decisions: Samples, space: SearchSpace, *, gradients: bool) -> EvaluatedPlans:
     decisions = decisions.detach().requires_grad_(gradients)
     with torch.set_grad_enabled(gradients):
         energies = cost(space.over_steps(decisions))

@@ -14,6 +14,8 @@ from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.spaces import StateSpace
 
+Way = Float[np.ndarray, " 3"]  # of the flange
+
 GRIPPER = 6  # of a pose
 _ROUNDING = 4 * torch.finfo(torch.float32).eps  # a norm is rounded more than once
 
@@ -181,14 +183,10 @@ class Workspace:
         upper[0, :3] = torch.minimum(upper[0, :3], room_up)
         return replace(space, lower=lower, upper=upper)
 
-    def is_near(self, state: Float[np.ndarray, " 7"], limits: LimitsConfig) -> bool:
-        """Return whether one action leads back inside; true of a robot that is inside."""
-        return is_allowed(self.way_back(state[:3]), limits)
-
     def kept(
         self, state: Float[np.ndarray, " 7"], actions: Float[np.ndarray, "steps 7"], limits: LimitsConfig
     ) -> Float[np.ndarray, "steps 7"]:
-        """Return actions whose targets are all inside, of a robot that is near.
+        """Return actions whose targets are all inside, of a robot whom one action leads back.
 
         A target is moved to the nearest place inside; where that is more than an action may be, towards the way back.
 
@@ -210,9 +208,7 @@ class Workspace:
         return np.asarray(np.clip(position, self.low, self.high) - position)
 
 
-def _within(
-    limits: LimitsConfig, sure: Float[np.ndarray, " 3"], wanted: Float[np.ndarray, " 3"]
-) -> Float[np.ndarray, " 3"]:
+def _within(limits: LimitsConfig, sure: Way, wanted: Way) -> Way:
     """Return the last way from an allowed one to a wanted one that is allowed, too: limits are convex."""
     if is_allowed(wanted, limits):
         return wanted
@@ -223,7 +219,7 @@ def _within(
     return np.asarray(sure + low * (wanted - sure))
 
 
-def is_allowed(way: Float[np.ndarray, " 3"], limits: LimitsConfig, slack_m: float = _NEAR_M) -> bool:
+def is_allowed(way: Way, limits: LimitsConfig, slack_m: float = _NEAR_M) -> bool:
     """Return whether a motion is within the limits of each axis and of the ball."""
     if (abs(way) > np.array(limits.xyz_m) + slack_m).any():
         return False

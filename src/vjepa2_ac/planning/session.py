@@ -14,7 +14,6 @@ from jaxtyping import Float
 from vjepa2_ac import __version__
 from vjepa2_ac.config import Config
 from vjepa2_ac.distributed import has_bf16, is_on_cpu, require_type_of_weights
-from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.lora import merge_adapter
 from vjepa2_ac.model.checkpoints.loading import load_base
@@ -39,26 +38,17 @@ class PlanningSession:
     checkpoint: str  # which one, as text; "" of a model
     warnings: tuple[str, ...] = ()  # why its plans may leave what the run was taught
 
-    def controller(
-        self,
-        *,
-        seed: int | None = None,
-        extrinsics: Float[np.ndarray, " 6"] | None = None,
-        progress: Progress = no_progress,
-    ) -> Controller:
+    def controller(self, *, seed: int | None = None, extrinsics: Float[np.ndarray, " 6"] | None = None) -> Controller:
         """Return a controller with these settings.
 
         Args:
             seed: Of all decisions; None: the config's.
             extrinsics: Pose of the camera, if the model uses it.
-            progress: Called with the number of evaluated action sequences of a decision.
 
         Raises:
             InputError: As `Controller`.
         """
-        controller = Controller.of_config(self.world_model, self.config, seed=seed, extrinsics=extrinsics)
-        controller.planner.progress = progress
-        return controller
+        return Controller.of_config(self.world_model, self.config, seed=seed, extrinsics=extrinsics)
 
     @property
     def encoder(self) -> str:
@@ -71,14 +61,14 @@ class PlanningSession:
         Raises:
             InputError: A goal would never end, or the last one has a bound.
         """
-        goals = folder.for_model(self.encoder, self.config.planning.energy.distance)
-        with_shares(goals, self.config.planning.goals, first=1)
+        planning, has_noise = self.config.planning, folder.noise is not None  # else no weights need to be hashed
+        goals = folder.for_model(self.encoder, planning.energy.distance) if has_noise else folder.goals
+        with_shares(goals, planning.goals, first=1)
         return goals
 
     def as_dict(self) -> dict[str, Any]:
         """Return the identity of the model as plain values: its name, and hashes of the weights."""
         model = self.world_model
-        dtype = next(model.parameters()).dtype
         return {
             "version": __version__,
             "time": utc_now(),
@@ -86,7 +76,7 @@ class PlanningSession:
                 "subject": self.subject,
                 "checkpoint": self.checkpoint or None,
                 **Fingerprints.of(model)._asdict(),
-                "dtype": str(dtype).removeprefix("torch."),
+                "dtype": str(next(model.parameters()).dtype).removeprefix("torch."),
                 "device": model.device.type,
                 "image_size": model.image_size,
             },

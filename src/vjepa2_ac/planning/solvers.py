@@ -26,13 +26,17 @@ class PlanStart:
     elites: Float[Tensor, "elites decisions dim"]
 
 
+Before = PlanStart | None
+Samples = Float[Tensor, "samples decisions dim"]
+
+
 @dataclass(frozen=True)
 class EvaluatedPlans:
     """Decisions with their energies; those without a finite one are left out, so it may be empty."""
 
     decisions: Float[Tensor, "finite decisions dim"]
     energies: Float[Tensor, " finite"]
-    gradients: Float[Tensor, "samples decisions dim"] | None = None  # of all samples, 0 where not finite
+    gradients: Samples | None = None  # of all samples, 0 where not finite
 
     def best(self, count: int) -> EvaluatedPlans:
         """Return the decisions of lowest energy, best first; fewer if there are not enough."""
@@ -55,14 +59,12 @@ class Solver:
     mean: Float[Tensor, "decisions dim"]  # of the distribution
     std: Float[Tensor, "decisions dim"]
 
-    def __init__(
-        self, space: SearchSpace, config: PlanningConfig, generator: Generator, start: PlanStart | None = None
-    ) -> None:
+    def __init__(self, space: SearchSpace, config: PlanningConfig, generator: Generator, start: Before = None) -> None:
         self._space, self._config, self._generator = space, config, generator
         self.mean = space.allowed(torch.zeros_like(space.lower) if start is None else start.mean)
         self.std = space.first_std
 
-    def sample(self) -> Float[Tensor, "samples decisions dim"]:
+    def sample(self) -> Samples:
         """Return the next decisions to evaluate, all allowed."""
         raise NotImplementedError
 
@@ -74,6 +76,11 @@ class Solver:
         """Return the current result; None: the best evaluated decisions."""
         return None
 
+    def _around_mean(self, *, try_mean: bool) -> Samples:
+        noise = white_noise(self._space, self._config.samples, self._generator)
+        noise[: int(try_mean)] = 0.0
+        return self._space.allowed(self.mean + self.std * noise)
+
     def _fit(self, best: Float[Tensor, "elites decisions dim"], keep_mean: Momentum, keep_std: Momentum) -> None:
         """Move the distribution to its elites; a single one does not change the standard deviation."""
         if len(best):
@@ -82,7 +89,7 @@ class Solver:
             self.std = keep_std * self.std + (1 - keep_std) * best.std(dim=0)
 
 
-def white_noise(space: SearchSpace, samples: int, generator: Generator) -> Float[Tensor, "samples decisions dim"]:
+def white_noise(space: SearchSpace, samples: int, generator: Generator) -> Samples:
     """Return independent standard normal numbers, zero on axes that are fixed in all decisions.
 
     Drawn decision by decision and for free axes only, in upstream's order: the same seed gives upstream's samples.
@@ -102,21 +109,16 @@ class CemSolver(Solver):
     Source: facebookresearch/vjepa2 @ c2963a4, notebooks/utils/mpc_utils.py, cem.
     """
 
-    def __init__(
-        self, space: SearchSpace, config: PlanningConfig, generator: Generator, start: PlanStart | None = None
-    ) -> None:
+    def __init__(self, space: SearchSpace, config: PlanningConfig, generator: Generator, start: Before = None) -> None:
         super().__init__(space, config, generator, start)
         cem = config.cem
         self.elites = cem.elites
         self._keep_mean = _momentum(space, cem.momentum_mean, cem.momentum_mean_gripper)
         self._keep_std = _momentum(space, cem.momentum_std, cem.momentum_std_gripper)
 
-    def sample(self) -> Float[Tensor, "samples decisions dim"]:
+    def sample(self) -> Samples:
         """Return samples of the distribution, clipped to the allowed set."""
-        noise = white_noise(self._space, self._config.samples, self._generator)
-        if self._config.cem.try_mean:
-            noise[0] = 0.0
-        return self._space.allowed(self.mean + self.std * noise)
+        return self._around_mean(try_mean=self._config.cem.try_mean)
 
     def update(self, evaluated: EvaluatedPlans) -> None:
         """Fit the distribution to the elites."""
@@ -142,14 +144,12 @@ class IcemSolver(Solver):
     Source: Pinneri et al., Sample-efficient Cross-Entropy Method for Real-time Planning, arXiv 2008.06389, algorithm 1.
     """
 
-    def __init__(
-        self, space: SearchSpace, config: PlanningConfig, generator: Generator, start: PlanStart | None = None
-    ) -> None:
+    def __init__(self, space: SearchSpace, config: PlanningConfig, generator: Generator, start: Before = None) -> None:
         super().__init__(space, config, generator, start)
         self.elites, self._iteration = config.icem.elites, 0
         self._kept = self.mean[None][:0] if start is None else self._few(start.elites)
 
-    def sample(self) -> Float[Tensor, "samples decisions dim"]:
+    def sample(self) -> Samples:
         """Return new samples, the reused elites, and in the last iteration the mean."""
         icem, space = self._config.icem, self._space
         count = icem.new_samples(self._config.samples, self._iteration)
@@ -171,9 +171,7 @@ class IcemSolver(Solver):
         return elites[: round(self._config.icem.kept * self.elites)]
 
 
-def coloured_noise(
-    samples: int, decisions: int, dim: int, exponent: float, generator: Generator
-) -> Float[Tensor, "samples decisions dim"]:
+def coloured_noise(samples: int, decisions: int, dim: int, exponent: float, generator: Generator) -> Samples:
     """Return normal numbers of variance 1 with a power spectrum 1 / frequency^exponent along decisions; 0: white.
 
     The constant component has the power of the lowest frequency.
@@ -203,11 +201,9 @@ class MppiSolver(Solver):
 
     elites = 10  # recorded; all samples decide
 
-    def sample(self) -> Float[Tensor, "samples decisions dim"]:
+    def sample(self) -> Samples:
         """Return the mean and samples around it."""
-        noise = white_noise(self._space, self._config.samples, self._generator)
-        noise[0] = 0.0
-        return self._space.allowed(self.mean + self.std * noise)
+        return self._around_mean(try_mean=True)
 
     def update(self, evaluated: EvaluatedPlans) -> None:
         """Move the mean to the weighted mean of the samples."""
@@ -233,9 +229,7 @@ class GradientSolver(Solver):
 
     uses_gradients = True
 
-    def __init__(
-        self, space: SearchSpace, config: PlanningConfig, generator: Generator, start: PlanStart | None = None
-    ) -> None:
+    def __init__(self, space: SearchSpace, config: PlanningConfig, generator: Generator, start: Before = None) -> None:
         super().__init__(space, config, generator, start)
         self.elites = config.gradient.starts
         noise = white_noise(space, self.elites, generator)
@@ -249,7 +243,7 @@ class GradientSolver(Solver):
         self._adam = torch.optim.Adam([self._place], lr=config.gradient.learning_rate)
         self._fall = torch.optim.lr_scheduler.LambdaLR(self._adam, lambda step: max(0.0, 1 - step / config.iterations))
 
-    def sample(self) -> Float[Tensor, "samples decisions dim"]:
+    def sample(self) -> Samples:
         """Return the current decisions of each descent."""
         return self._space.allowed(self._place * self._unit)
 

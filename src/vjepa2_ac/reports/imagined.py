@@ -6,7 +6,7 @@ from pathlib import Path
 
 from vjepa2_ac.decoding.imagine import Imagination, strip_of
 from vjepa2_ac.errors import UnreachableError
-from vjepa2_ac.media.film import draw_strip, durations, film_frames, held
+from vjepa2_ac.media.figure import draw_strip, durations, film_frames, held
 from vjepa2_ac.media.images import encode_png
 from vjepa2_ac.media.video import write_gif, write_video
 from vjepa2_ac.reporter import SILENT, Reporter

@@ -10,13 +10,10 @@ from typing import Any
 import numpy as np
 
 from vjepa2_ac import __version__
-from vjepa2_ac.config import Config
-from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.images import read_image
+from vjepa2_ac.media.images import read_image, require_image
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.goals import GOALS_FILE, GoalFolder, SubGoal, read_goal_folder
-from vjepa2_ac.planning.input_checks import require_image
 from vjepa2_ac.planning.session import PlanningSession
 from vjepa2_ac.serving.session import Session
 
@@ -26,28 +23,20 @@ _SIZE = 180, 320  # of the picture of the first decision
 _SOMEWHERE = np.array([0.4, 0.0, 0.4, np.pi, 0.0, 0.0, 0.0])
 
 
-def require_steps(config: Config) -> int:
-    """Return the control steps of a model step.
-
-    Raises:
-        InputError: Nobody knows.
-    """
-    return require_stride(config.data, to="say how long an action lasts", fix="Say which, as data.stride=4")
-
-
 def metadata_of(loaded: PlanningSession, session: Session) -> dict[str, Any]:
     """Return what a client may know of the server: plain values, without a path of this machine."""
     planning, options, model = loaded.config.planning, session.options, loaded.as_dict()["model"]
-    rate = _control_rate(loaded.config)
+    sections = (getattr(loaded.config.data, name) for name in loaded.config.data.own_sections())
+    rates = (getattr(one, "control_rate_hz", None) for one in sections)
+    rate = next((rate for rate in rates if rate is not None), None)  # None: only the data set knows
     return {
         "policy": "vjepa2-ac",
         "protocol": PROTOCOL,
         "version": __version__,
-        "predictor": model["predictor"],
-        "encoder": model["encoder"],
+        **{name: model[name] for name in ("predictor", "encoder")},
         "state": list(session.controller.spaces.state.names),
         "frame_of_states": loaded.config.data.pose_frame,
-        "control_steps": options.control_steps,
+        **{name: getattr(options, name) for name in ("control_steps", "deadline_s", "dry_run")},
         "seconds_per_step": None if rate is None else options.control_steps / rate,
         "horizon": planning.horizon,
         "limits": planning.limits.model_dump(mode="json"),
@@ -55,11 +44,9 @@ def metadata_of(loaded: PlanningSession, session: Session) -> dict[str, Any]:
         "seed": session.controller.seed,
         "checkpoint": loaded.checkpoint,
         "use_extrinsics": loaded.world_model.sizes.predictor.use_extrinsics,
-        "deadline_s": options.deadline_s,
         "image_keys": list(options.image_keys),
         "goals": sorted(session.goals)[:_MOST_NAMES],
         "warnings": list(loaded.warnings),
-        "dry_run": options.dry_run,
         **roboarena_metadata(session),
     }
 
@@ -107,13 +94,6 @@ def warm_up(controller: Controller) -> float:
     return time.perf_counter() - began
 
 
-def _control_rate(config: Config) -> float | None:
-    """Return the control steps a second; None: only the data set knows."""
-    sections = (getattr(config.data, name) for name in config.data.own_sections())
-    rates = (getattr(section, "control_rate_hz", None) for section in sections)
-    return next((rate for rate in rates if rate is not None), None)
-
-
 KeptGoals = Mapping[str, GoalFolder]
 
 _PICTURES = {".png", ".jpg", ".jpeg"}
@@ -139,14 +119,12 @@ def read_kept_goals(folder: Path) -> KeptGoals:
             continue
         if path.stem in kept:
             raise InputError(where=str(path), found=f"two goals named {path.stem!r}", fix="Rename one of them")
-        kept[path.stem] = read_goal_folder(path) if is_order else _picture(path)
+        if is_order:
+            kept[path.stem] = read_goal_folder(path)
+        else:
+            require_image(image := read_image(path), where=str(path))
+            kept[path.stem] = GoalFolder((SubGoal(image, name=path.stem),))
     if not kept:
         needed = f"pictures (PNG or JPEG), or folders with a {GOALS_FILE} (`vjepa2-ac goals` makes them)"
         raise InputError(where=f"--goals {folder}", found="no goal", needed=needed)
     return kept
-
-
-def _picture(path: Path) -> GoalFolder:
-    image = read_image(path)
-    require_image(image, where=str(path))
-    return GoalFolder((SubGoal(image, name=path.stem),))

@@ -33,12 +33,10 @@ class Access:
 
     def __post_init__(self) -> None:
         if not is_loopback(self.host) and self.key is None and not self.is_insecure:
-            raise InputError(
-                where=f"--host {self.host}",
-                found="an address that other machines can reach, and no key: whoever reaches it moves the robot",
-                needed="--key-file FILE with a key that clients send; or --host 127.0.0.1",
-                fix="--insecure serves without a key, in a network where everybody may move the robot",
-            )
+            found = "an address that other machines can reach, and no key: whoever reaches it moves the robot"
+            needed = "--key-file FILE with a key that clients send; or --host 127.0.0.1"
+            fix = "--insecure serves without a key, in a network where everybody may move the robot"
+            raise InputError(where=f"--host {self.host}", found=found, needed=needed, fix=fix)
 
     def why_not(self, host: str | None, authorization: str | None) -> tuple[int, str] | None:
         """Return the HTTP status and the reason why a request is refused; None: it may come in.

@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import encode_png
 from vjepa2_ac.planning.goals import SubGoal
-from vjepa2_ac.storage import user_can_write, write_atomically
+from vjepa2_ac.storage import require_new_folder, user_can_write, write_atomically
 from vjepa2_ac.storage.structured import json_text, plain, utc_now
 
 if TYPE_CHECKING:
@@ -50,7 +49,7 @@ class Recorder:
         self._mask: np.ndarray | None = None
         self._episode, self._done = 0, 0
         self._is_on = True
-        require_new_record(folder)
+        require_new_folder(folder)
         with user_can_write(folder):
             (folder / IMAGES).mkdir(parents=True, exist_ok=True)
             write_atomically(folder / ABOUT, json_text({"format": FORMAT, **about}))
@@ -96,7 +95,7 @@ class Recorder:
             raise ValueError("nothing was decided")
         if decision.why == "out of time" or (number and (config.context > 1 or config.warm_start)):
             return None  # it depends on the clock, or on decisions before it
-        goals, durations, left = self._goals[decision.goal :], [], number - decision.progress.since
+        goals, durations, left = self._goals[decision.progress.place :], [], number - decision.progress.since
         words = ["--start", self._image(frame), "--state=" + ",".join(repr(float(one)) for one in state)]
         for goal in goals:
             words += ["--goal", self._image(goal.image)]
@@ -129,13 +128,3 @@ class Recorder:
     def _end(self, why: str) -> None:
         self._is_on = False
         logger.warning("the record in %s %s: it ends here, the server goes on", self.folder, why)
-
-
-def require_new_record(folder: Path) -> None:
-    """Refuse a place where something is.
-
-    Raises:
-        InputError: It is a file, or a folder that is not empty.
-    """
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(where=f"--record {folder}", found="something that is there already", needed="a new folder")

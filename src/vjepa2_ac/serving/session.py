@@ -1,12 +1,14 @@
 """The session: one robot's requests, answered by a controller. It knows no sockets.
 
 Whatever is wrong or doubtful, nobody moves: a request that cannot be used is answered by a sentence, which openpi's
-clients raise as an error, and a decision without a result by an action of zeros. No action is ever sent twice.
+clients raise as an error, and a decision without a result by an action of zeros. No action is ever sent twice, and each
+is checked once more, independently of how it was planned.
 """
 
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -15,15 +17,18 @@ from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
+from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.controller import Controller, Decision
 from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.planning.planner import SearchCancelledError
-from vjepa2_ac.serving.motion import waypoints, why_not_sent
+from vjepa2_ac.planning.search_space import Workspace, is_allowed
 from vjepa2_ac.serving.recording import Recorder
 from vjepa2_ac.serving.request import IMAGE_KEYS, GivenGoal, Request, read_request
 from vjepa2_ac.serving.wire import WireError, pack, unpack
+from vjepa2_ac.spaces import StateSpace, apply_action, euler_from_matrices, matrices_from_euler
 from vjepa2_ac.storage.structured import plain
 
 logger = logging.getLogger(__name__)
@@ -186,30 +191,21 @@ class Session:
 
         Without a decision, or a plan in it, nobody moves.
         """
-        still, space = np.atleast_2d(state), self.controller.space
-        plan = None if decision is None else decision.plan
-        planned = still if decision is None or decision.states is None else decision.states[1:]
-        changes = np.zeros((space.steps, space.dim))
-        if plan is not None and not self.options.dry_run:
-            changes = plan.actions.double().numpy()
-        goal = None
+        planned, changes = np.atleast_2d(state), np.zeros((self.controller.space.steps, self.controller.space.dim))
+        found: dict[str, Any] = {
+            "target": planned, "why": why, "goal": None, "done": False, "energy": {"now": None, "plan": None},
+            "notes": self._notes,
+        }  # fmt: skip
         if decision is not None:
-            progress = decision.progress
+            progress, plan = decision.progress, decision.plan
             name = self._names[progress.place]
             goal = {"index": progress.place, "name": name, "since": progress.since, "changed": progress.changed}
-        found = {
-            "target": still if self.options.dry_run else planned,
-            "why": why,
-            "goal": goal,
-            "done": decision is not None and decision.done,
-            "energy": {
-                "now": None if decision is None else decision.energy_now,
-                "plan": None if plan is None else plan.energy,
-            },
-            "notes": self._notes,
-        }
-        if self.options.dry_run:
-            found |= {"dry_run": True, "planned": planned}
+            energy = {"now": decision.energy_now, "plan": None if plan is None else plan.energy}
+            found |= {"goal": goal, "done": decision.done, "energy": energy}
+            planned = planned if decision.states is None else decision.states[1:]
+            if plan is not None and not self.options.dry_run:
+                changes = plan.actions.double().numpy()
+        found |= {"dry_run": True, "planned": planned} if self.options.dry_run else {"target": planned}
         return {"actions": self._actions(state, changes), **plain(found)}
 
     def _actions(self, state: np.ndarray, changes: Float[np.ndarray, "steps dim"]) -> Float[np.ndarray, "rows dim"]:
@@ -250,3 +246,55 @@ def has_black_bars(frame: np.ndarray) -> bool:
     """Return whether an image was padded at its top and its bottom, as openpi's `resize_with_pad` does."""
     rows = max(1, int(_BAR * len(frame)))
     return not frame[:rows].any() and not frame[-rows:].any() and bool(frame.any())
+
+
+def waypoints(
+    state: Float[np.ndarray, " 7"], action: Float[np.ndarray, " 7"], steps: int
+) -> Float[np.ndarray, "steps 7"]:
+    """Return evenly spaced poses to the target, which is the last: x, y, z, extrinsic xyz angles, closedness 0 .. 1.
+
+    Positions go straight, rotations about one axis at one speed (R_delta^share @ R).
+
+    Args:
+        state: Measured: metres, radians, closedness.
+        action: Its change in a model step.
+        steps: Control steps of a model step.
+    """
+    shares = np.arange(1, steps + 1)[:, None] / steps
+    turn = Rotation.from_matrix(matrices_from_euler(action[3:6])).as_rotvec()
+    turns = Rotation.from_rotvec(shares * turn).as_matrix()
+    positions, gripper = (state[part] + shares * action[part] for part in (slice(0, 3), slice(6, 7)))
+    poses = np.concatenate([positions, euler_from_matrices(turns @ matrices_from_euler(state[3:6])), gripper], axis=1)
+    poses[-1] = apply_action(state, action)  # to the last bit
+    poses[:, 6] = poses[:, 6].clip(0.0, 1.0)
+    return poses
+
+
+_ROUNDING = 1e-6  # limits are float32 where actions are searched
+
+
+def why_not_sent(
+    state: Float[np.ndarray, " dim"], changes: Float[np.ndarray, "steps dim"], limits: LimitsConfig, space: StateSpace
+) -> str:
+    """Return why changes of a state must not be sent to a robot, as text; empty: they may.
+
+    Args:
+        state: Measured.
+        changes: Of each model step, one after another.
+        limits: Which they have to be within.
+        space: What the numbers are.
+    """
+    if not np.isfinite(changes).all():
+        return "a number that is not finite"
+    if not space.is_pose:
+        largest = np.array(limits.axes if isinstance(limits.axes, tuple) else (0.0,))
+        return "more than planning.limits.axes" if (abs(changes) > largest + _ROUNDING).any() else ""
+    if not all(is_allowed(change, limits, _ROUNDING) for change in changes[:, :3]):
+        return "more than planning.limits.xyz or its ball"
+    if (abs(changes[:, 3:6]) > min(limits.rotation + _ROUNDING, math.pi)).any():
+        return "more than planning.limits.rotation"
+    if abs(changes[:, 6]).max() > 1.0:  # open and close are changes of 1, whatever the limit
+        return "more than a gripper can change"
+    box, targets = Workspace.of(limits, space), state[:3] + np.cumsum(changes[:, :3], axis=0)
+    is_out = box is not None and changes[:, :3].any() and (abs(box.way_back(targets)) > _ROUNDING).any()
+    return "out of planning.limits.workspace" if is_out else ""

@@ -101,17 +101,14 @@ def resimulate(folder: str | Path, episode: Episode, start: int, camera: str = "
         found, needed = "x".join(map(str, episode.states.shape)), f"{steps}x7, as simulated: data.states: pose"
         raise InputError(where=where, found=f"states of {found} numbers", needed=needed)
     eye = RECORDED_CAMERAS[camera] if simulation.cameras == 3 else "exterior_1"  # recorded with one, all are the same
-    again = Resimulation(simulation.spec, number, start, eye, arm_of(number, simulation.spec))
+    again = Resimulation(simulation, number, start, eye, arm_of(number, simulation))
     off = np.abs(again.under(np.zeros((0, 7)), 1).states[0] - np.asarray(episode.states[start], dtype=np.float64))
     off[3:6] = np.minimum(off[3:6], np.abs(2 * np.pi - off[3:6]))  # -pi and pi are one angle
     if off.max() > _STATE_TOLERANCE:
         versions = simulation.other_versions
-        raise InputError(
-            where=f"{where}: control step {start}",
-            found=f"simulated again, the state differs by up to {off.max():.2g}",
-            needed="what was recorded",
-            fix="Record it again with this version" + f"; it was recorded with {versions}" * bool(versions),
-        )
+        found = f"simulated again, the state differs by up to {off.max():.2g}"
+        fix = "Record it again with this version" + f"; it was recorded with {versions}" * bool(versions)
+        raise InputError(where=f"{where}: control step {start}", found=found, needed="what was recorded", fix=fix)
     return again
 
 

@@ -13,8 +13,6 @@ pytest.importorskip("av", reason="the extra `video` is not installed")
 
 from tiny_models import tiny_model
 from vjepa2_ac.cli import main
-from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.sources.indexed_source import open_source
 from vjepa2_ac.media.video import write_video
 from vjepa2_ac.planning.goals import read_goal_folder
 from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
@@ -83,14 +81,6 @@ def test_a_model_adds_energies_and_the_noise_of_a_resting_arm(
     assert "Goal 1: its threshold" in printed
     found = read_goal_folder(tmp_path / "goals").for_model(noise["encoder"], "l1")
     assert [goal.floor for goal in found] == [noise["energy"]] * 3
-
-
-def test_the_arm_of_an_episode_may_rest_itself(workshop: Path, tmp_path: Path) -> None:
-    states = open_source(DataConfig(path=str(workshop / "set"))).read(0).states
-    rests = (np.abs(np.diff(states, axis=0)) < 5e-4).all(axis=1)
-    status, file = goals(workshop, tmp_path / "goals", "--model", str(workshop / "model"))
-    assert status == 0
-    assert (file["noise"] is not None) == bool(rests.any())
 
 
 def test_an_episode_is_named_or_numbered_and_every_so_many_frames_are_taken(workshop: Path, tmp_path: Path) -> None:
@@ -189,15 +179,6 @@ def test_what_cannot_be_is_one_line_and_leaves_nothing(
     assert error.startswith("error: ")
     assert wrong in error
     assert not list(tmp_path.iterdir())
-
-
-def test_a_folder_that_holds_something_is_left_as_it_is(
-    workshop: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "mine.txt").write_text("mine")
-    assert goals(workshop, tmp_path)[0] == 2
-    assert "already there and not empty" in capsys.readouterr().err
-    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
 
 def test_of_a_long_film_every_so_many_frames_are_looked_at(

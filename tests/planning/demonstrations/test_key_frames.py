@@ -90,13 +90,6 @@ def test_key_frames_ascend_leave_out_the_start_and_are_few(parts: list) -> None:
         assert 0 < frames[0] <= frames[-1] < len(states)
 
 
-def test_one_frame_is_no_demonstration() -> None:
-    for make in (lambda: gripper_key_frames(way()), lambda: every_key_frame(1, 3), lambda: every_key_frame(9, 0),
-                 lambda: latent_key_frames(1, lambda _: np.zeros(1), 3)):  # fmt: skip
-        with pytest.raises(ValueError, match="frame"):
-            make()
-
-
 @given(st.integers(2, 60), st.integers(1, 20))
 def test_every_so_many_frames_end_with_the_last(frames: int, step: int) -> None:
     found = [key.frame for key in every_key_frame(frames, step)]
@@ -114,11 +107,6 @@ def test_frames_between_keep_the_key_frames_and_are_so_far_apart(gaps: list[int]
     ways = np.diff([0, *(key.frame for key in found)])
     assert (ways >= 1).all()
     assert (ways < 1.5 * step).all() if step > 1 else (ways == 1).all()
-
-
-def test_frames_between_are_one_apart_at_least() -> None:
-    with pytest.raises(ValueError, match="every 0 frames"):
-        with_frames_between([KeyFrame(3, "end")], 0)
 
 
 def embedded(*corners: float, frames: int = 20) -> np.ndarray:

@@ -1,7 +1,6 @@
 """The closed-loop benchmark: table, metrics and video agree."""
 
 import json
-import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -20,7 +19,6 @@ from tiny_models import tiny_model
 from vjepa2_ac.cli import main
 from vjepa2_ac.cli.console.tables import benchmark_notes
 from vjepa2_ac.decoding.decoder_folder import load_decoder
-from vjepa2_ac.errors import UserError
 from vjepa2_ac.evaluation.answer import CLOSED_LOOP_FILE
 from vjepa2_ac.media.video import count_frames
 from vjepa2_ac.model.network.world_model import WorldModel
@@ -79,13 +77,6 @@ def test_a_robot_of_joints_is_steered_by_its_joints(
     (tmp_path / "other.yaml").write_text(config.read_text().replace("joint_position", "other"))
     assert main([*given, "--config", str(tmp_path / "other.yaml"), "planning.limits.axes=[0.2]"]) == 2
     assert "other numbers than the simulated arm measures" in capsys.readouterr().err
-
-
-def test_a_model_without_states_is_steered(tmp_path: Path) -> None:
-    tiny_model(states=False).save_pretrained(tmp_path / "model")
-    session = load_to_plan(str(tmp_path / "model"), overrides=SMALL)
-    run_benchmark(agent_of_session(session), BenchmarkOptions(episodes=1, steps=2, films=0), tmp_path / "out")
-    assert metrics(tmp_path / "out")["policies"]["model"]["why_counts"] == {"planned": 2}
 
 
 def test_a_decoder_adds_what_was_imagined_to_the_film_and_changes_no_metric(model: str, tmp_path: Path) -> None:
@@ -209,15 +200,6 @@ def test_what_cannot_be_is_one_line(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_missing_library_is_reported_before_anything_is_done(
-    model: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(UserError, match="PyAV"):
-        run_benchmark(agent_of(model), BenchmarkOptions(), tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-
-
 def test_goals_on_the_way_come_from_one_demonstration_of_the_same_problem(model: str, tmp_path: Path) -> None:
     given = ["simulate", model, "--task", "reach", "--episodes", "2", "--films", "0", *SMALL]
     found = {}
@@ -243,33 +225,6 @@ def test_a_problem_that_cannot_be_demonstrated_is_told_before_any_is_worked_on(
     assert error.startswith("error: demonstration of problem 0 (pick): the oracle ends ")
     assert "planning.limits.xyz" in error
     assert not list(tmp_path.iterdir())
-
-
-def test_placing_is_filmed_and_its_criterion_is_told(
-    model: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    given = [
-        "simulate",
-        model,
-        "--task",
-        "place",
-        "--episodes",
-        "1",
-        "--films",
-        "1",
-        "--all",
-        "--out",
-        str(tmp_path),
-        *SMALL,
-    ]
-    assert main(given) == 0
-    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
-    assert "18 steps of 0.27 s" in shown
-    assert "released" in shown
-    about, policies = (metrics(tmp_path)[key] for key in ("about", "policies"))
-    assert (about["success_below_cm"], about["success_also"]) == (4, "released on the table")
-    assert [policies[name]["success"]["value"] for name in ("do nothing", "oracle")] == [0.0, 1.0]
-    assert count_frames(tmp_path / FILM, where="film") == 4 + 17 + 4
 
 
 @pytest.mark.parametrize("way", ["none", "demonstration"])

@@ -65,23 +65,6 @@ def test_a_block_that_is_held_over_the_mark_is_near_and_not_placed() -> None:
     assert problem.succeeded(arm.command(arm.state - holding[6] * np.eye(7)[6], 8), arm.block)
 
 
-class NeverOpens(Oracle):
-    """Carries the block to the mark and stays there."""
-
-    def act(self, image: np.ndarray, state: np.ndarray) -> np.ndarray:
-        action = super().act(image, state)
-        return np.append(action[:6], max(0.0, action[6]))
-
-
-def test_an_episode_that_ends_with_the_block_in_the_hand_is_none_of_the_successes() -> None:
-    arm = arm_for("place", DOMAIN_A, size=(18, 32))
-    result = run_task(RolloutSpec("place", DOMAIN_A, 1, seed=5), NeverOpens(LIMITS, arm), arm)
-    (episode,) = result.episodes
-    assert episode.distances_m[-1] < 0.03
-    assert (episode.success, episode.success_ever, episode.steps_needed) == (False, False, None)
-    assert result.success_rate.value == result.success_ever_rate.value == 0.0
-
-
 def test_the_goal_image_of_a_place_shows_the_block_on_the_mark() -> None:
     arm = arm_for("place", DOMAIN_B)
     for index in (0, 1):  # the mark is where it belongs in every episode

@@ -10,17 +10,10 @@ from tiny_models import tiny_model
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.demonstrations.key_frames import gripper_key_frames
+from vjepa2_ac.simulation.closed_loop.benchmark import DemonstratedGoals, DemonstrationSpec, demonstrate, every_step
 from vjepa2_ac.simulation.closed_loop.policies import Planning
 from vjepa2_ac.simulation.closed_loop.rollout import put, run_episode
-from vjepa2_ac.simulation.closed_loop.sub_goals import (
-    DemonstratedGoals,
-    DemonstrationSpec,
-    demonstrate,
-    every_step,
-)
 from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, HOLDING, arm_for, make_problem
-from vjepa2_ac.simulation.recording.record import RecordingSpec, arm_of, carry_out
 from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B
 
 SMALL = (36, 64)
@@ -34,9 +27,9 @@ def test_the_grasp_is_among_the_goals_of_a_pick(domain) -> None:
         goals = DemonstratedGoals("pick", domain, size=SMALL)(problem)
         assert [goal.name for goal in goals] == ["before closing", "closed", "end"]
         assert [goal.gripper for goal in goals] == ["held", "close", "held"]
-        shown = demonstrate(problem, arm, DemonstrationSpec())
-        frames = [int(np.argmax([np.array_equal(goal.image, frame) for frame in shown.frames])) for goal in goals]
-        at_block, closed, lifted = shown.states[frames]
+        seen, states = demonstrate(problem, arm, DemonstrationSpec())
+        frames = [int(np.argmax([np.array_equal(goal.image, frame) for frame in seen])) for goal in goals]
+        at_block, closed, lifted = states[frames]
         np.testing.assert_allclose(at_block[:3], problem.block_start[:3] + np.array([0, 0, GRASP_M]), atol=0.015)
         assert at_block[6] < 0.02
         assert closed[6] == pytest.approx(HOLDING, abs=0.05)
@@ -66,14 +59,14 @@ def test_every_step_of_a_demonstration_is_a_goal_up_to_where_it_rests() -> None:
     key_goals, goals = (
         DemonstratedGoals("pick", DOMAIN_A, one, SMALL)(problem) for one in (None, every_step(DemonstrationSpec()))
     )
-    shown = demonstrate(problem, arm, DemonstrationSpec())
-    for goal, frame in zip(goals, shown.frames[1:], strict=False):
+    frames, states = demonstrate(problem, arm, DemonstrationSpec())
+    for goal, frame in zip(goals, frames[1:], strict=False):
         np.testing.assert_array_equal(goal.image, frame)
     np.testing.assert_array_equal(goals[-1].image, key_goals[-1].image)
     assert [goal.name for goal in goals if goal.name != "on the way"] == [goal.name for goal in key_goals]
     assert [goal.gripper for goal in goals].count("close") == 1
     assert [goal.at_most for goal in goals] == [*[2] * (len(goals) - 1), None]
-    hand = np.linalg.norm(np.diff(shown.states[: len(goals) + 1, :3], axis=0), axis=1)
+    hand = np.linalg.norm(np.diff(states[: len(goals) + 1, :3], axis=0), axis=1)
     assert hand.max() < 0.08, "each goal is within a step of the one before"
 
 
@@ -92,25 +85,4 @@ def test_a_planner_is_given_the_goals_of_the_problem() -> None:
     episode = run_episode(arm, policy, problem, steps=5)
     assert [bool(action) for action in episode.actions[:, 6]] == [False, False, False, True, False]
     assert controller.decision is not None
-    assert (controller.decision.goal, controller.decision.progress.since) == (2, 4)
-
-
-def test_recorded_demonstrations_have_their_grasp_among_their_key_frames() -> None:
-    """At every control step, with noise on the way and fingers that take some frames to close."""
-    spec = RecordingSpec("A", steps=41, seed=3, task="pick")
-    for index in (0, 2):
-        motion = carry_out(arm_of(index, spec), index, spec)
-        states = np.concatenate([motion.poses, motion.gripper[:, None]], axis=1)
-        keys = gripper_key_frames(states)
-        names = [key.name for key in keys]
-        assert names.index("closed") == names.index("before closing") + 1
-        frames = {key.name: key.frame for key in keys}
-        assert states[frames["before closing"], 6] < 0.05
-        assert states[frames["closed"], 6] == pytest.approx(HOLDING, abs=0.05)
-        assert frames["closed"] - frames["before closing"] <= 6
-        assert names[-1] == "end"
-        assert len(keys) <= 6
-    motion = carry_out(arm_of(4, spec), 4, spec)  # its first grasp fails, so it opens and closes again
-    names = [key.name for key in gripper_key_frames(np.concatenate([motion.poses, motion.gripper[:, None]], axis=1))]
-    assert names.count("closed") == 2
-    assert names.count("opened") == 1
+    assert (controller.decision.progress.place, controller.decision.progress.since) == (2, 4)

@@ -13,9 +13,18 @@ from vjepa2_ac.simulation.closed_loop.tasks import (
     SUCCESS_M,
     make_problem,
 )
-from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B, Domain
+from vjepa2_ac.simulation.world.domains import (
+    BLOCK_M,
+    DOMAIN_A,
+    DOMAIN_B,
+    FINGER_INSIDE_M,
+    FINGER_TRAVEL_M,
+    FINGERTIP_M,
+    MARK_M,
+    WORK_AREA_M,
+    Domain,
+)
 from vjepa2_ac.simulation.world.motion import MotionRecipe, forward_kinematics, inverse_kinematics, rest_joints
-from vjepa2_ac.simulation.world.scene import BLOCK_M, FINGER_INSIDE_M, FINGER_TRAVEL_M, FINGERTIP_M, MARK_M, WORK_AREA_M
 from vjepa2_ac.spaces import matrices_from_euler
 
 RECIPE = MotionRecipe()

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, arm_for
-from vjepa2_ac.simulation.world.domains import DOMAIN_A
+from vjepa2_ac.simulation.world.domains import BLOCK_M, DOMAIN_A
 from vjepa2_ac.simulation.world.motion import forward_kinematics
-from vjepa2_ac.simulation.world.scene import BLOCK_M
 
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 

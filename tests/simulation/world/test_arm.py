@@ -6,17 +6,11 @@ import numpy as np
 import pytest
 
 from projections import hand_pixel
-from vjepa2_ac.errors import InputError, UnreachableError
-from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B, Domain, DomainRanges, named_domain, sample_domain
-from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ, HIGH, HOME, LOW, forward_kinematics, rest_joints
-from vjepa2_ac.spaces import matrices_from_euler
-
-mujoco = pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
-
-from vjepa2_ac.simulation.world.arm import SimulatedArm  # noqa: E402
-from vjepa2_ac.simulation.world.camera import View  # noqa: E402
-from vjepa2_ac.simulation.world.scene import (  # noqa: E402
+from vjepa2_ac.errors import UnreachableError
+from vjepa2_ac.simulation.world.domains import (
     BLOCK_M,
+    DOMAIN_A,
+    DOMAIN_B,
     FINGER_HALF_M,
     FINGER_INSIDE_M,
     FINGER_OUTSIDE_M,
@@ -24,9 +18,19 @@ from vjepa2_ac.simulation.world.scene import (  # noqa: E402
     FINGERTIP_M,
     MARK_M,
     SUBSTEPS,
+    Domain,
+    DomainRanges,
     compile_scene,
     load_mujoco,
+    sample_domain,
 )
+from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ, HIGH, HOME, LOW, forward_kinematics, rest_joints
+from vjepa2_ac.spaces import matrices_from_euler
+
+mujoco = pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
+
+from vjepa2_ac.simulation.world.arm import SimulatedArm  # noqa: E402
+from vjepa2_ac.simulation.world.camera import View  # noqa: E402
 
 REACHES = HOME + np.array([[0] * 7, [0.4, 0.3, 0.0, 0.4, 0.1, 0.2, 0.5], [-0.6, 0.2, 0.3, -0.2, 0.0, -0.3, 0.0]])
 
@@ -135,11 +139,6 @@ def test_domain_b_is_outside_the_training_domains_of_the_base() -> None:
     ranges = DomainRanges()
     assert ranges.azimuth_deg[0] <= DOMAIN_A.camera.azimuth_deg <= ranges.azimuth_deg[1] < DOMAIN_B.camera.azimuth_deg
     assert ranges.base_yaw_deg[1] < DOMAIN_B.base_yaw_deg
-
-
-def test_an_unknown_domain_is_refused_by_name() -> None:
-    with pytest.raises(InputError, match=r"'C'.*A, B"):
-        named_domain("C")
 
 
 def test_missing_mujoco_is_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,8 +8,6 @@ from vjepa2_ac.simulation.world.motion import (
     HOME,
     LOW,
     OutOfReachError,
-    _frames,
-    _jacobian,
     forward_kinematics,
     inverse_kinematics,
 )
@@ -53,15 +51,6 @@ def test_many_poses_at_once_equal_one_by_one() -> None:
     joints = np.random.default_rng(1).uniform(LOW, HIGH, size=(2, 3, 7))
     one_by_one = [[forward_kinematics(one) for one in row] for row in joints]
     np.testing.assert_allclose(forward_kinematics(joints), one_by_one, atol=1e-12)
-
-
-def test_the_jacobian_predicts_a_small_motion() -> None:
-    rng = np.random.default_rng(2)
-    joints, step = random_joints(rng, 0.8), 1e-5 * rng.standard_normal(7)
-    before, after = forward_kinematics(joints), forward_kinematics(joints + step)
-    turn = matrices_from_euler(after[3:]) @ matrices_from_euler(before[3:]).T
-    moved = np.concatenate([after[:3] - before[:3], [turn[2, 1], turn[0, 2], turn[1, 0]]])
-    np.testing.assert_allclose(_jacobian(_frames(joints)) @ step, moved, atol=1e-9)
 
 
 def test_inverse_kinematics_returns_to_every_pose_within_the_limits() -> None:

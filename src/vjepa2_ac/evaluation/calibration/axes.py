@@ -35,9 +35,9 @@ from vjepa2_ac.evaluation.result import Row
 from vjepa2_ac.intervals import Estimate, bootstrapped, mean_of, ratio
 from vjepa2_ac.model.adapter.lora import merge_adapter
 from vjepa2_ac.model.distances import squared_difference
-from vjepa2_ac.planning.axes import FORMAT, require_axes_in
 from vjepa2_ac.planning.model_setup import Axes, Fingerprints
 from vjepa2_ac.planning.planner import Planner
+from vjepa2_ac.planning.settings import AXES_FORMAT, require_axes_in
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
 from vjepa2_ac.storage.structured import utc_now
 
@@ -126,9 +126,7 @@ class AxisFit:
             **{name: getattr(self, name).as_dict() for name in _ESTIMATES},
             "centre_m": list(self.centre_m),
             "matrix": self.matrix.tolist(),
-            "pairs": self.pairs,
-            "episodes": self.episodes,
-            "problem": self.problem,
+            **{name: getattr(self, name) for name in ("pairs", "episodes", "problem")},
         }
 
 
@@ -172,7 +170,8 @@ def fit_axes(
     def of_sums(sums: Float[np.ndarray, "1 *batch 18"]) -> Float[np.ndarray, "*batch 3"]:
         fitted = _matrix(sums[0])
         flat = np.sqrt(np.abs(np.linalg.det(fitted[..., :2, :2])))
-        return np.stack([nearby + _wrapped(_yaw(fitted) - nearby), flat, _condition(fitted)], axis=-1)
+        sizes = np.linalg.svd(fitted, compute_uv=False)
+        return np.stack([nearby + _wrapped(_yaw(fitted) - nearby), flat, sizes[..., 0] / sizes[..., -1]], axis=-1)
 
     fitted_yaw, gain, condition = bootstrapped(of_sums, products[None], episode_ids)
     yaw = _yaw_of_least_error(errors, episode_ids)
@@ -219,11 +218,6 @@ def _yaw(matrix: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch"]
     """Return the angle in degrees of the rotation nearest to the horizontal block (its polar decomposition)."""
     sine, cosine = matrix[..., 1, 0] - matrix[..., 0, 1], matrix[..., 0, 0] + matrix[..., 1, 1]
     return np.asarray(np.degrees(np.arctan2(sine, cosine)))
-
-
-def _condition(matrix: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch"]:
-    sizes = np.linalg.svd(matrix, compute_uv=False)
-    return np.asarray(sizes[..., 0] / sizes[..., -1])
 
 
 def _turned(start: RolloutStart, axes: Axes) -> RolloutStart:
@@ -284,9 +278,8 @@ def infer_axes(
     axes = Axes(math.radians(_yaw_of_least_error(errors, names).value), centre_m)
     executed = np.stack([start.true[_MOVE] for start in starts])
     reach = min(1.0, max(_LEAST_M, _ROOM * float(np.linalg.norm(executed, axis=1).max())))
-    planner = Planner(
-        _SEARCH.model_copy(update={"limits": LimitsConfig(xyz=(reach, reach, reach), gripper_mode="held")})
-    )
+    limits = LimitsConfig(xyz=(reach, reach, reach), gripper_mode="held")
+    planner = Planner(_SEARCH.model_copy(update={"limits": limits}))
     inferred = []
     for done, start in enumerate(starts, start=1):
         inferred.append(_inferred(model, _turned(start, axes), planner, at_once))
@@ -346,18 +339,13 @@ def calibrate_axes(
             latents = encode(batch)
             starts += [start_of(latents, row, 0, len(starts) + row) for row in range(len(batch.starts))]
     fit = infer_axes(world_model, starts, config.planning.energy.samples_at_once, reporter.task("inferring moves"))
-    data = {
-        "path": config.data.path,
-        "cameras": list(config.data.cameras),
-        "stride": config.data.model_stride,
-        "split": split,
-    }
+    data = config.data
     return fit, {
-        "format": FORMAT,
+        "format": AXES_FORMAT,
         "verdict": fit.words(),
         **fit.as_dict(),
         "model": {"subject": model, **known._asdict()},
-        "data": data,
+        "data": {"path": data.path, "cameras": list(data.cameras), "stride": data.model_stride, "split": split},
         "version": __version__,
         "time": utc_now(),
     }

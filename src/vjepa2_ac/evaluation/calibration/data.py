@@ -21,9 +21,10 @@ from vjepa2_ac.data.loader import validation_windows
 from vjepa2_ac.data.windows import spread
 from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch
-from vjepa2_ac.episode import Batch, Episode, LatentBatch, Progress, no_progress
+from vjepa2_ac.episode import Episode, Progress, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.calibration.variants import (
+    Encode,
     ReadOnce,
     SameClips,
     Variant,
@@ -51,14 +52,9 @@ class VariantProbe:
     @property
     def better(self) -> VariantResult | None:
         """The variant that fits best, if it certainly fits better than the unchanged data."""
-        certain = [
-            one
-            for one in self.results
-            if one.is_certainly_better(needed=ENOUGH_EPISODES)
-            and one.gain > _GAIN
-            and one.ratio.high < 1  # else it only fails less
-        ]
-        return max(certain, key=lambda one: one.gain, default=None)
+        certain = [one for one in self.results if one.is_certainly_better(needed=ENOUGH_EPISODES)]
+        better = [one for one in certain if one.gain > _GAIN and one.ratio.high < 1]  # else it only fails less
+        return max(better, key=lambda one: one.gain, default=None)
 
     def verdict(self) -> str:
         """Return as text whether the unchanged data fit the model best."""
@@ -103,17 +99,13 @@ def probe_config(
 
 
 def probe_variants(
-    model: Predictor,
-    encode: Callable[[Batch], LatentBatch],
-    dataset: Dataset,
-    sample: ClipSample,
-    progress: Progress = no_progress,
+    model: Predictor, encode: Encode, dataset: Dataset, sample: ClipSample, progress: Progress = no_progress
 ) -> VariantProbe:
     """Measure a model's one-step error on unchanged clips, and under each variant.
 
     Args:
         model: The predictor.
-        encode: Turns a batch of pixels into latents on the model's device.
+        encode: Makes the latents.
         dataset: The source of clips, at a fixed stride.
         sample: The clips.
         progress: Called with (clips done, clips in total).
@@ -139,18 +131,17 @@ def probe_variants(
 
 def _with_room(
     dataset: Dataset, candidates: list[tuple[int, int]], clips: int
-) -> tuple[list[tuple[int, int]], tuple[int, ...]]:
+) -> tuple[list[tuple[int, int]], list[int]]:
     """Return the starts of clips, and the shifts for which each has states before and after it."""
     steps, length = dataset.table.num_steps, dataset.config.clip_steps
     enough = max(1, min(clips, len(candidates) // 4))
-    fitting: list[tuple[int, int]] = candidates
-    shifts: tuple[int, ...] = ()
-    for count in range(1, len(SHIFTS) + 1):
-        room = SHIFTS[count - 1]
+    fitting, shifts = candidates, list[int]()
+    for room in SHIFTS:
         wider = [(episode, start) for episode, start in fitting if room <= start <= steps[episode] - length - room]
         if len(wider) < enough:
             break
-        fitting, shifts = wider, SHIFTS[:count]
+        fitting = wider
+        shifts.append(room)
     return [fitting[place] for place in spread(len(fitting), clips)], shifts
 
 
@@ -171,17 +162,16 @@ def variants_of(config: DataConfig, shifts: Sequence[int]) -> list[Variant]:
         for shift in (size, -size)
     ]
     if config.actions == "difference":  # a command has no opposite
-        found.append(_variant("the states backwards", "reverse the order of the frames", _of_states(_backwards)))
+        turned = _of_states(lambda states: np.ascontiguousarray(states[::-1]))
+        found.append(_variant("the states backwards", "reverse the order of the frames", turned))
     if config.states == "pose":
         for axis, name in enumerate("xy"):
             repair = f"negate {name}, with the rotation (as of a mirror)"
             found.append(_variant(f"{name} negated", repair, _of_states(partial(mirrored, axis=axis))))
-        found.append(_variant("the gripper inverted", config.gripper_fix, _of_states(_with_gripper_inverted)))
+        inverted = _of_states(lambda states: np.append(states[:, :-1], 1 - states[:, -1:], axis=1))
+        found.append(_variant("the gripper inverted", config.gripper_fix, inverted))
     if not config.is_cache:
-        exchanged, flipped = (
-            partial(_with_changed_frames, change=change)
-            for change in (lambda frames: frames[..., ::-1], lambda frames: frames[:, :, ::-1])
-        )
+        exchanged, flipped = _of_frames(lambda frames: frames[..., ::-1]), _of_frames(lambda frames: frames[:, :, ::-1])
         repair = "exchange red and blue (OpenCV reads and writes BGR) where the data is written"
         found.append(_variant("red and blue exchanged", repair, exchanged, has_frames=True))
         repair = "flip the frames, left to right, where the data is written"
@@ -192,9 +182,12 @@ def variants_of(config: DataConfig, shifts: Sequence[int]) -> list[Variant]:
 def _variant(name: str, repair: str, change: Callable[[Episode], Episode], *, has_frames: bool = False) -> Variant:
     """Return a variant of changed episodes; without frames where they are the same."""
 
+    def no_frames(steps: Sequence[int]) -> np.ndarray:
+        return np.zeros((len(steps), 1, 1, 3), np.uint8)
+
     def changed(episode: Episode) -> Episode:
         found = change(episode)
-        return found if has_frames else replace(found, read_frames=_no_frames, read_latents=None)
+        return found if has_frames else replace(found, read_frames=no_frames, read_latents=None)
 
     def view(dataset: Dataset) -> Dataset:
         return replace(dataset, source=ReadOnce(dataset.source, changed))
@@ -208,10 +201,6 @@ def mirrored(states: Float[np.ndarray, "steps 7"], axis: int) -> Float[np.ndarra
     mirror[axis] = -1
     rotations = matrices_from_euler(states[:, POSE.rotation]) * mirror[:, None] * mirror
     return np.concatenate([states[:, POSE.position] * mirror, euler_from_matrices(rotations), states[:, -1:]], axis=1)
-
-
-def _no_frames(steps: Sequence[int]) -> np.ndarray:
-    return np.zeros((len(steps), 1, 1, 3), np.uint8)
 
 
 def _steps(shift: int) -> str:
@@ -229,16 +218,8 @@ def _of_states(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Episode]
     return lambda episode: replace(episode, states=change(episode.states))
 
 
-def _backwards(states: np.ndarray) -> np.ndarray:
-    return np.ascontiguousarray(states[::-1])
+def _of_frames(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Episode], Episode]:
+    def changed(episode: Episode) -> Episode:
+        return replace(episode, read_frames=lambda steps: np.ascontiguousarray(change(episode.read_frames(steps))))
 
-
-def _with_gripper_inverted(states: np.ndarray) -> np.ndarray:
-    return np.concatenate([states[:, : POSE.gripper], 1 - states[:, POSE.gripper :]], axis=1)
-
-
-def _with_changed_frames(episode: Episode, change: Callable[[np.ndarray], np.ndarray]) -> Episode:
-    def read(steps: Sequence[int]) -> np.ndarray:
-        return np.ascontiguousarray(change(episode.read_frames(steps)))
-
-    return replace(episode, read_frames=read)
+    return changed

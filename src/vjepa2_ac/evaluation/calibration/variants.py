@@ -38,6 +38,8 @@ from vjepa2_ac.runs.folder import is_run
 from vjepa2_ac.runs.loading import load_run
 from vjepa2_ac.spaces import ActionSpace
 
+Encode = Callable[[Batch], LatentBatch]  # pixels into latents, on the model's device
+
 _MARGIN = 2.0  # half-widths of the 95 % interval: the best of several is easily better by chance
 _EPISODES_NEEDED = 2  # for an interval
 _EPISODES_TO_BE_SURE = 10  # an interval from fewer is too narrow
@@ -98,12 +100,11 @@ class VariantErrors:
         ids, moved_cm = [episode for episode, _ in self.clips], None
         if space.position is not None:
             moved_cm = float(np.median(space.shown_size(self.actions.reshape(-1, self.actions.shape[-1]))))
-        error, persistence = (float(one.mean()) for one in self.errors)
         difference = None if beside is None else self._minus(beside)
         of_model, of_nothing = self.errors
         return VariantResult(
-            name, ratio(of_model, of_nothing, ids), error, persistence, moved_cm, len(ids), len(set(ids)), difference,
-            repair,
+            name, ratio(of_model, of_nothing, ids), float(of_model.mean()), float(of_nothing.mean()), moved_cm,
+            len(ids), len(set(ids)), difference, repair,
         )  # fmt: skip
 
     def _minus(self, other: VariantErrors) -> Estimate:
@@ -126,17 +127,13 @@ class SameClips:
 
 
 def measure_variants(
-    model: Predictor,
-    encode: Callable[[Batch], LatentBatch],
-    clips: SameClips,
-    variants: Sequence[Variant],
-    progress: Progress = no_progress,
+    model: Predictor, encode: Encode, clips: SameClips, variants: Sequence[Variant], progress: Progress = no_progress
 ) -> list[VariantErrors]:
     """Measure a model's one-step error on the same clips under each variant; each episode is read once for all.
 
     Args:
         model: The predictor.
-        encode: Turns a batch of pixels into latents on the model's device.
+        encode: Makes the latents.
         clips: What to measure on.
         variants: The first one decides which clips can be read.
         progress: Called with (clips done, clips in total), of all variants.
@@ -167,11 +164,7 @@ def measure_variants(
 
 
 def _read(
-    variant: Variant,
-    dataset: Dataset,
-    windows: Sequence[tuple[int, int]],
-    encode: Callable[[Batch], LatentBatch],
-    latents: LatentBatch,
+    variant: Variant, dataset: Dataset, windows: Sequence[tuple[int, int]], encode: Encode, latents: LatentBatch
 ) -> Iterable[LatentBatch]:
     """Yield a batch of clips under a variant; frames are encoded only if it has some of its own."""
     for batch in batches_of(variant.view(dataset), windows, batch_size=len(windows)):
@@ -238,12 +231,9 @@ def require_learned(model: ModelConfig) -> None:
         InputError: It is.
     """
     if model.base is None:
-        raise InputError(
-            where="model.random",
-            found="a model that has learned nothing",
-            needed="one that can say which stride it was trained at",
-            fix="Set data.stride to a number, or name another model with model.base (data calibrate: --model)",
-        )
+        found, needed = "a model that has learned nothing", "one that can say which stride it was trained at"
+        fix = "Set data.stride to a number, or name another model with model.base (data calibrate: --model)"
+        raise InputError(where="model.random", found=found, needed=needed, fix=fix)
 
 
 @dataclass(frozen=True)
@@ -364,12 +354,9 @@ def calibrate_model(
         InputError: As `calibrate`; or the data is a latent cache.
     """
     if dataset.config.is_cache:
-        raise InputError(
-            where=f"data.path: {dataset.config.path}",
-            found=f"latents that were encoded for clips at stride {dataset.config.stride}",
-            needed="frames at every candidate stride",
-            fix="Calibrate on the data set itself, with data.cache: off",
-        )
+        found = f"latents that were encoded for clips at stride {dataset.config.stride}"
+        needed, fix = "frames at every candidate stride", "Calibrate on the data set itself, with data.cache: off"
+        raise InputError(where=f"data.path: {dataset.config.path}", found=found, needed=needed, fix=fix)
     world_model.eval()
     sample = replace(sample, batch_size=config.validation.batch_size)
     encode = partial(encode_batch, world_model, device=accelerator.device, chunk=config.model.encode_chunk)
@@ -378,12 +365,7 @@ def calibrate_model(
 
 
 def calibrate(
-    model: Predictor,
-    encode: Callable[[Batch], LatentBatch],
-    dataset: Dataset,
-    sample: ClipSample,
-    *,
-    progress: Progress = no_progress,
+    model: Predictor, encode: Encode, dataset: Dataset, sample: ClipSample, *, progress: Progress = no_progress
 ) -> Calibration:
     """Measure a model's one-step error over persistence at each stride.
 
@@ -392,7 +374,7 @@ def calibrate(
 
     Args:
         model: The predictor.
-        encode: Turns a batch of pixels into latents on the model's device.
+        encode: Makes the latents.
         dataset: The source of clips; its config has the candidates, its own stride does not matter.
         sample: The clips at each stride.
         progress: Called with (clips done, clips in total).

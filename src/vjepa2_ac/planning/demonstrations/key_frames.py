@@ -17,6 +17,8 @@ from vjepa2_ac.planning.goals import GripperMode, SubGoal
 from vjepa2_ac.planning.search_space import GRIPPER
 from vjepa2_ac.spaces import actions_from_states
 
+States = Float[np.ndarray, "frames 7"]
+
 GRIPS = 0.15  # of closedness: less is no change of the gripper
 _MOVES = 0.02  # of closedness, from one frame to the next: less is no motion of the fingers
 _PAUSE = 2  # frames that the fingers may rest within one change
@@ -46,7 +48,7 @@ OF_MODEL_STEPS = StillRule(lasts=1, apart=1)
 """Where a frame is a model step."""
 
 
-def gripper_key_frames(states: Float[np.ndarray, "frames 7"], rule: StillRule | None = None) -> tuple[KeyFrame, ...]:
+def gripper_key_frames(states: States, rule: StillRule | None = None) -> tuple[KeyFrame, ...]:
     """Return where the gripper begins to change and where it has changed, where the arm stops, and the end.
 
     Where the arm leaves before the fingers have come to rest, the gripper has changed at the last frame before that, if
@@ -64,8 +66,6 @@ def gripper_key_frames(states: Float[np.ndarray, "frames 7"], rule: StillRule | 
     after a binary gripper has changed, and stops by joint velocities; here a change has a beginning and an end.
     """
     rule, last = rule or StillRule(), len(states) - 1
-    if last < 1:
-        raise ValueError(f"{len(states)} frames are no demonstration")
     found: dict[int, str] = {}
     changes = _gripper_changes(states[:, GRIPPER])
     for begin, end in changes:
@@ -97,7 +97,7 @@ def _gripper_changes(closedness: Float[np.ndarray, " frames"]) -> list[tuple[int
     return [(begin, end) for begin, end, _ in found if abs(closedness[end] - closedness[begin]) >= GRIPS]
 
 
-def _before_leaving(states: Float[np.ndarray, "frames 7"], begin: int, end: int) -> int:
+def _before_leaving(states: States, begin: int, end: int) -> int:
     """Return the last frame of a change of the gripper at which the arm is where it began, or the end of the change."""
     changed = np.abs(states[begin : end + 1, GRIPPER] - states[begin, GRIPPER])
     moved = np.linalg.norm(states[begin : end + 1, :3] - states[begin, :3], axis=1)
@@ -105,14 +105,14 @@ def _before_leaving(states: Float[np.ndarray, "frames 7"], begin: int, end: int)
     return begin + int(there[-1]) if len(there) else end
 
 
-def _stops(states: Float[np.ndarray, "frames 7"], lasts: int) -> list[int]:
+def _stops(states: States, lasts: int) -> list[int]:
     """Return where the arm comes to rest for at least so many frames; at the start it has not come to rest."""
     still = _are_below(actions_from_states(states), _STILL_M, _STILL_RAD, _MOVES)
     begins = [frame for frame in range(1, len(still)) if still[frame] and not still[frame - 1]]
     return [begin for begin in begins if still[begin : begin + lasts].all() and begin + lasts <= len(still)]
 
 
-def resting(states: Float[np.ndarray, "frames 7"]) -> Bool[np.ndarray, " neighbours"]:
+def resting(states: States) -> Bool[np.ndarray, " neighbours"]:
     """Return of each frame but the last whether arm and fingers rest until the next one, up to what sensors measure."""
     return _are_below(actions_from_states(states), *_REST)
 
@@ -152,12 +152,7 @@ def with_frames_between(keys: Sequence[KeyFrame], step: int, name: str = "on the
         keys: In order.
         step: Frames from one goal to the next.
         name: Of the further ones, `{}` in it their number.
-
-    Raises:
-        ValueError: A step below 1.
     """
-    if step < 1:
-        raise ValueError(f"every {step} frames")
     found: list[KeyFrame] = []
     for before, key in itertools.pairwise((KeyFrame(0, "start"), *keys)):
         ways = [one for one in range(before.frame + step, key.frame, step) if 2 * (key.frame - one) >= step]
@@ -169,14 +164,9 @@ def every_key_frame(frames: int, step: int) -> tuple[KeyFrame, ...]:
     """Return every `step`-th frame but the first, and the last; one less than half a step before the last is left out.
 
     Args:
-        frames: Of the demonstration.
-        step: From one key frame to the next.
-
-    Raises:
-        ValueError: Fewer than two frames, or a step below 1.
+        frames: Of the demonstration, two or more.
+        step: From one key frame to the next, one or more.
     """
-    if frames < 2:
-        raise ValueError(f"{frames} frames are no demonstration")
     return with_frames_between([KeyFrame(frames - 1, "end")], step, "frame {}")
 
 
@@ -190,17 +180,12 @@ def latent_key_frames(
     was being done: this is the goal before.
 
     Args:
-        frames: Of the demonstration.
+        frames: Of the demonstration, two or more.
         distances: Of all frames to the one of an index, in latents.
-        least: Frames from one goal to the next, and from the start to the first.
-
-    Raises:
-        ValueError: Fewer than two frames, or `least` below 1.
+        least: Frames from one goal to the next, and from the start to the first; one or more.
 
     Source of the rule: zcczhang/UVD @ e7d657a, uvd/decomp/decomp.py, embedding_decomp.
     """
-    if frames < 2 or least < 1:
-        raise ValueError(f"{frames} frames, goals {least} apart")
     found = [frames - 1]
     while (before := _maximum_before(_smoothed(distances(found[-1])[: found[-1] + 1], least), least)) is not None:
         found.append(before)
@@ -235,10 +220,7 @@ class Timing:
 
 
 def sub_goals_of(
-    images: Sequence[np.ndarray],
-    keys: Sequence[KeyFrame],
-    timing: Timing,
-    states: Float[np.ndarray, "frames 7"] | None = None,
+    images: Sequence[np.ndarray], keys: Sequence[KeyFrame], timing: Timing, states: States | None = None
 ) -> tuple[SubGoal, ...]:
     """Return key frames as goals, with the demonstration's durations and, if states are known, gripper modes.
 

@@ -22,7 +22,7 @@ from vjepa2_ac.data.windows import require_frames
 from vjepa2_ac.encoding.batch import encode_frames
 from vjepa2_ac.episode import FrameReader, Progress, no_progress
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.film import spread_with_ends
+from vjepa2_ac.media.figure import spread_with_ends
 from vjepa2_ac.media.video import count_frames, read_frames
 from vjepa2_ac.planning.demonstrations.key_frames import (
     KeyFrame,
@@ -196,9 +196,7 @@ def _keys(recording: Recording, options: KeyFrameOptions, seen: _Encoded | None)
     if recording.states is None:
         found, fix = f"{recording.name}: no measured poses", "Take --by latent with --model, or --by every N"
         raise InputError(where="--by gripper", found=found, needed="an episode with poses and gripper", fix=fix)
-    return gripper_key_frames(
-        recording.states, StillRule() if options.apart is None else StillRule(apart=options.apart)
-    )
+    return gripper_key_frames(recording.states, StillRule(apart=options.apart or StillRule.apart))
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,8 +18,20 @@ from matplotlib import colormaps
 from vjepa2_ac.evaluation.action_score import AXES, ways_of
 from vjepa2_ac.evaluation.estimates import Curve, gain_over, one_step_over_persistence, over_persistence
 from vjepa2_ac.evaluation.result import ACTIONS, DecodedStrip, Evaluation, Example, Landscapes, Mode, TrainingCurve
-from vjepa2_ac.media.figure import BLUE, GREEN, GREY, ORANGE, RED, headline, visible, written_figure
-from vjepa2_ac.media.film import FilmStrip, Kind, StripRow, draw_strip
+from vjepa2_ac.media.figure import (
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    RED,
+    FilmStrip,
+    Kind,
+    StripRow,
+    draw_strip,
+    headline,
+    visible,
+    written_figure,
+)
 from vjepa2_ac.reports.comparison import Comparison
 
 _NOTHING = "persistence (doing nothing)"

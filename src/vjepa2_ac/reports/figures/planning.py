@@ -12,8 +12,7 @@ import numpy as np
 from matplotlib.patches import Rectangle
 
 from vjepa2_ac.data.transforms import crop_box
-from vjepa2_ac.media.figure import BLUE, GREY, ORANGE, RED, headline, written_figure
-from vjepa2_ac.media.film import MEANING, Kind, show_framed
+from vjepa2_ac.media.figure import BLUE, GREY, MEANING, ORANGE, RED, Kind, headline, show_framed, written_figure
 from vjepa2_ac.planning.decision import PlanResult, summarize
 from vjepa2_ac.spaces import POSE
 
@@ -59,7 +58,7 @@ def plot_plan(answer: PlanResult, path: Path, imagined: ImaginedPlan | None = No
 
 
 def _pictures(part: Any, answer: PlanResult) -> None:
-    goals = answer.question.goals
+    goals = [goal.image for goal in answer.question.goals]
     shown = sorted({*range(len(goals))[: _MOST_GOALS - 1], len(goals) - 1})
     named = {"start": answer.question.start}
     named |= {f"goal {place + 1} of {len(goals)}" if len(goals) > 1 else "goal": goals[place] for place in shown}
@@ -94,7 +93,7 @@ def _search(part: Any, answer: PlanResult, plan: Plan) -> None:
     colours = mpl.colormaps["viridis"](np.linspace(0.9, 0.0, len(plan.iterations)))
     factor = answer.state_space.shown_factor
     first, upper = answer.actions[0] * factor, answer.space.upper[0].double().numpy() * factor
-    shown = answer.shown_axes  # one again where there are fewer than three numbers
+    shown = answer.controller.shown_axes  # one again where there are fewer than three numbers
     across, up, third = shown[0], shown[min(1, len(shown) - 1)], shown[-1]
     for number, (one, colour) in enumerate(zip(plan.iterations, colours, strict=True), start=1):
         tried = one.elites[:, 0].double().numpy() * factor

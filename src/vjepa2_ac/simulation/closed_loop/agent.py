@@ -19,7 +19,7 @@ from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.goals import GoalFolder, SubGoal
 from vjepa2_ac.planning.session import PlanningSession
-from vjepa2_ac.serving.client import PlanningClient, goal_keys
+from vjepa2_ac.serving.wire import PlanningClient, goal_keys
 from vjepa2_ac.simulation.closed_loop.policies import (
     GoalsOf,
     Image,

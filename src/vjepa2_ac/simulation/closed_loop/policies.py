@@ -17,11 +17,10 @@ from vjepa2_ac.evaluation.imagined_plan import imagined_next
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, RELEASED, TaskName, TaskProblem
-from vjepa2_ac.simulation.world.arm import SimulatedArm, State
+from vjepa2_ac.simulation.world.arm import Block, SimulatedArm, State
 
 GoalsOf = Callable[[TaskProblem], Sequence[SubGoal]]
 Image = UInt8[np.ndarray, "height width 3"]
-Block = Float[np.ndarray, " 4"]  # as in `TaskProblem`
 
 _ALMOST = 1 - 1e-9  # of a limit: rounding must not exceed it
 

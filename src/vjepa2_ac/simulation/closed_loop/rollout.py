@@ -16,7 +16,7 @@ from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.intervals import Estimate, mean_of, share_of
 from vjepa2_ac.simulation.closed_loop.policies import Moves, Planning, Policy
 from vjepa2_ac.simulation.closed_loop.tasks import STEPS, TaskName, TaskProblem, arm_for, make_problem
-from vjepa2_ac.simulation.world.arm import SimulatedArm
+from vjepa2_ac.simulation.world.arm import Block, Mark, SimulatedArm, State
 from vjepa2_ac.simulation.world.domains import Domain, named_domain
 from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ, HIGH, LOW, OutOfReachError, rest_joints
 from vjepa2_ac.spaces import apply_action
@@ -220,7 +220,9 @@ def run_episode(
         measured = states[-1] if policy.moves == Moves.FLANGE else np.append(arm.joints, arm.closedness)
         action = np.asarray(policy.act(frames[-1], measured), dtype=np.float64)
         seconds.append(time.perf_counter() - began)
-        actions.append(_checked(action, policy))
+        if action.shape != (policy.moves.value,) or not np.isfinite(action).all():
+            raise ValueError(f"{policy.name}: {action.tolist()} is no action of {policy.moves.value} finite numbers")
+        actions.append(action)
         whys.append(policy.why)
         if keep_frames and isinstance(policy, Planning):
             imagined.append(policy.imagined())
@@ -244,12 +246,7 @@ def run_episode(
     )
 
 
-def put(
-    arm: SimulatedArm,
-    state: Float[np.ndarray, " 7"],
-    block: Float[np.ndarray, " 4"] | None,
-    mark: Float[np.ndarray, " 2"] | None = None,
-) -> SimulatedArm:
+def put(arm: SimulatedArm, state: State, block: Block | None, mark: Mark | None = None) -> SimulatedArm:
     """Put arm, block and mark somewhere, via the arm's rest pose: its redundant joint must not depend on the past.
 
     Raises:
@@ -263,7 +260,7 @@ def put(
     return arm
 
 
-def send_action(arm: SimulatedArm, action: Float[np.ndarray, " 7"], stride: int) -> bool:
+def send_action(arm: SimulatedArm, action: State, stride: int) -> bool:
     """Command the state after an action for `stride` control steps, its closedness within 0 .. 1.
 
     The target is that action from the *measured* state. If no joint angles reach it, the arm moves along the straight
@@ -285,16 +282,10 @@ def send_action(arm: SimulatedArm, action: Float[np.ndarray, " 7"], stride: int)
     return False
 
 
-def ways_along(state: Float[np.ndarray, " 7"], action: Float[np.ndarray, " 7"]) -> Sequence[Float[np.ndarray, " 7"]]:
+def ways_along(state: State, action: State) -> Sequence[State]:
     """Return equally spaced states on the straight line of an action, the nearest first."""
     shares = np.arange(1, _PARTS + 1)[:, None] / _PARTS
     return list(apply_action(np.tile(state, (_PARTS, 1)), shares * action))
-
-
-def _checked(action: Float[np.ndarray, " dim"], policy: Policy) -> Float[np.ndarray, " dim"]:
-    if action.shape != (policy.moves.value,) or not np.isfinite(action).all():
-        raise ValueError(f"{policy.name}: {action.tolist()} is no action of {policy.moves.value} finite numbers")
-    return action
 
 
 def _send_joints(arm: SimulatedArm, action: Float[np.ndarray, " 8"], stride: int) -> bool:

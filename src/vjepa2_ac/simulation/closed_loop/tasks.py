@@ -12,18 +12,18 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from vjepa2_ac.simulation.world.arm import ContactArm, SimulatedArm
+from vjepa2_ac.simulation.world.arm import Block, ContactArm, Mark, SimulatedArm, State
 from vjepa2_ac.simulation.world.camera import FRAME_SIZE
-from vjepa2_ac.simulation.world.domains import Domain
-from vjepa2_ac.simulation.world.motion import MotionRecipe, downward_poses, poses_in_base
-from vjepa2_ac.simulation.world.scene import (
+from vjepa2_ac.simulation.world.domains import (
     BLOCK_M,
     FINGER_HALF_M,
     FINGER_INSIDE_M,
     FINGER_OUTSIDE_M,
     FINGER_TRAVEL_M,
     FINGERTIP_M,
+    Domain,
 )
+from vjepa2_ac.simulation.world.motion import MotionRecipe, downward_poses, poses_in_base
 
 TaskName = Literal["reach", "push", "pick", "place"]
 
@@ -66,10 +66,10 @@ class TaskProblem:
 
     task: TaskName
     index: int
-    start: Float[np.ndarray, " 7"]
-    goal: Float[np.ndarray, " 7"]  # of the arm in the goal image
-    block_start: Float[np.ndarray, " 4"] | None = None  # None: there is no block
-    block_goal: Float[np.ndarray, " 4"] | None = None
+    start: State
+    goal: State  # of the arm in the goal image
+    block_start: Block | None = None  # None: there is no block
+    block_goal: Block | None = None
 
     @property
     def ends(self) -> Float[np.ndarray, "2 4"]:
@@ -83,11 +83,11 @@ class TaskProblem:
         return np.stack([self.block_start, self.block_goal])
 
     @property
-    def mark(self) -> Float[np.ndarray, " 2"] | None:
+    def mark(self) -> Mark | None:
         """Middle of the mark on the table, x and y: under the block's goal (place); None: there is none."""
         return self.block_goal[:2] if self.task == "place" and self.block_goal is not None else None
 
-    def distance_m(self, state: Float[np.ndarray, " 7"], block: Float[np.ndarray, " 4"] | None = None) -> float:
+    def distance_m(self, state: State, block: Block | None = None) -> float:
         """Return the distance of the moved object to its goal: of the block if there is one, else of the flange.
 
         Rotations and the gripper do not count.
@@ -101,7 +101,7 @@ class TaskProblem:
             raise ValueError(f"{self.task} is done by a block, and there is none")
         return float(np.linalg.norm(block[:3] - self.block_goal[:3]))
 
-    def succeeded(self, state: Float[np.ndarray, " 7"], block: Float[np.ndarray, " 4"] | None = None) -> bool:
+    def succeeded(self, state: State, block: Block | None = None) -> bool:
         """Return whether the task is done in a state of arm and block.
 
         The distance is below `SUCCESS_M`; place: and the block lies on the table, and the gripper has released it.

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import multiprocessing
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -31,10 +31,9 @@ from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError, MissingFileError
 from vjepa2_ac.media.images import encode_jpeg
 from vjepa2_ac.simulation.closed_loop.tasks import arm_for
-from vjepa2_ac.simulation.world.arm import SimulatedArm
-from vjepa2_ac.simulation.world.domains import Domain, DomainRanges, named_domain, sample_domain
+from vjepa2_ac.simulation.world.arm import Look, SimulatedArm
+from vjepa2_ac.simulation.world.domains import Domain, DomainRanges, load_mujoco, named_domain, sample_domain
 from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ, Motion, MotionRecipe, random_reaching
-from vjepa2_ac.simulation.world.scene import load_mujoco
 from vjepa2_ac.storage.structured import json_text, read_json_object, record_of
 
 RecordedTask = Literal["push", "pick", "place"]
@@ -63,10 +62,10 @@ class RecordingSpec:
     """What an episode of a simulated data set is."""
 
     domain: str | Domain | DomainRanges  # or its name; ranges, or `random`: another world in every episode
-    steps: int = 41  # control steps (15 per second); see `default_steps`
-    seed: int = 0  # determines motion, outcome and worlds
+    steps: Annotated[int, Field(ge=2, le=1_000_000)] = 41  # control steps (15 per second); see `default_steps`
+    seed: Annotated[int, Field(ge=0)] = 0  # determines motion, outcome and worlds
     cameras: Literal[1, 3] = 1  # 1: the three images of a step are the same one; 3: one image per camera
-    recipe: MotionRecipe | None = None  # ranges of the motion, without a task
+    recipe: MotionRecipe = field(default_factory=MotionRecipe)  # ranges of the motion, without a task
     task: RecordedTask | None = None  # with a block: half of the episodes by script, half at random
 
     @property
@@ -81,16 +80,6 @@ class RecordingSpec:
         return DomainRanges() if self.domain == "random" else named_domain(self.domain)
 
 
-def world_of(index: int, spec: RecordingSpec) -> Domain:
-    """Return the world of an episode.
-
-    Raises:
-        InputError: No domain has this name.
-    """
-    worlds = spec.worlds
-    return worlds if isinstance(worlds, Domain) else sample_domain(_stream(index, spec, _WORLD), worlds)
-
-
 def arm_of(index: int, spec: RecordingSpec) -> SimulatedArm:
     """Return an arm in the world of an episode; with a task it has contacts.
 
@@ -98,16 +87,13 @@ def arm_of(index: int, spec: RecordingSpec) -> SimulatedArm:
         InputError: An unknown domain.
         UnreachableError: MuJoCo is not installed.
     """
-    return arm_for(spec.task or "reach", world_of(index, spec))
+    worlds = spec.worlds
+    world = worlds if isinstance(worlds, Domain) else sample_domain(_stream(index, spec, _WORLD), worlds)
+    return arm_for(spec.task or "reach", world)
 
 
 def carry_out(
-    arm: SimulatedArm,
-    index: int,
-    spec: RecordingSpec,
-    *,
-    until: int | None = None,
-    look: Callable[[SimulatedArm], None] | None = None,
+    arm: SimulatedArm, index: int, spec: RecordingSpec, *, until: int | None = None, look: Look | None = None
 ) -> Motion:
     """Carry out an episode, and return its motion.
 
@@ -116,7 +102,7 @@ def carry_out(
         index: Number of the episode.
         spec: What an episode is.
         until: Control step at which arm and block are left, as they were when it was measured; None: after the last.
-        look: Called at every control step, at the time of its measurements.
+        look: Called with the arm.
     """
     rng = _stream(index, spec, _MOTION)
     if spec.task is not None:  # contacts depend on all that happened before
@@ -177,19 +163,19 @@ def record_dataset(
     """
     load_mujoco()
     if min(episodes, spec.steps - 1, workers, 1 if shards is None else shards, spec.seed + 1) < 1:
-        raise InputError(
-            where="simulate record",
-            found=f"episodes {episodes}, steps {spec.steps}, shards {shards}, workers {workers}, seed {spec.seed}",
-            needed="at least 1 episode, 2 steps, 1 shard, 1 worker, seed 0",
-        )
+        found = f"episodes {episodes}, steps {spec.steps}, shards {shards}, workers {workers}, seed {spec.seed}"
+        needed = "at least 1 episode, 2 steps, 1 shard, 1 worker, seed 0"
+        raise InputError(where="simulate record", found=found, needed=needed)
     record = partial(record_episode, spec=replace(spec, domain=spec.worlds))
 
     def watched() -> Iterator[DroidEpisode]:
-        for done, episode in enumerate(_recorded(record, episodes, workers), start=1):
-            yield episode
-            progress(done, episodes)
+        with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:  # starts none before its work
+            recorded = (map if workers == 1 else pool.map)(record, range(episodes))
+            for done, episode in enumerate(recorded, start=1):
+                yield episode
+                progress(done, episodes)
 
-    notes = {SIMULATION_FILE: json_text(asdict(RecordedSimulation.of(spec, episodes)))}
+    notes = {SIMULATION_FILE: json_text(RecordedSimulation.of(spec, episodes).as_dict())}
     return write_droid_rlds(folder, watched(), shards=shards or -(-episodes // 32), notes=notes)
 
 
@@ -243,16 +229,6 @@ def _velocity(positions: Float[np.ndarray, "steps dim"]) -> Float[np.ndarray, "s
     return np.concatenate([ways[:1], ways]) * CONTROL_RATE_HZ
 
 
-def _recorded(record: Callable[[int], DroidEpisode], episodes: int, workers: int) -> Iterator[DroidEpisode]:
-    """Yield the episodes in order; in parallel, if so many processes are wanted."""
-    if workers == 1:
-        yield from map(record, range(episodes))
-        return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context) as pool:
-        yield from pool.map(record, range(episodes))
-
-
 # ---- simulation.json ----
 
 SIMULATION_FILE = "simulation.json"
@@ -263,34 +239,24 @@ _AGAIN = "Record it again: the same options give the same episodes"
 _NUMBER = re.compile(r"_(\d{6,})/")  # as `episode_folder` writes it
 
 
-@dataclass(frozen=True)
-class RecordedSimulation:
-    """Everything that determines the episodes of a data set; exactly one of domain and ranges is given."""
+@dataclass(frozen=True, kw_only=True)
+class RecordedSimulation(RecordingSpec):
+    """Everything that determines the episodes of a data set; the worlds are no name."""
 
     version: str  # of this program
     libraries: dict[str, str]  # and of those that determine last digits
     episodes: Annotated[int, Field(ge=1)]
-    steps: Annotated[int, Field(ge=2, le=1_000_000)]
-    seed: Annotated[int, Field(ge=0)]
-    cameras: Literal[1, 3]
-    recipe: MotionRecipe
-    task: RecordedTask | None
-    domain: Domain | None = None
-    ranges: DomainRanges | None = None
 
     @classmethod
     def of(cls, spec: RecordingSpec, episodes: int) -> RecordedSimulation:
         """Return the record of a data set, worlds and recipe written out, whatever names and defaults mean later."""
-        worlds, recipe = spec.worlds, spec.recipe or MotionRecipe()
-        domain, ranges = (worlds, None) if isinstance(worlds, Domain) else (None, worlds)
-        how = (spec.steps, spec.seed, spec.cameras, recipe, spec.task, domain, ranges)
-        return cls(version(_PROGRAM), {name: version(name) for name in _LIBRARIES}, episodes, *how)
+        libraries, how = {name: version(name) for name in _LIBRARIES}, vars(spec) | {"domain": spec.worlds}
+        return cls(version=version(_PROGRAM), libraries=libraries, episodes=episodes, **how)
 
-    @property
-    def spec(self) -> RecordingSpec:
-        """What an episode is."""
-        worlds = self.domain or self.ranges or DomainRanges()
-        return RecordingSpec(worlds, self.steps, self.seed, self.cameras, self.recipe, self.task)
+    def as_dict(self) -> dict[str, Any]:
+        """Return the content of the file: one of its keys `domain` and `ranges` has the world or worlds."""
+        values, key = asdict(self), "domain" if isinstance(self.domain, Domain) else "ranges"
+        return values | {"domain": None, "ranges": None} | {key: values["domain"]}
 
     @property
     def other_versions(self) -> str:
@@ -305,17 +271,14 @@ class RecordedSimulation:
         Raises:
             InputError: It is no episode of this data set.
         """
-        found = _NUMBER.search(episode_id)
-        number = int(found[1]) if found else self.episodes
-        name = "random" if self.domain is None else self.domain.name
+        match = _NUMBER.search(episode_id)
+        number = int(match[1]) if match else self.episodes
+        name = self.domain.name if isinstance(self.domain, Domain) else "random"
         if number < self.episodes and f"{episode_folder(number, self.seed, name)}/" in episode_id:
             return number
-        raise InputError(
-            where=SIMULATION_FILE,
-            found=f"not the episode {episode_id!r}",
-            needed=f"one of the {self.episodes} simulated with seed {self.seed}",
-            fix="Episodes are told apart by the folder in their identity; keep data.fields.identity as it is",
-        )
+        found, needed = f"not the episode {episode_id!r}", f"one of {self.episodes} simulated with seed {self.seed}"
+        fix = "Episodes are told apart by the folder in their identity; keep data.fields.identity as it is"
+        raise InputError(where=SIMULATION_FILE, found=found, needed=needed, fix=fix)
 
 
 def read_simulation(folder: str | Path) -> RecordedSimulation:
@@ -332,13 +295,10 @@ def read_simulation(folder: str | Path) -> RecordedSimulation:
     try:
         values = read_json_object(where, needed=_NEEDED, fix=_AGAIN)
     except MissingFileError:
-        raise InputError(
-            where=where,
-            found="no such file: these are not simulated episodes, or an older version recorded them",
-            needed=_NEEDED,
-            fix=f"What happens under other actions can only be simulated. {_AGAIN}",
-        ) from None
-    simulation = record_of(RecordedSimulation, values, where=where, needed=_NEEDED, fix=_AGAIN)
-    if (simulation.domain is None) == (simulation.ranges is None):
+        found = "no such file: these are not simulated episodes, or an older version recorded them"
+        fix = f"What happens under other actions can only be simulated. {_AGAIN}"
+        raise InputError(where=where, found=found, needed=_NEEDED, fix=fix) from None
+    worlds = [one for key in ("domain", "ranges") if (one := values.pop(key, None)) is not None]
+    if len(worlds) != 1:
         raise InputError(where=where, found="not one of the keys domain and ranges", needed=_NEEDED, fix=_AGAIN)
-    return simulation
+    return record_of(RecordedSimulation, values | {"domain": worlds[0]}, where=where, needed=_NEEDED, fix=_AGAIN)

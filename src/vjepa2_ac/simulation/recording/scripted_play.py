@@ -5,9 +5,7 @@ Commands are as in the closed loop: one target state per model step, held for th
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import suppress
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -16,8 +14,8 @@ from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.episode import ACTION_DIM
 from vjepa2_ac.simulation.closed_loop.policies import Oracle, shortened
 from vjepa2_ac.simulation.closed_loop.rollout import put, ways_along
-from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, TaskProblem, make_problem
-from vjepa2_ac.simulation.world.arm import SimulatedArm
+from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, TaskName, TaskProblem, make_problem
+from vjepa2_ac.simulation.world.arm import Look, SimulatedArm
 from vjepa2_ac.simulation.world.motion import Motion, MotionRecipe, OutOfReachError
 from vjepa2_ac.spaces import apply_action
 
@@ -28,13 +26,7 @@ _AREA = np.array([[0.30, -0.28], [0.64, 0.28]])  # of the flange while playing, 
 
 
 def play(
-    arm: SimulatedArm,
-    task: Literal["push", "pick", "place"],
-    steps: int,
-    rng: np.random.Generator,
-    *,
-    script: bool,
-    look: Callable[[SimulatedArm], None] | None = None,
+    arm: SimulatedArm, task: TaskName, steps: int, rng: np.random.Generator, *, script: bool, look: Look | None = None
 ) -> Motion:
     """Return a demonstration of `steps` control steps with an arm that touches the block.
 
@@ -42,11 +34,11 @@ def play(
 
     Args:
         arm: From `arm_for` of this task.
-        task: The problem at the start, and whether the gripper is used.
+        task: One with a block: the problem at the start, and whether the gripper is used.
         steps: Control steps; 0: only the start is drawn.
         rng: The only source of randomness.
         script: Whether an oracle solves the problem, with noise; otherwise, random play.
-        look: Called at every control step, at the time of its measurements.
+        look: Called with the arm.
 
     Raises:
         UnreachableError: MuJoCo is not installed.

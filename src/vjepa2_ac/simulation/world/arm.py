@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
 from vjepa2_ac.simulation.world.camera import FRAME_SIZE, RayCamera
-from vjepa2_ac.simulation.world.domains import Domain
+from vjepa2_ac.simulation.world.domains import FINGER_TRAVEL_M, SUBSTEPS, Domain, compile_scene, load_mujoco
 from vjepa2_ac.simulation.world.motion import (
     GRIPPER_LAG_S,
     Joints,
@@ -19,10 +20,11 @@ from vjepa2_ac.simulation.world.motion import (
     rest_joints,
     tracking_share,
 )
-from vjepa2_ac.simulation.world.scene import FINGER_TRAVEL_M, SUBSTEPS, compile_scene, load_mujoco
 from vjepa2_ac.spaces import euler_from_matrices
 
 State = Float[np.ndarray, " 7"]  # or an action; legend: episode.py
+Block = Float[np.ndarray, " 4"]  # its pose, as in `TaskProblem`
+Mark = Float[np.ndarray, " 2"]  # its middle, likewise
 
 WRIST_FOV_DEG = 70.0
 _EXTERIOR_TURNS_DEG = {"exterior_1": 0.0, "exterior_2": -100.0}  # of the cameras that stand still
@@ -66,16 +68,16 @@ class SimulatedArm:
         return self._closedness
 
     @property
-    def block(self) -> Float[np.ndarray, " 4"] | None:
-        """Pose of the block, as in `TaskProblem`; None: there is none."""
+    def block(self) -> Block | None:
+        """Pose of the block; None: there is none."""
         return None
 
     @property
-    def mark(self) -> Float[np.ndarray, " 2"] | None:
-        """Middle of the mark on the table, as in `TaskProblem`; None: there is none."""
+    def mark(self) -> Mark | None:
+        """Middle of the mark on the table; None: there is none."""
         return None
 
-    def place(self, block: Float[np.ndarray, " 4"] | None, mark: Float[np.ndarray, " 2"] | None) -> None:
+    def place(self, block: Block | None, mark: Mark | None) -> None:
         """Put the block (at a pose at once, at rest) and the mark on the table; None: it stays.
 
         Raises:
@@ -167,6 +169,8 @@ class SimulatedArm:
         return np.asarray(flange @ mount)
 
 
+Look = Callable[[SimulatedArm], None]  # at every control step, at the time of its measurements
+
 _GRIP_STAYS = 0.05  # a gripper command that changes by less keeps the last command, and so its force
 _MOVED, _FINGERS, _BLOCK = slice(0, 9), slice(7, 9), slice(9, 16)  # of qpos
 
@@ -193,18 +197,18 @@ class ContactArm(SimulatedArm):
         return float(np.clip(1.0 - self._data.qpos[_FINGERS].mean() / FINGER_TRAVEL_M, 0.0, 1.0))
 
     @property
-    def block(self) -> Float[np.ndarray, " 4"]:
+    def block(self) -> Block:
         """Position of the block's centre and its rotation about z, in the robot base frame: metres, radians."""
         turn, place = self.domain.base_pose()[:3, :3], self._data.qpos[_BLOCK]
         rotation = turn.T @ Rotation.from_quat(place[3:], scalar_first=True).as_matrix()
         return np.append(turn.T @ place[:3], np.arctan2(rotation[1, 0], rotation[0, 0]))
 
     @property
-    def mark(self) -> Float[np.ndarray, " 2"] | None:
+    def mark(self) -> Mark | None:
         """Middle of the mark in the robot base frame, x and y in metres; None: there is none."""
         return np.asarray(self._data.mocap_pos[0] @ self.domain.base_pose()[:3, :2]) if self._has_mark else None
 
-    def place(self, block: Float[np.ndarray, " 4"] | None, mark: Float[np.ndarray, " 2"] | None) -> None:
+    def place(self, block: Block | None, mark: Mark | None) -> None:
         """Put the block, upright and at rest, and the mark at once; None: it stays.
 
         Raises:

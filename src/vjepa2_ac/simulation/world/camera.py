@@ -8,10 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from vjepa2_ac.simulation.world.domains import CameraPlace, Domain
-from vjepa2_ac.simulation.world.scene import ARM_GROUP, STATIC_GROUP, load_mujoco
+from vjepa2_ac.simulation.world.domains import ARM_GROUP, STATIC_GROUP, CameraPlace, Domain, load_mujoco
 
-FRAME_SIZE = FRAME_HEIGHT, FRAME_WIDTH = 180, 320  # size of DROID's images in RLDS
+FRAME_SIZE = 180, 320  # height and width: size of DROID's images in RLDS
 
 Pose = Float[np.ndarray, "4 4"]  # x right, y down, z into the image, in the world
 Point = Float[np.ndarray, " 3"]

@@ -167,18 +167,22 @@ class Motion:
         return forward_kinematics(self.joints)
 
 
-def random_reaching(domain: Domain, steps: int, rng: np.random.Generator, recipe: MotionRecipe | None = None) -> Motion:
+def random_reaching(
+    domain: Domain, steps: int, rng: np.random.Generator, recipe: MotionRecipe = MotionRecipe()
+) -> Motion:
     """Return a random demonstration of `steps` control steps.
 
     The same generator gives the same motion in the *world*, whatever the mounting of the robot.
     """
-    recipe = recipe or MotionRecipe()
     ways = -(-steps // recipe.stride) + 1
     times = np.arange(ways + 1) * recipe.stride
     positions, turns, closed = _waypoints(ways, rng, recipe)
     path = PchipInterpolator(times, np.concatenate([positions, turns[:, None]], axis=1))(np.arange(steps + 1))
     gripper = closed[np.arange(steps + 1) // recipe.stride]
-    commanded = _joints_along(poses_in_base(downward_poses(path), domain), domain)
+    joints = [rest := rest_joints(domain)]
+    for pose in poses_in_base(downward_poses(path), domain):
+        joints.append(inverse_kinematics(pose, joints[-1], rest=rest))
+    commanded = np.array(joints[1:])
     return Motion(
         commanded_joints=commanded[1:],
         commanded_gripper=gripper[1:],
@@ -239,11 +243,3 @@ def _waypoints(
         closed.append(1.0 - closed[-1] if rng.uniform() < recipe.gripper_share else closed[-1])
     path = np.array(points)
     return path[:, :3], path[:, 3], np.array(closed)
-
-
-def _joints_along(poses: Float[np.ndarray, "steps 6"], domain: Domain) -> Float[np.ndarray, "steps 7"]:
-    rest = rest_joints(domain)
-    joints = [inverse_kinematics(poses[0], rest, rest=rest)]
-    for pose in poses[1:]:
-        joints.append(inverse_kinematics(pose, joints[-1], rest=rest))
-    return np.array(joints)
