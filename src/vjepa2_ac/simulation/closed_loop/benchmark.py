@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from vjepa2_ac import __version__
-from vjepa2_ac.media.film import side_by_side
+from vjepa2_ac.media.film import below_each_other, side_by_side
+from vjepa2_ac.media.images import encode_png
 from vjepa2_ac.media.video import video_library, write_video
 from vjepa2_ac.planning.goals import read_goal_folder
 from vjepa2_ac.reporter import SILENT, Reporter
@@ -26,7 +27,7 @@ from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ
 from vjepa2_ac.storage import user_can_write, write_atomically
 from vjepa2_ac.storage.structured import utc_now
 
-FILE, FILM = "closed_loop.json", "closed_loop.mp4"
+FILE, FILM, STILLS = "closed_loop.json", "closed_loop.mp4", "closed_loop.png"
 FORMAT = 1  # incremented when a reader of the file would have to change
 
 
@@ -83,6 +84,8 @@ def run_benchmark(
     if options.films:
         rate_hz = CONTROL_RATE_HZ / options.stride
         files.append(write_video(folder / FILM, film_frames(results[0]), rate_hz=rate_hz))
+        write_atomically(folder / STILLS, encode_png(stills(results[0])))
+        files.append(folder / STILLS)
     return benchmark, tuple(files)
 
 
@@ -151,6 +154,8 @@ def _rounded(numbers: Float[np.ndarray, "episodes _"]) -> list[list[float]]:
     return [[round(one, 4) for one in row] for row in numbers.tolist()]
 
 
+_OUTCOMES = ("missed", "reached")
+_STILLS = 3  # episodes
 _HOLD = 4  # number of repetitions of the first and the last image of an episode
 
 
@@ -162,15 +167,28 @@ def film_frames(result: ClosedLoopResult) -> Iterator[UInt8[np.ndarray, "_ _ 3"]
             return
         about = f"{spec.task}, domain {spec.world.name}    episode {number} of {len(result.episodes)}"
         for step, (frame, distance_m) in enumerate(zip(episode.frames, episode.distances_m, strict=True)):
-            outcome = ("   missed", "   reached")[episode.success] if step == steps else ""
+            outcome = f"   {_OUTCOMES[episode.success]}" if step == steps else ""
             caption = f"{result.policy}:   {100 * distance_m:.1f} cm from the goal{outcome}"
             images, captions = [frame, episode.goal_image], [caption, "goal"]
             if any(one is not None for one in episode.imagined):
                 image, about_it = _imagined(episode, step)
                 images.append(image)
                 captions.append(about_it)
-            image = side_by_side(images, captions, f"{about}    step {step} of {steps}")
+            large = side_by_side(images[:1], captions[:1], f"{about}    step {step} of {steps}")
+            image = below_each_other([large, side_by_side(images[1:], captions[1:], enlarged=1)])
             yield from itertools.repeat(image, _HOLD if step in {0, steps} else 1)
+
+
+def stills(result: ClosedLoopResult) -> UInt8[np.ndarray, "_ _ 3"]:
+    """Return start, end and goal of the first episodes that were filmed, at least one."""
+    rows = []
+    for number, episode in enumerate(result.episodes[:_STILLS], start=1):
+        if episode.frames is not None:
+            start, end = (f"{100 * episode.distances_m[step]:.1f} cm from the goal" for step in (0, -1))
+            captions = [f"start {number}: {start}", f"end: {end}, {_OUTCOMES[episode.success]}", "goal"]
+            images = [episode.frames[0], episode.frames[-1], episode.goal_image]
+            rows.append(side_by_side(images, captions, enlarged=1))
+    return below_each_other(rows)
 
 
 def _imagined(episode: EpisodeResult, step: int) -> tuple[UInt8[np.ndarray, "height width 3"], str]:
