@@ -144,7 +144,7 @@ def strip_of(imagination: Imagination) -> FilmStrip:
                 rows.append(StripRow(_HAPPENS, kind, np.concatenate([first, truth]), captions, story))
             if not number and recorded and told.decoded_truth is not None:
                 frames = np.concatenate([decoded_first, told.decoded_truth])
-                rows.append(StripRow("the same, encoded\nand decoded", "decoded", frames, story=story))
+                rows.append(StripRow("the same,\ndecoded", "decoded", frames, story=story))
             frames = np.concatenate([decoded_first, one.frames])
             rows.append(StripRow(f"{one.model} imagines", "imagined", frames, story=story, outlines=one.outlines))
     clip = f"{_short(told.episode_id)} from control step {told.start}" if told.episode_id else "from an image"

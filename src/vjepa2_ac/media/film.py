@@ -5,7 +5,6 @@ Every image says what it is: recorded, what the simulator shows, decoded from th
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -59,6 +58,11 @@ class FilmStrip:
     seconds: tuple[float, ...]  # of each frame since the start
     source: str = ""  # model and clip, in small letters
 
+    @property
+    def about_outlines(self) -> str:
+        """What the outlines mean, if there are any."""
+        return "; white line: where the arm really is" * any(row.outlines is not None for row in self.rows)
+
 
 def spread_with_ends(size: int, count: int) -> list[int]:
     """Return at most `count` of `range(size)`, evenly spread, each once, the first and the last among them."""
@@ -79,7 +83,13 @@ def draw_strip(film: FilmStrip, *, side: int = 116) -> Pixels:
     patches = [Patch(color=colour, label=meaning) for kind, (colour, meaning) in MEANING.items() if kind in kinds]
     with _figure(film, size) as figure:
         legend = {"ncols": max(1, size[0] // _LEGEND), "fontsize": 8, "handlelength": 1, "alignment": "left"}
-        figure.legend(handles=patches, loc="outside lower left", title=film.source or None, title_fontsize=7, **legend)
+        figure.legend(
+            handles=patches,
+            loc="outside lower left",
+            title=film.source + film.about_outlines or None,
+            title_fontsize=7,
+            **legend,
+        )
         draw_rows(figure, film)
         return pixels_of(figure)
 
@@ -108,12 +118,11 @@ def film_frames(film: FilmStrip, *, side: int = 172) -> Iterator[Pixels]:
     stories, tellers = dict.fromkeys(row.story for row in film.rows), dict.fromkeys(row.label for row in film.rows)
     down, across = sorted((list(stories), list(tellers)), key=len)
     cells = {names: row for row in film.rows for names in ((row.story, row.label), (row.label, row.story))}
-    outlined = any(row.outlines is not None for row in film.rows)
     for place, seconds in enumerate(film.seconds):
         when = f"{seconds:.2f} s after the only frame that is given" if place else "the start: all that is given"
         size = _STORY + len(across) * (side + _GAP), _HEAD + len(down) * (side + _GAP)
         with _figure(film, size) as figure:
-            figure.supxlabel(when + "; white line: where the arm really is" * outlined, fontsize=9, x=0.01, ha="left")
+            figure.supxlabel(when + film.about_outlines, fontsize=9, x=0.01, ha="left")
             grid = figure.subplots(len(down), len(across), squeeze=False)
             for name, beside in zip(down, grid, strict=True):
                 for other, axes in zip(across, beside, strict=True):
@@ -121,7 +130,7 @@ def film_frames(film: FilmStrip, *, side: int = 172) -> Iterator[Pixels]:
                         axes.set_axis_off()
                     else:
                         _show(axes, row, place)
-                beside[0].set_ylabel(textwrap.fill(name, 13), rotation=0, ha="right", va="center")
+                beside[0].set_ylabel(name.replace(", ", ",\n"), rotation=0, ha="right", va="center")
             for other, axes in zip(across, grid[0], strict=True):
                 axes.set_title(other, fontsize=9.5)
             yield pixels_of(figure)

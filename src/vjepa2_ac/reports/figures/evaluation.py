@@ -293,12 +293,10 @@ def decoded_strip(evaluation: Evaluation, strip: DecodedStrip) -> FilmStrip:
     """Return the decoded images of an example clip."""
     labels: dict[str, tuple[str, Kind]] = {
         "truth": ("what happened", "recorded"),
-        "decoded_truth": ("what happened,\nencoded and decoded", "decoded"),
+        "decoded_truth": ("the same,\ndecoded", "decoded"),
     }
     rows = [
-        StripRow(
-            *labels.get(name, (f"{_short(name)} imagines,\nsame actions", "imagined")), np.ascontiguousarray(frames)
-        )
+        StripRow(*labels.get(name, (f"{_short(name)}\nimagines", "imagined")), np.ascontiguousarray(frames))
         for name, frames in strip.rows.items()
     ]
     times = range(len(rows[0].frames))

@@ -180,7 +180,7 @@ def plot_goals(made: MadeGoals, path: Path) -> Path:
     images = [made.first, *(goal.image for goal in made.goals)]
     rows = -(-len(images) // _ACROSS)
     states, course = made.recording.states, made.course
-    heights = [2.4 * rows, *(1.5 for given in (states, course) if given is not None)]
+    heights = [1.9 * rows, *(1.4 for given in (states, course) if given is not None)]
     options = made.options
     how = f"every {options.every} frames" if options.by == "every" else f"by {options.by}"
     count = f"{len(made.goals)} goal{'s' * (len(made.goals) > 1)}"
