@@ -255,6 +255,9 @@ def _doctor(options: argparse.Namespace) -> int:
     return 0 if needed <= available else 1
 
 
+_CLIP = "--episode B_seed5_00h39_000039 --start 5"  # held out; the arm is low, with room to move in the image
+
+
 def _demo(_options: argparse.Namespace) -> int:
     """Record a simulated arm, train a tiny world model with LoRA, say whether it helped, and film what it imagines.
 
@@ -269,7 +272,7 @@ def _demo(_options: argparse.Namespace) -> int:
         f"train {BUILTIN}demo",
         f"decoder {BUILTIN}demo",
         "evaluate demo/run",
-        "imagine demo/run --decoder demo/decoder --actions true,left,close",
+        f"imagine demo/run --decoder demo/decoder --actions up,left,none --steps 4 {_CLIP}",
     ]
     for words in commands[Path(_SIMULATED).exists() :]:
         print(f"$ vjepa2-ac {words}", flush=True)

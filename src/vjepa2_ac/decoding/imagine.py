@@ -18,7 +18,7 @@ from torch import Tensor
 from vjepa2_ac.decoding.decoder_folder import DecoderCard
 from vjepa2_ac.decoding.network import Decoder, as_pixels
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.media.film import FilmStrip, Kind, StripRow
+from vjepa2_ac.media.film import FilmStrip, StripRow
 from vjepa2_ac.model.state_integration import counterfactual_states, feasible_actions
 from vjepa2_ac.spaces import StateSpace
 
@@ -140,16 +140,15 @@ def strip_of(imagination: Imagination) -> FilmStrip:
             story, recorded = _story(one), name == AS_RECORDED
             if not number and (truth := told.truth if recorded else one.truth) is not None:
                 captions = ("", *map(_short_action, one.actions)) if recorded else ()
-                kind: Kind = "recorded" if recorded else "simulated"
-                rows.append(StripRow(_HAPPENS, kind, np.concatenate([first, truth]), captions, story))
+                frames = np.concatenate([first, truth])
+                rows.append(StripRow(_HAPPENS, "recorded" if recorded else "simulated", frames, captions, story))
             if not number and recorded and told.decoded_truth is not None:
                 frames = np.concatenate([decoded_first, told.decoded_truth])
                 rows.append(StripRow("the same,\ndecoded", "decoded", frames, story=story))
             frames = np.concatenate([decoded_first, one.frames])
             rows.append(StripRow(f"{one.model} imagines", "imagined", frames, story=story, outlines=one.outlines))
     clip = f"{_short(told.episode_id)} from control step {told.start}" if told.episode_id else "from an image"
-    times = range(len(rows[0].frames)) if rows else range(0)
-    seconds = tuple(time * told.seconds_per_step for time in times)
+    seconds = tuple(time * told.seconds_per_step for time in range(len(rows[0].frames) if rows else 0))
     title = "What if? " * any(one.name != AS_RECORDED for one in told.rollouts) + _TITLE
     return FilmStrip(title, tuple(rows), seconds, source=f"{told.subject}, {clip}")
 

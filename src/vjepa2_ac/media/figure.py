@@ -24,7 +24,6 @@ from vjepa2_ac.storage import atomic_writer
 # noncharacters, and marks that change the direction of text.
 _HIDDEN = re.compile("[\\x00-\\x08\\x0b-\\x1f\\x7f-\\x9f\\u202a-\\u202e\\u2066-\\u2069\\ud800-\\udfff\\ufffe\\uffff]")
 GREY, BLUE, ORANGE, GREEN, RED = "#8a8a8a", "#1f6fb4", "#d1762a", "#2b8a3e", "#b3246b"
-_LETTERS_PER_INCH = 12  # of a headline
 _STYLE = {
     "axes.spines.right": False,
     "axes.spines.top": False,
@@ -37,8 +36,8 @@ _STYLE = {
 
 def headline(figure: Any, words: str) -> None:
     """Write one line above a figure, whose layout makes room for it; what does not fit is left out."""
-    room = int(figure.get_figwidth() * _LETTERS_PER_INCH)
-    figure.suptitle(textwrap.shorten(words, room, placeholder=" …"), fontsize=10.5, x=0.01, ha="left")
+    line = textwrap.shorten(words, int(12 * figure.get_figwidth()), placeholder=" …")  # 12 letters in an inch
+    figure.suptitle(line, fontsize=10.5, x=0.01, ha="left")
 
 
 @contextmanager

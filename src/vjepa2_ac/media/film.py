@@ -148,13 +148,6 @@ def loop_of(film: FilmStrip) -> list[tuple[int, float]]:
     return [(last, _PREVIEW_S), (0, _START_S), *zip(range(1, last), steps, strict=False), (last, _END_S)]
 
 
-def held(frames: Sequence[np.ndarray], seconds: Sequence[float], rate_hz: float) -> Iterator[np.ndarray]:
-    """Yield each frame as often as a video of this rate needs to show it that long."""
-    for frame, one in zip(frames, seconds, strict=True):
-        for _ in range(max(1, round(one * rate_hz))):
-            yield frame
-
-
 @contextmanager
 def _figure(film: FilmStrip, size: tuple[int, int]) -> Iterator[Any]:
     """Yield a figure of a width and a height in pixels, with the title of a film."""

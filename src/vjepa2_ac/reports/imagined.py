@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from vjepa2_ac.decoding.imagine import Imagination, strip_of
 from vjepa2_ac.errors import UnreachableError
-from vjepa2_ac.media.film import draw_strip, film_frames, held, loop_of
+from vjepa2_ac.media.film import draw_strip, film_frames, loop_of
 from vjepa2_ac.media.images import encode_png
 from vjepa2_ac.media.video import write_gif, write_video
 from vjepa2_ac.reporter import SILENT, Reporter
@@ -29,9 +31,10 @@ def write_film_of(imagination: Imagination, folder: Path, *, reporter: Reporter 
         write_atomically(folder / STRIP, encode_png(draw_strip(strip)))
         images, loop = list(film_frames(strip)), loop_of(strip)
         frames, seconds = [images[place] for place, _ in loop], [shown for _, shown in loop]
+        times = [max(1, round(shown * _RATE_HZ)) for shown in seconds]  # that a video repeats each frame
         written = [folder / STRIP, write_gif(folder / GIF, frames, seconds=seconds)]
         try:
-            written.append(write_video(folder / VIDEO, held(frames, seconds, _RATE_HZ), rate_hz=_RATE_HZ))
+            written.append(write_video(folder / VIDEO, np.repeat(frames, times, axis=0), rate_hz=_RATE_HZ))
         except UnreachableError as error:  # PyAV is not installed
             reporter.note(f"No {VIDEO}: {error}")
         write_atomically(folder / JSON, json_text(_as_dict(imagination)))

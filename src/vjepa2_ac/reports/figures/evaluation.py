@@ -35,10 +35,9 @@ _DRAWN_FIRST = ("loss", "over_persistence", "learning_rate", "grad_norm")
 
 def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
     """Write the figure of an evaluation as PNG; it is written atomically."""
-    about = evaluation.about
-    step = step_of(about.checkpoint.partition(" ")[0])
+    step = step_of(evaluation.about.checkpoint.partition(" ")[0])
     with written_figure(path, 9.2, 4.9, dpi=150) as figure:
-        headline(figure, visible(about.subject)[-60:] + ("" if step is None else f", step {step:,}"))
+        headline(figure, visible(evaluation.about.subject)[-60:] + ("" if step is None else f", step {step:,}"))
         left, right = figure.subfigures(1, 2, width_ratios=[4, 5], wspace=0.02)
         upper, lower = left.subfigures(2, 1, height_ratios=[3, 2])
         draw_errors(upper, evaluation)
@@ -55,7 +54,7 @@ def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
 def plot_comparison(comparison: Comparison, path: Path) -> Path:
     """Write the curves of several runs as PNG; it is written atomically."""
     styles = itertools.cycle({"linestyle": dashes, "color": colour} for dashes in _DASHES for colour in _RUNS)
-    with written_figure(path, 9.5, 4.5, dpi=110, size=9) as figure:
+    with written_figure(path, 9.2, 4.7, dpi=130) as figure:
         axes = figure.subplots()
         drawn = _curves(axes, comparison.seconds, zip(comparison.curves.values(), styles, strict=False))
         axes.set(title=f"{comparison.title} (band: 95 % over episodes)", ylabel="latent error / persistence")

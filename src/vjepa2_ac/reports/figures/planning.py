@@ -180,7 +180,7 @@ def plot_goals(made: MadeGoals, path: Path) -> Path:
     images = [made.first, *(goal.image for goal in made.goals)]
     rows = -(-len(images) // _ACROSS)
     states, course = made.recording.states, made.course
-    heights = [1.9 * rows, *(1.4 for given in (states, course) if given is not None)]
+    heights = [2.0 * rows, *(1.4 for given in (states, course) if given is not None)]
     options = made.options
     how = f"every {options.every} frames" if options.by == "every" else f"by {options.by}"
     count = f"{len(made.goals)} goal{'s' * (len(made.goals) > 1)}"
@@ -230,7 +230,7 @@ def _energy(axes: Any, made: MadeGoals, course: EnergyCourse) -> None:
     if made.noise is not None:
         axes.axhline(made.noise.energy, color=RED, linewidth=1.0, linestyle="--", label="noise of a resting arm")
     axes.set(title="Energy along the demonstration", xlabel="frame", ylim=(0, None))
-    axes.legend(fontsize=7, loc="upper right", ncols=3)
+    axes.legend(fontsize=7, loc="lower right", bbox_to_anchor=(1.0, 0.97), ncols=3)
 
 
 def plot_axes(fit: AxisFit, path: Path) -> Path:

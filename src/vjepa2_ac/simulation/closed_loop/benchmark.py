@@ -83,9 +83,8 @@ def run_benchmark(
     write_atomically(files[0], json.dumps(benchmark_as_dict(benchmark), indent=1, allow_nan=False) + "\n")
     if options.films:
         rate_hz = CONTROL_RATE_HZ / options.stride
-        files.append(write_video(folder / FILM, film_frames(results[0]), rate_hz=rate_hz))
         write_atomically(folder / STILLS, encode_png(stills(results[0])))
-        files.append(folder / STILLS)
+        files += [write_video(folder / FILM, film_frames(results[0]), rate_hz=rate_hz), folder / STILLS]
     return benchmark, tuple(files)
 
 
@@ -155,7 +154,6 @@ def _rounded(numbers: Float[np.ndarray, "episodes _"]) -> list[list[float]]:
 
 
 _OUTCOMES = ("missed", "reached")
-_STILLS = 3  # episodes
 _HOLD = 4  # number of repetitions of the first and the last image of an episode
 
 
@@ -180,9 +178,9 @@ def film_frames(result: ClosedLoopResult) -> Iterator[UInt8[np.ndarray, "_ _ 3"]
 
 
 def stills(result: ClosedLoopResult) -> UInt8[np.ndarray, "_ _ 3"]:
-    """Return start, end and goal of the first episodes that were filmed, at least one."""
+    """Return start, end and goal of the first three episodes, or of fewer if fewer were filmed."""
     rows = []
-    for number, episode in enumerate(result.episodes[:_STILLS], start=1):
+    for number, episode in enumerate(result.episodes[:3], start=1):
         if episode.frames is not None:
             start, end = (f"{100 * episode.distances_m[step]:.1f} cm from the goal" for step in (0, -1))
             captions = [f"start {number}: {start}", f"end: {end}, {_OUTCOMES[episode.success]}", "goal"]
