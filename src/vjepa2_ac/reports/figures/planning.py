@@ -152,8 +152,8 @@ def _path(axes: Any, answer: PlanResult) -> None:
             axes.plot(way[:, number], "o-", markersize=4, label=space.names[number])
         axes.set(title="Planned states", xlabel="model step", ylabel="change from now")
     else:
-        axes.plot(way[:, 0], way[:, 1], "o-", color=RED, markersize=4, label="x, y (from above)")
-        axes.plot(way[:, 0], way[:, 2], "s:", color=BLUE, markersize=4, label="x, z (from the side)")
+        axes.plot(way[:, 0], way[:, 1], "o-", color=RED, markersize=4, label="x, y")
+        axes.plot(way[:, 0], way[:, 2], "s:", color=BLUE, markersize=4, label="x, z")
         axes.plot(0, 0, "o", color="black", markersize=6, zorder=6)
         reach = 1.2 * max(float(np.abs(way[:, space.position]).max()), 1.0)
         axes.set(xlabel="x from here (cm)", xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
