@@ -77,6 +77,7 @@ GIVEN = {  # pattern: what the reader has; in this order, in every page
     r"builtin:(debug|default)": rf"builtin:\1 {OF_DROID}",
     r"CONFIG checkpoint.remote=gs://my-bucket/my-run": "builtin:demo run_dir=runs/mirrored checkpoint.remote=mirror",
     r"CONFIG": "builtin:demo",
+    r" --episode B_seed5_00h39_000039 --start 5": "",  # of the 60 that the demo records
     r"RUN_OR_MODEL|\bMODEL\b": "builtin:sim-tiny",
     r"init PATH|init data/my_robot$": "init demo/data --model builtin:sim-tiny --out my.yaml --overwrite",
     r"runs/(lora|a)\b": "demo/run",
@@ -107,7 +108,7 @@ BEFORE = (  # as `vjepa2-ac demo`, and what other pages have of it
     "vjepa2-ac train builtin:demo",
     "vjepa2-ac decoder builtin:demo",
     "vjepa2-ac evaluate demo/run",
-    "vjepa2-ac imagine demo/run --decoder demo/decoder --actions true,left,close",
+    "vjepa2-ac imagine demo/run --decoder demo/decoder --actions up,left,none --steps 4",
     "vjepa2-ac train builtin:demo run_dir=demo/other seed=1",
     "vjepa2-ac evaluate demo/other",
 )

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from PIL import Image, ImageSequence
 
 import vjepa2_ac
 from paths import ROOT
@@ -127,6 +128,16 @@ def test_the_pages_are_short_together() -> None:
     pages = [ROOT / "README.md", *(path for path in (ROOT / "docs").glob("*.md") if path.name != "log.md")]
     assert sum(map(words_of, pages)) <= 25_000
     assert len((ROOT / "README.md").read_text().split()) <= 1_200
+
+
+def test_pictures_are_at_most_twice_as_wide_as_high_and_the_readmes_film_is_a_short_loop() -> None:
+    pages = "".join(path.read_text() for path in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
+    names = {Path(name).name for name in re.findall(r"!\[[^]]*]\(([^)]+)\)", pages)}
+    for path in filter(lambda path: path.name in names, (*ROOT.glob("docs/*"), *ROOT.glob("benchmarks/results/*"))):
+        with Image.open(path) as picture:
+            assert picture.width <= 2 * picture.height, path
+    with Image.open(ROOT / "docs/imagined.gif") as film:
+        assert sum(frame.info["duration"] for frame in ImageSequence.Iterator(film)) <= 6_000
 
 
 def test_the_menu_is_short() -> None:

@@ -16,13 +16,13 @@ def draw(results: Sequence[Figures], path: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(13.0, 4.6), layout="constrained")
+    figure = Figure(figsize=(9.2, 8.0), layout="constrained")
     FigureCanvasAgg(figure)
-    bars, ways, counts = figure.subplots(1, 3, width_ratios=(1.5, 1.0, 0.9))
-    _bars(bars, results)
-    _ways(ways, results)
-    _counts(counts, results)
-    figure.savefig(path, dpi=110)
+    places = figure.subplot_mosaic([["bars", "bars"], ["ways", "counts"]])
+    _bars(places["bars"], results)
+    _ways(places["ways"], results)
+    _counts(places["counts"], results)
+    figure.savefig(path, dpi=130)
 
 
 _COLOURS = {"zero-shot": "#999999", "calibrated": "#9467bd", "LoRA": "#1f77b4", "full": "#2ca02c", "scratch": "#d62728"}
@@ -42,11 +42,12 @@ def _bars(axes: Any, results: Sequence[Figures]) -> None:
             error = [[share.value - share.low], [share.high - share.value]]
             look = {"color": _COLOURS[method.kind], "alpha": 1.0 if side or of == "none" else 0.55}
             axes.bar(at, share.value, 0.8 if of == "none" else 0.38, yerr=error, capsize=2, **look)
-    axes.set_xticks(range(len(names)), names, rotation=40, ha="right")
+    axes.set_xticks(range(len(names)), names, rotation=30, ha="right")
     axes.set_ylim(0, 1.05)
     axes.set_ylabel("goals reached: within 5 cm at the end")
     axes.set_title(
-        "Reach after a change of camera and look, 20 demonstrations\n(pale: base of one camera, full: of many)"
+        "Reach after a change of camera and look, 20 demonstrations (pale: base of one camera, full: of many)",
+        fontsize=11,
     )
 
 

@@ -175,13 +175,13 @@ def draw(cells: Sequence[Figures], path: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(12.0, 6.0), layout="constrained")
+    figure = Figure(figsize=(9.2, 5.4), layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(2, 3, sharex=True)
     shown: dict[str, Callable[[Figures], float]] = {
-        "validation error / persistence": lambda one: one["validation"]["rollout_over_persistence_last"],
-        "mean rank of the true action (moves)": lambda one: one["validation"]["action_rank"],
-        "closed loop: cm left at the end": left_cm,
+        "error / persistence": lambda one: one["validation"]["rollout_over_persistence_last"],
+        "others that look better": lambda one: one["validation"]["action_rank"],
+        "cm left in closed loop": left_cm,
     }
     for row, motions in zip(panels, ("narrow", "varied"), strict=True):
         for axes, (title, figure_of) in zip(row, shown.items(), strict=True):
@@ -194,8 +194,8 @@ def draw(cells: Sequence[Figures], path: Path) -> None:
                 steps = [one["cell"]["step"] for one in run]
                 axes.plot(steps, [figure_of(one) for one in run], color=colour, marker=".", alpha=0.8, label=label)
             axes.set_ylim(bottom=0)
-            axes.set_title(f"{motions} demonstrations: {title}", fontsize=9)
+            axes.set_title(f"{motions} data: {title}", fontsize=10)
     for axes in panels[1]:
         axes.set_xlabel("optimizer steps (0: the base)")
     panels[0][0].legend()
-    figure.savefig(path, dpi=110)
+    figure.savefig(path, dpi=130)

@@ -67,11 +67,9 @@ def named(imagination: Imagination) -> dict[tuple[str, str], Imagined]:
     return {(one.model, one.name): one for one in imagination.rollouts}
 
 
-def test_recorded_actions_are_imagined_by_base_and_adapter_others_by_the_adapter(imagine: Imagine) -> None:
-    found = imagine(actions=("true", "none", "close"))
-    assert list(named(found)) == [
-        ("base", AS_RECORDED), ("adapter", AS_RECORDED), ("adapter", "none"), ("adapter", "close"),
-    ]  # fmt: skip
+def test_all_actions_are_imagined_by_base_and_adapter(imagine: Imagine) -> None:
+    found = imagine(actions=("true", "close"))
+    assert list(named(found)) == [(who, what) for what in (AS_RECORDED, "close") for who in ("base", "adapter")]
     for one in found.rollouts:
         assert one.frames.shape == (STEPS, 32, 32, 3)
         assert one.truth is None
@@ -84,20 +82,10 @@ def test_a_perfect_predictor_shows_decoded_truth_bit_for_bit(
     imagine: Imagine, true_latents: list[Tensor], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(WorldModel, "rollout", lambda *_: true_latents[0][:, 1:])
-    found = imagine(actions=("true",))
+    found = imagine(actions=("true", "up"))
     for one in found.rollouts:
         np.testing.assert_array_equal(one.frames, found.decoded_truth)
     assert (found.decoded_truth != found.decoded_first).any()
-
-
-def test_persistence_shows_the_decoded_first_frame(imagine: Imagine, monkeypatch: pytest.MonkeyPatch) -> None:
-    def copied(_: WorldModel, context: Tensor, actions: Tensor, *__: object) -> Tensor:
-        return context[:, -1:].expand(-1, actions.shape[1], -1, -1)
-
-    monkeypatch.setattr(WorldModel, "rollout", copied)
-    found = imagine(actions=("true", "up"))
-    for one in found.rollouts:
-        np.testing.assert_array_equal(one.frames, np.broadcast_to(found.decoded_first, one.frames.shape))
 
 
 def test_a_model_is_given_one_frame_and_recorded_states_with_recorded_actions_only(
@@ -108,8 +96,7 @@ def test_a_model_is_given_one_frame_and_recorded_states_with_recorded_actions_on
     episode = dataset.table.find(found.episode_id)
     steps = range(found.start, found.start + 2 * STEPS + 1, 2)
     recorded = dataset.source.read(episode).states[list(steps)]
-    (*as_recorded, counterfactual) = given
-    assert len(as_recorded) == 2
+    as_recorded, (counterfactual, _) = given[:2], given[2:]
     for context, *_ in given:
         assert torch.equal(context, true_latents[0][:, :1])
     for _, actions, states, *_ in as_recorded:
@@ -126,7 +113,7 @@ def test_a_model_is_given_one_frame_and_recorded_states_with_recorded_actions_on
 def test_frames_are_those_of_the_clip_that_was_named(imagine: Imagine, make_config: MakeConfig) -> None:
     dataset = open_dataset(make_config().data)
     name = dataset.table.identity(int(dataset.episodes[2]))
-    found = imagine(actions=("true",), episode=name, start=5)
+    found = imagine(actions=("true",), episode=name[3:], start=5)  # a part that no other name has
     assert (found.episode_id, found.start) == (name, 5)
     assert imagine(actions=("true",), episode=name).start == 0
     assert len(found.truth) == len(found.decoded_truth) == STEPS
@@ -166,9 +153,8 @@ def test_files_of_actions_have_their_names_and_never_that_of_the_recording(
     np.savetxt(tmp_path / "up.csv", 2 * rows, delimiter=",")
     found = imagine(actions=("up", *map(str, files), str(tmp_path / "up.csv")))
     names = ["up", "up.npy", f"{AS_RECORDED}.npy", str(files[2]), "up.csv"]
-    assert [one.name for one in found.rollouts] == names
-    assert {one.model for one in found.rollouts} == {"adapter"}
-    for _, actions, states, *_ in given[1:4]:
+    assert [one.name for one in found.rollouts if one.model == "adapter"] == names
+    for _, actions, states, *_ in given[2:8]:
         np.testing.assert_allclose(actions[0].numpy(), rows[:STEPS], atol=1e-6)
         np.testing.assert_allclose(states[0, :, 2] - states[0, 0, 2], 0.02 * np.arange(STEPS), atol=1e-5)
 
@@ -197,7 +183,7 @@ def test_where_nothing_was_simulated_nothing_is_said_of_what_would_happen(whole_
         ({"actions": ("nowhere.npy",)}, "nowhere.npy: cannot be read"),
         ({"actions": ()}, "--actions"),
         ({"size_m": 0.0}, "--size"),
-        ({"episode": "nobody"}, "--episode: no episode nobody"),
+        ({"episode": "nobody"}, "--episode: 0 episodes with nobody"),
         ({"episode": "first", "start": -1}, r"--start: -1, in an episode of 24 steps.*0 to 17"),
         ({"episode": "first", "start": 18}, r"--start: 18, .*0 to 17: 3 model steps take 7 control steps"),
         ({"episode": "first", "steps": 12}, "a longer episode"),

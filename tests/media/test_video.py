@@ -255,7 +255,7 @@ def test_nothing_is_left_of_a_video_that_cannot_be(tmp_path: Path) -> None:
 def test_a_film_without_pyav_is_a_gif_and_a_note(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     noted: list[str] = []
     monkeypatch.setitem(sys.modules, "av", None)
-    for name, value in (("draw_strip", FRAMES[0]), ("film_frames", FRAMES[:2]), ("durations", [0.1, 0.1])):
+    for name, value in (("draw_strip", FRAMES[0]), ("film_frames", FRAMES[:2]), ("loop_of", [(1, 0.1), (0, 0.1)])):
         monkeypatch.setattr(imagined, name, lambda *_, value=value, **__: value)
     for name in ("strip_of", "_as_dict"):
         monkeypatch.setattr(imagined, name, lambda _: {})

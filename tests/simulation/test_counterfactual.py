@@ -98,6 +98,7 @@ def test_the_hand_goes_where_the_name_says_in_states_and_in_images(start: Resimu
     assert (pixels["left"][0] - hand_pixel(arm, right.states[-1])[0]) * np.sign(across) > 15
     for name, outcome in (("up", up), ("left", left)):  # what moved there is the hand
         x, y = pixels[name].astype(int)
+        assert outcome.silhouettes[-1][y, x]
         changed = np.abs(outcome.frames[-1].astype(int) - none.frames[-1])
         assert changed[y - 2 : y + 3, x - 2 : x + 3].mean() > changed.mean() + 10
 

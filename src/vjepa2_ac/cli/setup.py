@@ -251,6 +251,9 @@ def _doctor(options: argparse.Namespace) -> int:
     return 0 if needed <= available else 1
 
 
+_CLIP = "--episode B_seed5_00h39_000039 --start 5"  # held out; the arm is low, with room to move in the image
+
+
 def _demo(_options: argparse.Namespace) -> int:
     """Record a simulated arm, train a tiny world model with LoRA, film what it imagines, and say whether it helped.
 
@@ -264,7 +267,7 @@ def _demo(_options: argparse.Namespace) -> int:
         _RECORD.format(path=_SIMULATED),
         f"train {BUILTIN}demo",
         f"decoder {BUILTIN}demo",
-        "imagine demo/run --decoder demo/decoder --actions true,left,close",
+        f"imagine demo/run --decoder demo/decoder --actions up,left,none --steps 4 {_CLIP}",
         "evaluate demo/run --decoder demo/decoder",
     ]
     for words in commands[Path(_SIMULATED).exists() :]:

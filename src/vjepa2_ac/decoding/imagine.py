@@ -8,16 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import groupby
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from vjepa2_ac.decoding.decoder_folder import DecoderCard
 from vjepa2_ac.decoding.network import Decoder, as_pixels
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.media.figure import FilmStrip, StripRow
+from vjepa2_ac.media.film import FilmStrip, StripRow
 from vjepa2_ac.model.state_integration import counterfactual_states, feasible_actions
 from vjepa2_ac.spaces import StateSpace
 
@@ -26,6 +27,7 @@ Image = UInt8[np.ndarray, "size size 3"]  # as the encoder sees it
 Film = UInt8[np.ndarray, "steps size size 3"]
 
 AS_RECORDED = "as recorded"
+_HAPPENS, _TITLE = "what really happens", "One frame is given, the rest is imagined"
 _MUCH_WORSE_DB = 5.0
 _LONGEST_NAME = 44  # characters
 _LEAST_CM, _LEAST_GRIP = 0.15, 0.05  # smaller parts of an action are not named
@@ -58,6 +60,7 @@ class Imagined:
     actions: Actions
     frames: Film  # after each action
     truth: Film | None = None
+    outlines: Bool[np.ndarray, "time size size"] | None = None  # where the arm really is, from the start on
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,29 +124,35 @@ def shown(decoder: Decoder, latents: Float[Tensor, "steps tokens dim"]) -> Film:
 
 
 def strip_of(imagination: Imagination) -> FilmStrip:
-    """Return the rows: truth, decoded truth, recorded actions as each model imagines them, then other actions."""
+    """Return the rows: for each sequence of actions, the recorded one first, what happens, then each model."""
     told, first, decoded_first = imagination, imagination.first[None], imagination.decoded_first[None]
-    recorded = [one for one in told.rollouts if one.name == AS_RECORDED]
-    rows = []
-    if told.truth is not None:
-        captions = ("", *map(_short_action, recorded[0].actions)) if recorded else ()
-        rows.append(StripRow("what happened", "recorded", np.concatenate([first, told.truth]), captions))
-    if told.decoded_truth is not None:
-        frames = np.concatenate([decoded_first, told.decoded_truth])
-        rows.append(StripRow("what happened,\nencoded and decoded", "decoded", frames))
-    for one in sorted(told.rollouts, key=lambda one: one.name != AS_RECORDED):
-        label = f"{one.model} imagines,\nsame actions"
-        if one.name != AS_RECORDED:
-            length = 100 * float(np.linalg.norm(one.actions[0, :3])) if one.actions.shape[1] == _POSE else 0.0
-            label = f"{one.model} imagines:\n{one.name}" + (f", {length:.1f} cm a step" if length >= _LEAST_CM else "")
-        rows.append(StripRow(label, "imagined", np.concatenate([decoded_first, one.frames])))
-        if one.truth is not None and one.name != AS_RECORDED:
-            frames = np.concatenate([first, one.truth])
-            rows.append(StripRow(f"what really happens:\n{one.name}", "simulated", frames))
-    clip = f"{_short(told.episode_id)} from control step {told.start}"
-    title = f"{told.subject}, {clip if told.episode_id else 'from an image'}"
-    times = range(len(rows[0].frames)) if rows else range(0)
-    return FilmStrip(title, tuple(rows), tuple(time * told.seconds_per_step for time in times))
+    rows: list[StripRow] = []
+    ordered = sorted(told.rollouts, key=lambda one: one.name != AS_RECORDED)
+    for name, rollouts in groupby(ordered, key=lambda one: one.name):
+        for number, one in enumerate(rollouts):
+            story, recorded = _story(one), name == AS_RECORDED
+            if not number and (truth := told.truth if recorded else one.truth) is not None:
+                captions = ("", *map(_short_action, one.actions)) if recorded else ()
+                frames = np.concatenate([first, truth])
+                rows.append(StripRow(_HAPPENS, "recorded" if recorded else "simulated", frames, captions, story))
+            if not number and recorded and told.decoded_truth is not None:
+                frames = np.concatenate([decoded_first, told.decoded_truth])
+                rows.append(StripRow("the same,\ndecoded", "decoded", frames, story=story))
+            frames = np.concatenate([decoded_first, one.frames])
+            rows.append(StripRow(f"{one.model} imagines", "imagined", frames, story=story, outlines=one.outlines))
+    clip = f"{_short(told.episode_id)} from control step {told.start}" if told.episode_id else "from an image"
+    seconds = tuple(time * told.seconds_per_step for time in range(len(rows[0].frames) if rows else 0))
+    title = "What if? " * any(one.name != AS_RECORDED for one in told.rollouts) + _TITLE
+    return FilmStrip(title, tuple(rows), seconds, source=f"{told.subject}, {clip}")
+
+
+def _story(one: Imagined) -> str:
+    """Return what is done, in few words."""
+    if one.name == AS_RECORDED:
+        return AS_RECORDED
+    length = 100 * float(np.linalg.norm(one.actions[0, :3])) if one.actions.shape[1] == _POSE else 0.0
+    name = "still" if one.name == "none" else one.name
+    return name + (f", {length:.3g} cm a step" if length >= _LEAST_CM else "")
 
 
 def _short_action(action: Float[np.ndarray, " action_dim"]) -> str:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from vjepa2_ac.config import Config, LimitsConfig
 from vjepa2_ac.config.data import Split
@@ -41,6 +41,7 @@ from vjepa2_ac.spaces import StateSpace
 
 _RATE_HZ = 15.0  # of a robot, where nobody says: DROID's
 _SEARCHED = 64  # clips, among which the one with the most motion is shown
+Frames = UInt8[np.ndarray, "time h w 3"]
 TRUE = "true"  # the word for the recorded actions
 
 
@@ -143,16 +144,25 @@ class Film:
     imagination: Imagination
     dataset: Dataset
     episode: int
-    as_seen: Callable[[UInt8[np.ndarray, "time h w 3"]], UInt8[np.ndarray, "time size size 3"]]  # by the encoder
+    as_seen: Callable[[Frames], UInt8[np.ndarray, "time size size 3"]]  # by the encoder
 
-    def with_outcomes(self, outcomes: Callable[[np.ndarray], UInt8[np.ndarray, "time h w 3"]]) -> Film:
-        """Return the film with what really happens under actions that were not recorded, by their outcome."""
+    def with_outcomes(self, outcomes: Mapping[str, tuple[Frames, Bool[np.ndarray, "time h w"]]]) -> Film:
+        """Return the film with what really happens.
+
+        Args:
+            outcomes: The name of actions that were not recorded -> the frames of the camera from the start on, and
+                which pixels show the arm.
+        """
         told = self.imagination
-        rollouts = tuple(
-            replace(one, truth=told.truth if one.name == AS_RECORDED else self.as_seen(outcomes(one.actions))[1:])
-            for one in told.rollouts
-        )
-        return replace(self, imagination=replace(told, rollouts=rollouts))
+
+        def with_outcome(one: Imagined) -> Imagined:
+            if one.name == AS_RECORDED:
+                return replace(one, truth=told.truth)
+            frames, arm = outcomes[one.name]
+            seen = self.as_seen(np.repeat(np.uint8(255) * arm[..., None], 3, axis=-1))
+            return replace(one, truth=self.as_seen(frames)[1:], outlines=seen[..., 0] > 127)
+
+        return replace(self, imagination=replace(told, rollouts=tuple(map(with_outcome, told.rollouts))))
 
 
 def imagine_clip(subject: str, asked: ImagineOptions, *, reporter: Reporter = SILENT) -> Film:
@@ -185,8 +195,6 @@ def imagine_clip(subject: str, asked: ImagineOptions, *, reporter: Reporter = SI
         start, states = Start.of(latents, dataset.spaces.state), latents.states[0].double().cpu().numpy()[:-1]
         for name, actions in chosen.items():
             for one in loaded.contenders:
-                if name != AS_RECORDED and one.role != "trained":
-                    continue  # others by the one that is looked at
                 with one.switched():
                     rolled = rolled_out(one.model.rollout, start, actions, states if name == AS_RECORDED else None)
                 rollouts.append(Imagined(one.name, name, actions, shown(decoder.decoder, rolled)))
@@ -236,10 +244,7 @@ def _window(dataset: Dataset, asked: ImagineOptions) -> tuple[int, int]:
             raise InputError(where="--steps", found=found, needed=f"{most} at most")
         windows = validation_windows(dataset, asked.split, clips=_SEARCHED)
         return max(windows, key=lambda window: _motion(dataset, *window))
-    episode = dataset.table.find(asked.episode)
-    if episode is None:
-        example = dataset.table.identity(int(dataset.episodes[0]))
-        raise InputError(where="--episode", found=f"no episode {asked.episode}", needed=f"one such as {example}")
+    episode = _episode(dataset, asked.episode)
     start, last = asked.start or 0, int(lengths[episode]) - clip
     if not 0 <= start <= last:
         needed = (
@@ -250,6 +255,17 @@ def _window(dataset: Dataset, asked: ImagineOptions) -> tuple[int, int]:
     return episode, start
 
 
+def _episode(dataset: Dataset, name: str) -> int:
+    """Return an episode by its name, or by a part that no other name has."""
+    table, places = dataset.table, [int(place) for place in dataset.episodes]
+    whole = table.find(name)
+    found = [place for place in places if name in table.identity(place)] if whole is None else [whole]
+    if len(found) != 1:
+        has, example = f"{len(found)} episodes with {name} in their name", table.identity((found or places)[0])
+        raise InputError(where="--episode", found=has, needed=f"one such as {example}, or a part that only it has")
+    return found[0]
+
+
 def _motion(dataset: Dataset, episode: int, start: int) -> float:
     """Return how far the robot moves in a clip, added up over its model steps."""
     steps = range(start, start + dataset.config.clip_steps, dataset.config.model_stride)
@@ -257,8 +273,6 @@ def _motion(dataset: Dataset, episode: int, start: int) -> float:
     return dataset.spaces.state.path_length(states)
 
 
-def _as_seen(
-    config: Config, size: int, frames: UInt8[np.ndarray, "time h w 3"]
-) -> UInt8[np.ndarray, "time size size 3"]:
+def _as_seen(config: Config, size: int, frames: Frames) -> UInt8[np.ndarray, "time size size 3"]:
     """Return camera frames as the encoder sees them."""
     return frames_as_seen(view(frames, config.data.crop), size)

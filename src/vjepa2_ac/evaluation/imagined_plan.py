@@ -11,7 +11,7 @@ from jaxtyping import Float
 from vjepa2_ac.data.transforms import frames_as_seen, view
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
 from vjepa2_ac.decoding.imagine import Film, Image, shown
-from vjepa2_ac.media.figure import spread_with_ends
+from vjepa2_ac.media.film import spread_with_ends
 from vjepa2_ac.planning.controller import Decision
 from vjepa2_ac.planning.decision import PlanResult
 

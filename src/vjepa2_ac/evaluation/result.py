@@ -2,7 +2,7 @@
 
 Axes: clips in one fixed order; horizon 1 .. H model steps ahead (index h - 1; H is frames - 1). All errors compare
 layer-normalised latents, by all metrics that are registered. What has intervals is computed from these by
-`evaluation.estimates`; the rows by `evaluation.rows`, the verdict as text by `evaluation.verdict`.
+`evaluation.estimates`; the rows by `evaluation.rows`, the answer by `evaluation.answer`.
 """
 
 from __future__ import annotations

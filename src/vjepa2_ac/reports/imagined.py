@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from vjepa2_ac.decoding.imagine import Imagination, strip_of
 from vjepa2_ac.errors import UnreachableError
-from vjepa2_ac.media.figure import draw_strip, durations, film_frames, held
+from vjepa2_ac.media.film import draw_strip, film_frames, loop_of
 from vjepa2_ac.media.images import encode_png
 from vjepa2_ac.media.video import write_gif, write_video
 from vjepa2_ac.reporter import SILENT, Reporter
@@ -14,7 +16,6 @@ from vjepa2_ac.storage import user_can_write, write_atomically
 from vjepa2_ac.storage.structured import json_text
 
 STRIP, VIDEO, GIF, JSON = "imagined.png", "imagined.mp4", "imagined.gif", "imagined.json"
-_SLOWER = 2.0  # than reality, so that an eye can follow
 _RATE_HZ = 15.0
 
 
@@ -28,10 +29,12 @@ def write_film_of(imagination: Imagination, folder: Path, *, reporter: Reporter 
     with user_can_write(folder):
         folder.mkdir(parents=True, exist_ok=True)
         write_atomically(folder / STRIP, encode_png(draw_strip(strip)))
-        frames, seconds = list(film_frames(strip)), durations(strip, slower=_SLOWER)
+        images, loop = list(film_frames(strip)), loop_of(strip)
+        frames, seconds = [images[place] for place, _ in loop], [shown for _, shown in loop]
+        times = [max(1, round(shown * _RATE_HZ)) for shown in seconds]  # that a video repeats each frame
         written = [folder / STRIP, write_gif(folder / GIF, frames, seconds=seconds)]
         try:
-            written.append(write_video(folder / VIDEO, held(frames, seconds, _RATE_HZ), rate_hz=_RATE_HZ))
+            written.append(write_video(folder / VIDEO, np.repeat(frames, times, axis=0), rate_hz=_RATE_HZ))
         except UnreachableError as error:  # PyAV is not installed
             reporter.note(f"No {VIDEO}: {error}")
         write_atomically(folder / JSON, json_text(_as_dict(imagination)))

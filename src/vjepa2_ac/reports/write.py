@@ -25,7 +25,8 @@ from vjepa2_ac.evaluation.evaluate_run import measure_subject
 from vjepa2_ac.evaluation.request import EvaluationOptions
 from vjepa2_ac.evaluation.result import L1, DecodedStrip, EpisodeScore, Evaluation, Example, Row, RowTable, sections
 from vjepa2_ac.evaluation.rows import rows_of
-from vjepa2_ac.media.figure import draw_strip, svg_of, visible
+from vjepa2_ac.media.figure import svg_of, visible
+from vjepa2_ac.media.film import draw_strip
 from vjepa2_ac.media.images import encode_jpeg
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.reports.figures.evaluation import decoded_strip, drawings, example_strip, plot_evaluation

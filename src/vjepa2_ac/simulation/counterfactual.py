@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from vjepa2_ac.decoding.imagine import AS_RECORDED
 from vjepa2_ac.episode import Episode
 from vjepa2_ac.errors import InputError, UserError
 from vjepa2_ac.evaluation.imagined import Film
@@ -38,6 +40,7 @@ class Outcome:
     """What happened: rendered and measured at the start and after every model step."""
 
     frames: UInt8[np.ndarray, "time height width 3"]  # through JPEG, as those of the data set
+    silhouettes: Bool[np.ndarray, "time height width"]  # which pixels show the arm, or a block
     states: Float[np.ndarray, "time 7"]  # measured
     blocks: Float[np.ndarray, "time 4"] | None  # x, y, z, rotation about z in the robot base frame; None: no block
     reached: Bool[np.ndarray, " time-1"]  # whether joint angles reach each action's target; else the arm went part way
@@ -62,17 +65,21 @@ class Resimulation:
         """
         arm = self.arm
         carry_out(arm, self.number, self.spec, until=self.start)
-        images, states, blocks, reached = [arm.image(self.camera)], [arm.state], [arm.block], []
+
+        def look() -> tuple[Any, ...]:
+            return arm.image(self.camera), arm.silhouette(self.camera), arm.state, arm.block
+
+        seen, reached = [look()], []
         for action in actions:
             reached.append(send_action(arm, np.asarray(action, dtype=np.float64), stride))
-            images.append(arm.image(self.camera))
-            states.append(arm.state)
-            blocks.append(arm.block)
+            seen.append(look())
+        images, silhouettes, states, blocks = zip(*seen, strict=True)
         encoded = [encode_jpeg(image, quality=JPEG_QUALITY) for image in images]
         return Outcome(
             frames=decode_jpegs(encoded, range(len(encoded)), "a simulated frame"),
+            silhouettes=np.stack(silhouettes),
             states=np.stack(states),
-            blocks=None if arm.block is None else np.stack([block for block in blocks if block is not None]),
+            blocks=None if arm.block is None else np.stack(blocks),
             reached=np.array(reached, bool),
         )
 
@@ -124,4 +131,6 @@ def with_what_happens(film: Film) -> Film:
     except UserError as error:
         note = f"What really happens under other actions is not known: {error}"
         return replace(film, imagination=replace(film.imagination, notes=(*film.imagination.notes, note)))
-    return film.with_outcomes(lambda actions: arm.under(actions, film.dataset.config.model_stride).frames)
+    stride, rollouts = film.dataset.config.model_stride, film.imagination.rollouts
+    outcomes = {one.name: arm.under(one.actions, stride) for one in rollouts if one.name != AS_RECORDED}
+    return film.with_outcomes({name: (one.frames, one.silhouettes) for name, one in outcomes.items()})

@@ -20,7 +20,7 @@ from vjepa2_ac.data.transforms import frames_as_seen
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
 from vjepa2_ac.decoding.imagine import AS_RECORDED, Imagination, Imagined, Start, rolled_out, shown, strip_of
 from vjepa2_ac.episode import Batch, LatentBatch
-from vjepa2_ac.media.figure import draw_strip
+from vjepa2_ac.media.film import draw_strip
 from vjepa2_ac.media.images import encode_png
 from vjepa2_ac.model.adapter.lora import base_only
 from vjepa2_ac.model.network.world_model import WorldModel

@@ -59,7 +59,7 @@ def test_an_episode_becomes_goals_by_its_gripper(
         str(workshop / "set"), "gripper", 4, 41,
     )  # fmt: skip
     with Image.open(tmp_path / "goals/goals.png") as sheet:
-        assert sheet.width == 1300
+        assert sheet.width == 1196
     printed = capsys.readouterr().out
     assert "No energies and no noise floor: --model measures them." in printed
     assert "before closing" in printed

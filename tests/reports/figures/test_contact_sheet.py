@@ -43,7 +43,7 @@ def test_any_number_of_rows_and_any_shape_of_image_fit(
 ) -> None:
     strips = [strip(steps=steps, size=size) for _ in range(rows)]
     seen = pixels(plot_contact_sheet(sheet(*strips), tmp_path / "sheet.png"))
-    assert seen.shape[1] == 1600
+    assert seen.shape[1] == 1430
     assert [path.name for path in tmp_path.iterdir()] == ["sheet.png"]
 
 

@@ -20,6 +20,7 @@ from vjepa2_ac.cli import main
 from vjepa2_ac.cli.console.tables import benchmark_notes
 from vjepa2_ac.decoding.decoder_folder import load_decoder
 from vjepa2_ac.evaluation.answer import CLOSED_LOOP_FILE
+from vjepa2_ac.media.images import read_image
 from vjepa2_ac.media.video import count_frames
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.session import load_to_plan
@@ -28,6 +29,7 @@ from vjepa2_ac.serving.session import Session, SessionOptions
 from vjepa2_ac.simulation.closed_loop.agent import JOINT_FIELDS, Agent, agent_of_session
 from vjepa2_ac.simulation.closed_loop.benchmark import (
     FILM,
+    STILLS,
     BenchmarkOptions,
     film_frames,
     run_benchmark,
@@ -91,7 +93,8 @@ def test_a_decoder_adds_what_was_imagined_to_the_film_and_changes_no_metric(mode
     frames, plain_frames = list(film_frames(shown.results[0])), list(film_frames(plain.results[0]))
     assert [one is not None and one.shape for one in filmed.imagined] == [filmed.goal_image.shape] * 2
     assert (other.imagined, plain.results[0].episodes[0].imagined) == ((), (None, None))
-    assert frames[0].shape[1] > 1.4 * plain_frames[0].shape[1]
+    np.testing.assert_array_equal(frames[0][:, :320], plain_frames[0][:, :320])
+    assert frames[0].shape[1] > 640
     assert metrics(tmp_path / "d")["about"]["decoder"] == str(tmp_path / "decoder")
     one, two = (metrics(tmp_path / name)["policies"]["tiny"]["by_episode"] for name in "pd")
     assert one["distance_cm"] == two["distance_cm"]
@@ -158,14 +161,15 @@ def test_a_broken_model_does_nothing_says_so_and_ends_with_status_1(
 def test_the_film_shows_what_the_model_saw_beside_the_goal(model: str, tmp_path: Path) -> None:
     asked = BenchmarkOptions(episodes=2, steps=1, films=1)
     benchmark, files = run_benchmark(agent_of(model), asked, tmp_path)
-    assert [file.name for file in files] == [CLOSED_LOOP_FILE, FILM]
+    assert [file.name for file in files] == [CLOSED_LOOP_FILE, FILM, STILLS]
     steered = benchmark.results[0]
     frames = list(film_frames(steered))
     episode = steered.episodes[0]
     for frame, image in ((frames[0], episode.frames[0]), (frames[-1], episode.frames[1])):
-        np.testing.assert_array_equal(frame[-360::2, :640:2], image)
-        np.testing.assert_array_equal(frame[-360::2, -640::2], episode.goal_image)
+        np.testing.assert_array_equal(frame[60:420:2, :640:2], image)
+        np.testing.assert_array_equal(frame[-180:, :320], episode.goal_image)
     assert (frames[0] != frames[-1]).any()
+    np.testing.assert_array_equal(read_image(tmp_path / STILLS)[-180:, -320:], episode.goal_image)
 
 
 def test_what_was_unusual_is_noted(model: str, tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from vjepa2_ac.data.windows import require_frames
 from vjepa2_ac.encoding.batch import encode_frames
 from vjepa2_ac.episode import FrameReader, Progress, no_progress
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.figure import spread_with_ends
+from vjepa2_ac.media.film import spread_with_ends
 from vjepa2_ac.media.video import count_frames, read_frames
 from vjepa2_ac.planning.demonstrations.key_frames import (
     KeyFrame,

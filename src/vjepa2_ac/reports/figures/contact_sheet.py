@@ -20,9 +20,9 @@ _IDLE = "#c9c9c9"
 _OUTCOME = {True: ("success", GREEN), False: ("failure", "#c0392b"), None: ("", "#b5b5b5")}
 _STRIDES = ("#7fb3dd", BLUE, "#0b3558", "#7a4fa3", "#333333")
 
-_WIDTH, _LABEL, _FILM, _ROW, _PANELS = 16.0, 1.8, 13.8, 2.1, 2.6  # inches
+_WIDTH, _LABEL, _FILM, _ROW, _PANELS = 11.0, 1.6, 9.0, 1.6, 2.5  # inches
 _EDGE = 0.2 / _WIDTH  # of the sheet, left and right
-_LEAST, _MOST, _PICTURE = 4, 14, 1.15  # pictures in a row, and the height in inches at which they are counted
+_LEAST, _MOST, _PICTURE = 4, 14, 0.8  # pictures in a row, and the height in inches at which they are counted
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,9 +67,9 @@ def pictures_per_row(height: int, width: int) -> int:
 
 def plot_contact_sheet(sheet: ContactSheet, path: Path) -> Path:
     """Write the contact sheet of a data set as PNG; it is written atomically."""
-    facts = [line for fact in sheet.facts for line in textwrap.wrap(fact, 205, subsequent_indent="    ")]
+    facts = [line for fact in sheet.facts for line in textwrap.wrap(fact, 150, subsequent_indent="    ")]
     heights = [0.7 + 0.18 * len(facts), _PANELS, *(_ROW for _ in sheet.strips)]
-    with written_figure(path, _WIDTH, sum(heights), layout="none", facecolor="white") as figure:
+    with written_figure(path, _WIDTH, sum(heights), dpi=130, layout="none", facecolor="white") as figure:
         words, panels, *rows = figure.subfigures(len(heights), 1, height_ratios=heights)
         words.text(_EDGE, 1 - 0.16 / heights[0], sheet.title, size=13, weight="bold", va="top")
         words.text(_EDGE, 1 - 0.5 / heights[0], "\n".join(facts), size=9, va="top", linespacing=1.4)
@@ -83,17 +83,18 @@ def plot_contact_sheet(sheet: ContactSheet, path: Path) -> Path:
 
 def _panels(part: Any, sheet: ContactSheet) -> None:
     """Draw the small plots of the whole set: lengths, motion per model step, places and directions."""
-    grid = part.add_gridspec(1, 4, left=0.035, right=0.975, bottom=0.3, top=0.92, width_ratios=(2.4, 4.6, 3.4, 3.0))
+    edges = {"left": 0.04, "right": 0.96, "bottom": 0.34, "top": 0.9}
+    grid = part.add_gridspec(1, 4, **edges, wspace=0.28, width_ratios=(2.0, 4.2, 3.4, 3.0))
     lengths = part.add_subplot(grid[0])
     lengths.hist(sheet.lengths_s, bins=min(40, max(5, len(sheet.lengths_s) // 2)), color=GREY)
-    lengths.set_title("Length of episodes (s)")
+    lengths.set_title("Episodes by length (s)")
     lengths.locator_params(axis="y", nbins=4, integer=True)
     _motion(part.add_subplot(grid[1]), sheet)
     if (places := sheet.places_m) is not None:
         axes = part.add_subplot(grid[2])
         shown = axes.scatter(-places[:, 1], places[:, 0], c=places[:, 2], s=2, cmap="viridis", linewidths=0)
         axes.set_aspect("equal", adjustable="datalim")
-        axes.set(title="Where the flange was, from above (m; colour: height)")
+        axes.set(title="Flange, from above (m)")
         axes.set(xlabel="-y: to the robot's right", ylabel="x: forward")
         axes.locator_params(nbins=5)
         part.colorbar(shown, ax=axes, fraction=0.04, pad=0.02)
@@ -120,7 +121,7 @@ def _directions(part: Any, axes: Any, directions: Float[np.ndarray, "rows column
     if directions.min() < ENOUGH_NEAR < directions.max():
         axes.contour(directions, [ENOUGH_NEAR], extent=extent, origin="lower", colors=ORANGE, linewidths=1.2)
     share = (directions >= ENOUGH_NEAR).mean()
-    axes.set_title(f"Directions of steps: {share:.0%} are taught")
+    axes.set_title(f"Directions: {share:.0%} taught")
     axes.set_xticks([-180, -90, 0, 90, 180], ["-x", "-y", "+x", "+y", "-x"])
     axes.set_yticks([-1, 0, 1], ["-z", "", "+z"])
     part.colorbar(shown, ax=axes, fraction=0.04, pad=0.02, ticks=[0, ENOUGH_NEAR, 1, 2])
@@ -140,9 +141,9 @@ def _motion(axes: Any, sheet: ContactSheet) -> None:
         axes.plot(reached, share, color=colour, linewidth=1.5, label=label)
     if sheet.reference is not None:
         axes.axvline(sheet.reference, color=ORANGE, linestyle="--", linewidth=1.2, label="upstream's example pair")
-    less = "move the flange less far than this (cm)" if has_poses else "change no number by more (% of its range)"
+    less = "move less far (cm)" if has_poses else "change less (% of a range)"
     axes.set(title=f"Share of model steps (%) that {less}", xlim=(0, far), ylim=(0, 102))
-    axes.legend(frameon=True, framealpha=0.85, edgecolor="none", fontsize=8, loc="lower right")
+    axes.legend(frameon=True, framealpha=0.85, edgecolor="none", fontsize=7, loc="lower right")
 
 
 def _strip(part: Any, strip: Strip, control_rate_hz: float, fastest: float) -> None:

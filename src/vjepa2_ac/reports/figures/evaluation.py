@@ -18,20 +18,8 @@ from matplotlib import colormaps
 from vjepa2_ac.evaluation.action_score import AXES, ways_of
 from vjepa2_ac.evaluation.estimates import Curve, gain_over, one_step_over_persistence, over_persistence
 from vjepa2_ac.evaluation.result import ACTIONS, DecodedStrip, Evaluation, Example, Landscapes, Mode, TrainingCurve
-from vjepa2_ac.media.figure import (
-    BLUE,
-    GREEN,
-    GREY,
-    ORANGE,
-    RED,
-    FilmStrip,
-    Kind,
-    StripRow,
-    draw_strip,
-    headline,
-    visible,
-    written_figure,
-)
+from vjepa2_ac.media.figure import BLUE, GREEN, GREY, ORANGE, RED, headline, visible, written_figure
+from vjepa2_ac.media.film import FilmStrip, Kind, StripRow, draw_rows
 from vjepa2_ac.reports.comparison import Comparison
 
 _NOTHING = "persistence (doing nothing)"
@@ -46,25 +34,25 @@ _DRAWN_FIRST = ("loss", "over_persistence", "learning_rate", "grad_norm")
 
 def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
     """Write the figure of an evaluation as PNG; it is written atomically."""
-    with written_figure(path, 13.0, 6.2, dpi=110, size=9) as figure:
-        headline(figure, evaluation.title)
-        left, right = figure.subfigures(1, 2, width_ratios=[5, 6], wspace=0.02)
+    with written_figure(path, 9.2, 4.9, dpi=150) as figure:
+        headline(figure, visible(evaluation.title)[-80:])
+        left, right = figure.subfigures(1, 2, width_ratios=[4, 5], wspace=0.02)
         upper, lower = left.subfigures(2, 1, height_ratios=[3, 2])
         draw_errors(upper, evaluation)
         draw_use_of_actions(lower, evaluation)
-        if evaluation.examples:
-            axes = right.subplots()
-            strip = example_strip(evaluation, evaluation.examples[0], most=4)
+        if evaluation.decoded is not None and evaluation.decoded.strips:
+            draw_rows(right, decoded_strip(evaluation, evaluation.decoded.strips[0]))
+        elif evaluation.examples:
+            strip = example_strip(evaluation, evaluation.examples[0])
             rows = tuple(row for row in strip.rows if row.kind != "latents") or strip.rows
-            axes.imshow(draw_strip(replace(strip, rows=rows)))
-            axes.set_axis_off()
+            draw_rows(right, replace(strip, rows=rows))
     return path
 
 
 def plot_comparison(comparison: Comparison, path: Path) -> Path:
     """Write the curves of several runs as PNG; it is written atomically."""
     styles = itertools.cycle({"linestyle": dashes, "color": colour} for dashes in _DASHES for colour in _RUNS)
-    with written_figure(path, 9.5, 4.5, dpi=110, size=9) as figure:
+    with written_figure(path, 9.2, 4.7, dpi=130) as figure:
         axes = figure.subplots()
         drawn = _curves(axes, comparison.seconds, zip(comparison.curves.values(), styles, strict=False))
         axes.set(title=f"{comparison.title} (band: 95 % over episodes)", ylabel="latent error / persistence")
@@ -281,21 +269,20 @@ def training_charts(curves: Sequence[TrainingCurve]) -> dict[str, list[TrainingC
     return {kind: charts[kind] for kind in sorted(charts, key=rank)[:_MOST_CHARTS]}
 
 
-def example_strip(evaluation: Evaluation, example: Example, most: int = 9) -> FilmStrip:
+def example_strip(evaluation: Evaluation, example: Example) -> FilmStrip:
     """Return an example clip: its frames, the error of each patch over them, and true and predicted latents."""
-    times = np.unique(np.linspace(0, len(example.true_colours) - 1, num=most).round().astype(int))
     frames = example.true_colours if example.frames is None else example.frames
     worst = max(float(errors.max()) for errors in example.errors.values())
-    rows = [] if example.frames is None else [StripRow("true frames", "recorded", frames[times])]
+    rows = [] if example.frames is None else [StripRow("true frames", "recorded", frames)]
     for name, errors in example.errors.items():
-        shown = [_overlay(frames[time], errors[time - 1] if time else None, worst) for time in times]
-        captions = tuple(f"mean {errors[time - 1].mean():.3f}" if time else "" for time in times)
+        shown = [_overlay(frame, of_frame, worst) for frame, of_frame in zip(frames, (None, *errors), strict=True)]
+        captions = ("", *(f"mean {of_frame.mean():.3f}" for of_frame in errors))
         rows.append(StripRow(f"error of {_short(name)}", "error", np.stack(shown), captions))
-    rows.append(StripRow("true latents", "latents", example.true_colours[times]))
+    rows.append(StripRow("true latents", "latents", example.true_colours))
     for name, colours in example.predicted_colours.items():
         whole = np.concatenate([example.true_colours[:1], colours])
-        rows.append(StripRow(f"latents predicted\nby {_short(name)}", "latents", whole[times]))
-    seconds = tuple(float(time) * evaluation.about.seconds_per_step for time in times)
+        rows.append(StripRow(f"latents predicted\nby {_short(name)}", "latents", whole))
+    seconds = tuple(time * evaluation.about.seconds_per_step for time in range(len(frames)))
     return FilmStrip(f"{visible(example.why)[:80]}: from control step {example.start}", tuple(rows), seconds)
 
 
@@ -303,12 +290,10 @@ def decoded_strip(evaluation: Evaluation, strip: DecodedStrip) -> FilmStrip:
     """Return the decoded images of an example clip."""
     labels: dict[str, tuple[str, Kind]] = {
         "truth": ("what happened", "recorded"),
-        "decoded_truth": ("what happened,\nencoded and decoded", "decoded"),
+        "decoded_truth": ("the same,\ndecoded", "decoded"),
     }
     rows = [
-        StripRow(
-            *labels.get(name, (f"{_short(name)} imagines,\nsame actions", "imagined")), np.ascontiguousarray(frames)
-        )
+        StripRow(*labels.get(name, (f"{_short(name)}\nimagines", "imagined")), np.ascontiguousarray(frames))
         for name, frames in strip.rows.items()
     ]
     times = range(len(rows[0].frames))

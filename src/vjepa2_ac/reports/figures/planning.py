@@ -12,7 +12,8 @@ import numpy as np
 from matplotlib.patches import Rectangle
 
 from vjepa2_ac.data.transforms import crop_box
-from vjepa2_ac.media.figure import BLUE, GREY, MEANING, ORANGE, RED, Kind, headline, show_framed, written_figure
+from vjepa2_ac.media.figure import BLUE, GREY, ORANGE, RED, headline, written_figure
+from vjepa2_ac.media.film import MEANING, Kind, show_framed
 from vjepa2_ac.planning.decision import PlanResult, summarize
 from vjepa2_ac.spaces import POSE
 
@@ -25,10 +26,9 @@ if TYPE_CHECKING:  # of other rooms, which the figure of one need not load
 PLAN_IMAGE, GOALS_IMAGE = "plan.png", "goals.png"
 
 _FRAME = "#e8b10c"
-_ROW, _ROW_OF_IMAGINED = 3.4, 2.3  # inches
+_WIDTH, _ROW, _ROW_OF_IMAGINED = 9.2, 2.6, 1.8  # inches
 _MOST_NUMBERS = 8  # of a vector
-_ACROSS = 6  # images of goals in a row
-_NAME = 70  # characters of a recording's name, its end
+_ACROSS = 4  # images of goals in a row
 _MOST_GOALS = 3  # that are shown: the first ones, and the last
 _STAR: dict[str, Any] = {"marker": "*", "s": 150, "color": RED, "edgecolors": "white", "zorder": 5}
 
@@ -49,8 +49,8 @@ def plot_plan(answer: PlanResult, path: Path, imagined: ImaginedPlan | None = No
         if answer.slices:
             rows.append((_ROW, _slices))
     heights = [height for height, _ in rows]
-    with written_figure(path, 13.0, 0.9 + sum(heights), size=9) as figure:
-        headline(figure, summarize(answer))
+    with written_figure(path, _WIDTH, 0.5 + sum(heights), dpi=130) as figure:
+        headline(figure, summarize(answer).partition(". ")[0])  # what it does; how it was found is printed
         parts = figure.subfigures(len(rows), 1, squeeze=False, height_ratios=heights)[:, 0]
         for part, (_, draw) in zip(parts, rows, strict=True):
             draw(part, answer)
@@ -140,13 +140,8 @@ def _energies(axes: Any, answer: PlanResult, plan: Plan) -> None:
     for name, (level, colour, dashes) in levels.items():
         if np.isfinite(level):
             axes.axhline(level, color=colour, linestyle=dashes, label=f"{name}: {level:.4f}")
-    seen = np.array([*elites, *lowest, plan.energy])
-    seen = seen[np.isfinite(seen)]
-    if len(seen):  # the lines of the present may lie beyond: the legend has their numbers
-        room = max(0.15 * float(np.ptp(seen)), 1e-4)
-        axes.set_ylim(seen.min() - room, seen.max() + 3 * room)
     axes.set(title="Energy", xlabel="iteration", ylabel=f"energy ({answer.controller.config.energy.distance})")
-    axes.legend(loc="upper right", fontsize=7.5)
+    axes.legend(fontsize=7)
 
 
 def _path(axes: Any, answer: PlanResult) -> None:
@@ -157,13 +152,13 @@ def _path(axes: Any, answer: PlanResult) -> None:
             axes.plot(way[:, number], "o-", markersize=4, label=space.names[number])
         axes.set(title="Planned states", xlabel="model step", ylabel="change from now")
     else:
-        axes.plot(way[:, 0], way[:, 1], "o-", color=RED, markersize=4, label="x, y (from above)")
-        axes.plot(way[:, 0], way[:, 2], "s:", color=BLUE, markersize=4, label="x, z (from the side)")
+        axes.plot(way[:, 0], way[:, 1], "o-", color=RED, markersize=4, label="x, y")
+        axes.plot(way[:, 0], way[:, 2], "s:", color=BLUE, markersize=4, label="x, z")
         axes.plot(0, 0, "o", color="black", markersize=6, zorder=6)
         reach = 1.2 * max(float(np.abs(way[:, space.position]).max()), 1.0)
         axes.set(xlabel="x from here (cm)", xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
         axes.set_title("Planned path of the flange,\nrobot base frame")
-    axes.legend(fontsize=7.5)
+    axes.legend(fontsize=7, handlelength=1.2)
 
 
 def _slices(part: Any, answer: PlanResult) -> None:
@@ -185,13 +180,12 @@ def plot_goals(made: MadeGoals, path: Path) -> Path:
     images = [made.first, *(goal.image for goal in made.goals)]
     rows = -(-len(images) // _ACROSS)
     states, course = made.recording.states, made.course
-    heights = [2.8 * rows, *(1.8 for given in (states, course) if given is not None)]
-    options, name = made.options, made.recording.name
+    heights = [2.0 * rows, *(1.4 for given in (states, course) if given is not None)]
+    options = made.options
     how = f"every {options.every} frames" if options.by == "every" else f"by {options.by}"
     count = f"{len(made.goals)} goal{'s' * (len(made.goals) > 1)}"
-    name = name if len(name) <= _NAME else f"…{name[-_NAME:]}"
-    with written_figure(path, 13.0, 0.5 + sum(heights)) as figure:
-        headline(figure, f"{count}, {how}; {options.stride} frames are a model step. Of {name}")
+    with written_figure(path, _WIDTH, 0.5 + sum(heights), dpi=130) as figure:
+        headline(figure, f"{count}, {how}; {options.stride} frames are a model step")
         sheet, *parts = figure.subfigures(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0]
         for place, axes in enumerate(sheet.subplots(rows, _ACROSS, squeeze=False).flat):
             axes.set_axis_off()
@@ -236,7 +230,7 @@ def _energy(axes: Any, made: MadeGoals, course: EnergyCourse) -> None:
     if made.noise is not None:
         axes.axhline(made.noise.energy, color=RED, linewidth=1.0, linestyle="--", label="noise of a resting arm")
     axes.set(title="Energy along the demonstration", xlabel="frame", ylim=(0, None))
-    axes.legend(fontsize=7, loc="upper right", ncols=3)
+    axes.legend(fontsize=7, loc="lower right", bbox_to_anchor=(1.0, 0.97), ncols=3)
 
 
 def plot_axes(fit: AxisFit, path: Path) -> Path:
@@ -245,7 +239,7 @@ def plot_axes(fit: AxisFit, path: Path) -> Path:
         words = (
             f"yaw {fit.yaw_degrees}, fitted yaw {fit.fitted_yaw_degrees}, gain {fit.gain}, condition {fit.condition}"
         )
-        headline(figure, words, across=110)
+        headline(figure, words)
         left, right = figure.subplots(1, 2, sharex=True, sharey=True)
         reach = 105 * max(float(np.abs(moves[:, :2]).max()) for moves in (fit.executed, fit.inferred)) or 1.0
         left.scatter(*(100 * fit.executed[:, :2].T), s=9, color=GREY, label="executed")

@@ -16,7 +16,8 @@ from vjepa2_ac import __version__
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.answer import CLOSED_LOOP_FILE, Question, closed_loop
-from vjepa2_ac.media.figure import side_by_side
+from vjepa2_ac.media.film import below_each_other, side_by_side
+from vjepa2_ac.media.images import encode_png
 from vjepa2_ac.media.video import video_library, write_video
 from vjepa2_ac.planning.demonstrations.key_frames import (
     OF_MODEL_STEPS,
@@ -131,7 +132,7 @@ def demonstrate(
     return shown.frames, shown.states
 
 
-FILM = "closed_loop.mp4"
+FILM, STILLS = "closed_loop.mp4", "closed_loop.png"
 FORMAT = 2  # incremented when a reader of the file would have to change
 
 
@@ -194,7 +195,8 @@ def run_benchmark(
     write_atomically(files[0], json.dumps(benchmark_as_dict(benchmark), indent=1, allow_nan=False) + "\n")
     if options.films:
         rate_hz = CONTROL_RATE_HZ / options.stride
-        files.append(write_video(folder / FILM, film_frames(results[0]), rate_hz=rate_hz))
+        write_atomically(folder / STILLS, encode_png(stills(results[0])))
+        files += [write_video(folder / FILM, film_frames(results[0]), rate_hz=rate_hz), folder / STILLS]
     return benchmark, tuple(files)
 
 
@@ -262,6 +264,7 @@ def _rounded(numbers: Float[np.ndarray, "episodes _"]) -> list[list[float]]:
     return [[round(one, 4) for one in row] for row in numbers.tolist()]
 
 
+_OUTCOMES = ("missed", "reached")
 _HOLD = 4  # number of repetitions of the first and the last image of an episode
 
 
@@ -273,15 +276,28 @@ def film_frames(result: ClosedLoopResult) -> Iterator[UInt8[np.ndarray, "_ _ 3"]
             return
         about = f"{spec.task}, domain {spec.world.name}    episode {number} of {len(result.episodes)}"
         for step, (frame, distance_m) in enumerate(zip(episode.frames, episode.distances_m, strict=True)):
-            outcome = ("   missed", "   reached")[episode.success] if step == steps else ""
+            outcome = f"   {_OUTCOMES[episode.success]}" if step == steps else ""
             caption = f"{result.policy}:   {100 * distance_m:.1f} cm from the goal{outcome}"
             images, captions = [frame, episode.goal_image], [caption, "goal"]
             if any(one is not None for one in episode.imagined):
                 image, about_it = _imagined(episode, step)
                 images.append(image)
                 captions.append(about_it)
-            image = side_by_side(images, captions, f"{about}    step {step} of {steps}")
+            large = side_by_side(images[:1], captions[:1], f"{about}    step {step} of {steps}")
+            image = below_each_other([large, side_by_side(images[1:], captions[1:], enlarged=1)])
             yield from itertools.repeat(image, _HOLD if step in {0, steps} else 1)
+
+
+def stills(result: ClosedLoopResult) -> UInt8[np.ndarray, "_ _ 3"]:
+    """Return start, end and goal of the first three episodes, or of fewer if fewer were filmed."""
+    rows = []
+    for number, episode in enumerate(result.episodes[:3], start=1):
+        if episode.frames is not None:
+            start, end = (f"{100 * episode.distances_m[step]:.1f} cm from the goal" for step in (0, -1))
+            captions = [f"start {number}: {start}", f"end: {end}, {_OUTCOMES[episode.success]}", "goal"]
+            images = [episode.frames[0], episode.frames[-1], episode.goal_image]
+            rows.append(side_by_side(images, captions, enlarged=1))
+    return below_each_other(rows)
 
 
 def _imagined(episode: EpisodeResult, step: int) -> tuple[UInt8[np.ndarray, "height width 3"], str]:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from scipy.spatial.transform import Rotation
 
 from vjepa2_ac.simulation.world.camera import FRAME_SIZE, RayCamera
@@ -139,13 +139,20 @@ class SimulatedArm:
         Raises:
             ValueError: No such camera.
         """
+        return self._camera(camera).image(self._data)
+
+    def silhouette(self, camera: str = "exterior_1") -> Bool[np.ndarray, "height width"]:
+        """Return which pixels of the current image of a camera show the arm, or a block."""
+        return self._camera(camera).silhouette(self._data)
+
+    def _camera(self, camera: str) -> RayCamera:
         pose = self._camera_pose(camera)
         if camera not in self._cameras:
             fov = WRIST_FOV_DEG if camera == "wrist" else self.domain.camera.vertical_fov_deg
             self._cameras[camera] = RayCamera(self._model, self.domain, pose, fov, self._size)
         elif camera == "wrist":
             self._cameras[camera].move(pose)
-        return self._cameras[camera].image(self._data)
+        return self._cameras[camera]
 
     def extrinsics(self, camera: str = "exterior_1") -> Float[np.ndarray, " 6"]:
         """Return the pose of a camera in the robot base frame: x right, y down, z into the image."""

@@ -160,15 +160,26 @@ class RayCamera:
         near = behind.from_lamp.near_arm(self._caster, data)
         dark = near[self._caster.shaded(data, self._lamp, behind.spots[near], ARM_GROUP)]
         pixels[dark] = behind.shaded[dark]
+        seen, hits = self._see_arm(data, behind)
+        spots = behind.from_camera.origin + behind.from_camera.rays[seen] * hits.distance_m[:, None]
+        ambient, direct = self._light(data, spots, hits, ARM_GROUP)
+        pixels[seen] = _as_bytes(ambient + direct)
+        return pixels.reshape(self._height, self._width, 3)
+
+    def silhouette(self, data: Any) -> Bool[np.ndarray, "height width"]:
+        """Return which pixels of the image show the arm, or a block."""
+        behind = self._background = self._background or self._see_background(data)
+        shown = np.zeros(self._height * self._width, dtype=bool)
+        shown[self._see_arm(data, behind)[0]] = True
+        return shown.reshape(self._height, self._width)
+
+    def _see_arm(self, data: Any, behind: _Background) -> tuple[Int[np.ndarray, " seen"], Hits]:
+        """Return the pixels that show what can move, and what their rays hit."""
         view = behind.from_camera
         near = view.near_arm(self._caster, data)
         hits = self._caster.cast(data, view.origin, view.rays[near], ARM_GROUP)
         front = np.flatnonzero((hits.geoms >= 0) & (hits.distance_m < behind.distance_m[near]))
-        near, hits = near[front], Hits(*(part[front] for part in hits))
-        spots = view.origin + view.rays[near] * hits.distance_m[:, None]
-        ambient, direct = self._light(data, spots, hits, ARM_GROUP)
-        pixels[near] = _as_bytes(ambient + direct)
-        return pixels.reshape(self._height, self._width, 3)
+        return near[front], Hits(*(part[front] for part in hits))
 
     def _see_background(self, data: Any) -> _Background:
         size = (self._width, self._height)
