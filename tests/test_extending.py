@@ -112,9 +112,9 @@ def test_a_loss_trains_and_a_planner_and_an_energy_plan_by_yaml(at_home: Path, m
 def test_options_and_names_are_checked_when_the_config_is_read(at_home: Path, make_config) -> None:
     (at_home / "own.yaml").write_text(as_yaml(make_config()))
     wrong = (
-        ("training.loss=log_cosch", "did you mean 'log_cosh'"),
+        ("training.loss=log_cosch", "Did you mean log_cosh?"),
         ("training.loss_options={scale: much}", "scale"),
-        ("planning.energy.distance=larges", "did you mean 'largest'"),
+        ("planning.energy.distance=larges", "Did you mean largest?"),
         ("planning.planner_options={a: 1}", "no options of its own"),
     )
     for override, told in wrong:
