@@ -93,7 +93,7 @@ def _short(text: str) -> str:
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """Return a question that names the nearest of the known names, and a space; empty where none is near."""
-    close = difflib.get_close_matches(name, list(known), n=1)
+    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.7)
     return f"Did you mean {close[0]}? " if close else ""
 
 

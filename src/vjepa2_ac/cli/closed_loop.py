@@ -58,10 +58,7 @@ def add_serve(commands: cli.Commands) -> None:
 def add_simulate(commands: cli.Commands) -> None:
     """Add `simulate` to a parser: it records if its first word is `record`, else it tests a model in closed loop."""
     parser = cli.command(commands, "simulate", _simulate, "demo/run --task reach --domain B --episodes 10")
-    text = (
-        "who steers: the folder of a run, or what model.base takes, such as builtin:sim-tiny; or a server of one, as"
-        " ws://127.0.0.1:8000; or: record"
-    )
+    text = "a run, what model.base takes (builtin:sim-tiny), or the server of one (ws://127.0.0.1:8000); or: record"
     cli.add(parser, "subject RUN_OR_MODEL|ws://SERVER|record", text, cli.as_planner)
     cli.add(parser, "overrides key=value|FOLDER", "such as planning.samples=64; record: where the data go", nargs="*")
     text = "what is to be done (reach); record: push, pick or place, with a block on the table (none: reaching around)"
@@ -69,20 +66,14 @@ def add_simulate(commands: cli.Commands) -> None:
     text = "A or B; record: or random, another world in every episode (A)"
     cli.add(parser, "--domain", text, choices=["A", "B", "random"], default="A")
     cli.add(parser, "--episodes N", "how many (50; record: 40)", cli.count)
-    cli.add(
-        parser, "--steps N", "model steps (8; pick: 12, place: 18); record: control steps (41; place: 81)", cli.count
-    )
+    cli.add(parser, "--steps N", "model steps (8; pick 12, place 18); record: control steps (41; place 81)", cli.count)
     cli.add(parser, "--seed N", "which problems or demonstrations (0)", cli.whole_number(0, 2**31 - 1))
     group = parser.add_argument_group("to test a model")
     cli.add_checkpoint(group, default=None)
     cli.add(group, "--config CONFIG", "for a model: the config whose `planning` is used", cli.as_local)
-    text = (
-        "goals on the way: demonstration takes them from the oracle's solution of the same problem, where the gripper"
-        " changes or the arm stops; every-step: each model step of it (none)"
-    )
+    text = "goals on the way, of the oracle's solution: where gripper or arm stop, or each model step of it (none)"
     cli.add(group, "--sub-goals", text, choices=["none", "demonstration", "every-step"])
-    text = "a folder of goals on the way, that `vjepa2-ac goals` made: the same in every problem, of a fixed scene"
-    cli.add(group, "--goals FOLDER", text, cli.as_local)
+    cli.add(group, "--goals FOLDER", "goals on the way, that `vjepa2-ac goals` made, of a fixed scene", cli.as_local)
     cli.add(group, "--films N", "episodes in the video; 0: none (6)", cli.whole_number(0))
     cli.add_decoder(group, "in the video what the model imagined of each frame, a step ago")
     cli.add(group, "--out FOLDER", "where figures and video go (closed_loop/TASK-DOMAIN, in the run's)", cli.as_path)

@@ -30,10 +30,7 @@ def _add_commands(commands: cli.Commands) -> None:
     parser = cli.command(commands, "check", _check, "my_robot.yaml")
     cli.add_config(parser, such_as=such_as)
     cli.add(parser, "--limit N", "clips to load (32); to probe, twice as many", cli.count, default=32)
-    text = (
-        "probe the data with a model that knows robots (a run, or what model.base takes): does it predict better where"
-        " frames are shifted, mirrored, reversed, BGR, or the gripper is inverted?"
-    )
+    text = "ask a model that knows robots, too: are frames shifted, mirrored, reversed, BGR, or the gripper inverted?"
     cli.add(parser, "--model RUN_OR_MODEL", text, cli.as_model)
 
     parser = cli.command(commands, "index", _index, "my_robot.yaml")
@@ -48,13 +45,9 @@ def _add_commands(commands: cli.Commands) -> None:
 
     parser = cli.command(commands, "calibrate", _calibrate, "my_robot.yaml --limit 64")
     cli.add_config(parser, such_as=such_as)
-    text = (
-        "fit the moves that this model infers from pairs of frames to the executed ones: axes.json, for planning.axes"
-    )
-    cli.add(parser, "--axes RUN_OR_MODEL", text, cli.as_model)
+    cli.add(parser, "--axes RUN_OR_MODEL", "fit the moves that it infers to the executed ones: axes.json", cli.as_model)
     cli.add(parser, "--model MODEL", "ask another than model.base: a .pt, a folder, or a run", cli.as_model)
-    splits = ["train", "validation", "test"]
-    cli.add(parser, "--split", "which episodes (validation)", choices=splits, default="validation")
+    cli.add(parser, "--split", "of which (validation)", choices=["train", "validation", "test"], default="validation")
     cli.add(parser, "--limit N", "clips at each stride (64), or pairs of frames (200)", cli.count)
     cli.add(parser, "--frames N", "frames of a clip (the config's, 8 at most)", cli.whole_number(2, 256))
     cli.add(parser, "--out DIR", "where files go (inspection)", cli.as_path, default=out)

@@ -21,31 +21,29 @@ def add_evaluate(commands: cli.Commands) -> None:
     parser = cli.command(commands, "evaluate", _evaluate, "demo/run --clips 64 --decoder demo/decoder")
     text = "folder of a run, or (with --data) what model.base takes; several: their spread, too"
     cli.add(parser, "subjects RUN_OR_MODEL", text, cli.as_subject, nargs="+")
-    text = "what to compare with, on the same latents (the base of a run; nothing for a model)"
-    cli.add(parser, "--against base|RUN|MODEL", text, cli.as_model, nargs="+")
+    cli.add(parser, "--against base|RUN|MODEL", "what to compare with (the base of a run)", cli.as_model, nargs="+")
     cli.add(parser, "--clips N", "at most this many clips, spread over the episodes (256)", cli.count)
     cli.add_decoder(parser, "the rollouts as images, and measure these, too")
-    text = (
-        "plan from held-out frames, and hold the plans against the demonstrations: action error, Action Score (this"
-        " takes long: docs/evaluation.md); settings of the plan of one step, such as planning.samples=200, in place of"
-        " the config's, here or anywhere"
-    )
+    text = "plan, too, and compare with the demonstrations (long); with these settings of planning, here or anywhere"
     cli.add(parser, "--planning planning.key=value", text, nargs="*", dest="plan_settings")
     cli.add(parser, "--out FOLDER", "where figures go (the run's folder)", cli.as_path)
     group = parser.add_argument_group("data, and what is measured")
-    cli.add(
-        group,
-        "--data CONFIG",
-        "measure on other data: this config's (with its model.dtype, device, seed)",
-        cli.as_local,
-    )
+    cli.add(group, "--data CONFIG", "measure on its data (with its model.dtype, device, seed)", cli.as_local)
     cli.add(group, "--split", "which held-out episodes (test)", choices=["test", "validation"])
     cli.add_checkpoint(group)
     cli.add(group, "--planning-clips N", "clips to plan from, one frame of each (32)", cli.count, default=32)
     cli.add(group, "--calibrate", "measure the one-step error at other strides, too", action="store_true")
     cli.add(group, "--lpips FILE", "weights for LPIPS of the decoded images (docs/decoding.md)", cli.as_path)
     cli.add(group, "--lpips-heads FILE", "its heads: alex.pth or vgg.pth of version 0.1", cli.as_path)
-    _add_probes(parser.add_argument_group("use of the actions"))
+    group = parser.add_argument_group("use of the actions")
+    cli.add(group, "--sensitivity-clips N", "clips to try other actions on (32)", cli.whole_number(0))
+    cli.add(group, "--samples N", "other actions for each of them (64)", cli.count)
+    cli.add(group, "--landscapes N", "those with a landscape (8)", cli.whole_number(0), dest="landscape_clips")
+    cli.add(group, "--axes N", "clips of those to calibrate the axes by (32)", cli.whole_number(0), dest="axis_clips")
+    cli.add(group, "--nodes N", "points of a landscape along each axis (9)", cli.whole_number(3, 51))
+    cli.add(group, "--reach CM", "half its width (7.5)", cli.number_between(0.0, 1000.0, "cm"), dest="reach_cm")
+    cli.add(group, "--examples N", "clips to show (4)", cli.whole_number(0))
+    cli.add(group, "--at-once N", "actions computed together (64): lower it to save memory", cli.count)
     parser.set_defaults(overrides=[])
 
 
@@ -58,16 +56,12 @@ def add_compare(commands: cli.Commands) -> None:
 
 def add_imagine(commands: cli.Commands) -> None:
     """Add `imagine` to a parser."""
-    example = "demo/run --decoder demo/decoder --actions true,up,left"
-    parser = cli.command(commands, "imagine", _imagine, example)
+    parser = cli.command(commands, "imagine", _imagine, "demo/run --decoder demo/decoder --actions true,up,left")
     cli.add_planner(parser, such_as="with --image: such as planning.limits.xyz=data")
-    cli.add(
-        parser, "--decoder FOLDER", "what `vjepa2-ac decoder` made, or builtin:sim-tiny", cli.as_model, required=True
-    )
+    cli.add_decoder(parser, "what is imagined", required=True)
     text = (
-        "with commas between them: true (the recorded ones of a clip), none, up, down, left, right, forward, back,"
-        " open, close, in the robot's frame; or files, .npy or .csv: a row of 7 numbers for each step"
-        " (true,none,up,left,close)"
+        "with commas between them: true (as recorded), none, up, down, left, right, forward, back, open, close; or"
+        " files, .npy or .csv, with a row of 7 numbers for each step (true,none,up,left,close)"
     )
     cli.add(parser, "--actions NAMES", text)
     cli.add(parser, "--steps N", "model steps to imagine (7)", cli.count, default=7)
@@ -81,20 +75,6 @@ def add_imagine(commands: cli.Commands) -> None:
     group = parser.add_argument_group("instead of a clip")
     cli.add(group, "--image IMAGE", "what a camera sees: PNG or JPEG; actions by name only", cli.as_local)
     cli.add(group, "--state NUMBERS", "measured then, as `plan --state`")
-
-
-def _add_probes(group: argparse._ArgumentGroup) -> None:
-    cli.add(group, "--sensitivity-clips N", "clips to try other actions on (32)", cli.whole_number(0))
-    cli.add(group, "--samples N", "other actions for each of them (64)", cli.count)
-    cli.add(
-        group, "--landscapes N", "of those, with an energy landscape (8)", cli.whole_number(0), dest="landscape_clips"
-    )
-    cli.add(group, "--axes N", "clips of those to calibrate the axes by (32)", cli.whole_number(0), dest="axis_clips")
-    cli.add(group, "--nodes N", "points of a landscape along each axis (9)", cli.whole_number(3, 51))
-    text = "half the width of a landscape, and of the box of actions (7.5)"
-    cli.add(group, "--reach CM", text, cli.number_between(0.0, 1000.0, "cm"), dest="reach_cm")
-    cli.add(group, "--examples N", "clips to show (4)", cli.whole_number(0))
-    cli.add(group, "--at-once N", "actions computed together (64): lower it to save memory", cli.count)
 
 
 def _evaluate(options: argparse.Namespace) -> None:

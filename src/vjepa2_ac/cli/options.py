@@ -28,10 +28,6 @@ Commands: TypeAlias = "argparse._SubParsersAction[Parser]"
 Handler = Callable[[argparse.Namespace], int | None]
 
 _MOST = 10**9
-_EPILOG = (
-    "A default stands in brackets. With every command: --plugin MODULE, a module of yours that registers a form of"
-    " data, a loss, a planner, ... (docs/extending.md); repeatable."
-)
 _OPTION = re.compile(r"-(?![\d.])")  # but a negative number is a value
 _OVERRIDE = re.compile(r"[a-z_]+(\.\w+)+=")
 _Record = TypeVar("_Record")
@@ -79,11 +75,6 @@ class Parser(argparse.ArgumentParser):
         """Print the error, and exit with status 2."""
         super().error(printable(message))
 
-    def unrecognized(self, words: Sequence[str]) -> NoReturn:
-        """Print which words are unknown, and the option that may have been meant; exit with status 2."""
-        hint = did_you_mean(words[0], self._option_string_actions)
-        self.error(f"unrecognized arguments: {' '.join(words)}. {hint}".removesuffix(". ").rstrip())
-
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         known = [str(one) for one in action.choices or ()]
         if known and str(value) not in known:
@@ -102,7 +93,7 @@ def command(commands: Commands, name: str, handler: Handler, example: str = "") 
     """
     text = inspect.getdoc(handler) or ""
     parser = commands.add_parser(name, help=text.partition("\n\n")[0], description=text)
-    parser.example, parser.epilog = example, _EPILOG
+    parser.example, parser.epilog = example, "A default stands in brackets. Also: --plugin MODULE (docs/extending.md)."
     parser.set_defaults(handler=handler, parser=parser)
     add(parser, "--plugin MODULE", argparse.SUPPRESS, action="append", default=[])
     return parser
@@ -120,18 +111,16 @@ def add_commands(parser: Parser, groups: Mapping[str, Sequence[Callable[[Command
         parser.print_help()
         return 2
 
-    commands, names = parser.add_subparsers(metavar="COMMAND", help=argparse.SUPPRESS), dict[str, list[str]]()
+    commands = parser.add_subparsers(metavar="COMMAND", help=argparse.SUPPRESS)
     for title, adders in groups.items():
         before = len(commands.choices)
         for add_to in adders:
             add_to(commands)
-        names[title] = list(commands.choices)[before:]
-    width, parts = max(map(len, commands.choices)), [parser.description or ""]
-    for title, inner in names.items():
-        about = [(name, (commands.choices[name].description or "").partition("\n\n")[0]) for name in inner]
-        lines = [f"  {name:<{width}}  {text}" for name, text in about]
-        parts += ["\n".join([f"{title}:", *lines])] if lines else []
-    parser.description, parser.usage = "\n\n".join(parts), f"{parser.prog} COMMAND ..."
+        added = list(commands.choices.items())[before:]
+        lines = [f"  {name:<9} {(one.description or ' ').splitlines()[0]}" for name, one in added]
+        if lines:
+            parser.description = "\n".join([f"{parser.description}\n\n{title}:", *lines])
+    parser.usage = f"{parser.prog} COMMAND ..."
     parser.set_defaults(handler=no_command, parser=parser, plugin=[])
 
 
@@ -154,15 +143,15 @@ def add(
     parser.add_argument(*names, help=text, **how)
 
 
-def add_config(parser: argparse.ArgumentParser, *, such_as: str, what: str = "a YAML config") -> None:
+def add_config(parser: argparse.ArgumentParser, *, such_as: str, what: str = "a YAML config", **how: Any) -> None:
     """Add the config that a command reads, and `key=value` words behind it."""
-    add(parser, "config CONFIG", what, as_local)
+    add(parser, "config CONFIG", what, as_local, **how)
     add(parser, "overrides key=value", f"such as {such_as} (all keys: `vjepa2-ac config schema`)", nargs="*")
 
 
 def add_checkpoint(parser: argparse._ActionsContainer, default: str | None = "selected") -> None:
     """Add the option that selects a checkpoint of a run."""
-    text = "a step, or selected, newest or best (selected: the best by validation, else the newest)"
+    text = "or selected, newest, best (selected: the best by validation, else the newest)"
     add(parser, "--checkpoint STEP", text, default=default)
 
 
@@ -173,14 +162,13 @@ def add_planner(parser: argparse.ArgumentParser, *, such_as: str) -> None:
     group = parser.add_argument_group("the model")
     add_checkpoint(group)
     add(group, "--config CONFIG", "for a model: the config whose planning, crop and dtype count", as_local)
-    text = "the camera's x,y,z,roll,pitch,yaw in the robot base frame, if the model uses it"
-    add(group, "--extrinsics NUMBERS", text)
+    add(group, "--extrinsics NUMBERS", "the camera's x,y,z,roll,pitch,yaw in the base frame, if the model uses it")
 
 
-def add_decoder(parser: argparse._ActionsContainer, shows: str) -> None:
+def add_decoder(parser: argparse._ActionsContainer, shows: str, **how: Any) -> None:
     """Add `--decoder`, with which something is drawn."""
     text = f"show {shows}, with what `vjepa2-ac decoder` made, or builtin:sim-tiny"
-    add(parser, "--decoder FOLDER", text, as_model)
+    add(parser, "--decoder FOLDER", text, as_model, **how)
 
 
 def record_of_options(kind: Callable[..., _Record], options: argparse.Namespace, **others: Any) -> _Record:
@@ -335,10 +323,11 @@ def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> 
     """
     options, rest = parser.parse_known_args(arguments)
     parser, others = options.parser, [word for word in rest if "=" not in word or _OPTION.match(word)]
-    if rest and not hasattr(options, "overrides"):
-        parser.unrecognized(rest)
-    if any(map(_OPTION.match, others)):
-        parser.unrecognized(others)
+    takes_keys = hasattr(options, "overrides")
+    if any(map(_OPTION.match, others)) or (rest and not takes_keys):
+        unknown = others if takes_keys else rest
+        text = f"unrecognized arguments: {' '.join(unknown)}. {did_you_mean(unknown[0], parser._option_string_actions)}"
+        parser.error(text.removesuffix(". ").rstrip())
     if others and vars(options).get("subject") != "record":  # `simulate record` takes a folder there
         parser.error(f"{' '.join(others)!r} is no key=value (numbers go in one word: 0.4,0,0.3; names side by side)")
     if "subjects" in options:

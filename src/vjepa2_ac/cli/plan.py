@@ -27,27 +27,18 @@ def add_plan(commands: cli.Commands) -> None:
     parser = cli.command(commands, "plan", _plan, "demo/run --start a.png --goal b.png --state 0.4,0,0.3,3,0,0,0")
     cli.add_planner(parser, such_as=f"such as planning.horizon=2; quick, for a CPU: {_QUICK}")
     cli.add(parser, "--start IMAGE", "what the camera sees now: PNG or JPEG", cli.as_local, required=True)
-    text = (
-        "measured x,y,z (m), roll,pitch,yaw (radians, extrinsic xyz), gripper (0 open .. 1 closed); or the numbers of a"
-        " vector, as the data had them"
-    )
+    text = "measured x,y,z (m), roll,pitch,yaw (radians, extrinsic xyz), gripper (0 open .. 1 closed); or a vector"
     cli.add(parser, "--state NUMBERS", text, required=True)
-    text = "what it is to see in the end; again for goals that follow one another"
     goals = parser.add_mutually_exclusive_group(required=True)
-    cli.add(goals, "--goal IMAGE", text, cli.as_local, action="append")
+    cli.add(goals, "--goal IMAGE", "what it is to see; again for goals in a row", cli.as_local, action="append")
     cli.add(goals, "--goals FOLDER", "goals with rules of their own, that `vjepa2-ac goals` made", cli.as_path)
     cli.add(parser, "--out FOLDER", "where both files go (plan)", cli.as_path, default=Path("plan"))
     group = parser.add_argument_group("the goals")
     cli.add(group, "--durations STEPS", "model steps of all goals but the last, as 2,1 (equal shares)")
-    cli.add(
-        group, "--mask IMAGE", "what of the image counts: of the goal's size, black where it does not", cli.as_local
-    )
+    cli.add(group, "--mask IMAGE", "black where the goal image does not count, of its size", cli.as_local)
     group = parser.add_argument_group("the search, and its image")
     cli.add(group, "--seed N", "of the search (the config's)", cli.whole_number(0, 2**31 - 1))
-    text = (
-        "points of the image's energy maps along each axis; 0: no maps (13, or as many as evaluate no more action"
-        " sequences than the search)"
-    )
+    text = "points of the image's energy maps along each axis; 0: no maps (13, or fewer where the search is short)"
     cli.add(group, "--nodes N", text, cli.whole_number(0, 101))
     cli.add_decoder(group, "in the image what the planner imagined, beside the goal")
 
@@ -59,13 +50,9 @@ def add_goals(commands: cli.Commands) -> None:
     cli.add(parser, "overrides key=value", "of the config, such as data.camera=wrist_left", nargs="*")
     cli.add(parser, "--out FOLDER", "where goals.json and the images go: new or empty", cli.as_path, required=True)
     cli.add(parser, "--episode ID|NUMBER", "which one: its name in the data, or its number, from 0 (0)")
-    text = (
-        "gripper: where it changes, the arm stops, and the end, from the states; latent: where images stop becoming"
-        " more like the next goal, with --model; every N: every N-th frame (gripper; of a film latent)"
-    )
+    text = "gripper: where it changes or the arm stops; latent: by images; every N frames (gripper; of a film latent)"
     cli.add(parser, "--by gripper|latent|every", text, nargs="+")
-    text = "what will plan, for latents, energies and the noise floor: folder of a run, or what model.base takes"
-    cli.add(parser, "--model RUN_OR_MODEL", text, cli.as_model)
+    cli.add(parser, "--model RUN_OR_MODEL", "what will plan: for latents, energies and the noise floor", cli.as_model)
     cli.add(parser, "--stride N", "frames of a model step (data.stride); needed of a film", cli.count)
     group = parser.add_argument_group("where goals lie, and when the next one follows")
     cli.add_checkpoint(group, default=None)
@@ -74,9 +61,7 @@ def add_goals(commands: cli.Commands) -> None:
     share, energy = cli.number_between(0.0, 1.0, "the energy"), "below this share of the energy at a goal's beginning"
     cli.add(group, "--share X", f"{energy} the next one follows (none: by steps only)", share)
     cli.add(group, "--stop-share X", f"{energy} the last one is reached (none: an equal image)", share)
-    cli.add(
-        group, "--still VIDEO", "a film of the resting arm, for the noise floor (where the episode rests)", cli.as_path
-    )
+    cli.add(group, "--still VIDEO", "of the resting arm, for the noise floor (where the episode rests)", cli.as_path)
 
 
 def _plan(options: argparse.Namespace) -> int:

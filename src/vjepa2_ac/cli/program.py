@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
 import sys
 from collections.abc import Iterator, Sequence
 from functools import partial
@@ -24,6 +25,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     130 interrupted. A reader that closes early, as `head` does, changes nothing; a full disk for the output is an
     error, in the end.
     """
+    if "_ARGCOMPLETE" in os.environ:  # a shell asks what may stand at its cursor
+        from vjepa2_ac.cli.completion import complete
+
+        complete(_parser(os.environ["COMP_LINE"].split()[1:]))
     with process.own_streams() as lost, _our_warnings(), tidy_end():
         status = _run(arguments)
         if problem := lost():
@@ -97,8 +102,8 @@ def _our_warnings() -> Iterator[None]:
 def _parser(words: Sequence[str] = ()) -> Parser:
     parser = Parser(prog="vjepa2-ac", description="Fine-tune V-JEPA 2-AC with LoRA, and know whether it helped.")
     parser.add_argument("--version", action="version", version=__version__, help="show the version")
-    parser.epilog = "`vjepa2-ac COMMAND --help` begins with an example."
-    groups = {
+    parser.epilog = "`vjepa2-ac COMMAND --help` begins with an example. Completion behind TAB: docs/start.md."
+    groups: dict[str, list[Callable[[Commands], None]]] = {
         "begin": [setup.add_demo, setup.add_init, setup.add_download, setup.add_doctor, setup.add_config_command],
         "look": [data.add_data, evaluate.add_imagine],
         "train": [train.add_encode, train.add_train, train.add_decoder_command],

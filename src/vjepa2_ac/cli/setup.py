@@ -36,21 +36,11 @@ _RECORD = "simulate record {path} --domain B --episodes 60 --seed 5"
 def add_init(commands: cli.Commands) -> None:
     """Add `init` to a parser."""
     parser = cli.command(commands, "init", _init, "data/my_robot")
-    text = (
-        f"one of {', '.join(FORMS)}; or left out: the files tell. sim: simulated data and the tiny model. scratch: a"
-        " fresh predictor on V-JEPA 2.1's ViT-B, without Meta's action-conditioned model"
-    )
+    text = f"one of {', '.join(FORMS)} (the files tell); sim: simulated data; scratch: a fresh predictor"
     cli.add(parser, "form FORM", text, cli.as_place, nargs="?")
-    cli.add(
-        parser, "path PATH", "the data: a folder, or a URL (droid, lerobot, raw: DROID's own)", cli.as_place, nargs="?"
-    )
+    cli.add(parser, "path PATH", "a folder, or a URL (droid, lerobot, raw: DROID's own)", cli.as_place, nargs="?")
     cli.add(parser, "--out FILE", "the config to write (NAME.yaml, by the data's folder)", cli.as_path)
-    cli.add(
-        parser,
-        "--model MODEL",
-        "another than the released one: what model.base takes; scratch: an encoder",
-        cli.as_model,
-    )
+    cli.add(parser, "--model MODEL", "another than the released; scratch: an encoder", cli.as_model)
     cli.add(parser, "--overwrite", "write over a config that is there", action="store_true")
 
 
@@ -74,10 +64,8 @@ def add_download(commands: cli.Commands) -> None:
 def add_doctor(commands: cli.Commands) -> None:
     """Add `doctor` to a parser."""
     parser = cli.command(commands, "doctor", _doctor, "my_robot.yaml training.batch_size=4")
-    cli.add(parser, "config CONFIG", "a YAML config: does it fit?", cli.as_local, nargs="?")
-    cli.add(parser, "overrides key=value", "such as training.batch_size=4", nargs="*")
-    text = "for a bug report: versions, machine and settings; so, too, without CONFIG"
-    cli.add(parser, "--report", text, action="store_true")
+    cli.add_config(parser, such_as="training.batch_size=4", nargs="?")
+    cli.add(parser, "--report", "versions, machine and settings, for a bug report", action="store_true")
 
 
 def add_demo(commands: cli.Commands) -> None:
@@ -239,7 +227,8 @@ def _doctor(options: argparse.Namespace) -> int:
     if options.report or options.config is None:
         from vjepa2_ac.cli.console.setup import report_lines
 
-        print("\n".join(report_lines()))
+        for line in report_lines():
+            print(line)
         return 0
 
     from vjepa2_ac.config.loading import load_config

@@ -12,8 +12,7 @@ from vjepa2_ac.errors import InputError
 def add_train(commands: cli.Commands) -> None:
     """Add `train` to a parser."""
     parser = cli.command(commands, "train", _train, "my_robot.yaml training.steps=1000")
-    what = "a YAML config, or with --resume the folder of a run"
-    cli.add_config(parser, such_as="training.learning_rate=3e-4", what=what)
+    cli.add_config(parser, such_as="training.learning_rate=3e-4", what="a YAML config, or (--resume) a run's folder")
     cli.add(parser, "--resume", "go on with the run in the folder CONFIG", action="store_true")
     cli.add(parser, "--check", "do everything that can fail, and stop before the first step", action="store_true")
     cli.add(parser, "--allow-config-change", "go on with a run though the config is another", action="store_true")
@@ -38,10 +37,7 @@ def add_export(commands: cli.Commands) -> None:
     parser = cli.command(commands, "export", _export, "runs/my_robot merged")
     cli.add(parser, "run RUN", "folder of a run", cli.as_path)
     cli.add(parser, "folder FOLDER", "what is written: new or empty; official: or a .pt file", cli.as_path)
-    text = (
-        "merged: a folder that `model.base` takes. official: one .pt by Meta's names, for the official code. hub: the"
-        " adapter in PEFT's format with a model card, ready to upload"
-    )
+    text = "merged: for model.base; official: a .pt by Meta's names; hub: the adapter in PEFT's format, with a card"
     cli.add(parser, "--to", text, choices=["merged", "official", "hub"], default="merged")
     cli.add_checkpoint(parser)
 
