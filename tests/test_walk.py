@@ -42,7 +42,7 @@ def test_what_is_shown_is_what_the_program_takes(step, monkeypatch: pytest.Monke
     words = (step.shown if step.why_not else step.run).partition(" > ")[0]
     words = words.partition("|| ")[2] or words
     assert step.why_not or not re.search(r"[…\[\]]", words), "a placeholder"
-    if words.startswith("vjepa2-ac"):
+    if words.startswith("vjepa2-ac") and "…" not in words:
         monkeypatch.chdir(ROOT)
         options = program.parsed(program._parser(), shlex.split(words)[1:])
         config = str(getattr(options, "config", None))

@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-import argcomplete
 from argcomplete.completers import FilesCompleter
+from argcomplete.finders import CompletionFinder
 
 
-class _Completion(argcomplete.CompletionFinder):
+class _Completion(CompletionFinder):
     """Offers config keys where nothing else fits, too: argparse knows none behind an option."""
 
     def collect_completions(self, active_parsers: Any, parsed_args: Any, cword_prefix: str) -> list[str]:
@@ -19,7 +19,7 @@ class _Completion(argcomplete.CompletionFinder):
 
 def complete(parser: argparse.ArgumentParser) -> None:
     """Tell the shell that asks which words may stand at its cursor, and end the process."""
-    _Completion()(parser, always_complete_options=False, default_completer=_words)
+    _Completion()(parser, always_complete_options=False, default_completer=_words)  # type: ignore[arg-type] # any callable will do
 
 
 def _words(prefix: str, action: argparse.Action, **_others: Any) -> list[str]:

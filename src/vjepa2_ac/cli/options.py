@@ -151,8 +151,7 @@ def add_config(parser: argparse.ArgumentParser, *, such_as: str, what: str = "a 
 
 def add_checkpoint(parser: argparse._ActionsContainer, default: str | None = "selected") -> None:
     """Add the option that selects a checkpoint of a run."""
-    text = "or selected, newest, best (selected: the best by validation, else the newest)"
-    add(parser, "--checkpoint STEP", text, default=default)
+    add(parser, "--checkpoint STEP", "or best, newest, selected (the best, else the newest)", default=default)
 
 
 def add_planner(parser: argparse.ArgumentParser, *, such_as: str) -> None:
