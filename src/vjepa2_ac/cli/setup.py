@@ -36,9 +36,7 @@ _RECORD = "simulate record {path} --domain B --episodes 60 --seed 5"
 def add_init(commands: cli.Commands) -> None:
     """Add `init` to a parser."""
     parser = cli.command(commands, "init", _init, "data/my_robot")
-    cli.add(
-        parser, "form FORM", f"{', '.join(FORMS)} (the files tell); scratch: a new predictor", cli.as_place, nargs="?"
-    )
+    cli.add(parser, "form FORM", f"{', '.join(FORMS)} (the files tell); scratch: a new model", cli.as_place, nargs="?")
     cli.add(parser, "path PATH", "a folder, or a URL (droid, lerobot, raw: DROID's own)", cli.as_place, nargs="?")
     cli.add(parser, "--out FILE", "the config to write (NAME.yaml, by the data's folder)", cli.as_path)
     cli.add(parser, "--model MODEL", "another than the released; scratch: an encoder", cli.as_model)
