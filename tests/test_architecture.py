@@ -73,7 +73,7 @@ ORDERS: dict[str, list[str]] = {
     ],
     "evaluation.calibration": ["variants", "data axes"],
     "reports": ["metrics_json", "comparison paper", "figures", "write imagined sheet", "export"],
-    "cli": ["console", "options", "train", "data", "evaluate plan closed_loop setup", "program", "__main__"],
+    "cli": ["console", "options", "completion train", "data", "evaluate plan closed_loop setup", "program", "__main__"],
     "simulation": [
         "world",
         "closed_loop",

@@ -37,11 +37,12 @@ def test_no_exception_is_left_of_a_command_that_is_gone(table: str) -> None:
         assert not [pattern for pattern in WALK["NOT_WALKED"] if not any(re.search(pattern, one) for one in given)]
 
 
-@pytest.mark.parametrize("step", [step for step in STEPS if not step.why_not], ids=lambda step: step.shown)
-def test_what_is_walked_is_what_the_program_takes(step, monkeypatch: pytest.MonkeyPatch) -> None:
-    words = step.run.partition(" > ")[0].partition("|| ")[2] or step.run.partition(" > ")[0]
-    assert not re.search(r"[…\[\]]", words), "a placeholder"
-    if words.startswith("vjepa2-ac"):
+@pytest.mark.parametrize("step", STEPS, ids=lambda step: step.shown)
+def test_what_is_shown_is_what_the_program_takes(step, monkeypatch: pytest.MonkeyPatch) -> None:
+    words = (step.shown if step.why_not else step.run).partition(" > ")[0]
+    words = words.partition("|| ")[2] or words
+    assert step.why_not or not re.search(r"[…\[\]]", words), "a placeholder"
+    if words.startswith("vjepa2-ac") and "…" not in words:
         monkeypatch.chdir(ROOT)
         options = program.parsed(program._parser(), shlex.split(words)[1:])
         config = str(getattr(options, "config", None))

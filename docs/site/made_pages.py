@@ -81,7 +81,7 @@ def commands_page() -> str:
     """Return a section for each command, with what `--help` prints."""
     os.environ["COLUMNS"] = _COLUMNS
     leaves = {" ".join(words): parser for words, parser in _leaves(_parser(), ())}
-    lines = ["# Every command", "", "As `vjepa2-ac COMMAND --help` prints them.", ""]
+    lines = ["# Every command", "", "As `vjepa2-ac COMMAND --help` prints them; [TAB completes](../start.md) them.", ""]
     lines += [f"- [{name}](#{name.replace(' ', '-')}): {_first_sentence(one)}" for name, one in leaves.items()]
     for name, parser in leaves.items():
         lines += ["", f"## {name}", "", "```text", parser.format_help().strip(), "```"]

@@ -1,5 +1,6 @@
 """Error types, and their messages for the user: unusable input, or a machine that lacks what is needed."""
 
+import difflib
 import errno
 import importlib
 import json
@@ -9,6 +10,7 @@ import shlex
 import shutil
 import sys
 import unicodedata
+from collections.abc import Iterable
 from functools import partial
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
@@ -92,6 +94,12 @@ def _short(text: str) -> str:
         return text
     half = _MOST_CHARACTERS // 2
     return f"{text[:half]} … {text[-half:]}"
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return a question that names the nearest of the known names, and a space; empty where none is near."""
+    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.7)
+    return f"Did you mean {close[0]}? " if close else ""
 
 
 def in_words(error: BaseException) -> str:

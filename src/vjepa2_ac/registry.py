@@ -7,7 +7,6 @@ imported when they are used; an installed package lists its own as entry points 
 
 from __future__ import annotations
 
-import difflib
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from importlib import import_module
@@ -18,7 +17,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, Field
 
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, did_you_mean
 
 _Thing = TypeVar("_Thing")
 
@@ -56,9 +55,8 @@ class Registry:
             ValueError: It is not; names those that are.
         """
         if name not in self._things and name not in (names := self.names()):
-            close = difflib.get_close_matches(name, names, n=1)
-            meant = f"did you mean {close[0]!r}? " if close else ""
-            raise ValueError(f"no {self.kind} of this name; {meant}known are {', '.join(map(repr, names))}")
+            known = ", ".join(map(repr, names))
+            raise ValueError(f"no {self.kind} of this name. {did_you_mean(name, names)}Known are {known}")
         return name
 
     def find(self, name: str) -> Any:

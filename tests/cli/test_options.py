@@ -1,8 +1,8 @@
 """Options with invalid or out-of-range numbers are refused with the valid range."""
 
-import argparse
 import errno
 import re
+import shlex
 import sys
 from collections.abc import Callable
 from dataclasses import MISSING, fields
@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from made_pages import _leaves
 from vjepa2_ac.cli import main, program, setup
 from vjepa2_ac.cli.options import parsed
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
@@ -41,41 +42,34 @@ def test_an_invalid_number_is_refused_with_the_valid_range(
         assert re.search(rf"error: argument {option}.*: {re.escape(repr(text))} is not {needed}$", last_line(capsys))
 
 
-def leaves(
-    parser: argparse.ArgumentParser, words: tuple[str, ...] = ()
-) -> dict[tuple[str, ...], argparse.ArgumentParser]:
-    """Return the parsers of all commands, by the words that lead to each."""
-    inner = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
-    if not inner:
-        return {words: parser}
-    found: dict[tuple[str, ...], argparse.ArgumentParser] = {}
-    for name, one in inner[0].choices.items():
-        found |= leaves(one, (*words, name))
-    return found
+COMMANDS = dict(_leaves(program._parser(), ()))  # by the words that lead to each
 
 
-COMMANDS = leaves(program._parser())
-WITHOUT_SETTINGS = {("compare",), ("data", "converter"), ("demo",), ("init",), ("export",), ("download",), ("imagine",)}
-BEHIND = {  # what each must be given, and an option with a value
-    ("train",): (["c.yaml"], ["--check"]),
-    ("evaluate",): (["run"], ["--clips", "3"]),
-    ("data", "check"): (["c.yaml"], ["--limit", "3"]),
-    ("data", "index"): (["c.yaml"], ["--rebuild"]),
-    ("data", "inspect"): (["c.yaml"], ["--rows", "3"]),
-    ("data", "calibrate"): (["c.yaml"], ["--limit", "3"]),
-    ("encode",): (["c.yaml"], ["--out", "folder"]),
-    ("decoder",): (["c.yaml"], ["--check"]),
-    ("doctor",): (["c.yaml"], []),
-    ("goals",): (["c.yaml"], ["--out", "folder"]),
-    ("plan",): (["run"], ["--start", "a.png", "--state", "-0.1,0,0,0,0,0,0", "--goal", "b.png"]),
-    ("serve",): (["run"], ["--port", "3"]),
-    ("config",): (["show", "c.yaml"], []),
-    ("simulate",): (["run"], ["--episodes", "3"]),
-}
+def example(words: tuple[str, ...]) -> list[str]:
+    """Return what the help of a command says to type, without the program, and without what is the shell's."""
+    title, line = COMMANDS[words].format_help().splitlines()[:2]
+    assert title == "example:"
+    return shlex.split(line.partition(" > ")[0], comments=True)[1:]
 
 
-def test_every_command_is_known_to_take_settings_or_not() -> None:
-    assert set(COMMANDS) == set(BEHIND) | WITHOUT_SETTINGS, "say of a new command which it is"
+WITH_SETTINGS = [words for words in COMMANDS if hasattr(parsed(program._parser(), example(words)), "overrides")]
+
+
+@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+def test_help_begins_with_an_example_that_is_right_and_fits_80_columns(words: tuple[str, ...], monkeypatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    given = example(words)
+    assert given[: len(words)] == list(words)
+    assert parsed(program._parser(), given).handler
+    assert max(map(len, COMMANDS[words].format_help().splitlines())) <= 80
+
+
+def test_without_a_command_all_are_listed_in_a_line_each(capsys: pytest.CaptureFixture[str]) -> None:
+    assert [main([]), main(["data"])] == [2, 2]
+    printed = capsys.readouterr().out
+    assert "from other packages" not in printed
+    assert max(map(len, printed.splitlines())) <= 80
+    assert all(re.search(rf"^  {words[-1]} +[A-Z].{{20,}}[.?]$", printed, re.MULTILINE) for words in COMMANDS)
 
 
 @pytest.mark.parametrize(
@@ -97,22 +91,21 @@ def test_the_help_says_the_defaults_of_the_records_that_options_fill(command: st
         assert re.search(rf"\({default}[;)]", helps[name]), name
 
 
-@pytest.mark.parametrize("words", BEHIND, ids=" ".join)
+@pytest.mark.parametrize("words", WITH_SETTINGS, ids=" ".join)
 def test_settings_may_stand_anywhere_behind_what_they_are_of(words: tuple[str, ...]) -> None:
-    given, option = BEHIND[words]
+    given, behind = example(words), len(words) + (2 if words == ("config",) else 1)
     first, second = "planning.samples=64", "data.path=a=b"
-    for order in ([first, second, *option], [first, *option, second], [*option, first, second]):
-        options = parsed(program._parser(), [*words, *given, *order])
-        assert options.overrides == [first, second], order
-        assert vars(options).get("subjects", ["run"]) == ["run"]
+    for order in ([first, second, *given[behind:]], [first, *given[behind:], second], [*given[behind:], first, second]):
+        options = parsed(program._parser(), [*given[:behind], *order])
+        assert [one for one in options.overrides if one in {first, second}] == [first, second]
+        assert vars(options).get("subjects", ["demo/run"]) == ["demo/run"]
 
 
-@pytest.mark.parametrize("words", BEHIND, ids=" ".join)
+@pytest.mark.parametrize("words", WITH_SETTINGS, ids=" ".join)
 def test_what_is_no_setting_is_refused(words: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
-    given, option = BEHIND[words]
     with pytest.raises(SystemExit, match="2"):
-        main([*words, *given, *option, "a.b=1", "--stepz", "3"])
-    assert last_line(capsys).endswith("unrecognized arguments: --stepz 3")
+        main([*example(words), "a.b=1", "--stepz", "3"])
+    assert f"vjepa2-ac {' '.join(words)}: error: unrecognized arguments: --stepz 3" in last_line(capsys)
 
 
 def test_a_folder_whose_name_looks_like_a_setting_is_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -135,6 +128,11 @@ def test_evaluate_needs_something_to_evaluate(capsys: pytest.CaptureFixture[str]
         (["evaluate", "run", "--clips", "3", "other"], "'other' is no key=value"),
         (["config", "schema", "training.steps=3"], "config schema training.steps=3"),
         (["plan", "run", "--start", "a", "--goal", "b", "--state", "1", "2", "-3"], r"'2 -3'.*in one word"),
+        (["trian", "c.yaml"], "'trian' is unknown. Did you mean train[?]"),
+        (["data", "chek", "c.yaml"], "Did you mean check[?]"),
+        (["evaluate", "run", "--split", "tset"], "Did you mean test[?]"),
+        (["demo", "--plugn", "x"], "unrecognized arguments: --plugn x. Did you mean --plugin[?]"),
+        (["qqq"], "'qqq' is unknown. Known are demo, init, "),
         (["simulate", "run", "--episodes", "3", "samples"], "'samples'"),
         (["simulate", "record", "out", "--stepz", "3"], "unrecognized arguments: --stepz 3"),
         (["data", "check", "c.yaml", "--limit", "3", "samples"], "'samples'"),

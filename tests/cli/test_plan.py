@@ -115,7 +115,6 @@ WRONG = {
     "degrees": (["--state", "0.4,0,0.3,180,0,5,0"], "multiply the angles by pi / 180"),
     "too few numbers": (["--state", "0.4,0,0.3"], "3 numbers in the shape (3,)"),
     "limits below zero": (["planning.limits.xyz=[-0.05,0.05,0.05]"], "planning.limits.xyz.0"),
-    "an unknown knob": (["planning.horizn=2"], "did you mean horizon?"),
     "a knob of training": (["training.steps=2"], "a setting that planning does not use"),
     "durations for one goal": (["--durations", "2"], "'2' for 1 goal"),
     "durations of nothing": (["--goal", "{here}/goal.png", "--durations", "0"], "whole numbers from 1"),

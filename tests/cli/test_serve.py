@@ -85,7 +85,6 @@ WRONG = {
     "--certificate none.pem": ["--certificate", "none.pem"],
     "--certificate-key key.pem: no --certificate": ["--certificate-key", "key.pem"],
     "--extrinsics": ["--extrinsics", "1,2"],
-    "training.steps=3: a setting that planning does not use": ["training.steps=3"],
     "planning.limits: workspace: the corner": ["planning.limits.workspace=[[0,0,0],[0,1,1]]"],
 }
 

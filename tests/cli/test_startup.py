@@ -5,7 +5,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from paths import ROOT
+from vjepa2_ac.cli import main
 
 WRONG = """
 train nope.yaml
@@ -107,3 +110,14 @@ def test_threads_of_pytorch_sleep_soon_where_they_have_nothing_to_do_unless_the_
         command = [sys.executable, "-c", program]
         said = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stderr
         assert f"GOMP_SPINCOUNT = '{expected}'" in said
+
+
+def test_a_bug_report_names_this_machine_and_no_secret_or_path(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    monkeypatch.setenv("HF_TOKEN", "hidden")
+    monkeypatch.setenv("VJEPA2_AC_CACHE", "/home/hidden/cache")
+    assert main(["doctor", "--report"]) == 0
+    printed = capsys.readouterr().out
+    for told in ("vjepa2-ac 0.", f"Python {sys.version.split()[0]}", "torch 2.", "peft 0.", "CPU: ", "GPU: ", "CUDA"):
+        assert told in printed
+    assert "VJEPA2_AC_CACHE=(a path)" in printed
+    assert not [word for word in ("hidden", str(Path.home()), str(ROOT)) if word in printed]

@@ -1,12 +1,12 @@
 """Paths: each has one meaning everywhere, and none is mistaken for another kind."""
 
 import argparse
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from made_pages import _leaves
 from vjepa2_ac.cli.options import as_local, as_model, as_path, as_place, as_planner, as_subject
 from vjepa2_ac.cli.program import _parser, main
 from vjepa2_ac.config import DiskCacheConfig
@@ -84,19 +84,10 @@ def test_the_cache_of_the_environment_is_a_path_like_any_other(monkeypatch: pyte
         cache_folder(DiskCacheConfig())
 
 
-def actions_of(parser: argparse.ArgumentParser) -> Iterator[tuple[str, argparse.Action]]:
-    for action in parser._actions:
-        if isinstance(action, argparse._SubParsersAction):
-            for inner in action.choices.values():
-                yield from actions_of(inner)
-        else:
-            yield parser.prog, action
-
-
 def test_every_path_on_the_command_line_is_read_alike() -> None:
     words = {"CONFIG", "FOLDER", "DIR", "PATH", "PNG", "IMAGE", "RUN", "MODEL", "RUN_OR_MODEL"}
     found = 0
-    for command, action in actions_of(_parser()):
+    for command, action in ((words, one) for words, parser in _leaves(_parser(), ()) for one in parser._actions):
         is_path = words & set(str(action.metavar).replace("|", " ").split())
         if is_path and action.dest != "overrides":
             found += 1

@@ -32,66 +32,65 @@ _OF_A_MODEL = ("sub_goals", "goals", "films", "decoder", "checkpoint", "config",
 
 def add_serve(commands: cli.Commands) -> None:
     """Add `serve` to a parser."""
-    parser = cli.command(commands, "serve", _serve)
+    parser = cli.command(commands, "serve", _serve, "demo/run --goals goals --key-file key --host 0.0.0.0")
     cli.add_planner(parser, such_as="such as planning.limits.xyz=[0.01,0.01,0.01]")
-    cli.add(parser, "--goals FOLDER", "that a client may name: pictures, and folders that `goals` made", cli.as_path)
+    cli.add(parser, "--goals FOLDER", "what a client may name: pictures, and folders that `goals` made", cli.as_path)
     text = "delta: changes of each model step; pose: waypoints to the target pose, one a control step (delta)"
     cli.add(parser, "--actions delta|pose", text, choices=["delta", "pose"], default="delta")
-    cli.add(parser, "--image-key KEY", "the key of the camera's picture in requests (the usual ones)")
+    cli.add(parser, "--host ADDRESS", "where it listens (127.0.0.1: this machine only)", default="127.0.0.1")
+    cli.add(parser, "--port N", "0: a free one (8000)", cli.whole_number(0, 65535), default=8000)
+    cli.add(parser, "--key-file FILE", "with the key that clients send; needed where others can reach it", cli.as_path)
+    cli.add(parser, "--dry-run", "plan, and answer zeros: the robot stays where it is", action="store_true")
+    group = parser.add_argument_group("messages")
+    cli.add(group, "--image-key KEY", "the key of the camera's picture in requests (the usual ones)")
     text = "what is told on connect; roboarena: its six keys only (full)"
-    cli.add(parser, "--metadata full|roboarena", text, choices=["full", "roboarena"], default="full")
-    text = "of a decision; then the action is zero (60)"
-    cli.add(parser, "--deadline SECONDS", text, cli.number_between(0, 3600, "seconds"), default=60.0)
-    cli.add(parser, "--dry-run", "plan, and answer zeros", action="store_true")
-    group = parser.add_argument_group("who may")
-    cli.add(group, "--host ADDRESS", "where it listens (127.0.0.1: this machine only)", default="127.0.0.1")
-    cli.add(group, "--port N", "0: a free one (8000)", cli.whole_number(0, 65535), default=8000)
-    cli.add(group, "--key-file FILE", "with the key that clients send; needed where others can reach it", cli.as_path)
+    cli.add(group, "--metadata full|roboarena", text, choices=["full", "roboarena"], default="full")
+    text = "longest time for a decision; then the action is zero (60)"
+    cli.add(group, "--deadline SECONDS", text, cli.number_between(0, 3600, "seconds"), default=60.0)
+    group = parser.add_argument_group("access")
     cli.add(group, "--insecure", "no key, although others can reach the address", action="store_true")
     cli.add(group, "--allow-host NAME", "a name that a proxy serves it under; repeatable", action="append", default=[])
     cli.add(group, "--certificate FILE", "TLS: the certificate and those it is signed by, PEM", cli.as_path)
     cli.add(group, "--certificate-key FILE", "its private key, PEM (in the same file)", cli.as_path)
     group = parser.add_argument_group("record")
     cli.add(group, "--record FOLDER", "every decision with its pictures, in a new folder", cli.as_path)
-    size = cli.number_between(0, 10_000, "gigabytes")
-    cli.add(group, "--record-gb GB", "where the record ends (2)", size, default=2.0)
+    cli.add(group, "--record-gb GB", "its largest size (2)", cli.number_between(0, 10_000, "gigabytes"), default=2.0)
 
 
 def add_simulate(commands: cli.Commands) -> None:
     """Add `simulate` to a parser: it records if its first word is `record`, else it tests a model in closed loop."""
-    parser = cli.command(commands, "simulate", _simulate)
-    text = "who steers: the folder of a run, what model.base takes, or a server, as ws://127.0.0.1:8000; or: record"
+    parser = cli.command(commands, "simulate", _simulate, "demo/run --task reach --domain B --episodes 10")
+    text = "a run, what model.base takes (builtin:sim-tiny), or the server of one (ws://127.0.0.1:8000); or: record"
     cli.add(parser, "subject RUN_OR_MODEL|ws://SERVER|record", text, cli.as_planner)
     cli.add(parser, "overrides key=value|FOLDER", "such as planning.samples=64; record: where the data go", nargs="*")
+    text = "what is to be done (reach); record: push, pick or place, with a block on the table (none: reaching around)"
+    cli.add(parser, "--task", text, choices=["reach", "push", "pick", "place"])
     text = "A or B; record: or random, another world in every episode (A)"
     cli.add(parser, "--domain", text, choices=["A", "B", "random"], default="A")
     cli.add(parser, "--episodes N", "how many (50; record: 40)", cli.count)
-    text = "model steps (8; pick: 12, place: 18); record: control steps (41; place: 81)"
-    cli.add(parser, "--steps N", text, cli.count)
+    cli.add(parser, "--steps N", "model steps (8; pick 12, place 18); record: control steps (41; place 81)", cli.count)
     cli.add(parser, "--seed N", "which problems or demonstrations (0)", cli.whole_number(0, 2**31 - 1))
-    text = "what is to be done (reach); record: push, pick or place, with a block on the table (none: reaching around)"
-    cli.add(parser, "--task", text, choices=["reach", "push", "pick", "place"])
-    cli.add_all(parser)
-    group = parser.add_argument_group("of a model that steers")
+    group = parser.add_argument_group("to test a model")
+    cli.add_all(group)
     cli.add_checkpoint(group, default=None)
-    cli.add(group, "--config CONFIG", "of a model: a config whose `planning` is used", cli.as_local)
-    text = "goals on the way, of the oracle's solution: demonstration: its key frames; every-step: all of it (none)"
+    cli.add(group, "--config CONFIG", "for a model: the config whose `planning` is used", cli.as_local)
+    text = "goals on the way, of the oracle's solution: where gripper or arm stop, or each model step of it (none)"
     cli.add(group, "--sub-goals", text, choices=["none", "demonstration", "every-step"])
-    text = "a folder of goals on the way, that `vjepa2-ac goals` made: the same in every problem, of a fixed scene"
-    cli.add(group, "--goals FOLDER", text, cli.as_local)
+    cli.add(group, "--goals FOLDER", "goals on the way, that `vjepa2-ac goals` made, of a fixed scene", cli.as_local)
     cli.add(group, "--films N", "episodes in the video; 0: none (6)", cli.whole_number(0))
-    cli.add_decoder(group, "in the video what the model imagined of each frame, one step ago")
+    cli.add_decoder(group, "in the video what the model imagined of each frame, a step ago")
     cli.add(group, "--out FOLDER", "where figures and video go (closed_loop/TASK-DOMAIN, in the run's)", cli.as_path)
-    cli.add(group, "--key-file FILE", "of a server that needs a key: the file with it", cli.as_path)
-    group = parser.add_argument_group("of record")
+    cli.add(group, "--key-file FILE", "the key of a server that needs one", cli.as_path)
+    group = parser.add_argument_group("to record data")
     cli.add(group, "--cameras", "1: all three images are the same one (1)", cli.whole_number(1, 3), choices=[1, 3])
     cli.add(group, "--workers N", "processes; the data are the same whatever their number (1)", cli.count)
 
 
 def _serve(options: argparse.Namespace) -> int:
-    """Serve a planner to a robot over a websocket, in the protocol of openpi's clients.
+    """Serve a planner to a robot, over a websocket.
 
-    Pictures, states and goals in, actions within planning.limits out (docs/serving.md). Runs until SIGTERM or Ctrl-C.
+    In the protocol of openpi's clients: pictures, states and goals in, actions within planning.limits out
+    (docs/serving.md). Runs until SIGTERM or Ctrl-C.
     """
     from vjepa2_ac.serving.access import Access, read_key
 
@@ -173,10 +172,10 @@ def _loaded(options: argparse.Namespace, goals: KeptGoals | None, extrinsics: np
 
 
 def _simulate(options: argparse.Namespace) -> int:
-    """Let a model steer a simulated arm to a goal image, beside doing nothing, chance and an oracle.
+    """Let a model steer a simulated arm; or record data of it.
 
-    Or, as `simulate record FOLDER`: record demonstrations of the arm as a DROID data set. Status 1 where the model
-    gave no finite energy in any decision.
+    It steers to a goal image, beside doing nothing, chance and an oracle. Or, as `simulate record FOLDER`: record
+    demonstrations of the arm as a DROID data set. Status 1 where the model gave no finite energy in any decision.
     """
     if options.subject == "record":
         _refuse(options, _OF_A_MODEL, needed="a model that steers")

@@ -19,49 +19,48 @@ _CLIPS, _PAIRS = 64, 200  # to calibrate by: strides, axes (as the paper)
 
 def add_data(commands: cli.Commands) -> None:
     """Add `data` with its commands to a parser."""
-    text = "Look at a data set before training on it."
+    text = "Look at a data set: can it be read, what is in it, does it fit?"
     parser = commands.add_parser("data", help=text, description=text)
-    inner = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    cli.add_commands(parser, {"commands": [_add_commands]})
+
+
+def _add_commands(commands: cli.Commands) -> None:
     such_as, out = "data.camera=wrist_left", Path("inspection")
 
-    parser = cli.command(inner, "check", _check)
+    parser = cli.command(commands, "check", _check, "my_robot.yaml")
     cli.add_config(parser, such_as=such_as)
     cli.add(parser, "--limit N", "clips to load (32); to probe, twice as many", cli.count, default=32)
-    text = (
-        "probe the data with a model that knows robots (a run, or what model.base takes): does it predict better where"
-        " frames are shifted, mirrored, reversed, BGR, or the gripper is inverted?"
-    )
+    text = "ask a model that knows robots, too: are frames shifted, mirrored, reversed, BGR, or the gripper inverted?"
     cli.add(parser, "--model RUN_OR_MODEL", text, cli.as_model)
 
-    parser = cli.command(inner, "index", _index)
+    parser = cli.command(commands, "index", _index, "my_robot.yaml")
     cli.add_config(parser, such_as=such_as)
     cli.add(parser, "--rebuild", "build it again, also where one is kept", action="store_true")
 
-    parser = cli.command(inner, "inspect", _inspect)
+    parser = cli.command(commands, "inspect", _inspect, "my_robot.yaml --out inspection")
     cli.add_config(parser, such_as=such_as)
-    cli.add(parser, "--out DIR", "where to (inspection)", cli.as_path, default=out)
+    cli.add(parser, "--out DIR", "where files go (inspection)", cli.as_path, default=out)
     cli.add(parser, "--episodes --limit N", "episodes whose motion is looked at (100)", cli.count, default=100)
     cli.add(parser, "--rows N", "episodes on the contact sheet (8)", cli.count, default=8)
 
-    parser = cli.command(inner, "calibrate", _calibrate)
+    parser = cli.command(commands, "calibrate", _calibrate, "my_robot.yaml --limit 64")
     cli.add_config(parser, such_as=such_as)
-    text = (
-        "fit the moves that this model infers from pairs of frames to the executed ones: axes.json, for planning.axes"
-    )
-    cli.add(parser, "--axes RUN_OR_MODEL", text, cli.as_model)
-    cli.add(parser, "--model MODEL", "of strides: another than model.base: a .pt, a folder, or a run", cli.as_model)
-    splits = ["train", "validation", "test"]
-    cli.add(parser, "--split", "(validation)", choices=splits, default="validation")
+    cli.add(parser, "--axes RUN_OR_MODEL", "fit the moves that it infers to the executed ones: axes.json", cli.as_model)
+    cli.add(parser, "--model MODEL", "ask another than model.base: a .pt, a folder, or a run", cli.as_model)
+    cli.add(parser, "--split", "of which (validation)", choices=["train", "validation", "test"], default="validation")
     cli.add(parser, "--limit N", "clips at each stride (64), or pairs of frames (200)", cli.count)
-    cli.add(parser, "--frames N", "of a clip (the config's, 8 at most)", cli.whole_number(2, 256))
-    cli.add(parser, "--out DIR", "where to (inspection)", cli.as_path, default=out)
+    cli.add(parser, "--frames N", "frames of a clip (the config's, 8 at most)", cli.whole_number(2, 256))
+    cli.add(parser, "--out DIR", "where files go (inspection)", cli.as_path, default=out)
 
-    parser = cli.command(inner, "converter", _converter)
-    cli.add(parser, "name NAME", "which one", nargs="?")
+    parser = cli.command(commands, "converter", _converter, "mp4_and_csv > mp4_and_csv.py")
+    cli.add(parser, "name NAME", "which script", nargs="?")
 
 
 def _converter(options: argparse.Namespace) -> None:
-    """Print a script that makes a readable data set of another form, such as ROS bags; without NAME, list them."""
+    """Print a script that makes a data set of another form, as ROS bags.
+
+    Without NAME: list the scripts.
+    """
     from vjepa2_ac.init.converters import converter_text, converters
 
     if options.name is not None:
@@ -72,7 +71,7 @@ def _converter(options: argparse.Namespace) -> None:
 
 
 def _check(options: argparse.Namespace) -> int:
-    """Open the data, load some clips as training would, and look at every number.
+    """Read some clips as training would, and check every number.
 
     Exit status 0: all is well or only warnings, 1: training would learn nothing or not begin, 2: something cannot
     be used.
@@ -117,7 +116,7 @@ def _probe(config: Config, model: str, *, clips: int) -> None:
 
 
 def _index(options: argparse.Namespace) -> None:
-    """Build the index of a data set, or show the one that is kept on this machine."""
+    """Build the index of a data set, or show the one that is kept."""
     config = cli.read_config(options.config, options.overrides).data
 
     from vjepa2_ac.cli.console.tables import index_lines
@@ -132,7 +131,7 @@ def _index(options: argparse.Namespace) -> None:
 
 
 def _inspect(options: argparse.Namespace) -> None:
-    """Say what is in a data set, and draw it: text, inspect.json, a contact sheet."""
+    """Say what is in a data set, and draw a contact sheet."""
     config = cli.read_config(options.config, options.overrides)
     cli.make_folder(options.out)
 
@@ -158,9 +157,10 @@ def _inspect(options: argparse.Namespace) -> None:
 
 
 def _calibrate(options: argparse.Namespace) -> int:
-    """Let a model say how many control steps its model step is: its error over persistence at each stride.
+    """Find how many control steps a model's step is, or its axes.
 
-    Or, with --axes: how its axes lie to the robot's; status 1 where that stays unknown.
+    By its error over persistence at each stride. With --axes: how its axes lie to the robot's; status 1 where that
+    stays unknown.
     """
     config = cli.read_config(options.config, options.overrides, base=options.axes is None)
     if options.axes is not None:

@@ -18,33 +18,40 @@ if TYPE_CHECKING:
 
 
 def add_evaluate(commands: cli.Commands) -> None:
-    """Add `evaluate` and `compare` to a parser."""
-    parser = cli.command(commands, "evaluate", _evaluate)
+    """Add `evaluate` to a parser."""
+    parser = cli.command(commands, "evaluate", _evaluate, "demo/run --clips 64 --decoder demo/decoder")
     text = "folder of a run, or (with --data) what model.base takes; several: their spread, too"
     cli.add(parser, "subjects RUN_OR_MODEL", text, cli.as_subject, nargs="+")
-    cli.add(parser, "--data CONFIG", "measure on its data (with its model.dtype, device, seed)", cli.as_local)
-    text = "what to compare with, on the same latents; default: the base of a run, nothing for a model"
-    cli.add(parser, "--against base|RUN|MODEL", text, cli.as_model, nargs="+")
-    cli.add(parser, "--out FOLDER", "where figures go; default: the run's folder", cli.as_path)
-    cli.add(parser, "--split", "which held-out episodes (test)", choices=["test", "validation"])
+    cli.add(parser, "--against base|RUN|MODEL", "what to compare with (the base of a run)", cli.as_model, nargs="+")
     cli.add(parser, "--clips N", "at most this many clips, spread over the episodes (256)", cli.count)
-    cli.add_checkpoint(parser)
-    cli.add_decoder(parser, "the rollouts, which are measured as images, too")
-    cli.add(parser, "--lpips FILE", "weights for LPIPS of the decoded images (docs/decoding.md)", cli.as_path)
-    cli.add(parser, "--lpips-heads FILE", "its heads: alex.pth or vgg.pth of version 0.1", cli.as_path)
+    cli.add_decoder(parser, "the rollouts as images, and measure these, too")
+    text = "plan, too, and compare with the demonstrations (long); with these settings of planning, here or anywhere"
+    cli.add(parser, "--planning planning.key=value", text, nargs="*", dest="plan_settings")
+    cli.add(parser, "--out FOLDER", "where figures go (the run's folder)", cli.as_path)
     cli.add_all(parser)
-    cli.add(parser, "--calibrate", "measure the one-step error at other strides, too", action="store_true")
-    _add_probes(parser.add_argument_group("use of the actions"))
-    group = parser.add_argument_group("plans (they take long: see docs/evaluation.md)")
-    text = (
-        "plan from held-out frames, and hold the plans against the demonstrations: action error, Action Score; settings"
-        " of the plan of one step, such as planning.samples=200, in place of the config's, here or anywhere"
-    )
-    cli.add(group, "--planning planning.key=value", text, nargs="*", dest="plan_settings")
+    group = parser.add_argument_group("data, and what is measured")
+    cli.add(group, "--data CONFIG", "measure on its data (with its model.dtype, device, seed)", cli.as_local)
+    cli.add(group, "--split", "which held-out episodes (test)", choices=["test", "validation"])
+    cli.add_checkpoint(group)
     cli.add(group, "--planning-clips N", "clips to plan from, one frame of each (32)", cli.count, default=32)
+    cli.add(group, "--calibrate", "measure the one-step error at other strides, too", action="store_true")
+    cli.add(group, "--lpips FILE", "weights for LPIPS of the decoded images (docs/decoding.md)", cli.as_path)
+    cli.add(group, "--lpips-heads FILE", "its heads: alex.pth or vgg.pth of version 0.1", cli.as_path)
+    group = parser.add_argument_group("use of the actions")
+    cli.add(group, "--sensitivity-clips N", "clips to try other actions on (32)", cli.whole_number(0))
+    cli.add(group, "--samples N", "other actions for each of them (64)", cli.count)
+    cli.add(group, "--landscapes N", "those with a landscape (8)", cli.whole_number(0), dest="landscape_clips")
+    cli.add(group, "--axes N", "clips of those to calibrate the axes by (32)", cli.whole_number(0), dest="axis_clips")
+    cli.add(group, "--nodes N", "points of a landscape along each axis (9)", cli.whole_number(3, 51))
+    cli.add(group, "--reach CM", "half its width (7.5)", cli.number_between(0.0, 1000.0, "cm"), dest="reach_cm")
+    cli.add(group, "--examples N", "clips to show (4)", cli.whole_number(0))
+    cli.add(group, "--at-once N", "actions computed together (64): lower it to save memory", cli.count)
     parser.set_defaults(overrides=[])
 
-    parser = cli.command(commands, "compare", _compare)
+
+def add_compare(commands: cli.Commands) -> None:
+    """Add `compare` to a parser."""
+    parser = cli.command(commands, "compare", _compare, "runs/lora runs/full --out comparison.png")
     cli.add(parser, "runs RUN", "folders with a metrics.json, two or more", cli.as_path, nargs="+")
     cli.add(parser, "--out PNG", "the image (comparison.png)", cli.as_path, default=Path("comparison.png"))
     cli.add_all(parser)
@@ -52,45 +59,32 @@ def add_evaluate(commands: cli.Commands) -> None:
 
 def add_imagine(commands: cli.Commands) -> None:
     """Add `imagine` to a parser."""
-    parser = cli.command(commands, "imagine", _imagine)
+    parser = cli.command(commands, "imagine", _imagine, "demo/run --decoder demo/decoder --actions true,up,left")
     cli.add_planner(parser, such_as="with --image: such as planning.limits.xyz=data")
-    cli.add(
-        parser, "--decoder FOLDER", "what `vjepa2-ac decoder` made, or builtin:sim-tiny", cli.as_model, required=True
-    )
+    cli.add_decoder(parser, "what is imagined", required=True)
     text = (
-        "with commas between them: true (the recorded ones of a clip), none, up, down, left, right, forward, back,"
-        " open, close, in the robot's frame; or files, .npy or .csv: a row of 7 numbers for each step"
-        " (true,none,up,left,close)"
+        "with commas between them: true (as recorded), none, up, down, left, right, forward, back, open, close; or"
+        " files, .npy or .csv, with a row of 7 numbers for each step (true,none,up,left,close)"
     )
     cli.add(parser, "--actions NAMES", text)
     cli.add(parser, "--steps N", "model steps to imagine (7)", cli.count, default=7)
     cli.add(parser, "--size CM", "of a named action in each step, within planning.limits (5)", float, default=5.0)
-    cli.add(parser, "--episode ID", "the clip's name in the data (that of the split with the most motion)")
-    cli.add(parser, "--start N", "its first control step (0)", cli.whole_number(0))
+    cli.add(parser, "--out FOLDER", "where the film goes (imagined, in the run's)", cli.as_path)
+    group = parser.add_argument_group("the clip")
+    cli.add(group, "--episode ID", "its episode's name in the data, or a part of it (the one with the most motion)")
+    cli.add(group, "--start N", "its first control step (0)", cli.whole_number(0))
+    cli.add(group, "--split", "which episodes (test)", choices=["test", "validation", "train"], default="test")
+    cli.add(group, "--data CONFIG", "clips of other data; needed for a model", cli.as_local)
     group = parser.add_argument_group("instead of a clip")
     cli.add(group, "--image IMAGE", "what a camera sees: PNG or JPEG; actions by name only", cli.as_local)
     cli.add(group, "--state NUMBERS", "measured then, as `plan --state`")
-    cli.add(parser, "--split", "of the clip (test)", choices=["test", "validation", "train"], default="test")
-    cli.add(parser, "--data CONFIG", "clips of other data; needed for a model", cli.as_local)
-    cli.add(parser, "--out FOLDER", "where the film goes (imagined, in the run's)", cli.as_path)
-
-
-def _add_probes(group: argparse._ArgumentGroup) -> None:
-    cli.add(group, "--sensitivity-clips N", "clips to try other actions on (32)", cli.whole_number(0))
-    cli.add(group, "--samples N", "other actions for each of them (64)", cli.count)
-    cli.add(
-        group, "--landscapes N", "of those, with an energy landscape (8)", cli.whole_number(0), dest="landscape_clips"
-    )
-    cli.add(group, "--axes N", "clips of those to calibrate the axes by (32)", cli.whole_number(0), dest="axis_clips")
-    cli.add(group, "--nodes N", "of a landscape along each axis (9)", cli.whole_number(3, 51))
-    text = "half the width of landscape and box (7.5)"
-    cli.add(group, "--reach CM", text, cli.number_between(0.0, 1000.0, "cm"), dest="reach_cm")
-    cli.add(group, "--examples N", "clips to show (4)", cli.whole_number(0))
-    cli.add(group, "--at-once N", "actions computed together (64): lower it to save memory", cli.count)
 
 
 def _evaluate(options: argparse.Namespace) -> None:
-    """Measure a run or a model on held-out episodes, beside its base, doing nothing and wrong actions."""
+    """Measure a run on held-out episodes: did it become better?
+
+    Its predictions stand beside those of its base, of doing nothing and of wrong actions. A model is measured likewise.
+    """
     from vjepa2_ac.evaluation.request import settle
 
     asked = _asked(options)
@@ -165,7 +159,10 @@ def _asked(options: argparse.Namespace) -> list[tuple[str, EvaluationOptions]]:
 
 
 def _compare(options: argparse.Namespace) -> None:
-    """Put runs side by side that `evaluate` has measured on the same clips: one table, one image."""
+    """Put evaluated runs side by side: one table, one image.
+
+    `evaluate` has measured them on the same clips.
+    """
     from vjepa2_ac.reports.comparison import compare
 
     comparison = compare(options.runs)
@@ -180,11 +177,11 @@ def _compare(options: argparse.Namespace) -> None:
 
 
 def _imagine(options: argparse.Namespace) -> None:
-    """Show what a model imagines from one frame of a held-out clip, or from an image.
+    """Film what a model imagines from a frame, under any actions.
 
-    Under the recorded actions, beside the truth and the base, and under actions that were not taken: a strip, an MP4
-    and a GIF. Of data that `simulate record` made, what really happens is shown, too. A decoded image is no evidence of
-    success: docs/decoding.md.
+    From a frame of a held-out clip under the recorded actions, beside the truth and the base, and under actions that
+    were not taken; or from an image: a strip, an MP4 and a GIF. Of data that `simulate record` made, what really
+    happens is shown, too. A decoded image is no evidence of success: docs/decoding.md.
     """
     _require_one_start(options)
 

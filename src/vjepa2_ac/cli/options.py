@@ -7,12 +7,13 @@ import contextlib
 import inspect
 import os
 import re
-from collections.abc import Callable, Iterable, Sequence
+import textwrap
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias, TypeVar
 
-from vjepa2_ac.errors import InputError, printable
+from vjepa2_ac.errors import InputError, did_you_mean, printable
 from vjepa2_ac.storage import places
 
 if TYPE_CHECKING:
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
     from vjepa2_ac.planning.session import PlanningSession
 
-Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
+Commands: TypeAlias = "argparse._SubParsersAction[Parser]"
 Handler = Callable[[argparse.Namespace], int | None]
 
 _MOST = 10**9
@@ -34,26 +35,93 @@ _Number = TypeVar("_Number", int, float)
 _Read = TypeVar("_Read")
 
 
+class _Help(argparse.HelpFormatter):
+    """A usage that has only what must be given; paragraphs stay apart, and one with indented lines stays as it is."""
+
+    def add_usage(self, usage: Any, actions: Iterable[argparse.Action], groups: Any, prefix: Any = None) -> None:
+        one_of = [action for group in groups if group.required for action in group._group_actions]
+        given = [action for action in actions if action.required or not action.option_strings or action in one_of]
+        super().add_usage(usage, given, groups, prefix)
+
+    def _split_lines(self, text: str, width: int) -> list[str]:
+        return textwrap.wrap(text, width, break_on_hyphens=False)  # vjepa2-ac stays in one line
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        parts = text.split("\n\n")
+        filled = (part if "\n  " in part else "\n".join(self._split_lines(part, width)) for part in parts)
+        return textwrap.indent("\n\n".join(filled), indent)
+
+
 class Parser(argparse.ArgumentParser):
-    """A parser whose messages cannot move a terminal's cursor, and which takes `-0.3,0.1` for a value."""
+    """A parser whose help begins with an example, and whose errors say what a wrong word may have meant.
+
+    Its messages cannot move a terminal's cursor, and it takes `-0.3,0.1` for a value.
+    """
+
+    example = ""  # what stands behind its name
 
     def __init__(self, **how: Any) -> None:
-        super().__init__(**how)
+        super().__init__(**how, formatter_class=_Help, add_help=False)
+        self.add_argument("-h", "--help", action="help", help=argparse.SUPPRESS)
+        self._positionals.title = "arguments"
         self._negative_number_matcher = re.compile(r"^-[\d.]")
+
+    def format_help(self) -> str:
+        """Return the example, then the usage and what can be given."""
+        example = f"example:\n  {self.prog} {self.example}\n\n" if self.example else ""
+        return example + super().format_help()
 
     def error(self, message: str) -> NoReturn:
         """Print the error, and exit with status 2."""
         super().error(printable(message))
 
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        known = [str(one) for one in action.choices or ()]
+        if known and str(value) not in known:
+            hint = did_you_mean(str(value), known) or f"Known are {', '.join(known)}"
+            raise argparse.ArgumentError(action, f"{value!r} is unknown. {hint.rstrip()}")
 
-def command(commands: Commands, name: str, handler: Handler) -> argparse.ArgumentParser:
-    """Add a command with its handler, whose docstring is the help, and return its parser."""
+
+def command(commands: Commands, name: str, handler: Handler, example: str = "") -> Parser:
+    """Add a command, and return its parser.
+
+    Args:
+        commands: Of a parser.
+        name: What is typed.
+        handler: Its docstring is the help; the first paragraph, a short line, stands in the list of commands.
+        example: What is typed behind the name, in the help.
+    """
     text = inspect.getdoc(handler) or ""
     parser = commands.add_parser(name, help=text.partition("\n\n")[0], description=text)
-    parser.set_defaults(handler=handler)
-    about = "a module of yours that registers a form of data, a loss, a planner, ... (docs/extending.md); repeatable"
-    add(parser, "--plugin MODULE", about, action="append", default=[])
+    parser.example, parser.epilog = example, "A default stands in brackets. Also: --plugin MODULE (docs/extending.md)."
+    parser.set_defaults(handler=handler, parser=parser)
+    add(parser, "--plugin MODULE", argparse.SUPPRESS, action="append", default=[])
     return parser
+
+
+def add_commands(parser: Parser, groups: Mapping[str, Sequence[Callable[[Commands], None]]]) -> None:
+    """Give a parser commands, which its help lists in groups, a line each; without a command it is shown.
+
+    Args:
+        parser: It gets them.
+        groups: By title, what adds commands.
+    """
+
+    def no_command(_options: argparse.Namespace) -> int:
+        parser.print_help()
+        return 2
+
+    commands = parser.add_subparsers(metavar="COMMAND", help=argparse.SUPPRESS)
+    for title, adders in groups.items():
+        before = len(commands.choices)
+        for add_to in adders:
+            add_to(commands)
+        added = list(commands.choices.items())[before:]
+        lines = [f"  {name:<9} {(one.description or ' ').splitlines()[0]}" for name, one in added]
+        if lines:
+            parser.description = "\n".join([f"{parser.description}\n\n{title}:", *lines])
+    parser.usage = f"{parser.prog} COMMAND ..."
+    parser.set_defaults(handler=no_command, parser=parser, plugin=[])
 
 
 def add(
@@ -75,37 +143,36 @@ def add(
     parser.add_argument(*names, help=text, **how)
 
 
-def add_config(parser: argparse.ArgumentParser, *, such_as: str, what: str = "a YAML config") -> None:
+def add_config(parser: argparse.ArgumentParser, *, such_as: str, what: str = "a YAML config", **how: Any) -> None:
     """Add the config that a command reads, and `key=value` words behind it."""
-    add(parser, "config CONFIG", what, as_local)
-    add(parser, "overrides key=value", f"such as {such_as}", nargs="*")
+    add(parser, "config CONFIG", what, as_local, **how)
+    add(parser, "overrides key=value", f"such as {such_as} (all keys: `vjepa2-ac config schema`)", nargs="*")
 
 
 def add_checkpoint(parser: argparse._ActionsContainer, default: str | None = "selected") -> None:
     """Add the option that selects a checkpoint of a run."""
-    text = "which one: the selected (default: the best by validation, else the newest), or that of a step"
-    add(parser, "--checkpoint selected|newest|best|STEP", text, default=default)
+    add(parser, "--checkpoint STEP", "or best, newest, selected (the best, else the newest)", default=default)
 
 
 def add_planner(parser: argparse.ArgumentParser, *, such_as: str) -> None:
     """Add the run or the model that plans, `key=value` words behind it, and what else a `planning_session` is of."""
     add(parser, "subject RUN_OR_MODEL", "folder of a run, or what model.base takes", as_model)
     add(parser, "overrides key=value", such_as, nargs="*")
-    add_checkpoint(parser)
-    add(parser, "--config CONFIG", "for a model: the config whose planning, crop and dtype count", as_local)
-    text = "the camera's x,y,z,roll,pitch,yaw in the robot base frame, if the model uses it"
-    add(parser, "--extrinsics NUMBERS", text)
+    group = parser.add_argument_group("the model")
+    add_checkpoint(group)
+    add(group, "--config CONFIG", "for a model: the config whose planning, crop and dtype count", as_local)
+    add(group, "--extrinsics NUMBERS", "the camera's x,y,z,roll,pitch,yaw in the base frame, if the model uses it")
 
 
-def add_all(parser: argparse.ArgumentParser) -> None:
+def add_all(parser: argparse._ActionsContainer) -> None:
     """Add the option that shows more than the answer."""
     add(parser, "--all", "print every table, too, and the files that were written", action="store_true")
 
 
-def add_decoder(parser: argparse._ActionsContainer, shows: str) -> None:
+def add_decoder(parser: argparse._ActionsContainer, shows: str, **how: Any) -> None:
     """Add `--decoder`, with which something is drawn."""
-    text = f"shows {shows}: the folder that `vjepa2-ac decoder` made, or builtin:sim-tiny"
-    add(parser, "--decoder FOLDER", text, as_model)
+    text = f"show {shows}, with what `vjepa2-ac decoder` made, or builtin:sim-tiny"
+    add(parser, "--decoder FOLDER", text, as_model, **how)
 
 
 def record_of_options(kind: Callable[..., _Record], options: argparse.Namespace, **others: Any) -> _Record:
@@ -259,11 +326,12 @@ def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> 
     the names of several runs or models for names.
     """
     options, rest = parser.parse_known_args(arguments)
-    others = [word for word in rest if "=" not in word or _OPTION.match(word)]
-    if rest and not hasattr(options, "overrides"):
-        parser.error(f"unrecognized arguments: {' '.join(rest)}")
-    if any(map(_OPTION.match, others)):
-        parser.error(f"unrecognized arguments: {' '.join(others)}")
+    parser, others = options.parser, [word for word in rest if "=" not in word or _OPTION.match(word)]
+    takes_keys = hasattr(options, "overrides")
+    if any(map(_OPTION.match, others)) or (rest and not takes_keys):
+        unknown = others if takes_keys else rest
+        text = f"unrecognized arguments: {' '.join(unknown)}. {did_you_mean(unknown[0], parser._option_string_actions)}"
+        parser.error(text.removesuffix(". ").rstrip())
     if others and vars(options).get("subject") != "record":  # `simulate record` takes a folder there
         parser.error(f"{' '.join(others)!r} is no key=value (numbers go in one word: 0.4,0,0.3; names side by side)")
     if "subjects" in options:

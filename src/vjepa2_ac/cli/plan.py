@@ -22,52 +22,50 @@ _FILMS = (".mp4", ".m4v", ".mov")
 
 def add_plan(commands: cli.Commands) -> None:
     """Add `plan` to a parser."""
-    parser = cli.command(commands, "plan", _plan)
+    parser = cli.command(commands, "plan", _plan, "demo/run --start a.png --goal b.png --state 0.4,0,0.3,3,0,0,0")
     cli.add_planner(parser, such_as=f"such as planning.horizon=2; quick, for a CPU: {_QUICK}")
-    cli.add(parser, "--start IMAGE", "what the camera sees: PNG or JPEG", cli.as_local, required=True)
-    text = (
-        "measured x,y,z (m), roll,pitch,yaw (rad, extrinsic xyz), gripper (0 open .. 1 closed); or a vector's numbers"
-    )
+    cli.add(parser, "--start IMAGE", "what the camera sees now: PNG or JPEG", cli.as_local, required=True)
+    text = "measured x,y,z (m), roll,pitch,yaw (radians, extrinsic xyz), gripper (0 open .. 1 closed); or a vector"
     cli.add(parser, "--state NUMBERS", text, required=True)
-    text = "what it shall see; again for goals that follow one another"
     goals = parser.add_mutually_exclusive_group(required=True)
-    cli.add(goals, "--goal IMAGE", text, cli.as_local, action="append")
+    cli.add(goals, "--goal IMAGE", "what it is to see; again for goals in a row", cli.as_local, action="append")
     cli.add(goals, "--goals FOLDER", "goals with rules of their own, that `vjepa2-ac goals` made", cli.as_path)
-    cli.add(parser, "--durations STEPS", "model steps of all goals but the last, as 2,1 (equal shares)")
-    text = "what of the image counts: of the goal's size, black where it does not"
-    cli.add(parser, "--mask IMAGE", text, cli.as_local)
-    cli.add(parser, "--seed N", "default: the config's", cli.whole_number(0, 2**31 - 1))
-    text = "of the image's energy maps along each axis; 0: no maps (13, or as many as cost no more than the search)"
-    cli.add(parser, "--nodes N", text, cli.whole_number(0, 101))
-    cli.add_decoder(parser, "what the planner imagined, beside the goal, in the image")
-    cli.add(parser, "--out FOLDER", "for both files (plan)", cli.as_path, default=Path("plan"))
+    cli.add(parser, "--out FOLDER", "where both files go (plan)", cli.as_path, default=Path("plan"))
+    group = parser.add_argument_group("the goals")
+    cli.add(group, "--durations STEPS", "model steps of all goals but the last, as 2,1 (equal shares)")
+    cli.add(group, "--mask IMAGE", "black where the goal image does not count, of its size", cli.as_local)
+    group = parser.add_argument_group("the search, and its image")
+    cli.add(group, "--seed N", "of the search (the config's)", cli.whole_number(0, 2**31 - 1))
+    text = "points of the image's energy maps along each axis; 0: no maps (13, or fewer where the search is short)"
+    cli.add(group, "--nodes N", text, cli.whole_number(0, 101))
+    cli.add_decoder(group, "in the image what the planner imagined, beside the goal")
 
 
 def add_goals(commands: cli.Commands) -> None:
     """Add `goals` to a parser."""
-    parser = cli.command(commands, "goals", _goals)
+    parser = cli.command(commands, "goals", _goals, "my_robot.yaml --episode 3 --out goals/cup")
     cli.add(parser, "source CONFIG|VIDEO", "a config, of whose data the episode is; or a film, MP4", cli.as_local)
     cli.add(parser, "overrides key=value", "of the config, such as data.camera=wrist_left", nargs="*")
     cli.add(parser, "--out FOLDER", "where goals.json and the images go: new or empty", cli.as_path, required=True)
     cli.add(parser, "--episode ID|NUMBER", "which one: its name in the data, or its number, from 0 (0)")
-    text = "gripper: where it changes or the arm stops; latent: by images, with --model; every N frames (film: latent)"
+    text = "gripper: where it changes or the arm stops; latent: by images; every N frames (gripper; of a film latent)"
     cli.add(parser, "--by gripper|latent|every", text, nargs="+")
-    text = "that will plan: for latents, energies and the noise floor; the folder of a run, or what model.base takes"
-    cli.add(parser, "--model RUN_OR_MODEL", text, cli.as_model)
-    cli.add_checkpoint(parser, default=None)
+    cli.add(parser, "--model RUN_OR_MODEL", "what will plan: for latents, energies and the noise floor", cli.as_model)
     cli.add(parser, "--stride N", "frames of a model step (data.stride); needed of a film", cli.count)
-    cli.add(parser, "--apart N", "least frames from one goal to another (gripper: 4; latent: 4 model steps)", cli.count)
-    cli.add(parser, "--slack N", "model steps that a goal may take fewer or more (3)", cli.whole_number(0), default=3)
-    share, energy = cli.number_between(0.0, 1.0, "the energy"), "of the energy at a goal's beginning, below which"
-    cli.add(parser, "--share X", f"{energy} the next one follows (none: by steps only)", share)
-    cli.add(parser, "--stop-share X", f"{energy} the last one is reached (none: an equal image)", share)
-    cli.add(parser, "--still VIDEO", "of the resting arm, for the noise floor (where the episode rests)", cli.as_path)
+    group = parser.add_argument_group("where goals lie, and when the next one follows")
+    cli.add_checkpoint(group, default=None)
+    cli.add(group, "--apart N", "least frames from one goal to another (gripper: 4; latent: 4 model steps)", cli.count)
+    cli.add(group, "--slack N", "model steps that a goal may take fewer or more (3)", cli.whole_number(0), default=3)
+    share, energy = cli.number_between(0.0, 1.0, "the energy"), "below this share of the energy at a goal's beginning"
+    cli.add(group, "--share X", f"{energy} the next one follows (none: by steps only)", share)
+    cli.add(group, "--stop-share X", f"{energy} the last one is reached (none: an equal image)", share)
+    cli.add(group, "--still VIDEO", "of the resting arm, for the noise floor (where the episode rests)", cli.as_path)
 
 
 def _plan(options: argparse.Namespace) -> int:
-    """Plan from an image and a state to a goal image: plan.json, and an image of how the planner came to it.
+    """Plan actions from an image and a state to a goal image.
 
-    Status 1 where the model gives no finite energy.
+    Written are plan.json, and an image of how the planner came to it. Status 1 where the model gives no finite energy.
     """
     from vjepa2_ac.data.sources.indexed_source import measured_space
 
@@ -151,9 +149,10 @@ def _goals_of(options: argparse.Namespace, horizon: int) -> GoalFolder:
 
 
 def _goals(options: argparse.Namespace) -> None:
-    """Make goals of one demonstration, an episode or a film: its key frames with durations and gripper.
+    """Make goals that follow one another, of a demonstration.
 
-    They are in a folder that `plan --goals` and `simulate --goals` take, with a contact sheet.
+    They are key frames of an episode or a film, with durations and gripper, in a folder that `plan --goals` and
+    `simulate --goals` take, with a contact sheet.
     """
     by, every = _way(options)
     cli.require_new_place(options.out)

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import logging
+import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from importlib.metadata import entry_points
 from pathlib import Path
 
 from vjepa2_ac import __version__, process
 from vjepa2_ac.cli import closed_loop, data, evaluate, plan, setup, train
-from vjepa2_ac.cli.options import Handler, Parser, parsed, speaks
+from vjepa2_ac.cli.options import Commands, Handler, Parser, add_commands, parsed, speaks
 from vjepa2_ac.errors import InputError, UserError, extra_of, in_words, is_out_of_memory, pip_install, printable
 from vjepa2_ac.process import EXIT_STATUS, StoppedError, tidy_end
 
@@ -24,6 +25,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     130 interrupted. A reader that closes early, as `head` does, changes nothing; a full disk for the output is an
     error, in the end.
     """
+    if "_ARGCOMPLETE" in os.environ:  # a shell asks what may stand at its cursor
+        from vjepa2_ac.cli.completion import complete
+
+        complete(_parser(os.environ["COMP_LINE"].split()[1:]))
     with process.own_streams() as lost, _our_warnings(), tidy_end():
         status = _run(arguments)
         if problem := lost():
@@ -94,20 +99,27 @@ def _our_warnings() -> Iterator[None]:
         ours.removeHandler(handler)
 
 
-def _parser(words: Sequence[str] = ()) -> argparse.ArgumentParser:
-    parser: argparse.ArgumentParser = Parser(
-        prog="vjepa2-ac", description="Fine-tune V-JEPA 2-AC with LoRA, and know whether it helped."
-    )
-    parser.add_argument("--version", action="version", version=__version__)
-    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    first = (setup.add_demo, setup.add_init, train.add_train, evaluate.add_evaluate, evaluate.add_imagine)
-    of_data = (data.add_data, train.add_encode, train.add_decoder_command, setup.add_doctor)
-    of_planning = (plan.add_plan, plan.add_goals, closed_loop.add_serve, closed_loop.add_simulate)
-    for add in (*first, *of_data, *of_planning, train.add_export, setup.add_config_command, setup.add_download):
-        add(commands)
-    for one in entry_points(group="vjepa2_ac.commands"):  # of other packages; imported only if it is asked for
+def _parser(words: Sequence[str] = ()) -> Parser:
+    parser = Parser(prog="vjepa2-ac", description="Fine-tune V-JEPA 2-AC with LoRA, and know whether it helped.")
+    parser.add_argument("--version", action="version", version=__version__, help="show the version")
+    parser.epilog = "`vjepa2-ac COMMAND --help` begins with an example. Completion behind TAB: docs/start.md."
+    groups: dict[str, list[Callable[[Commands], None]]] = {
+        "begin": [setup.add_demo, setup.add_init, setup.add_download, setup.add_doctor, setup.add_config_command],
+        "look": [data.add_data, evaluate.add_imagine],
+        "train": [train.add_encode, train.add_train, train.add_decoder_command],
+        "judge": [evaluate.add_evaluate, evaluate.add_compare, closed_loop.add_simulate],
+        "use": [plan.add_plan, plan.add_goals, closed_loop.add_serve, train.add_export],
+        "from other packages": [partial(_add_others, words)],
+    }
+    add_commands(parser, groups)
+    return parser
+
+
+def _add_others(words: Sequence[str], commands: Commands) -> None:
+    """Add commands of installed packages, which are imported only if they are asked for."""
+    for one in entry_points(group="vjepa2_ac.commands"):
         if next(iter(words), None) == one.name:
             one.load()(commands)
         else:
-            commands.add_parser(one.name, help=f"of {one.value.partition(':')[0]}")
-    return parser
+            about = f"of {one.value.partition(':')[0]}"
+            commands.add_parser(one.name, help=about, description=about)

@@ -35,23 +35,17 @@ _RECORD = "simulate record {path} --domain B --episodes 60 --seed 5"
 
 def add_init(commands: cli.Commands) -> None:
     """Add `init` to a parser."""
-    parser = cli.command(commands, "init", _init)
-    text = (
-        f"one of {', '.join(FORMS)}; or left out: the files tell. sim: simulated data and the tiny model. scratch: a"
-        " fresh predictor on V-JEPA 2.1's ViT-B, without Meta's action-conditioned model"
-    )
-    cli.add(parser, "form FORM", text, cli.as_place, nargs="?")
-    place = "the data: a folder, or a URL (droid, lerobot, raw: DROID's own)"
-    cli.add(parser, "path PATH", place, cli.as_place, nargs="?")
-    cli.add(parser, "--out FILE", "the config (NAME.yaml, by the data's folder)", cli.as_path)
-    model = "instead of the released: what model.base takes; scratch: an encoder"
-    cli.add(parser, "--model MODEL", model, cli.as_model)
+    parser = cli.command(commands, "init", _init, "data/my_robot")
+    cli.add(parser, "form FORM", f"{', '.join(FORMS)} (the files tell); scratch: a new model", cli.as_place, nargs="?")
+    cli.add(parser, "path PATH", "a folder, or a URL (droid, lerobot, raw: DROID's own)", cli.as_place, nargs="?")
+    cli.add(parser, "--out FILE", "the config to write (NAME.yaml, by the data's folder)", cli.as_path)
+    cli.add(parser, "--model MODEL", "another than the released; scratch: an encoder", cli.as_model)
     cli.add(parser, "--overwrite", "write over a config that is there", action="store_true")
 
 
 def add_config_command(commands: cli.Commands) -> None:
     """Add `config` to a parser."""
-    parser = cli.command(commands, "config", _config)
+    parser = cli.command(commands, "config", _config, "text builtin:own_robot > my_robot.yaml")
     parser.add_argument("what", choices=["schema", "list", "show", "text"])
     cli.add(parser, "config CONFIG", "for show and text: a YAML config, or builtin:NAME", cli.as_local, nargs="?")
     cli.add(parser, "overrides key=value", "for show: such as training.steps=100", nargs="*")
@@ -59,27 +53,30 @@ def add_config_command(commands: cli.Commands) -> None:
 
 def add_download(commands: cli.Commands) -> None:
     """Add `download` to a parser."""
-    parser = cli.command(commands, "download", _download)
-    cli.add(parser, "name NAME", "as --list shows it (default: vjepa2-ac-vitg, the world model, 11.7 GB)", nargs="?")
-    cli.add(parser, "--to PATH", "where to (default: checkpoints/NAME.pt)", cli.as_path)
+    parser = cli.command(commands, "download", _download, "vjepa2-ac-vitg")
+    cli.add(parser, "name NAME", "as --list shows it (vjepa2-ac-vitg, the world model, 11.7 GB)", nargs="?")
+    cli.add(parser, "--to PATH", "the file to write (checkpoints/NAME.pt)", cli.as_path)
     cli.add(parser, "--url", "another address of the same file than Meta's")
     cli.add(parser, "--list", "show names, sizes and licences, and fetch nothing", action="store_true")
 
 
 def add_doctor(commands: cli.Commands) -> None:
     """Add `doctor` to a parser."""
-    cli.add_config(cli.command(commands, "doctor", _doctor), such_as="training.batch_size=4")
+    parser = cli.command(commands, "doctor", _doctor, "my_robot.yaml training.batch_size=4")
+    cli.add_config(parser, such_as="training.batch_size=4", nargs="?")
+    cli.add(parser, "--report", "versions, machine and settings, for a bug report", action="store_true")
 
 
 def add_demo(commands: cli.Commands) -> None:
     """Add `demo` to a parser."""
-    cli.command(commands, "demo", _demo)
+    cli.command(commands, "demo", _demo, "    # then look at demo/run/report.html")
 
 
 def _init(options: argparse.Namespace) -> int:
-    """Write a commented config for the data and the machine that are there, and say what to do next.
+    """Write a commented config for your data and this machine.
 
-    Guesses are marked, and the data are looked at as `data check` does; exit status as of that.
+    Guesses are marked, the data are looked at as `data check` does (exit status as of that), and the next commands are
+    printed.
     """
     form, path = _form_and_path(options.form, options.path)
     name = _name_of(form, path)
@@ -173,10 +170,13 @@ def _next(draft: Draft, out: Path, name: str) -> list[tuple[str, str]]:
 
 
 def _config(options: argparse.Namespace) -> None:
-    """schema: every key with its range, as JSON schema.
+    """Show the configs of the package, and every key with its range.
 
-    list: the configs that come with the package. text: one of them with its comments, to begin a config of your own
-    with. show: a config with every default.
+    What is shown:
+      list    the configs that come with the package
+      text    one of them with its comments, to begin a config of your own with
+      show    a config with every default
+      schema  every key with its range, as JSON schema
     """
     from vjepa2_ac.config.loading import config_as_yaml, config_path, config_schema, load_config, packaged_configs
 
@@ -196,7 +196,7 @@ def _config(options: argparse.Namespace) -> None:
 
 
 def _download(options: argparse.Namespace) -> None:
-    """Fetch a published checkpoint: Meta's world model, or an encoder of V-JEPA 2 or 2.1.
+    """Fetch Meta's world model, or an encoder of V-JEPA 2 or 2.1.
 
     It goes on where it stopped; its size is checked.
     """
@@ -216,10 +216,18 @@ def _download(options: argparse.Namespace) -> None:
 
 
 def _doctor(options: argparse.Namespace) -> int:
-    """Estimate the GPU memory of a run, part by part, by a step on tensors without numbers: nothing is loaded.
+    """Say whether a run fits this GPU, or what this machine is.
 
-    Exit status 0: it fits, 1: it does not, 2: something cannot be used.
+    The memory is estimated part by part, by a step on tensors without numbers: nothing is loaded. Exit status 0: it
+    fits, 1: it does not, 2: something cannot be used.
     """
+    if options.report or options.config is None:
+        from vjepa2_ac.cli.console.setup import report_lines
+
+        for line in report_lines():
+            print(line)
+        return 0
+
     from vjepa2_ac.config.loading import load_config
 
     config = load_config(options.config, options.overrides)
@@ -255,10 +263,10 @@ _CLIP = "--episode B_seed5_00h39_000039 --start 5"  # held out; the arm is low, 
 
 
 def _demo(_options: argparse.Namespace) -> int:
-    """Record a simulated arm, train a tiny world model with LoRA, film what it imagines, and say whether it helped.
+    """See all of it on a simulated arm: record, train, judge, film.
 
-    All of it is in the folder demo, in 4 to 6 minutes on 2 cores, without a download. The same command goes on after a
-    stop.
+    A tiny world model is trained with LoRA. All of it is in the folder demo, in 4 to 6 minutes on 2 cores, without a
+    download. The same command goes on after a stop.
     """
     from vjepa2_ac.simulation.world.domains import load_mujoco
 

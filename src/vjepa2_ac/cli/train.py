@@ -11,43 +11,39 @@ from vjepa2_ac.errors import InputError
 
 def add_train(commands: cli.Commands) -> None:
     """Add `train` to a parser."""
-    parser = cli.command(commands, "train", _train)
-    what = "a YAML config, or with --resume the folder of a run"
-    cli.add_config(parser, such_as="training.learning_rate=3e-4", what=what)
+    parser = cli.command(commands, "train", _train, "my_robot.yaml training.steps=1000")
+    cli.add_config(parser, such_as="training.learning_rate=3e-4", what="a YAML config, or (--resume) a run's folder")
     cli.add(parser, "--resume", "go on with the run in the folder CONFIG", action="store_true")
-    cli.add(parser, "--check", "do everything that can fail and stop before the first step", action="store_true")
-    cli.add(parser, "--allow-config-change", "go on though the config is another", action="store_true")
+    cli.add(parser, "--check", "do everything that can fail, and stop before the first step", action="store_true")
+    cli.add(parser, "--allow-config-change", "go on with a run though the config is another", action="store_true")
 
 
 def add_encode(commands: cli.Commands) -> None:
     """Add `encode` to a parser."""
-    parser = cli.command(commands, "encode", _encode)
+    parser = cli.command(commands, "encode", _encode, "my_robot.yaml")
     cli.add_config(parser, such_as="data.cache_dtype=int8")
-    cli.add(parser, "--out FOLDER", "of the cache, for data.source: latents (where data.cache finds it)", cli.as_path)
+    cli.add(parser, "--out FOLDER", "the cache, for data.source: latents (where data.cache finds it)", cli.as_path)
 
 
 def add_decoder_command(commands: cli.Commands) -> None:
     """Add `decoder` to a parser."""
-    parser = cli.command(commands, "decoder", _decoder)
+    parser = cli.command(commands, "decoder", _decoder, "my_robot.yaml")
     cli.add_config(parser, such_as="decoder.size=medium")
     cli.add(parser, "--check", "do what can fail, and write nothing", action="store_true")
 
 
 def add_export(commands: cli.Commands) -> None:
     """Add `export` to a parser."""
-    parser = cli.command(commands, "export", _export)
-    cli.add(parser, "run RUN", "the folder of a run", cli.as_path)
-    cli.add(parser, "folder FOLDER", "where to, new or empty; official: or a .pt file", cli.as_path)
-    text = (
-        "merged: a folder that `model.base` takes. official: one .pt by Meta's names, for the official code. hub: the"
-        " adapter in PEFT's format with a model card, ready to upload"
-    )
+    parser = cli.command(commands, "export", _export, "runs/my_robot merged")
+    cli.add(parser, "run RUN", "folder of a run", cli.as_path)
+    cli.add(parser, "folder FOLDER", "what is written: new or empty; official: or a .pt file", cli.as_path)
+    text = "merged: for model.base; official: a .pt by Meta's names; hub: the adapter in PEFT's format, with a card"
     cli.add(parser, "--to", text, choices=["merged", "official", "hub"], default="merged")
     cli.add_checkpoint(parser)
 
 
 def _train(options: argparse.Namespace) -> None:
-    """Train an adapter (or the whole predictor) as a config says.
+    """Train a LoRA adapter, or the whole predictor, as a config says.
 
     SIGTERM, SIGINT, SIGUSR1, SIGHUP: finish the step, write a checkpoint, end with status 75; the same command goes
     on from there. A second signal: end at once.
@@ -75,10 +71,10 @@ def _train(options: argparse.Namespace) -> None:
 
 
 def _encode(options: argparse.Namespace) -> None:
-    """Run the frozen encoder once over all frames that the clips of a config need, and cache the latents.
+    """Encode all frames once, and cache the latents for training.
 
-    Stopping it costs the few episodes in progress at most: the same command goes on. Several processes (torchrun)
-    share the work.
+    Those that the clips of a config need, by the frozen encoder. Stopping it costs the few episodes in progress at
+    most: the same command goes on. Several processes (torchrun) share the work.
     """
     config = cli.read_config(options.config, options.overrides, base=True)
 
@@ -102,10 +98,11 @@ def _encode(options: argparse.Namespace) -> None:
 
 
 def _decoder(options: argparse.Namespace) -> None:
-    """Train a decoder on the latents of true frames: what `imagine` and --decoder show images with.
+    """Train what turns latents into images, for films.
 
-    It belongs to the config's encoder and camera, and serves every run on them. Stopping it costs a checkpoint's
-    distance at most: the same command goes on.
+    It is trained on the latents of true frames, and what `imagine` and --decoder show images with. It belongs to
+    the config's encoder and camera, and serves every run on them. Stopping it costs a checkpoint's distance at
+    most: the same command goes on.
     """
     config = cli.read_config(options.config, options.overrides, base=True)
 
@@ -125,7 +122,7 @@ def _decoder(options: argparse.Namespace) -> None:
 
 
 def _export(options: argparse.Namespace) -> None:
-    """Write a run's model, adapter merged in, or its adapter, for others to use."""
+    """Write a run's model, or its adapter, for others to use."""
     from vjepa2_ac.runs.folder import read_run_config
 
     read_run_config(options.run)

@@ -1,12 +1,21 @@
-"""Lines and tables of doctor and download: the memory of a run part by part, and the published checkpoints."""
+"""Lines and tables of doctor and download: a run's memory part by part, this machine, the published checkpoints."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+import platform
+import re
+import shlex
+import subprocess
+from collections.abc import Iterator, Sequence
+from importlib.metadata import PackageNotFoundError, requires, version
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich import box
 from rich.table import Table
+
+from vjepa2_ac import __version__
 
 if TYPE_CHECKING:
     from vjepa2_ac.model.checkpoints.published import Published
@@ -18,6 +27,44 @@ UNTESTED = (
     "Measured on tensors without numbers. It was compared with what PyTorch keeps on a CPU and with what lives at once"
     " on an imagined GPU, not yet with a GPU's measured peak."
 )
+_INSTRUCTIONS = ("avx2", "avx512f", "avx512_bf16", "amx_bf16", "asimd", "sve", "bf16")  # of products of matrices
+_SETTINGS = re.compile("(ACCELERATE|CUDA|GOMP|MKL|MUJOCO|NCCL|OMP|PYTORCH|TORCH|VJEPA2_AC)_.*|.*RANK|WORLD_SIZE")
+
+
+def report_lines() -> Iterator[str]:
+    """Yield what a bug report needs of this machine: versions, CPU, GPU, settings; no secret, no path.
+
+    What PyTorch sees comes last: importing it may be what fails.
+    """
+    root, about = Path(__file__).parents[4], Path("/proc/cpuinfo").read_text(encoding="utf-8")
+    commit = _output(f"git -C {shlex.quote(str(root))} describe --always --dirty") if (root / ".git").exists() else ""
+    yield f"vjepa2-ac {__version__} {commit}".rstrip()
+    yield f"Python {platform.python_version()}, {platform.platform()}"
+    name, has = re.search(r"model name\s*: (.*)", about), [one for one in _INSTRUCTIONS if one in about.split()]
+    yield f"CPU: {name[1] if name else platform.machine()}, {os.cpu_count()} cores, {' '.join(has)}"
+    asked = [line for line in requires("vjepa2-ac") or [] if not re.search("extra == .(data|dev|docs)", line)]
+    yield f"Libraries: {', '.join(dict.fromkeys(_with_version(line) for line in asked))}"
+    for key, value in sorted(os.environ.items()):
+        if _SETTINGS.fullmatch(key):
+            yield f"{key}={'(a path)' if '/' in value else value}"
+    yield f"GPU: {_output('nvidia-smi --query-gpu=name,memory.total,driver_version --format=csv,noheader') or 'none'}"
+
+    import torch
+
+    yield f"PyTorch: CUDA {torch.version.cuda}, sees {torch.cuda.device_count()} GPUs"
+
+
+def _output(command: str) -> str:
+    """Return what a program prints; nothing where it is not there."""
+    return subprocess.getoutput(f"{command} 2>/dev/null")  # noqa: S605 - our own words
+
+
+def _with_version(requirement: str) -> str:
+    name = re.split(r"[^\w.-]", requirement)[0]
+    try:
+        return f"{name} {version(name)}"
+    except PackageNotFoundError:
+        return f"{name} (not here)"
 
 
 def memory_lines(estimate: MemoryEstimate) -> list[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import glob
 import math
 import re
@@ -14,7 +13,7 @@ from typing import Any
 from vjepa2_ac import storage
 from vjepa2_ac.config import LeRobotData, LeRobotFields
 from vjepa2_ac.data.files import in_parallel
-from vjepa2_ac.errors import InputError, MissingFileError
+from vjepa2_ac.errors import InputError, MissingFileError, did_you_mean
 from vjepa2_ac.media.video import is_deep_grey
 from vjepa2_ac.storage import FileInfo
 from vjepa2_ac.storage.structured import read_json_object
@@ -132,9 +131,7 @@ class DatasetInfo:
 def missing(where: str, kind: str, name: str, place: str, known: Iterable[str]) -> InputError:
     """Return the error of a missing name, with the existing ones, and a suggestion."""
     known = list(known)
-    close = difflib.get_close_matches(name, known, n=1)
-    hint = f"Did you mean {close[0]}? " if close else ""
-    fix = f"{hint}It has: {', '.join(known) or 'none'}"
+    fix = f"{did_you_mean(name, known)}It has: {', '.join(known) or 'none'}"
     return InputError(where=where, found=f"no {kind} {name} in {place}", needed="one that it has", fix=fix)
 
 

@@ -9,7 +9,6 @@ copy whose images or texts were encoded again has another length, and is not fou
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -38,7 +37,7 @@ from vjepa2_ac.data.sources.rlds.tfrecord import (
     span_at,
 )
 from vjepa2_ac.episode import STATE_DIM, Episode, EpisodeInfo, FrameReader, Progress
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, did_you_mean
 from vjepa2_ac.spaces import POSE, require_finite, zero_steps
 
 IDENTITY_SEPARATOR = "--"  # as in the published lists of DROID's idle ranges
@@ -94,10 +93,8 @@ class Record:
         """
         if name not in self.located:
             known = sorted(self.located)
-            close = difflib.get_close_matches(name, known, n=1)
             found = f"no feature {name}; the record has {', '.join(known) or 'none'}"
-            fix = f"Did you mean {close[0]}? Set data.fields" if close else "Set data.fields"
-            raise InputError(where=str(self._span), found=found, fix=fix)
+            raise InputError(where=str(self._span), found=found, fix=f"{did_you_mean(name, known)}Set data.fields")
         return self.located[name]
 
     def floats(self, name: str) -> Float32[np.ndarray, " values"]:
