@@ -102,7 +102,7 @@ def _undrawn() -> Iterator[Callable[..., None]]:
     from matplotlib.figure import Figure
 
     draw = Figure.draw
-    Figure.draw = lambda self, renderer: None  # type: ignore[method-assign]
+    Figure.draw = lambda *_: None  # type: ignore[method-assign]
     yield draw
     Figure.draw = draw  # type: ignore[method-assign]
 
