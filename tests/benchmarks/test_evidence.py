@@ -120,6 +120,7 @@ def _held_out(make: Any, *arguments: Any) -> Any:
     return make(*arguments).model_copy(update={"validation_share": 0.2, "test_share": 0.3})
 
 
+@pytest.mark.usefixtures("drawn")
 def test_a_cell_is_trained_and_measured_and_its_base_comes_back(small: Any, tmp_path: Path) -> None:
     cell = small.cells.Cell("look", "many cameras", "LoRA r4 + in/out", 4, 0)
     figures = small.measure.measure(cell, small.folder, goals=1)

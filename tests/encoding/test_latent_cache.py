@@ -525,6 +525,7 @@ def test_knobs_that_contradict_a_cache_are_errors(tmp_path: Path, knobs: dict[st
         config_of(tmp_path, tmp_path, **knobs)
 
 
+@pytest.mark.usefixtures("drawn")
 def test_a_cache_can_be_checked_and_inspected(a_cache: tuple[Dataset, Dataset, Path], tmp_path: Path) -> None:
     config = alone(a_cache[1], camera=None).config
     found = {finding.about: finding for finding in check_data(config)}
