@@ -52,8 +52,8 @@ from simulated import clone, simulated  # noqa: E402, F401
 
 # Begun first, each by a process of its own: whoever comes to them last would work alone in the end.
 LONGEST = (
-    "test_notebook.py", "test_quickstart.py", "test_end_to_end.py", "test_fake_gpu.py", "test_real_client.py",
-    "test_site.py", "test_wheel.py", "test_memory.py",
+    "test_notebook.py", "test_quickstart.py", "test_end_to_end.py", "test_memory.py", "test_page.py", "test_step.py",
+    "test_fake_gpu.py", "test_benchmark.py", "test_real_client.py", "test_site.py", "test_wheel.py",
 )  # fmt: skip
 
 

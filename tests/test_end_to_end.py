@@ -159,6 +159,7 @@ def test_real_robot_pictures_go_the_whole_way_and_the_error_falls(shared: Path, 
     data = shared / "data/bridge_rlds/bridge_dataset/1.0.0"
     config = str(ROOT / "configs/bridge.yaml")
     overrides = [f"data.path={data}", f"run_dir={tmp_path / 'run'}", "training.steps=20", "validation.every=20"]
+    overrides += ["validation.ranking_samples=4"]
     assert main(["train", config, *overrides]) == 0
     rows = list(read_metrics_log(tmp_path / "run" / "metrics.jsonl"))
     losses = [row["loss"] for row in rows if row["kind"] == "train"]

@@ -70,6 +70,7 @@ def test_it_runs_as_it_is(tmp_path: Path) -> None:
     assert float(apart) < float(still.split(" cm")[0]), "with LoRA, planning is better than standing still"
 
 
+@pytest.mark.filterwarnings("ignore:__array__ implementation")  # of a tensor that is drawn
 def test_it_runs_with_a_file_of_official_form(
     tmp_path: Path, simulated: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
