@@ -46,7 +46,7 @@ encoders: $(SIMULATION)  ## what each published encoder costs, by doctor's arith
 	$(BIN)/python benchmarks/encoders.py
 
 test: $(INSTALLED)  ## the whole test suite, on all cores (8 at most), a thread each; a folder in one process: .venv/bin/pytest tests/data
-	OMP_NUM_THREADS=1 $(BIN)/pytest -q -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder --durations 10
+	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/pytest -q -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder --durations 10
 
 # There is no CPU wheel of PyTorch 2.11: this takes the one with CUDA, 5 GB in all, which runs without a GPU, too.
 $(OLDEST)/installed: pyproject.toml constraints.txt

@@ -47,7 +47,8 @@ NO_GUIDES = {
 }
 
 FEW_STEPS = (
-    "training.steps=2 validation.every=1 checkpoint.every=1 validation.clips=4 data.workers=0 training.batch_size=2"
+    "training.steps=2 validation.every=1 checkpoint.every=1 validation.clips=4 validation.ranking_samples=4"
+    " data.workers=0 training.batch_size=2"
     " training.accumulation=1 training.warmup_steps=0 training.allow_weak_base=true"
 )
 FEW_CLIPS = "--clips 4 --sensitivity-clips 2 --samples 8 --examples 1 --landscapes 1 --nodes 3 --axes 2"

@@ -15,7 +15,6 @@ from paths import ROOT
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 TARGETS = set(re.findall(r"^([a-z][\w-]*):", (ROOT / "Makefile").read_text(), flags=re.MULTILINE))
 CHECKS = runpy.run_path(str(ROOT / "scripts/check_links.py"))
-FORMS = sorted((ROOT / ".github/ISSUE_TEMPLATE").glob("[!c]*.yml"))
 WORKFLOWS = sorted((ROOT / ".github/workflows").glob("*.yml"))
 
 LIBRARIES = "bitsandbytes|Franka|PEFT|PEP 610|protobuf.dev|PyTorch|TFDS|torchmetrics|torchvision|WCAG"
@@ -92,16 +91,6 @@ def test_contributing_is_short_and_leads_to_each_recipe() -> None:
     extending = re.findall(r"^## (An? .+)$", (ROOT / "docs/extending.md").read_text(), flags=re.MULTILINE)
     assert len(extending) == 8
     assert all(f"docs/extending.md#{title.lower().replace(' ', '-')}" in page for title in extending)
-
-
-@pytest.mark.parametrize("path", FORMS, ids=lambda path: path.stem)
-def test_an_issue_form_can_be_filled_in(path: Path) -> None:
-    form = loaded(path)
-    assert {"name", "description", "body"} <= set(form)
-    fields = [field for field in form["body"] if field["type"] != "markdown"]
-    assert {field["type"] for field in fields} <= {"input", "textarea", "dropdown", "checkboxes"}
-    assert len({field["id"] for field in fields}) == len(fields)
-    assert all(field["attributes"]["label"] for field in fields)
 
 
 @pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.stem)

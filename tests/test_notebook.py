@@ -6,6 +6,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import matplotlib.pyplot as plt
 import nbformat
 import pytest
 import yaml
@@ -19,16 +20,12 @@ OTHER = 'MODEL = "checkpoints/vjepa2-ac-vitg.pt"'
 SIZES = {"image_size": 64, "encoder": {"heads": 4}, "predictor": {"heads": 4}}  # tests/golden/model/tiny.json
 
 
-def executed(folder: Path, line: str = LINE) -> tuple[str, int]:
+def executed(folder: Path) -> tuple[str, int]:
     """Run the notebook where Jupyter would, in `examples` of a folder; return what it printed, and its images."""
     notebook = nbformat.read(NOTEBOOK, as_version=4)
-    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
-    assert code[0].source == LINE
-    code[0].source = line
-    (folder / "examples").mkdir()
     resources = {"metadata": {"path": str(folder / "examples")}}
     NotebookClient(notebook, timeout=600, kernel_name="python3", resources=resources).execute()
-    outputs = [output for cell in code for output in cell.outputs]
+    outputs = [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
     assert not [output.text for output in outputs if output.get("name") == "stderr"]
     images = sum("image/png" in output.get("data", {}) for output in outputs)
     return "".join(output.get("text", "") for output in outputs), images
@@ -42,6 +39,10 @@ def quiet(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "1")  # other tests have the other cores
 
 
+def code() -> list[str]:
+    return [cell.source for cell in nbformat.read(NOTEBOOK, as_version=4).cells if cell.cell_type == "code"]
+
+
 def test_it_is_stored_without_outputs() -> None:
     stored = json.loads(NOTEBOOK.read_text())
     code = [cell for cell in stored["cells"] if cell["cell_type"] == "code"]
@@ -51,8 +52,8 @@ def test_it_is_stored_without_outputs() -> None:
 
 def test_one_line_is_all_that_changes() -> None:
     cells = nbformat.read(NOTEBOOK, as_version=4).cells
-    code = [cell.source for cell in cells if cell.cell_type == "code"]
-    assert [text for text in code if re.search(r"^\s*MODEL\s*=", text, flags=re.MULTILINE)] == [LINE]
+    assert code()[0] == LINE
+    assert [text for text in code() if re.search(r"^\s*MODEL\s*=", text, flags=re.MULTILINE)] == [LINE]
     assert OTHER in cells[0].source
     official = yaml.safe_load((ROOT / "configs/debug.yaml").read_text())
     assert official["model"]["base"] in OTHER
@@ -60,6 +61,7 @@ def test_one_line_is_all_that_changes() -> None:
 
 @pytest.mark.usefixtures("quiet")
 def test_it_runs_as_it_is(tmp_path: Path) -> None:
+    (tmp_path / "examples").mkdir()
     printed, images = executed(tmp_path)
     assert images == 6, "clips, errors by patch, two energies, loss, evaluation"
     for words in ("12 episodes", "builtin:sim-tiny on cpu", "of persistence", "Validation at step 40", "The adapter"):
@@ -68,9 +70,14 @@ def test_it_runs_as_it_is(tmp_path: Path) -> None:
     assert float(apart) < float(still.split(" cm")[0]), "with LoRA, planning is better than standing still"
 
 
-@pytest.mark.usefixtures("quiet")
-def test_it_runs_with_a_file_of_official_form(tmp_path: Path, simulated: Path) -> None:
-    """The config of real data, with an address and sizes that a test can have, stands where the notebook looks."""
+@pytest.mark.filterwarnings("ignore:__array__ implementation")  # of a tensor that is drawn
+def test_it_runs_with_a_file_of_official_form(
+    tmp_path: Path, simulated: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The config of real data, with an address and sizes that a test can have, stands where the notebook looks.
+
+    Without a kernel, which has to import everything anew.
+    """
     shutil.copyfile(GOLDEN / "model/tiny.pt", tmp_path / "official.pt")
     config: dict[str, Any] = yaml.safe_load((ROOT / "configs/debug.yaml").read_text())
     config["data"] |= {"path": str(simulated), "frames": 3, "validation_share": 0.3, "test_share": 0.3}
@@ -82,7 +89,16 @@ def test_it_runs_with_a_file_of_official_form(tmp_path: Path, simulated: Path) -
     (tmp_path / "configs").mkdir()
     (tmp_path / "configs/debug.yaml").write_text(yaml.safe_dump(config))
 
-    printed, images = executed(tmp_path, 'MODEL = "official.pt"')
-    assert images == 6
+    (tmp_path / "examples").mkdir()
+    monkeypatch.chdir(tmp_path / "examples")
+    images: list[object] = []
+    for shows in ("matplotlib.pyplot.show", "IPython.display.display"):
+        monkeypatch.setattr(shows, lambda *shown: images.append(shown))
+    scope: dict[str, Any] = {}
+    for source in ['MODEL = "official.pt"', *code()[1:]]:
+        exec(source, scope)  # noqa: S102
+    plt.close("all")
+    printed = capsys.readouterr().out
+    assert len(images) == 6
     assert "official.pt on cpu: 16 tokens of 48 numbers" in printed
     assert (tmp_path / "demo/first_hour/official/run/report.html").is_file()

@@ -77,15 +77,6 @@ def test_without_options_only_droid_is_asked_for(machine: Machine) -> None:
     assert [call.split()[0] for call in machine.calls] == ["curl"]
 
 
-def test_login_happens_only_when_asked(machine: Machine) -> None:
-    machine.install("curl", "gcloud")
-    machine.run()
-    machine.run(*BUCKET)
-    assert LOGIN not in machine.calls
-    machine.run("--login")
-    assert machine.calls.count(LOGIN) == 1
-
-
 def test_a_bucket_is_created_once(machine: Machine) -> None:
     machine.install("curl", "gcloud")
     first, second = machine.run(*BUCKET), machine.run(*BUCKET)
@@ -93,14 +84,6 @@ def test_a_bucket_is_created_once(machine: Machine) -> None:
     assert "gs://my-checkpoints is created, private, in us-central1." in first.stdout
     assert "gs://my-checkpoints is there already, in us-central1." in second.stdout
     assert [call for call in machine.calls if "buckets" in call] == [LIST, CREATE, LIST]
-
-
-def test_a_bucket_elsewhere_stays_there(machine: Machine) -> None:
-    machine.install("curl", "gcloud")
-    machine.bucket.write_text("EU")
-    done = machine.run(*BUCKET)
-    assert done.returncode == 0
-    assert "is there already, in EU.\nIt stays there: a bucket cannot move to us-central1." in done.stdout
 
 
 @pytest.mark.parametrize(

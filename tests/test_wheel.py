@@ -1,5 +1,6 @@
 """The wheel: built as docs/releasing.md says, whole, and enough on its own outside of the checkout."""
 
+import json
 import os
 import shutil
 import subprocess
@@ -60,16 +61,30 @@ def test_it_has_every_file_of_the_package_and_no_other(wheel: Path) -> None:
     assert any(name.endswith("licenses/NOTICE") for name in zipfile.ZipFile(wheel).namelist())
 
 
-def test_it_is_enough_outside_of_the_checkout(installed: Path, tmp_path: Path) -> None:
-    def command(*words: object) -> str:
-        return run(sys.executable, "-m", "vjepa2_ac.cli", *words, at=tmp_path, path=installed)
+COMMANDS = """
+import contextlib, io, json, sys
+import vjepa2_ac
+from vjepa2_ac.cli import main
+printed = [vjepa2_ac.__file__]
+for words in json.loads(sys.argv[1]):
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        assert main(words) == 0, words
+    printed.append(out.getvalue())
+print(json.dumps(printed))
+"""
 
-    where = run(sys.executable, "-c", "import vjepa2_ac; print(vjepa2_ac.__file__)", at=tmp_path, path=installed)
-    assert Path(where.strip()).is_relative_to(installed)
+
+def test_it_is_enough_outside_of_the_checkout(installed: Path, tmp_path: Path) -> None:
     write_npz(tmp_path / "own", range(8))
-    said = command("init", "own", "--model", "builtin:sim-tiny", "--out", "own.yaml")
+    commands = (
+        "init own --model builtin:sim-tiny --out own.yaml", "config list", "data converter ros2_bag",
+        "train own.yaml --check training.allow_weak_base=true",
+    )  # fmt: skip
+    words = json.dumps([command.split() for command in commands])
+    where, said, listed, converter, _ = json.loads(
+        run(sys.executable, "-c", COMMANDS, words, at=tmp_path, path=installed)
+    )
+    assert Path(where).is_relative_to(installed)
     assert "vjepa2-ac train own.yaml --check" in said
-    assert "builtin:demo" in command("config", "list")
-    (tmp_path / "ros2_bag.py").write_text(command("data", "converter", "ros2_bag"))
-    assert (tmp_path / "ros2_bag.py").read_text() == (ROOT / "examples/convert/ros2_bag.py").read_text()
-    command("train", "own.yaml", "--check", "training.allow_weak_base=true")
+    assert "builtin:demo" in listed
+    assert converter == (ROOT / "examples/convert/ros2_bag.py").read_text()

@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -50,16 +49,6 @@ def test_a_row_is_on_disk_as_soon_as_it_is_there_and_what_is_unfinished_is_marke
     table.add({"way": "b"})
     assert json.loads(file.read_text())["rows"][1:] == [{"way": "b"}]
     assert list(file.parent.iterdir()) == [file]
-
-
-def test_the_file_is_replaced_as_a_whole(rows: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    file = tmp_path / "rows.json"
-    table = rows.Rows(file)
-    table.add({"way": "a"})
-    monkeypatch.setattr(os, "fsync", lambda _: (_ for _ in ()).throw(KeyboardInterrupt))  # killed while it is written
-    with pytest.raises(KeyboardInterrupt):
-        table.add({"way": "b"})
-    assert json.loads(file.read_text())["rows"] == [{"way": "a"}]
 
 
 def test_what_fails_is_a_row_and_the_end_is_an_error_but_out_of_memory_is_a_result(

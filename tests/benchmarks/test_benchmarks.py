@@ -3,7 +3,6 @@
 import json
 import re
 import sys
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -69,71 +68,6 @@ def test_all_rows_of_a_training_step_come_from_one_command_and_what_runs_out_of_
     assert first["waits"] > 0
     assert first["first_s"] > 0
     assert first["compiled_after"] == 0
-
-
-def test_a_way_that_fails_is_a_row_and_the_others_are_measured_all_the_same(
-    train_step: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bench, done = sys.modules["train_step_variants"].Bench, Counter[str]()
-    usual = bench._our_step
-
-    def step(self: Any, run: Any, batches: Any, latents: Any, way: str) -> None:
-        done[way] += 1
-        if way == "per_step" or (way == "auto" and done[way] > 2):  # at once; or when it is timed
-            raise RuntimeError(f"no {way} today\nand no more")
-        usual(self, run, batches, latents, way)
-
-    monkeypatch.setattr(bench, "_our_step", step)
-    file = tmp_path / "steps.json"
-    ways = ["--attention", "per_step", "auto", "dense", "--profile"]
-    with pytest.raises(SystemExit, match="2 of 3 rows failed"):
-        train_step.main(["--quick", "--no-memory", "--official", str(tmp_path), *ways, "--json", str(file)])
-    found = {row["way"]: row["problem"] for row in json.loads(file.read_text())["rows"]}
-    failed = {way: f"failed: RuntimeError: no {way} today" for way in ("per_step", "auto")}
-    assert found == {"dense": None, **failed}
-    printed = capsys.readouterr().out
-    for way, said in failed.items():
-        assert re.search(rf"^ +4 +1 +no +cache +{way} +{said}$", printed, re.MULTILINE)
-    assert [way for way, _, _ in rows(printed)] == ["dense"]
-
-
-def test_what_ends_the_program_leaves_the_rows_that_were_there(
-    train_step: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bench, done = sys.modules["train_step_variants"].Bench, Counter[bool]()
-    usual = bench._our_step
-
-    def step(self: Any, run: Any, batches: Any, latents: Any, way: str) -> None:
-        done[latents is None] += 1
-        if (
-            done[True] > 9
-        ):  # ways take 2 steps each, and 2 of a round to warm up: this is in the third round that counts
-            raise KeyboardInterrupt
-        usual(self, run, batches, latents, way)
-
-    monkeypatch.setattr(bench, "_our_step", step)
-    monkeypatch.setitem(train_step.QUICK, "repeats", 5)
-    file = tmp_path / "steps.json"
-    with pytest.raises(KeyboardInterrupt):
-        train_step.main([
-            "--quick", "--no-memory", "--official", str(tmp_path), "--source", "cache", "pixels", "--json", str(file),
-        ])  # fmt: skip
-    found = json.loads(file.read_text())["rows"]
-    assert [(row["encoder"], row["repeats"], row.get("finished", True)) for row in found] == [
-        (False, 5, True), (False, 5, True), (True, 1, False), (True, 1, False),
-    ]  # fmt: skip
-
-
-def test_an_official_code_that_fails_is_a_row_and_ours_is_measured_without_it(
-    train_step: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "src" / "models").mkdir(parents=True)
-    (tmp_path / "src" / "models" / "ac_predictor.py").write_text("raise OSError('not today')")
-    with pytest.raises(SystemExit, match="1 of 3 rows failed"):
-        train_step.main(["--quick", "--no-memory", "--official", str(tmp_path)])
-    printed = capsys.readouterr().out
-    assert "official, failed: OSError: not today" in printed
-    assert [way for way, _, _ in rows(printed)] == ["dense", "auto"]
 
 
 def test_the_batch_that_was_found_is_a_row_and_is_timed(

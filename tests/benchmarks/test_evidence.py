@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from paths import ROOT
+from vjepa2_ac.config import ValidationConfig
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.simulation.recording.record import RecordingSpec
 from vjepa2_ac.simulation.world.domains import DOMAIN_A
@@ -91,6 +92,8 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
         cells, prepare, measure = modules.cells, modules.prepare, modules.measure
         patch.setattr(cells, "STEPS", 2)
         patch.setattr(cells, "TRAINING", cells.TRAINING.model_copy(update={"warmup_steps": 1, "batch_size": 2}))
+        short = partial(ValidationConfig, ranking_samples=2)
+        patch.setattr(measure, "ValidationConfig", lambda clips, **given: short(clips=clips // 10, **given))
         few = cells.PLANNING.model_copy(update={"samples": 12, "iterations": 1})
         patch.setattr(measure, "planner", partial(measure.planner, config=few))
         patch.setattr(measure, "CLIPS", 6)
@@ -117,6 +120,7 @@ def _held_out(make: Any, *arguments: Any) -> Any:
     return make(*arguments).model_copy(update={"validation_share": 0.2, "test_share": 0.3})
 
 
+@pytest.mark.usefixtures("drawn")
 def test_a_cell_is_trained_and_measured_and_its_base_comes_back(small: Any, tmp_path: Path) -> None:
     cell = small.cells.Cell("look", "many cameras", "LoRA r4 + in/out", 4, 0)
     figures = small.measure.measure(cell, small.folder, goals=1)

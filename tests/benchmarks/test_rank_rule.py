@@ -7,7 +7,6 @@ from typing import Any
 import pytest
 
 from benches import imported
-from vjepa2_ac.errors import InputError
 
 pytest.importorskip("mujoco")
 
@@ -53,21 +52,3 @@ def test_it_goes_on_where_it_stopped_and_shows_what_diverged(
     table = capsys.readouterr().out.splitlines()[-5:]
     assert table[0] == "| 4 | 0.625 | 0.625 | 0.625 | 0.625 |"
     assert table[-1] == "| 64 | diverged | diverged | diverged | diverged |"
-
-
-def test_a_run_that_is_not_finite_has_diverged_and_any_other_error_is_one(
-    rank_rule: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    cell = next(rank_rule.all_cells())
-
-    def fail(found: str) -> None:
-        def train(*_: object) -> None:
-            raise InputError(where="training", found=found)
-
-        monkeypatch.setattr(rank_rule, "train", train)
-
-    fail("a loss or gradient that is not finite")
-    assert rank_rule.measure(cell, tmp_path, 7) == {"one_step": None, "last_horizon": None}
-    fail("no such data set")
-    with pytest.raises(InputError, match="no such data set"):
-        rank_rule.measure(cell, tmp_path, 7)

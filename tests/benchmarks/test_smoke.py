@@ -46,9 +46,9 @@ def test_it_runs_to_its_end(
                 monkeypatch.setattr(module.rlds_index, attribute, getattr(module.rlds_index, attribute))
             monkeypatch.setenv("STORAGE_EMULATOR_HOST", "")
         if name == "load_memory":
-            monkeypatch.setattr(
-                module, "SMALL", ModelSizes(encoder=EncoderSizes(depth=1), predictor=PredictorSizes(depth=1))
-            )
+            few = ModelSizes(encoder=EncoderSizes(depth=1), predictor=PredictorSizes(depth=1))
+            monkeypatch.setattr(module, "SMALL", few)
+            monkeypatch.setattr(subprocess, "run", lambda words, main=module.main, **_: main(words[2:]))
         if name == "loader":
             monkeypatch.setattr(module, "DROID_EPISODES", 2_000)
             monkeypatch.setattr(module.measure_workers, "__defaults__", (2, 2))

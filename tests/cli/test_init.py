@@ -47,7 +47,7 @@ def test_data_that_cannot_be_trained_on_give_a_config_all_the_same_and_status_2(
         (here / f"data/my robot/v1.0/{number:03d}.npz").unlink()
     assert main(["init", "data/my robot/v1.0", "--model", "builtin:sim-tiny"]) in {1, 2}
     told = capsys.readouterr()
-    assert "three episodes or more" in told.out + told.err
+    assert "episodes among 2" in told.out + told.err
     assert "Mend this first, then: vjepa2-ac data check my-robot.yaml\n\nNext:" in told.out
     assert load_config(here / "my-robot.yaml").data.validation_share == 0.15
 

@@ -214,6 +214,7 @@ def test_the_check_tells_numbers_that_teach_nothing(states: np.ndarray, about: s
     assert words in found[about].text
 
 
+@pytest.mark.usefixtures("drawn")
 def test_inspection_and_frame_of_vectors(tmp_path: Path) -> None:
     from vjepa2_ac.cli.console.tables import motion_table
 

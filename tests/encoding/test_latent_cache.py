@@ -508,6 +508,7 @@ def test_a_cache_has_one_stride(a_cache: tuple[Dataset, Dataset, Path]) -> None:
         a_cache[1].with_stride(4)
 
 
+@pytest.mark.usefixtures("drawn")
 def test_a_cache_can_be_checked_and_inspected(a_cache: tuple[Dataset, Dataset, Path], tmp_path: Path) -> None:
     config = alone(a_cache[1], camera=None).config
     found = {finding.about: finding for finding in check_data(config)}

@@ -12,11 +12,12 @@ from itertools import pairwise
 from xml.etree import ElementTree as ET
 
 import numpy as np
+import pytest
+from vjepa2_ac.evaluation.verdict import verdict
 
 from evaluation_results import evaluation
 from planned import with_plans
 from vjepa2_ac.evaluation.result import Evaluation, TrainingCurve
-from vjepa2_ac.evaluation.verdict import verdict
 from vjepa2_ac.reports.write import MOST_CLIPS, report_page, write_report
 
 VOID = {"br", "hr", "img", "input", "meta", "wbr"}
@@ -109,8 +110,9 @@ def named(name: str) -> Evaluation:
     )
 
 
-def test_no_name_can_change_the_page_but_for_its_text() -> None:
+def test_no_name_can_change_the_page_but_for_its_text(request: pytest.FixtureRequest) -> None:
     harmless = Page(report_page(named("a/b")))
+    request.getfixturevalue("drawn")
     hostile = Page(report_page(named(HOSTILE)))
     without_breaks = [[one for one in page.elements if one[0] != "wbr"] for page in (harmless, hostile)]
     assert [tag for tag, _ in without_breaks[0]] == [tag for tag, _ in without_breaks[1]]
@@ -134,11 +136,13 @@ def test_the_page_refers_to_nothing_but_itself() -> None:
     assert not re.search(r"https?:|//\w|@import|url\(|\bon\w+=|javascript:", re.sub(r"base64,[^\"]*", "", html))
 
 
+@pytest.mark.usefixtures("drawn")
 def test_the_same_evaluation_gives_the_same_bytes(tmp_path) -> None:
     one, other = (write_report(evaluation(), tmp_path / name) for name in ("one.html", "other.html"))
     assert one.read_bytes() == other.read_bytes()
 
 
+@pytest.mark.usefixtures("drawn")
 def test_the_page_stays_small_whatever_was_measured() -> None:
     rng = np.random.default_rng(0)
     one = evaluation(frames=16, size=512)

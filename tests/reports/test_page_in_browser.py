@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -25,10 +26,14 @@ addEventListener("message", told => Object.assign(document.documentElement.datas
 </script></head><body><iframe src="probed.html" width="WIDTH" height="900" style="border: 0"></iframe></body></html>"""
 
 
+@cache
+def page() -> str:
+    return report_page(evaluation(others=("a run with a name that is rather long/and/has/slashes",)))
+
+
 def probed(folder: Path, *, dark: bool, width: int) -> dict[str, str]:
     """Return what the page is like in a window of a width, which a frame may have less than a browser's least."""
-    html = report_page(evaluation(others=("a run with a name that is rather long/and/has/slashes",)))
-    html = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", html, count=1).replace("</head>", PROBE)
+    html = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", page(), count=1).replace("</head>", PROBE)
     (folder / "probed.html").write_text(html, encoding="utf-8")
     frame = folder / "frame.html"
     frame.write_text(FRAME.replace("WIDTH", str(width)), encoding="utf-8")
@@ -60,6 +65,7 @@ def test_what_a_name_smuggles_in_is_not_run_even_if_it_were_not_escaped(tmp_path
     assert any("Content Security Policy" in line for line in seen.console)
 
 
+@pytest.mark.usefixtures("drawn")
 @pytest.mark.parametrize(("dark", "width"), [(True, 1400), (False, 400)])
 def test_the_page_fits_the_window_in_its_colours_and_shows_its_images(tmp_path, dark, width) -> None:
     found = probed(tmp_path, dark=dark, width=width)

@@ -54,6 +54,14 @@ class Nursery:
         wish |= {"arguments": words[2:]} if words[0] == "-m" else {"script": words[0], "arguments": words[1:]}
         return Child(self._ask(wish), self)
 
+    def run(self, *words: str, folder: Path) -> subprocess.CompletedProcess[str]:
+        """Do as `start_script` in this environment, to its end; what it prints goes through files in a folder."""
+        out, err = folder / "stdout.txt", folder / "stderr.txt"
+        for file in (out, err):
+            file.write_text("")
+        child = self.start_script(*words, environment=dict(os.environ), out=str(out), err=str(err))
+        return subprocess.CompletedProcess(words, child.wait(), out.read_text(), err.read_text())
+
     def wait_for(self, child: int) -> int:
         """Wait for a child; return its status, negative where a signal ended it."""
         return self._ask({"wait": child})
@@ -168,6 +176,8 @@ def _become(wish: dict, main: Callable[[list[str]], int]) -> None:
             os.environ.update(wish["environment"])
             os.chdir(wish["cwd"])
         status = _script(wish) if "script" in wish else main(wish["arguments"])
+    except SystemExit as ended:
+        status = int(ended.code or 0)
     finally:
         threading._shutdown()
         atexit._run_exitfuncs()  # as at the end of any process; otherwise semaphores stay, and their tracker says so
@@ -179,8 +189,8 @@ def _script(wish: dict) -> int:
     sys.path.insert(0, str(Path(wish["script"]).parent))
     try:
         runpy.run_path(wish["script"], run_name="__main__")
-    except SystemExit as ended:
-        return int(ended.code or 0)
+    except SystemExit:
+        raise
     except BaseException:
         traceback.print_exc()
         return 1

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
-import torch
 
 import killable
 from killable import Nursery
@@ -18,13 +17,14 @@ from synthetic import write_synthetic_droid
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict, parse_config
 from vjepa2_ac.episode import Progress
-from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.process import HANG_UP, SIGNALS
 from vjepa2_ac.reporter import SILENT, Reporter
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # the process that only hands out tests does without PyTorch, which takes seconds
+    import torch
     from accelerate import Accelerator
 
+    from vjepa2_ac.model.network.world_model import WorldModel
     from vjepa2_ac.training.setup import Run
 
 TINY = {
@@ -158,7 +158,7 @@ def tiny_config(run_dir: Path, data_folder: Path, base_folder: Path, **changes: 
             "steps": 6, "batch_size": 2, "accumulation": 2, "learning_rate": 1e-3, "warmup_steps": 1,
             "precision": "fp32", "device": "cpu", "log_every": 1, "allow_weak_base": True,
         },
-        "validation": {"every": 3, "clips": 4, "batch_size": 2},
+        "validation": {"every": 3, "clips": 4, "batch_size": 2, "ranking_samples": 4},
         "checkpoint": {"every": 2, "keep": 5},
         "tracking": {"tensorboard": False},
     }  # fmt: skip
@@ -207,6 +207,8 @@ def as_yaml(config: Config) -> str:
 @pytest.fixture
 def encoded_frames(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """How many frames went through the encoder, a number for each chunk."""
+    from vjepa2_ac.model.network.world_model import WorldModel
+
     counted: list[int] = []
     encode = WorldModel.encode
 

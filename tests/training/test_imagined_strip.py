@@ -36,6 +36,7 @@ def names(run: Path) -> list[str]:
 STRIPS = ["step-00000000.png", "step-00000003.png", "step-00000006.png"]
 
 
+@pytest.mark.usefixtures("drawn")
 def test_a_run_with_strips_equals_the_one_without_bit_for_bit(
     make_config, reporter, whole_run, decoder, monkeypatch
 ) -> None:

@@ -174,8 +174,8 @@ Seam = tuple[str, ...]
 
 def seam() -> Seam:
     """Return the functions of ours that want something of the network just now, from the outermost to the innermost."""
-    calls = [frame for frame in traceback.extract_stack() if "/vjepa2_ac/" in frame.filename]
-    return tuple(call.name for call in calls if "/storage/remote/" not in call.filename)
+    calls = [frame.f_code for frame, _ in traceback.walk_stack(None) if "/vjepa2_ac/" in frame.f_code.co_filename]
+    return tuple(call.co_name for call in calls if "/storage/remote/" not in call.co_filename)[::-1]
 
 
 def use_in_every_way(dataset: Dataset) -> None:

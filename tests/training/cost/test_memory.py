@@ -1,5 +1,6 @@
 """The memory estimate adds up what is allocated at once, depends on every relevant knob, and doctor prints it."""
 
+import json
 from typing import Any
 
 import pytest
@@ -8,6 +9,7 @@ import torch
 from sized_runs import LORA, built, model_sizes, run_config
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import Config, DataConfig, EncoderSizes, ModelSizes, ReplayConfig
+from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.model.adapter.lora import trainable_report
 from vjepa2_ac.model.network.predictor_network import KeyValueCache
 from vjepa2_ac.training.cost.memory import USUAL_GPU, count_parameters, estimate_memory, ways_to_fit
@@ -62,20 +64,28 @@ def test_the_peak_is_that_of_training_or_of_validation() -> None:
     assert estimate.total(checkpointing=True) > estimate_memory(few, ModelSizes()).total(checkpointing=True)
 
 
+USUAL = {"run_dir": "run", "data": {"path": "set", "frames": 16}, "model": {"base": "not-here.pt"}}
+
+
+def usual(**training: object) -> Config:
+    """Return a run that is measured once for all tests."""
+    return parse_config({**USUAL, "training": training}, where="test")
+
+
 def test_a_run_that_fits_needs_no_knob_and_a_large_one_names_them() -> None:
     sizes = ModelSizes()
-    small, large = run_config(data__frames=16), run_config(data__frames=16, training__batch_size=8)
+    small, large = usual(batch_size=2), usual(batch_size=8)
     assert ways_to_fit(small, sizes, USUAL_GPU) == []
     knobs = ways_to_fit(large, sizes, USUAL_GPU)
     assert knobs == ["training.gradient_checkpointing=true"]
-    checked = run_config(data__frames=16, training__batch_size=8, training__gradient_checkpointing=True)
+    checked = usual(batch_size=8, gradient_checkpointing=True)
     assert estimate_memory(checked, sizes).total(checkpointing=True) <= USUAL_GPU
     assert ways_to_fit(large, sizes, 10**9) is None
 
 
 def test_knobs_that_make_it_fit_change_both_data_sets() -> None:
     room = 4 * 10**9
-    alone = run_config(data__frames=16, training__batch_size=8)
+    alone = usual(batch_size=8)
     assert any("batch_size=1 " in knob for knob in ways_to_fit(alone, ModelSizes(), room) or ())
     replay = ReplayConfig(data=DataConfig(path="other", frames=16))
     knobs = ways_to_fit(alone.model_copy(update={"replay": replay}), ModelSizes(), room) or []
@@ -88,7 +98,7 @@ def test_doctor_says_whether_it_fits_and_what_it_has_not_been_compared_with(
 ) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     path = tmp_path / "run.yaml"
-    path.write_text("run_dir: run\ndata: {path: set, frames: 16}\nmodel: {base: not-here.pt}\n")
+    path.write_text(json.dumps(USUAL))
     assert main(["doctor", str(path), f"training.batch_size={batch}"]) == status
     reported = capsys.readouterr().out
     assert word in reported

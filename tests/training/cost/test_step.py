@@ -53,16 +53,13 @@ KNOBS: dict[str, dict[str, Any]] = {
 }
 
 
-CASES = [  # each value of each knob at least once, and with others each time
-    ("LoRA", "bf16", "small", "L1"),
+CASES = [  # each value of each knob at least once
     ("LoRA", "fp16, float32 base", "many heads, little MLP", "smooth, long rollout"),
     ("LoRA of one layer, dropout", "bf16, float32 base", "wide, few tokens", "L2, no rollout"),
-    ("DoRA, dropout", "bf16", "wide latents, extrinsics", "smooth, long rollout"),
+    ("DoRA, dropout", "bf16", "wide latents, extrinsics", "L1"),
     ("DoRA, dropout", "fp32", "no states", "L1"),
-    ("LoRA everywhere, heads whole", "fp32", "many heads, little MLP", "L1"),
-    ("LoRA everywhere, heads whole", "bf16", "wide latents, extrinsics", "L2, no rollout"),
-    ("everything", "bf16", "no states", "L1"),
-    ("everything", "fp16, float32 base", "wide, few tokens", "smooth, long rollout"),
+    ("LoRA everywhere, heads whole", "fp32", "small", "L1"),
+    ("everything", "bf16", "no states", "smooth, long rollout"),
 ]
 
 
@@ -125,7 +122,7 @@ def test_a_step_takes_what_it_takes_on_a_cpu(names: tuple[str, ...]) -> None:
 
 @pytest.mark.parametrize(
     ("adapter", "rollout_steps"),
-    [("LoRA", 4), ("DoRA, dropout", 1), ("everything", 2)],
+    [("LoRA", 2), ("DoRA, dropout", 1), ("everything", 1)],
 )
 def test_all_blocks_are_inferred_from_two_and_three(
     adapter: str, rollout_steps: int, monkeypatch: pytest.MonkeyPatch
