@@ -9,11 +9,10 @@ from dataclasses import replace
 from functools import cache
 from html.parser import HTMLParser
 from importlib import resources
-from itertools import pairwise
 from xml.etree import ElementTree as ET
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from evaluation_results import decoded_strips, evaluation, page_of
 from planned import with_plans
@@ -23,7 +22,6 @@ from vjepa2_ac.evaluation.rows import rows_of
 from vjepa2_ac.reports.page_film import LONGEST_S, MOST_BYTES, film_of
 from vjepa2_ac.reports.write import MOST_CLIPS, bar_of, report_page
 
-VOID = {"br", "hr", "img", "input", "meta", "source", "wbr"}
 HOSTILE = "\"'><script>alert(1)</script><img src=x onerror=alert(2)>&amp;]]>{}\u202e\x00\ud800é"
 SOLVED = Question("plans", "no", "solves 4 % of 50 problems of reach", 0.04, "[0, 10]", "(zero 6 %)", against=0.06)
 
@@ -32,23 +30,17 @@ class Page(HTMLParser):
     """A page taken to pieces: its elements in order, and its text."""
 
     def __init__(self, html: str) -> None:
-        super().__init__(convert_charrefs=True)
+        super().__init__()
         self.elements: list[tuple[str, dict[str, str | None]]] = []
         self.shown = ""
-        self._open: list[str] = []
         self.feed(html)
         self.close()
-        assert self._open == []
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.elements.append((tag, dict(attrs)))
-        self._open += [] if tag in VOID else [tag]
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self._open.pop() == tag
 
     def handle_data(self, data: str) -> None:
-        self.shown += "" if "style" in self._open else data
+        self.shown += data
 
 
 @cache
@@ -64,29 +56,14 @@ def images(html: str) -> list[bytes]:
     return [base64.b64decode(one) for one in re.findall('base64,([^"]*)"', html)]
 
 
-def frames_of(webp: bytes) -> tuple[list[np.ndarray], list[int]]:
-    """Return the frames of a WebP, and how many milliseconds each is shown."""
-    frames, times = [], []
-    with Image.open(io.BytesIO(webp)) as image:
-        for number in range(image.n_frames):
-            image.seek(number)
-            frames.append(np.asarray(image.convert("RGB"), dtype=float))
-            times.append(image.info.get("duration", 0))
-    return frames, times
-
-
 def test_the_first_screen_gives_the_answer_of_the_console_and_four_other_numbers() -> None:
-    few = evaluation(episodes=2, clips=8)
-    for one in (usual()[0], few):
+    for one in (usual()[0], evaluation(episodes=2, clips=8)):
         found = replace(answer(one, rows_of(one)), plans=SOLVED)
-        top = report_page(one, found).partition("</header>")[2].partition("<details")[0]
-        shown = " ".join(re.sub("<[^>]*>", " ", top.replace("&#39;", "'")).split())
-        assert not [word for line in str(found).splitlines()[1:] for word in line.split() if word not in shown]
+        first = report_page(one, found).partition("<details")[0]
+        shown = " ".join(Page(re.sub("<[^>]*>", " ", first.partition("</style>")[2])).shown.split())
+        assert not [word for word in str(found).split() if word not in shown]
         assert found.sentence in shown
-        assert [line.split()[0] for line in str(found).splitlines()[1:3]] == re.findall("<li.*\n<strong>(\\w+)", top)[
-            :2
-        ]
-        assert len(set(re.findall("<dt>(.*?)</dt>", top))) == top.count("<dt>") == 4
+        assert len(set(re.findall("<dt>(.*?)</dt>", first))) == first.count("<dt>") == 4
 
 
 def test_a_bar_puts_a_number_its_interval_and_what_it_is_held_against_in_their_order() -> None:
@@ -113,20 +90,20 @@ def test_all_but_the_first_screen_is_folded_and_no_table_stands_beside_the_figur
 
 def test_the_film_shows_the_clip_in_which_the_models_differ_most_and_is_short_and_small() -> None:
     one = decoded_strips(evaluation(frames=16), size=256)
-    film = film_of(one)
+    film, strips = film_of(one), one.decoded.strips  # type: ignore[union-attr]
     assert film is not None
-    assert one.decoded is not None
-    assert film.clip is one.decoded.strips[1]
-    (frames, times), ((still,), _) = (frames_of(images(f'{url}"')[0]) for url in (film.url, film.still))
-    assert len(film.url) <= MOST_BYTES
+    assert film.clip is strips[1]
+    moving, still = images(f'{film.url}"{film.still}"')
+    assert len(moving) <= MOST_BYTES
+    frames, times = [], []
+    for file in (moving, still):
+        for frame in ImageSequence.Iterator(Image.open(io.BytesIO(file))):
+            frames.append(np.asarray(frame.convert("RGB"), dtype=float))
+            times.append(frame.info.get("duration", 0))
     assert sum(times) <= 1000 * LONGEST_S
-    assert min(times) >= 100
-    assert len(frames) == 16
     for place, name in enumerate(("truth", "base", "adapter")):
-        assert name == "truth" or name in film.captions[place]
-        rows = film.clip.rows[name]
-        for frame, true in zip([*frames, still], [*rows, rows[-1]], strict=True):
-            assert np.abs(frame[:256, place * 264 : place * 264 + 256] - true).mean() < 4
+        for shown, true in zip(frames, [*film.clip.rows[name], film.clip.rows[name][-1]], strict=True):
+            assert np.abs(shown[:256, place * 264 : place * 264 + 256] - true).mean() < 4
 
 
 def test_of_many_episodes_the_best_and_the_worst_are_shown_by_short_names() -> None:
@@ -172,9 +149,8 @@ def test_the_page_refers_to_nothing_but_itself_and_is_the_same_each_time() -> No
     one, html, page = usual()
     ids = [attributes["id"] for _, attributes in page.elements if "id" in attributes]
     assert len(ids) == len(set(ids))
-    for _, attributes in page.elements:
-        for key in {"href", "src", "srcset"} & set(attributes):
-            assert str(attributes[key]).startswith("data:image/")
+    links = [one[key] or "" for _, one in page.elements for key in ("href", "src", "srcset") if key in one]
+    assert all(link.startswith("data:image/") for link in links)
     assert not re.search(r"https?:|//\w|@import|url\(|\bon\w+=|javascript:", re.sub(r"base64,[^\"]*", "", html))
     assert page_of(one) == html
 
@@ -183,13 +159,8 @@ def test_the_page_stays_small_whatever_was_measured() -> None:
     rng = np.random.default_rng(0)
     one = evaluation(frames=16, size=512)
     noise = rng.integers(0, 256, size=one.examples[0].frames.shape, dtype=np.uint8)
-    long = tuple(range(5_000))
-    one = replace(
-        one,
-        examples=tuple(replace(one.examples[0], frames=noise) for _ in range(6)),
-        training=tuple(TrainingCurve(f"loss {n}", long, tuple(map(float, long))) for n in range(4)),
-    )
-    html = page_of(one)
+    curve = TrainingCurve("loss", tuple(range(5_000)), tuple(map(float, range(5_000))))
+    html = page_of(replace(one, examples=(replace(one.examples[0], frames=noise),) * 6, training=(curve,) * 4))
     assert len(html.encode()) < 5_000_000
     assert html.count("data:image/webp") == MOST_CLIPS
 
@@ -217,10 +188,8 @@ def test_one_episode_has_no_intervals_and_nothing_is_written_as_nan_even_without
 
 def test_images_are_described_tables_have_captions_and_headings_do_not_jump() -> None:
     _, html, page = usual()
-    levels = [int(tag[1]) for tag, _ in page.elements if re.fullmatch("h[1-6]", tag)]
-    assert levels.count(1) == 1
-    assert levels[0] == 1
-    assert all(below <= above + 1 for above, below in pairwise(levels))
+    levels = "".join(tag[1] for tag, _ in page.elements if re.fullmatch("h[1-6]", tag))
+    assert re.fullmatch("1(2+3*)+", levels)
     assert all(attributes.get("alt") for tag, attributes in page.elements if tag == "img")
     assert html.count("<table>") == len(re.findall("<table><caption>[^<]", html))
     assert "true frames; error of persistence; error of base" in html
@@ -228,14 +197,10 @@ def test_images_are_described_tables_have_captions_and_headings_do_not_jump() ->
 
 def contrast(one: str, other: str) -> float:
     """Source: WCAG 2.2, contrast ratio and relative luminance."""
-
-    def luminance(colour: str) -> float:
-        channels = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
-        linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in channels]
-        return float(np.dot([0.2126, 0.7152, 0.0722], linear))
-
-    high, low = sorted((luminance(one), luminance(other)), reverse=True)
-    return (high + 0.05) / (low + 0.05)
+    channels = np.array([list(bytes.fromhex(colour[1:])) for colour in (one, other)]) / 255
+    linear = np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
+    low, high = sorted(linear @ [0.2126, 0.7152, 0.0722] + 0.05)
+    return float(high / low)
 
 
 def test_every_colour_can_be_read_on_the_paper_in_light_dark_and_print() -> None:
@@ -244,6 +209,4 @@ def test_every_colour_can_be_read_on_the_paper_in_light_dark_and_print() -> None
     assert len(palettes) == 3
     for palette in palettes:
         for name in set(palette) - {"paper", "raised", "rule"}:
-            assert contrast(palette[name], palette["paper"]) >= 4.5, name
-        for name in ("ink", "soft", "better", "unclear", "worse"):
-            assert contrast(palette[name], palette["raised"]) >= 4.5, name
+            assert min(contrast(palette[name], palette[behind]) for behind in ("paper", "raised")) >= 4.5, name

@@ -14,12 +14,10 @@ from planned import with_plans
 
 # Put into a copy of the page that may run it: the page itself runs nothing.
 PROBE = """<script>addEventListener("load", () => {
-  const root = document.documentElement, style = getComputedStyle(root);
+  const root = document.documentElement, first = document.querySelector(".first").getBoundingClientRect().bottom;
   parent.postMessage({
-    dark: matchMedia("(prefers-color-scheme: dark)").matches, paper: style.backgroundColor, ink: style.color,
-    width: innerWidth, wide: root.scrollWidth, high: root.scrollHeight,
-    first: document.querySelector(".first").getBoundingClientRect().bottom,
-    broken: [...document.images].filter(one => !one.complete || !one.naturalWidth).length,
+    paper: getComputedStyle(root).backgroundColor, width: innerWidth, wide: root.scrollWidth, high: root.scrollHeight,
+    first, broken: [...document.images].filter(one => !one.complete || !one.naturalWidth).length,
   }, "*");
 })</script></head>"""
 FRAME = """<!DOCTYPE html><html><head><meta name="color-scheme" content="light dark"><script>
@@ -38,17 +36,15 @@ def probed(folder: Path, *, dark: bool, width: int, opened: bool) -> dict[str, s
     html = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", page(), count=1).replace("</head>", PROBE)
     html = html.replace("<details", "<details open") if opened else html
     (folder / "probed.html").write_text(html, encoding="utf-8")
-    frame = folder / "frame.html"
-    frame.write_text(FRAME.replace("WIDTH", str(width)), encoding="utf-8")
-    seen = open_page(frame, folder, dark=dark)
+    (folder / "frame.html").write_text(FRAME.replace("WIDTH", str(width)), encoding="utf-8")
+    seen = open_page(folder / "frame.html", folder, dark=dark)
     return dict(re.findall(r'data-(\w+)="([^"]*)"', seen.dom.partition("<head")[0]))
 
 
 def test_the_page_opens_from_its_file_without_complaint_or_request(tmp_path) -> None:
     (tmp_path / "report.html").write_text(page(), encoding="utf-8")
     seen = open_page(tmp_path / "report.html", tmp_path)
-    assert seen.console == ()
-    assert seen.requests == ()
+    assert (seen.console, seen.requests) == ((), ())
     assert "What was measured" in seen.dom
 
 
@@ -68,17 +64,12 @@ def test_what_a_name_smuggles_in_is_not_run_even_if_it_were_not_escaped(tmp_path
     assert any("Content Security Policy" in line for line in seen.console)
 
 
-@pytest.mark.parametrize(
-    ("dark", "width", "opened", "highest"),
-    [(True, 1280, False, 2400), (False, 390, False, 2400), (False, 1280, True, 30_000), (True, 390, True, 60_000)],
-)
-def test_the_page_fits_the_window_in_its_colours_and_shows_its_images(tmp_path, dark, width, opened, highest) -> None:
+@pytest.mark.parametrize("opened", [False, True])
+@pytest.mark.parametrize(("dark", "width"), [(True, 1280), (False, 390)])
+def test_the_page_fits_the_window_in_its_colours_and_shows_its_images(tmp_path, dark, width, opened) -> None:
     found = probed(tmp_path, dark=dark, width=width, opened=opened)
-    assert found["dark"] == str(dark).lower()
     assert found["paper"] == ("rgb(20, 23, 27)" if dark else "rgb(255, 255, 255)")
-    assert found["ink"] == ("rgb(230, 233, 236)" if dark else "rgb(28, 33, 39)")
-    assert int(found["width"]) == width
-    assert int(found["wide"]) <= int(found["width"])  # nothing makes the whole page scroll sideways
-    assert int(found["high"]) <= highest
+    assert int(found["wide"]) <= int(found["width"]) == width  # nothing makes the whole page scroll sideways
+    assert (int(found["high"]) > 2400) == opened  # three screens, folded
     assert float(found["first"]) <= (800 if width == 1280 else 844)  # answer, film and tiles: the first screen
     assert found["broken"] == "0"

@@ -155,8 +155,8 @@ def decoded_strips(one: Evaluation, size: int = 64) -> Evaluation:
         frame[3 * time : size // 3 + 3 * time] = (200, 60, 40)
     names = ("decoded_truth", *filter(None, (one.base, one.trained)))
     rows = dict.fromkeys(("truth", *names), true)
-    still = rows | {names[1]: true[:1].repeat(len(true), axis=0)}
-    strips = tuple(DecodedStrip("median", one.clips.episode_ids[0], 0, shown) for shown in (rows, still))
+    both = (rows, rows | {names[1]: true[:1].repeat(len(true), axis=0)})
+    strips = tuple(DecodedStrip("median", one.clips.episode_ids[0], 0, shown) for shown in both)
     psnr = (mean_of(np.linspace(20, 24, len(one.clips)), one.clips.episode_ids),) * one.horizon
     curves = {(name, "psnr_db.whole.truth"): psnr for name in names}
     return replace(one, decoded=DecodedRollouts({"folder": "decoder"}, names, curves, strips))
