@@ -41,6 +41,20 @@ def no_progress(done: int, total: int) -> None:
     """Show nothing."""
 
 
+def short_names(names: Sequence[str]) -> dict[str, str]:
+    """Return for each name of an episode the end by which it differs from the others; of a single one all of it.
+
+    Folders and files that all have at their end, such as trajectory.h5, are left out.
+    """
+    parts, short, count = {name: name.split("/") for name in names}, dict.fromkeys(names, ""), 0
+    while len({part[-1] for part in parts.values()}) == 1 < min(map(len, parts.values())):
+        parts = {name: part[:-1] for name, part in parts.items()}
+    while len(set(short.values())) < len(parts) > 1:
+        count += 1
+        short = {name: "/".join(part[-count:]) for name, part in parts.items()}
+    return short if count else {name: name for name in names}
+
+
 STATE_DIM = 7  # of a pose
 ACTION_DIM = 7
 EXTRINSICS_DIM = 6

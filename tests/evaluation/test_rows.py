@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from evaluation_results import evaluation
+from evaluation_results import evaluation, page_of
 from planned import with_plans
 from vjepa2_ac.cli.console.progress import PlainConsole
 from vjepa2_ac.cli.console.tables import row_tables
@@ -11,7 +11,6 @@ from vjepa2_ac.evaluation.result import L1
 from vjepa2_ac.evaluation.rows import rows_of
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics, write_metrics
-from vjepa2_ac.reports.write import report_page
 
 WHOLE = with_plans(evaluation(others=("runs/other",)))
 
@@ -53,7 +52,7 @@ def test_console_page_and_file_show_the_same_rows(tmp_path: Path) -> None:
     console = PlainConsole(width=250)
     with console.capture() as capture:
         console.print(*row_tables(rows, "Held-out episodes"))
-    shown, page = capture.get(), report_page(WHOLE)
+    shown, page = capture.get(), page_of(WHOLE)
     for row in rows:
         assert str(row) in page, row
         assert row.detail or str(row) in shown, row

@@ -1,4 +1,4 @@
-"""The report page in a real browser: no errors, no requests, no scripts; light and dark, wide and narrow."""
+"""The report page in a real browser: no errors, no requests, no scripts; light and dark, wide and narrow, folded."""
 
 from __future__ import annotations
 
@@ -9,16 +9,17 @@ from pathlib import Path
 import pytest
 
 from browser import open_page
-from evaluation_results import evaluation
-from vjepa2_ac.reports.write import report_page, write_report
+from evaluation_results import decoded_strips, evaluation, page_of
+from planned import with_plans
+
+pytestmark = pytest.mark.usefixtures("drawn")
 
 # Put into a copy of the page that may run it: the page itself runs nothing.
 PROBE = """<script>addEventListener("load", () => {
-  const root = document.documentElement, style = getComputedStyle(root);
+  const root = document.documentElement, first = document.querySelector(".first").getBoundingClientRect().bottom;
   parent.postMessage({
-    dark: matchMedia("(prefers-color-scheme: dark)").matches, paper: style.backgroundColor, ink: style.color,
-    width: innerWidth, wide: root.scrollWidth,
-    broken: [...document.images].filter(one => !one.complete || !one.naturalWidth).length,
+    paper: getComputedStyle(root).backgroundColor, width: innerWidth, wide: root.scrollWidth, high: root.scrollHeight,
+    first, broken: [...document.images].filter(one => !one.complete || !one.naturalWidth).length,
   }, "*");
 })</script></head>"""
 FRAME = """<!DOCTYPE html><html><head><meta name="color-scheme" content="light dark"><script>
@@ -28,50 +29,49 @@ addEventListener("message", told => Object.assign(document.documentElement.datas
 
 @cache
 def page() -> str:
-    return report_page(evaluation(others=("a run with a name that is rather long/and/has/slashes",)))
+    """Return a page of everything that can be measured."""
+    return page_of(decoded_strips(with_plans(evaluation(others=("a run with a rather long name/and/slashes",)))))
 
 
-def probed(folder: Path, *, dark: bool, width: int) -> dict[str, str]:
+def probed(folder: Path, *, dark: bool, width: int, opened: bool) -> dict[str, str]:
     """Return what the page is like in a window of a width, which a frame may have less than a browser's least."""
     html = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", page(), count=1).replace("</head>", PROBE)
+    html = html.replace("<details", "<details open") if opened else html
     (folder / "probed.html").write_text(html, encoding="utf-8")
-    frame = folder / "frame.html"
-    frame.write_text(FRAME.replace("WIDTH", str(width)), encoding="utf-8")
-    seen = open_page(frame, folder, dark=dark)
+    (folder / "frame.html").write_text(FRAME.replace("WIDTH", str(width)), encoding="utf-8")
+    seen = open_page(folder / "frame.html", folder, dark=dark)
     return dict(re.findall(r'data-(\w+)="([^"]*)"', seen.dom.partition("<head")[0]))
 
 
 def test_the_page_opens_from_its_file_without_complaint_or_request(tmp_path) -> None:
-    seen = open_page(write_report(evaluation(), tmp_path / "report.html"), tmp_path)
-    assert seen.console == ()
-    assert seen.requests == ()
+    (tmp_path / "report.html").write_text(page(), encoding="utf-8")
+    seen = open_page(tmp_path / "report.html", tmp_path)
+    assert (seen.console, seen.requests) == ((), ())
     assert "What was measured" in seen.dom
 
 
 def test_the_browser_of_these_tests_would_tell_of_requests_and_complaints(tmp_path) -> None:
-    page = tmp_path / "page.html"
-    page.write_text('<img src="http://127.0.0.1:9/picture.png"><script>missing()</script>')
-    seen = open_page(page, tmp_path)
+    broken = tmp_path / "page.html"
+    broken.write_text('<img src="http://127.0.0.1:9/picture.png"><script>missing()</script>')
+    seen = open_page(broken, tmp_path)
     assert seen.requests == ("http://127.0.0.1:9/picture.png",)
     assert any("missing is not defined" in line for line in seen.console)
 
 
 def test_what_a_name_smuggles_in_is_not_run_even_if_it_were_not_escaped(tmp_path) -> None:
-    html = report_page(evaluation()).replace("<main>", '<main><script>document.title = "run"</script>')
-    page = tmp_path / "smuggled.html"
-    page.write_text(html, encoding="utf-8")
-    seen = open_page(page, tmp_path)
+    smuggled = tmp_path / "smuggled.html"
+    smuggled.write_text(page().replace("<main>", '<main><script>document.title = "run"</script>'), encoding="utf-8")
+    seen = open_page(smuggled, tmp_path)
     assert "<title>run</title>" not in seen.dom
     assert any("Content Security Policy" in line for line in seen.console)
 
 
-@pytest.mark.usefixtures("drawn")
-@pytest.mark.parametrize(("dark", "width"), [(True, 1400), (False, 400)])
-def test_the_page_fits_the_window_in_its_colours_and_shows_its_images(tmp_path, dark, width) -> None:
-    found = probed(tmp_path, dark=dark, width=width)
-    assert found["dark"] == str(dark).lower()
+@pytest.mark.parametrize("opened", [False, True])
+@pytest.mark.parametrize(("dark", "width"), [(True, 1280), (False, 390)])
+def test_the_page_fits_the_window_in_its_colours_and_shows_its_images(tmp_path, dark, width, opened) -> None:
+    found = probed(tmp_path, dark=dark, width=width, opened=opened)
     assert found["paper"] == ("rgb(20, 23, 27)" if dark else "rgb(255, 255, 255)")
-    assert found["ink"] == ("rgb(230, 233, 236)" if dark else "rgb(28, 33, 39)")
-    assert int(found["width"]) == width
-    assert int(found["wide"]) <= int(found["width"])  # nothing makes the whole page scroll sideways
+    assert int(found["wide"]) <= int(found["width"]) == width  # nothing makes the whole page scroll sideways
+    assert (int(found["high"]) > 2400) == opened  # three screens, folded
+    assert float(found["first"]) <= (800 if width == 1280 else 844)  # answer, film and tiles: the first screen
     assert found["broken"] == "0"

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from vjepa2_ac.evaluation.answer import answer
 from vjepa2_ac.evaluation.calibration.axes import TRIED_DEGREES, AxisFit, fit_axes
 from vjepa2_ac.evaluation.estimates import episode_scores
 from vjepa2_ac.evaluation.result import (
@@ -18,6 +19,8 @@ from vjepa2_ac.evaluation.result import (
     About,
     ActionRanking,
     Clips,
+    DecodedRollouts,
+    DecodedStrip,
     Evaluation,
     Example,
     Landscape,
@@ -32,7 +35,9 @@ from vjepa2_ac.evaluation.result import (
     TrainingCurve,
     Way,
 )
+from vjepa2_ac.evaluation.rows import rows_of
 from vjepa2_ac.intervals import mean_of
+from vjepa2_ac.reports.write import report_page
 from vjepa2_ac.spaces import POSE_CHANGE
 
 ABOUT = About(
@@ -136,6 +141,25 @@ def _example(rng: np.random.Generator, why: str, episode_id: str, times: int, mo
         colours,
         dict.fromkeys(models, colours[1:] // 2 + 40),
     )
+
+
+def page_of(one: Evaluation) -> str:
+    """Return the report with the answer that the console shows."""
+    return report_page(one, answer(one, rows_of(one)))
+
+
+def decoded_strips(one: Evaluation, size: int = 64) -> Evaluation:
+    """Return an evaluation with two decoded clips of a falling bar; in the second one the base sees it stand still."""
+    true = np.full((one.about.frames, size, size, 3), 90, np.uint8)
+    for time, frame in enumerate(true):
+        frame[3 * time : size // 3 + 3 * time] = (200, 60, 40)
+    names = ("decoded_truth", *filter(None, (one.base, one.trained)))
+    rows = dict.fromkeys(("truth", *names), true)
+    both = (rows, rows | {names[1]: true[:1].repeat(len(true), axis=0)})
+    strips = tuple(DecodedStrip("median", one.clips.episode_ids[0], 0, shown) for shown in both)
+    psnr = (mean_of(np.linspace(20, 24, len(one.clips)), one.clips.episode_ids),) * one.horizon
+    curves = {(name, "psnr_db.whole.truth"): psnr for name in names}
+    return replace(one, decoded=DecodedRollouts({"folder": "decoder"}, names, curves, strips))
 
 
 @lru_cache(maxsize=8)

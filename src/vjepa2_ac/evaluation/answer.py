@@ -40,6 +40,7 @@ class Question:
     beside: str = ""  # what to hold the number against
     seems: Literal["yes", "no", ""] = ""  # by the number alone
     why: str = ""  # a sentence: why nothing can be known
+    against: float = 0.0  # what figures hold the number against: nothing, chance, or the best rival
 
 
 @dataclass(frozen=True)
@@ -221,7 +222,7 @@ def _plans(rows: Mapping[str, Row], of_base: Mapping[str, Row]) -> Question:
             seems = "yes" if lower.value > 0 else "no"
             word = word_of(lower, SAME_MOVES, seems)
         held = f"base {percent(of_base[key].value)} %, {held}"
-    return Question("plans", word, says, rank.value, interval_of(rank), f"({held})", seems)
+    return Question("plans", word, says, rank.value, interval_of(rank), f"({held})", seems, against=CHANCE)
 
 
 def closed_loop(shares: Mapping[str, Estimate], model: str, oracle: str, problems: int, task: str) -> Question:
@@ -245,4 +246,4 @@ def closed_loop(shares: Mapping[str, Estimate], model: str, oracle: str, problem
     beside = ", ".join(f"{name} {100 * one.value:.0f} %" for name, one in shares.items() if name != model)
     says = f"solves {100 * own.value:.0f} % of {problems} problems of {task}"
     known: Word = "not known yet" if why else word
-    return Question("plans", known, says, own.value, interval_of(own), f"({beside})", why=why)
+    return Question("plans", known, says, own.value, interval_of(own), f"({beside})", why=why, against=best.value)

@@ -166,6 +166,17 @@ def encode_png(pixels: UInt8[np.ndarray, "height width channels"]) -> bytes:
     return file.getvalue()
 
 
+def encode_webp(
+    frames: Sequence[UInt8[np.ndarray, "height width 3"]], seconds: Sequence[float], *, quality: int
+) -> bytes:
+    """Return frames of one size as an endless WebP, each shown for so long; one frame: a still image."""
+    file = io.BytesIO()
+    first, *others = (Image.fromarray(frame) for frame in frames)
+    times = [int(1000 * one) for one in seconds]
+    first.save(file, "WEBP", save_all=True, append_images=others, duration=times, loop=0, quality=quality)
+    return file.getvalue()
+
+
 def resized(pixels: UInt8[np.ndarray, "height width 3"], side: int) -> UInt8[np.ndarray, "side side 3"]:
     """Return an image at another size, for people: smooth, not the way the encoder resizes."""
     if pixels.shape[:2] == (side, side):

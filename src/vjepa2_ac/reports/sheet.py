@@ -14,7 +14,7 @@ from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.idle import runs_of
 from vjepa2_ac.data.inspection.statistics import CHANGED, MOVED, RELEASED_STEP_CM, Inspection, idle_runs, largest_change
 from vjepa2_ac.data.transforms import crop_box
-from vjepa2_ac.episode import Progress, no_progress
+from vjepa2_ac.episode import Progress, no_progress, short_names
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.reports.figures.contact_sheet import ContactSheet, Strip, pictures_per_row, plot_contact_sheet
 
@@ -35,11 +35,12 @@ def plot_dataset(inspection: Inspection, path: Path, *, rows: int = 8, progress:
         InputError: A frame cannot be read, and `data.broken_episodes` does not leave its episode out.
     """
     dataset, shown = inspection.dataset, _rows_of(inspection, rows)
-    names = _short_names([dataset.table.identity(one.index) for one in shown])
+    identities = [dataset.table.identity(one.index) for one in shown]
+    names = short_names(identities)
     strips = []
-    for done, (one, name) in enumerate(zip(shown, names, strict=True), start=1):
+    for done, (one, name) in enumerate(zip(shown, identities, strict=True), start=1):
         try:
-            strips.append(_strip(inspection, one, name))
+            strips.append(_strip(inspection, one, names[name]))
         except InputError as error:
             dataset.leave_out(one.index, error)
         progress(done, len(shown))
@@ -83,15 +84,6 @@ def _rows_of(inspection: Inspection, rows: int) -> list[ReadEpisode]:
     shares[shares.index(max(shares))] += rows - sum(shares)
     chosen = [one for group, share in zip(groups, shares, strict=True) for one in group[: max(share, 0)]]
     return sorted(chosen, key=lambda one: inspection.sample.index(one))
-
-
-def _short_names(names: Sequence[str]) -> list[str]:
-    """Return names without their common leading folders; of "a--b" only a, if that is unique."""
-    heads = [name.split("--")[0] for name in names]
-    parts = [name.split("/") for name in (heads if len(set(heads)) == len(names) else names)]
-    while len(parts) > 1 and len({part[0] for part in parts}) == 1 and min(map(len, parts)) > 1:
-        parts = [part[1:] for part in parts]
-    return ["/".join(part) for part in parts]
 
 
 def _strip(inspection: Inspection, one: ReadEpisode, name: str) -> Strip:
