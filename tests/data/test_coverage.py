@@ -101,13 +101,13 @@ def test_too_few_steps_decide_nothing() -> None:
 
 @pytest.mark.parametrize("domain", ["A"])
 def test_random_reaching_of_the_simulator_is_fit_and_one_way_reaching_is_narrow(domain: str) -> None:
-    def recorded(recipe: MotionRecipe | None) -> Coverage | None:
+    def recorded(recipe: MotionRecipe) -> Coverage | None:
         generator = np.random.default_rng(0)
         motions = [random_reaching(named_domain(domain), 61, generator, recipe) for _ in range(12)]
         states = [np.concatenate([one.poses, one.gripper[:, None]], axis=1) for one in motions]
         return coverage_by([ReadEpisode(0, one, ((0, 61),)) for one in states], POSE, 4)
 
-    assert recorded(None).verdict == "fit to plan with"
+    assert recorded(MotionRecipe()).verdict == "fit to plan with"
     one_way = recorded(MotionRecipe(drift_m=(0.01, 0.0, 0.0)))
     assert "steps go to 7% of all directions; nearly all go one way" in one_way.narrow
 

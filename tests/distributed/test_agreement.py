@@ -44,7 +44,7 @@ def test_what_one_rank_alone_meets_ends_both_with_its_error(
 ) -> None:
     config = make_config(data__cache="auto", data__cache_dir=str(tmp_path / "cache"))
     for said in start_both(config, tmp_path, happens, status=3):
-        assert said.startswith(("InputError: ", "UnreachableError: "))
+        assert said.startswith(("InputError: ", "MissingFileError: ", "UnreachableError: "))
         assert found in said
 
 

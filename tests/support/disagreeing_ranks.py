@@ -83,7 +83,7 @@ def each_meets_another_broken_episode() -> None:
 
     def loader(dataset: object, **given: object) -> object:
         for batch in make(dataset, **given):  # type: ignore[arg-type]
-            dataset.broken.met(f"episode {RANK}", "its image is damaged")  # type: ignore[attr-defined]
+            dataset.dataset.broken.met(f"episode {RANK}", "its image is damaged")  # type: ignore[attr-defined]
             yield replace(batch, **{key: getattr(batch, key)[:1] for key in ("states", "actions", "frames")},
                           episode_ids=batch.episode_ids[:1], starts=batch.starts[:1])  # fmt: skip
 

@@ -8,7 +8,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-from peft import set_peft_model_state_dict
 from pydantic import Field
 from torch import Tensor
 
@@ -23,6 +22,7 @@ from vjepa2_ac.model.adapter.lora import (
     knobs_of,
     lora_config,
     lora_weights,
+    set_peft_model_state_dict,
     set_trainable,
     train_everything,
     wrap,
