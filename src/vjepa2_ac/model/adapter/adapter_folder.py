@@ -22,14 +22,17 @@ from vjepa2_ac.model.adapter.lora import (
     knobs_of,
     lora_config,
     lora_weights,
-    set_peft_model_state_dict,
     set_trainable,
     train_everything,
     wrap,
 )
 from vjepa2_ac.model.network.pretrained_folder import read_tensors, save_tensors
 from vjepa2_ac.model.network.world_model import WorldModel, fit_heads
+from vjepa2_ac.model.quiet_imports import quiet_imports
 from vjepa2_ac.storage.structured import read_json_object, record_of
+
+with quiet_imports():
+    from peft import set_peft_model_state_dict
 
 CARD = "vjepa2_ac.json"
 ADAPTER_FILE = "adapter_config.json"  # PEFT's name
