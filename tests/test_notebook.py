@@ -64,7 +64,13 @@ def test_it_runs_as_it_is(tmp_path: Path) -> None:
     (tmp_path / "examples").mkdir()
     printed, images = executed(tmp_path)
     assert images == 6, "clips, errors by patch, two energies, loss, evaluation"
-    for words in ("12 episodes", "builtin:sim-tiny on cpu", "of persistence", "Validation at step 40", "lower than the base"):
+    for words in (
+        "12 episodes",
+        "builtin:sim-tiny on cpu",
+        "of persistence",
+        "Validation at step 40",
+        "lower than the base",
+    ):
         assert words in printed, words
     apart, still = printed.split("On average ")[-1].split(" cm apart; not moving at all would be ")
     assert float(apart) < float(still.split(" cm")[0]), "with LoRA, planning is better than standing still"

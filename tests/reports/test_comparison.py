@@ -39,6 +39,8 @@ def test_runs_are_compared_with_the_first_one_pair_by_pair(tmp_path: Path) -> No
     assert [one.value for one in found.curves["half"]] == pytest.approx([0.5] * 4, rel=1e-4)
     assert found.notes == ()
     assert found.title.endswith(" episodes")
+    assert found.best == "half"
+    assert max(map(len, str(found).splitlines())) <= 80
     assert plot_comparison(found, tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
 
 

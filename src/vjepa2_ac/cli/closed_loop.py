@@ -239,7 +239,7 @@ def _run_benchmark(options: argparse.Namespace) -> int:
         cli.show(name, benchmark_table(benchmark), files=files)
     answer = _answer(benchmark)
     cli.show(*benchmark_notes(benchmark), str(answer), f"Next: {_next(answer, options)}")
-    cli.show(*(f"Film: {file}" for file in files[1:]))
+    cli.show(*(f"Film: {file}" for file in files[1:2]))
     return int(any(set(result.why_counts) == {"no finite energy"} for result in benchmark.results))
 
 

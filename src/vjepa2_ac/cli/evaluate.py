@@ -109,7 +109,8 @@ def _evaluate(options: argparse.Namespace) -> None:
             tables = row_tables(rows_of(measured.evaluation), "Held-out episodes")
             cli.show(name, *tables, *notes, files=measured.files)
         cli.show(str(measured.answer), f"Next: {_next(measured, options.data)}")
-        cli.show(f"Report with all tables: {measured.report}")
+        film = "" if measured.evaluation.decoded is None else "film and "
+        cli.show(f"Report with {film}all tables: {measured.report}")
     if len(evaluations) > 1:
         cli.show(spread(evaluations))
 
@@ -173,7 +174,8 @@ def _compare(options: argparse.Namespace) -> None:
 
     tables = row_tables(comparison.rows, comparison.title) if options.all else []
     files = [plot_comparison(comparison, options.out), *write_tables(comparison.rows, options.out)]
-    cli.show(*tables, str(comparison), *comparison.notes, files=files)
+    best = options.runs[list(comparison.answers).index(comparison.best)]
+    cli.show(*tables, str(comparison), *comparison.notes, f"Next: vjepa2-ac export {best}", files=files)
 
 
 def _imagine(options: argparse.Namespace) -> None:

@@ -35,6 +35,12 @@ class Comparison:
     notes: tuple[str, ...]
     answers: Mapping[str, Answer]
 
+    @property
+    def best(self) -> str:
+        """The run whose error is clearly the lowest; else the first."""
+        clear = [row for row in self.rows if row.key == "gain_over_first" and row.estimate.side(of=0.0) == 1]
+        return max(clear, key=lambda row: row.value).model if clear else next(iter(self.answers))
+
     def __str__(self) -> str:
         """Return the answers of all runs, a line each, and how much better than the first one the best of them is."""
         first, *others = self.answers
@@ -48,7 +54,7 @@ class Comparison:
         for name, found in shown:
             cells = [f"{one.word} {'' if one.share is None else f'{percent(one.share)} %'}" for one in found.questions]
             lines.append(f"  {name[-wide:]:<{wide}}" + "".join(f"  {cell:<{_CELL}}" for cell in cells))
-        lines.append("  (error below the base's; what a wrong action costs; other moves that look better)")
+        lines.append("  (error below the base's; cost of a wrong action; moves that look better)")
         best = max(others, key=lambda name: gains[name].value)
         gain = gains[best].estimate
         how = {1: "lower", -1: "higher", 0: "not clearly other"}[gain.side(of=0.0)]
