@@ -393,3 +393,20 @@ def test_a_folder_that_processes_do_not_share_is_refused_before_the_work(
     with pytest.raises(InputError, match="all machines of the run share"):
         encode_dataset.with_latents(config, open_dataset(config.data), model, second, SilentReporter())  # type: ignore[arg-type]
     assert not encoded_frames
+
+
+def test_ctrl_c_keeps_what_is_done(make_config: MakeConfig, tmp_path: Path, encoded_frames: list[int]) -> None:
+    config, out = make_config(data__start_every=2), tmp_path / "out"
+
+    def pressed(done: int, _total: int) -> None:
+        if done >= 24:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        encode(config, out, pressed)
+    done = len(latents_in(out))
+    assert done >= 2
+    assert not list(out.rglob("*.partial"))
+    encoded_frames.clear()
+    assert encode(config, out).is_finished
+    assert sum(encoded_frames) == (8 - done) * 12

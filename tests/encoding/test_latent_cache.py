@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from pydantic import ValidationError
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
@@ -518,3 +519,19 @@ def test_a_cache_can_be_checked_and_inspected(a_cache: tuple[Dataset, Dataset, P
     dataset = open_dataset(config)
     sheet = plot_dataset(inspect_dataset(dataset), tmp_path / "sheet.png", rows=2)
     assert sheet.stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("knobs", "reported"),
+    [
+        ({"augment": {"brightness": 0.1}, "cache": "auto"}, "augment"),
+        ({"augment": {"brightness": 0.1}, "source": "latents", "cache": "off"}, "augment"),
+        ({"source": "latents", "cache": "require"}, "itself a cache"),
+        ({"source": "latents", "cache": "off", "path": "gs://bucket/cache"}, "on this machine"),
+        ({"source": "latents", "cache": "off", "stride": "auto"}, "stride auto"),
+    ],
+    ids=str,
+)
+def test_knobs_that_contradict_a_cache_are_errors(tmp_path: Path, knobs: dict[str, Any], reported: str) -> None:
+    with pytest.raises(ValidationError, match=reported):
+        config_of(tmp_path, tmp_path, **knobs)

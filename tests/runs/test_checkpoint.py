@@ -395,3 +395,17 @@ def test_without_validations_there_is_no_best_and_without_checkpoints_nothing(tm
     assert str(select_checkpoint(tmp_path)) == "step-00000010 (the newest: none was selected)"
     with pytest.raises(InputError, match=r"no best checkpoint.*one of the steps 10"):
         select_checkpoint(tmp_path, "best")
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"step": "10"}, {"step": -1}, {"clips_done": None}, {"processes": 0}, {"data": [{"broken": {"a": 3}}]},
+     {"best_error": "low"}, {"loss_scale": [1]}, {"run_id": 3}, {"unheard_of": 3}],
+    ids=str,
+)  # fmt: skip
+def test_a_state_of_other_types_is_refused_by_name(tmp_path: Path, changes: dict[str, object]) -> None:
+    checkpoint = write(tmp_path, 10)
+    (checkpoint / "state.json").write_text(json.dumps({"step": 10, "clips_done": 40} | changes))
+    write_manifest(checkpoint)  # whoever can write the file can write the manifest
+    with pytest.raises(InputError, match=f"state.json: .*{next(iter(changes))}.*older one"):
+        read_state(newest_checkpoint(tmp_path))

@@ -280,3 +280,10 @@ def test_a_run_whose_clock_jumps_to_and_fro_is_the_same_run(
     assert sorted(path.name for path in (run / "checkpoints").iterdir()) == names
     mirrored = sorted(path.name for path in (tmp_path / "disk/checkpoints").iterdir())
     assert mirrored in (names, names[1:])  # in the background: the first may be outdated before its turn comes
+
+
+def test_a_checkpoint_is_due_by_minutes_too(make_config, reporter, tmp_path) -> None:
+    for name, minutes, written in (("often", 1e-9, [1, 2, 3]), ("rarely", 60.0, [3]), ("never", None, [3])):
+        knobs = {"checkpoint__every": 100, "checkpoint__every_minutes": minutes, "checkpoint__keep_best": "off"}
+        run = train(make_config(run_dir=str(tmp_path / name), training__steps=3, **knobs), reporter)
+        assert sorted(int(path.name.split("-")[1]) for path in (run / "checkpoints").glob("step-*")) == written

@@ -2,9 +2,10 @@
 
 import os
 import pty
+import select
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -42,6 +43,29 @@ def start(make_config, nursery: Nursery, tmp_path: Path) -> Start:
         return nursery.start("train", str(tmp_path / "config.yaml"), folder=tmp_path / "run", **streams)
 
     return start_run
+
+
+@pytest.fixture
+def pipe(tmp_path: Path) -> Iterator[tuple[str, int]]:
+    """A pipe by name, and the end of it that a test may read."""
+    path = str(tmp_path / "pipe")
+    os.mkfifo(path)
+    reader = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    yield path, reader
+    os.close(reader)
+
+
+def test_a_run_whose_reader_leaves_is_the_run_that_it_would_be(start: Start, pipe, tmp_path: Path, whole: Path) -> None:
+    path, reader = pipe
+    err = tmp_path / "err"
+    err.touch()
+    child = start(out=path, err=str(err))
+    assert select.select([reader], [], [], 120)[0], "nothing was said"  # before there is a writer, reading would end
+    assert os.read(reader, 10), "its first line, as `| head -1` would"
+    os.dup2(os.open(os.devnull, os.O_RDONLY), reader)
+    assert child.wait() == 0
+    assert err.read_text() == ""
+    assert_same_run(whole, tmp_path / "run")
 
 
 def test_a_run_whose_log_has_no_room_is_the_run_that_it_would_be(start: Start, tmp_path: Path, whole: Path) -> None:

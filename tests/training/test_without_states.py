@@ -7,16 +7,21 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from run_fixtures import TINY
+from same_run import metrics
 from vector_sets import write_vectors
-from vjepa2_ac.config import Config, LimitsConfig, ModelSizes, PlanningConfig
+from vjepa2_ac.config import Config, LimitsConfig, ModelConfig, ModelSizes, PlanningConfig
 from vjepa2_ac.config.planning import CemConfig
 from vjepa2_ac.episode import STATE_DIM
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
+from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.planning.session import load_to_plan
+from vjepa2_ac.reports.export import export_run
 from vjepa2_ac.reports.write import evaluate_subject
 from vjepa2_ac.runs.loading import load_run
 from vjepa2_ac.training.loop import train
@@ -26,6 +31,7 @@ SIZES = {**TINY, "predictor": {**TINY["predictor"], "use_states": False}}  # typ
 PROBES = ProbeOptions(sensitivity_clips=2, samples=4, landscape_clips=1, nodes=3, examples=1)
 QUICK = EvaluationOptions(split="validation", clips=4, probes=PROBES)
 SEARCH = PlanningConfig(samples=6, iterations=2, cem=CemConfig(elites=3))
+STATE = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2])
 
 
 @pytest.fixture(scope="module")
@@ -33,6 +39,13 @@ def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("base") / "model"
     WorldModel.random(ModelSizes.model_validate(SIZES), seed=3).save_pretrained(folder)
     return folder
+
+
+def start_of(kind: str, base: Path) -> dict[str, Any]:
+    """Return the knobs of a run of an adapter on a base, or from scratch."""
+    if kind == "lora":
+        return {"model__base": str(base), "adapter__modules_to_save": ["action_encoder"]}
+    return {"model__base": None, "model__random": SIZES, "adapter__kind": "none"}
 
 
 def with_states(base: Path, width: int) -> WorldModel:
@@ -59,6 +72,32 @@ def drive(controller: Controller, state: np.ndarray) -> np.ndarray:
         if len(state) == STATE_DIM:
             state[-1] = np.clip(state[-1], 0, 1)  # a gripper opens no farther
     return np.stack(actions)
+
+
+@pytest.mark.parametrize("kind", ["lora", "none"])
+def test_from_training_to_a_plan(make_config: MakeConfig, reporter: Any, tmp_path: Path, base: Path, kind: str) -> None:
+    folder = train(make_config(**start_of(kind, base)), reporter)
+    losses = [row["loss"] for row in metrics(folder) if row["kind"] == "train"]
+    assert len(losses) == 6
+    assert np.isfinite(losses).all()
+    run = load_run(folder)
+    assert not run.world_model.sizes.predictor.use_states
+
+    evaluation = evaluate_subject(str(folder), QUICK).evaluation
+    assert list(evaluation.models) == (["base", "adapter"] if kind == "lora" else ["model"])
+
+    assert drive(Controller.of_run(run, SEARCH), STATE).shape == (2, 7)
+    merged = export_run(folder, tmp_path / "merged").path
+    loaded = load_base(ModelConfig(base=str(merged), dtype="float32"), seed=5)
+    assert loaded.sizes == run.world_model.sizes
+    generator = torch.Generator().manual_seed(1)
+    latents, actions, states = (torch.randn(1, 2, *shape, generator=generator) for shape in ((4, 24), (7,), (7,)))
+    with torch.no_grad():
+        expected = run.world_model.eval().predict(latents, actions, states)
+        torch.testing.assert_close(loaded.predict(latents, actions, states), expected, atol=1e-5, rtol=1e-5)
+    drive(load_to_plan(str(merged), overrides=["planning.samples=6", "planning.cem.elites=3"]).controller(), STATE)
+    with pytest.raises(InputError, match=r"Meta's code has no other.* --to merged"):
+        export_run(folder, tmp_path / "official.pt", "official")
 
 
 def test_states_of_any_width_need_no_new_head(
