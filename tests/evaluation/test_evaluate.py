@@ -10,7 +10,6 @@ import pytest
 from torch import Tensor
 
 from vjepa2_ac.evaluation.answer import answer
-from vjepa2_ac.evaluation.calibration.axes import infer_axes
 from vjepa2_ac.evaluation.estimates import (
     difference_to,
     gain_over,
@@ -31,15 +30,15 @@ from vjepa2_ac.reports.metrics_json import metrics_as_dict
 from vjepa2_ac.spaces import vector_actions
 from worlds import DIM, TIME, TOKENS, Copier, Halfway, Oracle, about, again, clips_batch
 
-PROBES = ProbeOptions(sensitivity_clips=6, samples=20, landscape_clips=3, nodes=5, examples=3, at_once=7)
+PROBES = ProbeOptions(sensitivity_clips=6, samples=20, landscape_clips=3, axis_clips=0, nodes=5, examples=3, at_once=7)
 
 
 def evaluated(trained: object, base: object | None = None, *, size: int = 4, **changes: object) -> Evaluation:
     contenders = [] if base is None else [Contender("base", "base", base)]  # type: ignore[arg-type]
     contenders.append(Contender("adapter", "trained", trained))  # type: ignore[arg-type]
     batch = clips_batch(actions=changes.pop("actions", None))  # type: ignore[arg-type]
-    find_axes = changes.pop("find_axes", None)
-    return evaluate(contenders, again(batch, size), about(**changes), probes=replace(PROBES, find_axes=find_axes))  # type: ignore[arg-type]
+    probes = replace(PROBES, axis_clips=changes.pop("axis_clips", 0))  # type: ignore[arg-type]
+    return evaluate(contenders, again(batch, size), about(**changes), probes=probes)
 
 
 def pair_of(found: Evaluation) -> tuple[PredictionErrors, PredictionErrors]:
@@ -210,12 +209,12 @@ def test_the_axes_of_base_and_adapter_are_found_and_those_of_vectors_are_not() -
         def predict(self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
             return super().predict(latents, Axes(-np.pi / 2).actions(actions), states, extrinsics)
 
-    found = evaluated(Oracle(), Quarter(), find_axes=infer_axes)
+    found = evaluated(Oracle(), Quarter(), axis_clips=6)
     yaws = {row.model: row.value for row in rows_of(found) if row.key == "axes.yaw_degrees"}
     assert yaws == {"base": pytest.approx(90.0, abs=3.0), "adapter": pytest.approx(0.0, abs=3.0)}
     written = metrics_as_dict(found)["models"]
     assert {name: one["axes"]["yaw_degrees"]["value"] for name, one in written.items()} == yaws
-    vectors = evaluated(Oracle(), space=vector_actions(7, "change"), find_axes=infer_axes)
+    vectors = evaluated(Oracle(), space=vector_actions(7, "change"), axis_clips=6)
     assert not vectors.models["adapter"].beside
 
 

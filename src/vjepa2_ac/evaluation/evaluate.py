@@ -26,6 +26,7 @@ from vjepa2_ac.evaluation.action_use import (
     rank_actions,
     start_of,
 )
+from vjepa2_ac.evaluation.calibration.axes import infer_axes
 from vjepa2_ac.evaluation.distribution import LatentSums, distribution_of, latent_noise_floor
 from vjepa2_ac.evaluation.estimates import episode_scores
 from vjepa2_ac.evaluation.measure import ALL, Predictor, joined, measured, prediction, with_other_actions
@@ -219,9 +220,9 @@ def _measure(
     if seen.planned:
         planner = model if contender.to_plan is None else contender.to_plan()
         found = replace(found, plans=measure_plans(planner, seen.planned, probes.planning, progress("planning")))
-    if probes.find_axes is not None and starts and probes.axis_clips and space.is_pose:
+    if starts and probes.axis_clips and space.is_pose:
         chosen = [starts[place] for place in spread(len(starts), probes.axis_clips)]
-        found = replace(found, beside={"axes": probes.find_axes(model, chosen, probes.at_once, progress("axes"))})
+        found = replace(found, beside={"axes": infer_axes(model, chosen, probes.at_once, progress("axes"))})
     return found
 
 

@@ -11,10 +11,9 @@ Where it differs: docs/evaluation_reference.md.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.data import Split
@@ -63,7 +62,6 @@ class ProbeOptions:
     at_once: int = 64  # samples per batch
     planning_clips: int = 0  # number of clips whose plans are compared with the demonstration; of poses only
     planning: PlanningConfig = field(default_factory=PlanningConfig)  # settings of one-step plans
-    find_axes: Callable[..., Any] | None = None  # `evaluation.calibration.axes.infer_axes`; None: no axes
 
 
 @dataclass(frozen=True)

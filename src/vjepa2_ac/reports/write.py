@@ -18,8 +18,6 @@ from markupsafe import Markup
 
 from vjepa2_ac.episode import short_names
 from vjepa2_ac.evaluation.answer import Answer, Question, answer, interval_of, percent, with_closed_loop
-from vjepa2_ac.evaluation.calibration.axes import infer_axes
-from vjepa2_ac.evaluation.calibration.variants import calibrate_model
 from vjepa2_ac.evaluation.estimates import Curve, over_persistence
 from vjepa2_ac.evaluation.evaluate_run import measure_subject
 from vjepa2_ac.evaluation.request import EvaluationOptions
@@ -221,7 +219,7 @@ def evaluate_subject(subject: str, asked: EvaluationOptions | None = None, repor
         InputError: As `measure_subject`.
     """
     asked = asked or EvaluationOptions()
-    evaluation = measure_subject(subject, asked, reporter=reporter, find_axes=infer_axes, calibrate=calibrate_model)
+    evaluation = measure_subject(subject, asked, reporter=reporter)
     about, found = evaluation.about, answer(evaluation, rows_of(evaluation))
     if about.checkpoint:
         found = with_closed_loop(found, Path(about.subject), about.checkpoint)
