@@ -183,12 +183,11 @@ def test_energy_and_change_are_the_distances_of_the_world() -> None:
     start = starts()[0]
     true = start.action.double().numpy()
     other = true + np.array([0.03, 0, 0, 0, 0, 0, 0])
-    tried = evaluate_actions(Oracle(), start, np.stack([true, other]), at_once=1)
-    assert tried.energy == pytest.approx([0.0, 3.0 / DIM], abs=1e-5), "3 cm in one of the numbers"
-    assert tried.change == pytest.approx([0.0, 3.0 / DIM], abs=1e-5)
-    half = evaluate_actions(Halfway(), start, np.stack([2 * true, other]), at_once=7)
-    assert half.energy[0] == pytest.approx(0.0, abs=1e-5)
-    assert half.change[1] == pytest.approx(1.5 / DIM, abs=1e-5)
+    for found in evaluate_actions(Oracle(), start, np.stack([true, other]), at_once=1):
+        assert found == pytest.approx([0.0, 3.0 / DIM], abs=1e-5), "3 cm in one of the numbers"
+    energy, change = evaluate_actions(Halfway(), start, np.stack([2 * true, other]), at_once=7)
+    assert energy[0] == pytest.approx(0.0, abs=1e-5)
+    assert change[1] == pytest.approx(1.5 / DIM, abs=1e-5)
 
 
 def test_ranks_are_counted_by_hand() -> None:

@@ -18,7 +18,6 @@ from vjepa2_ac.evaluation.estimates import (
     one_step_over_persistence,
     over_persistence,
     stratum_gain,
-    stratum_over_persistence,
 )
 from vjepa2_ac.evaluation.evaluate import Contender, evaluate
 from vjepa2_ac.evaluation.request import ProbeOptions
@@ -83,7 +82,7 @@ def test_a_model_that_ignores_actions_has_no_sensitivity_and_the_rank_of_chance(
     for ranking in sensitivity.rankings:
         assert set(ranking.rank) == {0.5}
         assert {k: share.value for k, share in ranking.top.items()} == pytest.approx(
-            {k: ranking.chance_of_top(k) for k in ranking.top}
+            {k: k / (ranking.samples + 1) for k in ranking.top}
         )
     assert gap_of_actions(found.models["adapter"].errors, "shuffled") == Estimate(0.0, 0.0, 0.0)
     assert answer(found, rows_of(found)).uses_actions.word == "no"
@@ -128,7 +127,7 @@ def test_a_part_counts_its_own_steps_only(oracle: Evaluation) -> None:
     made_up = np.where(first, 2 * nothing, nothing / 4)
     errors = replace(errors, arrays={**errors.arrays, ("true", "teacher_forced", "l1"): made_up})
     for part, value in ((Stratum("first", "motion", first), 2.0), (Stratum("rest", "motion", ~first), 0.25)):
-        assert stratum_over_persistence(errors, part).value == pytest.approx(value)
+        assert one_step_over_persistence(errors, "true", part).value == pytest.approx(value)
         assert stratum_gain(errors, base, part).value == pytest.approx(1 - value)
 
 

@@ -55,14 +55,6 @@ class RolloutStart:
         return np.random.default_rng([seed, int.from_bytes(digest, "big")])
 
 
-@dataclass(frozen=True)
-class EvaluatedActions:
-    """The results of each evaluated action of a start."""
-
-    energy: Float[np.ndarray, " samples"]  # L1 distance of the prediction to the true next frame
-    change: Float[np.ndarray, " samples"]  # L1 distance of the prediction to that with the true action
-
-
 def start_of(
     batch: LatentBatch, row: int, step: int, clip: int, *, end: int | None = None, action: Tensor | None = None
 ) -> RolloutStart:
@@ -113,7 +105,7 @@ def moves_of(batch: LatentBatch, row: int, clip: int, space: ActionSpace, reach:
 @torch.no_grad()
 def evaluate_actions(
     model: Predictor, start: RolloutStart, actions: Float[np.ndarray, "samples action_dim"], *, at_once: int
-) -> EvaluatedActions:
+) -> Float[np.ndarray, "2 samples"]:
     """Predict one step from one frame under each action; with the true state and camera.
 
     Args:
@@ -121,14 +113,18 @@ def evaluate_actions(
         start: The frame.
         actions: In the units of the data.
         at_once: Samples per batch: limits the memory.
+
+    Returns:
+        Energies, and changes: the L1 distances of each prediction to the true next frame, and to the prediction with
+        the true action.
     """
     expected = _predict(model, start, start.action[None])[0]
-    energies, changes = [], []
+    found = []
     for part in torch.from_numpy(actions.astype(np.float32)).to(start.action).split(at_once):  # type: ignore[no-untyped-call]  # torch
         predicted = _predict(model, start, part)
-        energies.append(absolute_difference(predicted, start.following).mean(dim=(1, 2)))
-        changes.append(absolute_difference(predicted, expected).mean(dim=(1, 2)))
-    return EvaluatedActions(*(torch.cat(parts).cpu().numpy().astype(np.float64) for parts in (energies, changes)))
+        distances = [absolute_difference(predicted, to).mean(dim=(1, 2)) for to in (start.following, expected)]
+        found.append(torch.stack(distances))
+    return np.asarray(torch.cat(found, dim=1).cpu().numpy().astype(np.float64))
 
 
 def _predict(
@@ -280,10 +276,10 @@ def _places(
     for done, start in enumerate(starts, start=1):
         generator = start.generator(pool.seed)
         drawn = [start.true[None], *(draw(start, generator) for draw in draws)]
-        found = evaluate_actions(model, start, np.concatenate(drawn), at_once=at_once)
-        own, *others = np.split(found.energy, [1, 1 + pool.samples])
+        energies, changes = evaluate_actions(model, start, np.concatenate(drawn), at_once=at_once)
+        own, *others = np.split(energies, [1, 1 + pool.samples])
         places.append([_place(own[0], one) for one in others])
-        numbers.append((found.change[1 : 1 + pool.samples].mean(), others[0].std(), start.persistence))
+        numbers.append((changes[1 : 1 + pool.samples].mean(), others[0].std(), start.persistence))
         progress(done, len(starts))
     return np.array(places).swapaxes(0, 1), np.array(numbers).T
 
@@ -358,7 +354,7 @@ def _landscape(
     nodes = axes.shape[1]
     evaluated = np.tile(start.true, (nodes**3, 1))
     evaluated[:, _AXES] = _places_of(axes)
-    energy = evaluate_actions(model, start, evaluated, at_once=at_once).energy.reshape(nodes, nodes, nodes)
+    energy = evaluate_actions(model, start, evaluated, at_once=at_once)[0].reshape(nodes, nodes, nodes)
     minimum = evaluated[lowest(energy).ravel(), _AXES].mean(axis=0)
     return Landscape(
         episode_id=start.episode_id,

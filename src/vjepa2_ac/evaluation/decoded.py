@@ -29,7 +29,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.evaluate import ClipName, Contender, FramesOfRow, RepeatableClips
 from vjepa2_ac.evaluation.measure import prediction
 from vjepa2_ac.evaluation.result import DecodedRollouts, DecodedStrip, Example
-from vjepa2_ac.intervals import Estimate, bootstrapped
+from vjepa2_ac.intervals import Estimate, ratios
 from vjepa2_ac.media.image_similarity import mean_where, moving_region, psnr, ssim_map
 from vjepa2_ac.reporter import SILENT, Reporter
 
@@ -124,10 +124,7 @@ def _decoded(
     batch: LatentBatch, contenders: Sequence[Contender], trained: TrainedDecoder, frames_of_row: FramesOfRow | None
 ) -> _Images:
     decoder, latents = trained.decoder, batch.latents
-    rollouts = {
-        DECODED_TRUTH: latents[:, 1:],
-        DECODED_PERSISTENCE: latents[:, :1].expand_as(latents[:, 1:]),
-    }
+    rollouts = {DECODED_TRUTH: latents[:, 1:], DECODED_PERSISTENCE: latents[:, :1].expand_as(latents[:, 1:])}
     for one in contenders:
         with one.switched():
             rollouts[one.name] = prediction(one.model, batch)
@@ -167,8 +164,7 @@ def _measured(images: _Images, lpips: Lpips | None) -> dict[tuple[str, str], Flo
 def _means(values: Float[np.ndarray, "clips horizon"], ids: Sequence[str]) -> tuple[Estimate, ...]:
     """Return means over the clips that have a value."""
     finite = np.isfinite(values)
-    columns = np.stack([np.where(finite, values, 0.0), finite.astype(np.float64)])
-    return bootstrapped(lambda sums: sums[0] / sums[1], columns, ids)
+    return ratios(np.where(finite, values, 0.0), finite.astype(np.float64), ids)
 
 
 Backbone = Literal["alex", "vgg"]

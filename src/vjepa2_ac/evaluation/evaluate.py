@@ -27,7 +27,7 @@ from vjepa2_ac.evaluation.action_use import (
     start_of,
 )
 from vjepa2_ac.evaluation.calibration.axes import infer_axes
-from vjepa2_ac.evaluation.distribution import LatentSums, distribution_of, latent_noise_floor
+from vjepa2_ac.evaluation.distribution import LatentSums, distribution_of, noise_floor
 from vjepa2_ac.evaluation.estimates import episode_scores
 from vjepa2_ac.evaluation.measure import ALL, Predictor, joined, measured, prediction, with_other_actions
 from vjepa2_ac.evaluation.request import ProbeOptions
@@ -109,12 +109,10 @@ def evaluate(
         clips=known,
         models=models,
         strata=strata_of(known, about.space),
-        episodes=(),
-        examples=(),
         planning=study_of(seen.planned, probes.planning) if seen.planned else None,
         metrics=metrics,
         copies=distribution_of(seen.copies, seen.true),
-        noise_floor=latent_noise_floor(seen.true),
+        noise_floor=tuple(noise_floor(column, ids) for column in seen.true.pooled.swapaxes(0, 1)),
     )
     notes, width = [], seen.actions.shape[-1]
     if probes.sensitivity_clips and probes.landscape_clips and width < 3:
@@ -187,12 +185,7 @@ def _collect(
 
 
 def _measure(
-    contender: Contender,
-    seen: _Seen,
-    clips: Clips,
-    probes: ProbeOptions,
-    about: About,
-    reporter: Reporter,
+    contender: Contender, seen: _Seen, clips: Clips, probes: ProbeOptions, about: About, reporter: Reporter
 ) -> ModelResult:
     """Measure one model beyond its predictions: what is asked for, and applies."""
     name, model, starts, space = contender.name, contender.model, seen.starts, about.space

@@ -32,7 +32,7 @@ from vjepa2_ac.evaluation.request import EvaluationOptions, settle
 from vjepa2_ac.evaluation.result import PERSISTENCE, About, Evaluation, Measurement, Role, TrainingCurve
 from vjepa2_ac.model.adapter.lora import base_only, unadapted_copy
 from vjepa2_ac.model.checkpoints.loading import load_base
-from vjepa2_ac.model.network.world_model import WorldModel, heads_to_replace, widths_as_text
+from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import select_checkpoint
 from vjepa2_ac.runs.folder import METRICS, is_run
@@ -134,9 +134,7 @@ def _like(subject: str, world_model: WorldModel, other: str, config: Config, wid
             needed="the same one: errors are compared on the same latents",
             fix="Evaluate each by itself, and put their ratios to persistence side by side with `vjepa2-ac compare`",
         )
-    if heads_to_replace(loaded.sizes, widths):
-        needed = f"{widths.state} and {widths.action}, as the data of {subject} has"
-        raise InputError(where=where, found=f"a model of {widths_as_text(loaded.sizes)}", needed=needed)
+    require_widths(loaded, widths, where=where)
     return loaded
 
 

@@ -99,24 +99,18 @@ def _strip_of(inspection: Inspection, one: ReadEpisode, name: str) -> Strip:
     height, width = episode.read_frames([int(pictured[0])]).shape[1:3]
     count = min(pictures_per_row(height, width), len(pictured))
     at = pictured[((np.arange(count) + 0.5) * len(pictured) / count).astype(np.int64)].astype(np.int64)
+    changes = np.gradient(one.states, axis=0) if steps > 1 else np.zeros_like(one.states)
+    is_pose, space = inspection.has_poses, dataset.spaces.state
+    changed = space.shown_size(changes) if is_pose else largest_change(changes, inspection.ranges)
     return Strip(
         name=name,
         success=episode.info.success,
         frames=episode.read_frames([int(step) for step in at]),
-        speed=_change_per_step(one, inspection) * episode.control_rate_hz,
-        closedness=one.states[:, dataset.spaces.state.gripper] if inspection.has_poses else None,
+        speed=changed * episode.control_rate_hz,
+        closedness=one.states[:, space.gripper] if is_pose else None,
         shaded=_shaded(dataset, one),
         seen=crop_box(height, width, dataset.config.crop),
     )
-
-
-def _change_per_step(one: ReadEpisode, inspection: Inspection) -> Float[np.ndarray, " steps"]:
-    """Return the motion in each control step, in the sheet's unit."""
-    if len(one.states) == 1:
-        return np.zeros(1)
-    if not inspection.has_poses:
-        return largest_change(np.gradient(one.states, axis=0), inspection.ranges)
-    return inspection.dataset.spaces.state.shown_size(np.gradient(one.states, axis=0))
 
 
 def _shaded(dataset: Dataset, one: ReadEpisode) -> tuple[tuple[int, int], ...]:

@@ -76,17 +76,11 @@ class PagePart:
     notes: Sequence[str]
 
 
-def write_report(evaluation: Evaluation, path: Path, found: Answer) -> Path:
-    """Write the page; it is written atomically. The same evaluation and answer give the same bytes."""
-    write_atomically(path, report_page(evaluation, found))
-    return path
-
-
 def report_page(evaluation: Evaluation, found: Answer) -> str:
     """Return an evaluation and its answer as one HTML page that needs no network, no script and no other file.
 
-    It is smaller than 5 MB for any evaluation of usual length: clips, points of curves and episodes are limited, and
-    images of clips have the best quality that fits.
+    The same evaluation and answer give the same bytes. It is smaller than 5 MB for any evaluation of usual length:
+    clips, points of curves and episodes are limited, and images of clips have the best quality that fits.
     """
     rows = rows_of(evaluation)
     environment = Environment(
@@ -228,6 +222,7 @@ def evaluate_subject(subject: str, asked: EvaluationOptions | None = None, repor
         plot_evaluation(evaluation, folder / PLOT),
         write_metrics(evaluation, folder / METRICS_FILE),
         *write_tables(rows_of(evaluation), folder / METRICS_FILE),
-        write_report(evaluation, folder / REPORT, found),
+        folder / REPORT,
     )
+    write_atomically(folder / REPORT, report_page(evaluation, found))
     return Evaluated(evaluation, found, files)

@@ -26,7 +26,6 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.calibration.variants import (
     Encode,
     ReadOnce,
-    SameClips,
     Variant,
     VariantResult,
     load_named,
@@ -119,8 +118,7 @@ def probe_variants(
     dataset = replace(dataset, config=dataset.config.model_copy(update={"frames": frames}))
     windows, shifts = _with_room(dataset, candidates, sample.clips)
     variants = [Variant(AS_THEY_ARE, lambda same: same), *variants_of(dataset.config, shifts)]
-    clips = SameClips(dataset, windows, sample.batch_size)
-    plain, *measured = measure_variants(model, encode, clips, variants, progress)
+    plain, *measured = measure_variants(model, encode, dataset, windows, variants, sample.batch_size, progress)
     space = dataset.spaces.action
     results = [
         found.result(one.name, space, beside=plain, repair=one.repair)

@@ -117,34 +117,32 @@ class VariantErrors:
         return ratio_difference((one, persistence), (other.errors[0, theirs], other.errors[1, theirs]), ids)
 
 
-@dataclass(frozen=True)
-class SameClips:
-    """The clips on which variants are compared."""
-
-    dataset: Dataset
-    windows: Sequence[tuple[int, int]]  # episode and first control step of each
-    batch_size: int  # clips that are computed together
-
-
 def measure_variants(
-    model: Predictor, encode: Encode, clips: SameClips, variants: Sequence[Variant], progress: Progress = no_progress
+    model: Predictor,
+    encode: Encode,
+    dataset: Dataset,
+    windows: Sequence[tuple[int, int]],
+    variants: Sequence[Variant],
+    batch_size: int,
+    progress: Progress = no_progress,
 ) -> list[VariantErrors]:
     """Measure a model's one-step error on the same clips under each variant; each episode is read once for all.
 
     Args:
         model: The predictor.
         encode: Makes the latents.
-        clips: What to measure on.
+        dataset: What to measure on.
+        windows: Episode and first control step of each clip.
         variants: The first one decides which clips can be read.
+        batch_size: Clips that are computed together.
         progress: Called with (clips done, clips in total), of all variants.
 
     Raises:
         InputError: A clip cannot be read; or, by `data.broken_episodes`, none of them.
     """
-    first, dataset, windows = variants[0], clips.dataset, clips.windows
+    first, done = variants[0], 0
     parts: list[list[VariantErrors]] = [[] for _ in variants]
-    done = 0
-    for batch in batches_of(first.view(dataset), windows, batch_size=clips.batch_size):
+    for batch in batches_of(first.view(dataset), windows, batch_size=batch_size):
         latents, read = encode(batch), replace(dataset, source=ReadOnce(dataset.source))
         places = [dataset.table.find(name) for name in batch.episode_ids]
         here = [(place, start) for place, start in zip(places, batch.starts, strict=True) if place is not None]
@@ -357,7 +355,6 @@ def calibrate_model(
         found = f"latents that were encoded for clips at stride {dataset.config.stride}"
         needed, fix = "frames at every candidate stride", "Calibrate on the data set itself, with data.cache: off"
         raise InputError(where=f"data.path: {dataset.config.path}", found=found, needed=needed, fix=fix)
-    world_model.eval()
     sample = replace(sample, batch_size=config.validation.batch_size)
     encode = partial(encode_batch, world_model, device=accelerator.device, chunk=config.model.encode_chunk)
     with accelerator.autocast(), torch.no_grad():
@@ -390,8 +387,7 @@ def calibrate(
     windows = validation_windows(views[possible[-1]], split, clips=sample.clips)
     widest_first = possible[::-1]
     variants = [Variant(str(stride), partial(_at_stride, views[stride])) for stride in widest_first]
-    clips = SameClips(dataset, windows, sample.batch_size)
-    found = measure_variants(model, encode, clips, variants, progress)
+    found = measure_variants(model, encode, dataset, windows, variants, sample.batch_size, progress)
     errors, space = dict(zip(widest_first, found, strict=True)), dataset.spaces.action
     results = {stride: errors[stride].result(f"stride {stride} ({stride / rate:.2f} s)", space) for stride in possible}
     if len(results) > 1:
