@@ -192,8 +192,8 @@ def _summed(
 def p_of_no_difference(kernel: Float[np.ndarray, "episodes episodes"], *, flips: int = FLIPS, seed: int = 0) -> float:
     """Return the probability of a discrepancy as large as this one if predictions and truth were exchangeable.
 
-    The kernel is that of `episode_pairs`. Each flip exchanges prediction and truth of a random half of the episodes. Of few episodes it cannot be small: at
-    least 2 / 2^episodes.
+    The kernel is that of `episode_pairs`. Each flip exchanges prediction and truth of a random half of the
+    episodes. Of few episodes it cannot be small: at least 2 / 2^episodes.
     """
     if (count := len(kernel)) < 2:
         return math.nan
