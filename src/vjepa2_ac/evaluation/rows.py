@@ -240,10 +240,9 @@ class _Rows(list[Row]):
             for name, plans in models.items():
                 if other is not None and plans is not other:
                     for key, one in differences_of(study, plans, other).items():
-                        label, style = _PLAN_DIFFERENCES[key], {"form": "+.1f", "detail": True}
-                        style["better"] = "higher" if key == "score" else "lower"
-                        group, key = f"Plans minus those of {whose}", f"plans_minus_{kind}.{key}"
-                        self.line(group, label, key, {name: one}, **style)
+                        group, key_of = f"Plans minus those of {whose}", f"plans_minus_{kind}.{key}"
+                        style = {"form": "+.1f", "better": "higher" if key == "score" else "lower", "detail": True}
+                        self.line(group, _PLAN_DIFFERENCES[key], key_of, {name: one}, **style)
 
     def add_decoded(self) -> None:
         """Add the metrics of decoded rollouts."""
