@@ -72,7 +72,7 @@ ORDERS: dict[str, list[str]] = {
         "training",
     ],
     "evaluation.calibration": ["variants", "data axes"],
-    "reports": ["metrics_json", "comparison paper", "figures page_film", "write imagined sheet", "export"],
+    "reports": ["metrics_json", "comparison paper", "figures", "write imagined sheet", "export"],
     "cli": ["console", "options", "completion train", "data", "evaluate plan closed_loop setup", "program", "__main__"],
     "simulation": [
         "world",

@@ -153,18 +153,16 @@ def _collect(
 ) -> _Seen:
     names, space = [contender.name for contender in contenders], about.space
     seen, actions = _Seen({name: [] for name in names}, {name: LatentSums() for name in names}), []
-    probed = set(spread(clips.count, probes.sensitivity_clips)) if probes.sensitivity_clips else set()
-    plans = probes.planning_clips if space.position is not None else 0
-    planned = set(spread(clips.count, plans)) if plans else set()
+    probed = set(spread(clips.count, probes.sensitivity_clips))
+    planned = set(spread(clips.count, probes.planning_clips if space.position is not None else 0))
 
     def add(ids: Sequence[str], name: str, way: Way, mode: Mode, predicted: torch.Tensor) -> None:
         if (way, mode) == ("true", "rollout"):
             seen.predicted[name].add(predicted, ids)
-        elif (way, mode, name) == ("persistence", "rollout", names[0]):  # copies are the same for all models
-            seen.copies.add(predicted, ids)
 
     for batch, others in with_other_actions(batch for batch, _ in clips.read(None)):
         seen.true.add(batch.latents[:, 1:], batch.episode_ids)
+        seen.copies.add(batch.latents[:, :1].expand_as(batch.latents[:, 1:]), batch.episode_ids)
         for contender in contenders:
             watch = partial(add, batch.episode_ids, contender.name)
             with contender.switched():
@@ -272,7 +270,9 @@ def clips_of(
         words = f"the norm of the action is {least:.3g} or more, a tenth of its 95th percentile"
         return Clips(episode_ids, starts, size, size >= max(least, np.finfo(float).tiny), words)
     moves = size >= SPEED_CM_S * seconds_per_step
-    turns = _angles(actions[..., space.rotation]) >= TURN_DEGREES_S * seconds_per_step
+    traces = np.trace(matrices_from_euler(actions[..., space.rotation]), axis1=-2, axis2=-1)
+    turned = np.degrees(np.arccos(np.clip((traces - 1) / 2, -1.0, 1.0)))
+    turns = turned >= TURN_DEGREES_S * seconds_per_step
     grips = np.abs(actions[..., space.gripper]) >= GRIP
     words = (
         f"the flange moves at {SPEED_CM_S:g} cm/s or more, or turns at {TURN_DEGREES_S:g} degrees/s or more, or the"
@@ -293,12 +293,6 @@ def strata_of(clips: Clips, space: ActionSpace) -> tuple[Stratum, ...]:
             name = f"{sizes.min():{form}} to {sizes.max():{form}} {unit}".rstrip()
             found.append(Stratum(name, "action size", steps))
     return tuple(stratum for stratum in found if stratum.steps.any())
-
-
-def _angles(rotations: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
-    """Return the angle of each rotation in degrees."""
-    traces = np.trace(matrices_from_euler(rotations), axis1=-2, axis2=-1)
-    return np.asarray(np.degrees(np.arccos(np.clip((traces - 1) / 2, -1.0, 1.0))))
 
 
 def chosen_clips(errors: PredictionErrors, moved: Float[np.ndarray, " clips"], count: int) -> dict[int, str]:

@@ -5,6 +5,7 @@ The page has the answer and a film first, then every number and its figure, fold
 
 from __future__ import annotations
 
+import base64
 import json
 import math
 import re
@@ -13,6 +14,8 @@ from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import UInt8
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
@@ -25,10 +28,10 @@ from vjepa2_ac.evaluation.result import L1, DecodedStrip, EpisodeScore, Evaluati
 from vjepa2_ac.evaluation.rows import rows_of
 from vjepa2_ac.media.figure import svg_of, visible
 from vjepa2_ac.media.film import draw_strip
+from vjepa2_ac.media.images import encode_webp
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.reports.figures.evaluation import decoded_strip, drawings, example_strip, plot_evaluation
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, write_metrics
-from vjepa2_ac.reports.page_film import film_of, webp_urls
 from vjepa2_ac.reports.paper import write_tables
 from vjepa2_ac.storage import write_atomically
 
@@ -38,7 +41,12 @@ _AT_EACH_END = 8  # episodes in a table
 _BYTES = 3_000_000  # of all clips together
 _MOST_TILES = 4
 _AT_AN_END = 10.0  # percent of the width of a bar, free on both sides
-
+LONGEST_S = 6.0  # of the film
+MOST_BYTES = 600_000  # likewise
+_STEP_S, _FIRST_S, _LAST_S = 0.5, 1.2, 1.8  # how long frames are shown
+_QUALITIES = (85, 70, 50, 30, 10)
+_THIN = 32  # a gap, or the bar of time, is so many times thinner than an image is wide
+_GREY, _PASSED = 170, (31, 111, 180)  # of gaps and bar, on white as well as on black
 _PARTS = {  # title, and how the keys of the rows begin; what it means stands in the template
     "errors": ("Error by horizon", r"(rollout|teacher_forced)\.\w+\.(over_pers|error)"),
     "base": ("Compared with the base", r"(rollout|teacher_forced)\.|one_step_gain"),
@@ -54,6 +62,8 @@ _PARTS = {  # title, and how the keys of the rows begin; what it means stands in
     "training": ("Training curves", "$^"),
     "others": ("Further measurements", ""),
 }
+
+Frame = UInt8[np.ndarray, "height width 3"]
 
 
 @dataclass(frozen=True)
@@ -185,6 +195,66 @@ def _clips(evaluation: Evaluation) -> dict[str, list[PageImage]]:
         part = "examples" if isinstance(one, Example) else "decoded"
         images[part].append(PageImage(url, f"{described}: row by row", one))
     return images
+
+
+@dataclass(frozen=True)
+class PageFilm:
+    """One clip as a film. URLs are data: URLs."""
+
+    url: str  # animated
+    still: str  # its last frame
+    captions: tuple[str, ...]  # of the columns
+    clip: DecodedStrip
+
+
+def film_of(evaluation: Evaluation) -> PageFilm | None:
+    """Return the film of the decoded clip whose last images differ most between base and model; None: none is decoded.
+
+    Without a base it is the clip in which most happens. The first frame is given to all.
+    """
+    strips = () if evaluation.decoded is None else evaluation.decoded.strips
+    if not strips:
+        return None
+    models = [name for name in (evaluation.base, evaluation.trained) if name is not None]
+    strip = max(strips, key=lambda one: _difference(one, models))
+    true = "truth" if "truth" in strip.rows else "decoded_truth"
+    columns = [strip.rows[name] for name in (true, *models)]
+    times = range(len(columns[0]))
+    frames = [_frame([column[time] for column in columns], time / times[-1]) for time in times]
+    step = min(_STEP_S, (LONGEST_S - _FIRST_S - _LAST_S) / max(len(times) - 2, 1))
+    shown = [_FIRST_S, *[step] * (len(times) - 2), _LAST_S]
+    (url,), (still,) = webp_urls([frames], shown, at_most=MOST_BYTES), webp_urls([frames[-1:]], at_most=MOST_BYTES)
+    return PageFilm(url, still, ("what happened", *(f"the {name} imagines" for name in models)), strip)
+
+
+def _difference(strip: DecodedStrip, models: Sequence[str]) -> float:
+    other = strip.rows[models[-1]][-1 if len(models) > 1 else 0]
+    return float(np.abs(strip.rows[models[0]][-1].astype(np.float64) - other).mean())
+
+
+def _frame(images: Sequence[Frame], passed: float) -> Frame:
+    """Return images side by side, and below them a bar for the share of the time that has passed."""
+    thin = max(1, images[0].shape[1] // _THIN)
+    with_gaps = [np.pad(one, ((0, thin), (0, thin), (0, 0)), constant_values=_GREY) for one in images]
+    frame = np.concatenate(with_gaps, axis=1)[:, :-thin]
+    frame[-thin:, : round(passed * frame.shape[1])] = _PASSED
+    return frame
+
+
+def webp_urls(films: Sequence[Sequence[Frame]], seconds: Sequence[float] = (1.0,), *, at_most: int) -> list[str]:
+    """Return films, or images of one frame each, as WebP in data: URLs, in the best quality in which all fit.
+
+    Args:
+        films: The frames of each.
+        seconds: How long each frame is shown.
+        at_most: Bytes of all together; if even the lowest quality takes more, it is that one.
+    """
+    encoded: list[bytes] = []
+    for quality in _QUALITIES:
+        encoded = [base64.b64encode(encode_webp(one, seconds, quality=quality)) for one in films]
+        if sum(map(len, encoded)) <= at_most:
+            break
+    return [f"data:image/webp;base64,{one.decode()}" for one in encoded]
 
 
 @dataclass(frozen=True)
