@@ -144,24 +144,23 @@ class ActionPool:
     actions: Float[np.ndarray, "count action_dim"]
     episode_ids: Sequence[str]  # of each action
     space: ActionSpace
-    reach: float  # half the width of the box along each of x, y, z, in metres; of poses only
-    samples: int  # drawn per start, from each of the two sources
+    probes: ProbeOptions  # `samples` drawn per start from each source; the box extends by `reach_cm`, of poses only
     seed: int  # a start gets the same actions whatever else is measured
 
     def of_others(self, start: RolloutStart, generator: np.random.Generator) -> Float[np.ndarray, "samples action_dim"]:
         """Draw actions of other episodes, with replacement; of the same one if there is no other."""
         others = np.flatnonzero(np.array(self.episode_ids) != start.episode_id)
-        chosen = generator.choice(others if len(others) else np.arange(len(self.actions)), size=self.samples)
+        chosen = generator.choice(others if len(others) else np.arange(len(self.actions)), size=self.probes.samples)
         return np.asarray(self.actions[chosen])
 
     def in_box(self, start: RolloutStart, generator: np.random.Generator) -> Float[np.ndarray, "samples action_dim"]:
         """Draw uniformly: for poses (dx, dy, dz) in the box, the rest being true; for vectors every number."""
         true, half = start.true, np.abs(self.actions).max(axis=0)
-        drawn = generator.uniform(-1.0, 1.0, size=(self.samples, len(true)))
+        drawn = generator.uniform(-1.0, 1.0, size=(self.probes.samples, len(true)))
         if self.space.position is None:
             return np.asarray(drawn * half)
-        evaluated = np.tile(true, (self.samples, 1))
-        evaluated[:, self.space.position] = drawn[:, self.space.position] * self.reach
+        evaluated = np.tile(true, (self.probes.samples, 1))
+        evaluated[:, self.space.position] = drawn[:, self.space.position] * (self.probes.reach_cm / 100)
         return evaluated
 
     def on_shell(self, start: RolloutStart, generator: np.random.Generator) -> Float[np.ndarray, "samples action_dim"]:
@@ -175,20 +174,15 @@ class ActionPool:
         if self.space.position is None:
             unit = np.abs(self.actions).max(axis=0)
         unit = unit[moved]
-        drawn = generator.normal(size=(self.samples, len(unit))) * (unit > 0)
+        drawn = generator.normal(size=(self.probes.samples, len(unit))) * (unit > 0)
         length = np.linalg.norm(true[moved] / np.where(unit > 0, unit, 1.0))
-        evaluated = np.tile(true, (self.samples, 1))
+        evaluated = np.tile(true, (self.probes.samples, 1))
         evaluated[:, moved] = drawn * unit * length / np.maximum(np.linalg.norm(drawn, axis=1), 1e-12)[:, None]
         return evaluated
 
 
 def measure_sensitivity(
-    model: Predictor,
-    starts: Sequence[RolloutStart],
-    pool: ActionPool,
-    *,
-    at_once: int,
-    progress: Progress = no_progress,
+    model: Predictor, starts: Sequence[RolloutStart], pool: ActionPool, progress: Progress = no_progress
 ) -> Sensitivity:
     """Evaluate other actions from each start.
 
@@ -196,22 +190,20 @@ def measure_sensitivity(
         model: The predictor.
         starts: One frame of each clip.
         pool: The pool of other actions.
-        at_once: Samples per batch.
         progress: Called with the number of finished starts.
     """
-    draws = pool.of_others, pool.in_box
-    (clips, box), (changes, _, persistence) = _places(model, starts, pool, draws, at_once, progress)
-    ids = [start.episode_id for start in starts]
+    (clips, box), (changes, _, persistence) = _places(model, starts, pool, (pool.of_others, pool.in_box), progress)
+    ids, samples = [start.episode_id for start in starts], pool.probes.samples
 
     def ranking(drawn_from: Literal["clips", "box"], places: Float[np.ndarray, "clips 2"]) -> Ranking:
         lower, same = places.T
-        among = {k: np.clip((k - lower) / (same + 1), 0.0, 1.0) for k in TOP if k <= pool.samples}
+        among = {k: np.clip((k - lower) / (same + 1), 0.0, 1.0) for k in TOP if k <= samples}
         return Ranking(
             drawn_from=drawn_from,
-            samples=pool.samples,
+            samples=samples,
             clips=tuple(start.clip for start in starts),
-            rank=_ranks(places, pool.samples),
-            mean_rank=mean_of(_ranks(places, pool.samples), ids),
+            rank=_ranks(places, samples),
+            mean_rank=mean_of(_ranks(places, samples), ids),
             top={k: mean_of(share, ids) for k, share in among.items()},
         )
 
@@ -241,14 +233,14 @@ def rank_actions(
         seed: Of the other actions.
         progress: Called with the number of finished moves.
     """
-    ids, reach, samples = tuple(move.episode_id for move in moves), probes.reach_cm / 100, probes.samples
-    pool = ActionPool(np.stack([move.true for move in moves]), ids, space, reach, samples, seed)
-    places, (_, spread, now) = _places(model, moves, pool, (pool.in_box, pool.on_shell), probes.at_once, progress)
-    in_box, on_shell = _ranks(places, samples)
+    ids = tuple(move.episode_id for move in moves)
+    pool = ActionPool(np.stack([move.true for move in moves]), ids, space, probes, seed)
+    places, (_, spread, now) = _places(model, moves, pool, (pool.in_box, pool.on_shell), progress)
+    in_box, on_shell = _ranks(places, probes.samples)
     ranks = (in_box + on_shell) / 2
     return ActionRanking(
-        samples=samples,
-        reach=reach,
+        samples=probes.samples,
+        reach=probes.reach_cm / 100,
         episode_ids=ids,
         ranks=ranks,
         rank=mean_of(ranks, ids),
@@ -263,7 +255,6 @@ def _places(
     starts: Sequence[RolloutStart],
     pool: ActionPool,
     draws: Sequence[Callable[[RolloutStart, np.random.Generator], np.ndarray]],
-    at_once: int,
     progress: Progress,
 ) -> tuple[Float[np.ndarray, "draws starts 2"], Float[np.ndarray, "3 starts"]]:
     """Evaluate the true action of each start among those of each draw.
@@ -276,10 +267,10 @@ def _places(
     for done, start in enumerate(starts, start=1):
         generator = start.generator(pool.seed)
         drawn = [start.true[None], *(draw(start, generator) for draw in draws)]
-        energies, changes = evaluate_actions(model, start, np.concatenate(drawn), at_once=at_once)
-        own, *others = np.split(energies, [1, 1 + pool.samples])
+        energies, changes = evaluate_actions(model, start, np.concatenate(drawn), at_once=pool.probes.at_once)
+        own, *others = np.split(energies, [1, 1 + pool.probes.samples])
         places.append([_place(own[0], one) for one in others])
-        numbers.append((changes[1 : 1 + pool.samples].mean(), others[0].std(), start.persistence))
+        numbers.append((changes[1 : 1 + pool.probes.samples].mean(), others[0].std(), start.persistence))
         progress(done, len(starts))
     return np.array(places).swapaxes(0, 1), np.array(numbers).T
 

@@ -251,12 +251,9 @@ def load_lpips(backbone: Path, heads: Path) -> Lpips:
         found = {f"heads.{number}": one.flatten() for number, one in enumerate(of_heads.values())}
         network.load_state_dict(network.state_dict() | found)
     except Exception as error:  # damaged and other files raise errors of many kinds
-        raise InputError(
-            where=f"--lpips {backbone} --lpips-heads {heads}",
-            found=f"cannot be read ({error})",
-            needed="torchvision's AlexNet or VGG16, and the heads of LPIPS for the same one",
-            fix="docs/decoding.md says where to get them",
-        ) from None
+        needed = "torchvision's AlexNet or VGG16, and the heads of LPIPS for the same one (docs/decoding.md)"
+        files, found = f"--lpips {backbone} --lpips-heads {heads}", f"cannot be read ({error})"
+        raise InputError(where=files, found=found, needed=needed) from None
     return network
 
 

@@ -197,9 +197,8 @@ def _measure(
     if starts:
         count, steps, width = seen.actions.shape
         actions, ids = seen.actions.reshape(count * steps, width), [one for one in seen.ids for _ in range(steps)]
-        pool = ActionPool(actions, ids, space, probes.reach_cm / 100, probes.samples, about.seed)
-        task = progress("other actions")
-        sensitivity = measure_sensitivity(model, starts, pool, at_once=probes.at_once, progress=task)
+        pool = ActionPool(actions, ids, space, probes, about.seed)
+        sensitivity = measure_sensitivity(model, starts, pool, progress("other actions"))
         task = progress("action ranking")
         ranking = rank_actions(model, seen.moves, space, probes, seed=about.seed, progress=task)
         found = replace(found, sensitivity=sensitivity, ranking=ranking)

@@ -128,12 +128,9 @@ def _like(subject: str, world_model: WorldModel, other: str, config: Config, wid
     loaded = load_run(Path(other)).world_model if is_other_run else load_base(model, seed=config.seed)
     same = loaded.image_size == world_model.image_size
     if not same or loaded.encoder_fingerprint() != world_model.encoder_fingerprint():
-        raise InputError(
-            where=where,
-            found=f"another encoder than that of {subject}",
-            needed="the same one: errors are compared on the same latents",
-            fix="Evaluate each by itself, and put their ratios to persistence side by side with `vjepa2-ac compare`",
-        )
+        found, needed = f"another encoder than that of {subject}", "the same one: errors are of the same latents"
+        fix = "Evaluate each by itself, and put their ratios to persistence side by side with `vjepa2-ac compare`"
+        raise InputError(where=where, found=found, needed=needed, fix=fix)
     require_widths(loaded, widths, where=where)
     return loaded
 

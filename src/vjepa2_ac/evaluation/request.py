@@ -96,12 +96,8 @@ def settle(subject: str, asked: EvaluationOptions) -> Config:
     """
     require_one_process()
     if (asked.lpips or asked.lpips_heads) and not (asked.decoder and asked.lpips and asked.lpips_heads):
-        raise InputError(
-            where="--lpips, --lpips-heads",
-            found="one without the others",
-            needed="a backbone (--lpips), its heads (--lpips-heads) and a --decoder, whose images LPIPS compares",
-            fix="docs/decoding.md says where to get the files",
-        )
+        needed = "a --decoder, whose images LPIPS compares, and both files (docs/decoding.md says where to get them)"
+        raise InputError(where="--lpips, --lpips-heads", found="one without the others", needed=needed)
     config = _config_of(subject, asked)
     for setting in asked.planning:
         if not setting.startswith("planning."):
@@ -113,12 +109,9 @@ def settle(subject: str, asked: EvaluationOptions) -> Config:
     if asked.probes.planning_clips:
         require_limits(config)
         if config.data.states == "pose" and config.data.frames < FRAMES:
-            raise InputError(
-                where="--planning",
-                found=f"clips of {config.data.frames} frames (data.frames)",
-                needed=f"{FRAMES} or more: plans are held against {FRAMES - 1} steps that were demonstrated",
-                fix=f"Give --data a config with data.frames of {FRAMES} or more, and --out",
-            )
+            found = f"clips of {config.data.frames} frames (data.frames)"
+            needed = f"{FRAMES} or more: plans are held against {STEPS} steps that were demonstrated"
+            raise InputError(where="--planning", found=found, needed=needed, fix="Give --data other clips, and --out")
     return config
 
 

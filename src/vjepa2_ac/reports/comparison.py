@@ -101,12 +101,9 @@ def _check_same_clips(one: Metrics, other: Metrics, first: Path, second: Path) -
     if not differences and one.clips.fingerprint != other.clips.fingerprint:
         differences = [f"other episodes or starts, of {one.about.data} and {other.about.data}"]
     if differences:
-        raise InputError(
-            where=f"{first} and {second}",
-            found=f"measured on different clips ({'; '.join(differences)})",
-            needed="the same clips",
-            fix="Evaluate them again with the same --data, --split and --clips",
-        )
+        fix = "Evaluate them again with the same --data, --split and --clips"
+        found = f"measured on different clips ({'; '.join(differences)})"
+        raise InputError(where=f"{first} and {second}", found=found, fix=fix)
 
 
 def _gains(measured: Mapping[str, Metrics]) -> list[Row]:

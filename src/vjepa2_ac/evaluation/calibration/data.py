@@ -26,6 +26,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.calibration.variants import (
     Encode,
     ReadOnce,
+    SameClips,
     Variant,
     VariantResult,
     load_named,
@@ -119,7 +120,8 @@ def probe_variants(
     dataset = replace(dataset, config=dataset.config.model_copy(update={"frames": frames}))
     windows, shifts = _with_room(dataset, candidates, sample.clips)
     variants = [Variant(AS_THEY_ARE, lambda same: same), *variants_of(dataset.config, shifts)]
-    plain, *measured = measure_variants(model, encode, dataset, windows, variants, sample.batch_size, progress)
+    clips = SameClips(dataset, windows, sample.batch_size)
+    plain, *measured = measure_variants(model, encode, clips, variants, progress)
     space = dataset.spaces.action
     results = [
         result_of(found, one.name, space, beside=plain, repair=one.repair)

@@ -113,32 +113,33 @@ def _of_clips(found: VariantErrors, clips: Iterable[tuple[str, int]]) -> tuple[n
     return of_model, of_nothing
 
 
+@dataclass(frozen=True)
+class SameClips:
+    """The clips on which variants are compared."""
+
+    dataset: Dataset
+    windows: Sequence[tuple[int, int]]  # episode and first control step of each
+    batch_size: int  # clips that are computed together
+
+
 def measure_variants(
-    model: Predictor,
-    encode: Encode,
-    dataset: Dataset,
-    windows: Sequence[tuple[int, int]],
-    variants: Sequence[Variant],
-    batch_size: int,
-    progress: Progress = no_progress,
+    model: Predictor, encode: Encode, clips: SameClips, variants: Sequence[Variant], progress: Progress = no_progress
 ) -> list[VariantErrors]:
     """Measure a model's one-step error on the same clips under each variant; each episode is read once for all.
 
     Args:
         model: The predictor.
         encode: Makes the latents.
-        dataset: What to measure on.
-        windows: Episode and first control step of each clip.
+        clips: What to measure on.
         variants: The first one decides which clips can be read.
-        batch_size: Clips that are computed together.
         progress: Called with (clips done, clips in total), of all variants.
 
     Raises:
         InputError: A clip cannot be read; or, by `data.broken_episodes`, none of them.
     """
-    first, done = variants[0], 0
+    first, done, dataset, windows = variants[0], 0, clips.dataset, clips.windows
     parts: list[VariantErrors] = [{} for _ in variants]
-    for batch in batches_of(first.view(dataset), windows, batch_size=batch_size):
+    for batch in batches_of(first.view(dataset), windows, batch_size=clips.batch_size):
         latents, read = encode(batch), replace(dataset, source=ReadOnce(dataset.source))
         places = [dataset.table.find(name) for name in batch.episode_ids]
         here = [(place, start) for place, start in zip(places, batch.starts, strict=True) if place is not None]
@@ -377,7 +378,8 @@ def calibrate(
     windows = validation_windows(views[possible[-1]], split, clips=sample.clips)
     widest_first = possible[::-1]
     variants = [Variant(str(stride), partial(_at_stride, views[stride])) for stride in widest_first]
-    found = measure_variants(model, encode, dataset, windows, variants, sample.batch_size, progress)
+    clips = SameClips(dataset, windows, sample.batch_size)
+    found = measure_variants(model, encode, clips, variants, progress)
     errors, space = dict(zip(widest_first, found, strict=True)), dataset.spaces.action
     names = {stride: f"stride {stride} ({stride / rate:.2f} s)" for stride in possible}
     results = {stride: result_of(errors[stride], name, space) for stride, name in names.items()}
