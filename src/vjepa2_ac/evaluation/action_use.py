@@ -312,9 +312,8 @@ def measure_landscapes(
     least = space.shown_factor * half / (nodes - 1)
     chance = np.mean([np.linalg.norm(_places_of(one.axes) - one.true, axis=1).mean() for one in maps])
     agreements, chances, counts = zip(*(_signs(maps, axis, least) for axis in range(3)), strict=True)
-    first, second, third = space.names[_AXES]
     return Landscapes(
-        axis_names=(first, second, third),
+        axis_names=space.names[_AXES],
         unit=space.shown_unit,
         maps=tuple(maps),
         distance=mean_of(np.array([one.distance for one in maps]), [one.episode_id for one in maps]),

@@ -270,7 +270,7 @@ class Landscape:
 class Landscapes:
     """Landscapes of some clips of one model, and statistics over them."""
 
-    axis_names: tuple[str, str, str]
+    axis_names: tuple[str, ...]  # three
     unit: str  # cm, or "" where the states are no poses
     maps: tuple[Landscape, ...]
     distance: Estimate  # mean over clips
