@@ -190,10 +190,8 @@ class Lpips(nn.Module):
         self.backbone, (self.compared, widths) = backbone, _COMPARED[backbone]
         self.features = _alexnet() if backbone == "alex" else _vgg16()
         self.heads = nn.ParameterList([nn.Parameter(torch.zeros(width)) for width in widths])
-        self.mean: Tensor
-        self.deviation: Tensor
-        self.register_buffer("mean", torch.tensor([-0.030, -0.088, -0.188])[:, None, None])  # of images in -1 .. 1
-        self.register_buffer("deviation", torch.tensor([0.458, 0.448, 0.450])[:, None, None])
+        self.mean = nn.Buffer(torch.tensor([-0.030, -0.088, -0.188])[:, None, None])  # of images in -1 .. 1
+        self.deviation = nn.Buffer(torch.tensor([0.458, 0.448, 0.450])[:, None, None])
         self.requires_grad_(False).eval()
 
     def seen(self, images: Float[Tensor, "images 3 height width"]) -> Features:
@@ -252,8 +250,8 @@ def load_lpips(backbone: Path, heads: Path) -> Lpips:
         network.load_state_dict(network.state_dict() | found)
     except Exception as error:  # damaged and other files raise errors of many kinds
         needed = "torchvision's AlexNet or VGG16, and the heads of LPIPS for the same one (docs/decoding.md)"
-        files, found = f"--lpips {backbone} --lpips-heads {heads}", f"cannot be read ({error})"
-        raise InputError(where=files, found=found, needed=needed) from None
+        where = f"--lpips {backbone} --lpips-heads {heads}"
+        raise InputError(where=where, found=f"cannot be read ({error})", needed=needed) from None
     return network
 
 

@@ -43,11 +43,8 @@ def rows_as_latex(rows: Sequence[Row]) -> str:
 
 
 def _tabular(columns: Sequence[str], tables: Iterable[RowTable]) -> str:
-    lines = [
-        rf"\begin{{tabular}}{{l{'r' * (1 + len(columns))}}}",
-        r"\toprule",
-        _line("", "by nothing or chance", *columns),
-    ]
+    head = _line("", "by nothing or chance", *columns)
+    lines = [rf"\begin{{tabular}}{{l{'r' * (1 + len(columns))}}}", r"\toprule", head]
     for table in tables:
         title = table.title.translate(_ESCAPED)
         lines += [r"\midrule", rf"\multicolumn{{{2 + len(columns)}}}{{l}}{{{title}}} \\"]
