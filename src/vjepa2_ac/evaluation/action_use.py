@@ -268,16 +268,12 @@ def _places(
         generator = start.generator(pool.seed)
         drawn = [start.true[None], *(draw(start, generator) for draw in draws)]
         energies, changes = evaluate_actions(model, start, np.concatenate(drawn), at_once=pool.probes.at_once)
-        own, *others = np.split(energies, [1, 1 + pool.probes.samples])
-        places.append([_place(own[0], one) for one in others])
+        own, others = energies[0], energies[1:].reshape(len(draws), -1)
+        same = np.abs(others - own) <= _SAME * max(abs(own), 1e-12)
+        places.append([((others < own) & ~same).sum(axis=1), same.sum(axis=1)])
         numbers.append((changes[1 : 1 + pool.probes.samples].mean(), others[0].std(), start.persistence))
         progress(done, len(starts))
-    return np.array(places).swapaxes(0, 1), np.array(numbers).T
-
-
-def _place(true: float, others: Float[np.ndarray, " samples"]) -> tuple[float, float]:
-    same = np.abs(others - true) <= _SAME * max(abs(true), 1e-12)
-    return float(((others < true) & ~same).sum()), float(same.sum())
+    return np.moveaxis(np.array(places, dtype=np.float64), 2, 0), np.array(numbers).T
 
 
 def _ranks(places: Float[np.ndarray, "*draws starts 2"], samples: int) -> Float[np.ndarray, "*draws starts"]:

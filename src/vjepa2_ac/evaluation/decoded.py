@@ -38,10 +38,7 @@ NEIGHBOURS = (DECODED_TRUTH, DECODED_PERSISTENCE, RAW_PERSISTENCE)
 TRUE_FRAMES = "truth"
 _LPIPS_AT_ONCE = 8  # images of each source: of VGG, 256 pixels and six sources they take 1.6 GB
 _CACHE = "Nothing is compared with true frames: the latents come from a cache, which holds only small ones."
-_LEFT_OUT = (
-    "{metric}, at the last horizon: {clips} clips are left out of the mean, since their images are identical or nothing"
-    " moves."
-)
+_LEFT_OUT = "clips are left out of the mean, since their images are identical or nothing moves."
 
 Images = Float[Tensor, "batch horizon 3 size size"]
 
@@ -85,7 +82,7 @@ def measure_decoded(
     for (source, name), array in arrays.items():
         count = int((~np.isfinite(array[:, -1])).sum())
         if count and not (name.endswith(DECODED_TRUTH) and source == DECODED_TRUTH):  # its own reference
-            left_out[name] = _LEFT_OUT.format(metric=name, clips=count)
+            left_out[name] = f"{name}, at the last horizon: {count} {_LEFT_OUT}"
     card, sources = decoder.card, (*NEIGHBOURS, *(one.name for one in contenders))
     kept = ("encoder", "crop", "data", "cameras", "episodes", "frames", "steps", "held_out")
     return DecodedRollouts(
@@ -104,12 +101,6 @@ class _Images:
     sources: Mapping[str, Images]  # neighbours and models, after frame 0
     decoded_first: Float[Tensor, "batch 1 3 size size"]
     true: Float[Tensor, "batch time 3 size size"] | None  # as the encoder saw them; None: from a cache
-
-    @property
-    def references(self) -> dict[str, Images]:
-        """What the sources are compared with."""
-        decoded = {DECODED_TRUTH: self.sources[DECODED_TRUTH]}
-        return decoded if self.true is None else {TRUE_FRAMES: self.true[:, 1:], **decoded}
 
     def strip(self, row: int, example: Example, models: Sequence[str]) -> DecodedStrip:
         """Return whole clips of one row, the given frame included."""
@@ -145,10 +136,12 @@ def _measured(images: _Images, lpips: Lpips | None) -> dict[tuple[str, str], Flo
 
     PSNR of identical images is infinite; where nothing moves, the region's values are NaN.
     """
-    moving = None if images.true is None else moving_region(images.true)
+    references, moving = {DECODED_TRUTH: images.sources[DECODED_TRUTH]}, None
+    if images.true is not None:
+        references, moving = {TRUE_FRAMES: images.true[:, 1:], **references}, moving_region(images.true)
     regions = {"whole": None} if moving is None else {"whole": None, "moving": moving}
     found: dict[tuple[str, str], Tensor] = {}
-    for reference, true in images.references.items():
+    for reference, true in references.items():
         for source, shown in images.sources.items():
             similar = ssim_map(shown, true)
             for region, where in regions.items():
@@ -157,7 +150,7 @@ def _measured(images: _Images, lpips: Lpips | None) -> dict[tuple[str, str], Flo
     if moving is not None:
         found[TRUE_FRAMES, "moving_share"] = moving.float().mean(dim=(-2, -1))
     if lpips is not None:
-        found |= lpips.of_pairs(images.sources, images.references)
+        found |= lpips.of_pairs(images.sources, references)
     return found
 
 

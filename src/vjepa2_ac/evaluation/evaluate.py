@@ -336,7 +336,6 @@ def make_example(
     """
     true = batch.latents[row].float().cpu()
     grid = math.isqrt(true.shape[1])
-    nothing = true[:1].expand_as(true[1:])
 
     def errors(values: Tensor) -> Float[np.ndarray, "horizon grid grid"]:
         of_patch = absolute_difference(values, true[1:]).mean(dim=-1)
@@ -348,7 +347,7 @@ def make_example(
         episode_id=batch.episode_ids[row],
         start=batch.starts[row],
         frames=frames,
-        errors={"persistence": errors(nothing)} | {name: errors(values) for name, values in predicted.items()},
+        errors={"persistence": errors(true[:1])} | {name: errors(values) for name, values in predicted.items()},
         true_colours=colours.of(true),
         predicted_colours={name: colours.of(values) for name, values in predicted.items()},
     )

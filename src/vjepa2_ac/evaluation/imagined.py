@@ -239,9 +239,7 @@ def _window(dataset: Dataset, asked: ImagineOptions) -> tuple[int, int]:
     episode = _episode(dataset, asked.episode)
     start, last = asked.start or 0, int(lengths[episode]) - clip
     if not 0 <= start <= last:
-        needed = (
-            f"0 to {last}: {asked.steps} model steps take {clip} control steps" if last >= 0 else "a longer episode"
-        )
+        needed = f"0 to {last}: a clip takes {clip} control steps" if last >= 0 else "a longer episode"
         found, fix = f"{start}, in an episode of {lengths[episode]} steps", "Lower --steps or --start"
         raise InputError(where="--start", found=found, needed=needed, fix=fix)
     return episode, start

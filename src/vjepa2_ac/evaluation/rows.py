@@ -250,9 +250,8 @@ class _Rows(list[Row]):
             return
         references, known = ("truth", "decoded_truth"), {metric for _, metric in found.curves}
         main = next(one for one in references if f"psnr_db.whole.{one}" in known)
-        for reference, (name, (label, form)), (region, where) in product(
-            references, _SIMILARITIES.items(), _REGIONS.items()
-        ):
+        every = product(references, _SIMILARITIES.items(), _REGIONS.items())
+        for reference, (name, (label, form)), (region, where) in every:
             metric = f"{name}.{region}.{reference}"
             if metric in known:
                 group = f"Decoded images against the {reference.replace('_', ' ')}: {label}, {where}"

@@ -44,8 +44,7 @@ class Comparison:
         lines.append(
             "  " + " " * wide + "".join(f"  {question.name:<{_CELL}}" for question in self.answers[first].questions)
         )
-        shown = list(self.answers.items())[:_MOST_RUNS]
-        for name, found in shown:
+        for name, found in list(self.answers.items())[:_MOST_RUNS]:
             cells = [f"{one.word} {'' if one.share is None else f'{percent(one.share)} %'}" for one in found.questions]
             lines.append(f"  {name[-wide:]:<{wide}}" + "".join(f"  {cell:<{_CELL}}" for cell in cells))
         lines.append("  (error below the base's; what a wrong action costs; other moves that look better)")

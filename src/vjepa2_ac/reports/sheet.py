@@ -80,10 +80,9 @@ def _shaded_means(config: DataConfig) -> str:
 
 def _rows_of(inspection: Inspection, rows: int) -> list[ReadEpisode]:
     """Return episodes of the sample, some of each outcome."""
-    groups = [
-        [one for one in inspection.sample if inspection.dataset.table.success[one.index] == kind] for kind in (1, 0, -1)
-    ]
-    groups = [group for group in groups if group]
+    success = inspection.dataset.table.success
+    by_outcome = ([one for one in inspection.sample if success[one.index] == kind] for kind in (1, 0, -1))
+    groups = [group for group in by_outcome if group]
     whole = sum(map(len, groups))
     shares = [max(1, round(rows * len(group) / whole)) for group in groups]
     shares[shares.index(max(shares))] += rows - sum(shares)

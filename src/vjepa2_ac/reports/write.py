@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import UInt8
@@ -66,8 +67,7 @@ _PARTS = {  # title, and how the keys of the rows begin; what it means stands in
 Frame = UInt8[np.ndarray, "height width 3"]
 
 
-@dataclass(frozen=True)
-class PageImage:
+class PageImage(NamedTuple):
     """An image of the page."""
 
     url: str
@@ -75,8 +75,7 @@ class PageImage:
     clip: Example | DecodedStrip | None = None  # that it shows
 
 
-@dataclass(frozen=True)
-class PagePart:
+class PagePart(NamedTuple):
     """A part of the page."""
 
     id: str
@@ -133,8 +132,7 @@ def _parts(evaluation: Evaluation, rows: Sequence[Row]) -> list[PagePart]:
         of_part[next(name for name, (_, keys) in _PARTS.items() if re.match(keys, row.key))].append(row)
     images: dict[str, list[PageImage]] = {name: [] for name in _PARTS} | _clips(evaluation)
     for one in drawings(evaluation):
-        url = svg_of(one.draw, one.width, one.height, evaluation)
-        images[one.part].append(PageImage(url, one.described))
+        images[one.part].append(PageImage(svg_of(one.draw, one.width, one.height, evaluation), one.described))
     notes = {
         "decoded": () if evaluation.decoded is None else evaluation.decoded.notes,
         "strides": tuple(str(one.as_dict().get("verdict", "")) for one in evaluation.beside.values()),
@@ -197,8 +195,7 @@ def _clips(evaluation: Evaluation) -> dict[str, list[PageImage]]:
     return images
 
 
-@dataclass(frozen=True)
-class PageFilm:
+class PageFilm(NamedTuple):
     """One clip as a film. URLs are data: URLs."""
 
     url: str  # animated
