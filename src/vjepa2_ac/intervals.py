@@ -107,8 +107,14 @@ def ratio(
     errors: Float[np.ndarray, " clips"], others: Float[np.ndarray, " clips"], episode_ids: Sequence[str]
 ) -> Estimate:
     """Return mean error over mean other error, most often persistence: clips are weighted by the denominator."""
-    columns = np.stack([errors, others])[:, :, None]
-    return bootstrapped(lambda sums: sums[0] / sums[1], columns, episode_ids)[0]
+    return ratios(errors[:, None], others[:, None], episode_ids)[0]
+
+
+def ratios(
+    errors: Float[np.ndarray, "clips metrics"], others: Float[np.ndarray, "clips metrics"], episode_ids: Sequence[str]
+) -> tuple[Estimate, ...]:
+    """Return the `ratio` of each metric."""
+    return bootstrapped(lambda sums: sums[0] / sums[1], np.stack([errors, others]), episode_ids)
 
 
 def ratio_difference(

@@ -55,7 +55,9 @@ def ranked(model: Predictor, batch: LatentBatch, samples: int = 40) -> ActionRan
 
 
 def pool_of(moves: list[RolloutStart], space: ActionSpace, samples: int) -> ActionPool:
-    return ActionPool(np.stack([move.true for move in moves]), ["an episode"] * len(moves), space, REACH, samples, 0)
+    return ActionPool(
+        np.stack([move.true for move in moves]), ["an episode"] * len(moves), space, ProbeOptions(samples=samples), 0
+    )
 
 
 def test_a_move_is_the_longest_within_reach_there_and_back() -> None:
@@ -176,19 +178,19 @@ def pool(
 ) -> ActionPool:
     batch = clips_batch(FEW)
     ids = tuple(name for name in batch.episode_ids for _ in range(TIME - 1))
-    return ActionPool(batch.actions.flatten(0, 1).double().numpy(), ids, space, reach, samples, seed)
+    probes = ProbeOptions(samples=samples, reach_cm=100 * reach, at_once=16)
+    return ActionPool(batch.actions.flatten(0, 1).double().numpy(), ids, space, probes, seed)
 
 
 def test_energy_and_change_are_the_distances_of_the_world() -> None:
     start = starts()[0]
     true = start.action.double().numpy()
     other = true + np.array([0.03, 0, 0, 0, 0, 0, 0])
-    tried = evaluate_actions(Oracle(), start, np.stack([true, other]), at_once=1)
-    assert tried.energy == pytest.approx([0.0, 3.0 / DIM], abs=1e-5), "3 cm in one of the numbers"
-    assert tried.change == pytest.approx([0.0, 3.0 / DIM], abs=1e-5)
-    half = evaluate_actions(Halfway(), start, np.stack([2 * true, other]), at_once=7)
-    assert half.energy[0] == pytest.approx(0.0, abs=1e-5)
-    assert half.change[1] == pytest.approx(1.5 / DIM, abs=1e-5)
+    for found in evaluate_actions(Oracle(), start, np.stack([true, other]), at_once=1):
+        assert found == pytest.approx([0.0, 3.0 / DIM], abs=1e-5), "3 cm in one of the numbers"
+    energy, change = evaluate_actions(Halfway(), start, np.stack([2 * true, other]), at_once=7)
+    assert energy[0] == pytest.approx(0.0, abs=1e-5)
+    assert change[1] == pytest.approx(1.5 / DIM, abs=1e-5)
 
 
 def test_ranks_are_counted_by_hand() -> None:
@@ -199,7 +201,7 @@ def test_ranks_are_counted_by_hand() -> None:
             return super().predict(latents, actions / 3, states, extrinsics)
 
     begun = starts()
-    found = measure_sensitivity(Third(), begun, pool(seed=4), at_once=16)
+    found = measure_sensitivity(Third(), begun, pool(seed=4))
     for number, start in enumerate(begun):
         generator = start.generator(4)
         drawn = [pool().of_others(start, generator), pool().in_box(start, generator)]
@@ -215,7 +217,7 @@ def test_ranks_are_counted_by_hand() -> None:
 
 
 def test_equal_energies_share_their_places() -> None:
-    found = measure_sensitivity(Copier(), starts(), pool(), at_once=16)
+    found = measure_sensitivity(Copier(), starts(), pool())
     for ranking in found.rankings:
         assert set(ranking.rank) == {0.5}
         assert ranking.top[1].value == pytest.approx(1 / (SAMPLES + 1))

@@ -64,8 +64,6 @@ def evaluation(*models: ModelResult, episodes: int = 8) -> Evaluation:
         clips=clips_of(actions, ids, tuple(range(CLIPS)), space=POSE_CHANGE, seconds_per_step=0.5),
         models={each.name: each for each in models},
         strata=(),
-        episodes=(),
-        examples=(),
     )
 
 

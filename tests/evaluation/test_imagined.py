@@ -185,7 +185,7 @@ def test_where_nothing_was_simulated_nothing_is_said_of_what_would_happen(whole_
         ({"size_m": 0.0}, "--size"),
         ({"episode": "nobody"}, "--episode: 0 episodes with nobody"),
         ({"episode": "first", "start": -1}, r"--start: -1, in an episode of 24 steps.*0 to 17"),
-        ({"episode": "first", "start": 18}, r"--start: 18, .*0 to 17: 3 model steps take 7 control steps"),
+        ({"episode": "first", "start": 18}, r"--start: 18, .*0 to 17: a clip takes 7 control steps"),
         ({"episode": "first", "steps": 12}, "a longer episode"),
         ({"steps": 12}, "--steps: 12 model steps"),
         ({"decoder": "nowhere"}, "--decoder nowhere"),

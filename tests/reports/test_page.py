@@ -20,8 +20,7 @@ from planned import with_plans
 from vjepa2_ac.evaluation.answer import Question, answer
 from vjepa2_ac.evaluation.result import Evaluation, TrainingCurve
 from vjepa2_ac.evaluation.rows import rows_of
-from vjepa2_ac.reports.page_film import LONGEST_S, MOST_BYTES, film_of
-from vjepa2_ac.reports.write import MOST_CLIPS, bar_of, report_page
+from vjepa2_ac.reports.write import LONGEST_S, MOST_BYTES, MOST_CLIPS, bar_of, film_of, report_page
 
 pytestmark = pytest.mark.usefixtures("drawn")
 

@@ -55,14 +55,6 @@ class RolloutStart:
         return np.random.default_rng([seed, int.from_bytes(digest, "big")])
 
 
-@dataclass(frozen=True)
-class EvaluatedActions:
-    """The results of each evaluated action of a start."""
-
-    energy: Float[np.ndarray, " samples"]  # L1 distance of the prediction to the true next frame
-    change: Float[np.ndarray, " samples"]  # L1 distance of the prediction to that with the true action
-
-
 def start_of(
     batch: LatentBatch, row: int, step: int, clip: int, *, end: int | None = None, action: Tensor | None = None
 ) -> RolloutStart:
@@ -113,7 +105,7 @@ def moves_of(batch: LatentBatch, row: int, clip: int, space: ActionSpace, reach:
 @torch.no_grad()
 def evaluate_actions(
     model: Predictor, start: RolloutStart, actions: Float[np.ndarray, "samples action_dim"], *, at_once: int
-) -> EvaluatedActions:
+) -> Float[np.ndarray, "2 samples"]:
     """Predict one step from one frame under each action; with the true state and camera.
 
     Args:
@@ -121,14 +113,18 @@ def evaluate_actions(
         start: The frame.
         actions: In the units of the data.
         at_once: Samples per batch: limits the memory.
+
+    Returns:
+        Energies, and changes: the L1 distances of each prediction to the true next frame, and to the prediction with
+        the true action.
     """
     expected = _predict(model, start, start.action[None])[0]
-    energies, changes = [], []
+    found = []
     for part in torch.from_numpy(actions.astype(np.float32)).to(start.action).split(at_once):  # type: ignore[no-untyped-call]  # torch
         predicted = _predict(model, start, part)
-        energies.append(absolute_difference(predicted, start.following).mean(dim=(1, 2)))
-        changes.append(absolute_difference(predicted, expected).mean(dim=(1, 2)))
-    return EvaluatedActions(*(torch.cat(parts).cpu().numpy().astype(np.float64) for parts in (energies, changes)))
+        distances = [absolute_difference(predicted, to).mean(dim=(1, 2)) for to in (start.following, expected)]
+        found.append(torch.stack(distances))
+    return np.asarray(torch.cat(found, dim=1).cpu().numpy().astype(np.float64))
 
 
 def _predict(
@@ -148,24 +144,23 @@ class ActionPool:
     actions: Float[np.ndarray, "count action_dim"]
     episode_ids: Sequence[str]  # of each action
     space: ActionSpace
-    reach: float  # half the width of the box along each of x, y, z, in metres; of poses only
-    samples: int  # drawn per start, from each of the two sources
+    probes: ProbeOptions  # `samples` drawn per start from each source; the box extends by `reach_cm`, of poses only
     seed: int  # a start gets the same actions whatever else is measured
 
     def of_others(self, start: RolloutStart, generator: np.random.Generator) -> Float[np.ndarray, "samples action_dim"]:
         """Draw actions of other episodes, with replacement; of the same one if there is no other."""
         others = np.flatnonzero(np.array(self.episode_ids) != start.episode_id)
-        chosen = generator.choice(others if len(others) else np.arange(len(self.actions)), size=self.samples)
+        chosen = generator.choice(others if len(others) else np.arange(len(self.actions)), size=self.probes.samples)
         return np.asarray(self.actions[chosen])
 
     def in_box(self, start: RolloutStart, generator: np.random.Generator) -> Float[np.ndarray, "samples action_dim"]:
         """Draw uniformly: for poses (dx, dy, dz) in the box, the rest being true; for vectors every number."""
         true, half = start.true, np.abs(self.actions).max(axis=0)
-        drawn = generator.uniform(-1.0, 1.0, size=(self.samples, len(true)))
+        drawn = generator.uniform(-1.0, 1.0, size=(self.probes.samples, len(true)))
         if self.space.position is None:
             return np.asarray(drawn * half)
-        evaluated = np.tile(true, (self.samples, 1))
-        evaluated[:, self.space.position] = drawn[:, self.space.position] * self.reach
+        evaluated = np.tile(true, (self.probes.samples, 1))
+        evaluated[:, self.space.position] = drawn[:, self.space.position] * (self.probes.reach_cm / 100)
         return evaluated
 
     def on_shell(self, start: RolloutStart, generator: np.random.Generator) -> Float[np.ndarray, "samples action_dim"]:
@@ -179,20 +174,15 @@ class ActionPool:
         if self.space.position is None:
             unit = np.abs(self.actions).max(axis=0)
         unit = unit[moved]
-        drawn = generator.normal(size=(self.samples, len(unit))) * (unit > 0)
+        drawn = generator.normal(size=(self.probes.samples, len(unit))) * (unit > 0)
         length = np.linalg.norm(true[moved] / np.where(unit > 0, unit, 1.0))
-        evaluated = np.tile(true, (self.samples, 1))
+        evaluated = np.tile(true, (self.probes.samples, 1))
         evaluated[:, moved] = drawn * unit * length / np.maximum(np.linalg.norm(drawn, axis=1), 1e-12)[:, None]
         return evaluated
 
 
 def measure_sensitivity(
-    model: Predictor,
-    starts: Sequence[RolloutStart],
-    pool: ActionPool,
-    *,
-    at_once: int,
-    progress: Progress = no_progress,
+    model: Predictor, starts: Sequence[RolloutStart], pool: ActionPool, progress: Progress = no_progress
 ) -> Sensitivity:
     """Evaluate other actions from each start.
 
@@ -200,22 +190,20 @@ def measure_sensitivity(
         model: The predictor.
         starts: One frame of each clip.
         pool: The pool of other actions.
-        at_once: Samples per batch.
         progress: Called with the number of finished starts.
     """
-    draws = pool.of_others, pool.in_box
-    (clips, box), (changes, _, persistence) = _places(model, starts, pool, draws, at_once, progress)
-    ids = [start.episode_id for start in starts]
+    (clips, box), (changes, _, persistence) = _places(model, starts, pool, (pool.of_others, pool.in_box), progress)
+    ids, samples = [start.episode_id for start in starts], pool.probes.samples
 
     def ranking(drawn_from: Literal["clips", "box"], places: Float[np.ndarray, "clips 2"]) -> Ranking:
         lower, same = places.T
-        among = {k: np.clip((k - lower) / (same + 1), 0.0, 1.0) for k in TOP if k <= pool.samples}
+        among = {k: np.clip((k - lower) / (same + 1), 0.0, 1.0) for k in TOP if k <= samples}
         return Ranking(
             drawn_from=drawn_from,
-            samples=pool.samples,
+            samples=samples,
             clips=tuple(start.clip for start in starts),
-            rank=_ranks(places, pool.samples),
-            mean_rank=mean_of(_ranks(places, pool.samples), ids),
+            rank=_ranks(places, samples),
+            mean_rank=mean_of(_ranks(places, samples), ids),
             top={k: mean_of(share, ids) for k, share in among.items()},
         )
 
@@ -245,14 +233,14 @@ def rank_actions(
         seed: Of the other actions.
         progress: Called with the number of finished moves.
     """
-    ids, reach, samples = tuple(move.episode_id for move in moves), probes.reach_cm / 100, probes.samples
-    pool = ActionPool(np.stack([move.true for move in moves]), ids, space, reach, samples, seed)
-    places, (_, spread, now) = _places(model, moves, pool, (pool.in_box, pool.on_shell), probes.at_once, progress)
-    in_box, on_shell = _ranks(places, samples)
+    ids = tuple(move.episode_id for move in moves)
+    pool = ActionPool(np.stack([move.true for move in moves]), ids, space, probes, seed)
+    places, (_, spread, now) = _places(model, moves, pool, (pool.in_box, pool.on_shell), progress)
+    in_box, on_shell = _ranks(places, probes.samples)
     ranks = (in_box + on_shell) / 2
     return ActionRanking(
-        samples=samples,
-        reach=reach,
+        samples=probes.samples,
+        reach=probes.reach_cm / 100,
         episode_ids=ids,
         ranks=ranks,
         rank=mean_of(ranks, ids),
@@ -267,7 +255,6 @@ def _places(
     starts: Sequence[RolloutStart],
     pool: ActionPool,
     draws: Sequence[Callable[[RolloutStart, np.random.Generator], np.ndarray]],
-    at_once: int,
     progress: Progress,
 ) -> tuple[Float[np.ndarray, "draws starts 2"], Float[np.ndarray, "3 starts"]]:
     """Evaluate the true action of each start among those of each draw.
@@ -280,17 +267,13 @@ def _places(
     for done, start in enumerate(starts, start=1):
         generator = start.generator(pool.seed)
         drawn = [start.true[None], *(draw(start, generator) for draw in draws)]
-        found = evaluate_actions(model, start, np.concatenate(drawn), at_once=at_once)
-        own, *others = np.split(found.energy, [1, 1 + pool.samples])
-        places.append([_place(own[0], one) for one in others])
-        numbers.append((found.change[1 : 1 + pool.samples].mean(), others[0].std(), start.persistence))
+        energies, changes = evaluate_actions(model, start, np.concatenate(drawn), at_once=pool.probes.at_once)
+        own, others = energies[0], energies[1:].reshape(len(draws), -1)
+        same = np.abs(others - own) <= _SAME * max(abs(own), 1e-12)
+        places.append([((others < own) & ~same).sum(axis=1), same.sum(axis=1)])
+        numbers.append((changes[1 : 1 + pool.probes.samples].mean(), others[0].std(), start.persistence))
         progress(done, len(starts))
-    return np.array(places).swapaxes(0, 1), np.array(numbers).T
-
-
-def _place(true: float, others: Float[np.ndarray, " samples"]) -> tuple[float, float]:
-    same = np.abs(others - true) <= _SAME * max(abs(true), 1e-12)
-    return float(((others < true) & ~same).sum()), float(same.sum())
+    return np.moveaxis(np.array(places, dtype=np.float64), 2, 0), np.array(numbers).T
 
 
 def _ranks(places: Float[np.ndarray, "*draws starts 2"], samples: int) -> Float[np.ndarray, "*draws starts"]:
@@ -325,9 +308,8 @@ def measure_landscapes(
     least = space.shown_factor * half / (nodes - 1)
     chance = np.mean([np.linalg.norm(_places_of(one.axes) - one.true, axis=1).mean() for one in maps])
     agreements, chances, counts = zip(*(_signs(maps, axis, least) for axis in range(3)), strict=True)
-    first, second, third = space.names[_AXES]
     return Landscapes(
-        axis_names=(first, second, third),
+        axis_names=space.names[_AXES],
         unit=space.shown_unit,
         maps=tuple(maps),
         distance=mean_of(np.array([one.distance for one in maps]), [one.episode_id for one in maps]),
@@ -358,7 +340,7 @@ def _landscape(
     nodes = axes.shape[1]
     evaluated = np.tile(start.true, (nodes**3, 1))
     evaluated[:, _AXES] = _places_of(axes)
-    energy = evaluate_actions(model, start, evaluated, at_once=at_once).energy.reshape(nodes, nodes, nodes)
+    energy = evaluate_actions(model, start, evaluated, at_once=at_once)[0].reshape(nodes, nodes, nodes)
     minimum = evaluated[lowest(energy).ravel(), _AXES].mean(axis=0)
     return Landscape(
         episode_id=start.episode_id,

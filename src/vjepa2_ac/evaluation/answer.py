@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -76,19 +76,16 @@ class Answer:
         return f"It predicts better than {self.rival}, it uses the actions, and it plans better."
 
     def __str__(self) -> str:
-        return "\n".join(self._lines())
-
-    def _lines(self) -> Iterator[str]:
         between = _COLUMNS - len(self.subject) - len(self.measured)
-        yield f"{self.subject}{' ' * between if between > 1 else chr(10)}{self.measured}"
+        lines = [f"{self.subject}{' ' * between if between > 1 else chr(10)}{self.measured}"]
         wide = max(len(question.word) for question in self.questions)
         for question in self.questions:
             before = f"  {question.name:<12}  {question.word:<{wide}}  "
             room = _COLUMNS - len(before) - len(question.interval) - 1
             says, *more = textwrap.wrap(f"{question.says} {question.beside}", room)
-            yield f"{before}{says:<{room}} {question.interval}".rstrip()
-            yield from (" " * len(before) + text for text in more)
-        yield from textwrap.wrap(self.sentence, _COLUMNS)
+            lines.append(f"{before}{says:<{room}} {question.interval}".rstrip())
+            lines += (" " * len(before) + text for text in more)
+        return "\n".join([*lines, *textwrap.wrap(self.sentence, _COLUMNS)])
 
 
 def answer(evaluation: Evaluation, rows: Sequence[Row]) -> Answer:

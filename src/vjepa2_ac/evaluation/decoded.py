@@ -29,7 +29,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.evaluate import ClipName, Contender, FramesOfRow, RepeatableClips
 from vjepa2_ac.evaluation.measure import prediction
 from vjepa2_ac.evaluation.result import DecodedRollouts, DecodedStrip, Example
-from vjepa2_ac.intervals import Estimate, bootstrapped
+from vjepa2_ac.intervals import Estimate, ratios
 from vjepa2_ac.media.image_similarity import mean_where, moving_region, psnr, ssim_map
 from vjepa2_ac.reporter import SILENT, Reporter
 
@@ -38,10 +38,7 @@ NEIGHBOURS = (DECODED_TRUTH, DECODED_PERSISTENCE, RAW_PERSISTENCE)
 TRUE_FRAMES = "truth"
 _LPIPS_AT_ONCE = 8  # images of each source: of VGG, 256 pixels and six sources they take 1.6 GB
 _CACHE = "Nothing is compared with true frames: the latents come from a cache, which holds only small ones."
-_LEFT_OUT = (
-    "{metric}, at the last horizon: {clips} clips are left out of the mean, since their images are identical or nothing"
-    " moves."
-)
+_LEFT_OUT = "clips are left out of the mean, since their images are identical or nothing moves."
 
 Images = Float[Tensor, "batch horizon 3 size size"]
 
@@ -85,7 +82,7 @@ def measure_decoded(
     for (source, name), array in arrays.items():
         count = int((~np.isfinite(array[:, -1])).sum())
         if count and not (name.endswith(DECODED_TRUTH) and source == DECODED_TRUTH):  # its own reference
-            left_out[name] = _LEFT_OUT.format(metric=name, clips=count)
+            left_out[name] = f"{name}, at the last horizon: {count} {_LEFT_OUT}"
     card, sources = decoder.card, (*NEIGHBOURS, *(one.name for one in contenders))
     kept = ("encoder", "crop", "data", "cameras", "episodes", "frames", "steps", "held_out")
     return DecodedRollouts(
@@ -105,12 +102,6 @@ class _Images:
     decoded_first: Float[Tensor, "batch 1 3 size size"]
     true: Float[Tensor, "batch time 3 size size"] | None  # as the encoder saw them; None: from a cache
 
-    @property
-    def references(self) -> dict[str, Images]:
-        """What the sources are compared with."""
-        decoded = {DECODED_TRUTH: self.sources[DECODED_TRUTH]}
-        return decoded if self.true is None else {TRUE_FRAMES: self.true[:, 1:], **decoded}
-
     def strip(self, row: int, example: Example, models: Sequence[str]) -> DecodedStrip:
         """Return whole clips of one row, the given frame included."""
         rows = {} if self.true is None else {TRUE_FRAMES: as_pixels(self.true[row])}
@@ -124,10 +115,7 @@ def _decoded(
     batch: LatentBatch, contenders: Sequence[Contender], trained: TrainedDecoder, frames_of_row: FramesOfRow | None
 ) -> _Images:
     decoder, latents = trained.decoder, batch.latents
-    rollouts = {
-        DECODED_TRUTH: latents[:, 1:],
-        DECODED_PERSISTENCE: latents[:, :1].expand_as(latents[:, 1:]),
-    }
+    rollouts = {DECODED_TRUTH: latents[:, 1:], DECODED_PERSISTENCE: latents[:, :1].expand_as(latents[:, 1:])}
     for one in contenders:
         with one.switched():
             rollouts[one.name] = prediction(one.model, batch)
@@ -148,10 +136,12 @@ def _measured(images: _Images, lpips: Lpips | None) -> dict[tuple[str, str], Flo
 
     PSNR of identical images is infinite; where nothing moves, the region's values are NaN.
     """
-    moving = None if images.true is None else moving_region(images.true)
+    references, moving = {DECODED_TRUTH: images.sources[DECODED_TRUTH]}, None
+    if images.true is not None:
+        references, moving = {TRUE_FRAMES: images.true[:, 1:], **references}, moving_region(images.true)
     regions = {"whole": None} if moving is None else {"whole": None, "moving": moving}
     found: dict[tuple[str, str], Tensor] = {}
-    for reference, true in images.references.items():
+    for reference, true in references.items():
         for source, shown in images.sources.items():
             similar = ssim_map(shown, true)
             for region, where in regions.items():
@@ -160,15 +150,14 @@ def _measured(images: _Images, lpips: Lpips | None) -> dict[tuple[str, str], Flo
     if moving is not None:
         found[TRUE_FRAMES, "moving_share"] = moving.float().mean(dim=(-2, -1))
     if lpips is not None:
-        found |= lpips.of_pairs(images.sources, images.references)
+        found |= lpips.of_pairs(images.sources, references)
     return found
 
 
 def _means(values: Float[np.ndarray, "clips horizon"], ids: Sequence[str]) -> tuple[Estimate, ...]:
     """Return means over the clips that have a value."""
     finite = np.isfinite(values)
-    columns = np.stack([np.where(finite, values, 0.0), finite.astype(np.float64)])
-    return bootstrapped(lambda sums: sums[0] / sums[1], columns, ids)
+    return ratios(np.where(finite, values, 0.0), finite.astype(np.float64), ids)
 
 
 Backbone = Literal["alex", "vgg"]
@@ -194,10 +183,8 @@ class Lpips(nn.Module):
         self.backbone, (self.compared, widths) = backbone, _COMPARED[backbone]
         self.features = _alexnet() if backbone == "alex" else _vgg16()
         self.heads = nn.ParameterList([nn.Parameter(torch.zeros(width)) for width in widths])
-        self.mean: Tensor
-        self.deviation: Tensor
-        self.register_buffer("mean", torch.tensor([-0.030, -0.088, -0.188])[:, None, None])  # of images in -1 .. 1
-        self.register_buffer("deviation", torch.tensor([0.458, 0.448, 0.450])[:, None, None])
+        self.mean = nn.Buffer(torch.tensor([-0.030, -0.088, -0.188])[:, None, None])  # of images in -1 .. 1
+        self.deviation = nn.Buffer(torch.tensor([0.458, 0.448, 0.450])[:, None, None])
         self.requires_grad_(False).eval()
 
     def seen(self, images: Float[Tensor, "images 3 height width"]) -> Features:
@@ -255,12 +242,9 @@ def load_lpips(backbone: Path, heads: Path) -> Lpips:
         found = {f"heads.{number}": one.flatten() for number, one in enumerate(of_heads.values())}
         network.load_state_dict(network.state_dict() | found)
     except Exception as error:  # damaged and other files raise errors of many kinds
-        raise InputError(
-            where=f"--lpips {backbone} --lpips-heads {heads}",
-            found=f"cannot be read ({error})",
-            needed="torchvision's AlexNet or VGG16, and the heads of LPIPS for the same one",
-            fix="docs/decoding.md says where to get them",
-        ) from None
+        needed = "torchvision's AlexNet or VGG16, and the heads of LPIPS for the same one (docs/decoding.md)"
+        where = f"--lpips {backbone} --lpips-heads {heads}"
+        raise InputError(where=where, found=f"cannot be read ({error})", needed=needed) from None
     return network
 
 

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -121,11 +120,6 @@ def spread_of(predicted: LatentSums, true: LatentSums) -> tuple[Estimate, ...]:
     return bootstrapped_by_weights(of_weights, len(names))
 
 
-def latent_noise_floor(true: LatentSums) -> tuple[float, ...]:
-    """Return the noise floor of the discrepancy, by horizon."""
-    return tuple(noise_floor(column, true.episode_ids) for column in true.pooled.swapaxes(0, 1))
-
-
 def _sketched(flat: Float[Tensor, "batch horizon numbers"]) -> Float[Tensor, "batch horizon places"]:
     numbers = flat.shape[-1]
     if numbers <= MOST_SKETCHED:
@@ -147,19 +141,8 @@ def _hashes(numbers: int, device: torch.device) -> tuple[Int[Tensor, " numbers"]
         return place.to(device), sign.to(device)
 
 
-@dataclass(frozen=True)
-class EpisodePairs:
-    """Sums of kernels over the clips of each pair of episodes, 0 of an episode with itself: all that estimates need."""
-
-    both: Float[np.ndarray, "episodes episodes"]  # k(x, x') + k(y, y') - k(x, y') - k(y, x')
-    true: Float[np.ndarray, "episodes episodes"]  # k(y, y')
-    counts: Float[np.ndarray, "episodes episodes"]  # of pairs
-
-
 def discrepancy(
-    predicted: Float[np.ndarray, "clips dim"],
-    true: Float[np.ndarray, "clips dim"],
-    episode_ids: Sequence[str],
+    predicted: Float[np.ndarray, "clips dim"], true: Float[np.ndarray, "clips dim"], episode_ids: Sequence[str]
 ) -> tuple[Estimate, float]:
     """Return the discrepancy of predicted and true features of the same clips, with its interval over episodes.
 
@@ -174,37 +157,45 @@ def discrepancy(
     Source: Gretton et al. (2012), A Kernel Two-Sample Test, lemma 6, with pairs of one episode left out as pairs of one
     sample are there; the kernel: Luo et al. (2410.05203), JEDi.
     """
-    pairs = episode_pairs(predicted, true, episode_ids)
+    pairs, counts = episode_pairs(predicted, true, episode_ids), _counts(episode_ids)
 
     def of_weights(weights: np.ndarray) -> np.ndarray:
-        return np.asarray(_SCALE * _quadratic(weights, pairs.both) / _quadratic(weights, pairs.counts))[:, None]
+        return np.asarray(_SCALE * _quadratic(weights, pairs) / _quadratic(weights, counts))[:, None]
 
-    (squared,) = bootstrapped_by_weights(of_weights, len(pairs.both))
+    (squared,) = bootstrapped_by_weights(of_weights, len(pairs))
     return squared, p_of_no_difference(pairs)
 
 
 def episode_pairs(
     predicted: Float[np.ndarray, "clips dim"], true: Float[np.ndarray, "clips dim"], episode_ids: Sequence[str]
-) -> EpisodePairs:
-    """Return the sums of kernels over each pair of episodes, in the order of their sorted names."""
+) -> Float[np.ndarray, "episodes episodes"]:
+    """Return k(x, x') + k(y, y') - k(x, y') - k(y, x'), summed over the clips of each pair of episodes."""
+    one, other = predicted.astype(np.float64), true.astype(np.float64)
+    across = _kernel(one, other)
+    return _summed(_kernel(one, one) + _kernel(other, other) - across - across.T, episode_ids)
+
+
+def _counts(episode_ids: Sequence[str]) -> Float[np.ndarray, "episodes episodes"]:
+    return _summed(np.ones((len(episode_ids), len(episode_ids))), episode_ids)
+
+
+def _summed(
+    kernel: Float[np.ndarray, "clips clips"], episode_ids: Sequence[str]
+) -> Float[np.ndarray, "episodes episodes"]:
+    """Return the sums over the clips of each pair of episodes, by their sorted names; 0 of an episode with itself."""
     names, episode_of = np.unique(np.array(episode_ids), return_inverse=True)
     member = np.eye(len(names))[episode_of]
-    one, other = predicted.astype(np.float64), true.astype(np.float64)
-    of_true, across = _kernel(other, other), _kernel(one, other)
-    both = _kernel(one, one) + of_true - across - across.T
-    clips = np.bincount(episode_of, minlength=len(names))
-    sums = member.T @ both @ member, member.T @ of_true @ member, np.outer(clips, clips).astype(np.float64)
-    return EpisodePairs(*(one - np.diag(np.diag(one)) for one in sums))
+    sums = member.T @ kernel @ member
+    return np.asarray(sums - np.diag(np.diag(sums)))
 
 
-def p_of_no_difference(pairs: EpisodePairs, *, flips: int = FLIPS, seed: int = 0) -> float:
+def p_of_no_difference(kernel: Float[np.ndarray, "episodes episodes"], *, flips: int = FLIPS, seed: int = 0) -> float:
     """Return the probability of a discrepancy as large as this one if predictions and truth were exchangeable.
 
-    Each flip exchanges prediction and truth of a random half of the episodes. Of few episodes it cannot be small: at
-    least 2 / 2^episodes.
+    The kernel is that of `episode_pairs`. Each flip exchanges prediction and truth of a random half of the
+    episodes. Of few episodes it cannot be small: at least 2 / 2^episodes.
     """
-    count, kernel = len(pairs.both), pairs.both
-    if count < 2:
+    if (count := len(kernel)) < 2:
         return math.nan
     signs = np.random.default_rng(seed).choice([-1.0, 1.0], size=(flips, count))
     least = kernel.sum() - _ROUNDING * np.abs(kernel).sum()
@@ -217,9 +208,9 @@ def noise_floor(true: Float[np.ndarray, "clips dim"], episode_ids: Sequence[str]
     What is smaller cannot be told from the choice of the episodes. It is cautious: halves are smaller than the whole,
     and unlike predictions they are not of the same clips. NaN of fewer than four episodes.
     """
-    pairs = episode_pairs(true, true, episode_ids)
-    kernel, counts, count = pairs.true, pairs.counts, len(pairs.true)
-    if count < 4:
+    values = true.astype(np.float64)
+    kernel, counts = _summed(_kernel(values, values), episode_ids), _counts(episode_ids)
+    if (count := len(kernel)) < 4:
         return math.nan
     rng = np.random.default_rng(0)
     half = np.stack([rng.permutation(count) < count // 2 for _ in range(HALVINGS)]).astype(np.float64)

@@ -15,7 +15,7 @@ from vjepa2_ac.evaluation.result import (
     Stratum,
     Way,
 )
-from vjepa2_ac.intervals import Estimate, bootstrapped, mean_of, ratio
+from vjepa2_ac.intervals import Estimate, bootstrapped, mean_of, ratio, ratios
 
 Curve = tuple[Estimate, ...]  # at horizon 1, 2, ...; index h - 1
 
@@ -23,18 +23,19 @@ Curve = tuple[Estimate, ...]  # at horizon 1, 2, ...; index h - 1
 def mean_error(errors: PredictionErrors, mode: Mode, metric: Metric = L1, way: Way = "true") -> Curve:
     """Return the mean error by horizon, of a model or of persistence."""
     found = errors.of(mode, metric, way)
-    return bootstrapped(lambda sums: sums[0] / sums[1], np.stack([found, np.ones_like(found)]), errors.episode_ids)
+    return ratios(found, np.ones_like(found), errors.episode_ids)
 
 
 def over_persistence(errors: PredictionErrors, mode: Mode, metric: Metric = L1, way: Way = "true") -> Curve:
     """Return mean error over mean persistence error by horizon: 1 as good as doing nothing; of L1, 0 is perfect."""
-    pair = [errors.of(mode, metric, each) for each in (way, "persistence")]
-    return bootstrapped(lambda sums: sums[0] / sums[1], np.stack(pair), errors.episode_ids)
+    return ratios(errors.of(mode, metric, way), errors.of(mode, metric, "persistence"), errors.episode_ids)
 
 
-def one_step_over_persistence(errors: PredictionErrors, actions: Actions = "true") -> Estimate:
-    """Return teacher-forced error over persistence, over all steps of the clips."""
-    return ratio(_one_step(errors, actions), _one_step(errors, "persistence"), errors.episode_ids)
+def one_step_over_persistence(
+    errors: PredictionErrors, actions: Actions = "true", stratum: Stratum | None = None
+) -> Estimate:
+    """Return teacher-forced error over persistence, over all steps of the clips or those of a stratum; NaN of none."""
+    return ratio(_one_step(errors, actions, stratum), _one_step(errors, "persistence", stratum), errors.episode_ids)
 
 
 def gain_over(errors: PredictionErrors, others: PredictionErrors, mode: Mode = "rollout", metric: Metric = L1) -> Curve:
@@ -49,8 +50,7 @@ def difference_to(
 ) -> Curve:
     """Return mean error minus that of another model by horizon, paired by clip: of L1, below 0 is better."""
     difference = errors.of(mode, metric) - others.of(mode, metric)
-    columns = np.stack([difference, np.ones_like(difference)])
-    return bootstrapped(lambda sums: sums[0] / sums[1], columns, errors.episode_ids)
+    return ratios(difference, np.ones_like(difference), errors.episode_ids)
 
 
 def cost_of_actions(errors: PredictionErrors, actions: Actions) -> Estimate:
@@ -65,25 +65,14 @@ def gap_of_actions(errors: PredictionErrors, actions: Actions) -> Estimate:
     return ratio((given - true).mean(axis=1), _one_step(errors, "persistence"), errors.episode_ids)
 
 
-def stratum_over_persistence(errors: PredictionErrors, stratum: Stratum) -> Estimate:
-    """Return teacher-forced error over persistence of the steps of a stratum; NaN where there are none."""
-    return ratio(_of_steps(errors, stratum), _of_steps(errors, stratum, "persistence"), errors.episode_ids)
-
-
 def stratum_gain(errors: PredictionErrors, others: PredictionErrors, stratum: Stratum) -> Estimate:
     """Return the share by which the teacher-forced error is smaller than another model's in a stratum, paired."""
-    left = ratio(_of_steps(errors, stratum), _of_steps(others, stratum), errors.episode_ids)
+    left = ratio(_one_step(errors, "true", stratum), _one_step(others, "true", stratum), errors.episode_ids)
     return Estimate(1 - left.value, 1 - left.high, 1 - left.low)
 
 
 def rank_difference(one: ActionRanking, other: ActionRanking) -> Estimate:
-    """Return the mean rank of one model minus that of another on the same moves, paired: below 0 is better.
-
-    Raises:
-        ValueError: They are of different moves.
-    """
-    if one.episode_ids != other.episode_ids:
-        raise ValueError("rankings of different moves")
+    """Return the mean rank of one model minus that of another on the same moves, paired: below 0 is better."""
     return mean_of(one.ranks - other.ranks, one.episode_ids)
 
 
@@ -105,11 +94,7 @@ def episode_scores(errors: PredictionErrors, base: PredictionErrors | None) -> t
     return tuple(sorted(scores, key=lambda score: score.over_persistence))
 
 
-def _one_step(errors: PredictionErrors, way: Way) -> np.ndarray:
-    """Return the teacher-forced L1 error of each clip."""
-    return np.asarray(errors.of("teacher_forced", L1, way).mean(axis=1))
-
-
-def _of_steps(errors: PredictionErrors, stratum: Stratum, way: Way = "true") -> np.ndarray:
-    """Return the sum of each clip's teacher-forced L1 errors in a stratum."""
-    return np.asarray((errors.of("teacher_forced", L1, way) * stratum.steps).sum(axis=1))
+def _one_step(errors: PredictionErrors, way: Way, stratum: Stratum | None = None) -> np.ndarray:
+    """Return the mean teacher-forced L1 error of each clip, or the sum of those in a stratum."""
+    found = errors.of("teacher_forced", L1, way)
+    return np.asarray(found.mean(axis=1) if stratum is None else (found * stratum.steps).sum(axis=1))

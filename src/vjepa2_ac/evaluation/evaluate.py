@@ -26,7 +26,8 @@ from vjepa2_ac.evaluation.action_use import (
     rank_actions,
     start_of,
 )
-from vjepa2_ac.evaluation.distribution import LatentSums, distribution_of, latent_noise_floor
+from vjepa2_ac.evaluation.calibration.axes import infer_axes
+from vjepa2_ac.evaluation.distribution import LatentSums, distribution_of, noise_floor
 from vjepa2_ac.evaluation.estimates import episode_scores
 from vjepa2_ac.evaluation.measure import ALL, Predictor, joined, measured, prediction, with_other_actions
 from vjepa2_ac.evaluation.request import ProbeOptions
@@ -108,12 +109,10 @@ def evaluate(
         clips=known,
         models=models,
         strata=strata_of(known, about.space),
-        episodes=(),
-        examples=(),
         planning=study_of(seen.planned, probes.planning) if seen.planned else None,
         metrics=metrics,
         copies=distribution_of(seen.copies, seen.true),
-        noise_floor=latent_noise_floor(seen.true),
+        noise_floor=tuple(noise_floor(column, ids) for column in seen.true.pooled.swapaxes(0, 1)),
     )
     notes, width = [], seen.actions.shape[-1]
     if probes.sensitivity_clips and probes.landscape_clips and width < 3:
@@ -154,18 +153,16 @@ def _collect(
 ) -> _Seen:
     names, space = [contender.name for contender in contenders], about.space
     seen, actions = _Seen({name: [] for name in names}, {name: LatentSums() for name in names}), []
-    probed = set(spread(clips.count, probes.sensitivity_clips)) if probes.sensitivity_clips else set()
-    plans = probes.planning_clips if space.position is not None else 0
-    planned = set(spread(clips.count, plans)) if plans else set()
+    probed = set(spread(clips.count, probes.sensitivity_clips))
+    planned = set(spread(clips.count, probes.planning_clips if space.position is not None else 0))
 
     def add(ids: Sequence[str], name: str, way: Way, mode: Mode, predicted: torch.Tensor) -> None:
         if (way, mode) == ("true", "rollout"):
             seen.predicted[name].add(predicted, ids)
-        elif (way, mode, name) == ("persistence", "rollout", names[0]):  # copies are the same for all models
-            seen.copies.add(predicted, ids)
 
     for batch, others in with_other_actions(batch for batch, _ in clips.read(None)):
         seen.true.add(batch.latents[:, 1:], batch.episode_ids)
+        seen.copies.add(batch.latents[:, :1].expand_as(batch.latents[:, 1:]), batch.episode_ids)
         for contender in contenders:
             watch = partial(add, batch.episode_ids, contender.name)
             with contender.switched():
@@ -186,12 +183,7 @@ def _collect(
 
 
 def _measure(
-    contender: Contender,
-    seen: _Seen,
-    clips: Clips,
-    probes: ProbeOptions,
-    about: About,
-    reporter: Reporter,
+    contender: Contender, seen: _Seen, clips: Clips, probes: ProbeOptions, about: About, reporter: Reporter
 ) -> ModelResult:
     """Measure one model beyond its predictions: what is asked for, and applies."""
     name, model, starts, space = contender.name, contender.model, seen.starts, about.space
@@ -205,9 +197,8 @@ def _measure(
     if starts:
         count, steps, width = seen.actions.shape
         actions, ids = seen.actions.reshape(count * steps, width), [one for one in seen.ids for _ in range(steps)]
-        pool = ActionPool(actions, ids, space, probes.reach_cm / 100, probes.samples, about.seed)
-        task = progress("other actions")
-        sensitivity = measure_sensitivity(model, starts, pool, at_once=probes.at_once, progress=task)
+        pool = ActionPool(actions, ids, space, probes, about.seed)
+        sensitivity = measure_sensitivity(model, starts, pool, progress("other actions"))
         task = progress("action ranking")
         ranking = rank_actions(model, seen.moves, space, probes, seed=about.seed, progress=task)
         found = replace(found, sensitivity=sensitivity, ranking=ranking)
@@ -219,9 +210,9 @@ def _measure(
     if seen.planned:
         planner = model if contender.to_plan is None else contender.to_plan()
         found = replace(found, plans=measure_plans(planner, seen.planned, probes.planning, progress("planning")))
-    if probes.find_axes is not None and starts and probes.axis_clips and space.is_pose:
+    if starts and probes.axis_clips and space.is_pose:
         chosen = [starts[place] for place in spread(len(starts), probes.axis_clips)]
-        found = replace(found, beside={"axes": probes.find_axes(model, chosen, probes.at_once, progress("axes"))})
+        found = replace(found, beside={"axes": infer_axes(model, chosen, probes.at_once, progress("axes"))})
     return found
 
 
@@ -278,7 +269,9 @@ def clips_of(
         words = f"the norm of the action is {least:.3g} or more, a tenth of its 95th percentile"
         return Clips(episode_ids, starts, size, size >= max(least, np.finfo(float).tiny), words)
     moves = size >= SPEED_CM_S * seconds_per_step
-    turns = _angles(actions[..., space.rotation]) >= TURN_DEGREES_S * seconds_per_step
+    traces = np.trace(matrices_from_euler(actions[..., space.rotation]), axis1=-2, axis2=-1)
+    turned = np.degrees(np.arccos(np.clip((traces - 1) / 2, -1.0, 1.0)))
+    turns = turned >= TURN_DEGREES_S * seconds_per_step
     grips = np.abs(actions[..., space.gripper]) >= GRIP
     words = (
         f"the flange moves at {SPEED_CM_S:g} cm/s or more, or turns at {TURN_DEGREES_S:g} degrees/s or more, or the"
@@ -299,12 +292,6 @@ def strata_of(clips: Clips, space: ActionSpace) -> tuple[Stratum, ...]:
             name = f"{sizes.min():{form}} to {sizes.max():{form}} {unit}".rstrip()
             found.append(Stratum(name, "action size", steps))
     return tuple(stratum for stratum in found if stratum.steps.any())
-
-
-def _angles(rotations: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
-    """Return the angle of each rotation in degrees."""
-    traces = np.trace(matrices_from_euler(rotations), axis1=-2, axis2=-1)
-    return np.asarray(np.degrees(np.arccos(np.clip((traces - 1) / 2, -1.0, 1.0))))
 
 
 def chosen_clips(errors: PredictionErrors, moved: Float[np.ndarray, " clips"], count: int) -> dict[int, str]:
@@ -349,7 +336,6 @@ def make_example(
     """
     true = batch.latents[row].float().cpu()
     grid = math.isqrt(true.shape[1])
-    nothing = true[:1].expand_as(true[1:])
 
     def errors(values: Tensor) -> Float[np.ndarray, "horizon grid grid"]:
         of_patch = absolute_difference(values, true[1:]).mean(dim=-1)
@@ -361,7 +347,7 @@ def make_example(
         episode_id=batch.episode_ids[row],
         start=batch.starts[row],
         frames=frames,
-        errors={"persistence": errors(nothing)} | {name: errors(values) for name, values in predicted.items()},
+        errors={"persistence": errors(true[:1])} | {name: errors(values) for name, values in predicted.items()},
         true_colours=colours.of(true),
         predicted_colours={name: colours.of(values) for name, values in predicted.items()},
     )

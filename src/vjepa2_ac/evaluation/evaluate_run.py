@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from accelerate import Accelerator
 from jaxtyping import UInt8
 
 from vjepa2_ac import __version__
@@ -23,8 +22,9 @@ from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
 from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, require_widths
 from vjepa2_ac.encoding.encode_dataset import with_latents_if_there
-from vjepa2_ac.episode import Batch, LatentBatch, Progress, Widths
+from vjepa2_ac.episode import Batch, LatentBatch, Widths
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.calibration.variants import calibrate_model
 from vjepa2_ac.evaluation.decoded import NEIGHBOURS, TRUE_FRAMES, load_lpips, measure_decoded
 from vjepa2_ac.evaluation.evaluate import ClipName, Contender, FramesOfRow, RepeatableClips, evaluate
 from vjepa2_ac.evaluation.measure import ClipSample
@@ -32,7 +32,7 @@ from vjepa2_ac.evaluation.request import EvaluationOptions, settle
 from vjepa2_ac.evaluation.result import PERSISTENCE, About, Evaluation, Measurement, Role, TrainingCurve
 from vjepa2_ac.model.adapter.lora import base_only, unadapted_copy
 from vjepa2_ac.model.checkpoints.loading import load_base
-from vjepa2_ac.model.network.world_model import WorldModel, heads_to_replace, widths_as_text
+from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import select_checkpoint
 from vjepa2_ac.runs.folder import METRICS, is_run
@@ -128,37 +128,20 @@ def _like(subject: str, world_model: WorldModel, other: str, config: Config, wid
     loaded = load_run(Path(other)).world_model if is_other_run else load_base(model, seed=config.seed)
     same = loaded.image_size == world_model.image_size
     if not same or loaded.encoder_fingerprint() != world_model.encoder_fingerprint():
-        raise InputError(
-            where=where,
-            found=f"another encoder than that of {subject}",
-            needed="the same one: errors are compared on the same latents",
-            fix="Evaluate each by itself, and put their ratios to persistence side by side with `vjepa2-ac compare`",
-        )
-    if heads_to_replace(loaded.sizes, widths):
-        needed = f"{widths.state} and {widths.action}, as the data of {subject} has"
-        raise InputError(where=where, found=f"a model of {widths_as_text(loaded.sizes)}", needed=needed)
+        found, needed = f"another encoder than that of {subject}", "the same one: errors are of the same latents"
+        fix = "Evaluate each by itself, and put their ratios to persistence side by side with `vjepa2-ac compare`"
+        raise InputError(where=where, found=found, needed=needed, fix=fix)
+    require_widths(loaded, widths, where=where)
     return loaded
 
 
-CalibrateStrides = Callable[[WorldModel, Dataset, Config, Accelerator, ClipSample, Progress], Measurement]
-
-
-def measure_subject(
-    subject: str,
-    asked: EvaluationOptions,
-    *,
-    reporter: Reporter = SILENT,
-    find_axes: Callable[..., Measurement] | None = None,
-    calibrate: CalibrateStrides | None = None,
-) -> Evaluation:
+def measure_subject(subject: str, asked: EvaluationOptions, *, reporter: Reporter = SILENT) -> Evaluation:
     """Measure a run or a model on held-out episodes. Cheap failures first.
 
     Args:
         subject: The folder of a run; or a model, as in `model.base`.
         asked: The options.
         reporter: Shows the progress of each part of the work.
-        find_axes: `evaluation.calibration.axes.infer_axes`; None: no axes.
-        calibrate: `evaluation.calibration.variants.calibrate_model`, if the options ask for it; None: no strides.
 
     Raises:
         InputError: The subject, the data, the decoder, a file of a metric, or a model to compare with cannot be used;
@@ -182,21 +165,18 @@ def measure_subject(
         world_model.set_encoder_aside()
     loaded.put_on(accelerator.device)
     beside: dict[str, Measurement] = {}
-    if asked.calibrate and calibrate is not None:
+    if asked.calibrate:
         sample, progress = ClipSample(asked.split, asked.clips), reporter.task("calibrating strides")
-        beside["strides"] = calibrate(world_model, dataset, config, accelerator, sample, progress)
+        beside["strides"] = calibrate_model(world_model, dataset, config, accelerator, sample, progress)
     encode = partial(encode_batch, world_model, device=accelerator.device, chunk=config.model.encode_chunk)
     clips = _clips(through_cache, chosen, config.validation.batch_size, encode, world_model.image_size)
+    axis_clips = asked.probes.axis_clips if dataset.spaces.state.is_base_pose else 0
     with accelerator.autocast():
         evaluation = evaluate(
             contenders,
             clips,
             _about(subject, run, config, dataset, asked),
-            probes=replace(
-                asked.probes,
-                planning=config.planning,
-                find_axes=find_axes if dataset.spaces.state.is_base_pose else None,
-            ),
+            probes=replace(asked.probes, planning=config.planning, axis_clips=axis_clips),
             reporter=reporter,
         )
         decoded = None

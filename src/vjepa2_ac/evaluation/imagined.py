@@ -19,15 +19,7 @@ from vjepa2_ac.data.sources.indexed_source import measured_space
 from vjepa2_ac.data.transforms import frames_as_seen, view
 from vjepa2_ac.data.windows import require_frames
 from vjepa2_ac.decoding.decoder_folder import load_decoder
-from vjepa2_ac.decoding.imagine import (
-    AS_RECORDED,
-    Imagination,
-    Imagined,
-    Start,
-    rolled_out,
-    shown,
-    worth_knowing,
-)
+from vjepa2_ac.decoding.imagine import AS_RECORDED, Imagination, Imagined, Start, rolled_out, shown, worth_knowing
 from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, encode_frames
 from vjepa2_ac.episode import Batch
@@ -247,9 +239,7 @@ def _window(dataset: Dataset, asked: ImagineOptions) -> tuple[int, int]:
     episode = _episode(dataset, asked.episode)
     start, last = asked.start or 0, int(lengths[episode]) - clip
     if not 0 <= start <= last:
-        needed = (
-            f"0 to {last}: {asked.steps} model steps take {clip} control steps" if last >= 0 else "a longer episode"
-        )
+        needed = f"0 to {last}: a clip takes {clip} control steps" if last >= 0 else "a longer episode"
         found, fix = f"{start}, in an episode of {lengths[episode]} steps", "Lower --steps or --start"
         raise InputError(where="--start", found=found, needed=needed, fix=fix)
     return episode, start

@@ -11,10 +11,9 @@ Where it differs: docs/evaluation_reference.md.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.data import Split
@@ -63,7 +62,6 @@ class ProbeOptions:
     at_once: int = 64  # samples per batch
     planning_clips: int = 0  # number of clips whose plans are compared with the demonstration; of poses only
     planning: PlanningConfig = field(default_factory=PlanningConfig)  # settings of one-step plans
-    find_axes: Callable[..., Any] | None = None  # `evaluation.calibration.axes.infer_axes`; None: no axes
 
 
 @dataclass(frozen=True)
@@ -98,12 +96,8 @@ def settle(subject: str, asked: EvaluationOptions) -> Config:
     """
     require_one_process()
     if (asked.lpips or asked.lpips_heads) and not (asked.decoder and asked.lpips and asked.lpips_heads):
-        raise InputError(
-            where="--lpips, --lpips-heads",
-            found="one without the others",
-            needed="a backbone (--lpips), its heads (--lpips-heads) and a --decoder, whose images LPIPS compares",
-            fix="docs/decoding.md says where to get the files",
-        )
+        needed = "a --decoder, whose images LPIPS compares, and both files (docs/decoding.md says where to get them)"
+        raise InputError(where="--lpips, --lpips-heads", found="one without the others", needed=needed)
     config = _config_of(subject, asked)
     for setting in asked.planning:
         if not setting.startswith("planning."):
@@ -115,12 +109,9 @@ def settle(subject: str, asked: EvaluationOptions) -> Config:
     if asked.probes.planning_clips:
         require_limits(config)
         if config.data.states == "pose" and config.data.frames < FRAMES:
-            raise InputError(
-                where="--planning",
-                found=f"clips of {config.data.frames} frames (data.frames)",
-                needed=f"{FRAMES} or more: plans are held against {FRAMES - 1} steps that were demonstrated",
-                fix=f"Give --data a config with data.frames of {FRAMES} or more, and --out",
-            )
+            found = f"clips of {config.data.frames} frames (data.frames)"
+            needed = f"{FRAMES} or more: plans are held against {STEPS} steps that were demonstrated"
+            raise InputError(where="--planning", found=found, needed=needed, fix="Give --data other clips, and --out")
     return config
 
 

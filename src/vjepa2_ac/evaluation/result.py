@@ -110,10 +110,6 @@ class Metric:
     of: Callable[[Tensor, Tensor], Tensor]  # predicted and true [batch time tokens dim] -> [batch time]
     smaller_is_better: bool = True
 
-    def side(self, of_ratio: Estimate) -> int:
-        """Return 1 or -1 if the whole interval of a ratio of two results is better or worse than 1, else 0."""
-        return of_ratio.side(of=1.0) * (-1 if self.smaller_is_better else 1)
-
 
 def _l1(predicted: Tensor, true: Tensor) -> Tensor:
     return absolute_difference(predicted, true).mean(dim=(2, 3))
@@ -142,19 +138,25 @@ ACTIONS: tuple[Actions, ...] = ("true", "zero", "shuffled")
 
 
 @dataclass(frozen=True)
-class About:
-    """The description of an evaluation: model, data and settings."""
+class WrittenAbout:
+    """What readers of metrics.json need of the description of an evaluation."""
 
-    subject: str  # the run or model, as given
     checkpoint: str  # which one, as text; "" for a model
     checkpoint_path: str  # likewise
-    source: str  # data.source
     data: str  # data.path
     cameras: tuple[str, ...]
     split: str
     frames: int  # of a clip
     stride: int  # control steps per model step
     seconds_per_step: float
+
+
+@dataclass(frozen=True)
+class About(WrittenAbout):
+    """The description of an evaluation: model, data and settings."""
+
+    subject: str  # the run or model, as given
+    source: str  # data.source
     space: ActionSpace  # of the actions
     seed: int
     version: str  # of this package
@@ -200,7 +202,7 @@ class PredictionErrors:
 class Ranking:
     """The rank of the true action among others by the L1 energy of a one-step prediction from one frame.
 
-    Equal energies share their rank. Chance: `mean_rank` 0.5, `top[k]` chance_of_top(k).
+    Equal energies share their rank. Chance: `mean_rank` 0.5, `top[k]` k / (samples + 1).
     """
 
     drawn_from: Literal["clips", "box"]  # the others: actions of other episodes, or uniform in a box
@@ -209,10 +211,6 @@ class Ranking:
     rank: Float[np.ndarray, " ranked"]  # share of the others with lower energy: 0 best, 1 worst
     mean_rank: Estimate
     top: Mapping[int, Estimate]  # k -> how often the true action is among the k of lowest energy (of samples + 1)
-
-    def chance_of_top(self, k: int) -> float:
-        """Return how often a model that ignores actions has the true one among its best k."""
-        return k / (self.samples + 1)
 
 
 @dataclass(frozen=True)
@@ -272,7 +270,7 @@ class Landscape:
 class Landscapes:
     """Landscapes of some clips of one model, and statistics over them."""
 
-    axis_names: tuple[str, str, str]
+    axis_names: tuple[str, ...]  # three
     unit: str  # cm, or "" where the states are no poses
     maps: tuple[Landscape, ...]
     distance: Estimate  # mean over clips
@@ -306,9 +304,6 @@ class PlanningStudy:
     one_step_beyond: float  # share of the demonstrated steps that exceed the limits along x, y or z
     three_steps_beyond: float
     settings: PlanningConfig  # of the one-step plans
-
-    def __len__(self) -> int:
-        return len(self.clips)
 
 
 @dataclass(frozen=True)
@@ -410,8 +405,8 @@ class Evaluation:
     clips: Clips
     models: Mapping[str, ModelResult]
     strata: tuple[Stratum, ...]
-    episodes: tuple[EpisodeScore, ...]  # best first
-    examples: tuple[Example, ...]
+    episodes: tuple[EpisodeScore, ...] = ()  # best first
+    examples: tuple[Example, ...] = ()
     training: tuple[TrainingCurve, ...] = ()
     beside: Mapping[str, Measurement] = field(default_factory=dict)  # as of a model: of the one that is evaluated
     notes: tuple[str, ...] = ()  # for the reader: why there is no base, no landscape ...

@@ -19,7 +19,6 @@ from vjepa2_ac.evaluation.estimates import (
     over_persistence,
     rank_difference,
     stratum_gain,
-    stratum_over_persistence,
 )
 from vjepa2_ac.evaluation.request import BEST_SCORE, STEPS
 from vjepa2_ac.evaluation.result import (
@@ -162,7 +161,7 @@ class _Rows(list[Row]):
             found = {name: one_step_over_persistence(one, actions) for name, one in self.errors.items()}
             self.line(group, f"{actions} actions", f"one_step.{actions}", found, chance=1.0)
         for part in self.evaluation.strata:
-            found = {name: stratum_over_persistence(one, part) for name, one in self.errors.items()}
+            found = {name: one_step_over_persistence(one, "true", part) for name, one in self.errors.items()}
             label = f"{part.name} ({int(part.steps.sum())} steps)"
             self.line(group, label, f"one_step.{part.kind}.{part.name}", found, chance=1.0)
         grown, gap = "Growth of the one-step error without the true actions", "The same, over the error of persistence"
@@ -191,7 +190,7 @@ class _Rows(list[Row]):
             self.line(group, label, key, {model: one.mean_rank}, form=".1%", chance=0.5)
             for k, share in one.top.items():
                 label, key = f"true action in the best {k} of {one.samples + 1}, {where}", f"top_{k}.{one.drawn_from}"
-                style: dict[str, Any] = {"better": "higher", "chance": one.chance_of_top(k), "detail": k != _TOP}
+                style: dict[str, Any] = {"better": "higher", "chance": k / (one.samples + 1), "detail": k != _TOP}
                 self.line(group, label, f"sensitivity.{key}", {model: share}, **style)
 
     def add_ranking(self, model: str, found: ActionRanking) -> None:
@@ -227,7 +226,7 @@ class _Rows(list[Row]):
         models = ways_of(self.evaluation)
         free = {"doing nothing": study.zero, "random": study.random, "within limits": study.within_limits}
         found = {name: metrics_of(study, plans) for name, plans in (free | models).items()}
-        group = f"Plans beside demonstrations, from {_clips(len(study))}"
+        group = f"Plans beside demonstrations, from {_clips(len(study.clips))}"
         for key, (label, form, detail) in _PLANS.items():
             kind, _, axis = key.partition(".")
             count = int(signed_along(study, AXES.index(axis)).sum()) if kind == "signs" else None
@@ -241,10 +240,9 @@ class _Rows(list[Row]):
             for name, plans in models.items():
                 if other is not None and plans is not other:
                     for key, one in differences_of(study, plans, other).items():
-                        label, style = _PLAN_DIFFERENCES[key], {"form": "+.1f", "detail": True}
-                        style["better"] = "higher" if key == "score" else "lower"
-                        group, key = f"Plans minus those of {whose}", f"plans_minus_{kind}.{key}"
-                        self.line(group, label, key, {name: one}, **style)
+                        group, key_of = f"Plans minus those of {whose}", f"plans_minus_{kind}.{key}"
+                        style = {"form": "+.1f", "better": "higher" if key == "score" else "lower", "detail": True}
+                        self.line(group, _PLAN_DIFFERENCES[key], key_of, {name: one}, **style)
 
     def add_decoded(self) -> None:
         """Add the metrics of decoded rollouts."""
@@ -252,9 +250,8 @@ class _Rows(list[Row]):
             return
         references, known = ("truth", "decoded_truth"), {metric for _, metric in found.curves}
         main = next(one for one in references if f"psnr_db.whole.{one}" in known)
-        for reference, (name, (label, form)), (region, where) in product(
-            references, _SIMILARITIES.items(), _REGIONS.items()
-        ):
+        every = product(references, _SIMILARITIES.items(), _REGIONS.items())
+        for reference, (name, (label, form)), (region, where) in every:
             metric = f"{name}.{region}.{reference}"
             if metric in known:
                 group = f"Decoded images against the {reference.replace('_', ' ')}: {label}, {where}"

@@ -50,8 +50,7 @@ class Comparison:
         lines.append(
             "  " + " " * wide + "".join(f"  {question.name:<{_CELL}}" for question in self.answers[first].questions)
         )
-        shown = list(self.answers.items())[:_MOST_RUNS]
-        for name, found in shown:
+        for name, found in list(self.answers.items())[:_MOST_RUNS]:
             cells = [f"{one.word} {'' if one.share is None else f'{percent(one.share)} %'}" for one in found.questions]
             lines.append(f"  {name[-wide:]:<{wide}}" + "".join(f"  {cell:<{_CELL}}" for cell in cells))
         lines.append("  (error below the base's; cost of a wrong action; moves that look better)")
@@ -107,12 +106,9 @@ def _check_same_clips(one: Metrics, other: Metrics, first: Path, second: Path) -
     if not differences and one.clips.fingerprint != other.clips.fingerprint:
         differences = [f"other episodes or starts, of {one.about.data} and {other.about.data}"]
     if differences:
-        raise InputError(
-            where=f"{first} and {second}",
-            found=f"measured on different clips ({'; '.join(differences)})",
-            needed="the same clips",
-            fix="Evaluate them again with the same --data, --split and --clips",
-        )
+        fix = "Evaluate them again with the same --data, --split and --clips"
+        found = f"measured on different clips ({'; '.join(differences)})"
+        raise InputError(where=f"{first} and {second}", found=found, fix=fix)
 
 
 def _gains(measured: Mapping[str, Metrics]) -> list[Row]:

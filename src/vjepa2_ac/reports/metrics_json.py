@@ -17,26 +17,12 @@ from pydantic_core import to_jsonable_python
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.answer import Answer, answer
 from vjepa2_ac.evaluation.request import SCORED
-from vjepa2_ac.evaluation.result import L1, Evaluation, Row
+from vjepa2_ac.evaluation.result import L1, Evaluation, Row, WrittenAbout
 from vjepa2_ac.storage import write_atomically
 from vjepa2_ac.storage.structured import json_text
 
 METRICS_FILE = "metrics.json"
 FORMAT = 4  # incremented when a reader of the file would have to change
-
-
-@dataclass(frozen=True)
-class WrittenAbout:
-    """What readers need of `about`."""
-
-    checkpoint: str
-    checkpoint_path: str
-    data: str
-    cameras: tuple[str, ...]
-    split: str
-    frames: int
-    stride: int
-    seconds_per_step: float
 
 
 @dataclass(frozen=True)

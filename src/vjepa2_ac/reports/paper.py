@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, fields
 from itertools import groupby
 from pathlib import Path
@@ -38,29 +38,18 @@ def rows_as_csv(rows: Sequence[Row]) -> str:
 def rows_as_latex(rows: Sequence[Row]) -> str:
     """Return the rows that are for a screen: a `tabular` (booktabs) for the groups of the same columns."""
     shown = sections([row for row in rows if not row.detail])
-    parts = [_tabular(columns, list(group)) for columns, group in groupby(shown, lambda one: one.columns)]
+    parts = [_tabular(columns, group) for columns, group in groupby(shown, lambda one: one.columns)]
     return "% needs \\usepackage{booktabs}; [low, high] is a 95 % interval over episodes\n" + "\n\n".join(parts) + "\n"
 
 
-def _tabular(columns: Sequence[str], tables: Sequence[RowTable]) -> str:
-    return "\n".join(
-        [
-            rf"\begin{{tabular}}{{l{'r' * (1 + len(columns))}}}",
-            r"\toprule",
-            _line("", "by nothing or chance", *columns),
-            *_body(tables, 2 + len(columns)),
-            r"\bottomrule",
-            r"\end{tabular}",
-        ]
-    )
-
-
-def _body(tables: Sequence[RowTable], width: int) -> Iterator[str]:
+def _tabular(columns: Sequence[str], tables: Iterable[RowTable]) -> str:
+    head = _line("", "by nothing or chance", *columns)
+    lines = [rf"\begin{{tabular}}{{l{'r' * (1 + len(columns))}}}", r"\toprule", head]
     for table in tables:
-        yield r"\midrule"
-        yield rf"\multicolumn{{{width}}}{{l}}{{{table.title.translate(_ESCAPED)}}} \\"
-        for label, chance, cells in table.lines:
-            yield r"\quad " + _line(label, chance, *cells)
+        title = table.title.translate(_ESCAPED)
+        lines += [r"\midrule", rf"\multicolumn{{{2 + len(columns)}}}{{l}}{{{title}}} \\"]
+        lines += (r"\quad " + _line(label, chance, *cells) for label, chance, cells in table.lines)
+    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"])
 
 
 def _line(*cells: str) -> str:

@@ -1,22 +1,26 @@
-"""Content of the contact sheet: the selection of episodes, frames and metrics of a data set."""
+"""The contact sheet of a data set: episodes as film strips and their motion, below a summary of the data set."""
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
+from matplotlib.patches import Patch, Rectangle
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.coverage import ReadEpisode
+from vjepa2_ac.data.coverage import ENOUGH_NEAR, ReadEpisode
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.idle import runs_of
 from vjepa2_ac.data.inspection.statistics import CHANGED, MOVED, RELEASED_STEP_CM, Inspection, idle_runs, largest_change
-from vjepa2_ac.data.transforms import crop_box
+from vjepa2_ac.data.transforms import CropBox, crop_box
 from vjepa2_ac.episode import Progress, no_progress, short_names
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.reports.figures.contact_sheet import ContactSheet, Strip, pictures_per_row, plot_contact_sheet
+from vjepa2_ac.media.figure import BLUE, GREEN, GREY, ORANGE, written_figure
 
 _PLACES = 6000  # points of the map, at most
 _FACTS = (
@@ -24,6 +28,27 @@ _FACTS = (
     ("cameras", "gripper", "states", "left out"),
     ("splits", "standing still", "sample"),
 )  # of the summary, line by line
+
+_IDLE = "#c9c9c9"
+_OUTCOME = {True: ("success", GREEN), False: ("failure", "#c0392b"), None: ("", "#b5b5b5")}
+_STRIDES = ("#7fb3dd", BLUE, "#0b3558", "#7a4fa3", "#333333")
+
+_WIDTH, _LABEL, _FILM, _ROW, _PANELS = 11.0, 1.6, 9.0, 1.6, 2.5  # inches
+_EDGE = 0.2 / _WIDTH  # of the sheet, left and right
+_LEAST, _MOST, _PICTURE = 4, 14, 0.8  # pictures in a row, and the height in inches at which they are counted
+
+
+@dataclass(frozen=True, eq=False)
+class Strip:
+    """One episode: some of its frames, and its motion at every control step."""
+
+    name: str
+    success: bool | None
+    frames: UInt8[np.ndarray, "time height width 3"]
+    speed: Float[np.ndarray, " steps"]  # per second, in cm of the flange; of vectors see `plot_contact_sheet`
+    closedness: Float[np.ndarray, " steps"] | None  # None: the states are no poses
+    shaded: tuple[tuple[int, int], ...]  # ranges [start, end) of steps: idle, or left out
+    seen: CropBox  # what the model sees of a picture
 
 
 def plot_dataset(inspection: Inspection, path: Path, *, rows: int = 8, progress: Progress = no_progress) -> Path:
@@ -40,31 +65,11 @@ def plot_dataset(inspection: Inspection, path: Path, *, rows: int = 8, progress:
     strips = []
     for done, (one, name) in enumerate(zip(shown, identities, strict=True), start=1):
         try:
-            strips.append(_strip(inspection, one, names[name]))
+            strips.append(_strip_of(inspection, one, names[name]))
         except InputError as error:
             dataset.leave_out(one.index, error)
         progress(done, len(shown))
-    return plot_contact_sheet(sheet_of(inspection, strips), path)
-
-
-def sheet_of(inspection: Inspection, strips: Sequence[Strip]) -> ContactSheet:
-    """Return the content of the sheet besides the strips: the title, the facts and the data of the plots."""
-    dataset, has_poses, coverage = inspection.dataset, inspection.has_poses, inspection.coverage
-    summary = inspection.summary
-    places = np.concatenate([one.states[:, dataset.spaces.state.sized] for one in inspection.sample])
-    return ContactSheet(
-        title=dataset.config.path,
-        facts=tuple("  ·  ".join(f"{name}: {summary[name]}" for name in line if name in summary) for line in _FACTS),
-        strips=tuple(strips),
-        control_rate_hz=dataset.control_rate_hz,
-        lengths_s=dataset.table.num_steps / dataset.control_rate_hz,
-        moved={one.stride: one.sizes[MOVED if has_poses else CHANGED] for one in inspection.steps},
-        reference=RELEASED_STEP_CM if has_poses else None,
-        places_m=places[:: -(-len(places) // _PLACES)] if has_poses else None,
-        shaded_means=_shaded_means(dataset.config),
-        ranges=None if has_poses else inspection.ranges,
-        directions=None if coverage is None else coverage.density,
-    )
+    return plot_contact_sheet(inspection, strips, path)
 
 
 def _shaded_means(config: DataConfig) -> str:
@@ -75,10 +80,9 @@ def _shaded_means(config: DataConfig) -> str:
 
 def _rows_of(inspection: Inspection, rows: int) -> list[ReadEpisode]:
     """Return episodes of the sample, some of each outcome."""
-    groups = [
-        [one for one in inspection.sample if inspection.dataset.table.success[one.index] == kind] for kind in (1, 0, -1)
-    ]
-    groups = [group for group in groups if group]
+    success = inspection.dataset.table.success
+    by_outcome = ([one for one in inspection.sample if success[one.index] == kind] for kind in (1, 0, -1))
+    groups = [group for group in by_outcome if group]
     whole = sum(map(len, groups))
     shares = [max(1, round(rows * len(group) / whole)) for group in groups]
     shares[shares.index(max(shares))] += rows - sum(shares)
@@ -86,7 +90,7 @@ def _rows_of(inspection: Inspection, rows: int) -> list[ReadEpisode]:
     return sorted(chosen, key=lambda one: inspection.sample.index(one))
 
 
-def _strip(inspection: Inspection, one: ReadEpisode, name: str) -> Strip:
+def _strip_of(inspection: Inspection, one: ReadEpisode, name: str) -> Strip:
     dataset = inspection.dataset
     episode = dataset.source.read(one.index)
     steps = len(one.states)
@@ -94,25 +98,18 @@ def _strip(inspection: Inspection, one: ReadEpisode, name: str) -> Strip:
     height, width = episode.read_frames([int(pictured[0])]).shape[1:3]
     count = min(pictures_per_row(height, width), len(pictured))
     at = pictured[((np.arange(count) + 0.5) * len(pictured) / count).astype(np.int64)].astype(np.int64)
+    changes = np.gradient(one.states, axis=0) if steps > 1 else np.zeros_like(one.states)
+    is_pose, space = inspection.has_poses, dataset.spaces.state
+    changed = space.shown_size(changes) if is_pose else largest_change(changes, inspection.ranges)
     return Strip(
         name=name,
         success=episode.info.success,
         frames=episode.read_frames([int(step) for step in at]),
-        steps=at,
-        speed=_change_per_step(one, inspection) * episode.control_rate_hz,
-        closedness=one.states[:, dataset.spaces.state.gripper] if inspection.has_poses else None,
+        speed=changed * episode.control_rate_hz,
+        closedness=one.states[:, space.gripper] if is_pose else None,
         shaded=_shaded(dataset, one),
         seen=crop_box(height, width, dataset.config.crop),
     )
-
-
-def _change_per_step(one: ReadEpisode, inspection: Inspection) -> Float[np.ndarray, " steps"]:
-    """Return the motion in each control step, in the sheet's unit."""
-    if len(one.states) == 1:
-        return np.zeros(1)
-    if not inspection.has_poses:
-        return largest_change(np.gradient(one.states, axis=0), inspection.ranges)
-    return inspection.dataset.spaces.state.shown_size(np.gradient(one.states, axis=0))
 
 
 def _shaded(dataset: Dataset, one: ReadEpisode) -> tuple[tuple[int, int], ...]:
@@ -124,3 +121,145 @@ def _shaded(dataset: Dataset, one: ReadEpisode) -> tuple[tuple[int, int], ...]:
     if dataset.config.states == "vector":
         return ()  # what standing still means is not known
     return tuple(runs_of(idle_runs(one.states, dataset.config)))
+
+
+# ---- drawing ----
+
+
+def pictures_per_row(height: int, width: int) -> int:
+    """Return the number of frames of a size in a row of the sheet."""
+    return int(min(max(_FILM // (_PICTURE * width / height + 0.06), _LEAST), _MOST))
+
+
+def plot_contact_sheet(inspection: Inspection, strips: Sequence[Strip], path: Path) -> Path:
+    """Write the contact sheet of a data set as PNG; it is written atomically.
+
+    Its unit of motion is cm of the flange. For vectors it is the change of the number that changes most, as a
+    percentage of its range; these have no positions in space.
+    """
+    summary, dataset = inspection.summary, inspection.dataset
+    known = ("  ·  ".join(f"{name}: {summary[name]}" for name in line if name in summary) for line in _FACTS)
+    facts = [line for fact in known for line in textwrap.wrap(fact, 150, subsequent_indent="    ")]
+    heights = [0.7 + 0.18 * len(facts), _PANELS, *(_ROW for _ in strips)]
+    with written_figure(path, _WIDTH, sum(heights), dpi=130, layout="none", facecolor="white") as figure:
+        words, panels, *rows = figure.subfigures(len(heights), 1, height_ratios=heights)
+        words.text(_EDGE, 1 - 0.16 / heights[0], dataset.config.path, size=13, weight="bold", va="top")
+        words.text(_EDGE, 1 - 0.5 / heights[0], "\n".join(facts), size=9, va="top", linespacing=1.4)
+        _panels(panels, inspection)
+        speeds = np.concatenate([strip.speed for strip in strips]) if strips else np.zeros(1)
+        fastest = max(float(np.percentile(speeds, 99.5)) * 1.15, 1.0)
+        for part, strip in zip(rows, strips, strict=True):
+            _strip(part, strip, dataset.control_rate_hz, fastest)
+    return path
+
+
+def _panels(part: Any, inspection: Inspection) -> None:
+    """Draw the small plots of the whole set: lengths, motion per model step, places and directions."""
+    dataset, has_poses = inspection.dataset, inspection.has_poses
+    lengths_s = dataset.table.num_steps / dataset.control_rate_hz
+    edges = {"left": 0.04, "right": 0.96, "bottom": 0.34, "top": 0.9}
+    grid = part.add_gridspec(1, 4, **edges, wspace=0.28, width_ratios=(2.0, 4.2, 3.4, 3.0))
+    lengths = part.add_subplot(grid[0])
+    lengths.hist(lengths_s, bins=min(40, max(5, len(lengths_s) // 2)), color=GREY)
+    lengths.set_title("Episodes by length (s)")
+    lengths.locator_params(axis="y", nbins=4, integer=True)
+    _motion(part.add_subplot(grid[1]), inspection)
+    if has_poses:
+        places = np.concatenate([one.states[:, dataset.spaces.state.sized] for one in inspection.sample])
+        places = places[:: -(-len(places) // _PLACES)]
+        axes = part.add_subplot(grid[2])
+        shown = axes.scatter(-places[:, 1], places[:, 0], c=places[:, 2], s=2, cmap="viridis", linewidths=0)
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.set(title="Flange, from above (m)")
+        axes.set(xlabel="-y: to the robot's right", ylabel="x: forward")
+        axes.locator_params(nbins=5)
+        part.colorbar(shown, ax=axes, fraction=0.04, pad=0.02)
+    if (coverage := inspection.coverage) is not None and coverage.density is not None:
+        _directions(part, part.add_subplot(grid[3]), coverage.density)
+    if not has_poses:
+        axes, ranges = part.add_subplot(grid[2:]), inspection.ranges
+        axes.bar(np.arange(len(ranges)), ranges[:, 1] - ranges[:, 0], bottom=ranges[:, 0], color=BLUE)
+        axes.set(title="Range of each number of the state", xlabel="number, from 0")
+        axes.locator_params(axis="x", integer=True)
+    shaded = _shaded_means(dataset.config)
+    speed = "speed (cm/s)" if has_poses else "fastest number (% of its range per second)"
+    meanings = {speed: BLUE} | ({"gripper: 0 open, 1 closed": ORANGE} if has_poses else {})
+    meanings |= {shaded: _IDLE} if shaded else {}
+    meanings["bright part of a picture: what the model sees"] = "none"
+    handles = [Patch(color=colour, label=label) for label, colour in meanings.items()]
+    part.legend(handles=handles, loc="lower right", ncols=4, fontsize=9, handlelength=1)
+
+
+def _directions(part: Any, axes: Any, directions: Float[np.ndarray, "rows columns"]) -> None:
+    """Draw the sphere of directions, each of the same area, as a map: x forward in the middle, z up."""
+    extent = (-180.0, 180.0, -1.0, 1.0)
+    shown = axes.imshow(directions, extent=extent, origin="lower", aspect="auto", cmap="Blues", vmin=0, vmax=2)
+    if directions.min() < ENOUGH_NEAR < directions.max():
+        axes.contour(directions, [ENOUGH_NEAR], extent=extent, origin="lower", colors=ORANGE, linewidths=1.2)
+    share = (directions >= ENOUGH_NEAR).mean()
+    axes.set_title(f"Directions: {share:.0%} taught")
+    axes.set_xticks([-180, -90, 0, 90, 180], ["-x", "-y", "+x", "+y", "-x"])
+    axes.set_yticks([-1, 0, 1], ["-z", "", "+z"])
+    part.colorbar(shown, ax=axes, fraction=0.04, pad=0.02, ticks=[0, ENOUGH_NEAR, 1, 2])
+
+
+def _motion(axes: Any, inspection: Inspection) -> None:
+    has_poses, rate_hz = inspection.has_poses, inspection.dataset.control_rate_hz
+    unit, reference = ("cm", RELEASED_STEP_CM) if has_poses else ("%", 1.0)
+    by_stride = {one.stride: one.sizes[MOVED if has_poses else CHANGED] for one in inspection.steps}
+    far = max([reference * 1.3, *(float(np.percentile(moved, 97)) for moved in by_stride.values() if len(moved))])
+    reached = np.linspace(0, far, 200)
+    for (stride, moved), colour in zip(by_stride.items(), _STRIDES, strict=False):
+        if not len(moved):
+            continue
+        share = np.searchsorted(np.sort(moved), reached, side="right") / len(moved) * 100
+        label = f"stride {stride} ({stride / rate_hz:.2f} s): median {np.median(moved):.1f} {unit}"
+        axes.plot(reached, share, color=colour, linewidth=1.5, label=label)
+    if has_poses:
+        axes.axvline(reference, color=ORANGE, linestyle="--", linewidth=1.2, label="upstream's example pair")
+    less = "move less far (cm)" if has_poses else "change less (% of a range)"
+    axes.set(title=f"Share of model steps (%) that {less}", xlim=(0, far), ylim=(0, 102))
+    axes.legend(frameon=True, framealpha=0.85, edgecolor="none", fontsize=7, loc="lower right")
+
+
+def _strip(part: Any, strip: Strip, control_rate_hz: float, fastest: float) -> None:
+    outcome, colour = _OUTCOME[strip.success]
+    steps = len(strip.speed)
+    grid = part.add_gridspec(
+        2, 2, left=_EDGE, right=1 - _EDGE, bottom=0.15, top=0.97, wspace=0, hspace=0.04,
+        width_ratios=(_LABEL, _FILM), height_ratios=(1.3, 0.5),
+    )  # fmt: skip
+    label = part.add_subplot(grid[:, 0])
+    label.set_axis_off()
+    label.add_patch(Rectangle((0, 0), 0.03, 1, color=colour))
+    label.text(0.08, 1.0, textwrap.fill(strip.name, 22, max_lines=5, placeholder="…"), va="top")
+    label.text(0.08, 0.47, outcome, color=colour, size=9, weight="bold", va="top")
+    label.text(0.08, 0.37, f"{steps} steps, {steps / control_rate_hz:.1f} s", color=GREY, va="top")
+    film = grid[0, 1].subgridspec(1, len(strip.frames), wspace=0.03)
+    for place, frame in enumerate(strip.frames):
+        axes = part.add_subplot(film[place])
+        axes.set_axis_off()
+        axes.imshow(_paler(frame, strip.seen), interpolation="nearest" if len(frame) < 100 else "antialiased")
+    _motion_of(part.add_subplot(grid[1, 1]), strip, control_rate_hz, fastest)
+
+
+def _paler(frame: UInt8[np.ndarray, "height width 3"], seen: CropBox) -> UInt8[np.ndarray, "height width 3"]:
+    """Return a frame that is pale where the model does not see it."""
+    shown = (frame * 0.3 + 255 * 0.35).astype(np.uint8)
+    part = np.s_[seen.top : seen.top + seen.height, seen.left : seen.left + seen.width]
+    shown[part] = frame[part]
+    return shown
+
+
+def _motion_of(axes: Any, strip: Strip, control_rate_hz: float, fastest: float) -> None:
+    seconds = (np.arange(len(strip.speed)) + 0.5) / control_rate_hz
+    for start, end in strip.shaded:
+        axes.axvspan(start / control_rate_hz, end / control_rate_hz, color=_IDLE, alpha=0.6, linewidth=0)
+    axes.fill_between(seconds, strip.speed, color=BLUE, alpha=0.25, linewidth=0)
+    axes.plot(seconds, strip.speed, color=BLUE, linewidth=1)
+    if strip.closedness is not None:
+        axes.plot(seconds, strip.closedness * fastest, color=ORANGE, linewidth=1.2)
+    axes.set(xlim=(0, len(strip.speed) / control_rate_hz), ylim=(0, fastest * 1.04))
+    axes.locator_params(axis="x", nbins=14)
+    axes.set_yticks([0, round(fastest / 1.15)])
+    axes.tick_params(labelsize=7, length=2, pad=1.5, colors=GREY)

@@ -5,6 +5,7 @@ The page has the answer and a film first, then every number and its figure, fold
 
 from __future__ import annotations
 
+import base64
 import json
 import math
 import re
@@ -12,14 +13,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
+from typing import NamedTuple
 
+import numpy as np
+from jaxtyping import UInt8
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from vjepa2_ac.episode import short_names
 from vjepa2_ac.evaluation.answer import Answer, Question, answer, interval_of, percent, with_closed_loop
-from vjepa2_ac.evaluation.calibration.axes import infer_axes
-from vjepa2_ac.evaluation.calibration.variants import calibrate_model
 from vjepa2_ac.evaluation.estimates import Curve, over_persistence
 from vjepa2_ac.evaluation.evaluate_run import measure_subject
 from vjepa2_ac.evaluation.request import EvaluationOptions
@@ -27,10 +29,10 @@ from vjepa2_ac.evaluation.result import L1, DecodedStrip, EpisodeScore, Evaluati
 from vjepa2_ac.evaluation.rows import rows_of
 from vjepa2_ac.media.figure import svg_of, visible
 from vjepa2_ac.media.film import draw_strip
+from vjepa2_ac.media.images import encode_webp
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.reports.figures.evaluation import decoded_strip, drawings, example_strip, plot_evaluation
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, write_metrics
-from vjepa2_ac.reports.page_film import film_of, webp_urls
 from vjepa2_ac.reports.paper import write_tables
 from vjepa2_ac.storage import write_atomically
 
@@ -40,7 +42,12 @@ _AT_EACH_END = 8  # episodes in a table
 _BYTES = 3_000_000  # of all clips together
 _MOST_TILES = 4
 _AT_AN_END = 10.0  # percent of the width of a bar, free on both sides
-
+LONGEST_S = 6.0  # of the film
+MOST_BYTES = 600_000  # likewise
+_STEP_S, _FIRST_S, _LAST_S = 0.5, 1.2, 1.8  # how long frames are shown
+_QUALITIES = (85, 70, 50, 30, 10)
+_THIN = 32  # a gap, or the bar of time, is so many times thinner than an image is wide
+_GREY, _PASSED = 170, (31, 111, 180)  # of gaps and bar, on white as well as on black
 _PARTS = {  # title, and how the keys of the rows begin; what it means stands in the template
     "errors": ("Error by horizon", r"(rollout|teacher_forced)\.\w+\.(over_pers|error)"),
     "base": ("Compared with the base", r"(rollout|teacher_forced)\.|one_step_gain"),
@@ -57,9 +64,10 @@ _PARTS = {  # title, and how the keys of the rows begin; what it means stands in
     "others": ("Further measurements", ""),
 }
 
+Frame = UInt8[np.ndarray, "height width 3"]
 
-@dataclass(frozen=True)
-class PageImage:
+
+class PageImage(NamedTuple):
     """An image of the page."""
 
     url: str
@@ -67,8 +75,7 @@ class PageImage:
     clip: Example | DecodedStrip | None = None  # that it shows
 
 
-@dataclass(frozen=True)
-class PagePart:
+class PagePart(NamedTuple):
     """A part of the page."""
 
     id: str
@@ -78,17 +85,11 @@ class PagePart:
     notes: Sequence[str]
 
 
-def write_report(evaluation: Evaluation, path: Path, found: Answer) -> Path:
-    """Write the page; it is written atomically. The same evaluation and answer give the same bytes."""
-    write_atomically(path, report_page(evaluation, found))
-    return path
-
-
 def report_page(evaluation: Evaluation, found: Answer) -> str:
     """Return an evaluation and its answer as one HTML page that needs no network, no script and no other file.
 
-    It is smaller than 5 MB for any evaluation of usual length: clips, points of curves and episodes are limited, and
-    images of clips have the best quality that fits.
+    The same evaluation and answer give the same bytes. It is smaller than 5 MB for any evaluation of usual length:
+    clips, points of curves and episodes are limited, and images of clips have the best quality that fits.
     """
     rows = rows_of(evaluation)
     environment = Environment(
@@ -131,8 +132,7 @@ def _parts(evaluation: Evaluation, rows: Sequence[Row]) -> list[PagePart]:
         of_part[next(name for name, (_, keys) in _PARTS.items() if re.match(keys, row.key))].append(row)
     images: dict[str, list[PageImage]] = {name: [] for name in _PARTS} | _clips(evaluation)
     for one in drawings(evaluation):
-        url = svg_of(one.draw, one.width, one.height, evaluation)
-        images[one.part].append(PageImage(url, one.described))
+        images[one.part].append(PageImage(svg_of(one.draw, one.width, one.height, evaluation), one.described))
     notes = {
         "decoded": () if evaluation.decoded is None else evaluation.decoded.notes,
         "strides": tuple(str(one.as_dict().get("verdict", "")) for one in evaluation.beside.values()),
@@ -195,6 +195,65 @@ def _clips(evaluation: Evaluation) -> dict[str, list[PageImage]]:
     return images
 
 
+class PageFilm(NamedTuple):
+    """One clip as a film. URLs are data: URLs."""
+
+    url: str  # animated
+    still: str  # its last frame
+    captions: tuple[str, ...]  # of the columns
+    clip: DecodedStrip
+
+
+def film_of(evaluation: Evaluation) -> PageFilm | None:
+    """Return the film of the decoded clip whose last images differ most between base and model; None: none is decoded.
+
+    Without a base it is the clip in which most happens. The first frame is given to all.
+    """
+    strips = () if evaluation.decoded is None else evaluation.decoded.strips
+    if not strips:
+        return None
+    models = [name for name in (evaluation.base, evaluation.trained) if name is not None]
+    strip = max(strips, key=lambda one: _difference(one, models))
+    true = "truth" if "truth" in strip.rows else "decoded_truth"
+    columns = [strip.rows[name] for name in (true, *models)]
+    times = range(len(columns[0]))
+    frames = [_frame([column[time] for column in columns], time / times[-1]) for time in times]
+    step = min(_STEP_S, (LONGEST_S - _FIRST_S - _LAST_S) / max(len(times) - 2, 1))
+    shown = [_FIRST_S, *[step] * (len(times) - 2), _LAST_S]
+    (url,), (still,) = webp_urls([frames], shown, at_most=MOST_BYTES), webp_urls([frames[-1:]], at_most=MOST_BYTES)
+    return PageFilm(url, still, ("what happened", *(f"the {name} imagines" for name in models)), strip)
+
+
+def _difference(strip: DecodedStrip, models: Sequence[str]) -> float:
+    other = strip.rows[models[-1]][-1 if len(models) > 1 else 0]
+    return float(np.abs(strip.rows[models[0]][-1].astype(np.float64) - other).mean())
+
+
+def _frame(images: Sequence[Frame], passed: float) -> Frame:
+    """Return images side by side, and below them a bar for the share of the time that has passed."""
+    thin = max(1, images[0].shape[1] // _THIN)
+    with_gaps = [np.pad(one, ((0, thin), (0, thin), (0, 0)), constant_values=_GREY) for one in images]
+    frame = np.concatenate(with_gaps, axis=1)[:, :-thin]
+    frame[-thin:, : round(passed * frame.shape[1])] = _PASSED
+    return frame
+
+
+def webp_urls(films: Sequence[Sequence[Frame]], seconds: Sequence[float] = (1.0,), *, at_most: int) -> list[str]:
+    """Return films, or images of one frame each, as WebP in data: URLs, in the best quality in which all fit.
+
+    Args:
+        films: The frames of each.
+        seconds: How long each frame is shown.
+        at_most: Bytes of all together; if even the lowest quality takes more, it is that one.
+    """
+    encoded: list[bytes] = []
+    for quality in _QUALITIES:
+        encoded = [base64.b64encode(encode_webp(one, seconds, quality=quality)) for one in films]
+        if sum(map(len, encoded)) <= at_most:
+            break
+    return [f"data:image/webp;base64,{one.decode()}" for one in encoded]
+
+
 @dataclass(frozen=True)
 class Evaluated:
     """The result of an evaluation, and its files."""
@@ -221,7 +280,7 @@ def evaluate_subject(subject: str, asked: EvaluationOptions | None = None, repor
         InputError: As `measure_subject`.
     """
     asked = asked or EvaluationOptions()
-    evaluation = measure_subject(subject, asked, reporter=reporter, find_axes=infer_axes, calibrate=calibrate_model)
+    evaluation = measure_subject(subject, asked, reporter=reporter)
     about, found = evaluation.about, answer(evaluation, rows_of(evaluation))
     if about.checkpoint:
         found = with_closed_loop(found, Path(about.subject), about.checkpoint)
@@ -230,6 +289,7 @@ def evaluate_subject(subject: str, asked: EvaluationOptions | None = None, repor
         plot_evaluation(evaluation, folder / PLOT),
         write_metrics(evaluation, folder / METRICS_FILE),
         *write_tables(rows_of(evaluation), folder / METRICS_FILE),
-        write_report(evaluation, folder / REPORT, found),
+        folder / REPORT,
     )
+    write_atomically(folder / REPORT, report_page(evaluation, found))
     return Evaluated(evaluation, found, files)

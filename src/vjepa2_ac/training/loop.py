@@ -17,14 +17,7 @@ from typing import TYPE_CHECKING
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict
-from vjepa2_ac.distributed import (
-    agreed,
-    all_reduce_max,
-    broadcast_object,
-    first_only,
-    make_accelerator,
-    require_same,
-)
+from vjepa2_ac.distributed import agreed, all_reduce_max, broadcast_object, first_only, make_accelerator, require_same
 from vjepa2_ac.process import StoppedError, stop_on_signals
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.runs.folder import CALIBRATION, CHANGES, config_changes
@@ -37,13 +30,7 @@ from vjepa2_ac.training.optim import require_optimizer
 from vjepa2_ac.training.resume import restore, save_checkpoint
 from vjepa2_ac.training.setup import Run, batches_from, set_up
 from vjepa2_ac.training.step import gradients, training_step
-from vjepa2_ac.training.validation import (
-    is_done,
-    record,
-    validate_base,
-    validate_if_due,
-    validation_metrics,
-)
+from vjepa2_ac.training.validation import is_done, record, validate_base, validate_if_due, validation_metrics
 
 if TYPE_CHECKING:
     from vjepa2_ac.evaluation.result import Validation

@@ -1,5 +1,6 @@
 """Statistics of a data set: equal to those computed by hand."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,6 @@ from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.inspection.statistics import MOVED, TURNED, idle_runs, inspect_dataset
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.reports import sheet as figure
-from vjepa2_ac.reports.figures.contact_sheet import ContactSheet
 from vjepa2_ac.reports.sheet import plot_dataset
 
 
@@ -94,11 +94,11 @@ def test_an_episode_of_the_sample_that_cannot_be_read_is_counted_and_named(caplo
 
 
 def test_a_broken_frame_is_left_out_of_the_contact_sheet(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    sheets: list[ContactSheet] = []
-    monkeypatch.setattr(figure, "plot_contact_sheet", lambda sheet, path: sheets.append(sheet) or path)
+    rows: list[Sequence[object]] = []
+    monkeypatch.setattr(figure, "plot_contact_sheet", lambda _, strips, path: rows.append(strips) or path)
     dataset = hundred(frozenset(), "skip", frozenset({7}))
     plot_dataset(inspect_dataset(dataset), tmp_path / "sheet.png", rows=100)
-    assert len(sheets[0].strips) == 99
+    assert len(rows[0]) == 99
     assert list(dataset.broken.reasons) == ["episode 7"]
     dataset = hundred(frozenset(), "error", frozenset({7}))
     with pytest.raises(InputError, match=r"pictures of episode 7: damaged\..*add to data\.exclude"):

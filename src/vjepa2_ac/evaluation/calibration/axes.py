@@ -94,20 +94,16 @@ class AxisFit:
 
     def words(self) -> str:
         """Return as text where the axes lie, and whether they can be planned by."""
-        yaw = self.yaw_degrees
+        yaw, (x, y) = self.yaw_degrees, self.centre_m
+        place = f"the middle of its motion, x {x:.2f} y {y:.2f} m" if any(self.centre_m) else "its base"
         between = f" (95 % interval {yaw.low:.0f} to {yaw.high:.0f})" if yaw.has_interval else ""
         text = (
-            f"Turned by {yaw.value:+.1f} degrees about {self._place}{between}, what the robot does is predicted best:"
+            f"Turned by {yaw.value:+.1f} degrees about {place}{between}, what the robot does is predicted best:"
             f" squared error {self.error} of that without a turn. The fit of inferred moves has yaw"
             f" {self.fitted_yaw_degrees.value:+.1f}, gain {self.gain}, condition {self.condition}"
             f" ({self.pairs} pairs of {self.episodes} episodes, off by {self.residual_cm.value:.1f} cm on average)."
         )
         return text if self.problem is None else f"{text} Not to plan by: {self.problem}."
-
-    @property
-    def _place(self) -> str:
-        x, y = self.centre_m
-        return f"the middle of its motion, x {x:.2f} y {y:.2f} m" if any(self.centre_m) else "its base"
 
     def rows(self, model: str) -> list[Row]:
         """Return the numbers as rows of an evaluation."""
@@ -293,7 +289,7 @@ def _inferred(model: Predictor, start: RolloutStart, planner: Planner, at_once: 
     def cost(actions: Float[Tensor, "samples 1 7"]) -> Float[Tensor, " samples"]:
         tried = np.tile(start.true, (len(actions), 1))
         tried[:, _MOVE] = actions[:, 0, _MOVE].double().numpy()
-        return torch.from_numpy(evaluate_actions(model, start, tried, at_once=at_once).energy)
+        return torch.from_numpy(evaluate_actions(model, start, tried, at_once=at_once)[0])
 
     drawn = int(start.generator(0).integers(2**62))
     return _numbers(planner.plan(cost, torch.Generator().manual_seed(drawn)).actions[0, _MOVE])

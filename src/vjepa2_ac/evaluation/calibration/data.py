@@ -31,6 +31,7 @@ from vjepa2_ac.evaluation.calibration.variants import (
     VariantResult,
     load_named,
     measure_variants,
+    result_of,
 )
 from vjepa2_ac.evaluation.measure import ClipSample, Predictor
 from vjepa2_ac.intervals import ENOUGH_EPISODES
@@ -123,10 +124,10 @@ def probe_variants(
     plain, *measured = measure_variants(model, encode, clips, variants, progress)
     space = dataset.spaces.action
     results = [
-        found.result(one.name, space, beside=plain, repair=one.repair)
+        result_of(found, one.name, space, beside=plain, repair=one.repair)
         for one, found in zip(variants[1:], measured, strict=True)
     ]
-    return VariantProbe(plain.result(AS_THEY_ARE, space), tuple(results))
+    return VariantProbe(result_of(plain, AS_THEY_ARE, space), tuple(results))
 
 
 def _with_room(

@@ -85,36 +85,32 @@ class VariantResult:
         return self.difference.value + _MARGIN * (self.difference.high - self.difference.value) < 0
 
 
-@dataclass(frozen=True)
-class VariantErrors:
-    """What was measured of one variant, clip by clip."""
+# By clip (episode, first control step): one-step, teacher-forced L1 of the model and of persistence; the actions.
+VariantErrors = dict[tuple[str, int], tuple[Float[np.ndarray, " 2"], Float[np.ndarray, "steps action_dim"]]]
 
-    errors: Float[np.ndarray, "2 clips"]  # one-step, teacher-forced L1 of the model and of persistence
-    actions: Float[np.ndarray, "clips steps action_dim"]
-    clips: tuple[tuple[str, int], ...]  # episode and first control step
 
-    def result(
-        self, name: str, space: ActionSpace, *, beside: VariantErrors | None = None, repair: str = ""
-    ) -> VariantResult:
-        """Return what it comes to, compared with another variant."""
-        ids, moved_cm = [episode for episode, _ in self.clips], None
-        if space.position is not None:
-            moved_cm = float(np.median(space.shown_size(self.actions.reshape(-1, self.actions.shape[-1]))))
-        difference = None if beside is None else self._minus(beside)
-        of_model, of_nothing = self.errors
-        return VariantResult(
-            name, ratio(of_model, of_nothing, ids), float(of_model.mean()), float(of_nothing.mean()), moved_cm,
-            len(ids), len(set(ids)), difference, repair,
-        )  # fmt: skip
+def result_of(
+    found: VariantErrors, name: str, space: ActionSpace, *, beside: VariantErrors | None = None, repair: str = ""
+) -> VariantResult:
+    """Return what the errors of a variant come to, compared with another one."""
+    ids, moved_cm, difference = [episode for episode, _ in found], None, None
+    of_model, of_nothing = _of_clips(found, found)
+    if space.position is not None:
+        moved_cm = float(np.median(space.shown_size(np.concatenate([actions for _, actions in found.values()]))))
+    if beside is not None:
+        both = [clip for clip in found if clip in beside]
+        names = [episode for episode, _ in both]
+        difference = ratio_difference(_of_clips(found, both), _of_clips(beside, both), names)
+    return VariantResult(
+        name, ratio(of_model, of_nothing, ids), float(of_model.mean()), float(of_nothing.mean()), moved_cm,
+        len(ids), len(set(ids)), difference, repair,
+    )  # fmt: skip
 
-    def _minus(self, other: VariantErrors) -> Estimate:
-        """Return the ratio minus another variant's, paired by clip."""
-        places = {clip: place for place, clip in enumerate(other.clips)}
-        pairs = [(place, places[clip]) for place, clip in enumerate(self.clips) if clip in places]
-        mine, theirs = (np.array(side, dtype=np.int64) for side in zip(*pairs, strict=True))
-        ids = [self.clips[place][0] for place in mine]
-        one, persistence = self.errors[:, mine]
-        return ratio_difference((one, persistence), (other.errors[0, theirs], other.errors[1, theirs]), ids)
+
+def _of_clips(found: VariantErrors, clips: Iterable[tuple[str, int]]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the errors of the model, and of persistence."""
+    of_model, of_nothing = np.array([found[clip][0] for clip in clips]).T.copy()
+    return of_model, of_nothing
 
 
 @dataclass(frozen=True)
@@ -141,26 +137,19 @@ def measure_variants(
     Raises:
         InputError: A clip cannot be read; or, by `data.broken_episodes`, none of them.
     """
-    first, dataset, windows = variants[0], clips.dataset, clips.windows
-    parts: list[list[VariantErrors]] = [[] for _ in variants]
-    done = 0
+    first, done, dataset, windows = variants[0], 0, clips.dataset, clips.windows
+    parts: list[VariantErrors] = [{} for _ in variants]
     for batch in batches_of(first.view(dataset), windows, batch_size=clips.batch_size):
         latents, read = encode(batch), replace(dataset, source=ReadOnce(dataset.source))
         places = [dataset.table.find(name) for name in batch.episode_ids]
         here = [(place, start) for place, start in zip(places, batch.starts, strict=True) if place is not None]
         for variant, found in zip(variants, parts, strict=True):
             seen = [latents] if variant is first else _read(variant, read, here, encode, latents)
-            found += [_measured(model, each) for each in seen]
+            for each in seen:
+                found |= _measured(model, each)
             done += len(batch.starts)
             progress(done, len(windows) * len(variants))
-    return [
-        VariantErrors(
-            np.concatenate([one.errors for one in found], axis=1),
-            np.concatenate([one.actions for one in found]),
-            tuple(clip for one in found for clip in one.clips),
-        )
-        for found in parts
-    ]
+    return parts
 
 
 def _read(
@@ -177,9 +166,9 @@ def _read(
 
 def _measured(model: Predictor, latents: LatentBatch) -> VariantErrors:
     found = measured(model, latents, ONE_STEP, (L1,))
-    errors = np.stack([found.of("teacher_forced", L1, way).mean(axis=1) for way, _ in ONE_STEP])
-    clips = tuple(zip(latents.episode_ids, latents.starts, strict=True))
-    return VariantErrors(errors, latents.actions.cpu().numpy().astype(np.float64), clips)
+    errors = np.stack([found.of("teacher_forced", L1, way).mean(axis=1) for way, _ in ONE_STEP], axis=1)
+    clips = zip(latents.episode_ids, latents.starts, strict=True)
+    return dict(zip(clips, zip(errors, latents.actions.cpu().numpy().astype(np.float64), strict=True), strict=True))
 
 
 @dataclass(frozen=True)
@@ -357,7 +346,6 @@ def calibrate_model(
         found = f"latents that were encoded for clips at stride {dataset.config.stride}"
         needed, fix = "frames at every candidate stride", "Calibrate on the data set itself, with data.cache: off"
         raise InputError(where=f"data.path: {dataset.config.path}", found=found, needed=needed, fix=fix)
-    world_model.eval()
     sample = replace(sample, batch_size=config.validation.batch_size)
     encode = partial(encode_batch, world_model, device=accelerator.device, chunk=config.model.encode_chunk)
     with accelerator.autocast(), torch.no_grad():
@@ -393,10 +381,11 @@ def calibrate(
     clips = SameClips(dataset, windows, sample.batch_size)
     found = measure_variants(model, encode, clips, variants, progress)
     errors, space = dict(zip(widest_first, found, strict=True)), dataset.spaces.action
-    results = {stride: errors[stride].result(f"stride {stride} ({stride / rate:.2f} s)", space) for stride in possible}
+    names = {stride: f"stride {stride} ({stride / rate:.2f} s)" for stride in possible}
+    results = {stride: result_of(errors[stride], name, space) for stride, name in names.items()}
     if len(results) > 1:
         best, second, *_ = _by_ratio(results)
-        results[best] = errors[best].result(results[best].name, space, beside=errors[second])
+        results[best] = result_of(errors[best], names[best], space, beside=errors[second])
     return Calibration(results, impossible, frames, split, rate)
 
 

@@ -19,13 +19,7 @@ from vjepa2_ac.config.model import EncoderKey
 from vjepa2_ac.episode import POSE_WIDTHS
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.base_model import check_sizes, find_base, read_sizes
-from vjepa2_ac.model.checkpoints.encoders import (
-    FoundEncoder,
-    encoder_in_file,
-    expected_sizes,
-    find_encoder,
-    sizes_with,
-)
+from vjepa2_ac.model.checkpoints.encoders import FoundEncoder, encoder_in_file, expected_sizes, find_encoder, sizes_with
 from vjepa2_ac.model.checkpoints.meta_file import (
     ENCODER_KEYS,
     FIX,

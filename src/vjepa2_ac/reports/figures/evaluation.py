@@ -17,7 +17,18 @@ from matplotlib import colormaps
 
 from vjepa2_ac.evaluation.action_score import AXES, ways_of
 from vjepa2_ac.evaluation.estimates import Curve, gain_over, one_step_over_persistence, over_persistence
-from vjepa2_ac.evaluation.result import ACTIONS, DecodedStrip, Evaluation, Example, Landscapes, Mode, TrainingCurve
+from vjepa2_ac.evaluation.result import (
+    ACTIONS,
+    DecodedRollouts,
+    DecodedStrip,
+    Evaluation,
+    Example,
+    Landscapes,
+    Mode,
+    PlanningStudy,
+    PredictionErrors,
+    TrainingCurve,
+)
 from vjepa2_ac.media.figure import BLUE, GREEN, GREY, ORANGE, RED, headline, visible, written_figure
 from vjepa2_ac.media.film import FilmStrip, Kind, StripRow, draw_rows
 from vjepa2_ac.reports.comparison import Comparison
@@ -78,8 +89,8 @@ def drawings(evaluation: Evaluation) -> Iterator[Drawing]:
     forced = partial(draw_errors, mode="teacher_forced")
     yield Drawing("errors", "Open-loop L1 error over persistence by horizon", 6.4, 3.6, draw_errors)
     yield Drawing("errors", "Teacher-forced L1 error over persistence by horizon", 6.4, 3.6, forced)
-    if evaluation.base is not None:
-        yield Drawing("base", "Gain over the base by horizon", 6.4, 3.4, draw_gains)
+    if (base := evaluation.base_errors) is not None:
+        yield Drawing("base", "Gain over the base by horizon", 6.4, 3.4, partial(draw_gains, base=base))
     if any(model.distribution and math.isfinite(model.distribution.spread[-1].value) for model in models):
         yield Drawing("spread", "Spread by horizon", 6.4, 3.4, draw_spread)
     yield Drawing("actions", "One-step error with other actions", 6.4, 3.0, draw_use_of_actions)
@@ -89,12 +100,12 @@ def drawings(evaluation: Evaluation) -> Iterator[Drawing]:
         rows = len(clips) * (2 if evaluation.base and evaluation.models[evaluation.base].landscapes else 1)
         described = "Energy around the true action: cross; lowest energy: ring"
         yield Drawing("landscapes", described, 9.0, 2.6 * rows, draw_landscapes)
-    if evaluation.planning is not None:
-        yield Drawing("planning", "Ends of plans", 11.0, 3.6, draw_plans)
+    if (study := evaluation.planning) is not None:
+        yield Drawing("planning", "Ends of plans", 11.0, 3.6, partial(draw_plans, study=study))
     if evaluation.episodes:
         yield Drawing("episodes", "Error of every episode", 6.4, 3.0, draw_episodes)
-    if evaluation.decoded is not None:
-        yield Drawing("decoded", "PSNR by horizon", 6.4, 3.6, draw_decoded)
+    if (decoded := evaluation.decoded) is not None:
+        yield Drawing("decoded", "PSNR by horizon", 6.4, 3.6, partial(draw_decoded, found=decoded))
     if charts := len(training_charts(evaluation.training)):
         yield Drawing("training", "Metrics over optimizer steps", 11.0, 2.8 * -(-charts // 3), draw_training)
 
@@ -108,14 +119,13 @@ def draw_errors(figure: Any, evaluation: Evaluation, mode: Mode = "rollout") -> 
     axes.set_ylim(0, None)
 
 
-def draw_gains(figure: Any, evaluation: Evaluation) -> None:
+def draw_gains(figure: Any, evaluation: Evaluation, base: PredictionErrors) -> None:
     """Draw the gain of the models over the base by horizon."""
-    base, models = evaluation.base_errors, evaluation.models
-    if base is not None:
-        gains = {name: gain_over(model.errors, base) for name, model in models.items() if model.errors is not base}
-        axes = _by_horizon(figure, evaluation, gains, level=(0.0, "the base"))
-        axes.set(title="Gain over the base, open loop, L1 (above 0: better)", ylabel="gain over the base")
-        axes.yaxis.set_major_formatter("{x:.0%}")
+    errors = {name: model.errors for name, model in evaluation.models.items()}
+    gains = {name: gain_over(one, base) for name, one in errors.items() if one is not base}
+    axes = _by_horizon(figure, evaluation, gains, level=(0.0, "the base"))
+    axes.set(title="Gain over the base, open loop, L1 (above 0: better)", ylabel="gain over the base")
+    axes.yaxis.set_major_formatter("{x:.0%}")
 
 
 def draw_spread(figure: Any, evaluation: Evaluation) -> None:
@@ -126,18 +136,16 @@ def draw_spread(figure: Any, evaluation: Evaluation) -> None:
     axes.set_ylim(0, None)
 
 
-def draw_decoded(figure: Any, evaluation: Evaluation) -> None:
+def draw_decoded(figure: Any, evaluation: Evaluation, found: DecodedRollouts) -> None:
     """Draw the PSNR of decoded rollouts by horizon, where something moves if the true frames say so."""
-    found = evaluation.decoded
-    if found is not None:
-        finite = {name for (_, name), curve in found.curves.items() if any(math.isfinite(one.value) for one in curve)}
-        names = ("psnr_db.moving.truth", "psnr_db.whole.truth", "psnr_db.whole.decoded_truth")
-        metric = next(name for name in names if name in finite)
-        curves = {source.replace("_", " "): found.curves[source, metric] for source in found.sources}
-        axes = _by_horizon(figure, evaluation, curves, level=None)
-        _, region, reference = metric.split(".")
-        where = "where something moves" if region == "moving" else "of the whole image"
-        axes.set(title=f"PSNR {where}, against the {reference.replace('_', ' ')}", ylabel="dB")
+    finite = {name for (_, name), curve in found.curves.items() if any(math.isfinite(one.value) for one in curve)}
+    names = ("psnr_db.moving.truth", "psnr_db.whole.truth", "psnr_db.whole.decoded_truth")
+    metric = next(name for name in names if name in finite)
+    curves = {source.replace("_", " "): found.curves[source, metric] for source in found.sources}
+    axes = _by_horizon(figure, evaluation, curves, level=None)
+    _, region, reference = metric.split(".")
+    where = "where something moves" if region == "moving" else "of the whole image"
+    axes.set(title=f"PSNR {where}, against the {reference.replace('_', ' ')}", ylabel="dB")
 
 
 def draw_use_of_actions(figure: Any, evaluation: Evaluation) -> None:
@@ -180,11 +188,8 @@ def draw_episodes(figure: Any, evaluation: Evaluation) -> None:
     axes.set_ylabel("L1 error / persistence")
 
 
-def draw_plans(figure: Any, evaluation: Evaluation) -> None:
+def draw_plans(figure: Any, evaluation: Evaluation, study: PlanningStudy) -> None:
     """Draw where plans of three steps end, along each axis, against where the demonstrations do."""
-    study = evaluation.planning
-    if study is None:
-        return
     colours = _colours(evaluation.models)
     for axis, axes in enumerate(figure.subplots(1, len(AXES))):
         demonstrated = 100 * study.demonstrated[..., axis].sum(axis=-1)

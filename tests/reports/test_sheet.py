@@ -1,0 +1,66 @@
+"""The contact sheet is written completely for any kind of episodes, and shows the right frames."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.data.inspection.statistics import inspect_dataset
+from vjepa2_ac.data.transforms import crop_box
+from vjepa2_ac.reports.sheet import Strip, pictures_per_row, plot_contact_sheet
+
+pytestmark = pytest.mark.usefixtures("drawn")
+
+Plotted = Callable[..., np.ndarray]
+
+
+@pytest.fixture
+def plotted(droid: Path, tmp_path: Path) -> Plotted:
+    """Return the pixels of a sheet of an inspected set with these rows."""
+    inspection = inspect_dataset(open_dataset(DataConfig(path=str(droid), frames=4, stride=2)))
+
+    def plot(*strips: Strip) -> np.ndarray:
+        path = plot_contact_sheet(inspection, strips, tmp_path / "sheet.png")
+        assert [path] == list(tmp_path.iterdir())
+        return (imread(path)[..., :3] * 255).round().astype(np.int16)
+
+    return plot
+
+
+def strip(colour: tuple[int, int, int] = (200, 30, 40), *, steps: int = 30, size: tuple[int, int] = (18, 32)) -> Strip:
+    count = min(pictures_per_row(*size), steps)
+    return Strip(
+        name="a/rather/long/name/of/an/episode" * 4,
+        success=True,
+        frames=np.full((count, *size, 3), colour, np.uint8),
+        speed=np.linspace(0, 20, steps),
+        closedness=np.linspace(0, 1, steps),
+        shaded=((0, 2),),
+        seen=crop_box(*size),
+    )
+
+
+@pytest.mark.parametrize(("rows", "steps", "size"), [(1, 1, (18, 32)), (12, 9, (64, 64)), (2, 40, (48, 20))])
+def test_any_number_of_rows_and_any_shape_of_image_fit(
+    plotted: Plotted, rows: int, steps: int, size: tuple[int, int]
+) -> None:
+    assert plotted(*(strip(steps=steps, size=size) for _ in range(rows))).shape[1] == 1430
+
+
+def test_the_crop_is_shown_unchanged_and_the_rest_is_pale(plotted: Plotted) -> None:
+    seen = plotted(strip())
+    as_it_is = (abs(seen - (200, 30, 40)).max(axis=-1) <= 2).sum()
+    pale = (abs(seen - (149, 98, 101)).max(axis=-1) <= 2).sum()
+    assert as_it_is > 10_000
+    assert pale / (pale + as_it_is) == pytest.approx(8 / 32, abs=0.03), "24 of 32 columns are seen"
+
+
+def test_episodes_stand_below_one_another_in_their_order(plotted: Plotted) -> None:
+    colours = [(200, 30, 40), (30, 200, 40), (40, 30, 200)]
+    three = plotted(*map(strip, colours))
+    centres = [np.argwhere(abs(three - colour).max(axis=-1) <= 2)[:, 0].mean() for colour in colours]
+    assert centres == sorted(centres)
