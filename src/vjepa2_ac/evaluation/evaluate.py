@@ -199,8 +199,7 @@ def _measure(
         actions, ids = seen.actions.reshape(count * steps, width), [one for one in seen.ids for _ in range(steps)]
         pool = ActionPool(actions, ids, space, probes, about.seed)
         sensitivity = measure_sensitivity(model, starts, pool, progress("other actions"))
-        task = progress("action ranking")
-        ranking = rank_actions(model, seen.moves, space, probes, seed=about.seed, progress=task)
+        ranking = rank_actions(model, seen.moves, space, probes, seed=about.seed, progress=progress("action ranking"))
         found = replace(found, sensitivity=sensitivity, ranking=ranking)
     moving = [start for start in starts if clips.moving[start.clip].any()] or starts
     if moving and probes.landscape_clips and seen.actions.shape[-1] >= 3:

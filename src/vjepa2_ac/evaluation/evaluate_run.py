@@ -184,13 +184,13 @@ def measure_subject(subject: str, asked: EvaluationOptions, *, reporter: Reporte
             decoder.to(accelerator.device)
             lpips = None if lpips is None else lpips.to(accelerator.device)
             decoded = measure_decoded(contenders, clips, decoder, evaluation.examples, lpips=lpips, reporter=reporter)
-    warned = warnings_of(Path(subject) / METRICS) if run else ()
+    warned = [f"In training, {text}." for text in warnings_of(Path(subject) / METRICS)] if run else []
     return replace(
         evaluation,
         decoded=decoded,
         training=_training_curves(Path(subject)) if run else (),
         beside=beside,
-        notes=(*loaded.notes, *(f"In training, {text}." for text in warned), *evaluation.notes),
+        notes=(*loaded.notes, *warned, *evaluation.notes),
     )
 
 

@@ -63,8 +63,9 @@ def export_run(folder: Path, destination: Path, form: Form = "merged", checkpoin
     _check_free(destination, form)
     kind = read_run_config(folder).adapter.kind
     if form == "hub" and kind != "lora":
-        found, fix = f"a run without an adapter (adapter.kind: {kind})", "Export the whole model with --to merged"
-        raise InputError(where=str(folder), found=found, needed="adapter.kind: lora, for --to hub", fix=fix)
+        found, needed = f"a run without an adapter (adapter.kind: {kind})", "adapter.kind: lora, for --to hub"
+        fix = "Export the whole model with --to merged or --to official"
+        raise InputError(where=str(folder), found=found, needed=needed, fix=fix)
     metrics = read_metrics(folder) if form == "hub" and (folder / METRICS_FILE).exists() else None
     run = load_run(folder, checkpoint)
     card = _card(run, folder, metrics) if form == "hub" else ""
