@@ -127,6 +127,8 @@ def _next(measured: Evaluated, data: str | None) -> str:
         return f"vjepa2-ac data check {about.subject}/config.yaml"
     if "no" in {answer.predicts.word, answer.uses_actions.word}:
         return f"vjepa2-ac data check {about.subject}/config.yaml --model {about.subject}"
+    if answer.plans.says.startswith("solves"):  # the closed loop has been measured
+        return f"vjepa2-ac serve {about.subject}"
     try:
         recorded = read_simulation(Path(about.data).resolve(strict=True))
     except (OSError, UserError):
