@@ -112,7 +112,7 @@ def test_states_of_any_width_need_no_new_head(
         with_states(base, width).save_pretrained(tmp_path / f"of {width}")
     asked = replace(QUICK, against=("base", str(tmp_path / "of 11")))
     assert list(evaluate_subject(str(folder), asked).evaluation.models) == ["base", "of 11", "adapter"]
-    with pytest.raises(InputError, match=r"states of 11 and actions of 7 numbers\. needed: states of 7 and actions of 7"):
+    with pytest.raises(InputError, match=r"states of 11 and actions of 7 numbers\. needed: states of 7"):
         evaluate_subject(str(folder), replace(QUICK, against=(str(tmp_path / "of 7"),)))
     planning = SEARCH.model_copy(update={"limits": LimitsConfig(axes=(0.1,))})
     assert drive(Controller.of_run(load_run(folder), planning), np.zeros(11)).shape == (2, 7)
