@@ -18,7 +18,7 @@ def draw(results: Sequence[Figures], path: Path) -> None:
 
     figure = Figure(figsize=(9.2, 8.0), layout="constrained")
     FigureCanvasAgg(figure)
-    places = figure.subplot_mosaic([["bars", "bars"], ["ways", "counts"]])
+    places: dict[str, Any] = figure.subplot_mosaic([["bars", "bars"], ["ways", "counts"]])
     _bars(places["bars"], results)
     _ways(places["ways"], results)
     _counts(places["counts"], results)
