@@ -249,7 +249,7 @@ def _answer(benchmark: ClosedLoopBenchmark) -> Answer:
     from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics
 
     agent, options = benchmark.agent, benchmark.options
-    how = f"vjepa2-ac evaluate {agent.subject}"
+    how = "" if cli.is_server(agent.subject) else f"vjepa2-ac evaluate {agent.subject}"
     unknown = not_measured("predicts", how), not_measured("uses actions", how)
     measured = (
         f"{options.task}, domain {options.world.name}, {options.model_steps} steps of {options.seconds_per_step:.2f} s"
@@ -266,6 +266,8 @@ def _next(answer: Answer, options: argparse.Namespace) -> str:
     """Return the command that follows from the answer of a closed loop."""
     if answer.plans.why:
         return f"vjepa2-ac simulate {options.subject} --task {options.task or 'reach'} --episodes 50"
+    if cli.is_server(options.subject):
+        return f"your robot's client at {options.subject} (docs/serving.md)"
     if answer.predicts.share is None:
         return f"vjepa2-ac evaluate {options.subject}"
     if answer.plans.word == "yes":
