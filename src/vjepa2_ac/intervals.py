@@ -39,6 +39,10 @@ class Estimate:
         """Return -1 or 1 if the whole interval is below or above a number, else 0: uncertain."""
         return -1 if self.high < of else 1 if self.low > of else 0
 
+    def below(self, level: float) -> Estimate:
+        """Return how far the number is below a level, with its interval."""
+        return Estimate(level - self.value, level - self.high, level - self.low)
+
     def as_dict(self) -> dict[str, float | None]:
         """Return plain values, for JSON; None where there is no value or no interval."""
         metrics = {"value": self.value, "low": self.low, "high": self.high}

@@ -150,18 +150,18 @@ def interval_of(share: Estimate) -> str:
     return f"[{100 * share.low:{form}}, {100 * share.high:{form}}]" if share.has_interval else ""
 
 
-def word_of(share: Estimate, same: float, seems: Literal["yes", "no", ""]) -> Word:
+def word_of(share: Estimate, same: float) -> Word:
     """Return yes or no if the interval of a difference lies on one side of 0 or within `same` of it, else unknown."""
     if max(abs(share.low), abs(share.high)) < same:
         return "no"
-    return "not known yet" if share.side(of=0.0) == 0 or not seems else seems
+    words: dict[int, Word] = {-1: "no", 0: "not known yet", 1: "yes"}
+    return words[share.side(of=0.0)]
 
 
 def _predicts(rows: Mapping[str, Row], horizon: int, ahead: str) -> Question:
     """Answer by the L1 error of the longest rollout: it has to be below the base's and below doing nothing's."""
     error = rows[f"rollout.{L1.name}.over_persistence.{horizon}"].estimate
-    below = Estimate(1 - error.value, 1 - error.high, 1 - error.low)
-    beside_nothing = _of_gain(below, "doing nothing's", ahead)
+    beside_nothing = _of_gain(error.below(1.0), "doing nothing's", ahead)
     gain = rows.get(f"rollout.{L1.name}.gain_over_base.{horizon}")
     if gain is None:
         return beside_nothing
@@ -179,9 +179,8 @@ def _predicts(rows: Mapping[str, Row], horizon: int, ahead: str) -> Question:
 
 def _of_gain(gain: Estimate, whose: str, ahead: str) -> Question:
     seems: Literal["yes", "no"] = "yes" if gain.value > SAME_ERROR else "no"
-    word = word_of(gain, SAME_ERROR, "yes" if gain.value > 0 else "no")
     says = f"error {_lower(gain)} than {whose}, {ahead}"
-    return Question("predicts", word, says, gain.value, interval_of(gain), seems=seems)
+    return Question("predicts", word_of(gain, SAME_ERROR), says, gain.value, interval_of(gain), seems=seems)
 
 
 def _lower(gain: Estimate) -> str:
@@ -192,7 +191,7 @@ def _uses_actions(rows: Mapping[str, Row]) -> Question:
     """Answer by what another clip's actions cost; the true ones have to fit best among others, too, where measured."""
     cost, gap = (rows[f"{name}.shuffled"].estimate for name in ("cost_of_actions", "gap_of_actions"))
     seems: Literal["yes", "no"] = "yes" if gap.value > SAME_ERROR else "no"
-    word = word_of(gap, SAME_ERROR, "yes" if gap.value > 0 else "no")
+    word = word_of(gap, SAME_ERROR)
     beside = ""
     for key in ("sensitivity.rank.clips", "sensitivity.rank.box"):
         if key in rows and word == "yes" and (rank := rows[key].estimate).side(of=CHANCE) != -1:
@@ -209,17 +208,11 @@ def _plans(rows: Mapping[str, Row], of_base: Mapping[str, Row]) -> Question:
         return not_measured("plans")
     rank = rows[key].estimate
     says = f"{percent(rank.value)} % of other moves look better than the true one"
-    beside_chance = Estimate(CHANCE - rank.value, CHANCE - rank.high, CHANCE - rank.low)
-    seems: Literal["yes", "no"] = "yes" if beside_chance.value > 0 else "no"
-    word = word_of(beside_chance, SAME_MOVES, seems)
-    held = "chance 50 %"
+    word, held = word_of(rank.below(CHANCE), SAME_MOVES), "chance 50 %"
     if (difference := rows.get("ranking.difference_to_base")) is not None:
-        lower = Estimate(-difference.value, -difference.high, -difference.low)
-        if word == "yes":
-            seems = "yes" if lower.value > 0 else "no"
-            word = word_of(lower, SAME_MOVES, seems)
+        word = word_of(difference.estimate.below(0.0), SAME_MOVES) if word == "yes" else word
         held = f"base {percent(of_base[key].value)} %, {held}"
-    return Question("plans", word, says, rank.value, interval_of(rank), f"({held})", seems, against=CHANCE)
+    return Question("plans", word, says, rank.value, interval_of(rank), f"({held})", against=CHANCE)
 
 
 def closed_loop(shares: Mapping[str, Estimate], model: str, oracle: str, problems: int, task: str) -> Question:

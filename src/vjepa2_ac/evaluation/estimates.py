@@ -68,7 +68,7 @@ def gap_of_actions(errors: PredictionErrors, actions: Actions) -> Estimate:
 def stratum_gain(errors: PredictionErrors, others: PredictionErrors, stratum: Stratum) -> Estimate:
     """Return the share by which the teacher-forced error is smaller than another model's in a stratum, paired."""
     left = ratio(_one_step(errors, "true", stratum), _one_step(others, "true", stratum), errors.episode_ids)
-    return Estimate(1 - left.value, 1 - left.high, 1 - left.low)
+    return left.below(1.0)
 
 
 def rank_difference(one: ActionRanking, other: ActionRanking) -> Estimate:

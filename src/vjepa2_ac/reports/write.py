@@ -281,14 +281,15 @@ def evaluate_subject(subject: str, asked: EvaluationOptions | None = None, repor
     """
     asked = asked or EvaluationOptions()
     evaluation = measure_subject(subject, asked, reporter=reporter)
-    about, found = evaluation.about, answer(evaluation, rows_of(evaluation))
+    about, rows = evaluation.about, rows_of(evaluation)
+    found = answer(evaluation, rows)
     if about.checkpoint:
         found = with_closed_loop(found, Path(about.subject), about.checkpoint)
     folder = asked.out or Path(subject)
     files = (
         plot_evaluation(evaluation, folder / PLOT),
         write_metrics(evaluation, folder / METRICS_FILE),
-        *write_tables(rows_of(evaluation), folder / METRICS_FILE),
+        *write_tables(rows, folder / METRICS_FILE),
         folder / REPORT,
     )
     write_atomically(folder / REPORT, report_page(evaluation, found))
