@@ -1,0 +1,310 @@
+"""What is explored: a model and what stands beside it, a decoder, held-out episodes; and a step of imagination."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.loader import batches_of
+from vjepa2_ac.data.transforms import frames_as_seen
+from vjepa2_ac.data.windows import require_frames
+from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
+from vjepa2_ac.decoding.imagine import shown
+from vjepa2_ac.distributed import make_accelerator
+from vjepa2_ac.encoding.batch import encode_batch
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.evaluate import Contender
+from vjepa2_ac.evaluation.evaluate_run import load_subject
+from vjepa2_ac.evaluation.request import EvaluationOptions, settle
+from vjepa2_ac.explore.messages import MOST_STEPS, GoalFrame
+from vjepa2_ac.model.distances import absolute_difference
+from vjepa2_ac.model.network.predictor_network import KeyValueCache
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.state_integration import counterfactual_states
+from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
+from vjepa2_ac.spaces import Spaces
+
+_KEPT_STEPS = 128  # of each model, for undo and for other branches
+_SAME = 2e-5  # of numbers of an action: links are rounded
+Pixels = UInt8[np.ndarray, "size size 3"]
+Actions = tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a person is: the given frame, and the actions that were taken from there."""
+
+    episode: int  # among those that are shown
+    start: int  # control step
+    actions: Actions = ()
+
+    @property
+    def before(self) -> Place:
+        """The place before the last action."""
+        return Place(self.episode, self.start, self.actions[:-1])
+
+    def after(self, action: tuple[float, ...]) -> Place:
+        """Return the place after one more action."""
+        return Place(self.episode, self.start, (*self.actions, action))
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """A frame that is true, and what was measured then."""
+
+    pixels: Pixels  # as the encoder sees it
+    latents: Float[Tensor, "tokens dim"]
+    state: Float[np.ndarray, " state_dim"]
+    action: tuple[float, ...] | None = None  # that was recorded, to the next moment; None: nobody knows
+
+
+@dataclass(frozen=True, eq=False)
+class _Imagined:
+    """The end of a path, imagined by one model."""
+
+    latents: Float[Tensor, "tokens dim"]
+    cache: KeyValueCache  # of the steps before
+
+
+class Explorer:
+    """Imagines what follows from a held-out frame, one action after another, for each of some models.
+
+    A path is a pure function of its `Place`: two pages, undo and a link need no state here. What was computed is kept
+    for a while.
+    """
+
+    def __init__(
+        self, world_model: WorldModel, contenders: tuple[Contender, ...], decoder: TrainedDecoder, dataset: Dataset
+    ) -> None:
+        """Prepare; `open_explorer` loads the parts.
+
+        Args:
+            world_model: Whose encoder is used; on its device.
+            contenders: What imagines, the subject last.
+            decoder: Of its latents.
+            dataset: Clips of two frames of one camera.
+
+        Raises:
+            InputError: Nobody knows which state follows from an action.
+        """
+        self.world_model, self.contenders, self.decoder, self.dataset = world_model, contenders, decoder, dataset
+        if self.spaces.action.follows == "unknown":
+            found = "commands of which nobody knows what they do to the state"
+            needed = "data.actions: difference; or join_actions: sum or last"
+            raise InputError(where="data.actions: recorded", found=found, needed=needed)
+        self.autocast: Callable[[], Any] = torch.no_grad
+        self.episodes: tuple[int, ...] = ()
+        self._kept: OrderedDict[tuple[int, Place], _Imagined] = OrderedDict()
+        self._pair = lru_cache(maxsize=256)(self._read_pair)
+
+    @property
+    def spaces(self) -> Spaces:
+        """What states and actions are."""
+        return self.dataset.spaces
+
+    @property
+    def stride(self) -> int:
+        """Control steps of a model step."""
+        return self.dataset.config.model_stride
+
+    @property
+    def device(self) -> torch.device:
+        """Where the models are."""
+        return self.world_model.device
+
+    def name(self, episode: int) -> str:
+        """Return the name of an episode in its data set."""
+        return self.dataset.table.identity(self.episodes[episode])
+
+    def steps(self, episode: int) -> int:
+        """Return the control steps of an episode."""
+        return int(self.dataset.table.num_steps[self.episodes[episode]])
+
+    def require(self, place: Place) -> Place:
+        """Return a place with its actions as they are understood: close to a recorded one, the recorded one.
+
+        Raises:
+            InputError: There is no such frame, or an action is none.
+        """
+        if place.episode >= len(self.episodes):
+            needed = f"0 to {len(self.episodes) - 1}"
+            raise InputError(where="episode", found=str(place.episode), needed=needed)
+        last = self.steps(place.episode) - 1 - self.stride
+        if not 0 <= place.start <= last:
+            raise InputError(where="start", found=f"control step {place.start}", needed=f"0 to {last}")
+        if len(place.actions) > MOST_STEPS:
+            fix = "Undo some, or begin anew from another frame"
+            raise InputError(where="actions", found=f"{len(place.actions)}", needed=f"at most {MOST_STEPS}", fix=fix)
+        width, understood = len(self.spaces.state), Place(place.episode, place.start)
+        for action in place.actions:
+            if len(action) != width or not np.isfinite(action).all() or np.abs(action).max() > np.pi:
+                needed = f"{width} numbers of one step, in metres, radians and closedness"
+                raise InputError(where="actions", found=f"{len(action)} numbers", needed=needed)
+            recorded = self.recorded_next(understood)
+            is_it = recorded is not None and np.allclose(action, recorded, atol=_SAME)
+            understood = understood.after(recorded if is_it and recorded is not None else action)
+        return understood
+
+    # ---- what is recorded ----
+
+    def moment(self, episode: int, step: int) -> Moment:
+        """Return the recorded moment at a control step."""
+        last = self.steps(episode) - 1 - self.stride
+        return self._pair(episode, step)[0] if step <= last else self._pair(episode, step - self.stride)[1]
+
+    def recorded(self, place: Place) -> Moment | None:
+        """Return the recorded moment at a place; None: the recording ended, or did something else."""
+        step = place.start
+        for action in place.actions:
+            moment = self.moment(place.episode, step)
+            step += self.stride
+            if action != moment.action or step >= self.steps(place.episode):
+                return None
+        return self.moment(place.episode, step)
+
+    def recorded_next(self, place: Place) -> tuple[float, ...] | None:
+        """Return the recorded action at a place; None: there is none."""
+        moment = self.recorded(place)
+        return None if moment is None else moment.action
+
+    @torch.no_grad()
+    def _read_pair(self, episode: int, step: int) -> tuple[Moment, Moment]:
+        (batch,) = batches_of(self.dataset, [(self.episodes[episode], step)], batch_size=1)
+        with self.autocast():
+            latents = encode_batch(self.world_model, batch, device=self.device, chunk=2).latents[0]
+        if batch.frames is None:
+            raise ValueError("a cache was refused")
+        pixels = frames_as_seen(batch.frames[0].numpy(), self.world_model.image_size)
+        states = batch.states[0].double().numpy()
+        action = batch.actions[0].double().numpy()
+        if self.spaces.action.follows == "target":
+            action = self.spaces.state.differences(np.stack([states[0], action]))[0]
+        first = Moment(pixels[0], latents[0], states[0], tuple(action.tolist()))
+        return first, Moment(pixels[1], latents[1], states[1])
+
+    # ---- what is imagined ----
+
+    def states(self, place: Place) -> Float[np.ndarray, "time state_dim"]:
+        """Return the states along a path: recorded as far as the recording goes that way, then integrated."""
+        states, at = [self.moment(place.episode, place.start).state], Place(place.episode, place.start)
+        for action in place.actions:
+            at = at.after(action)
+            recorded = self.recorded(at)
+            following = counterfactual_states(states[-1], np.array([action]), self.spaces.state)[1]
+            states.append(following if recorded is None else recorded.state)
+        return np.stack(states)
+
+    def imagined(self, teller: int, place: Place) -> Float[Tensor, "tokens dim"]:
+        """Return the latents at the end of a path as a model imagines them; without actions the true ones."""
+        return self._end(teller, place).latents
+
+    @torch.no_grad()
+    def _end(self, teller: int, place: Place) -> _Imagined:
+        key = (teller, place)
+        if key in self._kept:
+            self._kept.move_to_end(key)
+            return self._kept[key]
+        if not place.actions:
+            return _Imagined(self.moment(place.episode, place.start).latents, KeyValueCache())
+        before, states = self._end(teller, place.before), self.states(place)
+        given = states[-1] if self.spaces.action.follows == "target" else self._feasible(place, states)
+        model, cache = self.contenders[teller], before.cache.copy()
+        action, state = (torch.as_tensor(one, dtype=torch.float32, device=self.device) for one in (given, states[-2]))
+        with self.autocast(), model.switched():
+            predicted = model.model.predict(
+                before.latents[None, None], action[None, None], state[None, None], self._camera(place), cache
+            )
+        self._kept[key] = _Imagined(predicted[0, 0].float(), cache)
+        while len(self._kept) > _KEPT_STEPS * len(self.contenders):
+            self._kept.popitem(last=False)
+        return self._kept[key]
+
+    def _feasible(self, place: Place, states: np.ndarray) -> np.ndarray:
+        """Return the last action, its gripper as far as it can change: a model has seen nothing else."""
+        action, gripper = np.array(place.actions[-1]), self.spaces.state.gripper
+        if gripper is not None and self.recorded(place) is None:
+            action[gripper] = states[-1, gripper] - states[-2, gripper]
+        return action
+
+    def _camera(self, place: Place) -> Tensor | None:
+        if not self.world_model.sizes.predictor.use_extrinsics:
+            return None
+        (batch,) = batches_of(self.dataset, [(self.episodes[place.episode], place.start)], batch_size=1)
+        assert batch.extrinsics is not None  # noqa: S101  # `encode_batch` has refused it
+        return batch.extrinsics[:, :1].to(self.device)
+
+    def decoded(self, latents: Float[Tensor, "tokens dim"]) -> Pixels:
+        """Return latents as an image for people."""
+        return shown(self.decoder.decoder, latents[None])[0]
+
+
+def token_errors(imagined: Float[Tensor, "tokens dim"], true: Float[Tensor, "tokens dim"]) -> Float[Tensor, " tokens"]:
+    """Return the error of each patch: the mean absolute difference of its latent."""
+    return absolute_difference(imagined, true).mean(dim=-1)
+
+
+def relative_spread(latents: Float[Tensor, "tokens dim"], like: Float[Tensor, "tokens dim"]) -> float:
+    """Return the variance of latents over the patches of a frame, as a share of another frame's; 1: as varied."""
+    return float(latents.var(dim=0).sum() / like.var(dim=0).sum())
+
+
+@dataclass(frozen=True)
+class ExploreOptions:
+    """What is to be explored."""
+
+    subject: str
+    decoder: str
+    evaluation: EvaluationOptions  # checkpoint, data, against, split
+
+    def opened(self, reporter: Reporter = SILENT) -> tuple[Explorer, Config]:
+        """Load everything, on the device of the config; return it with the settings of planning.
+
+        Raises:
+            InputError: Subject, data or decoder cannot be used.
+        """
+        decoder = load_decoder(self.decoder)
+        config = settle(self.subject, self.evaluation)
+        one = {"frames": 2, "camera": config.data.cameras[0], "workers": 0}
+        config = config.model_copy(update={"data": config.data.model_copy(update=one)})
+        accelerator = make_accelerator(config)
+        dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
+        require_frames(config.data, to="show what is true")
+        loaded = load_subject(self.subject, config, self.evaluation, dataset, decoder)
+        loaded.put_on(accelerator.device)
+        decoder.to(accelerator.device)
+        explorer = Explorer(loaded.world_model, loaded.contenders, decoder, dataset)
+        explorer.autocast = accelerator.autocast
+        members = dataset.members(self.evaluation.split)[dataset.episodes]
+        long_enough = dataset.table.num_steps[dataset.episodes] > config.data.model_stride
+        explorer.episodes = tuple(int(one) for one in dataset.episodes[members & long_enough])
+        if not explorer.episodes:
+            dataset.windows(self.evaluation.split)  # says why
+        return explorer, config
+
+
+def goal_moment(explorer: Explorer, goal: GoalFrame) -> Moment:
+    """Return the frame to be reached.
+
+    Raises:
+        InputError: There is none.
+    """
+    if goal.episode >= len(explorer.episodes) or goal.step >= explorer.steps(goal.episode):
+        found = f"step {goal.step} of episode {goal.episode}"
+        raise InputError(where="goal", found=found, needed="a frame of an episode that is shown")
+    return explorer.moment(goal.episode, goal.step)
+
+
+def data_folder(explorer: Explorer) -> Path:
+    """Return where its data are."""
+    return Path(explorer.dataset.config.path)
