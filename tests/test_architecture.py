@@ -27,7 +27,7 @@ ORDERS: dict[str, list[str]] = {
         "decoding planning",
         "evaluation serving",
         "reports simulation training",
-        "api init",
+        "api init explore",
         "cli",
     ],
     "data": [
@@ -45,7 +45,7 @@ ORDERS: dict[str, list[str]] = {
     "data.sources": ["indexed_source", "rlds droid_raw lerobot npz latents"],
     "serving": [
         "wire access",
-        "request recording",
+        "request recording pages",
         "session",
         "about server",
     ],
@@ -65,6 +65,13 @@ ORDERS: dict[str, list[str]] = {
         "evaluate_run",
         "imagined imagined_plan",
     ],
+    "explore": [
+        "messages",
+        "explorer",
+        "search truth",
+        "views",
+        "server postcard watch",
+    ],
     "decoding": [
         "network",
         "decoder_folder frame_pairs",
@@ -73,7 +80,15 @@ ORDERS: dict[str, list[str]] = {
     ],
     "evaluation.calibration": ["variants", "data axes"],
     "reports": ["metrics_json", "comparison paper", "figures", "write imagined sheet", "export"],
-    "cli": ["console", "options", "completion train", "data", "evaluate plan closed_loop setup", "program", "__main__"],
+    "cli": [
+        "console",
+        "options",
+        "completion train",
+        "data",
+        "evaluate explore plan closed_loop setup",
+        "program",
+        "__main__",
+    ],
     "simulation": [
         "world",
         "closed_loop",
@@ -111,13 +126,13 @@ HOMES = {
     "tensorflow": [],
     "torchvision": [],
     "transformers": ["model/network/"],
-    "websockets": ["serving/"],
+    "websockets": ["explore/", "serving/"],
 }  # fmt: skip
 
 MOST_PARAMETERS = 6  # of a function, without self and cls: more are a record
 OF_OTHERS = {"model/adapter/low_rank.py: forward"}  # torch.autograd.Function takes every tensor as an argument
 MOST_FILES = 15  # in one folder, `__init__` included
-MOST_AT_THE_TOP, MOST_FLOORS = 26, 10  # rooms and files; lines of their order
+MOST_AT_THE_TOP, MOST_FLOORS = 27, 10  # rooms and files; lines of their order
 
 
 @cache

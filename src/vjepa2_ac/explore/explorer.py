@@ -6,7 +6,6 @@ from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -67,6 +66,7 @@ class Moment:
     latents: Float[Tensor, "tokens dim"]
     state: Float[np.ndarray, " state_dim"]
     action: tuple[float, ...] | None = None  # that was recorded, to the next moment; None: nobody knows
+    extrinsics: Float[Tensor, " 6"] | None = None  # of the camera, where the model uses them
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,15 +182,16 @@ class Explorer:
     def _read_pair(self, episode: int, step: int) -> tuple[Moment, Moment]:
         (batch,) = batches_of(self.dataset, [(self.episodes[episode], step)], batch_size=1)
         with self.autocast():
-            latents = encode_batch(self.world_model, batch, device=self.device, chunk=2).latents[0]
+            encoded = encode_batch(self.world_model, batch, device=self.device, chunk=2)
         if batch.frames is None:
             raise ValueError("a cache was refused")
         pixels = frames_as_seen(batch.frames[0].numpy(), self.world_model.image_size)
         states = batch.states[0].double().numpy()
-        action = batch.actions[0].double().numpy()
+        action = batch.actions[0, 0].double().numpy()
         if self.spaces.action.follows == "target":
             action = self.spaces.state.differences(np.stack([states[0], action]))[0]
-        first = Moment(pixels[0], latents[0], states[0], tuple(action.tolist()))
+        camera, latents = None if encoded.extrinsics is None else encoded.extrinsics[0, 0], encoded.latents[0]
+        first = Moment(pixels[0], latents[0], states[0], tuple(action.tolist()), camera)
         return first, Moment(pixels[1], latents[1], states[1])
 
     # ---- what is imagined ----
@@ -219,12 +220,11 @@ class Explorer:
             return _Imagined(self.moment(place.episode, place.start).latents, KeyValueCache())
         before, states = self._end(teller, place.before), self.states(place)
         given = states[-1] if self.spaces.action.follows == "target" else self._feasible(place, states)
-        model, cache = self.contenders[teller], before.cache.copy()
+        cache, camera = before.cache.copy(), self.camera(place)
         action, state = (torch.as_tensor(one, dtype=torch.float32, device=self.device) for one in (given, states[-2]))
-        with self.autocast(), model.switched():
-            predicted = model.model.predict(
-                before.latents[None, None], action[None, None], state[None, None], self._camera(place), cache
-            )
+        seen = before.latents[None, None], action[None, None], state[None, None]
+        with self.autocast(), self.contenders[teller].switched():
+            predicted = self.model(teller).predict(*seen, None if camera is None else camera[None, None], cache)
         self._kept[key] = _Imagined(predicted[0, 0].float(), cache)
         while len(self._kept) > _KEPT_STEPS * len(self.contenders):
             self._kept.popitem(last=False)
@@ -237,16 +237,19 @@ class Explorer:
             action[gripper] = states[-1, gripper] - states[-2, gripper]
         return action
 
-    def _camera(self, place: Place) -> Tensor | None:
-        if not self.world_model.sizes.predictor.use_extrinsics:
-            return None
-        (batch,) = batches_of(self.dataset, [(self.episodes[place.episode], place.start)], batch_size=1)
-        assert batch.extrinsics is not None  # noqa: S101  # `encode_batch` has refused it
-        return batch.extrinsics[:, :1].to(self.device)
+    def model(self, teller: int) -> WorldModel:
+        """Return what imagines; it counts within `contenders[teller].switched()`."""
+        model = self.contenders[teller].model
+        assert isinstance(model, WorldModel)  # noqa: S101  # `load_subject` loads no other
+        return model
+
+    def camera(self, place: Place) -> Float[Tensor, " 6"] | None:
+        """Return the camera's pose, where the models use it."""
+        return self.moment(place.episode, place.start).extrinsics
 
     def decoded(self, latents: Float[Tensor, "tokens dim"]) -> Pixels:
         """Return latents as an image for people."""
-        return shown(self.decoder.decoder, latents[None])[0]
+        return np.asarray(shown(self.decoder.decoder, latents[None])[0])
 
 
 def token_errors(imagined: Float[Tensor, "tokens dim"], true: Float[Tensor, "tokens dim"]) -> Float[Tensor, " tokens"]:
@@ -303,8 +306,3 @@ def goal_moment(explorer: Explorer, goal: GoalFrame) -> Moment:
         found = f"step {goal.step} of episode {goal.episode}"
         raise InputError(where="goal", found=found, needed="a frame of an episode that is shown")
     return explorer.moment(goal.episode, goal.step)
-
-
-def data_folder(explorer: Explorer) -> Path:
-    """Return where its data are."""
-    return Path(explorer.dataset.config.path)

@@ -33,7 +33,7 @@ class GoalFrame:
 
 
 @dataclass(frozen=True)
-class Request:
+class PageRequest:
     """What a page asks for; which of the fields count depends on the kind."""
 
     seq: Index
@@ -47,7 +47,7 @@ class Request:
     steps: Annotated[int, Field(ge=1, le=8)] = 1  # of a plan
 
 
-def read_request(text: str | bytes) -> Request:
+def read_request(text: str | bytes) -> PageRequest:
     """Return a request.
 
     Raises:
@@ -57,7 +57,7 @@ def read_request(text: str | bytes) -> Request:
         values = json.loads(text)
     except (ValueError, RecursionError):
         raise InputError(where="request", found="no JSON", needed="what explore's own page sends") from None
-    return record_of(Request, values, where="request", needed="what explore's own page sends")
+    return record_of(PageRequest, values, where="request", needed="what explore's own page sends")
 
 
 @dataclass(frozen=True)

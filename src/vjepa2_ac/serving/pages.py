@@ -80,9 +80,9 @@ def _file(connection: Any, name: str, content: bytes) -> Any:
     response = connection.respond(http.HTTPStatus.OK, "")
     ending = f".{name.rpartition('.')[2]}" if name else ".html"
     own = {"Content-Type": f"{_TYPES[ending]}; charset=utf-8", "Content-Length": str(len(content)), **_HEADERS}
-    for header, value in own.items():
+    for header in ("Content-Type", "Content-Length"):
         del response.headers[header]
-        response.headers[header] = value
+    response.headers.update(own)
     response.body = content
     return response
 

@@ -1,0 +1,138 @@
+"""The command explore: a page in which a person drives a model's imagination."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import sys
+import tempfile
+import webbrowser
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vjepa2_ac.cli import options as cli
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage.places import BUILTIN
+
+if TYPE_CHECKING:
+    from vjepa2_ac.config import Config
+    from vjepa2_ac.explore.explorer import ExploreOptions
+    from vjepa2_ac.explore.views import Views
+    from vjepa2_ac.serving.access import Access
+
+_DEMO_RUN, _BUILTIN_MODEL = "demo/run", f"{BUILTIN}sim-tiny"
+_EPISODES = 8  # simulated where a model of the package comes without data
+
+
+def add_explore(commands: cli.Commands) -> None:
+    """Add `explore` to a parser."""
+    parser = cli.command(commands, "explore", _explore, "demo/run --against base")
+    text = f"a run, or what model.base takes ({_DEMO_RUN} if it is there, else {_BUILTIN_MODEL})"
+    cli.add(parser, "subject RUN_OR_MODEL", text, cli.as_model, nargs="?")
+    cli.add(
+        parser, "overrides key=value", "of planning, such as planning.samples=200 (on a CPU a quick one)", nargs="*"
+    )
+    cli.add(parser, "--against base|RUN|MODEL", "what imagines beside it (the base of a run)", cli.as_model, nargs="+")
+    text = "what shows images: `vjepa2-ac decoder` made it (beside the run, else builtin:sim-tiny)"
+    cli.add(parser, "--decoder FOLDER", text, cli.as_model)
+    cli.add(parser, "--data CONFIG", "explore its data; needed for a model but the package's own", cli.as_local)
+    text = "write a page that plays without us into a folder: six moves, four deep; nothing is served"
+    cli.add(parser, "--export FOLDER", text, cli.as_path)
+    cli.add(parser, "--split", "which episodes (test)", choices=["test", "validation", "train"], default="test")
+    cli.add_checkpoint(parser)
+    group = parser.add_argument_group("the page")
+    cli.add(group, "--no-open", "print the page's address, and open no browser", action="store_true")
+    cli.add(group, "--port N", "0: a free one (8001)", cli.whole_number(0, 65535), default=8001)
+    cli.add(group, "--host ADDRESS", "where it listens (127.0.0.1: this machine only)", default="127.0.0.1")
+    cli.add(group, "--key-file FILE", "with the key that opens it; needed where others can reach it", cli.as_path)
+    cli.add(group, "--insecure", "no key, although others can reach the address", action="store_true")
+    cli.add(group, "--allow-host NAME", "a name that a proxy serves it under; repeatable", action="append", default=[])
+
+
+def _explore(options: argparse.Namespace) -> int:
+    """Open a page in which you drive the model's imagination.
+
+    Press a key and see what the model thinks happens, beside its base and what is true; choose a goal, see the energy,
+    let it plan (docs/explore.md). Runs until Ctrl-C.
+    """
+    from vjepa2_ac.runs.folder import is_run
+    from vjepa2_ac.serving.access import Access, read_key
+
+    subject = options.subject or (_DEMO_RUN if is_run(_DEMO_RUN) else _BUILTIN_MODEL)
+    key = None if options.key_file is None else read_key(options.key_file)
+    access = Access(options.host, key, options.insecure, tuple(options.allow_host))
+    if options.export is not None:
+        cli.require_new_place(options.export)
+    cli.require_subject(subject)
+    cli.say_places_elsewhere(subject)
+    with _data(subject, options) as data:
+        from vjepa2_ac.explore.views import Views
+
+        with cli.reporter() as reporter:
+            explorer, config = _asked(subject, data, options).opened(reporter)
+            views = Views.of(subject, explorer, config)
+            if options.export is not None:
+                from vjepa2_ac.explore.postcard import write_postcard
+
+                cli.show(files=[write_postcard(views, options.export, reporter.task("imagining", "futures"))])
+                return 0
+            about = f"{subject}, {len(explorer.episodes)} episodes; a step takes {views.step_seconds:.2f} s here"
+        _serve(views, access, options, about)
+    return 0
+
+
+def _serve(views: Views, access: Access, options: argparse.Namespace, about: str) -> None:
+    from vjepa2_ac.explore.server import serve_page
+
+    def ready(url: str) -> None:
+        cli.show(about, f"The page: {url}{'' if access.key is None else '?key=KEY'}   (Ctrl-C ends it)")
+        if not options.no_open and access.key is None and _has_window():
+            webbrowser.open(url)
+
+    with contextlib.suppress(KeyboardInterrupt):
+        serve_page(views, access, options.port, ready)
+
+
+def _has_window() -> bool:
+    """Return whether a browser would open in a window, and not in this terminal."""
+    return sys.platform in {"darwin", "win32"} or any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))
+
+
+@contextmanager
+def _data(subject: str, options: argparse.Namespace) -> Iterator[Config | None]:
+    """Yield the config whose data are explored: the given one; None, a run's own; or of episodes that are simulated."""
+    from vjepa2_ac.config.loading import load_config
+    from vjepa2_ac.runs.folder import is_run
+
+    if options.data is not None:
+        yield cli.read_config(options.data, of_run=True)
+    elif is_run(subject):
+        yield None
+    elif subject == _BUILTIN_MODEL:
+        from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
+
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "data"
+            record_dataset(path, RecordingSpec("A", seed=5), episodes=_EPISODES)
+            shares = ["data.validation_share=0.1", "data.test_share=0.8"]
+            yield load_config(f"{BUILTIN}demo", [f"data.path={path}", f"model.base={subject}", *shares])
+    else:
+        needed = "--data CONFIG, which names held-out episodes"
+        raise InputError(where=f"explore {subject}", found="a model, which has no data of its own", needed=needed)
+
+
+def _asked(subject: str, data: Config | None, options: argparse.Namespace) -> ExploreOptions:
+    """Return what is to be explored, with the decoder that is given, or lies beside the run, or is the package's."""
+    from vjepa2_ac.decoding.decoder_folder import CARD
+    from vjepa2_ac.evaluation.request import EvaluationOptions
+    from vjepa2_ac.explore.explorer import ExploreOptions
+
+    beside = Path(subject).parent / "decoder"
+    decoder = options.decoder or (str(beside) if (beside / CARD).is_file() else _BUILTIN_MODEL)
+    against = tuple(options.against) if options.against else None
+    how = {"split": options.split, "checkpoint": options.checkpoint, "data": data, "against": against}
+    planning = tuple(options.overrides)
+    return ExploreOptions(subject, decoder, EvaluationOptions(**how, out=Path(), planning=planning))

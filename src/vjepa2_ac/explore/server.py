@@ -1,0 +1,179 @@
+"""The server of the page: a socket for each page; one thread computes, and the newest request of a page wins."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import signal
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import Any
+
+from vjepa2_ac.errors import InputError, UserError, require_library
+from vjepa2_ac.explore.messages import MOST_BYTES, PageRequest, packed, read_request
+from vjepa2_ac.explore.views import Views
+from vjepa2_ac.planning.planner import SearchCancelledError
+from vjepa2_ac.serving.access import Access
+from vjepa2_ac.serving.pages import Page
+
+logger = logging.getLogger(__name__)
+
+_FILES = ("index.html", "style.css", "shared.js", "explore.js")
+_MOST_PAGES = 8
+
+
+@dataclass
+class _Client:
+    """One page: the request that waits, and whether the running one is wanted any more."""
+
+    waiting: PageRequest | None = None
+    arrived: asyncio.Event = field(default_factory=asyncio.Event)
+    replaced: threading.Event = field(default_factory=threading.Event)
+
+
+class ExploreServer:
+    """Serves `Views` to the pages of this machine's browsers."""
+
+    def __init__(self, views: Views, access: Access, port: int = 0) -> None:
+        """Prepare.
+
+        Args:
+            views: Answers requests.
+            access: Where it listens, and for whom.
+            port: 0: a free one.
+        """
+        self._views, self._access, self._port = views, access, port
+        self._page = Page.of_package("/", "explore/page", _FILES)
+        self._computing = ThreadPoolExecutor(1, "imagining")
+        self._pages = 0
+
+    async def run(self, stop: asyncio.Event, ready: Callable[[str], None]) -> None:
+        """Listen until `stop`; tell the page's address once it can be opened.
+
+        Raises:
+            InputError: The address cannot be listened on.
+        """
+        library = require_library("websockets.asyncio.server", where="explore", called="websockets", extra="explore")
+        access = self._access
+        try:
+            server = await library.serve(
+                self._came, access.host, self._port, process_request=self._asked,
+                compression=None, max_size=MOST_BYTES, server_header=None,
+            )  # fmt: skip
+        except OSError as error:
+            where, fix = f"{access.host}:{self._port}", "Choose another --port; 0 takes a free one"
+            raise InputError(where=where, found=f"cannot be listened on: {error.strerror}", fix=fix) from None
+        host, port = server.sockets[0].getsockname()[:2]
+        ready(f"http://{f'[{host}]' if ':' in host else host}:{port}/")
+        try:
+            await stop.wait()
+        finally:
+            server.close()
+            await server.wait_closed()
+            self._computing.shutdown(wait=False, cancel_futures=True)
+
+    def _asked(self, connection: Any, request: Any) -> Any:
+        return self._page.answer(connection, request, self._access)
+
+    async def _came(self, connection: Any) -> None:
+        if self._pages >= _MOST_PAGES:
+            await connection.close(1013, f"{_MOST_PAGES} pages are open")
+            return
+        self._pages += 1
+        client, closed = _Client(), require_library("websockets", where="explore", called="websockets", extra="explore")
+        answering = asyncio.ensure_future(self._answer_all(connection, client))
+        answering.add_done_callback(lambda _: asyncio.ensure_future(connection.close()))
+        try:
+            with contextlib.suppress(closed.exceptions.ConnectionClosed):
+                async for message in connection:
+                    if wrong := self._take(client, message):
+                        await connection.send(wrong)
+        finally:
+            self._pages -= 1
+            client.replaced.set()
+            answering.cancel()
+            for error in await asyncio.gather(answering, return_exceptions=True):
+                if isinstance(error, Exception) and not isinstance(error, closed.exceptions.ConnectionClosed):
+                    logger.error("a page was given up", exc_info=error)
+
+    def _take(self, client: _Client, message: str | bytes) -> bytes | None:
+        """Put a request in the place of the one that waits; return the answer to what is none."""
+        try:
+            client.waiting = read_request(message)
+        except InputError as error:
+            return packed("error", None, {"text": str(error)})
+        client.replaced.set()
+        client.arrived.set()
+        return None
+
+    async def _answer_all(self, connection: Any, client: _Client) -> None:
+        loop = asyncio.get_running_loop()
+        await connection.send(await loop.run_in_executor(self._computing, self._views.hello))
+        while True:
+            await client.arrived.wait()
+            client.arrived.clear()
+            request, client.replaced = client.waiting, threading.Event()
+            if request is None:
+                continue
+            told = asyncio.Queue[tuple[int, int]](1)
+
+            def progress(done: int, total: int, told: Any = told) -> None:
+                loop.call_soon_threadsafe(_newest, told, (done, total))
+
+            telling = asyncio.ensure_future(_tell(connection, request, told))
+            try:
+                answer = await loop.run_in_executor(
+                    self._computing, self._answer, request, progress, client.replaced.is_set
+                )
+            finally:
+                telling.cancel()
+                await asyncio.gather(telling, return_exceptions=True)
+            if answer is not None:
+                await connection.send(answer)
+
+    def _answer(
+        self, request: PageRequest, progress: Callable[[int, int], None], cancelled: Callable[[], bool]
+    ) -> bytes | None:
+        try:
+            return self._views.answer(request, progress, cancelled)
+        except SearchCancelledError:
+            return None
+        except UserError as error:
+            return packed("error", request.seq, {"text": str(error)})
+        except Exception:
+            logger.exception("a request of a page could not be answered")
+            return packed("error", request.seq, {"text": "This could not be computed; the terminal says more."})
+
+
+def _newest(told: asyncio.Queue[tuple[int, int]], progress: tuple[int, int]) -> None:
+    if told.full():
+        told.get_nowait()
+    told.put_nowait(progress)
+
+
+async def _tell(connection: Any, request: PageRequest, told: asyncio.Queue[tuple[int, int]]) -> None:
+    while True:
+        done, total = await told.get()
+        await connection.send(
+            packed("progress", request.seq, {"done": done, "total": total, "what": "action sequences"})
+        )
+
+
+def serve_page(views: Views, access: Access, port: int, ready: Callable[[str], None]) -> None:
+    """Serve until SIGTERM or SIGINT.
+
+    Raises:
+        InputError: As `ExploreServer.run`.
+    """
+
+    async def until_signalled() -> None:
+        stop, loop = asyncio.Event(), asyncio.get_running_loop()
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGTERM, signal.SIGINT):
+                loop.add_signal_handler(number, stop.set)
+        await ExploreServer(views, access, port).run(stop, ready)
+
+    asyncio.run(until_signalled())

@@ -1,0 +1,264 @@
+"""What a page is told: of a model and its data, of an episode, of a place, of energies and plans."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from torch import Tensor
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.config.planning import PlanningConfig
+from vjepa2_ac.episode import Progress, short_names
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.explore.explorer import Explorer, Pixels, Place, goal_moment, relative_spread, token_errors
+from vjepa2_ac.explore.messages import MOST_STEPS, Image, PageRequest, packed
+from vjepa2_ac.explore.search import Cancelled, Search
+from vjepa2_ac.explore.truth import TrueFrame, Truth
+from vjepa2_ac.media.film import spread_with_ends
+
+_QUICK = {"samples": 64, "iterations": 4}  # of a plan: docs/planning.md says how good it is
+_MOST_FRAMES = 16  # of a film strip
+_MOST_EPISODES = 500
+_SEARCHED = 32  # episodes, for the one with the most motion, and for the sizes of usual steps
+_USUAL = 90.0  # percentile of recorded changes
+_UNKNOWN = 0.05, 0.1, 0.5, 0.05  # step of a position, rotation, gripper, other number that the data never change
+_MOVES = (
+    ("forward", 0, 1), ("back", 0, -1), ("left", 1, 1), ("right", 1, -1), ("up", 2, 1), ("down", 2, -1),
+    ("turn left", 5, 1), ("turn right", 5, -1), ("open", 6, -1), ("close", 6, 1), ("still", None, 0),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """Answers a page's requests. It knows no sockets."""
+
+    subject: str
+    explorer: Explorer
+    search: Search
+    truth: Truth
+
+    @classmethod
+    def of(cls, subject: str, explorer: Explorer, config: Config) -> Views:
+        """Return the views of an explorer; on a CPU plans are searched quickly, unless the config says how."""
+        planning = config.planning
+        if explorer.device.type == "cpu" and planning == PlanningConfig(limits=planning.limits):
+            planning = planning.model_copy(update=_QUICK)
+        return cls(subject, explorer, Search(explorer, planning), Truth(explorer))
+
+    def answer(self, request: PageRequest, progress: Progress, cancelled: Cancelled) -> bytes:
+        """Return the answer to a request.
+
+        Args:
+            request: From a page.
+            progress: Of a search.
+            cancelled: Asked during a search, whether nobody waits for it any more.
+
+        Raises:
+            InputError: There is no such place, goal or model.
+            SearchCancelledError: It was cancelled.
+        """
+        if request.kind == "episode":
+            return self._episode(request)
+        actions = tuple(tuple(one) for one in request.actions)
+        place = self.explorer.require(Place(request.episode, request.start, actions))
+        if request.kind == "look":
+            return self._look(request, place)
+        return self._searched(request, place, progress, cancelled)
+
+    def hello(self) -> bytes:
+        """Return what a page is told first."""
+        explorer, space = self.explorer, self.explorer.spaces.state
+        names = [explorer.name(one) for one in range(min(len(explorer.episodes), _MOST_EPISODES))]
+        short, (episode, goal) = short_names(names), self._proposed
+        told = {
+            "subject": self.subject,
+            "tellers": [{"id": one.name, "label": one.name} for one in explorer.contenders],
+            "truth": "simulated" if self.truth.is_simulated else "recorded",
+            "episodes": [
+                {"name": short[name], "full": name, "steps": explorer.steps(index)} for index, name in enumerate(names)
+            ],
+            "stride": explorer.stride,
+            "seconds_per_step": explorer.stride / explorer.dataset.control_rate_hz,
+            "most_steps": MOST_STEPS,
+            "device": explorer.device.type,
+            "step_seconds": self.step_seconds,
+            "action": self._numbers,
+            "state": [self._unit(number) for number in range(len(space))],
+            "is_pose": space.is_base_pose,
+            "moves": self._moves,
+            "place": {"episode": episode, "start": 0},
+            "goal": {"episode": episode, "step": goal},
+        }
+        return packed("hello", None, told)
+
+    # ---- what can be done ----
+
+    def _unit(self, number: int) -> dict[str, Any]:
+        space, unit = self.explorer.spaces.state, self.explorer.spaces.state.units[number]
+        shown = {"m": ("cm", 100.0), "rad": ("°", 180 / np.pi)}.get(unit, (unit, 1.0))
+        return {"name": space.names[number], "unit": unit, "shown_unit": shown[0], "factor": shown[1]}
+
+    @cached_property
+    def _numbers(self) -> list[dict[str, Any]]:
+        """The numbers of an action, with the largest one that can be chosen, and a usual step."""
+        space, usual = self.explorer.spaces.state, self._usual_changes
+        steps = []
+        for number in range(len(space)):
+            kind = {"m": 0, "rad": 1}.get(space.units[number], 2 if number == space.gripper else 3)
+            steps.append(float(usual[number]) if usual[number] > _UNKNOWN[kind] / 10 else _UNKNOWN[kind])
+        for alike in (space.position, space.rotation):
+            if alike is not None:
+                steps[alike] = [max(steps[alike])] * len(steps[alike])
+        return [
+            {**self._unit(number), "name": space.change_names[number], "step": step, "most": 2 * step}
+            for number, step in enumerate(steps)
+        ]
+
+    @property
+    def _moves(self) -> list[dict[str, Any]]:
+        space = self.explorer.spaces.state
+        if space.is_base_pose:
+            return [{"id": name, "label": name, "axis": axis, "sign": sign} for name, axis, sign in _MOVES]
+        signs = [(number, sign, word) for number in range(len(space)) for sign, word in ((1, "+"), (-1, "-"))]
+        moves = [
+            {"id": f"{number}{word}", "label": f"{space.change_names[number]} {word}", "axis": number, "sign": sign}
+            for number, sign, word in signs
+        ]
+        return [*moves, {"id": "still", "label": "still", "axis": None, "sign": 0}]
+
+    def _changes(self, episode: int) -> Float[np.ndarray, "steps dim"]:
+        """Return the changes of the state in each model step of an episode."""
+        explorer = self.explorer
+        states = explorer.dataset.source.read(explorer.episodes[episode]).states[:: explorer.stride]
+        return explorer.spaces.state.differences(np.asarray(states, dtype=np.float64))
+
+    @cached_property
+    def _recorded_changes(self) -> list[Float[np.ndarray, "steps dim"]]:
+        return [self._changes(one) for one in range(min(_SEARCHED, len(self.explorer.episodes)))]
+
+    @property
+    def _usual_changes(self) -> Float[np.ndarray, " dim"]:
+        return np.asarray(np.percentile(np.abs(np.concatenate(self._recorded_changes)), _USUAL, axis=0))
+
+    @property
+    def _proposed(self) -> tuple[int, int]:
+        """The episode with the most motion, and its last frame for a goal."""
+        size = self.explorer.spaces.state.sized
+        ways = [float(np.linalg.norm(one[:, size], axis=1).sum()) for one in self._recorded_changes]
+        episode = int(np.argmax(ways))
+        return episode, self.explorer.steps(episode) - 1
+
+    @cached_property
+    def step_seconds(self) -> float:
+        """How long a step takes here, with its image: measured once, warm."""
+        still = (0.0,) * len(self.explorer.spaces.state)
+        for tried in range(2):
+            began, place = time.perf_counter(), Place(0, 0, (still,) * (tried + 1))
+            for teller in range(len(self.explorer.contenders)):
+                self.explorer.decoded(self.explorer.imagined(teller, place))
+        return time.perf_counter() - began
+
+    # ---- answers ----
+
+    def _episode(self, request: PageRequest) -> bytes:
+        explorer, index = self.explorer, request.episode
+        explorer.require(Place(index, 0))
+        last, stride = explorer.steps(index) - 1, explorer.stride
+        steps = [place * stride for place in spread_with_ends(last // stride + 1, _MOST_FRAMES)]
+        images = [
+            Image(f"frame-{number}", explorer.moment(index, step).pixels, f"recorded at control step {step}")
+            for number, step in enumerate(steps)
+        ]
+        return packed("episode", request.seq, {"episode": index, "steps": steps}, images)
+
+    def _look(self, request: PageRequest, place: Place) -> bytes:
+        explorer, start = self.explorer, self.explorer.moment(place.episode, place.start)
+        goal = None if request.goal is None else goal_moment(explorer, request.goal)
+        outcome, states = self.truth.outcome(place), explorer.states(place)
+        images = [Image("given", start.pixels, f"the given frame, recorded at control step {place.start}")]
+        images += [] if outcome is None else [Image("truth", outcome.pixels, _true_alt(outcome))]
+        images += [] if goal is None else [Image("goal", goal.pixels, "the goal frame")]
+        tellers = []
+        for number, contender in enumerate(explorer.contenders):
+            latents, name = explorer.imagined(number, place), contender.name
+            images.append(Image(f"imagined-{name}", explorer.decoded(latents), f"what {name} imagines"))
+            errors = None if outcome is None or not place.actions else token_errors(latents, outcome.latents)
+            if errors is not None:
+                images.append(Image(f"error-{name}", error_map(errors, explorer), f"where {name} is wrong"))
+            tellers.append({
+                "id": name,
+                "error": None if errors is None else float(errors.mean()),
+                "spread": relative_spread(latents, start.latents if outcome is None else outcome.latents),
+                "energy": None if goal is None else self.search.energy(latents, goal.latents),
+            })  # fmt: skip
+        position = explorer.spaces.state.position
+        told = {
+            "episode": place.episode,
+            "start": place.start,
+            "actions": place.actions,
+            "recorded": explorer.recorded(place) is not None,
+            "next_recorded": explorer.recorded_next(place),
+            "state": states[-1],
+            "path": None if position is None else states[:, position],
+            "truth": None if outcome is None else "simulated" if outcome.is_simulated else "recorded",
+            "truth_state": None if outcome is None else outcome.state,
+            "reached": None if outcome is None else outcome.reached,
+            "note": "" if outcome is None or outcome.reached else "The arm cannot go so far: it went as far as it can.",
+            "tellers": tellers,
+            "copying": None if outcome is None else float(token_errors(start.latents, outcome.latents).mean()),
+        }
+        return packed("look", request.seq, told, images)
+
+    def _searched(self, request: PageRequest, place: Place, progress: Progress, cancelled: Cancelled) -> bytes:
+        names = [one.name for one in self.explorer.contenders]
+        if request.goal is None or request.teller not in names:
+            raise InputError(where=request.kind, found="no goal, or no model", needed="both")
+        goal, teller = goal_moment(self.explorer, request.goal).latents, names.index(request.teller)
+        if request.kind == "plan":
+            found = self.search.plan(teller, place, goal, request.steps, progress, cancelled)
+            told = {
+                "actions": found.plan.actions.double(),
+                "energy_now": found.energy_now,
+                "energy_plan": found.plan.energy,
+                "why": found.plan.stopped,
+                "iterations": [
+                    {"lowest": one.lowest, "mean": one.elite_energy, "action": one.elites[0, 0].double()}
+                    for one in found.plan.iterations
+                    if len(one.elites)
+                ],
+            }
+            best = [self.explorer.decoded(one) for one in found.best]
+            images = [
+                Image(f"best-{number}", one, f"best of iteration {number + 1}") for number, one in enumerate(best)
+            ]
+            return packed("plan", request.seq, told, images)
+        width = len(self.explorer.spaces.state)
+        action = request.action if len(request.action) == width else [0.0] * width
+        maps = self.search.maps(teller, place, goal, action, progress, cancelled)
+        shown = [
+            {
+                "across": one.axes[0], "up": one.axes[1], "across_values": one.across, "up_values": one.up,
+                "energy": one.energy,
+            }
+            for one in maps
+        ]  # fmt: skip
+        now = self.search.energy(self.explorer.imagined(teller, place), goal)
+        return packed("energy", request.seq, {"maps": shown, "now": now}, ())
+
+
+def _true_alt(outcome: TrueFrame) -> str:
+    return f"what really happens, {'simulated' if outcome.is_simulated else 'recorded'}"
+
+
+def error_map(errors: Float[Tensor, " tokens"], explorer: Explorer) -> Pixels:
+    """Return the errors of patches as an image: from black, 0, over red and yellow to white, 1: an unrelated frame."""
+    size = explorer.world_model.image_size
+    grid = size // explorer.world_model.sizes.patch_size
+    shares = errors.float().reshape(grid, grid).cpu().numpy().repeat(size // grid, 0).repeat(size // grid, 1)
+    colours = np.stack([3 * shares, 3 * shares - 1, 3 * shares - 2], axis=-1)
+    return np.asarray(np.clip(255 * colours, 0, 255), dtype=np.uint8)
