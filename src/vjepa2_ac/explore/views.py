@@ -25,7 +25,8 @@ _QUICK = {"samples": 64, "iterations": 4}  # of a plan: docs/planning.md says ho
 _MOST_FRAMES = 16  # of a film strip
 _MOST_EPISODES = 500
 _SEARCHED = 32  # episodes, for the one with the most motion, and for the sizes of usual steps
-_USUAL = 90.0  # percentile of recorded changes
+_USUAL = 90.0  # percentile of recorded changes, of those that are more than a share of the largest: a gripper rests
+_MOVES_FROM = 0.1
 _UNKNOWN = 0.05, 0.1, 0.5, 0.05  # step of a position, rotation, gripper, other number that the data never change
 _MOVES = (
     ("forward", 0, 1), ("back", 0, -1), ("left", 1, 1), ("right", 1, -1), ("up", 2, 1), ("down", 2, -1),
@@ -143,7 +144,8 @@ class Views:
 
     @property
     def _usual_changes(self) -> Float[np.ndarray, " dim"]:
-        return np.asarray(np.percentile(np.abs(np.concatenate(self._recorded_changes)), _USUAL, axis=0))
+        sizes = np.abs(np.concatenate(self._recorded_changes)).T
+        return np.array([np.percentile(one[one >= _MOVES_FROM * one.max()], _USUAL) for one in sizes])
 
     @property
     def _proposed(self) -> tuple[int, int]:

@@ -1,0 +1,79 @@
+"""The server of the window in a thread of the test, and a real browser in front of it."""
+
+import asyncio
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from browser import browser
+from vjepa2_ac.explore.server import ExploreServer
+from vjepa2_ac.explore.views import Views
+from vjepa2_ac.serving.access import Access
+
+
+@contextmanager
+def serving(views: Views, access: Access | None = None, port: int = 0) -> Iterator[str]:
+    """Serve as long as the context lasts; yield the page's address."""
+    ready, address, of_loop, failed = threading.Event(), [], [], []
+
+    def tell(url: str) -> None:
+        address.append(url)
+        ready.set()
+
+    async def run() -> None:
+        stop = asyncio.Event()
+        of_loop.extend((asyncio.get_running_loop(), stop))
+        await ExploreServer(views, access or Access("127.0.0.1"), port).run(stop, tell)
+
+    def thread() -> None:
+        try:
+            asyncio.run(run())
+        except BaseException as error:
+            failed.append(error)
+            ready.set()
+
+    running = threading.Thread(target=thread)
+    running.start()
+    assert ready.wait(120)
+    if failed:
+        running.join()
+        raise failed[0]
+    try:
+        yield address[0]
+    finally:
+        of_loop[0].call_soon_threadsafe(of_loop[1].set)
+        running.join(120)
+        assert not running.is_alive()
+
+
+@contextmanager
+def chromium() -> Iterator[Any]:
+    """Yield a real browser, headless; skip aloud where there is none."""
+    import pytest
+
+    path, api = browser(), pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    with api.sync_playwright() as playwright:
+        started = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        try:
+            yield started
+        finally:
+            started.close()
+
+
+NewPage = Callable[..., Any]
+
+
+def watched(context: Any) -> tuple[Any, list[str]]:
+    """Return a page of a browser's context, and what it complains of or asks others for, which grows."""
+    page, wrong = context.new_page(), []
+    page.on("pageerror", lambda error: wrong.append(f"error: {error}"))
+    page.on("console", lambda message: wrong.append(message.text) if message.type == "error" else None)
+    page.on("request", lambda one: None if _is_own(one.url) else wrong.append(f"request: {one.url}"))
+    page.on("dialog", lambda dialog: (wrong.append(f"dialog: {dialog.message}"), dialog.dismiss()))
+    page.set_default_timeout(60_000)  # on a busy machine
+    return page, wrong
+
+
+def _is_own(url: str) -> bool:
+    return url.startswith(("http://127.0.0.1:", "ws://127.0.0.1:", "data:", "blob:", "file:"))
