@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from vjepa2_ac.evaluation.answer import Answer
+    from vjepa2_ac.explore.watch import WatchPage
     from vjepa2_ac.serving.about import KeptGoals
     from vjepa2_ac.serving.server import Served
     from vjepa2_ac.simulation.closed_loop.agent import Agent
@@ -41,6 +42,10 @@ def add_serve(commands: cli.Commands) -> None:
     cli.add(parser, "--port N", "0: a free one (8000)", cli.whole_number(0, 65535), default=8000)
     cli.add(parser, "--key-file FILE", "with the key that clients send; needed where others can reach it", cli.as_path)
     cli.add(parser, "--dry-run", "plan, and answer zeros: the robot stays where it is", action="store_true")
+    cli.add(
+        parser, "--watch", "a page at /watch/ shows what the planner sees and wants, with a STOP", action="store_true"
+    )
+    cli.add_decoder(parser, "on that page what the planner imagined")
     group = parser.add_argument_group("messages")
     cli.add(group, "--image-key KEY", "the key of the camera's picture in requests (the usual ones)")
     text = "what is told on connect; roboarena: its six keys only (full)"
@@ -97,6 +102,8 @@ def _serve(options: argparse.Namespace) -> int:
     if options.metadata == "roboarena" and options.actions != "pose":
         found, needed = f"--actions {options.actions}", "--actions pose: RoboArena knows no changes of a pose"
         raise InputError(where="--metadata roboarena", found=found, needed=needed)
+    if options.decoder is not None and not options.watch:
+        raise InputError(where="--decoder", found="no --watch", needed="the page that shows it")
     key = None if options.key_file is None else read_key(options.key_file)
     access = Access(options.host, key, options.insecure, tuple(options.allow_host))
     extrinsics, tls = cli.camera_pose(options.extrinsics), _tls(options)
@@ -109,7 +116,13 @@ def _serve(options: argparse.Namespace) -> int:
     if options.record is not None:
         cli.require_new_place(options.record)
     goals = None if options.goals is None else read_kept_goals(options.goals)
-    ended = serve(lambda: _loaded(options, goals, extrinsics), ServerOptions(access, options.port, tls), cli.show)
+    watch = None
+    if options.watch:
+        from vjepa2_ac.explore.watch import WatchPage
+
+        watch = WatchPage(options.subject, cli.given_decoder(options), cli.show)
+    how = ServerOptions(access, options.port, tls, watch=watch)
+    ended = serve(lambda: _loaded(options, goals, extrinsics, watch), how, cli.show)
     if not ended:  # a search or a loading that takes longer than anybody waits: nothing of it is to be kept
         sys.stdout.flush()
         sys.stderr.flush()
@@ -141,7 +154,9 @@ def _tls(options: argparse.Namespace) -> ssl.SSLContext | None:
     return context
 
 
-def _loaded(options: argparse.Namespace, goals: KeptGoals | None, extrinsics: np.ndarray | None) -> Served:
+def _loaded(
+    options: argparse.Namespace, goals: KeptGoals | None, extrinsics: np.ndarray | None, watch: WatchPage | None
+) -> Served:
     """Load the model, and make a first decision; runs in the planning thread."""
     from vjepa2_ac.data.windows import require_stride
     from vjepa2_ac.serving.about import in_words, metadata_of, roboarena_metadata, warm_up
@@ -151,6 +166,9 @@ def _loaded(options: argparse.Namespace, goals: KeptGoals | None, extrinsics: np
     from vjepa2_ac.serving.session import Session, SessionOptions
 
     loaded = cli.load_planning_session(options)
+    if watch is not None and watch.decoder is not None:
+        watch.decoder.require_fit(loaded.world_model, loaded.config.data.crop, subject=options.subject)
+        watch.decoder.to(loaded.world_model.device)
     steps = require_stride(loaded.config.data, to="say how long an action lasts", fix="Say which, as data.stride=4")
     how = SessionOptions(
         options.actions,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
@@ -13,6 +14,7 @@ from pydantic import Field
 
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import encode_jpeg
+from vjepa2_ac.spaces import Space
 from vjepa2_ac.storage.structured import plain, record_of
 
 MOST_BYTES = 1 << 16  # of a request
@@ -82,3 +84,10 @@ def packed(kind: str, seq: int | None, values: dict[str, Any], images: Sequence[
     about = [{"name": one.name, "bytes": len(data), "alt": one.alt} for one, data in zip(images, jpegs, strict=True)]
     text = json.dumps(plain({"kind": kind, "seq": seq, "images": about, **values}), allow_nan=False).encode()
     return b"".join([len(text).to_bytes(4, "big"), text, *jpegs])
+
+
+def shown_units(space: Space) -> list[dict[str, Any]]:
+    """Return, for each number of a state or an action: its name and unit, and the unit and factor for people."""
+    shown = {"m": ("cm", 100.0), "rad": ("°", 180 / math.pi)}
+    units = [(name, unit, *shown.get(unit, (unit, 1.0))) for name, unit in zip(space.names, space.units, strict=True)]
+    return [dict(zip(("name", "unit", "shown_unit", "factor"), one, strict=True)) for one in units]

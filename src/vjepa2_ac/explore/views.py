@@ -16,7 +16,7 @@ from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.episode import Progress, short_names
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.explore.explorer import Explorer, Pixels, Place, goal_moment, relative_spread, token_errors
-from vjepa2_ac.explore.messages import MOST_STEPS, Image, PageRequest, packed
+from vjepa2_ac.explore.messages import MOST_STEPS, Image, PageRequest, packed, shown_units
 from vjepa2_ac.explore.search import Cancelled, Search
 from vjepa2_ac.explore.truth import TrueFrame, Truth
 from vjepa2_ac.media.film import spread_with_ends
@@ -89,7 +89,7 @@ class Views:
             "device": explorer.device.type,
             "step_seconds": self.step_seconds,
             "action": self._numbers,
-            "state": [self._unit(number) for number in range(len(space))],
+            "state": shown_units(space),
             "is_pose": space.is_base_pose,
             "moves": self._moves,
             "place": {"episode": episode, "start": 0},
@@ -98,11 +98,6 @@ class Views:
         return packed("hello", None, told)
 
     # ---- what can be done ----
-
-    def _unit(self, number: int) -> dict[str, Any]:
-        space, unit = self.explorer.spaces.state, self.explorer.spaces.state.units[number]
-        shown = {"m": ("cm", 100.0), "rad": ("°", 180 / np.pi)}.get(unit, (unit, 1.0))
-        return {"name": space.names[number], "unit": unit, "shown_unit": shown[0], "factor": shown[1]}
 
     @cached_property
     def _numbers(self) -> list[dict[str, Any]]:
@@ -116,8 +111,8 @@ class Views:
             if alike is not None:
                 steps[alike] = [max(steps[alike])] * len(steps[alike])
         return [
-            {**self._unit(number), "name": space.change_names[number], "step": step, "most": 2 * step}
-            for number, step in enumerate(steps)
+            {**unit, "name": name, "step": step, "most": 2 * step}
+            for unit, name, step in zip(shown_units(space), space.change_names, steps, strict=True)
         ]
 
     @property

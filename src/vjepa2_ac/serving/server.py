@@ -12,10 +12,11 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 from vjepa2_ac.errors import InputError, require_library
 from vjepa2_ac.serving.access import Access
+from vjepa2_ac.serving.pages import Page
 from vjepa2_ac.serving.session import Counts, GoneError
 from vjepa2_ac.serving.wire import MOST_BYTES, pack
 
@@ -27,6 +28,18 @@ _OPEN_S = 10.0  # that a handshake may take
 _WAITING = 2  # messages of a client that are read before they are answered
 
 
+class Watcher(Protocol):
+    """A page that shows what is served, beside the robot's own path."""
+
+    page: Page
+
+    def begin(self, session: Session, robot: Callable[[], str | None]) -> None:
+        """Watch a session, once it is loaded, and know the address of the robot that is served, if one is."""
+
+    async def show(self, connection: Any) -> None:
+        """Show it to a page, until that is closed."""
+
+
 @dataclass(frozen=True)
 class ServerOptions:
     """Where and for whom a server listens."""
@@ -35,6 +48,7 @@ class ServerOptions:
     port: int = 8000  # 0: a free one
     certificate: ssl.SSLContext | None = None  # None: no TLS
     ping_s: float = 20.0  # between pings; a client that does not answer one for as long is gone
+    watch: Watcher | None = None  # the page that shows what is done
 
 
 @dataclass(frozen=True)
@@ -84,7 +98,6 @@ class PlanningServer:
                 options.access.host,
                 options.port,
                 process_request=self._asked,
-                origins=[None],  # a page in a browser sends one
                 compression=None,
                 max_size=MOST_BYTES,
                 max_queue=_WAITING,
@@ -116,13 +129,17 @@ class PlanningServer:
         if stop.is_set():
             return
         self._served = loading.result()
+        if self._options.watch is not None:
+            self._options.watch.begin(self._served.session, lambda: self._robot)
         self._ready.set()
         self._tell("ready")
         await stopping
 
     def _asked(self, connection: Any, request: Any) -> Any:
         """Answer what comes over HTTP, and refuse who may not come in; None: a robot may begin."""
-        path, status = request.path.partition("?")[0], http.HTTPStatus
+        path, status, watch = request.path.partition("?")[0], http.HTTPStatus, self._options.watch
+        if watch is not None and watch.page.has(path):
+            return watch.page.answer(connection, request, self._options.access)
         host, authorization = (_only(request.headers.get_all(name)) for name in ("Host", "Authorization"))
         if path == "/healthz":
             return connection.respond(status.OK, "OK\n")
@@ -136,15 +153,21 @@ class PlanningServer:
             return connection.respond(status.OK, self._page())
         if refused is None and path != "/":
             return connection.respond(status.NOT_FOUND, "no such page\n")
-        if refused is None and self._robot is not None and request.headers.get_all("Upgrade"):
-            refused = status.SERVICE_UNAVAILABLE.value, _busy(self._robot)
+        if refused is None and request.headers.get_all("Upgrade"):
+            if request.headers.get_all("Origin"):
+                refused = status.FORBIDDEN.value, "a page in a browser moves no robot"
+            elif self._robot is not None:
+                refused = status.SERVICE_UNAVAILABLE.value, _busy(self._robot)
         if refused is None:
             return None
         self._turned_away[str(refused[0])] += 1
         return connection.respond(status(refused[0]), f"{refused[1]}\n")
 
     async def _robot_came(self, connection: Any) -> None:
-        """Serve a robot until it leaves; one that comes before the model is loaded waits."""
+        """Serve a robot until it leaves, or a page that watches; one that comes before the model is loaded waits."""
+        if self._options.watch is not None and self._options.watch.page.has(connection.request.path):
+            await self._options.watch.show(connection)
+            return
         if self._robot is not None:  # both came at once
             await connection.close(1013, _busy(self._robot)[:100])
             return
@@ -189,6 +212,12 @@ class PlanningServer:
         except GoneError:
             return None
 
+    def release(self) -> None:
+        """Let actions move the robot again, after a page has stopped it."""
+        if self._served is not None and self._served.session.stopped.is_set():
+            self._served.session.stopped.clear()
+            self._tell("released: actions move the robot again")
+
     @property
     def _counts(self) -> Counts:
         return Counts() if self._served is None else self._served.session.counts
@@ -205,9 +234,11 @@ class PlanningServer:
         """Yield the metrics that are read when the page is made: Prometheus' collector."""
         families, counts = self._metrics.metrics_core, self._counts
         robots, gauge, counter = int(self._robot is not None), families.GaugeMetricFamily, families.CounterMetricFamily
+        stopped = int(self._served is not None and self._served.session.stopped.is_set())
         for family, name, about, label, values in (
             (gauge, "ready", "1 once requests are answered.", "", {"": int(self._ready.is_set())}),
             (gauge, "robots", "Robots that are connected.", "", {"": robots}),
+            (gauge, "stopped", "1 while a page has stopped the robot.", "", {"": stopped}),
             (counter, "requests_refused", "Requests that could not be used.", "", {"": counts.refused}),
             (counter, "requests_failed", "Requests at which the server failed.", "", {"": counts.failed}),
             (counter, "episodes", "Episodes that were begun.", "", {"": counts.episodes}),
@@ -221,7 +252,7 @@ class PlanningServer:
 
 
 def serve(load: Callable[[], Served], options: ServerOptions, tell: Callable[[str], None]) -> bool:
-    """Serve until SIGTERM or SIGINT; return whether the planning thread has ended, too.
+    """Serve until SIGTERM or SIGINT; return whether the planning thread has ended, too. SIGUSR1 releases a stop.
 
     Raises:
         InputError: As `PlanningServer.run`.
@@ -233,7 +264,10 @@ def serve(load: Callable[[], Served], options: ServerOptions, tell: Callable[[st
         numbers = (signal.SIGTERM, signal.SIGINT) if threading.current_thread() is threading.main_thread() else ()
         for number in numbers:
             loop.add_signal_handler(number, stop.set)
-        return await PlanningServer(load, options, tell).run(stop)
+        server = PlanningServer(load, options, tell)
+        if numbers:
+            loop.add_signal_handler(signal.SIGUSR1, server.release)
+        return await server.run(stop)
 
     return asyncio.run(until_signalled())
 

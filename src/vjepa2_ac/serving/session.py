@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import logging
 import math
+import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from jaxtyping import Float
@@ -37,6 +38,7 @@ ActionForm = Literal["delta", "pose"]
 Clock = Callable[[], float]  # seconds, from anywhere
 
 _MOST_NAMES = 20  # of goals in a message
+STOPPED = "stopped by the page"
 _BAR = 0.05  # share of an image's height, black at the top and at the bottom: a padded image
 
 
@@ -60,6 +62,16 @@ class Counts:
     failed: int = 0
     episodes: int = 0
     seconds: list[float] = field(default_factory=list)  # of each decision since it was last read
+
+
+class Observer(Protocol):
+    """Sees what a session does, as it does it: in the planning thread, so that it has to be quick."""
+
+    def goal(self, goals: Sequence[SubGoal], mask: np.ndarray | None) -> None:
+        """Take note of a goal, with which an episode begins."""
+
+    def decision(self, controller: Controller, frame: np.ndarray, state: np.ndarray, answer: Mapping[str, Any]) -> None:
+        """Take note of a decision, what it saw, and what is sent."""
 
 
 class GoneError(Exception):
@@ -92,6 +104,8 @@ class Session:
         self.goals = goals or {}
         self.counts = Counts()
         self.recorder: Recorder | None = None  # writes every decision down
+        self.watcher: Observer | None = None  # shows them, those that a stop or a deadline ended, too
+        self.stopped = threading.Event()  # while it is set, every answer is an action of zeros
         self._clock = clock
         self._episode: str | None = None
         self._goal: str | None = None  # fingerprint of the present one
@@ -151,15 +165,18 @@ class Session:
         self, frame: np.ndarray, state: np.ndarray, began: float, is_gone: Callable[[], bool]
     ) -> dict[str, Any]:
         planning_began, until = self._clock(), began + self.options.deadline_s
+        is_stopped = self.stopped.is_set
         try:
-            self.controller.act(frame, state, cancelled=lambda: is_gone() or self._clock() > until)
+            self.controller.act(frame, state, cancelled=lambda: is_gone() or is_stopped() or self._clock() > until)
         except SearchCancelledError:
             if is_gone():
                 raise GoneError from None
-            decision, why = None, "past the deadline"
+            decision, why = None, STOPPED if is_stopped() else "past the deadline"
         else:
             decision, why = self._checked(state)
             self._note(frame)
+            if is_stopped():
+                decision, why = replace(decision, plan=None, states=None), STOPPED
         found = self._message(decision, state, why)
         now = self._clock()
         found["policy_timing"] = {"infer_ms": 1e3 * (now - planning_began)}
@@ -168,8 +185,10 @@ class Session:
             found["server_timing"]["prev_total_ms"] = self._last_ms
         self.counts.decisions[why] += 1
         self.counts.seconds.append(now - began)
-        if self.recorder is not None and why != "past the deadline":
+        if self.recorder is not None and why not in {"past the deadline", STOPPED}:
             self.recorder.decision(self.controller, frame, state, found)
+        if self.watcher is not None:
+            self.watcher.decision(self.controller, frame, state, found)
         return found
 
     def _checked(self, state: np.ndarray) -> tuple[Decision, str]:
@@ -227,8 +246,9 @@ class Session:
         goals = goal.goals if goal.name is None else self.goals[goal.name]
         self.controller.follow(goals, mask=goal.mask)
         self._names = tuple(one.name for one in goals)
-        if self.recorder is not None:
-            self.recorder.goal(goals, goal.mask)
+        for observer in (self.recorder, self.watcher):
+            if observer is not None:
+                observer.goal(goals, goal.mask)
 
     def _known_names(self) -> str:
         names = list(self.goals)
