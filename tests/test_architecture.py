@@ -70,7 +70,7 @@ ORDERS: dict[str, list[str]] = {
         "explorer",
         "search truth",
         "views",
-        "server postcard watch",
+        "server watch",
     ],
     "decoding": [
         "network",

@@ -126,7 +126,7 @@ def words_of(path: Path) -> int:
 def test_the_pages_are_short_together() -> None:
     """Without the log, which tells of how things were."""
     pages = [ROOT / "README.md", *(path for path in (ROOT / "docs").glob("*.md") if path.name != "log.md")]
-    assert sum(map(words_of, pages)) <= 25_000
+    assert sum(map(words_of, pages)) <= 25_500
     assert len((ROOT / "README.md").read_text().split()) <= 1_200
 
 

@@ -349,10 +349,10 @@ function sentence(header, text, verdicts) {
 function hint(verdicts) {
   const verdict = verdicts[verdicts.length - 1];
   if (verdict) seen.add(verdict);
-  const [does, doesNot] = [seen.has("understood"), seen.has("not understood")];
+  const [does, fails] = [seen.has("understood"), seen.has("not understood")];
   const first = hello.is_pose ? "Press W, A, S, D …" : "Press + or − of a number:";
   let text = `${first} what does the model think happens?`;
-  if (does && doesNot) text = "You have seen an action that it understands, and one that it does not. Where is the border?";
+  if (does && fails) text = "You have seen an action that it understands, and one that it does not. Where is the border?";
   else if (does) text = "It understands that. Now find what it does not: the gripper (C), a turn (Q), a longer step, many steps.";
   else if (seen.size) text = "Now find an action that it understands: other directions, longer steps, or the recorded one (N).";
   part("hint").textContent = text;
