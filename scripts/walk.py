@@ -41,6 +41,7 @@ PAGES = {
     "docs/troubleshooting.md": "[data]",
 }
 NO_GUIDES = {
+    "docs/explore.md": "its commands serve until they are ended: tests/explore starts them",
     "CONTRIBUTING.md": "of developers: the extra dev",
     "docs/releasing.md": "of developers: the extra dev",
     "docs/IMPLEMENTATION_NOTES.md": "measurements on a GPU",

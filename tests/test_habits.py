@@ -72,7 +72,7 @@ def test_nothing_is_vendored() -> None:
     assert not [path for path in (ROOT / "src").rglob("*") if re.search(r"vendor|third.party|extern$", path.name)]
     kinds = {path.suffix for path in (ROOT / "src").rglob("*") if path.is_file() and "__pycache__" not in path.parts}
     kinds -= {part.suffix for folder in (ROOT / "src").glob("*.egg-info") for part in folder.iterdir()}
-    assert kinds <= {".py", ".typed", "", ".jinja", ".css", ".json", ".yaml", ".safetensors", ".xml"}
+    assert kinds <= {".py", ".typed", "", ".jinja", ".html", ".js", ".css", ".json", ".yaml", ".safetensors", ".xml"}
 
 
 # Pages, forms, workflows, hooks.

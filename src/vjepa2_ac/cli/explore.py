@@ -31,11 +31,11 @@ def add_explore(commands: cli.Commands) -> None:
     """Add `explore` to a parser."""
     parser = cli.command(commands, "explore", _explore, "demo/run --against base")
     text = f"a run, or what model.base takes ({_DEMO_RUN} if it is there, else {_BUILTIN_MODEL})"
-    cli.add(parser, "subject RUN_OR_MODEL", text, cli.as_model, nargs="?")
+    cli.add(parser, "subject RUN_OR_MODEL", text, cli.as_subject, nargs="?")
     cli.add(
         parser, "overrides key=value", "of planning, such as planning.samples=200 (on a CPU a quick one)", nargs="*"
     )
-    cli.add(parser, "--against base|RUN|MODEL", "what imagines beside it (the base of a run)", cli.as_model, nargs="+")
+    cli.add(parser, "--against base|RUN|MODEL", "what imagines beside it; repeatable (the base of a run)", cli.as_model, action="append")
     text = "what shows images: `vjepa2-ac decoder` made it (beside the run, else builtin:sim-tiny)"
     cli.add(parser, "--decoder FOLDER", text, cli.as_model)
     cli.add(parser, "--data CONFIG", "explore its data; needed for a model but the package's own", cli.as_local)
@@ -59,6 +59,8 @@ def _explore(options: argparse.Namespace) -> int:
     from vjepa2_ac.runs.folder import is_run
     from vjepa2_ac.serving.access import Access, read_key
 
+    if options.subject is not None and cli.is_override(options.subject):
+        options.subject, options.overrides = None, [options.subject, *options.overrides]
     subject = options.subject or (_DEMO_RUN if is_run(_DEMO_RUN) else _BUILTIN_MODEL)
     key = None if options.key_file is None else read_key(options.key_file)
     access = Access(options.host, key, options.insecure, tuple(options.allow_host))

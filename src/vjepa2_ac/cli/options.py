@@ -335,8 +335,8 @@ def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> 
     if others and vars(options).get("subject") != "record":  # `simulate record` takes a folder there
         parser.error(f"{' '.join(others)!r} is no key=value (numbers go in one word: 0.4,0,0.3; names side by side)")
     if "subjects" in options:
-        rest = [*filter(_is_override, options.subjects), *rest]
-        options.subjects = [word for word in options.subjects if not _is_override(word)]
+        rest = [*filter(is_override, options.subjects), *rest]
+        options.subjects = [word for word in options.subjects if not is_override(word)]
         if not options.subjects:
             parser.error("the following arguments are required: RUN_OR_MODEL")
     if rest:
@@ -346,10 +346,11 @@ def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> 
 
 def as_subject(text: str) -> str:
     """Parse the name of a run or a model, and leave a `key=value` among several of them unchanged, for `parsed`."""
-    return text if _is_override(text) else as_model(text)
+    return text if is_override(text) else as_model(text)
 
 
-def _is_override(word: str) -> bool:
+def is_override(word: str) -> bool:
+    """Return whether a word is a `key=value`, and no path."""
     return _OVERRIDE.match(word) is not None and not Path(word).exists()
 
 
