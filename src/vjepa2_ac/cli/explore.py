@@ -35,7 +35,8 @@ def add_explore(commands: cli.Commands) -> None:
     cli.add(
         parser, "overrides key=value", "of planning, such as planning.samples=200 (on a CPU a quick one)", nargs="*"
     )
-    cli.add(parser, "--against base|RUN|MODEL", "what imagines beside it; repeatable (the base of a run)", cli.as_model, action="append")
+    text = "what imagines beside it; repeatable (the base of a run)"
+    cli.add(parser, "--against base|RUN|MODEL", text, cli.as_model, action="append")
     text = "what shows images: `vjepa2-ac decoder` made it (beside the run, else builtin:sim-tiny)"
     cli.add(parser, "--decoder FOLDER", text, cli.as_model)
     cli.add(parser, "--data CONFIG", "explore its data; needed for a model but the package's own", cli.as_local)

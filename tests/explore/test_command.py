@@ -1,0 +1,50 @@
+"""The command itself: it simulates what a model of the package lacks, says where the page is, and ends when asked."""
+
+import json
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+from websockets.sync.client import connect
+
+from ranks import Rank
+from vjepa2_ac.cli import main
+
+
+def test_without_arguments_the_model_of_the_package_is_explored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    process = Rank(["-m", "vjepa2_ac.cli", "explore", "--no-open", "--port", "0"], dict(os.environ))
+    until = time.monotonic() + 120
+    while "The page: " not in (said := process.written()[0]):
+        assert process.poll() is None, process.written()
+        assert time.monotonic() < until
+        time.sleep(0.05)
+    url = said.partition("The page: ")[2].split()[0]
+    with connect(url.replace("http", "ws") + "socket", origin=url.rstrip("/"), max_size=None) as page:  # type: ignore[arg-type]
+        message = page.recv(timeout=60)
+        told = json.loads(message[4 : 4 + int.from_bytes(message[:4], "big")])
+    assert (told["subject"], told["truth"]) == ("builtin:sim-tiny", "simulated")
+    process.send_signal(signal.SIGTERM)
+    _, errors = process.communicate()
+    assert process.returncode == 0, errors
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["nowhere/run"], "nowhere/run"),
+        (["--host", "0.0.0.0"], "--key-file"),  # noqa: S104 - it is refused
+        (["builtin:sim-tiny", "--decoder", "nowhere"], "nowhere"),
+    ],
+)
+def test_what_cannot_be_explored_is_said_at_once(
+    words: list[str], says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["explore", "--no-open", *words]) == 2
+    assert says in capsys.readouterr().err
