@@ -70,7 +70,7 @@ ORDERS: dict[str, list[str]] = {
         "explorer",
         "search truth",
         "views",
-        "server watch",
+        "server postcard watch",
     ],
     "decoding": [
         "network",

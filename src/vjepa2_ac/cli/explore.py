@@ -40,6 +40,8 @@ def add_explore(commands: cli.Commands) -> None:
     text = "what shows images: `vjepa2-ac decoder` made it (beside the run, else builtin:sim-tiny)"
     cli.add(parser, "--decoder FOLDER", text, cli.as_model)
     cli.add(parser, "--data CONFIG", "explore its data; needed for a model but the package's own", cli.as_local)
+    text = "write a page that plays without us into a new folder: six moves, four deep; nothing is served"
+    cli.add(parser, "--export FOLDER", text, cli.as_path)
     cli.add(parser, "--split", "which episodes (test)", choices=["test", "validation", "train"], default="test")
     cli.add_checkpoint(parser)
     group = parser.add_argument_group("the page")
@@ -65,6 +67,8 @@ def _explore(options: argparse.Namespace) -> int:
     subject = options.subject or (_DEMO_RUN if is_run(_DEMO_RUN) else _BUILTIN_MODEL)
     key = None if options.key_file is None else read_key(options.key_file)
     access = Access(options.host, key, options.insecure, tuple(options.allow_host))
+    if options.export is not None:
+        cli.require_new_place(options.export)
     cli.require_subject(subject)
     cli.say_places_elsewhere(subject)
     with _data(subject, options) as data:
@@ -73,6 +77,11 @@ def _explore(options: argparse.Namespace) -> int:
         with cli.reporter() as reporter:
             explorer, config = _asked(subject, data, options).opened(reporter)
             views = Views.of(subject, explorer, config)
+            if options.export is not None:
+                from vjepa2_ac.explore.postcard import write_postcard
+
+                cli.show(files=[write_postcard(views, options.export, reporter.task("imagining", "futures"))])
+                return 0
             about = f"{subject}, {len(explorer.episodes)} episodes; a step takes {views.step_seconds:.2f} s here"
         _serve(views, access, options, about)
     return 0

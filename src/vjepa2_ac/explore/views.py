@@ -88,10 +88,10 @@ class Views:
             "most_steps": MOST_STEPS,
             "device": explorer.device.type,
             "step_seconds": self.step_seconds,
-            "action": self._numbers,
+            "action": self.numbers,
             "state": shown_units(space),
             "is_pose": space.is_base_pose,
-            "moves": self._moves,
+            "moves": self.moves,
             "place": {"episode": episode, "start": 0},
             "goal": {"episode": episode, "step": goal},
         }
@@ -100,7 +100,7 @@ class Views:
     # ---- what can be done ----
 
     @cached_property
-    def _numbers(self) -> list[dict[str, Any]]:
+    def numbers(self) -> list[dict[str, Any]]:
         """The numbers of an action, with the largest one that can be chosen, and a usual step."""
         space, usual = self.explorer.spaces.state, self._usual_changes
         steps = []
@@ -116,7 +116,8 @@ class Views:
         ]
 
     @property
-    def _moves(self) -> list[dict[str, Any]]:
+    def moves(self) -> list[dict[str, Any]]:
+        """The moves of a person, by name."""
         space = self.explorer.spaces.state
         if space.is_base_pose:
             return [{"id": name, "label": name, "axis": axis, "sign": sign} for name, axis, sign in _MOVES]
@@ -132,6 +133,22 @@ class Views:
         explorer = self.explorer
         states = explorer.dataset.source.read(explorer.episodes[episode]).states[:: explorer.stride]
         return explorer.spaces.state.differences(np.asarray(states, dtype=np.float64))
+
+    def action(self, move: dict[str, Any]) -> tuple[float, ...]:
+        """Return the action of a move, of a usual size."""
+        numbers = enumerate(self.numbers)
+        return tuple(move["sign"] * one["step"] if axis == move["axis"] else 0.0 for axis, one in numbers)
+
+    def middle(self) -> Place:
+        """Return the start whose state is nearest to the mean of all: from there is room in every direction."""
+        explorer, space = self.explorer, self.explorer.spaces.state
+        found = []
+        for episode in range(len(self._recorded_changes)):
+            states = explorer.dataset.source.read(explorer.episodes[episode]).states[: -explorer.stride, space.sized]
+            found += [(episode, step, np.asarray(state, np.float64)) for step, state in enumerate(states)]
+        mean = np.mean([state for *_, state in found], axis=0)
+        episode, start, _ = min(found, key=lambda one: float(np.linalg.norm(one[2] - mean)))
+        return Place(episode, start)
 
     @cached_property
     def _recorded_changes(self) -> list[Float[np.ndarray, "steps dim"]]:
