@@ -190,7 +190,7 @@ def test_a_person_sees_a_decision_and_stops_it_in_a_browser(running: Running) ->
     with chromium() as started_one, PlanningClient(running.url) as robot:
         seen, wrong = watched(started_one.new_context(viewport={"width": 390, "height": 844}))
         seen.goto(f"{running.http}/watch/")
-        seen.wait_for_function("!document.querySelector('[data-role=stop]').disabled")
+        seen.wait_for_function("() => !document.querySelector('[data-role=stop]').disabled")
         robot.infer(request(0, goal_image=GOAL))
         seen.locator('[data-role="imagined"]').wait_for(state="visible")
         assert "Decision 1, planned" in seen.locator('[data-role="sentence"]').inner_text()

@@ -18,7 +18,7 @@ from vjepa2_ac.storage.structured import plain
 
 MOVES, DEPTH = 6, 4
 FILE = "index.html"
-_QUALITY = 45  # of images of 96 pixels: 1,555 pairs are 4 MB
+_QUALITY = 40  # of images of 96 pixels: 1,555 pairs are 4 MB
 _DATA, _SCRIPT = "/*DATA*/", "/*SCRIPT*/"
 
 
@@ -62,7 +62,7 @@ def _tree(views: Views, progress: Progress, depth: int) -> dict[str, Any]:
     progress(len(paths), len(paths))
     found: dict[str, Any] = plain({
         "subject": views.subject,
-        "episode": views.explorer.name(first.episode),
+        "episode": views.episode_names[first.episode],
         "is_pose": views.explorer.spaces.state.is_base_pose,
         "seconds": views.explorer.stride / views.explorer.dataset.control_rate_hz,
         "moves": [{"label": move["label"], "size": _size(views, move)} for move in moves],

@@ -74,14 +74,14 @@ class Views:
     def hello(self) -> bytes:
         """Return what a page is told first."""
         explorer, space = self.explorer, self.explorer.spaces.state
-        names = [explorer.name(one) for one in range(min(len(explorer.episodes), _MOST_EPISODES))]
-        short, (episode, goal) = short_names(names), self._proposed
+        episode, goal = self._proposed
         told = {
             "subject": self.subject,
             "tellers": [{"id": one.name, "label": one.name} for one in explorer.contenders],
             "truth": "simulated" if self.truth.is_simulated else "recorded",
             "episodes": [
-                {"name": short[name], "full": name, "steps": explorer.steps(index)} for index, name in enumerate(names)
+                {"name": name, "full": explorer.name(index), "steps": explorer.steps(index)}
+                for index, name in enumerate(self.episode_names[:_MOST_EPISODES])
             ],
             "stride": explorer.stride,
             "seconds_per_step": explorer.stride / explorer.dataset.control_rate_hz,
@@ -96,6 +96,13 @@ class Views:
             "goal": {"episode": episode, "step": goal},
         }
         return packed("hello", None, told)
+
+    @cached_property
+    def episode_names(self) -> list[str]:
+        """The names of the episodes, as short as they differ."""
+        names = [self.explorer.name(one) for one in range(len(self.explorer.episodes))]
+        short = short_names(names)
+        return [short[name] for name in names]
 
     # ---- what can be done ----
 
