@@ -21,7 +21,6 @@ from PIL import Image
 from playwright.sync_api import Page, sync_playwright
 
 KEYS = "adwsrfqeoc"
-ROUNDS = 6
 FILM_KEYS = ("a", "a", "w", "c", "q", "0", "p")
 FRAME_MS = 700
 SIZE = {"width": 1400, "height": 860}
@@ -38,19 +37,26 @@ PRESSED = """key => new Promise(resolve => {
 })"""
 
 
-def main() -> None:
+def main(arguments: list[str] | None = None) -> None:
+    """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--film", type=Path, help="write a GIF of the page, too")
-    options, words = parser.parse_known_args()
+    parser.add_argument("--rounds", type=int, default=6, help="of ten keys each (6)")
+    options, words = parser.parse_known_args(arguments)
     command = [sys.executable, "-u", "-m", "vjepa2_ac.cli", "explore", *words, "--no-open", "--port", "0"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server, sync_playwright() as playwright:
+    with (
+        subprocess.Popen(  # noqa: S603 - our own command
+            command, stdout=subprocess.PIPE, text=True
+        ) as server,
+        sync_playwright() as playwright,
+    ):
         try:
             assert server.stdout is not None
             url = next(line.split()[2] for line in server.stdout if line.startswith("The page: "))
             path = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))))
             browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
             page = browser.new_page(viewport=SIZE)  # type: ignore[arg-type]
-            measure(page, url)
+            measure(page, url, options.rounds)
             if options.film:
                 film(page, options.film)
             browser.close()
@@ -58,13 +64,13 @@ def main() -> None:
             server.terminate()
 
 
-def measure(page: Page, url: str) -> None:
+def measure(page: Page, url: str, rounds: int) -> None:
     """Print how long the page takes to load, and each step of imagination."""
     page.goto(url)
     idle(page)
     loaded = page.evaluate("performance.now()")
     times: list[float] = []
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         for key in KEYS:
             times.append(page.evaluate(PRESSED, key))
             idle(page)
@@ -100,6 +106,7 @@ def film(page: Page, path: Path) -> None:
 
 
 def shot(page: Page) -> Any:
+    """Return what the page looks like, smaller."""
     picture = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
     return picture.resize((picture.width * 2 // 3, picture.height * 2 // 3), Image.Resampling.LANCZOS)
 

@@ -37,7 +37,7 @@ PACKAGE = ROOT / "src/vjepa2_ac"
 OURS = {path.name for root in (ROOT, PACKAGE, ROOT / "tests") for path in root.iterdir() if path.is_dir()}
 OURS -= {"src", "demo"}  # the second is made by commands
 
-GUIDES = ("data", "training", "evaluation", "decoding", "planning", "serving", "scaling", "encoders")
+GUIDES = ("data", "training", "evaluation", "decoding", "explore", "planning", "serving", "scaling", "encoders")
 FILES = ("json", "md", "npz", "png", "pt", "safetensors", "yaml")
 
 

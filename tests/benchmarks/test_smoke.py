@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from benches import imported
+from browser import browser
 from paths import ROOT
 from vjepa2_ac.cli import main as command_line
 from vjepa2_ac.config import EncoderSizes, ModelSizes, PredictorSizes
@@ -26,6 +27,7 @@ OTHERS = "\n".join(path.read_text() for path in Path(__file__).parent.glob("test
         ("load_memory", "{folder}/new --small", "bfloat16"),
         ("video", "--clips 1", "ours"),
         ("loader", "--clips 4", "index of 2,000 episodes"),
+        ("explore", "builtin:sim-tiny --rounds 1", "p95"),
     ],
 )
 def test_it_runs_to_its_end(
@@ -36,6 +38,8 @@ def test_it_runs_to_its_end(
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
+    if name == "explore":
+        browser()
     for module in imported(name, monkeypatch):
         if name in {"video", "loader"}:
             video = sys.modules["video"]
