@@ -134,6 +134,7 @@ class WatchPage:
             "action": [{**unit, "name": name} for unit, name in zip(units, space.change_names, strict=True)],
             "goals": sorted(session.goals),
             "dry_run": session.options.dry_run,
+            "decodes": self.decoder is not None,
             "release": f"kill -USR1 {os.getpid()}",
         }  # fmt: skip
         return packed("hello", None, told)

@@ -40,10 +40,12 @@ function setUp(header) {
 
 /** @param {any} header @param {import("./shared.js").Pictures} pictures */
 function draw(header, pictures) {
-  for (const name of ["camera", "goal", "imagined"]) swap(part(name), pictures.get(name));
-  part("no-image").hidden = pictures.has("imagined");
   const { goal, energy, why } = header;
-  part("goal-name").textContent = goal ? `goal ${goal.index + 1} of ${goal.count}${goal.name ? `: ${goal.name}` : ""}` : "goal";
+  for (const name of ["camera", "imagined"]) swap(part(name), pictures.get(name));
+  part("no-image").textContent = hello.decodes ? "There is no plan." : "serve --decoder shows it";
+  part("no-image").hidden = pictures.has("imagined");
+  if (goal) swap(part("goal"), pictures.get("goal"));
+  if (goal) part("goal-name").textContent = `goal ${goal.index + 1} of ${goal.count}${isNaN(goal.name) ? `: ${goal.name}` : ""}`;
   const words = header.action
     .map((/** @type {number} */ one, /** @type {number} */ axis) => ({ one, unit: hello.action[axis] }))
     .filter((/** @type {any} */ each) => each.one !== 0)
@@ -91,7 +93,7 @@ function drawEnergies() {
   const shapes = [shape("polyline", { class: "way", points: points.join(" ") })];
   past.forEach(({ energy, goal, episode }, at) => {
     const before = past[at - 1];
-    if (before && (before.goal?.index !== goal?.index || before.episode !== episode)) shapes.push(shape("path", { class: "height", d: `M${x(at - 0.5)} 0V${HEIGHT}` }));
+    if (before && (before.episode !== episode || (goal && before.goal && before.goal.index !== goal.index))) shapes.push(shape("path", { class: "height", d: `M${x(at - 0.5)} 0V${HEIGHT}` }));
     if (energy.plan !== null) shapes.push(shape("circle", { class: "now", cx: x(at), cy: y(energy.plan), r: 2 }));
   });
   part("energies").replaceChildren(...shapes);
@@ -100,9 +102,7 @@ function drawEnergies() {
 }
 
 async function stop() {
-  part("stop").textContent = "STOP …";
   await wire.ask("stop", {}); // the next status says that it holds
-  part("stop").textContent = "STOP";
 }
 
 part("stop").addEventListener("click", stop);
