@@ -54,12 +54,12 @@ def test_keys_and_thumbs_walk_the_tree_and_come_back(postcard: Path) -> None:
         page, wrong = watched(started.new_context(viewport={"width": 360, "height": 700}))
         page.goto(postcard.as_uri())
         said, image = page.locator("#said"), "document.getElementById('imagined').src"
-        page.wait_for_function(f"{image}.startsWith('data:')")
+        page.wait_for_function(f"() => {image}.startsWith('data:')")
         first = page.evaluate(image)
         page.keyboard.press("a")
-        page.wait_for_function("document.getElementById('said').textContent.startsWith('left')")
+        page.wait_for_function("() => document.getElementById('said').textContent.startsWith('left')")
         page.get_by_role("button", name="up").click()
-        page.wait_for_function("document.getElementById('said').textContent.startsWith('left, up')")
+        page.wait_for_function("() => document.getElementById('said').textContent.startsWith('left, up')")
         assert page.get_by_role("button", name="up").is_disabled()
         assert "copying the first frame" in page.locator("#verdict").inner_text()
         assert page.evaluate("document.documentElement.scrollWidth") <= 360
