@@ -167,9 +167,9 @@ def encode_png(pixels: UInt8[np.ndarray, "height width channels"]) -> bytes:
 
 
 def encode_webp(
-    frames: Sequence[UInt8[np.ndarray, "height width 3"]], seconds: Sequence[float], *, quality: int
+    frames: Sequence[UInt8[np.ndarray, "height width channels"]], seconds: Sequence[float], *, quality: int
 ) -> bytes:
-    """Return frames of one size as an endless WebP, each shown for so long; one frame: a still image."""
+    """Return frames (RGB or RGBA) of one size as an endless WebP, each shown for so long; one: a still image."""
     file = io.BytesIO()
     first, *others = (Image.fromarray(frame) for frame in frames)
     times = [int(1000 * one) for one in seconds]
