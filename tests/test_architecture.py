@@ -45,7 +45,7 @@ ORDERS: dict[str, list[str]] = {
     "data.sources": ["indexed_source", "rlds droid_raw lerobot npz latents"],
     "serving": [
         "wire access",
-        "request recording pages",
+        "request recording pages listening",
         "session",
         "about server",
     ],

@@ -53,8 +53,7 @@ def add_serve(commands: cli.Commands) -> None:
     text = "longest time for a decision; then the action is zero (60)"
     cli.add(group, "--deadline SECONDS", text, cli.number_between(0, 3600, "seconds"), default=60.0)
     group = parser.add_argument_group("access")
-    cli.add(group, "--insecure", "no key, although others can reach the address", action="store_true")
-    cli.add(group, "--allow-host NAME", "a name that a proxy serves it under; repeatable", action="append", default=[])
+    cli.add_access(group)
     cli.add(group, "--certificate FILE", "TLS: the certificate and those it is signed by, PEM", cli.as_path)
     cli.add(group, "--certificate-key FILE", "its private key, PEM (in the same file)", cli.as_path)
     group = parser.add_argument_group("record")
@@ -97,15 +96,12 @@ def _serve(options: argparse.Namespace) -> int:
     In the protocol of openpi's clients: pictures, states and goals in, actions within planning.limits out
     (docs/serving.md). Runs until SIGTERM or Ctrl-C.
     """
-    from vjepa2_ac.serving.access import Access, read_key
-
     if options.metadata == "roboarena" and options.actions != "pose":
         found, needed = f"--actions {options.actions}", "--actions pose: RoboArena knows no changes of a pose"
         raise InputError(where="--metadata roboarena", found=found, needed=needed)
     if options.decoder is not None and not options.watch:
         raise InputError(where="--decoder", found="no --watch", needed="the page that shows it")
-    key = None if options.key_file is None else read_key(options.key_file)
-    access = Access(options.host, key, options.insecure, tuple(options.allow_host))
+    access = cli.access_of(options)
     extrinsics, tls = cli.camera_pose(options.extrinsics), _tls(options)
     cli.require_goals(options.goals)
     cli.require_to_plan(options)

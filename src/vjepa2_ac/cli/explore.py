@@ -49,8 +49,7 @@ def add_explore(commands: cli.Commands) -> None:
     cli.add(group, "--port N", "0: a free one (8001)", cli.whole_number(0, 65535), default=8001)
     cli.add(group, "--host ADDRESS", "where it listens (127.0.0.1: this machine only)", default="127.0.0.1")
     cli.add(group, "--key-file FILE", "with the key that opens it; needed where others can reach it", cli.as_path)
-    cli.add(group, "--insecure", "no key, although others can reach the address", action="store_true")
-    cli.add(group, "--allow-host NAME", "a name that a proxy serves it under; repeatable", action="append", default=[])
+    cli.add_access(group)
 
 
 def _explore(options: argparse.Namespace) -> int:
@@ -60,13 +59,11 @@ def _explore(options: argparse.Namespace) -> int:
     let it plan (docs/explore.md). Runs until Ctrl-C.
     """
     from vjepa2_ac.runs.folder import is_run
-    from vjepa2_ac.serving.access import Access, read_key
 
     if options.subject is not None and cli.is_override(options.subject):
         options.subject, options.overrides = None, [options.subject, *options.overrides]
     subject = options.subject or (_DEMO_RUN if is_run(_DEMO_RUN) else _BUILTIN_MODEL)
-    key = None if options.key_file is None else read_key(options.key_file)
-    access = Access(options.host, key, options.insecure, tuple(options.allow_host))
+    access = cli.access_of(options)
     if options.export is not None:
         cli.require_new_place(options.export)
     cli.require_subject(subject)

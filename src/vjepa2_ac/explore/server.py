@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import signal
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -17,6 +16,7 @@ from vjepa2_ac.explore.messages import MOST_BYTES, PageRequest, packed, read_req
 from vjepa2_ac.explore.views import Views
 from vjepa2_ac.planning.planner import SearchCancelledError
 from vjepa2_ac.serving.access import Access
+from vjepa2_ac.serving.listening import listen, until_signalled, url_of
 from vjepa2_ac.serving.pages import Page
 
 logger = logging.getLogger(__name__)
@@ -57,17 +57,9 @@ class ExploreServer:
             InputError: The address cannot be listened on.
         """
         library = require_library("websockets.asyncio.server", where="explore", called="websockets", extra="explore")
-        access = self._access
-        try:
-            server = await library.serve(
-                self._came, access.host, self._port, process_request=self._asked,
-                compression=None, max_size=MOST_BYTES, server_header=None,
-            )  # fmt: skip
-        except OSError as error:
-            where, fix = f"{access.host}:{self._port}", "Choose another --port; 0 takes a free one"
-            raise InputError(where=where, found=f"cannot be listened on: {error.strerror}", fix=fix) from None
-        host, port = server.sockets[0].getsockname()[:2]
-        ready(f"http://{f'[{host}]' if ':' in host else host}:{port}/")
+        how = {"process_request": self._asked, "max_size": MOST_BYTES}
+        server = await listen(library, self._came, self._access, self._port, **how)
+        ready(f"{url_of(server, 'http')}/")
         try:
             await stop.wait()
         finally:
@@ -168,12 +160,5 @@ def serve_page(views: Views, access: Access, port: int, ready: Callable[[str], N
     Raises:
         InputError: As `ExploreServer.run`.
     """
-
-    async def until_signalled() -> None:
-        stop, loop = asyncio.Event(), asyncio.get_running_loop()
-        if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGTERM, signal.SIGINT):
-                loop.add_signal_handler(number, stop.set)
-        await ExploreServer(views, access, port).run(stop, ready)
-
-    asyncio.run(until_signalled())
+    server = ExploreServer(views, access, port)
+    until_signalled(lambda stop: server.run(stop, ready))

@@ -53,7 +53,7 @@ class Page:
             request: What came over it.
             access: The rules.
         """
-        parts, host = urlsplit(request.path), _only(request, "Host")
+        parts, host = urlsplit(request.path), single_header(request, "Host")
         key, status = parse_qs(parts.query).get("key"), http.HTTPStatus
         cookie = f"vjepa2-ac-{(host or '').rpartition(':')[2]}"  # browsers share cookies among the ports of a host
         refused = access.why_not(host, _authorization(request, cookie) if key is None else f"Bearer {key[0]}")
@@ -69,7 +69,7 @@ class Page:
                 response.headers["Set-Cookie"] = kept
             return response
         if name == SOCKET:
-            origin = urlsplit(_only(request, "Origin") or "").netloc
+            origin = urlsplit(single_header(request, "Origin") or "").netloc
             return None if origin == host else connection.respond(status.FORBIDDEN, "not this server's page\n")
         if name not in self.contents:
             return connection.respond(status.NOT_FOUND, "no such page\n")
@@ -87,7 +87,7 @@ def _file(connection: Any, name: str, content: bytes) -> Any:
     return response
 
 
-def _only(request: Any, name: str) -> str | None:
+def single_header(request: Any, name: str) -> str | None:
     """Return the value of a header that comes once."""
     values = request.headers.get_all(name)
     return values[0] if len(values) == 1 else None
@@ -100,4 +100,4 @@ def _authorization(request: Any, cookie: str) -> str | None:
         found.load("; ".join(request.headers.get_all("Cookie")))
     except http.cookies.CookieError:
         return None
-    return f"Bearer {unquote(found[cookie].value)}" if cookie in found else _only(request, "Authorization")
+    return f"Bearer {unquote(found[cookie].value)}" if cookie in found else single_header(request, "Authorization")

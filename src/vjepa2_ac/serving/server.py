@@ -14,9 +14,10 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
-from vjepa2_ac.errors import InputError, require_library
+from vjepa2_ac.errors import require_library
 from vjepa2_ac.serving.access import Access
-from vjepa2_ac.serving.pages import Page
+from vjepa2_ac.serving.listening import listen, until_signalled, url_of
+from vjepa2_ac.serving.pages import Page, single_header
 from vjepa2_ac.serving.session import Counts, GoneError
 from vjepa2_ac.serving.wire import MOST_BYTES, pack
 
@@ -92,27 +93,21 @@ class PlanningServer:
         """
         library = require_library("websockets.asyncio.server", where="serve", called="websockets", extra="serve")
         options = self._options
+        server = await listen(
+            library,
+            self._robot_came,
+            options.access,
+            options.port,
+            process_request=self._asked,
+            max_size=MOST_BYTES,
+            max_queue=_WAITING,
+            open_timeout=_OPEN_S,
+            ping_interval=options.ping_s,
+            ping_timeout=options.ping_s,
+            ssl=options.certificate,
+        )
         try:
-            server = await library.serve(
-                self._robot_came,
-                options.access.host,
-                options.port,
-                process_request=self._asked,
-                compression=None,
-                max_size=MOST_BYTES,
-                max_queue=_WAITING,
-                open_timeout=_OPEN_S,
-                ping_interval=options.ping_s,
-                ping_timeout=options.ping_s,
-                server_header=None,
-                ssl=options.certificate,
-            )
-        except OSError as error:
-            where = f"{options.access.host}:{options.port}"
-            fix = "Choose another --host or --port; 0 takes a free one"
-            raise InputError(where=where, found=f"cannot be listened on: {error.strerror or error}", fix=fix) from None
-        try:
-            self._tell(f"listening on {_url(options, server.sockets[0].getsockname())}")
+            self._tell(f"listening on {url_of(server, 'ws' if options.certificate is None else 'wss')}")
             await self._serve(stop)
         finally:
             server.close()
@@ -140,7 +135,7 @@ class PlanningServer:
         path, status, watch = request.path.partition("?")[0], http.HTTPStatus, self._options.watch
         if watch is not None and watch.page.has(path):
             return watch.page.answer(connection, request, self._options.access)
-        host, authorization = (_only(request.headers.get_all(name)) for name in ("Host", "Authorization"))
+        host, authorization = (single_header(request, name) for name in ("Host", "Authorization"))
         if path == "/healthz":
             return connection.respond(status.OK, "OK\n")
         if path == "/readyz":
@@ -257,19 +252,8 @@ def serve(load: Callable[[], Served], options: ServerOptions, tell: Callable[[st
     Raises:
         InputError: As `PlanningServer.run`.
     """
-
-    async def until_signalled() -> bool:
-        stop = asyncio.Event()
-        loop = asyncio.get_running_loop()
-        numbers = (signal.SIGTERM, signal.SIGINT) if threading.current_thread() is threading.main_thread() else ()
-        for number in numbers:
-            loop.add_signal_handler(number, stop.set)
-        server = PlanningServer(load, options, tell)
-        if numbers:
-            loop.add_signal_handler(signal.SIGUSR1, server.release)
-        return await server.run(stop)
-
-    return asyncio.run(until_signalled())
+    server = PlanningServer(load, options, tell)
+    return until_signalled(server.run, {signal.SIGUSR1: server.release})
 
 
 async def _first_of(*futures: asyncio.Future[Any]) -> None:
@@ -283,13 +267,3 @@ def _busy(robot: str) -> str:
 def _name(connection: Any) -> str:
     address = connection.remote_address
     return f"{address[0]}:{address[1]}" if isinstance(address, tuple) else "an unknown address"
-
-
-def _url(options: ServerOptions, address: tuple[Any, ...]) -> str:
-    host = f"[{address[0]}]" if ":" in str(address[0]) else address[0]
-    return f"{'ws' if options.certificate is None else 'wss'}://{host}:{address[1]}"
-
-
-def _only(values: list[str]) -> str | None:
-    """Return the value of a header that comes once."""
-    return values[0] if len(values) == 1 else None
