@@ -2,7 +2,7 @@
 
     python benchmarks/explore.py [RUN_OR_MODEL ...] [--film docs/explore.gif]
 
-needs Chromium and the extra dev. What stands behind --film goes to explore (a run, --decoder ...).
+needs Chromium and the extra dev. All other words go to explore (a run, --decoder ...).
 """
 
 from __future__ import annotations

@@ -1,6 +1,5 @@
 """The command itself: it simulates what a model of the package lacks, says where the page is, and ends when asked."""
 
-import json
 import os
 import signal
 import time
@@ -11,6 +10,7 @@ from websockets.sync.client import connect
 
 from ranks import Rank
 from vjepa2_ac.cli import main
+from windows import header
 
 
 def test_without_arguments_the_model_of_the_package_is_explored(
@@ -25,8 +25,7 @@ def test_without_arguments_the_model_of_the_package_is_explored(
         time.sleep(0.05)
     url = said.partition("The page: ")[2].split()[0]
     with connect(url.replace("http", "ws") + "socket", origin=url.rstrip("/"), max_size=None) as page:  # type: ignore[arg-type]
-        message = page.recv(timeout=60)
-        told = json.loads(message[4 : 4 + int.from_bytes(message[:4], "big")])
+        told = header(page.recv(timeout=60))
     assert (told["subject"], told["truth"]) == ("builtin:sim-tiny", "simulated")
     process.send_signal(signal.SIGTERM)
     _, errors = process.communicate()

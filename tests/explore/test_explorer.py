@@ -42,7 +42,7 @@ def test_steps_one_by_one_are_a_rollout_of_base_and_adapter(recorded: Views) -> 
 def test_what_was_looked_at_before_changes_nothing(recorded: Views) -> None:
     explorer, place = recorded.explorer, Place(0, 2, PATH)
     before = explorer.imagined(1, place)
-    explorer._kept.clear()
+    explorer._end.cache_clear()
     for other in (Place(0, 2, (LEFT,)), Place(0, 2, PATH[:2]), Place(1, 0, PATH), Place(0, 2, (*PATH[:3], UP))):
         explorer.imagined(1, other)
     assert torch.equal(explorer.imagined(1, place), before)

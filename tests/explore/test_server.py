@@ -11,7 +11,7 @@ from websockets.sync.client import connect
 
 from vjepa2_ac.explore.views import Views
 from vjepa2_ac.serving.access import Access
-from windows import serving
+from windows import header, serving
 
 KEY = "a-key-of-sixteen-characters"
 
@@ -31,11 +31,6 @@ def socket(url: str, origin: str | None = None, **headers: str) -> Any:
         url.replace("http", "ws") + "socket", origin=url.rstrip("/") if origin is None else origin or None,  # type: ignore[arg-type]
         additional_headers=headers, max_size=None,
     )  # fmt: skip
-
-
-def header(message: Any) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads(message[4 : 4 + int.from_bytes(message[:4], "big")])
-    return found
 
 
 def test_the_page_is_there_with_rules_for_the_browser(recorded: Views) -> None:

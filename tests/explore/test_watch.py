@@ -21,7 +21,7 @@ from vjepa2_ac.explore import watch as watching
 from vjepa2_ac.explore.watch import WatchPage
 from vjepa2_ac.serving.session import STOPPED, Session
 from vjepa2_ac.serving.wire import PlanningClient, pack, unpack
-from windows import chromium, watched
+from windows import chromium, header, watched
 
 GOAL = image(100)
 
@@ -41,11 +41,6 @@ def running(lines: list[str], tmp_path: Path) -> Iterator[Running]:
 def page(running: Running, origin: str | None = None, path: str = "/watch/socket") -> Any:
     own = running.http if origin is None else origin
     return websockets.sync.client.connect(running.url + path, origin=own, max_size=None, proxy=None)  # type: ignore[arg-type]
-
-
-def header(message: Any) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads(message[4 : 4 + int.from_bytes(message[:4], "big")])
-    return found
 
 
 def until(page: Any, is_it: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:

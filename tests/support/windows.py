@@ -1,6 +1,7 @@
 """The server of the window in a thread of the test, and a real browser in front of it."""
 
 import asyncio
+import json
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -10,6 +11,12 @@ from browser import browser
 from vjepa2_ac.explore.server import ExploreServer
 from vjepa2_ac.explore.views import Views
 from vjepa2_ac.serving.access import Access
+
+
+def header(message: Any) -> dict[str, Any]:
+    """Return what a message of the server says, without its images."""
+    found: dict[str, Any] = json.loads(message[4 : 4 + int.from_bytes(message[:4], "big")])
+    return found
 
 
 @contextmanager

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -23,14 +22,13 @@ from vjepa2_ac.decoding.imagine import shown
 from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.evaluate import Contender
-from vjepa2_ac.evaluation.evaluate_run import load_subject
+from vjepa2_ac.evaluation.evaluate_run import Subject, load_subject
 from vjepa2_ac.evaluation.request import EvaluationOptions, settle
 from vjepa2_ac.explore.messages import MOST_STEPS, GoalFrame
 from vjepa2_ac.model.distances import absolute_difference
 from vjepa2_ac.model.network.predictor_network import KeyValueCache
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.model.state_integration import counterfactual_states
+from vjepa2_ac.model.state_integration import counterfactual_states, feasible_actions
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
 from vjepa2_ac.spaces import Spaces
 
@@ -85,28 +83,33 @@ class Explorer:
     """
 
     def __init__(
-        self, world_model: WorldModel, contenders: tuple[Contender, ...], decoder: TrainedDecoder, dataset: Dataset
+        self,
+        subject: Subject,
+        decoder: TrainedDecoder,
+        dataset: Dataset,
+        episodes: tuple[int, ...],
+        autocast: Callable[[], Any],
     ) -> None:
-        """Prepare; `open_explorer` loads the parts.
+        """Prepare; `ExploreOptions.opened` loads the parts.
 
         Args:
-            world_model: Whose encoder is used; on its device.
-            contenders: What imagines, the subject last.
-            decoder: Of its latents.
+            subject: The models, on their device.
+            decoder: Of their latents.
             dataset: Clips of two frames of one camera.
+            episodes: Those that are shown, by their places in the data set.
+            autocast: Within which models compute.
 
         Raises:
             InputError: Nobody knows which state follows from an action.
         """
-        self.world_model, self.contenders, self.decoder, self.dataset = world_model, contenders, decoder, dataset
+        self.world_model, self.contenders = subject.world_model, subject.contenders
+        self.decoder, self.dataset, self.episodes, self.autocast = decoder, dataset, episodes, autocast
         if self.spaces.action.follows == "unknown":
             found = "commands of which nobody knows what they do to the state"
             needed = "data.actions: difference; or join_actions: sum or last"
             raise InputError(where="data.actions: recorded", found=found, needed=needed)
-        self.autocast: Callable[[], Any] = torch.no_grad
-        self.episodes: tuple[int, ...] = ()
-        self._kept: OrderedDict[tuple[int, Place], _Imagined] = OrderedDict()
         self._pair = lru_cache(maxsize=256)(self._read_pair)
+        self._end = lru_cache(maxsize=_KEPT_STEPS * len(self.contenders))(self._imagine)
 
     @property
     def spaces(self) -> Spaces:
@@ -163,15 +166,19 @@ class Explorer:
         last = self.steps(episode) - 1 - self.stride
         return self._pair(episode, step)[0] if step <= last else self._pair(episode, step - self.stride)[1]
 
+    def along(self, place: Place) -> list[Moment | None]:
+        """Return what is recorded at the start and after each action; None: the recording ended, or went elsewhere."""
+        step = place.start
+        found: list[Moment | None] = [self.moment(place.episode, step)]
+        for action in place.actions:
+            before, step = found[-1], step + self.stride
+            goes_there = before is not None and action == before.action and step < self.steps(place.episode)
+            found.append(self.moment(place.episode, step) if goes_there else None)
+        return found
+
     def recorded(self, place: Place) -> Moment | None:
         """Return the recorded moment at a place; None: the recording ended, or did something else."""
-        step = place.start
-        for action in place.actions:
-            moment = self.moment(place.episode, step)
-            step += self.stride
-            if action != moment.action or step >= self.steps(place.episode):
-                return None
-        return self.moment(place.episode, step)
+        return self.along(place)[-1]
 
     def recorded_next(self, place: Place) -> tuple[float, ...] | None:
         """Return the recorded action at a place; None: there is none."""
@@ -198,10 +205,8 @@ class Explorer:
 
     def states(self, place: Place) -> Float[np.ndarray, "time state_dim"]:
         """Return the states along a path: recorded as far as the recording goes that way, then integrated."""
-        states, at = [self.moment(place.episode, place.start).state], Place(place.episode, place.start)
-        for action in place.actions:
-            at = at.after(action)
-            recorded = self.recorded(at)
+        states = [self.moment(place.episode, place.start).state]
+        for action, recorded in zip(place.actions, self.along(place)[1:], strict=True):
             following = counterfactual_states(states[-1], np.array([action]), self.spaces.state)[1]
             states.append(following if recorded is None else recorded.state)
         return np.stack(states)
@@ -211,31 +216,24 @@ class Explorer:
         return self._end(teller, place).latents
 
     @torch.no_grad()
-    def _end(self, teller: int, place: Place) -> _Imagined:
-        key = (teller, place)
-        if key in self._kept:
-            self._kept.move_to_end(key)
-            return self._kept[key]
+    def _imagine(self, teller: int, place: Place) -> _Imagined:
         if not place.actions:
             return _Imagined(self.moment(place.episode, place.start).latents, KeyValueCache())
         before, states = self._end(teller, place.before), self.states(place)
-        given = states[-1] if self.spaces.action.follows == "target" else self._feasible(place, states)
+        given = states[-1] if self.spaces.action.follows == "target" else self._feasible(place, states[-2])
         cache, camera = before.cache.copy(), self.camera(place)
         action, state = (torch.as_tensor(one, dtype=torch.float32, device=self.device) for one in (given, states[-2]))
         seen = before.latents[None, None], action[None, None], state[None, None]
         with self.autocast(), self.contenders[teller].switched():
             predicted = self.model(teller).predict(*seen, None if camera is None else camera[None, None], cache)
-        self._kept[key] = _Imagined(predicted[0, 0].float(), cache)
-        while len(self._kept) > _KEPT_STEPS * len(self.contenders):
-            self._kept.popitem(last=False)
-        return self._kept[key]
+        return _Imagined(predicted[0, 0].float(), cache)
 
-    def _feasible(self, place: Place, states: np.ndarray) -> np.ndarray:
-        """Return the last action, its gripper as far as it can change: a model has seen nothing else."""
-        action, gripper = np.array(place.actions[-1]), self.spaces.state.gripper
-        if gripper is not None and self.recorded(place) is None:
-            action[gripper] = states[-1, gripper] - states[-2, gripper]
-        return action
+    def _feasible(self, place: Place, state: np.ndarray) -> np.ndarray:
+        """Return the last action, from a state, its gripper as far as it can change unless that was recorded."""
+        action = np.array(place.actions[-1:])
+        if self.recorded(place) is None:
+            action = feasible_actions(state, action, self.spaces.state)
+        return np.asarray(action[0])
 
     def model(self, teller: int) -> WorldModel:
         """Return what imagines; it counts within `contenders[teller].switched()`."""
@@ -286,14 +284,12 @@ class ExploreOptions:
         loaded = load_subject(self.subject, config, self.evaluation, dataset, decoder)
         loaded.put_on(accelerator.device)
         decoder.to(accelerator.device)
-        explorer = Explorer(loaded.world_model, loaded.contenders, decoder, dataset)
-        explorer.autocast = accelerator.autocast
         members = dataset.members(self.evaluation.split)[dataset.episodes]
         long_enough = dataset.table.num_steps[dataset.episodes] > config.data.model_stride
-        explorer.episodes = tuple(int(one) for one in dataset.episodes[members & long_enough])
-        if not explorer.episodes:
+        episodes = tuple(int(one) for one in dataset.episodes[members & long_enough])
+        if not episodes:
             dataset.windows(self.evaluation.split)  # says why
-        return explorer, config
+        return Explorer(loaded, decoder, dataset, episodes, accelerator.autocast), config
 
 
 def goal_moment(explorer: Explorer, goal: GoalFrame) -> Moment:

@@ -49,8 +49,10 @@ class Search:
         Raises:
             InputError: There are no limits for vectors.
         """
-        changes = {"horizon": steps, "action_repeat": 1}
-        return search_space(self.config.model_copy(update=changes), self._explorer.spaces.state)
+        return search_space(self._of(steps), self._explorer.spaces.state)
+
+    def _of(self, steps: int) -> PlanningConfig:
+        return self.config.model_copy(update={"horizon": steps, "action_repeat": 1})
 
     @property
     def axes(self) -> tuple[int, ...]:
@@ -85,8 +87,7 @@ class Search:
             InputError: There are no limits.
             SearchCancelledError: It was cancelled.
         """
-        config = self.config.model_copy(update={"horizon": steps, "action_repeat": 1})
-        planner = Planner(config, self.space(steps), progress=_ending(progress, cancelled))
+        planner = Planner(self._of(steps), self.space(steps), progress=_ending(progress, cancelled))
         with self._cost(teller, place, goal) as cost, torch.no_grad():
             plan = planner.plan(cost, torch.Generator().manual_seed(0), cancelled=cancelled)
             elites = torch.stack([one.elites[0] for one in plan.iterations if len(one.elites)][-8:] or [plan.actions])

@@ -135,12 +135,6 @@ class Views:
         ]
         return [*moves, {"id": "still", "label": "still", "axis": None, "sign": 0}]
 
-    def _changes(self, episode: int) -> Float[np.ndarray, "steps dim"]:
-        """Return the changes of the state in each model step of an episode."""
-        explorer = self.explorer
-        states = explorer.dataset.source.read(explorer.episodes[episode]).states[:: explorer.stride]
-        return explorer.spaces.state.differences(np.asarray(states, dtype=np.float64))
-
     def action(self, move: dict[str, Any]) -> tuple[float, ...]:
         """Return the action of a move, of a usual size."""
         numbers = enumerate(self.numbers)
@@ -148,18 +142,24 @@ class Views:
 
     def middle(self) -> Place:
         """Return the start whose state is nearest to the mean of all: from there is room in every direction."""
-        explorer, space = self.explorer, self.explorer.spaces.state
-        found = []
-        for episode in range(len(self._recorded_changes)):
-            states = explorer.dataset.source.read(explorer.episodes[episode]).states[: -explorer.stride, space.sized]
-            found += [(episode, step, np.asarray(state, np.float64)) for step, state in enumerate(states)]
+        explorer, found = self.explorer, []
+        for episode, states in enumerate(self._recorded_states):
+            shown = states[: -explorer.stride, explorer.spaces.state.sized]
+            found += [(episode, step, state) for step, state in enumerate(shown)]
         mean = np.mean([state for *_, state in found], axis=0)
         episode, start, _ = min(found, key=lambda one: float(np.linalg.norm(one[2] - mean)))
         return Place(episode, start)
 
     @cached_property
+    def _recorded_states(self) -> list[Float[np.ndarray, "steps dim"]]:
+        read, first = self.explorer.dataset.source.read, self.explorer.episodes[:_SEARCHED]
+        return [np.asarray(read(episode).states, dtype=np.float64) for episode in first]
+
+    @cached_property
     def _recorded_changes(self) -> list[Float[np.ndarray, "steps dim"]]:
-        return [self._changes(one) for one in range(min(_SEARCHED, len(self.explorer.episodes)))]
+        """The changes of the state in each model step of each of these episodes."""
+        space, stride = self.explorer.spaces.state, self.explorer.stride
+        return [space.differences(states[::stride]) for states in self._recorded_states]
 
     @property
     def _usual_changes(self) -> Float[np.ndarray, " dim"]:

@@ -180,9 +180,6 @@ class WatchPage:
 
 def _first_change(seen: _Seen, width: int) -> list[float]:
     """Return what the next action changes; zeros where it is to do nothing."""
-    is_sent = (
-        seen.decision is not None and seen.decision.plan is not None and seen.answer["why"] != "stopped by the page"
-    )
-    if not is_sent or seen.decision is None or seen.decision.plan is None:
+    if seen.decision is None or seen.decision.plan is None:
         return [0.0] * width
     return [float(number) for number in seen.decision.plan.actions[0]]

@@ -1,7 +1,7 @@
 // @ts-check
 /** What does a person see and do who drives a model's imagination? The server computes; the link has all state. */
 
-import { Wire, amount, digits, make, part, swap } from "./shared.js";
+import { Wire, amount, digits, make, part, shape, swap } from "./shared.js";
 
 /** @typedef {import("./shared.js").Header} Header */
 /** @typedef {import("./shared.js").Answer} Answer */
@@ -419,12 +419,6 @@ function drawPath(path, truth) {
   const ways = [...path, truth ?? path[0]].map(([x, y, z]) => [y0 - y, x0 - x, z0 - z]);
   const scale = 78 / Math.max(0.12, ...ways.flat().map(Math.abs));
   const at = (/** @type {number[]} */ way) => way.map((one) => one * scale);
-  /** @param {string} tag @param {{[name: string]: string | number}} values */
-  const shape = (tag, values) => {
-    const element = document.createElementNS("http://www.w3.org/2000/svg", tag);
-    for (const [name, one] of Object.entries(values)) element.setAttribute(name, String(one));
-    return element;
-  };
   const points = ways.slice(0, -1).map(at);
   const [u, v, w] = points[points.length - 1];
   const [tu, tv, tw] = at(ways[ways.length - 1]);

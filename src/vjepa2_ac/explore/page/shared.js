@@ -180,6 +180,18 @@ export function make(tag, { data = {}, ...properties } = {}, ...children) {
 }
 
 /**
+ * Make a shape of an SVG.
+ *
+ * @param {string} tag
+ * @param {{[name: string]: string | number}} values of its attributes
+ */
+export function shape(tag, values) {
+  const element = document.createElementNS("http://www.w3.org/2000/svg", tag);
+  for (const [name, one] of Object.entries(values)) element.setAttribute(name, String(one));
+  return element;
+}
+
+/**
  * Write a number in its unit.
  *
  * @param {number | null} value

@@ -1,7 +1,7 @@
 // @ts-check
 /** What does a served robot's planner see, want and do? Read-only, but for STOP. */
 
-import { Wire, amount, make, part, swap } from "./shared.js";
+import { Wire, amount, make, part, shape, swap } from "./shared.js";
 
 /** @typedef {{energy: {now: number | null, plan: number | null}, goal: any, episode: number}} Past */
 
@@ -83,12 +83,6 @@ function drawEnergies() {
   const top = Math.max(1e-9, .../** @type {number[]} */ (all));
   const x = (/** @type {number} */ at) => (WIDTH * (at + 0.5)) / Math.max(20, past.length);
   const y = (/** @type {number} */ energy) => HEIGHT - 4 - ((HEIGHT - 8) * energy) / top;
-  /** @param {string} tag @param {{[name: string]: string | number}} values */
-  const shape = (tag, values) => {
-    const element = document.createElementNS("http://www.w3.org/2000/svg", tag);
-    for (const [name, one] of Object.entries(values)) element.setAttribute(name, String(one));
-    return element;
-  };
   const points = past.flatMap(({ energy }, at) => (energy.now === null ? [] : [`${x(at)},${y(energy.now)}`]));
   const shapes = [shape("polyline", { class: "way", points: points.join(" ") })];
   past.forEach(({ energy, goal, episode }, at) => {
