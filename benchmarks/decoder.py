@@ -4,9 +4,9 @@
     python benchmarks/decoder.py --device cuda --dtype bfloat16 --image-size 256 --latent-dim 1408 --batch 64 \
         --size small medium
 
-A training step is forward, backward, optimizer and moving average, from latents that are there. `python
-benchmarks/fake_gpu decoder` counts the memory of one without a GPU. Ways take turns; a ratio under 1 is slower than the
-baseline, which is one matrix.
+A training step is forward, backward, optimizer and moving average, from latents that are there. Ways take turns; a
+ratio under 1 is slower than the baseline, which is one matrix. On CUDA beside it the peak of memory, alone on the
+device; `python benchmarks/fake_gpu decoder` counts that of a training step without a GPU.
 """
 
 from __future__ import annotations
@@ -16,9 +16,11 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from functools import partial
+from typing import Any
 
 import torch
-from rows import Rows
+from memory import peak_alone, peak_gb
+from rows import Rows, cell
 from timing import about, add_basics, add_repeats, introduction, prepare, ratio, rounds, settle
 
 from vjepa2_ac.config import DecoderConfig
@@ -36,23 +38,32 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = settle(_parse(given), QUICK)
     prepare(options)
     print(f"{introduction(options)}; {options.image_size} px, {options.latent_dim} numbers, batch {options.batch}")
-    print(f"{'':10} {'work':8} {'ms':>9} {'frames/s':>9} {'ratio':>6}")
+    print(f"{'':10} {'work':8} {'ms':>9} {'frames/s':>9} {'ratio':>6}{'peak GB':>9}")
     rows = Rows(options.json, **about(options, given))
-    for work, ways in (("show", _showing(options)), ("learn", _learning(options))):
-        seen = list(rounds(ways, options, lambda: None))[-1]
+    for work, ways_of in (("show", _showing), ("learn", _learning)):
+        peaks = {size: _peak(options, partial(ways_of, options), size) for size in ("linear", *options.size)}
+        seen = list(rounds(ways_of(options, "linear", *options.size), options, lambda: None))[-1]
         for way, turns in seen.items():
             seconds, gained = turns.median_s, ratio(seen["linear"], turns)
-            rows.add({"work": work, "way": way, **turns.figures(), "ratio": gained})
+            rows.add({"work": work, "way": way, **turns.figures(), "ratio": gained, "peak_gb": peaks[way]})
             if seconds is None:
                 print(f"{way:10} {work:8} {turns.problem}")
                 continue
-            shown = "" if gained is None else f"{gained:6.2f}"
-            print(f"{way:10} {work:8} {seconds * 1e3:9.1f} {options.batch / seconds:9.1f} {shown:>6}", flush=True)
+            shown = cell(gained, 6, ".2f") + cell(peaks[way], 9, ".2f")
+            print(f"{way:10} {work:8} {seconds * 1e3:9.1f} {options.batch / seconds:9.1f} {shown}", flush=True)
 
 
-def _showing(options: argparse.Namespace) -> dict[str, Callable[[], object]]:
+def _peak(options: argparse.Namespace, ways_of: Callable[..., Any], size: str) -> float | None:
+    """Return the peak of a size alone on the device, in 10^9 bytes; None on a CPU, where a process is no measure."""
+    if options.device == "cpu":
+        return None
+    found = peak_alone(lambda: peak_gb(ways_of(size)[size], options.device), [], options.device)
+    return None if found["problem"] else float(found["peak_gb"])
+
+
+def _showing(options: argparse.Namespace, *sizes: str) -> dict[str, Callable[[], object]]:
     latents = torch.randn(options.batch, _grid(options) ** 2, options.latent_dim, device=options.device)
-    decoders = {size: Decoder(_shape(options, size)) for size in ("linear", *options.size)}
+    decoders = {size: Decoder(_shape(options, size)) for size in sizes}
     ways: dict[str, Callable[[], object]] = {}
     for size, decoder in decoders.items():
         decoder.initialise(torch.Generator().manual_seed(0))
@@ -66,12 +77,12 @@ def _shown(decoder: Decoder, latents: torch.Tensor, options: argparse.Namespace)
         decoder.decode(latents)
 
 
-def _learning(options: argparse.Namespace) -> dict[str, Callable[[], object]]:
+def _learning(options: argparse.Namespace, *sizes: str) -> dict[str, Callable[[], object]]:
     pixels = (options.batch, 3, options.image_size, options.image_size)
     images = torch.randint(0, 256, pixels, dtype=torch.uint8, device=options.device)
     latents = torch.randn(options.batch, _grid(options) ** 2, options.latent_dim, device=options.device)
     ways: dict[str, Callable[[], object]] = {}
-    for size in ("linear", *options.size):
+    for size in sizes:
         config = DecoderConfig(size="tiny", batch_size=options.batch)  # the shape says the size
         steps = DecoderSteps(
             _shape(options, size), config, 0, torch.device(options.device), partial(_autocast, options), None

@@ -2,29 +2,41 @@
 
     python benchmarks/encoders.py               # all of them (make encoders)
     python benchmarks/encoders.py --only ViT-B  # those whose name has this in it; writes nothing
+    python benchmarks/encoders.py --device cuda # frames a second on a GPU, instead, with random weights in bfloat16
 
-Nothing is loaded: parameters and operations are counted, memory is measured on tensors without numbers. No row has been
-compared with a GPU. OUT/encoders.json has the numbers, OUT/encoders.md the table.
+Nothing is loaded: parameters and operations are counted, memory is measured on tensors without numbers.
+OUT/encoders.json has the numbers, OUT/encoders.md the table.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
+
+import torch
+from memory import let_go
+from memory import peak_gb as peak_of
+from rows import Rows, cell
+from timing import about, add_basics, add_repeats, introduction, prepare, rounds, settle
 
 from vjepa2_ac.config import Config, EncoderSizes, ModelSizes, PredictorSizes
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.data.sources.latents.cache_files import bytes_per_frame
+from vjepa2_ac.distributed import matmul_speed
 from vjepa2_ac.encoding.latent_cache import picture_bytes
 from vjepa2_ac.model.checkpoints.published import PUBLISHED
+from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.storage import write_atomically
 from vjepa2_ac.training.cost.flops import frame_flops
 from vjepa2_ac.training.cost.memory import GIGABYTE, count_parameters, estimate_memory
 
 IMAGE_SIZES = (256, 384)  # pixels
+QUICK = {"only": "ViT-B", "repeats": 1, "warm_up": 0, "threads": 1, "frames": 1}
 FRAMES_PER_HOUR = 15 * 3600  # of DROID's rate
 PREDICTORS = {
     "24x1024": PredictorSizes(width=1024, depth=24, heads=16),
@@ -58,7 +70,13 @@ def main(given: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results"), help="where table and numbers go")
     parser.add_argument("--only", default="", help="encoders whose name has this in it; writes nothing")
-    options = parser.parse_args(given)
+    parser.add_argument("--frames", type=int, default=16, help="at once, where speed is measured")
+    add_basics(parser)
+    add_repeats(parser)
+    options = settle(parser.parse_args(given), QUICK)
+    if options.device != "cpu" or options.quick:
+        print_speeds(options, list(sys.argv[1:] if given is None else given))
+        return
     costs = [cost_of(name, *about) for name, about in published().items() if options.only in name]
     text = table(costs)
     print(text)
@@ -67,6 +85,35 @@ def main(given: Sequence[str] | None = None) -> None:
         rows = json.dumps([asdict(one) for one in costs], indent=1)
         write_atomically(options.out / "encoders.json", (rows + "\n").encode())
         write_atomically(options.out / "encoders.md", (text + "\n").encode())
+
+
+def print_speeds(options: argparse.Namespace, given: list[str]) -> None:
+    """Print and add the frames a second of each encoder, of random weights, at the first image size."""
+    prepare(options)
+    ceiling = matmul_speed(torch.device(options.device), torch.bfloat16)
+    print(f"{introduction(options)}; bfloat16, {options.frames} frames at once, ceiling {ceiling / 1e12:.3g} TFLOP/s")
+    print(f"{'':12} {'frames/s':>9} {'MFU':>6} {'peak GB':>8}")
+    rows = Rows(options.json, **about(options, given))
+    for name, (encoder, _) in published().items():
+        if options.only in name:
+            rows.attempt(partial(add_speed, options, name, encoder, ceiling, rows), encoder=name)
+            let_go(options.device)
+    rows.finish()
+
+
+def add_speed(options: argparse.Namespace, name: str, encoder: EncoderSizes, ceiling: float, rows: Rows) -> None:
+    """Print and add the row of an encoder."""
+    sizes = ModelSizes(encoder=encoder, image_size=IMAGE_SIZES[0], predictor=PredictorSizes(width=64, depth=1, heads=1))
+    model = WorldModel.random(sizes, seed=0, dtype=torch.bfloat16, device=options.device).eval()
+    pixels = torch.randn(1, options.frames, 3, sizes.image_size, sizes.image_size, device=options.device)
+    encode = partial(model.encode, pixels, options.frames)
+    with torch.no_grad():
+        peak = peak_of(encode, options.device)
+        turns = list(rounds({name: encode}, options, lambda: None))[-1][name]
+    speed = turns.median_s and options.frames / turns.median_s
+    mfu = speed and speed * frame_flops(sizes) / ceiling
+    rows.add({"encoder": name, **turns.figures(), "frames_per_s": speed, "mfu": mfu, "peak_gb": peak})
+    print(f"{name:12} {cell(speed, 9, '.0f')} {cell(mfu, 6, '.0%')} {peak:8.2f}", flush=True)
 
 
 def published() -> dict[str, tuple[EncoderSizes, tuple[str, ...]]]:

@@ -40,7 +40,19 @@ from memory import is_expandable, let_go, peak_alone, peak_gb
 from official_planner import PLANNER
 from planning_variants import Bench
 from rows import Row, Rows, cell
-from timing import Turns, about, add_options, introduction, prepare, profiled, ratio, rounds, settle
+from timing import (
+    PROFILED_ROWS,
+    Turns,
+    about,
+    add_options,
+    introduction,
+    prepare,
+    profiled,
+    ratio,
+    rounds,
+    self_time,
+    settle,
+)
 
 from vjepa2_ac.distributed import matmul_speed
 
@@ -50,7 +62,6 @@ QUICK = {
 }  # fmt: skip
 _ON_CPU = {"layers": 2, "samples": 8, "iterations": 2, "horizon": [2, 4], "at_once": [8], "dtype": ["float32"]}
 _ON_CUDA = {"layers": 24, "samples": 800, "iterations": 10, "horizon": [1, 2], "at_once": [64], "dtype": ["bfloat16"]}
-_PROFILED_ROWS = 15
 _NAMES = f"{'horizon':>7}  {'way':22}"
 
 
@@ -144,14 +155,11 @@ def time_line(row: Row) -> str:
 
 def profile_decision(decide: Callable[[], object], bench: Bench, rows: Rows, named: Row) -> None:
     """Add and print where the time of a decision goes, and on CUDA how often the host waits for the device in it."""
-    on_cuda = bench.options.device != "cpu"
-    found = profiled(decide, bench.options.device)
-    order = "self_device_time_total" if on_cuda else "self_cpu_time_total"
-    dearest = sorted(found.events, key=lambda event: -getattr(event, order))[:_PROFILED_ROWS]
-    costs = [{"name": one.key, "ms": getattr(one, order) / 1e3, "count": one.count} for one in dearest]
-    rows.add({**named, "waits": found.waits, "dearest": costs})
-    print(found.events.table(sort_by=order, row_limit=_PROFILED_ROWS, max_name_column_width=40))
-    if on_cuda:
+    device = bench.options.device
+    found = profiled(decide, device)
+    rows.add({**named, "waits": found.waits, "dearest": found.dearest(device)})
+    print(found.events.table(sort_by=self_time(device), row_limit=PROFILED_ROWS, max_name_column_width=40))
+    if device != "cpu":
         print(f"the host waited, in {bench.options.iterations} iterations: {found.waits}")
 
 

@@ -19,12 +19,14 @@ from typing import Any, NamedTuple
 import torch
 from memory import alloc_retries, use_expandable_segments
 from rows import problem_of
+from torch._C._autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
 
 WAITS_ON = {
     "cuda": {"cudaStreamSynchronize", "cudaDeviceSynchronize", "cudaEventSynchronize"},  # as the profiler calls them
     "cpu": {"aten::_local_scalar_dense"},  # of which some ask no device: only whether counting works
 }
+PROFILED_ROWS = 15
 BESIDE = Path(__file__).resolve().parents[2] / "vjepa2"
 _REPEATS = {"cuda": (10, 3), "cpu": (3, 1)}  # that count, and to warm up: a GPU's clock has to rise
 
@@ -163,6 +165,22 @@ class Profile(NamedTuple):
 
     events: Any  # one for each kind, with `key` and `count`
     waits: dict[str, int]  # of the host for the device, by what it calls
+
+    def busy_ms(self) -> float:
+        """Return how long the device's kernels ran in all; 0 on a CPU."""
+        on_device = (event for event in self.events if event.device_type == DeviceType.CUDA)
+        return sum(event.self_device_time_total for event in on_device) / 1e3
+
+    def dearest(self, device: str) -> list[dict[str, Any]]:
+        """Return what took longest by itself, in milliseconds: of the device's kernels, or the CPU's operations."""
+        order = self_time(device)
+        events = sorted(self.events, key=lambda event: -getattr(event, order))[:PROFILED_ROWS]
+        return [{"name": one.key, "ms": getattr(one, order) / 1e3, "count": one.count} for one in events]
+
+
+def self_time(device: str) -> str:
+    """Return what the profiler calls the time that counts on a device."""
+    return "self_cpu_time_total" if device == "cpu" else "self_device_time_total"
 
 
 def profiled(work: Callable[[], object], device: str) -> Profile:

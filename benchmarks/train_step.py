@@ -15,8 +15,9 @@ All take turns, so that a busy machine slows them alike. On a CPU the process's 
 wall time; `ms` is the median, `min` the fastest. MFU: the model FLOPs of `training.cost.flops` over what the device
 does in a product of matrices, measured first. `retries`: how often the allocator had to give memory back while a way
 was timed, whose time then does not count. --profile counts, in a step of each way of ours, how often the host waits
-for the device, and what was compiled after warm-up; beside it the seconds of a setting's first step, which compiles (it
-counts for the first setting of a process only).
+for the device, how long its kernels ran, and what was compiled after warm-up; beside it the seconds of a setting's
+first step, which compiles (it counts for the first setting of a process only). Loss and norm of the gradients must be
+the same for all ways of ours, but for bfloat16's rounding.
 
 Peak memory, weights included, is of two steps in a pass of its own, after all times: each line alone on the device, or
 on a CPU in a process of its own. Beside it, what `doctor` estimates for our run of that setting, and by how much that
@@ -89,7 +90,8 @@ def measure_time(options: argparse.Namespace, dtype: str, settings: Sequence[Set
     if options.time:
         ceiling = matmul_speed(bench.device, bench.dtype)
         print(f"{dtype}: ceiling {ceiling / 1e12:.3g} TFLOP/s")
-        print(f"{NAMES}{'ms':>9}{'min':>9}{'clips/s':>9}{'MFU':>8}{'retries':>8}{f'of {ways[0]}':>15}")
+        titles = f"{'ms':>9}{'min':>9}{'clips/s':>9}{'MFU':>8}{'retries':>8}{f'of {ways[0]}':>15}"
+        print(f"{NAMES}{titles}{'loss':>10}{'gradients':>10}")
         for setting in settings:
             rows.attempt(partial(time_setting, bench, setting, ways, ceiling, rows), dtype=dtype, **asdict(setting))
     return ways
@@ -114,7 +116,7 @@ def time_setting(bench: Bench, setting: Setting, ways: Sequence[str], ceiling: f
     compiled = {"compiled_in_warm_up": warm - before, "compiled_after": compiled_graphs() - warm}
     for row in rows_so_far():
         if row["problem"] is None and bench.options.profile and row["way"] not in {OFFICIAL, OFFICIAL_FULL}:
-            row |= {**compiled, "waits": waits_of(steps[row["way"]], bench)}
+            row |= {**compiled, **seen_by_the_profiler(steps[row["way"]], bench)}
         rows.add(row)
         print(time_line(row), flush=True)
 
@@ -128,19 +130,24 @@ def time_row(
     flops = setting.batch * bench.flops_per_clip(setting, way)
     return {
         "measured": "time", "dtype": str(bench.dtype).removeprefix("torch."), "ceiling": ceiling, **asdict(setting),
-        "way": way, **figures, "first_s": started.first_s, "ratio": ratio(base, turns),
+        "way": way, **figures, "first_s": started.first_s, **started.found, "ratio": ratio(base, turns),
         "clips_per_s": seconds and setting.batch / seconds, "mfu": seconds and flops / seconds / ceiling,
     }  # fmt: skip
 
 
-def waits_of(step: Callable[[], object], bench: Bench) -> int | str:
-    """Return how often the host waits for the device in a step, or how profiling failed."""
+def seen_by_the_profiler(step: Callable[[], object], bench: Bench) -> Row:
+    """Return how often the host waits for the device in a step, and its dearest kernels, or how profiling failed."""
     try:
-        return sum(profiled(step, bench.options.device).waits.values())
+        found = profiled(step, bench.options.device)
+        return {
+            "waits": sum(found.waits.values()),
+            "busy_ms": found.busy_ms(),
+            "dearest": found.dearest(bench.options.device),
+        }
     except Exception as error:
         problem = problem_of(error)
     bench.let_go_of_a_step()
-    return problem
+    return {"waits": problem}
 
 
 def time_line(row: Row) -> str:
@@ -150,8 +157,11 @@ def time_line(row: Row) -> str:
     milliseconds = "".join(cell(row[key] * 1e3, 9, ".1f") for key in ("s", "min_s"))
     text = f"{names_of(row)}{milliseconds}{row['clips_per_s']:9.3f}{row['mfu']:8.1%}{row['alloc_retries']:8}"
     text += cell(row["ratio"], 15, ".2f")
+    if "loss" in row:
+        text += f"{row['loss']:10.5f}{row['grad_norm']:10.5f}"
     if "waits" in row:
         text += f"  [first step {row['first_s']:.1f} s, {row['waits']} waits,"
+        text += f" {row.get('busy_ms') or 0:.0f} ms of kernels,"
         text += f" {row['compiled_after']} compiled after warm-up]"
     return text
 
@@ -166,7 +176,7 @@ def compiled_graphs() -> int:
 def choose_ways(bench: Bench, options: argparse.Namespace, rows: Rows) -> list[str]:
     """Return the ways to compare, the baseline first; the official one only if it computes the same."""
     ours = our_ways(options.attention, compiled=options.compile)
-    plain = ["dense", *(way for way in ours if way != "dense")]
+    plain = ["dense", *(way for way in ours if way != "dense")] if options.time else ours  # memory has no baseline
     print(f"ours: {trainable_report(bench.model)}")
     if not has_checkout(options):
         print(f"official: skipped, for there is no {options.official / PREDICTOR}")
@@ -214,7 +224,9 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--rollout-steps", type=int, default=2)
     parser.add_argument("--dtype", nargs="+", choices=tuple(PRECISIONS), help="default: bfloat16; CPU: float32")
     parser.add_argument("--checkpointing", nargs="+", choices=("off", "on"), default=["off"])
-    parser.add_argument("--attention", nargs="+", default=["auto"], help="auto, per_step, flex, dense: a line each")
+    parser.add_argument(
+        "--attention", nargs="+", default=["auto"], help="auto, per_step, flex, dense, or auto+graph: a line each"
+    )
     parser.add_argument("--compile", action="store_true", help="each way of ours once more with compiled blocks")
     parser.add_argument("--full", action="store_true", help="the official step that trains every weight, too")
     parser.add_argument("--profile", action="store_true", help="count waits for the device, and compilations")

@@ -6,7 +6,7 @@ import argparse
 import itertools
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any
 from unittest import mock
@@ -34,7 +34,7 @@ from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.transforms import pixels_to_input
 from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.episode import Batch, LatentBatch
-from vjepa2_ac.model.adapter.lora import add_adapter
+from vjepa2_ac.model.adapter.lora import add_adapter, lora_layers
 from vjepa2_ac.model.checkpoints.loading import to_official
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.runs.checkpoint import RunState
@@ -47,8 +47,10 @@ from vjepa2_ac.training.step import training_step
 
 OFFICIAL = "official"
 OFFICIAL_FULL = "official_full"  # every weight of its predictor is trained
-COMPILED = "+compile"  # at the end of a way of ours
+COMPILED, GRAPH = "+compile", "+graph"  # at the end of a way of ours, in this order
 PRECISIONS = {"float32": "fp32", "bfloat16": "bf16"}
+_NEXT_TO_NOTHING = 1e-30  # as fast as any learning rate, and every step has the loss and the gradients of the first
+_OF_AN_ADAPTER = 0.01  # standard deviation of its second matrices: at zero the first ones have no gradient
 _PAST_WARM_UP = 1001  # a step at which the learning rate is what it mostly is
 
 
@@ -69,6 +71,7 @@ class Started:
     step: Callable[[], object] | None
     first_s: float | None
     problem: str | None
+    found: dict[str, float] = field(default_factory=dict)  # loss and norm of the gradients; none of an official way
 
 
 def our_ways(attention: Sequence[str], *, compiled: bool) -> list[str]:
@@ -120,7 +123,14 @@ class Bench:
         return self._official(whole=True)
 
     def compare(self) -> str | None:
-        """Return how the official predictor's loss and gradients differ from ours, on a short clip."""
+        """Return how the official predictor's loss and gradients differ from ours, on a short clip, in float32.
+
+        Its convolution, too: PyTorch rounds those to TF32 on CUDA unless told otherwise.
+        """
+        with torch.backends.cudnn.flags(allow_tf32=False):
+            return self._compared()
+
+    def _compared(self) -> str | None:
         setting = Setting(
             min(max(4, self.options.rollout_steps + 1), *self.options.frames), 1, False, "pixels" in self.options.source
         )
@@ -150,6 +160,7 @@ class Bench:
             model=ModelConfig(base="none", dtype="bfloat16" if self.precision == "bf16" else "float32"),
             training=TrainingConfig(
                 batch_size=setting.batch, accumulation=1, rollout_steps=options.rollout_steps,
+                learning_rate=_NEXT_TO_NOTHING,
                 device="cpu" if self.device.type == "cpu" else "cuda",
                 precision="bf16" if self.precision == "bf16" else "fp32", gradient_checkpointing=setting.checkpointing,
             ),
@@ -181,17 +192,16 @@ class Bench:
         for parameter in self.model.parameters():
             if not parameter.requires_grad:
                 parameter.data = parameter.data.to(self.dtype)
-        run, batches = self.run(setting), itertools.repeat(self.batch(setting))
+        run, batches = self.run(setting, graph=way.endswith(GRAPH)), itertools.repeat(self.batch(setting))
         return partial(self._our_step, run, batches, None if setting.encoder else latents, way)
 
-    def _our_step(self, run: Run, batches: Any, latents: LatentBatch | None, way: str) -> None:
+    def _our_step(self, run: Run, batches: Any, latents: LatentBatch | None, way: str) -> dict[str, float]:
         take_way(self.model, way)
         self.model.set_gradient_checkpointing(run.config.training.gradient_checkpointing)
         if latents is None:
-            training_step(run, batches, step=_PAST_WARM_UP)
-            return
+            return training_step(run, batches, step=_PAST_WARM_UP)
         with mock.patch("vjepa2_ac.training.step.encode", return_value=latents):  # they are there already
-            training_step(run, batches, step=_PAST_WARM_UP)
+            return training_step(run, batches, step=_PAST_WARM_UP)
 
     def start(self, setting: Setting, way: str) -> Started:
         """Do the first two steps of a way: what is compiled is compiled here, and what does not fit shows."""
@@ -200,8 +210,9 @@ class Bench:
             step = self.step(setting, way)
             step()
             first_s = time.perf_counter() - began
-            step()  # what is compiled for the second time
-            return Started(step, first_s, None)
+            metrics = step()  # what is compiled for the second time
+            found = {name: metrics[name] for name in ("loss", "grad_norm")} if isinstance(metrics, dict) else {}
+            return Started(step, first_s, None, found)
         except Exception as error:
             problem = problem_of(error)
         self.let_go_of_a_step()
@@ -230,6 +241,9 @@ class Bench:
             self._weights = {part: _in_type(official[part], self.dtype) for part in ("encoder", "predictor")}
         with no_fingerprints():
             add_adapter(model, AdapterConfig(), seed=0)
+        generator = torch.Generator(self.device).manual_seed(1)
+        for layer in lora_layers(model).values():
+            layer.lora_B["default"].weight.data.normal_(std=_OF_AN_ADAPTER, generator=generator)
         return model
 
     def _drawn(self, shape: tuple[int, ...]) -> Tensor:
@@ -247,9 +261,10 @@ class Bench:
             frames=max(self.options.frames), encoder="pixels" in self.options.source, device=self.device,
         )  # fmt: skip
 
-    def run(self, setting: Setting) -> Run:
+    def run(self, setting: Setting, *, graph: bool = False) -> Run:
         """Return the run that `training_step` works on."""
         config = self.config(setting)
+        config = config.model_copy(update={"training": config.training.model_copy(update={"cuda_graph": graph})})
         return Run(
             config=config,
             accelerator=self._accelerator(config),

@@ -6,6 +6,7 @@ import linecache
 import re
 import sys
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
 from itertools import chain
@@ -34,21 +35,24 @@ _MAKE_NOTHING = {_aten.empty, _aten.empty_like, _aten.empty_strided, _aten.new_e
 
 @dataclass(frozen=True)
 class Machine:
-    """A GPU, as far as a prediction knows of it."""
+    """A GPU, as far as a prediction knows of it: an H100 of 80 GB, with shares as measured there (docs/log.md)."""
 
-    tflops: float = 790.0  # of a large product of matrices in bfloat16
-    bandwidth: float = 4.3  # TB/s
+    tflops: float = 755.0  # of a large product of matrices in bfloat16
+    bandwidth: float = 3.0  # TB/s
     matmul: float = 0.85  # share of `tflops` that products of our sizes reach
-    attention: float = 0.55
+    attention: float = 0.27  # FlexAttention's, forward and backward
     float32_tflops: float = 50.0
     moved: float = 0.9  # share of `bandwidth`
+    moved_mixed: float = 0.4  # the same where types differ, as in a rotation: such kernels read number by number
     least_s: float = 2e-6  # of a kernel
+    launch_s: float = 33e-6  # of the host, for each kernel: Python, PyTorch and autograd
 
-    def seconds(self, name: str, flops: float, moved: float, dtype: torch.dtype) -> float:
+    def seconds(self, name: str, flops: float, moved: float, dtypes: Sequence[torch.dtype]) -> float:
         """Return how long a kernel takes: what it computes or what it moves, whichever is slower."""
         share = self.attention if "attention" in name else self.matmul
-        speed = self.float32_tflops if dtype == torch.float32 else self.tflops * share
-        return max(flops / (speed * 1e12), moved / (self.bandwidth * self.moved * 1e12), self.least_s)
+        speed = self.float32_tflops if dtypes[0] == torch.float32 else self.tflops * share
+        reached = self.moved if len(set(dtypes)) == 1 else self.moved_mixed
+        return max(flops / (speed * 1e12), moved / (self.bandwidth * reached * 1e12), self.least_s)
 
 
 class Cost(NamedTuple):
@@ -131,7 +135,7 @@ class Count(TorchDispatchMode):  # type: ignore[no-untyped-call]  # torch
         written = _tensors(out) or _written(func, args, kwargs)
         touched = [one for one in (*read, *written) if _device(one) == "cuda"]
         moved, flops = sum(map(_bytes, touched)), _flops(func, args, kwargs, out)
-        seconds = self.machine.seconds(str(func), flops, moved, touched[0].dtype)
+        seconds = self.machine.seconds(str(func), flops, moved, [one.dtype for one in touched])
         key = str(func), place()
         self.costs[key] = self.costs[key].plus(Cost(1.0, seconds, moved, flops), self.times)
         self._read = None

@@ -78,6 +78,9 @@ def computing_device(training: TrainingConfig) -> torch.device:
         needed = "a CUDA device: only there are losses scaled so that small gradients do not vanish"
         fix = "Set training.precision=fp32"
         raise InputError(where="training.precision", found="fp16 on a CPU", needed=needed, fix=fix)
+    if training.cuda_graph and on_cpu:
+        fix = "Set training.cuda_graph=false"
+        raise InputError(where="training.cuda_graph", found="true on a CPU", needed="a CUDA device", fix=fix)
     device = torch.device("cpu") if on_cpu else torch.device("cuda", cuda_index())
     if training.precision == "bf16":  # fp32 is for float32 weights only, and fp16 casts any weights
         fix = f"Set training.precision={'fp32 with model.dtype=float32' if on_cpu else 'fp16'}"

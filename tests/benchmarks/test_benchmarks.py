@@ -162,7 +162,7 @@ def test_a_decoder_is_timed_beside_the_linear_one(
 ) -> None:
     for bench in imported("decoder", monkeypatch):
         bench.main(["--quick", "--json", str(tmp_path / "rows.json")])
-    found = re.findall(r"^(linear|tiny) +(show|learn) +\S+ +\S+ +(\S+)$", capsys.readouterr().out, re.MULTILINE)
+    found = re.findall(r"^(linear|tiny) +(show|learn) +\S+ +\S+ +(\S+) +-$", capsys.readouterr().out, re.MULTILINE)
     assert [row[:2] for row in found] == [("linear", "show"), ("tiny", "show"), ("linear", "learn"), ("tiny", "learn")]
     assert [ratio for way, _, ratio in found if way == "linear"] == ["1.00", "1.00"]
     assert len(json.loads((tmp_path / "rows.json").read_text())["rows"]) == 4

@@ -1,11 +1,10 @@
-"""The commands for a real GPU that the notes tell can be given, end in time, and write down what they find."""
+"""What is measured on a GPU can be given, ends in time, and leaves what was found."""
 
 import re
 import shlex
+import subprocess
 import sys
 from collections.abc import Iterator
-from importlib.util import module_from_spec, spec_from_file_location
-from string import Template
 from typing import Any, get_args
 
 import pytest
@@ -15,42 +14,47 @@ from paths import ROOT
 from vjepa2_ac.model.network.attention import AttentionKind
 
 SECTION = (ROOT / "docs/IMPLEMENTATION_NOTES.md").read_text().split("\n## On a GPU\n")[1].split("\n## ")[0]
-(PRELUDE,) = re.findall(r"```bash\n(.*?)```", SECTION, re.DOTALL)
-VARIABLES = dict(re.findall(r'^(\w+)="?([^"\n]*)"?$', PRELUDE, re.MULTILINE))
-ROWS = re.findall(r"^\| (\w*) ?\| `([^`]+)` \|", SECTION, re.MULTILINE)
-COMMANDS = [(block, Template(command).substitute(VARIABLES)) for block, command in ROWS]
-MOST_S = 540
 
 
-def benchmark(name: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """Yield a benchmark's module; that of a folder is its `__main__`."""
-    path = ROOT / name
-    if path.is_file():
-        monkeypatch.delitem(sys.modules, path.stem, raising=False)  # planning is a folder of tests, too
-        yield from imported(path.stem, monkeypatch)
-        return
-    monkeypatch.syspath_prepend(str(path))
-    spec = spec_from_file_location("benchmark", path / "__main__.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = module_from_spec(spec)
-    spec.loader.exec_module(module)
-    yield module
-    del sys.modules["device"]
+@pytest.fixture
+def on_gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """The benchmark."""
+    yield from imported("on_gpu", monkeypatch)
 
 
-@pytest.mark.parametrize(
-    "command", re.findall(r"python benchmarks/[^`|]*", Template(SECTION).safe_substitute(VARIABLES))
-)
-def test_every_command_of_a_benchmark_can_be_given(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    _, script, *given = shlex.split(command)
-    for module in benchmark(script, monkeypatch):
-        options = module.parse(given)
-        attention = [*getattr(options, "attention", []), *getattr(options, "ways", [])]
-        assert set(attention) <= set(get_args(AttentionKind))
+def test_every_part_is_a_command_of_its_benchmark(on_gpu: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert len({part.name for part in on_gpu.PARTS}) == len(on_gpu.PARTS)
+    for part in on_gpu.PARTS:
+        for module in imported(part.benchmark, monkeypatch):
+            if not hasattr(module, "parse"):
+                continue
+            options = module.parse(part.arguments.split())
+            named = [*getattr(options, "attention", []), *getattr(options, "ways", [])]
+            assert {way.split("+")[0] for way in named} <= set(get_args(AttentionKind))
 
 
-def test_tests_that_are_named_are_there() -> None:
-    named = [word for _, command in COMMANDS for word in command.split() if word.startswith("tests/")]
-    assert named
-    assert all((ROOT / file).is_file() for file in named)
+def test_parts_run_one_after_the_other_and_one_that_fails_is_named(tmp_path: Any) -> None:
+    command = [sys.executable, str(ROOT / "benchmarks/on_gpu.py"), "--quick", "--out", str(tmp_path), "--only"]
+    done = subprocess.run([*command, "decoder", "chunk"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+    assert re.search(r"== chunk: exit 0.*ViT-B.*== decoder: exit 0.*tiny +learn", done.stdout, re.DOTALL)
+    assert {path.name for path in tmp_path.glob("*.json")} == {"decoder.json", "chunk.json"}
+    (tmp_path / "chunk.json").unlink()
+    (tmp_path / "chunk.json").mkdir()  # which cannot be written
+    done = subprocess.run([*command, "chunk"], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr.strip() == "failed or out of time: chunk"
+
+
+def test_a_part_that_takes_too_long_is_ended(on_gpu: Any, tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(on_gpu, "PARTS", [on_gpu.Part("serve", "serving", "", 0)])
+    with pytest.raises(SystemExit, match="out of time: serve"):
+        on_gpu.main(["--quick", "--out", str(tmp_path)])
+
+
+def test_commands_of_the_notes_can_be_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    commands = re.findall(r"python (benchmarks/\w+\.py[^`]*)`", SECTION)
+    assert len(commands) > 1
+    for script, *given in map(shlex.split, commands):
+        for module in imported(script.removeprefix("benchmarks/").removesuffix(".py"), monkeypatch):
+            module.parse(given)

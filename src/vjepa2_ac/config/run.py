@@ -48,6 +48,9 @@ class ReplayConfig(Section):
         return lines
 
 
+_GRAPH = "training.cuda_graph needs adapter.dropout 0, and bf16 or fp32"
+
+
 class Config(Section):
     """A complete run."""
 
@@ -94,6 +97,7 @@ class Config(Section):
             (model.random and lora, "model.random with adapter.kind lora would adapt noise; set adapter.kind: none"),
             (fp32 and model.dtype != "float32", "training.precision fp32 needs model.dtype float32"),
             (compiled and adapter.dora, "training.compile blocks cannot trace adapter.dora; set one of them off"),
+            (training.cuda_graph and (training.precision == "fp16" or adapter.dropout), _GRAPH),
             (best == "ranking" and not ranked, "checkpoint.keep_best ranking needs validation.ranking_clips"),
             (best == "off" and patient, "training.patience waits for a better one, and checkpoint.keep_best is off"),
             (predictor.use_extrinsics and blind, f"predictor.use_extrinsics needs camera poses, not in source {blind}"),

@@ -34,6 +34,7 @@ from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import RunState
 from vjepa2_ac.training.data_sets import first_clip, open_data_sets, require_fitting_clips, require_same_data
 from vjepa2_ac.training.loss import Objective
+from vjepa2_ac.training.micro_step import GraphedMicroStep, MicroStep, captured, plain_micro_step
 from vjepa2_ac.training.optim import make_optimizer, trained_parameters
 
 if TYPE_CHECKING:
@@ -77,6 +78,12 @@ class Run:
     def cast_matrices(self) -> CastMatrices:
         """The adapter in the type of the computation."""
         return CastMatrices(self.world_model.predictor, PRECISIONS[self.config.training.precision])
+
+    @cached_property
+    def micro_step(self) -> MicroStep:
+        """Adds the gradients of some clips; where `training.cuda_graph` says so, as a graph."""
+        plain = partial(plain_micro_step, self.objective, self.accelerator, self.scaler)
+        return GraphedMicroStep(plain, self.trained, captured) if self.config.training.cuda_graph else plain
 
     @property
     def clips_per_step(self) -> int:

@@ -142,11 +142,7 @@ def _accumulate(
             continue
         names += [f"{name} from step {start}" for name, start in zip(batch.episode_ids, batch.starts, strict=True)]
         parts = run.clips_per_step / len(batch.starts)
-        latents = encode(run, batch)
-        with run.accelerator.autocast():
-            forced, rollout = run.objective(latents)
-        run.scaler.scale((forced + rollout) / parts).backward()
-        losses = torch.stack([forced.detach(), rollout.detach()])
+        losses = run.micro_step(encode(run, batch), parts)
         totals += losses / parts
         if look_back is not None:
             look_back.add(batch, losses.sum())

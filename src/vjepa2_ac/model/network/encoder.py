@@ -159,6 +159,9 @@ class _ExactAttention(VJEPA2RopeAttention):  # type: ignore[misc]  # transformer
         super().__init__(config, config.hidden_size, config.num_attention_heads)
         self.layout = layout
 
+    def get_position_ids(self, x: Tensor, masks: Any = None) -> None:  # transformers' names
+        """Compute no positions, which would be ten kernels of every layer: those of the layout are in its tables."""
+
     def apply_rotary_embeddings(self, qk: Tensor, pos_ids: Any) -> Tensor:  # noqa: ARG002  # positions are the layout's
         """Return queries or keys [batch heads sequence head_dim], rotated by their position."""
         tables = rotary_tables(self.layout, qk.shape[-1], qk.device)

@@ -1,0 +1,151 @@
+"""Everything that needs a GPU, once: training step, memory, planning, encoders, decoder, a served decision.
+
+    python benchmarks/on_gpu.py --official ../vjepa2           # all of it: 15 to 20 minutes on an H100
+    python benchmarks/on_gpu.py --only graph official --out FOLDER
+
+Each part is a benchmark of this folder with the arguments below, in a process of its own that ends within its limit,
+and is imported while the part before it runs. What a part prints is in OUT/PART.log, its figures in OUT/PART.json,
+written after every row: whatever ends it leaves what was there. Parts that failed are named, and the exit status is 1
+then. Weights are random: times and memory do not depend on them. --official is a checkout of facebookresearch/vjepa2,
+whose step and planner are timed beside ours; without one they are left out.
+
+The command is made for a machine that is lent for minutes: PyTorch with CUDA, Triton and gcc are needed, what was
+compiled is read again from TORCHINDUCTOR_CACHE_DIR. benchmarks/results/gpu.txt has what it printed on an H100.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from timing import BESIDE
+
+_STEP = "--device cuda --frames 16 --repeats 3 --warm-up 1 --official"
+_PLAN = "--device cuda --horizon 1 --at-once 64 --no-memory --warm-up 1 --official"
+
+
+_QUICK = {"--device cuda": "--quick", "+graph": "", "--large --decisions 3": "--decisions 2"}
+
+
+@dataclass(frozen=True)
+class Part:
+    """A benchmark to run."""
+
+    name: str
+    benchmark: str
+    arguments: str
+    limit_s: int
+
+
+PARTS = (
+    Part("train", "train_step", f"{_STEP} none --no-memory --source cache --batch 2 8 --profile"
+         " --attention auto per_step auto+compile", 150),
+    Part("graph", "train_step", f"{_STEP} none --no-memory --source cache --batch 2 8 --profile"
+         " --attention auto+compile+graph", 90),
+    Part("graph_alone", "train_step", f"{_STEP} none --no-memory --source cache --batch 2 --attention auto+graph", 60),
+    Part("official", "train_step", f"{_STEP} OFFICIAL --full --no-memory --source pixels --batch 2 8"
+         " --checkpointing on --attention auto", 90),
+    Part("pixels", "train_step", f"{_STEP} none --no-memory --source pixels --batch 2 8"
+         " --attention auto auto+compile+graph", 90),
+    Part("checkpointing", "train_step", f"{_STEP} none --no-memory --source cache --batch 2 8 --checkpointing on"
+         " --attention auto auto+compile+graph", 90),
+    Part("memory", "train_step", f"{_STEP} none --memory --no-time --source cache pixels --batch 2 8"
+         " --checkpointing off on --attention auto", 90),
+    Part("official_memory", "train_step", f"{_STEP} OFFICIAL --full --memory --no-time --source pixels --batch 2 8"
+         " --checkpointing on --attention auto", 90),
+    Part("plan", "planning", f"{_PLAN} OFFICIAL --repeats 2", 120),
+    Part("compiled_plan", "planning", f"{_PLAN} none --repeats 1 --compile --no-adapter", 90),
+    Part("serve", "serving", "--large --decisions 3", 90),
+    Part("encoders", "encoders", "--device cuda", 60),
+    Part("chunk", "encoders", "--device cuda --only ViT-g --frames 64", 40),
+    Part("decoder", "decoder", "--device cuda --dtype bfloat16 --image-size 256 --latent-dim 1408 --batch 64"
+         " --size small medium", 60),
+    Part("numerics", "numerics", "--device cuda --ways per_step auto --compile --steps 60 --image-size 128 --width 512"
+         " --latent-dim 256 --frames 8", 240),
+    Part("latents", "latents", "--device cuda --encoder-layers 40 --predictor-layers 24 --batch 8 --workers 8"
+         " --frames 16 --episodes 120 --test-episodes 16 --domains random", 240),
+)  # fmt: skip
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the parts that are asked for."""
+    options = parse(arguments)
+    if options.part:
+        run(next(part for part in PARTS if part.name == options.part), options)
+        return
+    options.out.mkdir(parents=True, exist_ok=True)
+    parts = [part for part in PARTS if part.name in (options.only or [one.name for one in PARTS])]
+    given, failed = list(sys.argv[1:] if arguments is None else arguments), []
+    processes: list[subprocess.Popen[bytes]] = [started(parts[0], given, options.out)]
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit("ended"))
+    try:
+        for number, part in enumerate(parts):
+            began = time.monotonic()
+            if number + 1 < len(parts):
+                processes.append(started(parts[number + 1], given, options.out))
+            with suppress(subprocess.TimeoutExpired):
+                processes[number].communicate(b"go\n", timeout=part.limit_s)
+            code = end(processes[number])
+            print(f"== {part.name}: exit {code}, {time.monotonic() - began:.0f} s", flush=True)
+            print((options.out / f"{part.name}.log").read_text(), flush=True)
+            failed += [part.name] if code else []
+    finally:
+        for process in processes:
+            end(process)
+    if failed:
+        sys.exit(f"failed or out of time: {', '.join(failed)}")
+
+
+def end(process: subprocess.Popen[bytes]) -> int:
+    """End a process and all that it has started, if it has not ended; return its exit status."""
+    if process.poll() is None:
+        os.killpg(process.pid, signal.SIGKILL)
+    with suppress(BrokenPipeError):
+        assert process.stdin is not None
+        process.stdin.close()
+    return process.wait()
+
+
+def started(part: Part, given: Sequence[str], out: Path) -> subprocess.Popen[bytes]:
+    """Start the process of a part: it imports what it needs, and waits for its turn on the device."""
+    with (out / f"{part.name}.log").open("wb") as log:
+        return subprocess.Popen(  # noqa: S603 - this program
+            [sys.executable, "-u", __file__, *given, "--part", part.name],
+            stdin=subprocess.PIPE, stdout=log, stderr=subprocess.STDOUT, start_new_session=True,
+        )  # fmt: skip
+
+
+def run(part: Part, options: argparse.Namespace) -> None:
+    """Run a part, once it is its turn."""
+    given = part.arguments.replace("OFFICIAL", str(options.official))
+    if options.quick:
+        for ours, small in _QUICK.items():
+            given = given.replace(ours, small)
+    benchmark = importlib.import_module(part.benchmark)
+    if not sys.stdin.readline():  # the parent has ended
+        return
+    benchmark.main([*given.split(), "--json", str(options.out / f"{part.name}.json")])
+
+
+def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("benchmarks/results/gpu"), help="folder for logs and figures")
+    parser.add_argument("--official", type=Path, default=BESIDE, help="checkout (default: vjepa2 beside this project)")
+    parser.add_argument("--quick", action="store_true", help="tiny sizes on the CPU: whether it works")
+    parser.add_argument("--only", nargs="+", choices=[part.name for part in PARTS], help="some parts (default: all)")
+    parser.add_argument("--part", help=argparse.SUPPRESS)
+    return parser.parse_args(arguments)
+
+
+if __name__ == "__main__":
+    main()

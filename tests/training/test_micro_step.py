@@ -1,0 +1,140 @@
+"""A captured and replayed micro-step equals the plain one, whatever becomes of the gradients between steps."""
+
+import itertools
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import torch
+from torch import Tensor
+
+from run_fixtures import set_up
+from vjepa2_ac.config import Config
+from vjepa2_ac.distributed import make_accelerator
+from vjepa2_ac.episode import Batch
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.training.micro_step import Body, GraphedMicroStep, captured, plain_micro_step
+from vjepa2_ac.training.setup import Run, batches_from, encode
+from vjepa2_ac.training.step import training_step
+
+STEPS = 3
+NEEDS_CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+
+
+class Recorder:
+    """Simulates a CUDA graph: a replay repeats the recorded body, and needs gradients at their addresses."""
+
+    def __init__(self, run: Run) -> None:
+        self.run, self.captures, self.replays = run, 0, 0
+
+    def __call__(self, body: Body) -> Body:
+        for _ in range(2):  # to warm up, which adds gradients
+            body()
+        self.captures += 1
+        places = self.places()
+
+        def replay() -> None:
+            assert self.places() == places
+            self.replays += 1
+            body()
+
+        return replay
+
+    def places(self) -> list[int | None]:
+        return [None if one.grad is None else one.grad.data_ptr() for one in self.run.trained]
+
+
+def some_of(batch: Batch, clips: int) -> Batch:
+    parts = {name: value[:clips] for name, value in vars(batch).items() if isinstance(value, Tensor)}
+    return replace(batch, **parts, episode_ids=batch.episode_ids[:clips], starts=batch.starts[:clips])
+
+
+def uneven(batches: Iterator[Batch]) -> Iterator[Batch]:
+    """Leave out clips, as where some cannot be read: of the third micro-batch one, of the fifth all."""
+    for number, batch in enumerate(batches):
+        yield some_of(batch, {2: 1, 4: 0}.get(number, len(batch.starts)))
+
+
+def learned(run: Run, batches: Iterator[Batch]) -> list[Tensor]:
+    metrics = [training_step(run, batches, step) for step in range(1, STEPS + 1)]
+    losses = torch.tensor([[row["loss"], row["grad_norm"]] for row in metrics], dtype=torch.float64)
+    return [losses, *(parameter.detach().clone() for parameter in run.trained)]
+
+
+@pytest.fixture
+def make_run(make_config: Callable[..., Config], reporter) -> Callable[..., Run]:
+    def make(**changes: object) -> Run:
+        config = make_config(
+            adapter__dropout=0.0, training__batch_size=2, training__accumulation=2, training__learning_rate=1e-2,
+            training__warmup_steps=0, **changes,
+        )  # fmt: skip
+        return set_up(config, reporter)
+
+    return make
+
+
+def recorded(run: Run) -> Recorder:
+    """Let a run capture its micro-step, on whatever device."""
+    recorder = Recorder(run)
+    run.micro_step = GraphedMicroStep(run.micro_step, run.trained, recorder)
+    return recorder
+
+
+@pytest.mark.parametrize("order", [lambda batches: batches, uneven], ids=["even", "uneven"])
+def test_a_captured_micro_step_learns_what_the_plain_one_learns(make_run, order) -> None:
+    plain, other = (make_run() for _ in range(2))
+    expected = learned(plain, order(batches_from(plain)))
+    recorder = recorded(other)
+    found = learned(other, order(batches_from(other)))
+    assert all(map(torch.equal, found, expected))
+    assert recorder.captures == 1
+    assert recorder.replays == 2 * STEPS - (2 if order is uneven else 0)
+
+
+@pytest.mark.parametrize("none_before", [True, False])
+def test_a_capture_adds_to_the_gradients_that_are_there(make_run, none_before: bool) -> None:
+    run = make_run()
+    run.world_model.train()
+    first, second = (encode(run, batch) for batch in itertools.islice(batches_from(run), 2))
+    plain = partial(plain_micro_step, run.objective, run.accelerator, run.scaler)
+    recorder = recorded(run)
+    steps = [run.micro_step] * 2 if none_before else [plain, run.micro_step]
+
+    def gradients(*steps: Callable[..., Tensor]) -> list[Tensor]:
+        run.optimizer.zero_grad()
+        for step, latents in zip(steps, (first, second), strict=True):
+            step(latents, 2.0)
+        return [parameter.grad.clone() for parameter in run.trained]
+
+    expected = gradients(plain, plain)
+    assert all(map(torch.equal, gradients(*steps), expected))
+    assert (recorder.captures, recorder.replays) == (1, len(steps) - (not none_before))
+
+
+@NEEDS_CUDA
+def test_a_cuda_graph_learns_what_plain_launches_learn(make_run) -> None:
+    runs = [make_run(training__device="cuda", training__cuda_graph=graph) for graph in (False, True)]
+    expected, found = (learned(run, batches_from(run)) for run in runs)
+    assert isinstance(runs[1].micro_step, GraphedMicroStep)
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-5)
+
+
+def test_the_capture_is_that_of_cuda(make_run) -> None:
+    run = make_run()
+    training = run.config.training.model_copy(update={"cuda_graph": True})
+    run.config = run.config.model_copy(update={"training": training})
+    assert isinstance(run.micro_step, GraphedMicroStep)
+    assert run.micro_step._capture is captured
+
+
+def test_a_graph_on_a_cpu_is_refused(make_config) -> None:
+    with pytest.raises(InputError, match=r"training.cuda_graph.*a CUDA device"):
+        make_accelerator(make_config(training__cuda_graph=True, training__device="cpu", adapter__dropout=0.0))
+
+
+@pytest.mark.parametrize("changes", [{"training__precision": "fp16"}, {"adapter__dropout": 0.1}])
+def test_a_graph_that_would_repeat_random_numbers_or_a_loss_scale_is_refused(make_config, changes) -> None:
+    with pytest.raises(InputError, match=r"training.cuda_graph needs adapter.dropout 0, and bf16 or fp32"):
+        make_config(training__cuda_graph=True, **({"adapter__dropout": 0.0} | changes))
