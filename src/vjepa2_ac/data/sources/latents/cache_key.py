@@ -25,8 +25,8 @@ _NOT_OF_ENCODING = ("data", "format")  # how the names of the other parts begin
 class Encoding:
     """What determines a frame's latents besides the frame, and their size; made by `encoding.batch.encoding_of`.
 
-    The number of frames per pass of the encoder is not included: with this encoder it changes no bit on a CPU
-    (measured, tests/encoding/test_latent_cache.py), and elsewhere only the order of a sum.
+    The number of frames per pass of the encoder is not included: it changes only the order of a sum, and on
+    some CPUs nothing (tests/encoding/test_training_cache.py).
     """
 
     encoder: str  # WorldModel.encoder_fingerprint
