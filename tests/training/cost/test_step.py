@@ -22,6 +22,7 @@ from vjepa2_ac.training.cost.step import LiveStorages, measure_step
 from vjepa2_ac.training.loss import Objective
 
 TOLERANCE = 0.015
+SOME = ([1], [1], [1], [1])  # bytes of each phase
 ENDS = ["predictor_embed", "predictor_proj", "action_encoder", "state_encoder"]
 FLOAT32_BASE = {"model__dtype": "float32"}
 KNOBS: dict[str, dict[str, Any]] = {
@@ -171,3 +172,29 @@ def test_no_fake_table_is_left_for_a_run() -> None:
     assert not isinstance(rotary_tables(layout, 24, cpu).cosine, FakeTensor)
     measure_step(run_config(), model_sizes(width=24, heads=1), "cpu")
     assert not isinstance(rotary_tables(layout, 24, cpu).cosine, FakeTensor)
+
+
+@pytest.mark.parametrize(
+    ("changes", "times"),
+    [
+        ({"data__path": "another", "training__steps": 7, "training__learning_rate": 1e-5, "planning__samples": 900}, 0),
+        ({"data__frames": 7}, 1),
+        ({"model__dtype": "float32"}, 1),
+        ({"training__precision": "fp16"}, 1),
+        ({"training__batch_size": 3}, 1),
+        ({"training__rollout_steps": 3}, 1),
+        ({"training__attention": "per_step"}, 1),
+        ({"training__loss": "l2"}, 1),
+        ({"validation__batch_size": 3}, 1),
+        ({"adapter": {**LORA, "rank": 2}}, 1),
+    ],
+)
+def test_what_changes_the_bytes_is_measured_again_and_nothing_else_is(
+    monkeypatch: pytest.MonkeyPatch, changes: dict[str, Any], times: int
+) -> None:
+    measured: list[object] = []
+    monkeypatch.setattr(cost_step, "_measured", {})
+    monkeypatch.setattr(cost_step, "_measure", lambda *given: measured.append(given) or SOME)
+    for config in (run_config(), run_config(**changes)):
+        measure_step(config, model_sizes())
+    assert len(measured) == 1 + times

@@ -33,7 +33,11 @@ from vjepa2_ac.training.loss import Objective
 Kind = Literal["cpu", "cuda"]
 
 _BLOCKS = (2, 3)  # of the models that are measured
-_WITHOUT_EFFECT = {"training": {"gradient_checkpointing", "optimizer"}, "model": {"encode_chunk"}, "data": {"cache"}}
+_OF_LOSS = {"loss", "loss_options", "smooth_l1_beta", "teacher_forcing_weight", "rollout_weight", "rollout_steps"}
+_WITH_EFFECT = {
+    "plugins": True, "adapter": True, "model": {"dtype"}, "data": {"frames"}, "validation": {"batch_size"},
+    "training": {"attention", "precision", "batch_size", *_OF_LOSS},
+}  # fmt: skip
 
 _measured: dict[str, StepBytes] = {}
 
@@ -58,7 +62,7 @@ def measure_step(config: Config, sizes: ModelSizes, device: Kind = "cuda") -> St
     Raises:
         InputError: A knob of the adapter does not fit the predictor.
     """
-    key = f"{config.model_dump_json(exclude=_WITHOUT_EFFECT)} {sizes} {device}"
+    key = f"{config.model_dump_json(include=_WITH_EFFECT)} {sizes} {device}"
     if key not in _measured:
         depth = sizes.predictor.depth
         if depth <= _BLOCKS[1] or config.adapter.peft:  # whose options may make blocks differ
