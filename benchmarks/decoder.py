@@ -21,7 +21,7 @@ from typing import Any
 import torch
 from memory import peak_alone, peak_gb
 from rows import Rows, cell
-from timing import about, add_basics, add_repeats, introduction, prepare, ratio, rounds, settle
+from timing import about, add_basics, add_repeats, introduction, prepare, ratio, settle, timed
 
 from vjepa2_ac.config import DecoderConfig
 from vjepa2_ac.decoding.frame_pairs import Pairs
@@ -42,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     rows = Rows(options.json, **about(options, given))
     for work, ways_of in (("show", _showing), ("learn", _learning)):
         peaks = {size: _peak(options, partial(ways_of, options), size) for size in ("linear", *options.size)}
-        seen = list(rounds(ways_of(options, "linear", *options.size), options, lambda: None))[-1]
+        seen = timed(ways_of(options, "linear", *options.size), options)
         for way, turns in seen.items():
             seconds, gained = turns.median_s, ratio(seen["linear"], turns)
             rows.add({"work": work, "way": way, **turns.figures(), "ratio": gained, "peak_gb": peaks[way]})

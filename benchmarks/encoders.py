@@ -22,7 +22,7 @@ import torch
 from memory import let_go
 from memory import peak_gb as peak_of
 from rows import Rows, cell
-from timing import about, add_basics, add_repeats, introduction, prepare, rounds, settle
+from timing import about, add_basics, add_repeats, introduction, prepare, settle, timed
 
 from vjepa2_ac.config import Config, EncoderSizes, ModelSizes, PredictorSizes
 from vjepa2_ac.config.loading import parse_config
@@ -109,7 +109,7 @@ def add_speed(options: argparse.Namespace, name: str, encoder: EncoderSizes, cei
     encode = partial(model.encode, pixels, options.frames)
     with torch.no_grad():
         peak = peak_of(encode, options.device)
-        turns = list(rounds({name: encode}, options, lambda: None))[-1][name]
+        turns = timed({name: encode}, options)[name]
     speed = turns.median_s and options.frames / turns.median_s
     mfu = speed and speed * frame_flops(sizes) / ceiling
     rows.add({"encoder": name, **turns.figures(), "frames_per_s": speed, "mfu": mfu, "peak_gb": peak})

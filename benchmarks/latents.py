@@ -33,7 +33,7 @@ import torch
 from memory import let_go
 from random_models import no_fingerprints
 from rows import Row, Rows, cell
-from timing import Turns, about, add_basics, add_repeats, clock_s, introduction, prepare, ratio, rounds, settle
+from timing import about, add_basics, add_repeats, clock_s, introduction, prepare, ratio, settle, timed
 from torch import Tensor
 
 from vjepa2_ac.config import Config, DataConfig, EncoderSizes, ModelConfig, ModelSizes, PredictorSizes
@@ -141,9 +141,7 @@ def speed_row(options: argparse.Namespace, folder: Path, frames: int, rows: Rows
     runs = {"pictures": set_up(pictures), "latents": set_up(latents)}
     batches = {name: batches_from(run) for name, run in runs.items()}
     steps = {name: partial(training_step, run, batches[name], PAST_WARM_UP) for name, run in runs.items()}
-    turns: dict[str, Turns] = {}
-    for seen in rounds(steps, options, partial(let_go, options.device)):
-        turns = seen
+    turns = timed(steps, options, partial(let_go, options.device))
     for each in batches.values():
         each.close()
     for name, one in turns.items():

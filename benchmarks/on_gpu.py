@@ -31,9 +31,7 @@ from timing import BESIDE
 
 _STEP = "--device cuda --frames 16 --repeats 3 --warm-up 1 --official"
 _PLAN = "--device cuda --horizon 1 --at-once 64 --no-memory --warm-up 1 --official"
-
-
-_QUICK = {"--device cuda": "--quick", "+graph": "", "--large --decisions 3": "--decisions 2"}
+_QUICK = {"--device cuda": "--quick", "+graph": "", "--large --decisions 3": "--decisions 2"}  # instead, by --quick
 
 
 @dataclass(frozen=True)

@@ -12,13 +12,13 @@ import torch
 from decision_ways import OFFICIAL, PLAIN, Difference, Way
 from official_planner import PLANNER, OfficialPlanner
 from official_predictor import PREDICTOR
-from random_models import no_fingerprints, random_model
+from random_models import add_random_adapter, no_fingerprints, random_model
 from torch import Tensor, nn
 from torch.nn.functional import layer_norm
 
-from vjepa2_ac.config import AdapterConfig, EncoderSizes, ModelSizes, PredictorSizes
+from vjepa2_ac.config import EncoderSizes, ModelSizes, PredictorSizes
 from vjepa2_ac.config.planning import CemConfig, EnergyConfig, PlanningConfig
-from vjepa2_ac.model.adapter.lora import add_adapter, lora_layers
+from vjepa2_ac.model.adapter.lora import lora_layers
 from vjepa2_ac.model.checkpoints.loading import to_official
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.energy import Goal, Scene, WorldModelCost, distance
@@ -30,7 +30,6 @@ from vjepa2_ac.training.cost.flops import plan_flops
 POSE = (0.45, 0.10, 0.35, 3.0, 0.1, -0.4, 0.3)  # of an arm that points down
 WANTED = (0.03, -0.02, 0.04, 0.0, 0.0, 0.0, 0.3)  # the action of each step that leads to the goal
 _COMPARED_SAMPLES, _COMPARED_ITERATIONS = 8, 2
-_OF_AN_ADAPTER = 0.01  # standard deviation of its second matrices
 
 
 class PlainCost:
@@ -179,11 +178,8 @@ class Bench:
     @torch.no_grad()
     def _adapted(self) -> WorldModel:
         model = _copy(self.model)
-        with no_fingerprints():
-            add_adapter(model, AdapterConfig(), seed=0)
-        generator = torch.Generator(self.device).manual_seed(1)
+        add_random_adapter(model)
         for layer in lora_layers(model).values():
-            layer.lora_B["default"].weight.normal_(std=_OF_AN_ADAPTER, generator=generator)
             layer.base_layer.weight -= layer.get_delta_weight("default")
         model.predictor.requires_grad_(False)
         return model.eval()

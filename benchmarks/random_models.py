@@ -8,8 +8,11 @@ from unittest import mock
 
 import torch
 
-from vjepa2_ac.config import ModelSizes
+from vjepa2_ac.config import AdapterConfig, ModelSizes
+from vjepa2_ac.model.adapter.lora import add_adapter, lora_layers
 from vjepa2_ac.model.network.world_model import WorldModel
+
+_OF_AN_ADAPTER = 0.01  # standard deviation of its second matrices
 
 
 def random_model(sizes: ModelSizes, dtype: torch.dtype, device: torch.device | str) -> WorldModel:
@@ -18,6 +21,15 @@ def random_model(sizes: ModelSizes, dtype: torch.dtype, device: torch.device | s
     The same for the same sizes and kind of device.
     """
     return WorldModel.random(sizes, seed=0, dtype=dtype, device=device).float()
+
+
+def add_random_adapter(model: WorldModel) -> None:
+    """Adapt a model by a LoRA that is not zero: at zero its first matrices have no gradient."""
+    with no_fingerprints():
+        add_adapter(model, AdapterConfig(), seed=0)
+    generator = torch.Generator(model.device).manual_seed(1)
+    for layer in lora_layers(model).values():
+        layer.lora_B["default"].weight.data.normal_(std=_OF_AN_ADAPTER, generator=generator)
 
 
 @contextmanager

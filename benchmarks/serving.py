@@ -31,7 +31,6 @@ from vjepa2_ac.serving.wire import PlanningClient
 STATE = np.array([0.45, 0.0, 0.3, np.pi, 0.0, 0.0, 0.0])
 SMALL = ("planning.samples=10", "planning.iterations=1", "planning.limits.gripper_mode=held")
 LARGE = ("planning.samples=800", "planning.iterations=10", "planning.horizon=1", "planning.energy.samples_at_once=64")
-WARM_UP = {False: 10, True: 1}  # decisions that do not count, by --large
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -43,17 +42,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--json", type=Path, help="file for the figures")
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as folder:
-        model = large_model(Path(folder)) if options.large else "builtin:sim-tiny"
-        settings = LARGE if options.large else SMALL
+        small = "builtin:sim-tiny", SMALL, 10
+        model, settings, warm_up = (large_model(Path(folder)), LARGE, 1) if options.large else small
         command = [sys.executable, "-m", "vjepa2_ac.cli", "serve", model, "--port", "0", *settings]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:  # noqa: S603 - our own command
             try:
-                cost, whole = measure(
-                    address_of(server), options.decisions, WARM_UP[options.large], tuple(options.size)
-                )
+                cost, whole = measure(address_of(server), options.decisions, warm_up, tuple(options.size))
             finally:
                 server.terminate()
-    rows = Rows(options.json, size=list(options.size), decisions=options.decisions, model=options.large)
+    rows = Rows(options.json, size=list(options.size), decisions=options.decisions, large=options.large)
     row = {f"cost_ms_p{p}": round(float(np.percentile(cost, p)), 2) for p in (50, 95, 99)}
     for p in (50, 95):
         row[f"round_trip_ms_p{p}"] = round(float(np.percentile(whole, p)), 2)

@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 import torch
 from memory import alloc_retries, use_expandable_segments
 from rows import problem_of
-from torch._C._autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
 
 WAITS_ON = {
@@ -139,6 +138,16 @@ def rounds(
             yield seen
 
 
+def timed(
+    steps: Mapping[str, Callable[[], object]],
+    options: argparse.Namespace,
+    after_failure: Callable[[], object] = lambda: None,
+) -> dict[str, Turns]:
+    """Let all take turns, as `rounds` does, and return what was seen when all rounds were over."""
+    *_, seen = rounds(steps, options, after_failure)
+    return seen
+
+
 def _take_turn(step: Callable[[], object], turns: Turns, device: str, *, counts: bool) -> None:
     before = alloc_retries(device)
     try:
@@ -168,7 +177,7 @@ class Profile(NamedTuple):
 
     def busy_ms(self) -> float:
         """Return how long the device's kernels ran in all; 0 on a CPU."""
-        on_device = (event for event in self.events if event.device_type == DeviceType.CUDA)
+        on_device = (event for event in self.events if event.device_type.name == "CUDA")
         return sum(event.self_device_time_total for event in on_device) / 1e3
 
     def dearest(self, device: str) -> list[dict[str, Any]]:

@@ -15,7 +15,7 @@ import torch
 from accelerate import Accelerator
 from memory import let_go
 from official_predictor import PREDICTOR, Official, difference
-from random_models import no_fingerprints, random_model
+from random_models import add_random_adapter, random_model
 from rows import problem_of
 from torch import Tensor
 from torch.nn.functional import layer_norm
@@ -34,7 +34,6 @@ from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.transforms import pixels_to_input
 from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.episode import Batch, LatentBatch
-from vjepa2_ac.model.adapter.lora import add_adapter, lora_layers
 from vjepa2_ac.model.checkpoints.loading import to_official
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.runs.checkpoint import RunState
@@ -50,7 +49,6 @@ OFFICIAL_FULL = "official_full"  # every weight of its predictor is trained
 COMPILED, GRAPH = "+compile", "+graph"  # at the end of a way of ours, in this order
 PRECISIONS = {"float32": "fp32", "bfloat16": "bf16"}
 _NEXT_TO_NOTHING = 1e-30  # as fast as any learning rate, and every step has the loss and the gradients of the first
-_OF_AN_ADAPTER = 0.01  # standard deviation of its second matrices: at zero the first ones have no gradient
 _PAST_WARM_UP = 1001  # a step at which the learning rate is what it mostly is
 
 
@@ -150,7 +148,7 @@ class Bench:
             raise ValueError("a batch of latents")
         return frames.to(self.device)
 
-    def config(self, setting: Setting, *, whole: bool = False) -> Config:
+    def config(self, setting: Setting, *, whole: bool = False, graph: bool = False) -> Config:
         """Return what a run of a setting is (`whole`: without an adapter); its data and base are never opened."""
         options = self.options
         return Config(
@@ -160,7 +158,7 @@ class Bench:
             model=ModelConfig(base="none", dtype="bfloat16" if self.precision == "bf16" else "float32"),
             training=TrainingConfig(
                 batch_size=setting.batch, accumulation=1, rollout_steps=options.rollout_steps,
-                learning_rate=_NEXT_TO_NOTHING,
+                learning_rate=_NEXT_TO_NOTHING, cuda_graph=graph,
                 device="cpu" if self.device.type == "cpu" else "cuda",
                 precision="bf16" if self.precision == "bf16" else "fp32", gradient_checkpointing=setting.checkpointing,
             ),
@@ -239,11 +237,7 @@ class Bench:
         if has_checkout(self.options):  # in half the memory; both keep the same
             official = to_official(model)
             self._weights = {part: _in_type(official[part], self.dtype) for part in ("encoder", "predictor")}
-        with no_fingerprints():
-            add_adapter(model, AdapterConfig(), seed=0)
-        generator = torch.Generator(self.device).manual_seed(1)
-        for layer in lora_layers(model).values():
-            layer.lora_B["default"].weight.data.normal_(std=_OF_AN_ADAPTER, generator=generator)
+        add_random_adapter(model)
         return model
 
     def _drawn(self, shape: tuple[int, ...]) -> Tensor:
@@ -263,8 +257,7 @@ class Bench:
 
     def run(self, setting: Setting, *, graph: bool = False) -> Run:
         """Return the run that `training_step` works on."""
-        config = self.config(setting)
-        config = config.model_copy(update={"training": config.training.model_copy(update={"cuda_graph": graph})})
+        config = self.config(setting, graph=graph)
         return Run(
             config=config,
             accelerator=self._accelerator(config),

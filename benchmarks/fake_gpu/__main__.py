@@ -28,11 +28,10 @@ matrices and 0.27 for attention; 0.9 for bytes, 0.4 where types are mixed; produ
 are of all inputs and outputs, as if no cache helped, and a copy from the host is as fast as one within the device. All
 were measured on one H100, as was `host`: 33 us for each kernel. `ms` is the longer of both, for a step whose host is
 slower than its device. `floor`: model FLOPs (`training.cost.flops`) over the ceiling, and MFU is the floor over `ms`.
-FlexAttention stands for one flash
-operation that has the arithmetic of the pairs its mask leaves, as `auto` takes it where Triton is installed. Nothing is
-compiled. The official step keeps float32 weights under autocast and its dense mask, for which PyTorch takes its
-efficient kernel, counted as fast as flash: kinder than it is. Of a decision two iterations are computed, and the second
-counts for all others, which are alike.
+FlexAttention stands for one flash operation that has the arithmetic of the pairs its mask leaves, as `auto` takes it
+where Triton is installed. Nothing is compiled. The official step keeps float32 weights under autocast and its dense
+mask, for which PyTorch takes its efficient kernel, counted as fast as flash: kinder than it is. Of a decision two
+iterations are computed, and the second counts for all others, which are alike.
 """
 
 from __future__ import annotations

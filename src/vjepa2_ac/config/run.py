@@ -48,9 +48,6 @@ class ReplayConfig(Section):
         return lines
 
 
-_GRAPH = "training.cuda_graph needs adapter.dropout 0, and bf16 or fp32"
-
-
 class Config(Section):
     """A complete run."""
 
@@ -86,7 +83,8 @@ class Config(Section):
     def _parts_fit(self) -> Config:
         training, adapter, model, best = self.training, self.adapter, self.model, self.checkpoint.keep_best
         predictor, steps, lora = (model.random or model.sizes).predictor, training.rollout_steps, adapter.kind == "lora"
-        fp32, compiled = training.precision == "fp32", training.compile != "off" and lora
+        graph, fp32, compiled = training.cuda_graph, training.precision == "fp32", training.compile != "off" and lora
+        draws_or_scales = training.precision == "fp16" or adapter.dropout > 0  # which a graph would repeat
         patient, ranked = training.patience is not None, self.validation.ranking_clips > 0
         stray = [name for name in ("targets", "modules_to_save") if "state_encoder" in getattr(adapter, name)]
         stray = stray if lora and not predictor.use_states else []
@@ -97,7 +95,7 @@ class Config(Section):
             (model.random and lora, "model.random with adapter.kind lora would adapt noise; set adapter.kind: none"),
             (fp32 and model.dtype != "float32", "training.precision fp32 needs model.dtype float32"),
             (compiled and adapter.dora, "training.compile blocks cannot trace adapter.dora; set one of them off"),
-            (training.cuda_graph and (training.precision == "fp16" or adapter.dropout), _GRAPH),
+            (graph and draws_or_scales, "training.cuda_graph needs adapter.dropout 0, and bf16 or fp32"),
             (best == "ranking" and not ranked, "checkpoint.keep_best ranking needs validation.ranking_clips"),
             (best == "off" and patient, "training.patience waits for a better one, and checkpoint.keep_best is off"),
             (predictor.use_extrinsics and blind, f"predictor.use_extrinsics needs camera poses, not in source {blind}"),

@@ -64,7 +64,9 @@ class GraphedMicroStep:
         """Capture a micro-step on copies of these clips; gradients are as before afterwards."""
         copies: dict[str, Any] = {name: one.clone() for name, one in _tensors(latents).items()}
         given, losses = replace(latents, **copies), torch.zeros(2, device=latents.latents.device)
-        before = [None if one.grad is None else one.grad.clone() for one in self._trained]
+        before = [parameter.grad for parameter in self._trained]
+        for parameter in self._trained:
+            parameter.grad = None  # the graph gets tensors of its own
 
         def body() -> None:
             losses.copy_(self._plain(given, parts))
