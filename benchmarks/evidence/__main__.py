@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from cells import Cell, all_cells, candidate_cells
+from other_worlds import TASKS
 
 
 def main() -> int:
@@ -32,9 +33,14 @@ def main() -> int:
     if options.table:
         write_tables(folder, options.out, options.page)
         return 0
-    prepare(folder, options.seeds)
     cells = list(candidate_cells() if options.choose else all_cells(options.seeds))
     cells = [cell for cell in cells if options.only is None or options.only in cell.name]
+    for task in sorted({cell.shift for cell in cells if cell.shift in TASKS and not TASKS[cell.shift].is_there}):
+        print(
+            f"{task} is left out: make worlds/{TASKS[task].program} makes its environment (docs/worlds.md)", flush=True
+        )
+        cells = [cell for cell in cells if cell.shift != task]
+    prepare(folder, {cell.shift for cell in cells}, options.seeds)
     missing = [cell for cell in cells if not _result(results, cell).exists()]
     print(f"{len(cells)} cells, {len(cells) - len(missing)} of them done", flush=True)
     failed = _run(missing, results, options)
@@ -62,6 +68,7 @@ def _run(cells: list[Cell], results: Path, options: argparse.Namespace) -> int:
     sys.path.append(str(Path(__file__).resolve().parents[1]))
     from cell_processes import in_processes
     from measure import measure_alone
+    from results import last, reached
 
     numbers = itertools.count(1)
 
@@ -69,13 +76,10 @@ def _run(cells: list[Cell], results: Path, options: argparse.Namespace) -> int:
         path = _result(results, cell)
         path.with_suffix(".part").write_text(json.dumps(figures, indent=1))
         path.with_suffix(".part").rename(path)
-        reached = [row[-1] < 5.0 for row in figures["reach"]["l1"]["distance_cm"]]
-        error = figures["shifted"]["rollout_over_persistence"][-1]
-        print(
-            f"{next(numbers)}/{len(cells)} {cell.name}: error {error:.3f}, reach {sum(reached)}/{len(reached)},"
-            f" {figures['minutes']:.1f} min",
-            flush=True,
-        )
+        solved = reached(figures)
+        error = f"error {last(figures):.3f}, " if "shifted" in figures else ""
+        done = f"{next(numbers)}/{len(cells)} {cell.name}: {error}reached {sum(solved)}/{len(solved)}"
+        print(f"{done}, {figures['minutes']:.1f} min", flush=True)
 
     work = [(cell, options.folder, options.goals, options.choose) for cell in cells]
     return in_processes(measure_alone, work, options.workers, keep)

@@ -6,21 +6,23 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Literal
 
+from other_worlds import TASKS
+
 from vjepa2_ac.config import AdapterConfig, TrainingConfig
 from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B, Domain
 
-Shift = Literal["look", "motion"]
 Base = Literal["one camera", "many cameras", "none"]
 
-SHIFTS: dict[Shift, Domain] = {
+SHIFTS: dict[str, Domain] = {
     "look": replace(DOMAIN_B, name="look", base_yaw_deg=DOMAIN_A.base_yaw_deg, lag_s=DOMAIN_A.lag_s),
     "motion": replace(DOMAIN_A, name="motion", base_yaw_deg=60.0, lag_s=DOMAIN_B.lag_s),
 }
 """look: camera turned by 43 degrees, other colours, light, table and things on it; the arm moves as in A. motion: looks
-like A, but the robot is mounted turned by 60 degrees, so that an action moves the arm elsewhere in the picture."""
+like A, but the robot is mounted turned by 60 degrees, so that an action moves the arm elsewhere in the picture.
+Tasks of worlds that others made (`other_worlds.TASKS`) are shifts, too: of that world before and after its change."""
 
-TURNS: dict[Shift, float] = {
+TURNS: dict[str, float] = {
     "look": DOMAIN_A.camera.azimuth_deg - SHIFTS["look"].camera.azimuth_deg,
     "motion": SHIFTS["motion"].base_yaw_deg,
 }
@@ -61,9 +63,11 @@ class Method:
     """How the weights change."""
 
     name: str
-    kind: Literal["zero-shot", "calibrated", "LoRA", "full", "scratch"]
+    kind: Literal["zero-shot", "calibrated", "LoRA", "full", "scratch", "cloned"]
     rank: int = 0
     in_out: bool = False  # whether the layers before and after the blocks are trained whole, beside the adapter
+    dora: bool = False
+    blocks: bool = True  # False: of the blocks one layer alone, by rank 1 (PEFT asks for one)
     times: int = 1  # so many times the steps
     learning_rate: float = 1e-3
 
@@ -73,8 +77,14 @@ class Method:
         if self.kind != "LoRA":
             return AdapterConfig(kind="none")
         whole = IN_OUT if self.in_out else ()
-        given = {"rank": self.rank, "alpha": 2.0 * self.rank, "dropout": 0.0, "modules_to_save": whole}
-        return AdapterConfig.model_validate(given)
+        given = {
+            "rank": self.rank,
+            "alpha": 2.0 * self.rank,
+            "dropout": 0.0,
+            "modules_to_save": whole,
+            "dora": self.dora,
+        }
+        return AdapterConfig.model_validate(given if self.blocks else {**given, "targets": ["blocks.0.attn.q"]})
 
     @property
     def training(self) -> TrainingConfig:
@@ -98,9 +108,12 @@ METHODS = {
             for both in (False, True)
             for rank in (4, 8, 16, 32)
         ),
+        Method("in/out only", "LoRA", 1, in_out=True, blocks=False, learning_rate=5e-3),
+        Method("DoRA r16", "LoRA", 16, dora=True, learning_rate=5e-3),
         Method("full", "full", learning_rate=8e-3),
         Method("scratch", "scratch", learning_rate=1.2e-2),
         Method("scratch, 3x steps", "scratch", times=3, learning_rate=1.2e-2),
+        Method("behaviour cloning", "cloned", times=3),
     )
 }
 
@@ -127,7 +140,7 @@ def method_of(name: str) -> Method:
 class Cell:
     """One run: trained once, measured once."""
 
-    shift: Shift
+    shift: str  # of SHIFTS, or a task of other_worlds.TASKS
     base: Base
     method: str
     episodes: int  # demonstrations of the shifted domain
@@ -143,15 +156,35 @@ class Cell:
 def all_cells(seeds: int = 3) -> Iterator[Cell]:
     """Yield every cell, those that matter most first."""
     main = ("zero-shot", AXES, BEST, "full", "scratch")
+    arm = tuple(name for name, method in METHODS.items() if method.kind != "cloned")
     for seed in range(seeds):
         yield from _of("look", main, 20, seed)
     for seed in range(seeds):
-        yield from _of("look", tuple(name for name in METHODS if name not in main), 20, seed)
+        yield from _of("look", tuple(name for name in arm if name not in main), 20, seed)
     for seed in range(seeds):
         yield from _of("motion", main, 20, seed)
     for seed in range(seeds):
         for episodes in (10, 40):
             yield from _of("look", (BEST, "full", "scratch"), episodes, seed)
+    yield from world_cells(seeds)
+
+
+def world_cells(seeds: int) -> Iterator[Cell]:
+    """Yield the cells of worlds that others made."""
+    for seed in range(seeds):
+        for task in TASKS:
+            yield from _of(task, IN_WORLDS, 20, seed)
+    for seed in range(seeds):
+        for task in FEW_AND_MANY:
+            for episodes in (5, 80):
+                yield from _of(task, (BEST, "full", "scratch, 3x steps", "behaviour cloning"), episodes, seed)
+
+
+IN_WORLDS = (
+    "zero-shot", "in/out only", "LoRA r4", "LoRA r16", BEST, "DoRA r16", "full", "scratch", "scratch, 3x steps",
+    "behaviour cloning",
+)  # fmt: skip
+FEW_AND_MANY = ("Lift", "Door")  # tasks that are learned from 5 and 80 demonstrations, too
 
 
 def candidate_cells() -> Iterator[Cell]:
@@ -160,9 +193,11 @@ def candidate_cells() -> Iterator[Cell]:
         yield Cell("look", "none" if method.kind == "scratch" else "many cameras", name, 20, 0)
 
 
-def _of(shift: Shift, methods: tuple[str, ...], episodes: int, seed: int) -> Iterator[Cell]:
+def _of(shift: str, methods: tuple[str, ...], episodes: int, seed: int) -> Iterator[Cell]:
     for name in methods:
-        bases: tuple[Base, ...] = ("none",) if METHODS[name].kind == "scratch" else BASES
+        bases: tuple[Base, ...] = BASES if shift in SHIFTS else BASES[:1]
+        if METHODS[name].kind in {"scratch", "cloned"}:
+            bases = ("none",)
         for base in bases:
             yield Cell(shift, base, name, 0 if name == "zero-shot" else episodes, seed)
 

@@ -10,12 +10,15 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
+import other_worlds
 import torch
 from cells import PLANNING, SHIFTS, Cell, energies_of, method_of
-from prepare import base_model, data_a, data_shifted, training_episodes
+from cloning import Cloning, clone
+from offline import offline_figures, visited_correlation
+from prepare import base_model, data_before, data_shifted, training_episodes
 
-from vjepa2_ac.config import Config, DataConfig, ModelConfig, PlanningConfig, ValidationConfig
-from vjepa2_ac.config.data import Split
+from vjepa2_ac.config import Config, ModelConfig, PlanningConfig, ValidationConfig
+from vjepa2_ac.config.data import DataConfig, Split
 from vjepa2_ac.config.training import CheckpointConfig
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.loader import validation_batches
@@ -33,8 +36,9 @@ from vjepa2_ac.planning.model_setup import Axes, Fingerprints
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.checkpoint import NEWEST
 from vjepa2_ac.runs.loading import load_run
-from vjepa2_ac.simulation.closed_loop.policies import Oracle, Planning, Policy, RandomActions, ZeroActions
+from vjepa2_ac.simulation.closed_loop.policies import Image, Oracle, Planning, Policy, RandomActions, ZeroActions
 from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, run_task
+from vjepa2_ac.simulation.closed_loop.tasks import Problem, TaskProblem
 from vjepa2_ac.storage import write_atomically
 from vjepa2_ac.storage.structured import json_text
 from vjepa2_ac.training.cost.memory import count_parameters
@@ -55,6 +59,8 @@ def measure(cell: Cell, folder: Path, *, goals: int = GOALS, choosing: bool = Fa
         choosing: Measure on validation episodes and goals, to choose settings by.
     """
     config = config_of(cell, folder)
+    if method_of(cell.method).kind == "cloned":
+        return _cloned(cell, config, folder, goals, choosing=choosing)
     started = time.process_time(), time.perf_counter()
     file, axes = None, None
     if method_of(cell.method).kind in {"zero-shot", "calibrated"}:
@@ -74,16 +80,29 @@ def measure(cell: Cell, folder: Path, *, goals: int = GOALS, choosing: bool = Fa
         **trained,
         "shifted": _as_dict(held_out(model, config, split, axes=axes)),
     }
+    if axes is None:
+        figures["offline"] = _offline(model, config, split)
     if cell.base != "none":
-        figures["forgetting"] = _forgetting(model, folder, config)
+        figures["forgetting"] = _forgetting(model, data_before(folder, cell.shift), config)
     if model.adaptation is not None:
         merge_adapter(model)
     goals_seed = (VALIDATION_GOALS if choosing else TEST_GOALS) + cell.seed
+    settings = {"axes": file} if cell.shift in SHIFTS else {"config": other_worlds.PLANNING}
     figures["reach"] = {
-        distance: reach(cell, planner(model, distance, axes=file), seed=goals_seed, goals=goals)
+        distance: closed_loop(cell, planner(model, distance, **settings), folder, seed=goals_seed, goals=goals)
         for distance in energies_of(cell)
     }
     return figures
+
+
+def _cloned(cell: Cell, config: Config, folder: Path, goals: int, *, choosing: bool) -> dict[str, Any]:
+    """Return the figures of a policy that imitates: it predicts nothing."""
+    began, model = time.process_time(), load_base(config.model, seed=cell.seed)
+    policy = Cloning(clone(config, model, config.training.steps, cell.seed), config.data.crop)
+    minutes, seed = (time.process_time() - began) / 60, (VALIDATION_GOALS if choosing else TEST_GOALS) + cell.seed
+    found = closed_loop(cell, policy, folder, seed=seed, goals=goals)
+    trained = {"trained_share": 1.0, "adapter_mb": 0.0, "cpu_minutes": minutes, "minutes": minutes}
+    return {"cell": asdict(cell) | {"name": cell.name}, **trained, "reach": {"l1": found}}
 
 
 def measure_alone(cell: Cell, folder: Path, goals: int, choosing: bool) -> dict[str, Any]:
@@ -91,7 +110,7 @@ def measure_alone(cell: Cell, folder: Path, goals: int, choosing: bool) -> dict[
     torch.set_num_threads(1)
     figures = measure(cell, folder, goals=goals, choosing=choosing) | {"made_with": made_with()}
     if method_of(cell.method).kind == "zero-shot":
-        figures["baselines"] = baselines(cell, goals=goals)
+        figures["baselines"] = baselines(cell, folder, goals=goals)
     return figures
 
 
@@ -113,7 +132,7 @@ def config_of(cell: Cell, folder: Path) -> Config:
         run_dir=str(folder / "runs" / cell.name),
         seed=cell.seed,
         data=data.model_copy(update={"exclude": left_out}),
-        model=ModelConfig(base=base_model(folder, cell.base, cell.seed), dtype="float32"),
+        model=ModelConfig(base=base_model(folder, cell.base, cell.seed, cell.shift), dtype="float32"),
         adapter=method.adapter,
         training=method.training,
         validation=ValidationConfig(every=method.training.steps, clips=40, batch_size=20),
@@ -121,23 +140,51 @@ def config_of(cell: Cell, folder: Path) -> Config:
     )
 
 
-def baselines(cell: Cell, *, goals: int = GOALS) -> dict[str, Any]:
+def baselines(cell: Cell, folder: Path, *, goals: int = GOALS) -> dict[str, Any]:
     """Return how far those get who need no model, on the same goals."""
-    limits = PLANNING.limits
-    policies: tuple[Policy, ...] = (ZeroActions(), RandomActions(limits, cell.seed), Oracle(limits))
-    return {policy.name: reach(cell, policy, seed=TEST_GOALS + cell.seed, goals=goals) for policy in policies}
+    limits, seed = PLANNING.limits, TEST_GOALS + cell.seed
+    policies: list[Policy] = [ZeroActions(), RandomActions(limits, cell.seed)]
+    policies += [Oracle(limits)] if cell.shift in SHIFTS else []
+    found = {policy.name: closed_loop(cell, policy, folder, seed=seed, goals=goals) for policy in policies}
+    if cell.shift not in SHIFTS:
+        found["oracle"] = other_worlds.figures_of(other_worlds.problems(folder, cell.shift, seed, goals)[1], seed)
+    return found
 
 
 def planner(model: WorldModel, distance: str, config: PlanningConfig = PLANNING, axes: str | None = None) -> Policy:
     """Return a policy that plans with a model, in calibrated axes where a file of them is given."""
     energy = config.energy.model_copy(update={"distance": distance})
-    return Planning(Controller(model, config.model_copy(update={"energy": energy, "axes": axes})))
+    controller = Controller(model, config.model_copy(update={"energy": energy, "axes": axes}))
+    if config is other_worlds.PLANNING:
+        return Planning(controller, goals_of=other_worlds.goals_of)
+    return Watched(controller)
 
 
-def reach(cell: Cell, policy: Policy, *, seed: int, goals: int) -> dict[str, Any]:
+class Watched(Planning):
+    """A planner that is asked after each decision how its energies agree with true distances (`reach` only)."""
+
+    def reset(self, problem: Problem, goal_image: Image) -> None:
+        """Begin an episode."""
+        super().reset(problem, goal_image)
+        self._wanted = TaskProblem.of(problem).goal[:3]
+        self.agreements: list[float] = getattr(self, "agreements", [])
+
+    def act(self, image: Image, state: np.ndarray) -> np.ndarray:
+        """Return the first action of a plan."""
+        action = super().act(image, state)
+        found = visited_correlation(self.controller, self._wanted, len(self.agreements))
+        self.agreements += [] if found is None else [found]
+        return action
+
+
+def closed_loop(cell: Cell, policy: Policy, folder: Path, *, seed: int, goals: int) -> dict[str, Any]:
     """Return distances to the goal (cm) before the first step and after each, and seconds of a decision."""
+    if cell.shift not in SHIFTS:
+        return other_worlds.closed_loop(folder, cell.shift, policy, seed=seed, goals=goals)
     result = run_task(RolloutSpec("reach", SHIFTS[cell.shift], goals, seed), policy)
+    agreements = policy.agreements if isinstance(policy, Watched) else []
     return {
+        **({"visited": float(np.mean(agreements))} if agreements else {}),
         "goals_seed": seed,
         "distance_cm": np.round(result.distance_cm, 3).tolist(),
         "seconds_per_decision": float(result.seconds.mean()),
@@ -157,6 +204,19 @@ def held_out(
     return prediction_errors(model, encoded if axes is None else (_turned(batch, axes) for batch in encoded))
 
 
+def _offline(model: WorldModel, config: Config, split: Split) -> dict[str, float]:
+    """Return what might tell how a model fares in closed loop."""
+    dataset = with_latents_if_there(config, open_dataset(config.data), model)
+    train, test = (
+        [
+            encode_batch(model, batch, device=torch.device("cpu"), chunk=64)
+            for batch in validation_batches(dataset, one, clips=CLIPS, batch_size=32)
+        ]
+        for one in ("train", split)
+    )
+    return offline_figures(model, dataset.spaces.action, train, test, PLANNING)
+
+
 def _turned(batch: LatentBatch, axes: Axes) -> LatentBatch:
     return replace(batch, states=axes.poses(batch.states), actions=axes.actions(batch.actions))
 
@@ -171,10 +231,9 @@ def _calibrated(config: Config, model: WorldModel, path: Path) -> tuple[str | No
     return str(path), Axes.read(str(path), Fingerprints.of(model)), found
 
 
-def _forgetting(model: WorldModel, folder: Path, config: Config) -> dict[str, Any]:
-    """Return errors on A with the adapter on and off, and whether off is the base's to the last bit."""
-    on_a: DataConfig = data_a(folder)
-    config = config.model_copy(update={"data": on_a})
+def _forgetting(model: WorldModel, before: DataConfig, config: Config) -> dict[str, Any]:
+    """Return errors before the shift with the adapter on and off, and whether off is the base's to the last bit."""
+    config = config.model_copy(update={"data": before})
     on = held_out(model, config)
     if model.adaptation is None:
         return {"on": _as_dict(on)}

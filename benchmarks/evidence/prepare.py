@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
-from cells import SHIFTS, TRAINING, Base, Shift
+from cells import SHIFTS, TRAINING, Base
+from other_worlds import TASKS, data_of, record
 
 from vjepa2_ac.config import Config, DataConfig, ModelConfig, RldsData
 from vjepa2_ac.config.loading import load_config
@@ -21,6 +23,7 @@ from vjepa2_ac.training.loop import train
 BUILTIN = "builtin:sim-tiny"
 EPISODES_A, EPISODES_SHIFTED = 400, 100
 SEED_A, SEED_SHIFTED = 11, 21  # of recordings; another than those of the demo and its base
+WORLD_STEPS = 4_000  # of the base of a world
 BASE_CONFIG = Path(__file__).with_name("base_one_camera.yaml")
 
 
@@ -38,30 +41,61 @@ def data_a(folder: Path) -> DataConfig:
     )
 
 
-def data_shifted(folder: Path, shift: Shift) -> DataConfig:
+def data_before(folder: Path, shift: str) -> DataConfig:
+    """Return the data that a base of one camera was trained on, before a shift."""
+    return data_a(folder) if shift in SHIFTS else data_of(folder, shift, "before")
+
+
+def data_shifted(folder: Path, shift: str) -> DataConfig:
     """Return the data of a shifted domain: half of its episodes may be trained on, the others are held out."""
+    if shift not in SHIFTS:
+        return data_of(folder, shift, "after")
     update = {"path": str(folder / f"data-{shift}"), "validation_share": 0.12, "test_share": 0.35}
     return data_a(folder).model_copy(update=update)
 
 
-def base_model(folder: Path, base: Base, seed: int) -> str:
+def base_model(folder: Path, base: Base, seed: int, shift: str = "look") -> str:
     """Return what `model.base` takes for a base, or for a predictor without a past."""
     if base == "many cameras":
         return BUILTIN
-    return str(folder / (f"scratch-{seed}" if base == "none" else "base-one-camera"))
+    of_one = "base-one-camera" if shift in SHIFTS else f"base-{shift}"
+    return str(folder / (f"scratch-{seed}" if base == "none" else of_one))
 
 
-def prepare(folder: Path, seeds: int, reporter: Reporter = SILENT) -> None:
-    """Make everything that is not there yet: some 25 minutes on one core, nearly all of it the base of one camera."""
+def prepare_world(folder: Path, task: str, reporter: Reporter = SILENT) -> None:
+    """Make what the cells of a world need: demonstrations before and after its change, and a base of those before."""
+    for when in ("before", "after"):
+        record(folder, task, when)
+    base = Path(base_model(folder, "one camera", 0, task))
+    encode(data_of(folder, task, "before"), BUILTIN)  # all share its encoder
+    encode(data_of(folder, task, "after"), BUILTIN)
+    if not base.exists():
+        changes = [
+            f"run_dir={folder / f'run-{base.name}'}",
+            f"training.steps={WORLD_STEPS}",
+            "training.allow_weak_base=true",
+        ]
+        config = load_config(BASE_CONFIG, changes)
+        start = config.model.model_copy(update={"base": base_model(folder, "none", 0), "random": None})
+        config = config.model_copy(update={"data": data_of(folder, task, "before"), "model": start})
+        export_run(train(config, reporter), base)
+
+
+def prepare(folder: Path, shifts: Collection[str], seeds: int, reporter: Reporter = SILENT) -> None:
+    """Make everything that is not there yet; of our own arm some 25 minutes on one core, most of it its first base."""
     folder.mkdir(parents=True, exist_ok=True)
+    for seed in range(seeds):
+        _without_a_past(Path(base_model(folder, "none", seed)), seed)
+    for task in filter(TASKS.__contains__, shifts):
+        prepare_world(folder, task, reporter)
+    if not any(shift in SHIFTS for shift in shifts):
+        return
     _record(data_a(folder), "A", EPISODES_A, SEED_A)
     for shift in SHIFTS:
         _record(data_shifted(folder, shift), shift, EPISODES_SHIFTED, SEED_SHIFTED)
     if not Path(base_model(folder, "one camera", 0)).exists():
         run = train(_base_config(folder), reporter)
         export_run(run, Path(base_model(folder, "one camera", 0)))
-    for seed in range(seeds):
-        _without_a_past(Path(base_model(folder, "none", seed)), seed)
     for data in (data_a(folder), *(data_shifted(folder, shift) for shift in SHIFTS)):
         for base in ("one camera", "many cameras"):
             encode(data, base_model(folder, base, 0))

@@ -33,8 +33,9 @@ def of_policy(results: Sequence[Figures], base: str, name: str, shift: str = "lo
 
 
 def reached(one: Figures, distance: str = "l1") -> list[bool]:
-    """Return which goals a cell reached, by which energy."""
-    return [row[-1] < REACHED_CM for row in one["reach"][distance]["distance_cm"]]
+    """Return which goals a cell reached, by which energy; in worlds of others, what was done at the end."""
+    found = one["reach"][distance]
+    return list(found["solved"]) if "solved" in found else [row[-1] < REACHED_CM for row in found["distance_cm"]]
 
 
 def share_reached(found: Sequence[Figures]) -> Estimate:

@@ -8,12 +8,16 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from cells import AXES, BASES, BEST, METHODS, TURNS
+from cells import AXES, BASES, BEST, FEW_AND_MANY, IN_WORLDS, METHODS, SHIFTS, TURNS
+from offline import correlations
+from other_worlds import TASKS
 from plot import draw
 from results import Figures, last, main_cells, of_policy, pick, reached, read_results, share_reached
 
 from vjepa2_ac.intervals import mean_of, share_of
 
+FEWEST = 20  # cells from which a correlation is told
+EPISODES = 20  # demonstrations of a cell of the main tables
 TABLE, PLOT = "evidence.md", "evidence.png"
 _BEGIN, _END = "<!-- made by `make evidence`: begin -->", "<!-- made by `make evidence`: end -->"
 
@@ -48,7 +52,15 @@ def write_tables(folder: Path, out: Path, page: Path | None = None) -> None:
     out.mkdir(parents=True, exist_ok=True)
     text = "\n\n".join(
         part
-        for part in (_main(results), _motion(results), _axes(results), _by_episodes(results), _lora(results))
+        for part in (
+            _main(results),
+            _motion(results),
+            _axes(results),
+            _by_episodes(results),
+            _lora(results),
+            of_worlds(results),
+            trust(results),
+        )
         if part
     )
     text = f"{text}\n\n{NOTES}\n{_made_with(results)}"
@@ -91,7 +103,7 @@ def summary(results: Sequence[Figures]) -> str:
     for name in ("do nothing", "random", "oracle"):
         parts = [part for base in BASES for part in (*_short(of_policy(results, base, name)), "")]
         rows.append(f"| {name} | | {' | '.join(parts)} |")
-    for method in METHODS.values():
+    for method in (one for one in METHODS.values() if one.kind != "cloned"):
         by_base = [main_cells(results, "none" if method.kind == "scratch" else base, method.name) for base in BASES]
         share = next((one["trained_share"] for found in by_base for one in found), 0.0)
         parts = []
@@ -187,6 +199,71 @@ def _lora(results: Sequence[Figures]) -> str:
                     f" ({spread}); reached {ours}, full fine-tuning {theirs}"
                 )
     return "### LoRA against full fine-tuning\n\n" + "\n".join(lines) if lines else ""
+
+
+def of_worlds(results: Sequence[Figures]) -> str:
+    """Return a table of what was done in worlds that others made, a column for each task."""
+    tasks = [task for task in TASKS if pick(results, shift=task)]
+    if not tasks:
+        return ""
+    rows = [f"| {EPISODES} demonstrations | {' | '.join(tasks)} |", "|---|" + "---|" * len(tasks)]
+    for name, label in (("do nothing", "do nothing"), ("random", "random"), ("oracle", "expert")):
+        rows.append(f"| {label} | {' | '.join(_done(of_policy(results, BASES[0], name, task)) for task in tasks)} |")
+    for method in IN_WORLDS:
+        found = [pick(results, shift=task, method=method) for task in tasks]
+        found = [[one for one in cells if one["cell"]["episodes"] in (0, EPISODES)] for cells in found]
+        rows.append(f"| {method} | {' | '.join(map(_done, found))} |")
+    title = "### Worlds that others made: solved at the end; error 0.8 s ahead"
+    return f"{title}\n\n" + "\n".join([*rows, "", *_few_and_many(results)])
+
+
+def _few_and_many(results: Sequence[Figures]) -> list[str]:
+    rows = ["| demonstrations | 5 | 20 | 80 |", "|---|---|---|---|"]
+    for task in FEW_AND_MANY:
+        for method in (BEST, "full", "scratch, 3x steps", "behaviour cloning"):
+            found = [pick(results, shift=task, method=method, episodes=count) for count in (5, EPISODES, 80)]
+            rows += [f"| {task}: {method} | {' | '.join(map(_done, found))} |"] if any(found) else []
+    return rows
+
+
+def _done(found: Sequence[Figures]) -> str:
+    """Return the share of all problems that were solved, with its interval, and the error at the farthest horizon."""
+    if not found:
+        return ""
+    share = share_reached(found)
+    error = [last(one) for one in found if "shifted" in one]
+    return f"{share.value:.0%} [{share.low:.0%}, {share.high:.0%}]" + (f"; {np.mean(error):.3f}" if error else "")
+
+
+def trust(results: Sequence[Figures]) -> str:
+    """Return which offline figure goes with closed-loop success, over the cells of our own arm."""
+    cells = [one for one in results if "offline" in one and "visited" in one["reach"]["l1"]]
+    if len(cells) < FEWEST:
+        return ""
+    groups = {"all": cells, **{shift: [one for one in cells if one["cell"]["shift"] == shift] for shift in SHIFTS}}
+    lines = []
+    for label, some in groups.items():
+        if len(some) >= FEWEST:
+            found = correlations([_offline_row(one) for one in some], [-float(np.mean(reached(one))) for one in some])
+            for name, one in sorted(found.items(), key=lambda pair: -pair[1]["value"]):
+                value = f"{one['value']:.2f} [{one['low']:.2f}, {one['high']:.2f}]"
+                lines.append(f"| {label}, {len(some)} cells | {name} | {value} |")
+    head = "| cells | offline figure, lower is better | Spearman with goals missed |\n|---|---|---|"
+    return "### Which offline figure predicts closed-loop success?\n\n" + "\n".join([head, *lines])
+
+
+def _offline_row(one: Figures) -> dict[str, float]:
+    shifted, first = one["shifted"], one["shifted"]["one_step"]
+    errors = {
+        f"error over persistence, {step} steps": value
+        for step, value in enumerate(shifted["rollout_over_persistence"], 1)
+    }
+    return {
+        **errors,
+        "cost of wrong actions, negative": 1 - shifted["one_step_shuffled_actions"] / first,
+        **one["offline"],
+        "energy and distance over visited plans, negative": -one["reach"]["l1"]["visited"],
+    }
 
 
 def _made_with(results: Sequence[Figures]) -> str:

@@ -21,14 +21,16 @@ from vjepa2_ac.simulation.world.domains import DOMAIN_A
 pytest.importorskip("mujoco")
 
 
+MODULES = ("other_worlds", "cells", "prepare", "cloning", "offline", "measure", "results", "plot", "table")
+
+
 @pytest.fixture
 def evidence(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """The modules of benchmarks/evidence."""
-    names = ("cells", "prepare", "measure", "results", "plot", "table")
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks/evidence"))
-    yield SimpleNamespace(**{name: import_module(name) for name in names})
-    for name in names:
-        sys.modules.pop(name)
+    yield SimpleNamespace(**{name: import_module(name) for name in MODULES})
+    for name in MODULES:
+        sys.modules.pop(name, None)
 
 
 def test_cells_have_names_of_their_own_and_hold_all_that_is_to_be_compared(evidence: Any) -> None:
@@ -38,8 +40,12 @@ def test_cells_have_names_of_their_own_and_hold_all_that_is_to_be_compared(evide
         main = {
             cell.method for cell in cells if cell.shift == "look" and cell.base == base and cell.episodes in (0, 20)
         }
-        assert main == {name for name in evidence.cells.METHODS if not name.startswith("scratch")}
-    assert {cell.episodes for cell in cells if cell.method == evidence.cells.BEST} == {10, 20, 40}
+        methods = evidence.cells.METHODS.items()
+        assert main == {name for name, method in methods if method.kind not in {"scratch", "cloned"}}
+    of_best = [cell for cell in cells if cell.method == evidence.cells.BEST]
+    assert {cell.episodes for cell in of_best if cell.shift == "look"} == {10, 20, 40}
+    assert {cell.episodes for cell in of_best if cell.shift == "Lift"} == {5, 20, 80}
+    assert {cell.method for cell in cells if cell.shift == "LIBERO-swap"} == set(evidence.cells.IN_WORLDS)
     assert {cell.seed for cell in cells if cell.method == "full"} == {0, 1, 2}
 
 
@@ -87,8 +93,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     """Everything at its smallest: two steps, one goal; the figures mean nothing."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(ROOT / "benchmarks/evidence"))
-        names = ("cells", "prepare", "measure", "results", "plot", "table")
-        modules = SimpleNamespace(**{name: import_module(name) for name in names})
+        modules = SimpleNamespace(**{name: import_module(name) for name in MODULES})
         cells, prepare, measure = modules.cells, modules.prepare, modules.measure
         patch.setattr(cells, "STEPS", 2)
         patch.setattr(cells, "TRAINING", cells.TRAINING.model_copy(update={"warmup_steps": 1, "batch_size": 2}))
@@ -97,13 +102,15 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
         few = cells.PLANNING.model_copy(update={"samples": 12, "iterations": 1})
         patch.setattr(measure, "planner", partial(measure.planner, config=few))
         patch.setattr(measure, "CLIPS", 6)
+        for name, value in (("MOVES", 2), ("PLANS", 1), ("FEWER", {"samples": 12, "iterations": 1})):
+            patch.setattr(modules.offline, name, value)
         patch.setattr(measure, "PAIRS", 6)
         patch.setattr(measure, "base_model", lambda *_: prepare.BUILTIN)
         patch.setattr(prepare, "RecordingSpec", partial(RecordingSpec, steps=14))
         modules.folder = tmp_path_factory.mktemp("evidence")
         for name, make in (("data_a", prepare.data_a), ("data_shifted", prepare.data_shifted)):
-            for module in (prepare, measure):
-                patch.setattr(module, name, partial(_held_out, make))
+            patch.setattr(prepare, name, partial(_held_out, make))
+        patch.setattr(measure, "data_shifted", prepare.data_shifted)
         for data, domain in (
             (prepare.data_a(modules.folder), "A"),
             (prepare.data_shifted(modules.folder, "look"), "look"),
@@ -111,8 +118,8 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
             prepare._record(data, domain, 11, 3)
             prepare.encode(data, prepare.BUILTIN)
         yield modules
-    for name in names:
-        sys.modules.pop(name)
+    for name in MODULES:
+        sys.modules.pop(name, None)
 
 
 def _held_out(make: Any, *arguments: Any) -> Any:
@@ -129,11 +136,13 @@ def test_a_cell_is_trained_and_measured_and_its_base_comes_back(small: Any, tmp_
     assert 0 < figures["trained_share"] < 0.2
     assert figures["adapter_mb"] > 0
     assert len(figures["reach"]["l1"]["distance_cm"][0]) == 9
+    assert -1 <= figures["reach"]["l1"]["visited"] <= 1
+    assert len(figures["offline"]) == 10
 
     zero = replace(cell, method="zero-shot", episodes=0)
     before = small.measure.measure(zero, small.folder, goals=1)
     assert set(small.measure.made_with()) == {"torch", "commit"}
-    before["baselines"] = small.measure.baselines(zero, goals=1)
+    before["baselines"] = small.measure.baselines(zero, small.folder, goals=1)
     assert before["trained_share"] == 0
     assert before["shifted"] != figures["shifted"]
     assert (
@@ -187,3 +196,10 @@ def test_a_page_without_a_place_for_the_table_is_left_alone(small: Any, tmp_path
     with pytest.raises(ValueError, match="made by"):
         small.table.write_summary([], page)
     assert page.read_text() == "nothing"
+
+
+def test_a_figure_that_orders_models_as_their_success_does_is_found(evidence: Any) -> None:
+    rows = [{"good": -float(one), "useless": float(one % 3), "backwards": float(one)} for one in range(24)]
+    found = evidence.offline.correlations(rows, [-float(one) for one in range(24)], draws=50)
+    assert [found[name]["value"] for name in ("good", "backwards")] == pytest.approx([1.0, -1.0])
+    assert found["useless"]["low"] < 0 < found["useless"]["high"]

@@ -8,6 +8,7 @@ import pytest
 from same_run import assert_same_run
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.checkpoint import checkpoint_name, newest_checkpoint, read_state, select_checkpoint
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.training import loop, validation
@@ -107,3 +108,34 @@ def test_a_run_without_a_better_one_ends_when_patience_does(make_config, reporte
 def test_what_does_not_fit_together_is_refused(overrides: list[str], words: str) -> None:
     with pytest.raises(InputError, match=words):
         parse_config({"run_dir": "r", "data": {"path": "d"}, "model": {"base": "b"}}, overrides, where="here")
+
+
+def test_a_model_that_hardly_uses_the_actions_is_said_to_once_after_warm_up_and_at_the_end(
+    make_config, monkeypatch
+) -> None:
+    class Notes(Reporter):
+        def __init__(self) -> None:
+            self.warned: list[int] = []
+            self.step = 0
+
+        def validated(self, step: int, found: object) -> None:  # noqa: ARG002
+            self.step = step
+
+        def note(self, text: str) -> None:
+            if "hardly uses them" in text:
+                self.warned.append(self.step)
+
+    sizes = {
+        "image_size": 32,
+        "encoder": {"width": 24, "depth": 1, "heads": 2},
+        "predictor": {"width": 24, "depth": 1, "heads": 2},
+    }
+    copying = {"model__base": None, "model__random": sizes, "adapter__kind": "none", "training__learning_rate": 1e-12}
+    config = make_config(**EVERY_STEP, **copying, training__warmup_steps=2)
+    notes = Notes()
+    train(config, notes)
+    assert notes.warned == [2, 6]
+    monkeypatch.setattr(validation, "USED", -1.0)
+    notes = Notes()
+    train(config.model_copy(update={"run_dir": f"{config.run_dir}-other"}), notes)
+    assert notes.warned == []

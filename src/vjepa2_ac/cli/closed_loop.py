@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
+import shlex
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -24,7 +26,9 @@ if TYPE_CHECKING:
     from vjepa2_ac.serving.about import KeptGoals
     from vjepa2_ac.serving.server import Served
     from vjepa2_ac.simulation.closed_loop.agent import Agent
-    from vjepa2_ac.simulation.closed_loop.benchmark import ClosedLoopBenchmark
+    from vjepa2_ac.simulation.closed_loop.benchmark import BenchmarkOptions, ClosedLoopBenchmark
+
+    Benchmark = tuple[ClosedLoopBenchmark, tuple[Path, ...]]  # and its files
 
 _GB = 10**9
 _OF_RECORD = ("cameras", "workers")
@@ -74,6 +78,8 @@ def add_simulate(commands: cli.Commands) -> None:
     cli.add(parser, "--episodes N", "how many (50; record: 40)", cli.count)
     cli.add(parser, "--steps N", "model steps (8; pick 12, place 18); record: control steps (41; place 81)", cli.count)
     cli.add(parser, "--seed N", "which problems or demonstrations (0)", cli.whole_number(0, 2**31 - 1))
+    text = "instead of our arm a program in an environment of its own: 'PYTHON examples/worlds/robosuite.py Lift'"
+    cli.add(parser, "--world COMMAND", text)
     group = parser.add_argument_group("to test a model")
     cli.add_all(group)
     cli.add_checkpoint(group, default=None)
@@ -191,6 +197,8 @@ def _simulate(options: argparse.Namespace) -> int:
     It steers to a goal image, beside doing nothing, chance and an oracle. Or, as `simulate record FOLDER`: record
     demonstrations of the arm as a DROID data set. Status 1 where the model gave no finite energy in any decision.
     """
+    if options.world is not None:
+        _refuse(options, ("task",), needed="none: the world has its own")
     if options.subject == "record":
         _refuse(options, _OF_A_MODEL, needed="a model that steers")
         return _record(options)
@@ -206,6 +214,8 @@ def _record(options: argparse.Namespace) -> int:
         target = cli.as_path(options.overrides[0])
     except argparse.ArgumentTypeError as error:
         raise InputError(where="simulate record", found=str(error), needed="a folder of this machine") from None
+    if options.world is not None:
+        return _record_world(options, target)
     cli.require_new_place(target)
 
     from vjepa2_ac.simulation.recording.record import RecordingSpec, default_steps, record_dataset
@@ -218,6 +228,19 @@ def _record(options: argparse.Namespace) -> int:
         progress(0, episodes)
         folder = record_dataset(target, spec, episodes=episodes, workers=workers, progress=progress)
     cli.show(f"{episodes} episodes are in {folder}")
+    return 0
+
+
+def _record_world(options: argparse.Namespace, target: Path) -> int:
+    _refuse(options, _OF_RECORD, needed="the simulated arm: a world has one camera, and one process")
+
+    from vjepa2_ac.simulation.closed_loop.worlds import OtherWorld
+    from vjepa2_ac.simulation.recording.record_world import record_world
+
+    with OtherWorld(options.world) as world, cli.reporter() as reporter:
+        seeds = range(options.seed or 0, (options.seed or 0) + (options.episodes or 40))
+        solved = record_world(world, target, seeds, reporter.task("recording"))
+    cli.show(f"{len(seeds)} episodes are in {target}; the expert solved {solved}. Next: vjepa2-ac init {target}")
     return 0
 
 
@@ -237,16 +260,12 @@ def _run_benchmark(options: argparse.Namespace) -> int:
         _refuse(options, ("checkpoint", "config", "decoder", "overrides"), needed="the model itself; not its server")
 
     from vjepa2_ac.cli.console.tables import benchmark_notes, benchmark_table
-    from vjepa2_ac.simulation.closed_loop.benchmark import BenchmarkOptions, run_benchmark
-    from vjepa2_ac.simulation.world.domains import load_mujoco
+    from vjepa2_ac.simulation.closed_loop.benchmark import BenchmarkOptions
 
-    load_mujoco()
     chosen = cli.record_of_options(BenchmarkOptions, options)
     chosen = replace(chosen, films=min(chosen.films, chosen.episodes))
-    name = f"closed_loop/{chosen.task}-{chosen.domain}"
-    home = Path(options.subject) if is_run(options.subject) else Path()
-    with _agent(options) as agent, cli.reporter() as reporter:
-        benchmark, files = run_benchmark(agent, chosen, options.out or home / name, reporter)
+    home = (Path(options.subject) if is_run(options.subject) else Path()) / "closed_loop"
+    benchmark, files = (_in_our_world if options.world is None else _in_their_world)(options, chosen, home)
     checkpoint = benchmark.agent.checkpoint
     if options.all:
         name = f"{options.subject}: checkpoint {checkpoint}" if checkpoint else options.subject
@@ -257,17 +276,34 @@ def _run_benchmark(options: argparse.Namespace) -> int:
     return int(any(set(result.why_counts) == {"no finite energy"} for result in benchmark.results))
 
 
+def _in_our_world(options: argparse.Namespace, chosen: BenchmarkOptions, home: Path) -> Benchmark:
+    from vjepa2_ac.simulation.closed_loop.benchmark import run_benchmark
+    from vjepa2_ac.simulation.world.domains import load_mujoco
+
+    load_mujoco()
+    folder = options.out or home / f"{chosen.task}-{chosen.domain}"
+    with _agent(options) as agent, cli.reporter() as reporter:
+        return run_benchmark(agent, chosen, folder, reporter)
+
+
+def _in_their_world(options: argparse.Namespace, chosen: BenchmarkOptions, home: Path) -> Benchmark:
+    from vjepa2_ac.simulation.closed_loop.worlds import OtherWorld, run_world_benchmark
+
+    with OtherWorld(options.world) as world, _agent(options) as agent, cli.reporter() as reporter:
+        about = world.about
+        name = re.sub(r"\W+", "-", f"{about.task} {about.world}").strip("-")
+        return run_world_benchmark(agent, world, chosen, options.out or home / name, reporter)
+
+
 def _answer(benchmark: ClosedLoopBenchmark) -> Answer:
     """Return the answer of the closed loop; the other two questions as `evaluate` answered them of this checkpoint."""
     from vjepa2_ac.evaluation.answer import Answer, not_measured
     from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics
 
-    agent, options = benchmark.agent, benchmark.options
+    agent, trials = benchmark.agent, benchmark.trials
     how = "" if cli.is_server(agent.subject) else f"vjepa2-ac evaluate {agent.subject}"
     unknown = not_measured("predicts", how), not_measured("uses actions", how)
-    measured = (
-        f"{options.task}, domain {options.world.name}, {options.model_steps} steps of {options.seconds_per_step:.2f} s"
-    )
+    measured = f"{trials.task_name}, {trials.place}, {trials.model_steps} steps of {trials.seconds_per_step:.2f} s"
     found = Answer(agent.subject, measured, "doing nothing", *unknown, benchmark.plans)
     if agent.checkpoint and (Path(agent.subject) / METRICS_FILE).is_file():
         evaluated = read_metrics(Path(agent.subject))
@@ -279,7 +315,8 @@ def _answer(benchmark: ClosedLoopBenchmark) -> Answer:
 def _next(answer: Answer, options: argparse.Namespace) -> str:
     """Return the command that follows from the answer of a closed loop."""
     if answer.plans.why:
-        return f"vjepa2-ac simulate {options.subject} --task {options.task or 'reach'} --episodes 50"
+        what = f"--task {options.task or 'reach'}" if options.world is None else f"--world {shlex.quote(options.world)}"
+        return f"vjepa2-ac simulate {options.subject} {what} --episodes 50"
     if cli.is_server(options.subject):
         return f"your robot's client at {options.subject} (docs/serving.md)"
     if answer.predicts.share is None:

@@ -149,6 +149,9 @@ class EncoderConfig(Section):
     (V-JEPA 2.1 only): as one image, through patches of its own."""
     heads: Heads | None = None
     """Attention heads of an encoder of a width that nobody has published; null: those of the published width."""
+    layer: Depth | None = None
+    """Its block after which features are taken; null: the last. Earlier ones (two thirds deep) were seen to tell more
+    of motion (docs/encoders.md). They are normalised without the last norm's weights, and cost less."""
 
 
 class ModelConfig(Section):

@@ -11,7 +11,7 @@ from vjepa2_ac.distributed import agreed, broadcast_object
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.action_use import RolloutStart, moves_of, rank_actions
-from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persistence
+from vjepa2_ac.evaluation.estimates import cost_of_actions, one_step_over_persistence, over_persistence
 from vjepa2_ac.evaluation.measure import prediction_errors
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import Validation
@@ -21,6 +21,7 @@ from vjepa2_ac.training.setup import Run, encode
 
 BEST_BY = "rollout_over_persistence_last"  # checkpoint.keep_best error: planning depends on the longest horizon
 RANK = "action_rank"  # checkpoint.keep_best ranking
+USED = 0.02  # share of error that wrong actions cost a model that uses them, at least
 _AT_ONCE = 64  # samples per batch: as many tokens as the clips of a small micro-batch
 _NOT_ASKED = (
     "The base is not asked whether it is better than persistence: with fresh input heads it predicts little until they"
@@ -33,7 +34,23 @@ def validate_if_due(run: Run, metrics_log: MetricsLog | None, reporter: Reporter
     step, config = run.state.step, run.config
     if step % config.validation.every != 0 and step != config.training.steps:
         return False
-    return record(run, validation_metrics(validate(run, reporter)), metrics_log)
+    found = validate(run, reporter)
+    is_first = step - config.validation.every < max(1, config.training.warmup_steps) <= step
+    if (is_first or step == config.training.steps) and (said := unused_actions(found)):
+        reporter.note(said)
+    return record(run, validation_metrics(found), metrics_log)
+
+
+def unused_actions(found: Validation) -> str:
+    """Return that a model hardly uses the actions, as text; empty: it does."""
+    cost = cost_of_actions(found.errors, "shuffled").value
+    if cost >= USED:
+        return ""
+    return (
+        f"Warning: the actions of other clips raise the error by {cost:.1%} only (used: {USED:.0%} and more): the model"
+        " hardly uses them, and cannot plan. Look at the data's axes and stride (vjepa2-ac data check); from scratch,"
+        " docs/encoders.md says what else to try"
+    )
 
 
 def record(run: Run, metrics: dict[str, Any], metrics_log: MetricsLog | None) -> bool:

@@ -21,7 +21,7 @@ from vjepa2_ac.evaluation.rows import rows_of
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.planning.decision import PlanResult
 from vjepa2_ac.simulation.closed_loop.benchmark import ClosedLoopBenchmark
-from vjepa2_ac.simulation.closed_loop.rollout import ClosedLoopResult
+from vjepa2_ac.simulation.closed_loop.rollout import ClosedLoopResult, RolloutSpec
 from vjepa2_ac.spaces import POSE, vector_states
 from worlds import Copier, Halfway, about, again, clips_batch
 
@@ -77,8 +77,8 @@ def benchmarks() -> list[Table]:
         final_distance_cm=Estimate(12.3, 10.1, 14.5), steps_needed=SHARE,
         seconds_per_decision=Estimate(16.2, 15.0, 17.0),
     )  # fmt: skip
-    options = Mock(task="reach", domain="B", episodes=100, seed=5, model_steps=20, seconds_per_step=0.27)
-    return [benchmark_table(Mock(spec=ClosedLoopBenchmark, options=options, results=(result,)))]
+    trials = RolloutSpec("reach", "B", episodes=100, seed=5, steps=20)
+    return [benchmark_table(Mock(spec=ClosedLoopBenchmark, trials=trials, results=(result,)))]
 
 
 @pytest.mark.parametrize("width", [80, 120])

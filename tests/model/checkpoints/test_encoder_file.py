@@ -366,3 +366,35 @@ print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
     assert int(done.stdout) < 120e6
+
+
+# Features of an earlier block.
+
+
+def test_an_earlier_layer_gives_the_features_after_that_block_from_a_smaller_network(
+    golden: Golden, tmp_path: Path
+) -> None:
+    whole, frames = model_of(golden.path), golden.io["frames.96"]
+    depth, seen = whole.sizes.encoder.depth, list[Tensor]()
+    layer = 2 * depth // 3
+    hook = whole.present_encoder.vit.layer[layer - 1].register_forward_hook(
+        lambda _, __, out: seen.append(out[0] if isinstance(out, tuple) else out)
+    )
+    whole.encode(frames[None])
+    hook.remove()
+    expected = torch.nn.functional.layer_norm(seen[0], seen[0].shape[-1:], eps=1e-6)
+    cut = model_of(golden.path, layer=layer)
+    assert len(cut.present_encoder.vit.layer) == cut.sizes.encoder.depth == layer < depth
+    assert_equal_to_rounding(cut.encode(frames[None])[0], expected)
+    assert cut.encoder_fingerprint() != whole.encoder_fingerprint()
+    cut.save_pretrained(tmp_path / "cut")
+    again = load_base(ModelConfig(base=str(tmp_path / "cut"), dtype="float32"), seed=0)
+    torch.testing.assert_close(again.encode(frames[None]), cut.encode(frames[None]), rtol=0, atol=0)
+    of_folder = model_of(tmp_path / "cut", layer=layer - 1)
+    torch.testing.assert_close(
+        of_folder.encode(frames[None]), model_of(golden.path, layer=layer - 1).encode(frames[None]), rtol=0, atol=0
+    )
+    last = model_of(golden.path, layer=depth)
+    torch.testing.assert_close(last.encode(frames[None]), whole.encode(frames[None]), rtol=0, atol=0)
+    with pytest.raises(InputError, match=rf"model.encoder.layer: {depth + 1}, .* at most {depth}"):
+        model_of(golden.path, layer=depth + 1)

@@ -109,15 +109,11 @@ def goals_notes(made: MadeGoals) -> tuple[str, ...]:
 
 def benchmark_table(benchmark: ClosedLoopBenchmark) -> Table:
     """Return a table with a row for each policy; the intervals are 95 %, over episodes."""
-    from vjepa2_ac.simulation.closed_loop.tasks import ALSO, SUCCESS_M
-
-    options = benchmark.options
-    also = f", {ALSO[options.task]}," if ALSO[options.task] else ""
-    criterion = f"within {100 * SUCCESS_M[options.task]:g} cm{also}"
+    trials = benchmark.trials
     table = MetricsTable(
-        f"{options.task} in domain {options.domain}: {options.episodes} problems of seed {options.seed},"
-        f" {options.model_steps} steps of {options.seconds_per_step:.2f} s (95 % interval over episodes)",
-        ["", f"{criterion} at the end", "once on the way", "left at the end, cm", "steps", "s per decision"],
+        f"{trials.task_name} in {trials.place}: {trials.episodes} problems of seed {trials.seed},"
+        f" {trials.model_steps} steps of {trials.seconds_per_step:.2f} s (95 % interval over episodes)",
+        ["", f"{trials.criterion} at the end", "once on the way", "left at the end, cm", "steps", "s per decision"],
     )
     for result in benchmark.results:
         table.add_row(

@@ -8,8 +8,9 @@ refused.
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -41,6 +42,7 @@ logger = logging.getLogger(__name__)
 
 _ON_THE_HUB = [CONFIG, "*.safetensors"]
 _PREFIXES = ("vjepa2.encoder.", "encoder.")  # in transformers: of a classification model, of a plain one
+_BLOCK = re.compile(r"(?:^|\.)(?:blocks|layer)\.(\d+)\.")  # in the names of Meta's files, of transformers, and of ours
 _ONLY_2_1 = ("norms_block.", "video_mod_embed", "img_mod_embed", "patch_embed_img.")
 
 
@@ -55,6 +57,26 @@ class FoundEncoder:
     origin: EncoderOrigin
     weights: Callable[[], Mapping[str, Tensor]]  # mapped, by the file's names
     rename: Rename
+    is_cut: bool = False  # after a block before the last: the weights of the last norm are not its own
+
+    def up_to(self, layer: int) -> FoundEncoder:
+        """Return the same encoder without the blocks after a layer.
+
+        Raises:
+            InputError: It has fewer blocks.
+        """
+        depth = self.sizes.depth
+        if layer > depth:
+            needed = f"at most {depth}, its number of blocks"
+            raise InputError(where="model.encoder.layer", found=f"{layer}, of {self.where}", needed=needed)
+        if layer == depth:
+            return self
+
+        def weights() -> dict[str, Tensor]:
+            blocks = {name: (tensor, _BLOCK.search(name)) for name, tensor in self.weights().items()}
+            return {name: tensor for name, (tensor, block) in blocks.items() if not block or int(block[1]) < layer}
+
+        return replace(self, sizes=self.sizes.model_copy(update={"depth": layer}), weights=weights, is_cut=True)
 
 
 def find_encoder(config: EncoderConfig) -> FoundEncoder:
@@ -73,7 +95,7 @@ def find_encoder(config: EncoderConfig) -> FoundEncoder:
     if config.heads not in {None, found.sizes.heads}:
         said = f"{found.sizes.heads} attention heads, and model.encoder.heads says {config.heads}"
         raise InputError(where=found.where, found=said, fix="Leave out model.encoder.heads")
-    return found
+    return found if config.layer is None else found.up_to(config.layer)
 
 
 def sizes_with(found: FoundEncoder, given: ModelSizes) -> ModelSizes:
@@ -103,6 +125,7 @@ def expected_sizes(config: EncoderConfig, given: ModelSizes) -> ModelSizes:
     if known is None or Path(config.path).exists():
         return sizes_with(find_encoder(config), given)
     encoder = known.encoder.sizes(known.family, config.frame).model_dump()
+    encoder["depth"] = min(encoder["depth"], config.layer or encoder["depth"])
     return record_of(ModelSizes, given.model_dump() | {"encoder": encoder}, where=f"model.encoder: {config.path}")
 
 

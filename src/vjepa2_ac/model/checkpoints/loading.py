@@ -177,6 +177,8 @@ def _on_encoder(found: FoundEncoder, sizes: ModelSizes, dtype: torch.dtype) -> W
     model = WorldModel.empty(sizes)
     fix = f"Get the original file. {FIX}"
     fill(model.present_encoder, found.weights(), found.rename, dtype, where=found.where, fix=fix)
+    if found.is_cut:
+        model.present_encoder.reset_last_norm()
     model.encoder_origin = found.origin
     return model
 

@@ -76,6 +76,11 @@ class Encoder(nn.Module):
         """Stay in eval mode, independent of the surrounding model."""
         return super().train(False)
 
+    def reset_last_norm(self) -> None:
+        """Make the last norm one without weights: those read belong to a layer that is not here."""
+        nn.init.ones_(self.vit.layernorm.weight)
+        nn.init.zeros_(self.vit.layernorm.bias)
+
     def initialise(self, generator: Generator) -> None:
         """Initialise every weight; the generator determines the values.
 

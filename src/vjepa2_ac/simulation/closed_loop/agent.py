@@ -30,7 +30,7 @@ from vjepa2_ac.simulation.closed_loop.policies import (
     RandomActions,
     ZeroActions,
 )
-from vjepa2_ac.simulation.closed_loop.tasks import TaskProblem
+from vjepa2_ac.simulation.closed_loop.tasks import Problem
 from vjepa2_ac.simulation.world.arm import SimulatedArm
 
 JOINT_FIELDS = ("steps/observation/joint_position", "steps/observation/gripper_position")
@@ -46,7 +46,7 @@ class Agent:
     seed: int  # of its decisions
     stride: int  # control steps of a model step
     warnings: tuple[str, ...]
-    policy: Callable[[SimulatedArm, GoalsOf | None], Policy]
+    policy: Callable[[SimulatedArm | None, GoalsOf | None], Policy]  # None: in another world, which tells no cameras
     goals_of: Callable[[GoalFolder], tuple[SubGoal, ...]]  # of a folder, for this model
     decoder: str | None = None  # by which videos show what was imagined
 
@@ -66,7 +66,7 @@ class ServedPlanner:
         self.client, self.name, self.why, self._goals_of = client, name, "", goals_of
         self._goal: dict[str, Any] = {}
 
-    def reset(self, problem: TaskProblem, goal_image: Image) -> None:
+    def reset(self, problem: Problem, goal_image: Image) -> None:
         """Begin an episode with a goal image, or with the goals on the way."""
         self.client.infer({"endpoint": "reset"})
         self._goal = {"goal/image": goal_image} if self._goals_of is None else goal_keys(self._goals_of(problem))
@@ -102,8 +102,11 @@ def agent_of_session(session: PlanningSession, decoder: TrainedDecoder | None = 
     if name in {ZeroActions.name, RandomActions.name, Oracle.name}:  # in tables the names of references are theirs
         name = f"model {name}"
 
-    def policy(arm: SimulatedArm, goals_of: GoalsOf | None) -> Policy:
-        controller = session.controller(extrinsics=arm.extrinsics() if uses_camera else None)
+    def policy(arm: SimulatedArm | None, goals_of: GoalsOf | None) -> Policy:
+        if arm is None and (uses_camera or config.data.states == "vector"):
+            found = "a model that takes the pose of the camera" if uses_camera else "a model of joints"
+            raise InputError(where="--world", found=found, needed="a model of poses: worlds tell nothing else")
+        controller = session.controller(extrinsics=arm.extrinsics() if arm and uses_camera else None)
         return Planning(controller, name, decoder, goals_of)
 
     return Agent(

@@ -30,12 +30,18 @@ from vjepa2_ac.planning.goals import SubGoal, read_goal_folder
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.simulation.closed_loop.agent import Agent
 from vjepa2_ac.simulation.closed_loop.policies import GoalsOf, Oracle, Policy, RandomActions, ZeroActions
-from vjepa2_ac.simulation.closed_loop.rollout import ClosedLoopResult, EpisodeResult, RolloutSpec, run_episode, run_task
-from vjepa2_ac.simulation.closed_loop.tasks import ALSO, STEPS, SUCCESS_M, TaskName, TaskProblem, arm_for
+from vjepa2_ac.simulation.closed_loop.rollout import (
+    ClosedLoopResult,
+    EpisodeResult,
+    RolloutSpec,
+    Trials,
+    run_episode,
+    run_task,
+)
+from vjepa2_ac.simulation.closed_loop.tasks import STEPS, TaskName, TaskProblem, arm_for
 from vjepa2_ac.simulation.world.arm import SimulatedArm
 from vjepa2_ac.simulation.world.camera import FRAME_SIZE
 from vjepa2_ac.simulation.world.domains import Domain
-from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ
 from vjepa2_ac.storage import user_can_write, write_atomically
 from vjepa2_ac.storage.structured import utc_now
 
@@ -151,7 +157,7 @@ class ClosedLoopBenchmark:
     """The results of a model (first), zero actions, chance and the oracle, on the same problems."""
 
     agent: Agent
-    options: BenchmarkOptions  # with the model's stride
+    trials: Trials
     results: tuple[ClosedLoopResult, ...]
 
     @property
@@ -159,7 +165,7 @@ class ClosedLoopBenchmark:
         """Whether the model plans better than what looks at no image."""
         shares = {result.policy: result.success_rate for result in self.results}
         model, *_, oracle = shares
-        return closed_loop(shares, model, oracle, self.options.episodes, self.options.task)
+        return closed_loop(shares, model, oracle, self.trials.episodes, self.trials.task_name)
 
 
 def run_benchmark(
@@ -191,29 +197,32 @@ def run_benchmark(
         spec = options if policy is model else replace(options, films=0)
         results.append(run_task(spec, policy, arm, reporter.task(f"{options.task}: {policy.name}")))
     benchmark = ClosedLoopBenchmark(agent, options, tuple(results))
-    files = [folder / CLOSED_LOOP_FILE]
+    return benchmark, write_benchmark(benchmark, folder)
+
+
+def write_benchmark(benchmark: ClosedLoopBenchmark, folder: Path) -> tuple[Path, ...]:
+    """Write closed_loop.json, and a video of what was filmed; return the files.
+
+    Raises:
+        UnreachableError: PyAV is missing.
+    """
+    files, of_model = [folder / CLOSED_LOOP_FILE], benchmark.results[0]
     write_atomically(files[0], json.dumps(benchmark_as_dict(benchmark), indent=1, allow_nan=False) + "\n")
-    if options.films:
-        rate_hz = CONTROL_RATE_HZ / options.stride
-        write_atomically(folder / STILLS, encode_png(stills(results[0])))
-        files += [write_video(folder / FILM, film_frames(results[0]), rate_hz=rate_hz), folder / STILLS]
-    return benchmark, tuple(files)
+    if any(episode.frames is not None for episode in of_model.episodes):
+        rate_hz = 1.0 / benchmark.trials.seconds_per_step
+        write_atomically(folder / STILLS, encode_png(stills(of_model)))
+        files += [write_video(folder / FILM, film_frames(of_model), rate_hz=rate_hz), folder / STILLS]
+    return tuple(files)
 
 
 def benchmark_as_dict(benchmark: ClosedLoopBenchmark) -> dict[str, Any]:
     """Return all metrics as plain values; see the docs for their meaning."""
-    agent, options = benchmark.agent, benchmark.options
-    asked = {key: value for key, value in asdict(options).items() if key != "films"}
+    agent = benchmark.agent
     return {
         "format": FORMAT,
         "about": {
             **{name: getattr(agent, name) for name in ("subject", "checkpoint", "decoder")},
-            **asked,
-            "domain": options.world.name,
-            "steps": options.model_steps,
-            "seconds_per_step": options.seconds_per_step,
-            "success_below_cm": 100 * SUCCESS_M[options.task],
-            "success_also": ALSO[options.task],
+            **benchmark.trials.as_dict(),
             "planning": agent.planning.model_dump(mode="json"),
             "warnings": list(agent.warnings),
             "planning_seed": agent.seed,
@@ -274,7 +283,7 @@ def film_frames(result: ClosedLoopResult) -> Iterator[UInt8[np.ndarray, "_ _ 3"]
     for number, episode in enumerate(result.episodes, start=1):
         if episode.frames is None:
             return
-        about = f"{spec.task}, domain {spec.world.name}    episode {number} of {len(result.episodes)}"
+        about = f"{spec.task_name}, {spec.place}    episode {number} of {len(result.episodes)}"
         for step, (frame, distance_m) in enumerate(zip(episode.frames, episode.distances_m, strict=True)):
             outcome = f"   {_OUTCOMES[episode.success]}" if step == steps else ""
             caption = f"{result.policy}:   {100 * distance_m:.1f} cm from the goal{outcome}"
@@ -283,9 +292,15 @@ def film_frames(result: ClosedLoopResult) -> Iterator[UInt8[np.ndarray, "_ _ 3"]
                 image, about_it = _imagined(episode, step)
                 images.append(image)
                 captions.append(about_it)
-            large = side_by_side(images[:1], captions[:1], f"{about}    step {step} of {steps}")
-            image = below_each_other([large, side_by_side(images[1:], captions[1:], enlarged=1)])
+            scale = _scale(frame)
+            large = side_by_side(images[:1], captions[:1], f"{about}    step {step} of {steps}", enlarged=2 * scale)
+            image = below_each_other([large, side_by_side(images[1:], captions[1:], enlarged=scale)])
             yield from itertools.repeat(image, _HOLD if step in {0, steps} else 1)
+
+
+def _scale(image: UInt8[np.ndarray, "height width 3"]) -> int:
+    """Return how much an image is to be enlarged, so that a caption has room over it."""
+    return max(1, FRAME_SIZE[1] // int(image.shape[1]))
 
 
 def stills(result: ClosedLoopResult) -> UInt8[np.ndarray, "_ _ 3"]:
@@ -296,7 +311,7 @@ def stills(result: ClosedLoopResult) -> UInt8[np.ndarray, "_ _ 3"]:
             start, end = (f"{100 * episode.distances_m[step]:.1f} cm from the goal" for step in (0, -1))
             captions = [f"start {number}: {start}", f"end: {end}, {_OUTCOMES[episode.success]}", "goal"]
             images = [episode.frames[0], episode.frames[-1], episode.goal_image]
-            rows.append(side_by_side(images, captions, enlarged=1))
+            rows.append(side_by_side(images, captions, enlarged=_scale(episode.goal_image)))
     return below_each_other(rows)
 
 

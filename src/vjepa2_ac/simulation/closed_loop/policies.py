@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from enum import Enum
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -16,10 +16,10 @@ from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
 from vjepa2_ac.evaluation.imagined_plan import imagined_next
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.goals import SubGoal
-from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, RELEASED, TaskName, TaskProblem
+from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, RELEASED, Problem, TaskName, TaskProblem
 from vjepa2_ac.simulation.world.arm import Block, SimulatedArm, State
 
-GoalsOf = Callable[[TaskProblem], Sequence[SubGoal]]
+GoalsOf = Callable[[Any], Sequence[SubGoal]]  # of a problem of its world
 Image = UInt8[np.ndarray, "height width 3"]
 
 _ALMOST = 1 - 1e-9  # of a limit: rounding must not exceed it
@@ -39,7 +39,7 @@ class Policy(Protocol):
     why: str  # reason of the last action, short enough to be counted
     moves: Moves  # what its states and actions are: poses of the flange, or joint angles and gripper
 
-    def reset(self, problem: TaskProblem, goal_image: Image) -> None:
+    def reset(self, problem: Problem, goal_image: Image) -> None:
         """Begin an episode. Only an oracle uses more of the problem than the images."""
 
     def act(self, image: Image, state: Float[np.ndarray, " dim"]) -> Float[np.ndarray, " dim"]:
@@ -58,7 +58,7 @@ class ZeroActions:
     def __init__(self, limits: LimitsConfig | None = None) -> None:
         self._limits = limits or LimitsConfig()
 
-    def reset(self, problem: TaskProblem, goal_image: Image) -> None:
+    def reset(self, problem: Problem, goal_image: Image) -> None:
         """Begin an episode."""
 
     def act(self, image: Image, state: State) -> State:  # noqa: ARG002 - of the protocol
@@ -84,7 +84,7 @@ class RandomActions(ZeroActions):
         super().__init__(limits)
         self._seed, self._rng = seed, np.random.default_rng(seed)
 
-    def reset(self, problem: TaskProblem, goal_image: Image) -> None:  # noqa: ARG002
+    def reset(self, problem: Problem, goal_image: Image) -> None:  # noqa: ARG002
         """Seed the generator for this problem."""
         self._rng = np.random.default_rng([self._seed, problem.index])
 
@@ -106,9 +106,13 @@ class Oracle(ZeroActions):
         super().__init__(limits)
         self._arm = arm
 
-    def reset(self, problem: TaskProblem, goal_image: Image) -> None:  # noqa: ARG002
-        """Set the goal."""
-        self._problem = problem
+    def reset(self, problem: Problem, goal_image: Image) -> None:  # noqa: ARG002
+        """Set the goal.
+
+        Raises:
+            ValueError: It is a problem of another world.
+        """
+        self._problem = TaskProblem.of(problem)
 
     def _way(self, state: State) -> State:
         way = _WAYS.get(self._problem.task)
@@ -139,7 +143,7 @@ class Planning:
         self._size = (0, 0)  # of the last image
         self.moves = Moves.FLANGE if controller.spaces.state.position is not None else Moves.JOINTS
 
-    def reset(self, problem: TaskProblem, goal_image: Image) -> None:
+    def reset(self, problem: Problem, goal_image: Image) -> None:
         """Give the planner the goal image, or the goals on the way."""
         if self._goals_of is None:
             self.controller.reset(goal_image)

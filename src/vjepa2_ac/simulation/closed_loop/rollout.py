@@ -7,15 +7,25 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.intervals import Estimate, mean_of, share_of
-from vjepa2_ac.simulation.closed_loop.policies import Moves, Planning, Policy
-from vjepa2_ac.simulation.closed_loop.tasks import STEPS, TaskName, TaskProblem, arm_for, make_problem
+from vjepa2_ac.simulation.closed_loop.policies import Image, Moves, Planning, Policy
+from vjepa2_ac.simulation.closed_loop.tasks import (
+    ALSO,
+    STEPS,
+    SUCCESS_M,
+    Problem,
+    TaskName,
+    TaskProblem,
+    arm_for,
+    make_problem,
+)
 from vjepa2_ac.simulation.world.arm import Block, Mark, SimulatedArm, State
 from vjepa2_ac.simulation.world.domains import Domain, named_domain
 from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ, HIGH, LOW, OutOfReachError, rest_joints
@@ -26,7 +36,7 @@ from vjepa2_ac.spaces import apply_action
 class EpisodeResult:
     """The record of an episode. Index 0 along `time` is before the first action."""
 
-    problem: TaskProblem
+    problem: Problem
     states: Float[np.ndarray, "time 7"]  # measured, in the robot base frame
     actions: Float[np.ndarray, "steps dim"]  # as returned by the policy
     blocks: Float[np.ndarray, "time 4"] | None  # pose of the block, as in `TaskProblem`; None: there is none
@@ -58,9 +68,44 @@ class EpisodeResult:
         return bool(self.reached[1:].any())
 
 
+class Trials(Protocol):
+    """The problems that policies are tried on, and how long they may take for each."""
+
+    @property
+    def episodes(self) -> int:
+        """Number of problems."""
+
+    @property
+    def seed(self) -> int:
+        """Of the problems."""
+
+    @property
+    def model_steps(self) -> int:
+        """Model steps of an episode."""
+
+    @property
+    def seconds_per_step(self) -> float:
+        """Length of a model step."""
+
+    @property
+    def task_name(self) -> str:
+        """What is to be done."""
+
+    @property
+    def place(self) -> str:
+        """Where it is done."""
+
+    @property
+    def criterion(self) -> str:
+        """When it is done, in a few words."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, for JSON."""
+
+
 @dataclass(frozen=True)
 class RolloutSpec:
-    """Problems of a task, and how long a policy may take for each."""
+    """Problems of a task of the simulated arm, and how long a policy may take for each."""
 
     task: TaskName = "reach"
     domain: str | Domain = "A"  # A, B, or a domain
@@ -94,12 +139,39 @@ class RolloutSpec:
         """The problems: the same for every policy, so that metrics can be paired."""
         return (make_problem(self.task, self.world, self.seed, index) for index in range(self.episodes))
 
+    @property
+    def task_name(self) -> str:
+        """What is to be done."""
+        return self.task
+
+    @property
+    def place(self) -> str:
+        """Where it is done."""
+        return f"domain {self.world.name}"
+
+    @property
+    def criterion(self) -> str:
+        """When it is done, in a few words."""
+        also = f", {ALSO[self.task]}," if ALSO[self.task] else ""
+        return f"within {100 * SUCCESS_M[self.task]:g} cm{also}"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, for JSON."""
+        return {
+            **{key: value for key, value in asdict(self).items() if key != "films"},
+            "domain": self.world.name,
+            "steps": self.model_steps,
+            "seconds_per_step": self.seconds_per_step,
+            "success_below_cm": 100 * SUCCESS_M[self.task],
+            "success_also": ALSO[self.task],
+        }
+
 
 @dataclass(frozen=True)
 class ClosedLoopResult:
     """A policy's episodes of a task; arrays hold one row per episode, estimates have 95 % intervals over episodes."""
 
-    spec: RolloutSpec
+    spec: Trials
     policy: str
     episodes: tuple[EpisodeResult, ...]
 
@@ -210,15 +282,91 @@ def run_episode(
         OutOfReachError: The problem's own start or goal cannot be reached.
         ValueError: An action that is not 7 finite numbers, or a block to be moved but an arm without one.
     """
-    goal_image = put(arm, problem.goal, problem.block_goal, problem.mark).image()
-    put(arm, problem.start, problem.block_start, problem.mark)
+    return run_in(SimulatedWorld(arm), policy, problem, Span(steps, stride), keep_frames=keep_frames)
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What is seen and measured at a moment, and how far the task has come."""
+
+    image: Image
+    state: State
+    distance_m: float  # of what the task moves, to its goal
+    is_done: bool
+    block: Block | None = None  # None: there is none
+    joints: Float[np.ndarray, " 8"] | None = None  # with the closedness; None: they are not told
+
+
+@dataclass(frozen=True)
+class Span:
+    """How long an episode is."""
+
+    steps: int  # model steps
+    stride: int  # control steps of each
+
+
+class World(Protocol):
+    """Where a policy acts: the simulated arm, or a world that others made."""
+
+    def begin(self, problem: Problem) -> tuple[Image, Observation]:
+        """Put everything where the problem starts; return its goal image, and what is seen."""
+
+    def act(self, action: Float[np.ndarray, " dim"], moves: Moves, stride: int) -> tuple[bool, Observation]:
+        """Carry an action out for so many control steps; return whether it was within reach, and what is seen then."""
+
+
+class SimulatedWorld:
+    """The simulated arm as a world.
+
+    Args:
+        arm: In the domain of the problems, from `arm_for` of their task; its pose does not matter.
+    """
+
+    def __init__(self, arm: SimulatedArm) -> None:
+        self._arm = arm
+
+    def begin(self, problem: Problem) -> tuple[Image, Observation]:
+        """Put arm and block where the problem starts; return its goal image, and what is seen.
+
+        Raises:
+            OutOfReachError: The problem's own start or goal cannot be reached.
+            ValueError: A block is to be moved and the arm has none, or it is a problem of another world.
+        """
+        self._problem, arm = TaskProblem.of(problem), self._arm
+        goal_image = put(arm, self._problem.goal, self._problem.block_goal, self._problem.mark).image()
+        put(arm, self._problem.start, self._problem.block_start, self._problem.mark)
+        return goal_image, self._seen()
+
+    def act(self, action: Float[np.ndarray, " dim"], moves: Moves, stride: int) -> tuple[bool, Observation]:
+        """Carry an action out for so many control steps; return whether it was within reach, and what is seen then."""
+        is_within = (send_action if moves == Moves.FLANGE else _send_joints)(self._arm, action, stride)
+        return is_within, self._seen()
+
+    def _seen(self) -> Observation:
+        arm, problem = self._arm, self._problem
+        state, block = arm.state, arm.block
+        distance_m, is_done = problem.distance_m(state, block), problem.succeeded(state, block)
+        joints = np.append(arm.joints, arm.closedness)
+        return Observation(
+            arm.image(), state, distance_m, is_done, None if problem.block_goal is None else block, joints
+        )
+
+
+def run_in(world: World, policy: Policy, problem: Problem, span: Span, *, keep_frames: bool = False) -> EpisodeResult:
+    """Let a policy solve a problem in a world, and return the record.
+
+    Raises:
+        ValueError: An action of other than the finite numbers that the policy moves, or joints where none are told.
+    """
+    goal_image, now = world.begin(problem)
     policy.reset(problem, goal_image)
-    states, blocks, frames = [arm.state], [arm.block], [arm.image()]
-    actions, seconds, whys, imagined, unreachable = [], [], [], [], 0
-    for _ in range(steps):
+    seen, actions, seconds, whys, imagined, unreachable = [now], [], [], [], [], 0
+    for _ in range(span.steps):
         began = time.perf_counter()
-        measured = states[-1] if policy.moves == Moves.FLANGE else np.append(arm.joints, arm.closedness)
-        action = np.asarray(policy.act(frames[-1], measured), dtype=np.float64)
+        measured = now.state if policy.moves == Moves.FLANGE else now.joints
+        if measured is None:
+            raise ValueError(f"{policy.name} moves joints, which this world does not tell")
+        action = np.asarray(policy.act(now.image, measured), dtype=np.float64)
         seconds.append(time.perf_counter() - began)
         if action.shape != (policy.moves.value,) or not np.isfinite(action).all():
             raise ValueError(f"{policy.name}: {action.tolist()} is no action of {policy.moves.value} finite numbers")
@@ -226,22 +374,22 @@ def run_episode(
         whys.append(policy.why)
         if keep_frames and isinstance(policy, Planning):
             imagined.append(policy.imagined())
-        unreachable += not (send_action if policy.moves == Moves.FLANGE else _send_joints)(arm, action, stride)
-        states.append(arm.state)
-        blocks.append(arm.block)
-        frames.append(arm.image())
+        is_within, now = world.act(action, policy.moves, span.stride)
+        unreachable += not is_within
+        seen.append(now)
+    blocks = [one.block for one in seen if one.block is not None]
     return EpisodeResult(
         problem=problem,
-        states=np.stack(states),
+        states=np.stack([one.state for one in seen]),
         actions=np.stack(actions),
-        blocks=None if problem.block_goal is None else np.stack([block for block in blocks if block is not None]),
-        distances_m=np.array([problem.distance_m(*seen) for seen in zip(states, blocks, strict=True)]),
-        reached=np.array([problem.succeeded(*seen) for seen in zip(states, blocks, strict=True)]),
+        blocks=np.stack(blocks) if blocks else None,
+        distances_m=np.array([one.distance_m for one in seen]),
+        reached=np.array([one.is_done for one in seen]),
         seconds=np.array(seconds),
         whys=tuple(whys),
         unreachable=unreachable,
         goal_image=goal_image,
-        frames=np.stack(frames) if keep_frames else None,
+        frames=np.stack([one.image for one in seen]) if keep_frames else None,
         imagined=tuple(imagined),
     )
 

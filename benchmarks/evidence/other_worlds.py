@@ -1,0 +1,130 @@
+"""Which tasks of others are part of the evidence, how are their worlds changed, and how does a policy fare there?"""
+
+from __future__ import annotations
+
+import pickle
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig, PlanningConfig
+from vjepa2_ac.episode import no_progress
+from vjepa2_ac.planning.goals import SubGoal
+from vjepa2_ac.simulation.closed_loop.benchmark import BenchmarkOptions
+from vjepa2_ac.simulation.closed_loop.policies import Policy
+from vjepa2_ac.simulation.closed_loop.rollout import ClosedLoopResult
+from vjepa2_ac.simulation.closed_loop.worlds import (
+    OtherWorld,
+    WorldProblem,
+    WorldTrials,
+    find_problems,
+    run_trials,
+)
+from vjepa2_ac.simulation.recording.record_world import record_world
+
+ROOT = Path(__file__).resolve().parents[2]
+STRIDE = 4  # control steps of a model step
+SIZE = 96  # pixels: those of the tiny encoder
+EPISODES_BEFORE, EPISODES_AFTER = 120, 120  # recorded in the world before and after its change
+CHANGED = ("--camera", "40", "--mount", "20", "--look", "dusk")  # robosuite: another camera, mounting and light
+FIRST = {"before": 0, "after": 10_000}  # seed of the recordings
+PLANNING = PlanningConfig(
+    samples=64,
+    iterations=4,
+    start_std=0.67,
+    limits=LimitsConfig(xyz=(0.075, 0.075, 0.075), gripper_mode="held"),
+    energy=EnergyConfig(distance="l1"),
+)
+"""As the reach tasks of our own arm; each goal on the way says what the gripper does."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """A task of a world, before and after a change of it."""
+
+    program: str  # in examples/worlds, and the name of its environment
+    before: tuple[str, ...]
+    after: tuple[str, ...]
+
+    @property
+    def is_there(self) -> bool:
+        """Whether its environment is (`make worlds/NAME`)."""
+        return self._python.exists()
+
+    @property
+    def _python(self) -> Path:
+        return ROOT / "worlds" / self.program / "bin" / "python"
+
+    def command(self, when: str) -> str:
+        """Return the command that starts the world."""
+        words = self.before if when == "before" else self.after
+        program = ROOT / "examples" / "worlds" / f"{self.program}.py"
+        return shlex.join([str(self._python), str(program), *words, "--size", str(SIZE)])
+
+
+TASKS = {
+    **{name: Task("robosuite", (name,), (name, *CHANGED)) for name in ("Lift", "Door", "Stack", "PickPlaceCan")},
+    "LIBERO-swap": Task("libero", ("libero_object",), ("libero_object_swap",)),
+    "LIBERO-object": Task("libero", ("libero_spatial",), ("libero_spatial_object",)),
+}
+
+
+def data_of(folder: Path, task: str, when: str) -> DataConfig:
+    """Return the data of a task; after the change half of the episodes may be trained on, the others are held out."""
+    held_out = {"validation_share": 0.1, "test_share": 0.1 if when == "before" else 0.25}
+    latents = {"cache": "auto", "cache_dir": str(folder / "latents"), "workers": 0}
+    path = str(folder / f"data-{task}-{when}")
+    return DataConfig.model_validate(
+        {"source": "npz", "path": path, "frames": 4, "stride": STRIDE, **held_out, **latents}
+    )
+
+
+def record(folder: Path, task: str, when: str) -> None:
+    """Record the demonstrations of a task that are not there yet."""
+    first, count = FIRST[when], EPISODES_BEFORE if when == "before" else EPISODES_AFTER
+    path = Path(data_of(folder, task, when).path)
+    if len(list(path.glob("*.npz"))) < count:
+        print(f"recording {path}", flush=True)
+        with OtherWorld(TASKS[task].command(when)) as world:
+            record_world(world, path, range(first, first + count))
+
+
+def problems(folder: Path, task: str, seed: int, goals: int) -> tuple[WorldTrials, ClosedLoopResult]:
+    """Return the problems after the change, with a goal for each model step; kept, since the expert takes its time."""
+    path = folder / "problems" / f"{task}-{seed}-{goals}.pickle"
+    if not path.exists():
+        options = BenchmarkOptions(episodes=goals, seed=seed, sub_goals="every-step")
+        with OtherWorld(TASKS[task].command("after")) as world:
+            found = find_problems(world, options, STRIDE, no_progress)
+        path.parent.mkdir(exist_ok=True)
+        path.with_suffix(".part").write_bytes(pickle.dumps(found))
+        path.with_suffix(".part").rename(path)
+    return pickle.loads(path.read_bytes())  # type: ignore[no-any-return]  # noqa: S301 - our own
+
+
+def closed_loop(folder: Path, task: str, policy: Policy, *, seed: int, goals: int) -> dict[str, Any]:
+    """Return how a policy fares after the change; by `Trials` of the expert's own problems."""
+    trials, _ = problems(folder, task, seed, goals)
+    with OtherWorld(TASKS[task].command("after")) as world:
+        return figures_of(run_trials(world, policy, trials, 0, no_progress), seed)
+
+
+def goals_of(problem: WorldProblem) -> tuple[SubGoal, ...]:
+    """Return a goal for each model step."""
+    return problem.goals
+
+
+def figures_of(result: ClosedLoopResult, seed: int) -> dict[str, Any]:
+    """Return distances (cm) before the first step and after each, and which problems were solved."""
+    return {
+        "goals_seed": seed,
+        "distance_cm": np.round(result.distance_cm, 3).tolist(),
+        "solved": result.successes.tolist(),
+        "solved_ever": [episode.success_ever for episode in result.episodes],
+        "seconds_per_decision": float(result.seconds.mean()),
+        "whys": result.why_counts,
+    }

@@ -1,0 +1,394 @@
+"""Worlds that others made: a program in an environment of its own is one more place for a model to act in.
+
+The program reads requests and writes answers, one JSON object a line, on its standard input and output. It knows
+nothing of this project, so that its pins are its own. docs/worlds.md has the protocol; examples/worlds three programs.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import shlex
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import Field
+
+from vjepa2_ac.episode import STATE_DIM, Progress
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.media.video import video_library
+from vjepa2_ac.planning.demonstrations.key_frames import (
+    OF_MODEL_STEPS,
+    Timing,
+    every_key_frame,
+    gripper_key_frames,
+    sub_goals_of,
+)
+from vjepa2_ac.planning.goals import SubGoal, read_goal_folder
+from vjepa2_ac.reporter import SILENT, Reporter
+from vjepa2_ac.simulation.closed_loop.agent import Agent
+from vjepa2_ac.simulation.closed_loop.benchmark import (
+    BenchmarkOptions,
+    ClosedLoopBenchmark,
+    DemonstrationSpec,
+    every_step,
+    write_benchmark,
+)
+from vjepa2_ac.simulation.closed_loop.policies import GoalsOf, Image, Moves, Policy, RandomActions, ZeroActions
+from vjepa2_ac.simulation.closed_loop.rollout import ClosedLoopResult, EpisodeResult, Observation, Span, run_in
+from vjepa2_ac.simulation.closed_loop.tasks import Problem
+from vjepa2_ac.spaces import actions_from_states, apply_action
+from vjepa2_ac.storage import user_can_write
+from vjepa2_ac.storage.structured import record_of
+
+EXPERT = "expert"
+_ENDS_S = 10.0  # a world that is told to end may take as long
+_LAST_LINES = 5  # of what it wrote about an error
+_TRIES = 2  # so many times the problems are drawn, until the expert has solved enough of them
+_SAYS = "docs/worlds.md has the protocol; examples/worlds programs that follow it"
+
+
+@dataclass(frozen=True)
+class AboutWorld:
+    """What a world says of itself, unasked, in its first line."""
+
+    world: str  # name and version
+    task: str
+    rate_hz: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)]  # control steps per second
+    steps: Annotated[int, Field(ge=1, le=1_000_000)]  # control steps that suffice for the task
+    instruction: str = ""  # the task in words
+    expert: bool = False  # whether it has one
+
+
+@dataclass(frozen=True)
+class WorldObservation(Observation):
+    """What a world answers."""
+
+    target: Float[np.ndarray, " 7"] | None = None  # that its expert held last
+    goal: Image | None = None  # of a reset: the image to aim at, where the world has one
+
+
+class OtherWorld(ExitStack):
+    """A world that runs as a program; `close` ends it.
+
+    Args:
+        command: Its program and arguments, as in a shell: PYTHON examples/worlds/robosuite.py Lift.
+
+    Raises:
+        InputError: It cannot be started, or is no world.
+    """
+
+    def __init__(self, command: str) -> None:
+        super().__init__()
+        self.command = command
+        self._errors = self.enter_context(tempfile.TemporaryFile())  # noqa: SIM115 - it is closed with the world
+        try:
+            self._process = subprocess.Popen(  # noqa: S603 - the user's own program
+                shlex.split(command),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=self._errors,
+                encoding="utf-8",
+                start_new_session=True,  # Ctrl-C ends us, and we end it
+            )
+        except (OSError, ValueError) as error:
+            self.close()
+            raise self._refused(f"it cannot be started: {error}") from None
+        self.callback(self._end)
+        try:
+            self.about = record_of(AboutWorld, self._read(), where=self._where, needed="what it is", fix=_SAYS)
+        except BaseException:
+            self.close()
+            raise
+
+    def reset(self, seed: int) -> WorldObservation:
+        """Begin the episode of a seed: the same one, whenever it is asked for.
+
+        Raises:
+            InputError: The world has ended, or answers something else.
+        """
+        return self._ask(do="reset", seed=seed)
+
+    def move(self, target: Float[np.ndarray, " 7"], steps: int) -> WorldObservation:
+        """Hold a target for some control steps: a pose in the frame of the robot's base, and a closedness.
+
+        Raises:
+            InputError: As `reset`.
+        """
+        return self._ask(do="move", target=target.tolist(), steps=steps)
+
+    def let_expert(self, steps: int, offset: Sequence[float] = (0.0, 0.0, 0.0)) -> WorldObservation:
+        """Let the expert act for some control steps, its targets moved by an offset in metres.
+
+        Raises:
+            InputError: As `reset`.
+        """
+        return self._ask(do=EXPERT, steps=steps, offset=list(offset))
+
+    @property
+    def _where(self) -> str:
+        return f"--world {self.command!r}"
+
+    def _ask(self, **request: Any) -> WorldObservation:
+        if self._process.stdin is not None:
+            with suppress(OSError):  # it has ended, which reading finds
+                self._process.stdin.write(f"{json.dumps(request)}\n")
+                self._process.stdin.flush()
+        return self._observed(self._read())
+
+    def _read(self) -> dict[str, Any]:
+        """Return the next answer.
+
+        Raises:
+            InputError: There is none, or it is no JSON object, or it says what is wrong.
+        """
+        try:
+            line = self._process.stdout.readline() if self._process.stdout else ""
+            answer = json.loads(line) if line else None
+        except ValueError:
+            raise self._refused(f"it wrote {line.strip()[:200]!r}", "a JSON object in a line") from None
+        if answer is None:
+            self._errors.seek(0)
+            said = self._errors.read().decode(errors="replace").strip().splitlines()[-_LAST_LINES:]
+            raise self._refused("\n".join([f"it has ended with status {self._process.wait()}", *said]) + "\n")
+        if not isinstance(answer, dict) or "error" in answer:
+            found = answer["error"] if isinstance(answer, dict) else answer
+            raise self._refused(str(found))
+        return answer
+
+    def _observed(self, answer: dict[str, Any]) -> WorldObservation:
+        try:
+            state, target = np.array(answer["state"], dtype=np.float64), answer.get("target")
+            if state.shape != (STATE_DIM,) or not np.isfinite(state).all():
+                raise ValueError(f"a state of {answer['state']}, not of seven finite numbers")  # noqa: TRY301
+            goal, distance_m, is_done = answer.get("goal"), float(answer["distance_m"]), answer["success"] is True
+            held = None if target is None else np.array(target, dtype=np.float64)
+            shown = None if goal is None else _image(goal)
+            return WorldObservation(_image(answer["image"]), state, distance_m, is_done, target=held, goal=shown)
+        except (KeyError, TypeError, ValueError) as error:
+            found = f"no {error}" if isinstance(error, KeyError) else str(error)
+            raise self._refused(found, "image, state, distance_m and success") from None
+
+    def _refused(self, found: str, needed: str = "") -> InputError:
+        return InputError(where=self._where, found=found, needed=needed, fix=_SAYS)
+
+    def _end(self) -> None:
+        for stream in (self._process.stdin, self._process.stdout):
+            if stream is not None:
+                stream.close()
+        try:
+            self._process.wait(_ENDS_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+
+def _image(found: dict[str, Any]) -> Image:
+    """Return an image from its height, width, and bytes in base64."""
+    pixels = np.frombuffer(base64.b64decode(found["rgb"]), dtype=np.uint8)
+    return pixels.copy().reshape(found["height"], found["width"], 3)
+
+
+@dataclass(frozen=True, eq=False)
+class WorldProblem:
+    """An episode of a world, and how its expert solves it."""
+
+    index: int  # the seed of its reset
+    goal_image: Image
+    goals: tuple[SubGoal, ...] = ()  # on the way, with the last one; none: the goal image alone
+
+
+@dataclass(frozen=True)
+class WorldTrials:
+    """The problems that a world's expert solves."""
+
+    about: AboutWorld
+    seed: int
+    stride: int
+    model_steps: int
+    problems: tuple[WorldProblem, ...]
+    asked: BenchmarkOptions
+    left_out: tuple[int, ...] = ()  # seeds that the expert does not solve
+
+    @property
+    def episodes(self) -> int:
+        """Number of problems."""
+        return len(self.problems)
+
+    @property
+    def seconds_per_step(self) -> float:
+        """Length of a model step."""
+        return self.stride / self.about.rate_hz
+
+    @property
+    def task_name(self) -> str:
+        """What is to be done."""
+        return self.about.task
+
+    @property
+    def place(self) -> str:
+        """Where it is done."""
+        return self.about.world
+
+    @property
+    def criterion(self) -> str:
+        """When it is done, in a few words."""
+        return "done"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, for JSON."""
+        return {
+            **vars(self.about),
+            "episodes": self.episodes,
+            "seeds": [problem.index for problem in self.problems],
+            "left_out": list(self.left_out),
+            "seed": self.seed,
+            "stride": self.stride,
+            "steps": self.model_steps,
+            "seconds_per_step": self.seconds_per_step,
+            "sub_goals": self.asked.sub_goals,
+            "goals": self.asked.goals,
+        }
+
+
+class _Acting:
+    """A world while a policy acts in it."""
+
+    def __init__(self, world: OtherWorld) -> None:
+        self._world = world
+
+    def begin(self, problem: Problem) -> tuple[Image, Observation]:
+        if not isinstance(problem, WorldProblem):
+            raise ValueError(f"{problem} is no problem of {self._world.about.world}")  # noqa: TRY004 - a wrong argument
+        self._now = self._world.reset(problem.index)
+        return problem.goal_image, self._now
+
+    def act(self, action: Float[np.ndarray, " dim"], moves: Moves, stride: int) -> tuple[bool, Observation]:  # noqa: ARG002
+        target = apply_action(self._now.state, action)
+        target[6] = np.clip(target[6], 0.0, 1.0)
+        self._now = self._world.move(target, stride)
+        return True, self._now
+
+
+def run_world_benchmark(
+    agent: Agent, world: OtherWorld, options: BenchmarkOptions, folder: Path, reporter: Reporter = SILENT
+) -> tuple[ClosedLoopBenchmark, tuple[Path, ...]]:
+    """Let model, zero actions and chance solve what the world's expert solves; write closed_loop.json and the video.
+
+    Args:
+        agent: The model and its planning settings.
+        world: Where they act.
+        options: How many problems, from which seed on, and their goals on the way. Task and domain are the world's.
+        folder: The output folder; created if it is missing.
+        reporter: Shows the progress of each policy.
+
+    Raises:
+        InputError: A folder that is not writable, a model that needs what worlds do not tell, goals that cannot be
+            used, or a world that has no goals, or whose expert solves fewer than half of the problems.
+        UnreachableError: PyAV is missing.
+    """
+    if options.films:
+        video_library()
+    with user_can_write(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    goals_of: GoalsOf | None = None
+    if options.goals is not None:
+        goals = agent.goals_of(read_goal_folder(Path(options.goals)))
+        goals_of = lambda _: goals  # noqa: E731
+    elif options.sub_goals != "none":
+        goals_of = lambda problem: problem.goals  # noqa: E731
+    model = agent.policy(None, goals_of)
+    name = world.about.task
+    trials, shown = find_problems(world, options, agent.stride, reporter.task(f"{name}: {EXPERT}"))
+    limits, results = agent.planning.limits, []
+    policies: tuple[Policy, ...] = (model, ZeroActions(), RandomActions(limits, options.seed))
+    for policy in policies:
+        progress = reporter.task(f"{name}: {policy.name}")
+        films = options.films if policy is model else 0
+        results.append(run_trials(world, policy, trials, films, progress))
+    benchmark = ClosedLoopBenchmark(agent, trials, (*results, shown))
+    return benchmark, write_benchmark(benchmark, folder)
+
+
+def run_trials(
+    world: OtherWorld, policy: Policy, trials: WorldTrials, films: int, progress: Progress
+) -> ClosedLoopResult:
+    """Let a policy solve the problems of a world.
+
+    Raises:
+        InputError: The world ends, or answers something else.
+    """
+    done, span = list[EpisodeResult](), Span(trials.model_steps, trials.stride)
+    for problem in trials.problems:
+        done.append(run_in(_Acting(world), policy, problem, span, keep_frames=len(done) < films))
+        progress(len(done), trials.episodes)
+    return ClosedLoopResult(trials, policy.name, tuple(done))
+
+
+def find_problems(
+    world: OtherWorld, options: BenchmarkOptions, stride: int, progress: Progress
+) -> tuple[WorldTrials, ClosedLoopResult]:
+    """Return as many problems as are asked for, and how the expert solves them: those that it does not are left out.
+
+    Raises:
+        InputError: It solves fewer than half, or there is no expert.
+    """
+    about = world.about
+    if not about.expert:
+        found, needed = f"{about.world} {about.task} has no expert", "one: it shows the goals, and what can be reached"
+        raise InputError(where=f"--world {world.command!r}", found=found, needed=needed, fix=_SAYS)
+    steps = options.steps or -(-about.steps // stride)
+    problems, shown, left_out = list[WorldProblem](), list[EpisodeResult](), list[int]()
+    for seed in range(options.seed, options.seed + _TRIES * options.episodes):
+        problem, episode = _demonstrated(world, seed, Span(steps, stride), options)
+        if episode.success:
+            problems.append(problem)
+            shown.append(episode)
+        else:
+            left_out.append(seed)
+        progress(len(problems), options.episodes)
+        if len(problems) == options.episodes:
+            break
+    else:
+        found = f"the expert solves {len(problems)} of {len(problems) + len(left_out)} problems in {steps} model steps"
+        fix = "Allow more of them with --steps"
+        raise InputError(where=f"--world {world.command!r}", found=found, needed="half of them", fix=fix)
+    trials = WorldTrials(about, options.seed, stride, steps, tuple(problems), options, tuple(left_out))
+    return trials, ClosedLoopResult(trials, EXPERT, tuple(shown))
+
+
+def _demonstrated(
+    world: OtherWorld, seed: int, span: Span, options: BenchmarkOptions
+) -> tuple[WorldProblem, EpisodeResult]:
+    """Let the expert solve an episode; return the problem with goals of what was seen, and the record."""
+    first = world.reset(seed)
+    seen = [first, *(world.let_expert(span.stride) for _ in range(span.steps))]
+    states, images = np.stack([one.state for one in seen]), [one.image for one in seen]
+    problem = WorldProblem(seed, images[-1] if first.goal is None else first.goal)
+    if options.sub_goals != "none":
+        spec = every_step(DemonstrationSpec()) if options.sub_goals == "every-step" else DemonstrationSpec()
+        keys = gripper_key_frames(states, OF_MODEL_STEPS) if spec.every is None else every_key_frame(len(seen), 1)
+        timing = Timing(1, spec.slack, spec.share)
+        goals = sub_goals_of([images[key.frame] for key in keys], keys, timing, states)
+        problem = replace(problem, goals=tuple(goals))
+    record = EpisodeResult(
+        problem=problem,
+        states=states,
+        actions=actions_from_states(states),
+        blocks=None,
+        distances_m=np.array([one.distance_m for one in seen]),
+        reached=np.array([one.is_done for one in seen]),
+        seconds=np.zeros(span.steps),
+        whys=("scripted",) * span.steps,
+        unreachable=0,
+        goal_image=problem.goal_image,
+        frames=None,
+    )
+    return problem, record

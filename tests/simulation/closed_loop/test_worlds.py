@@ -1,0 +1,165 @@
+"""Worlds that others made: they are driven and recorded as they say, whatever they do wrong is one sentence."""
+
+import json
+import re
+import shlex
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import fake_world
+
+pytest.importorskip("av", reason="the extra `video` is not installed")
+
+from paths import ROOT
+from tiny_models import tiny_model
+from vjepa2_ac.cli import main
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config.planning import LimitsConfig
+from vjepa2_ac.data.sources.npz import NpzSource
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.answer import CLOSED_LOOP_FILE
+from vjepa2_ac.planning.session import load_to_plan
+from vjepa2_ac.simulation.closed_loop.agent import agent_of_session
+from vjepa2_ac.simulation.closed_loop.benchmark import BenchmarkOptions
+from vjepa2_ac.simulation.closed_loop.policies import Image, Oracle, Problem, ZeroActions
+from vjepa2_ac.simulation.closed_loop.worlds import OtherWorld, find_problems, run_trials, run_world_benchmark
+from vjepa2_ac.simulation.recording.record_world import record_world
+
+SMALL = ["planning.samples=6", "planning.iterations=2", "planning.cem.elites=3"]
+
+
+def command(how: str = "") -> str:
+    return shlex.join([sys.executable, fake_world.__file__, how])
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> str:
+    folder = tmp_path_factory.mktemp("models") / "tiny"
+    tiny_model().save_pretrained(folder)
+    return str(folder)
+
+
+def test_a_model_and_those_without_one_act_on_the_problems_that_the_expert_solves(
+    model: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = ["simulate", model, "--world", command("sometimes hard"), "--episodes", "3", "--films", "1", "--all"]
+    assert main([*given, "--sub-goals", "every-step", "--out", str(tmp_path), *SMALL]) == 0
+    shown = capsys.readouterr().out
+    assert "Come in fake 1.0: 3 problems of seed 0, 3 steps of 0.40 s" in shown
+    found = json.loads((tmp_path / CLOSED_LOOP_FILE).read_text())
+    assert (found["about"]["seeds"], found["about"]["left_out"]) == ([0, 2, 3], [1])
+    assert list(found["policies"]) == ["tiny", "do nothing", "random", "expert"]
+    assert found["policies"]["expert"]["success"]["value"] == 1.0
+    still = np.array(found["policies"]["do nothing"]["by_episode"]["distance_cm"])
+    assert (still == still[:, :1]).all()
+    moved = np.array(found["policies"]["tiny"]["by_episode"]["distance_cm"])
+    np.testing.assert_array_equal(moved[:, 0], still[:, 0])
+    assert (np.abs(np.diff(moved, axis=1)) > 0.01).any()
+    assert {path.name for path in tmp_path.iterdir()} == {CLOSED_LOOP_FILE, "closed_loop.mp4", "closed_loop.png"}
+
+
+def test_a_policy_that_knows_the_goal_reaches_it_in_any_world() -> None:
+    class Homing(ZeroActions):
+        def reset(self, problem: Problem, goal_image: Image) -> None:  # noqa: ARG002
+            self.place = fake_world.place_of(problem.index)
+
+        def _way(self, state: np.ndarray) -> np.ndarray:
+            return np.append(self.place - state[:3], np.zeros(4))
+
+    with OtherWorld(command()) as world:
+        trials, shown = find_problems(world, BenchmarkOptions(episodes=4, seed=5), 4, lambda *_: None)
+        again, shown_again = find_problems(world, BenchmarkOptions(episodes=4, seed=5), 4, lambda *_: None)
+        result = run_trials(world, Homing(), trials, 0, lambda *_: None)
+        with pytest.raises(ValueError, match="no problem of the simulated arm"):
+            run_trials(world, Oracle(LimitsConfig()), trials, 0, lambda *_: None)
+    assert result.success_rate.value == 1.0
+    np.testing.assert_array_equal(shown.distance_cm, shown_again.distance_cm)
+    assert (
+        [problem.index for problem in trials.problems] == [problem.index for problem in again.problems] == [5, 6, 7, 8]
+    )
+
+
+def test_a_recording_is_a_data_set_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    with OtherWorld(command()) as world:
+        assert record_world(world, tmp_path, range(2)) == 2
+        first = {file.name: file.stat().st_mtime_ns for file in tmp_path.iterdir()}
+        assert record_world(world, tmp_path, range(4)) == 4
+    assert {file.name: file.stat().st_mtime_ns for file in tmp_path.iterdir() if file.name in first} == first
+    source = NpzSource(DataConfig.model_validate({"source": "npz", "path": str(tmp_path)}))
+    episodes = [source.read(number) for number in range(4)]
+    assert [episode.info.success for episode in episodes] == [True] * 4
+    assert {(episode.control_rate_hz, episode.metadata["language"]) for episode in episodes} == {(10.0, "come here")}
+    for number, episode in enumerate(episodes):
+        targets = np.load(tmp_path / f"Come_{number:06d}.npz")["actions"]
+        assert len(targets) == len(episode.states) < fake_world.ABOUT["steps"] + 1
+        assert (np.ptp(targets[:, :3], axis=0) > 0).any() == bool(number % 2), "every second one is disturbed"
+        image = episode.read_frames([0])[0]
+        assert image.shape == (24, 32, 3)
+        assert image[..., 0].any()
+
+
+@pytest.mark.parametrize(
+    ("world", "said"),
+    [
+        ("nowhere/python world.py", "cannot be started: .*nowhere/python"),
+        (f"{sys.executable} 'world.py", "cannot be started: No closing quotation"),
+        (command("no such task"), "ended with status 1\nthere is no task of this name"),
+        (command("chatty"), "wrote 'Welcome to my world!'. needed: a JSON object"),
+        (command("no rate"), "rate_hz: "),
+        (command("dies"), "ended with status 1\n(.*\n)*RuntimeError: the cube fell off the table"),
+        (command("refuses"), "the arm is asleep"),
+        (command("six numbers"), "not of seven finite numbers. needed: image, state, distance_m and success"),
+        (command("no expert"), "fake 1.0 Come has no expert"),
+        (command("hard"), "the expert solves 0 of 4 problems in 3 model steps. needed: half of them"),
+    ],
+)
+def test_what_a_world_does_wrong_is_said(model: str, tmp_path: Path, world: str, said: str) -> None:
+    agent = agent_of_session(load_to_plan(model, overrides=SMALL))
+    with pytest.raises(InputError, match=said), OtherWorld(world) as opened:
+        run_world_benchmark(agent, opened, BenchmarkOptions(episodes=2, films=0), tmp_path)
+
+
+def test_options_of_our_arm_mean_nothing_in_a_world(model: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["simulate", model, "--world", command(), "--task", "reach"]) == 2
+    assert "--task: simulate" in capsys.readouterr().err
+    assert main(["simulate", "record", "folder", "--world", command(), "--cameras", "3"]) == 2
+    assert "a world has one camera" in capsys.readouterr().err
+
+
+WORLDS = ("robosuite", "libero", "metaworld")
+
+
+@pytest.mark.parametrize("name", WORLDS)
+def test_pins_are_the_same_wherever_they_stand_and_programs_are_short_and_alone(name: str) -> None:
+    places = {"Makefile": rf"WORLD_{name} := (.+)", "docs/worlds.md": rf"`{name}.py` \| `pip install ([^`]+)`"}
+    places[f"examples/worlds/{name}.py"] = r"bin/pip install (.+)"
+    pins = {place: re.findall(pattern, (ROOT / place).read_text()) for place, pattern in places.items()}
+    assert len({tuple(found) for found in pins.values()}) == 1, pins
+    text = (ROOT / f"examples/worlds/{name}.py").read_text()
+    assert not re.search(r"^\s*(from|import) vjepa2_ac", text, flags=re.MULTILINE)
+    body = text[text.index('"""', 3) + 3 :]
+    assert sum(bool(line.strip()) for line in body.splitlines()) < 120
+
+
+@pytest.mark.parametrize("name", WORLDS)
+def test_a_real_world_is_driven_by_its_expert(name: str, tmp_path: Path) -> None:
+    python = ROOT / "worlds" / name / "bin" / "python"
+    if not python.exists():
+        pytest.skip(f"no environment of {name} (docs/worlds.md): make worlds/{name}")
+    task = {"robosuite": "Lift", "libero": "libero_object", "metaworld": "reach-v3"}[name]
+    with OtherWorld(shlex.join([str(python), str(ROOT / "examples" / "worlds" / f"{name}.py"), task])) as world:
+        first, second = world.reset(3), world.reset(3)
+        np.testing.assert_array_equal(first.image, second.image)
+        np.testing.assert_array_equal(first.state, second.state)
+        assert first.image.shape == (256, 256, 3)
+        assert first.image.std() > 10
+        assert record_world(world, tmp_path, range(1)) == 1
+        still = world.move(world.reset(0).state, 4)
+        assert np.linalg.norm(still.state[:3] - world.reset(0).state[:3]) < 0.02
+        up = world.reset(0).state + np.array([0.0, 0.0, 0.05, 0.0, 0.0, 0.0, 0.0])
+        assert 0.03 < world.move(up, 15).state[2] - world.reset(0).state[2] < 0.07, (
+            "targets are metres in the base frame"
+        )

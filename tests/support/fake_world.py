@@ -1,0 +1,68 @@
+"""A world as a program: a hand is to come to a place that its seed determines. Its argument says what is wrong."""
+
+import base64
+import json
+import sys
+from typing import Any
+
+import numpy as np
+
+HOW = sys.argv[1] if len(sys.argv) > 1 else "as it should be"
+ABOUT = {"world": "fake 1.0", "task": "Come", "instruction": "come here", "rate_hz": 10, "steps": 12, "expert": True}
+REACH_M = 0.03  # of a control step
+
+
+def place_of(seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).uniform([0.3, -0.1, 0.2], [0.5, 0.1, 0.4])
+
+
+class World:
+    def reset(self, seed: int) -> dict[str, Any]:
+        self.place = place_of(seed)
+        self.is_hard = HOW == "hard" or (HOW == "sometimes hard" and seed % 3 == 1)
+        self.state = np.array([0.4, 0.0, 0.3, np.pi, 0.0, 0.0, 0.0])
+        return self.seen()
+
+    def move(self, target: list[float], steps: int) -> dict[str, Any]:
+        for _ in range(steps):
+            way = np.array(target[:3]) - self.state[:3]
+            self.state[:3] += way * min(1.0, REACH_M / max(float(np.linalg.norm(way)), 1e-9))
+            self.state[6] = target[6]
+        return self.seen()
+
+    def expert(self, steps: int, offset: list[float]) -> dict[str, Any]:
+        target = [*(self.state[:3] if self.is_hard else self.place + offset), np.pi, 0.0, 0.0, 0.0]
+        return {**self.move(target, steps), "target": target}
+
+    def seen(self) -> dict[str, Any]:
+        image = np.zeros((24, 32, 3), dtype=np.uint8)
+        for place, channel in ((self.state, 0), (self.place, 1)):
+            row, column = int(12 + 100 * place[1]), int(16 + 100 * (place[0] - 0.4))
+            image[max(0, row - 2) : row + 2, max(0, column - 2) : column + 2, channel] = 255
+        far = float(np.linalg.norm(self.state[:3] - self.place))
+        pixels = {"height": 24, "width": 32, "rgb": base64.b64encode(image.tobytes()).decode()}
+        state = self.state.tolist() if HOW != "six numbers" else self.state.tolist()[:6]
+        return {"image": pixels, "state": state, "success": far < 0.02, "distance_m": far}
+
+
+def say(line: str) -> None:
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
+
+
+def main() -> None:
+    about = ABOUT | {"no expert": {"expert": False}, "no rate": {"rate_hz": 0}}.get(HOW, {})
+    if HOW == "no such task":
+        sys.exit("there is no task of this name")
+    say("Welcome to my world!" if HOW == "chatty" else json.dumps(about))
+    world = World()
+    for line in sys.stdin:
+        request = json.loads(line)
+        if HOW == "dies":
+            raise RuntimeError("the cube fell off the table")
+        answer = {"error": "the arm is asleep"} if HOW == "refuses" else getattr(world, request.pop("do"))(**request)
+        say(json.dumps(answer))
+
+
+if __name__ == "__main__":
+    main()
