@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 CLEAR_M, NEAR_M = 0.10, 0.012  # height of what is carried over what it passes; closer than this it is there
 FIT_M = 0.07  # the fingers hold no wider thing
-WALL_M, DEEP_M, LOW_M = 0.006, 0.032, 0.013  # from the grip site to a rim, a top, what a thing lies on
+WALL_M, DEEP_M, LOW_M = 0.015, 0.032, 0.011  # from the grip site to a rim, a top, what a thing lies on
 DOWN = Rotation.from_euler("xyz", [np.pi, 0.0, np.pi / 2])  # the fingers close along y
 SIDES = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
 GRIPPER = np.array([[x, y, z] for x in np.linspace(-0.1, 0.1, 9) for y in (-0.03, 0.0, 0.03) for z in (-0.11, -0.03)]
@@ -37,7 +37,7 @@ class Expert:
                 rest = np.array([*self.world.at(target)[:2], top + self.world.at(name)[2] - low])
                 yield from self.pick(name, rest)
                 if self.corners(name)[:, 2].min() > low + 0.03:  # it is held
-                    yield from self.put(name, rest)
+                    yield from self.put(name, rest, falls=site is None)
         self.turned = self.world.state()[3:6]
         yield from self.grip(self.world.state()[6] > 0.1, steps=10_000)
 
@@ -51,13 +51,13 @@ class Expert:
         return (turned + data.geom_xpos[parts, None]).reshape(-1, 3) - self.world.base()
 
     def touched(self, points):
-        """How many of the points are in things."""
+        """How many of the points are in things or near them: the walls of LIBERO's furniture are thin."""
         model, data = self.world.sim.model, self.world.sim.data
         robot = model.body_rootid[model.body_name2id("robot0_base")]
         parts = np.flatnonzero((model.geom_group == 0) & (model.body_rootid[model.geom_bodyid] != robot))
         turns, places = data.geom_xmat[parts].reshape(-1, 3, 3), data.geom_xpos[parts, None] - self.world.base()
         local = np.einsum("pji,pcj->pci", turns, points - places) - model.geom_aabb[parts, None, :3]
-        return (np.abs(local) < model.geom_aabb[parts, None, 3:]).all(-1).any(0).sum()
+        return (np.abs(local) < model.geom_aabb[parts, None, 3:] + NEAR_M).all(-1).any(0).sum()
 
     def go(self, where, closedness, near=NEAR_M, most=60):
         """Yield the target pose until the hand is there or comes no further; what is to be reached may move."""
@@ -75,9 +75,11 @@ class Expert:
             yield np.array([*still[:3], *self.turned, closedness])
 
     def grasp(self, name, carry):
-        """Where and how turned the open fingers, from above, come between the fewest things, here and once carried."""
+        """Where and how turned the open fingers, from above, come between the fewest things, here and on the way."""
         corners, choices = self.corners(name), []
         low, high = corners.min(axis=0)[2], corners.max(axis=0)[2]
+        high_m = max(0.0, carry[2]) + CLEAR_M
+        way = [np.zeros(3), carry, *([*(share * carry[:2]), high_m] for share in np.linspace(0.0, 1.0, 5))]
         for degrees in range(-90, 91, 15):
             turn = Rotation.from_euler("z", degrees, degrees=True) * DOWN
             local = turn.inv().apply(corners)
@@ -85,11 +87,11 @@ class Expert:
             middle = (first + last) / 2
             rims = [first[0] + WALL_M, last[0] - WALL_M]
             width = last[0] - first[0]
-            for along in [middle[0]] if width < FIT_M else rims:
+            for along, effort in [(middle[0], 100 * width)] if width < FIT_M else [(rim, 20) for rim in rims]:
                 place = turn.apply([along, middle[1], 0.0])
                 place[2] = max(high - DEEP_M, low + LOW_M)
-                hits = sum(self.touched(turn.apply(GRIPPER) + place + shift) for shift in (np.zeros(3), carry))
-                choices.append((hits + 100 * width + abs(degrees) / 30, *place, *turn.as_euler("xyz")))
+                hits = self.touched((turn.apply(GRIPPER) + place + np.array(way)[:, None]).reshape(-1, 3))
+                choices.append((hits + effort + abs(degrees) / 30, *place, *turn.as_euler("xyz")))
         return np.split(np.array(min(choices)[1:]), 2)
 
     def pick(self, name, rest):
@@ -102,12 +104,11 @@ class Expert:
         lifted = place + above * (1.0 + max(0.0, rest[2] - before[2]) / CLEAR_M)
         yield from self.go(lambda: lifted, 1.0)
 
-    def put(self, name, rest):
-        """Carry what is held over where it is to rest, lower it as far as it goes, let go, and leave."""
-        above = np.array([0.0, 0.0, CLEAR_M])
-        over = rest + above
-        yield from self.go(lambda: self.world.state()[:3] + over - self.world.at(name), 1.0)
-        yield from self.go(lambda: [*self.world.state()[:3], *(rest - self.world.at(name))[:2], -AHEAD_M], 1.0)
+    def put(self, name, rest, falls):
+        """Carry what is held over where it is to rest, lower it, as far as it goes if it is not to fall, and leave."""
+        above, low = np.array([0.0, 0.0, CLEAR_M]), rest - [0.0, 0.0, 0.0 if falls else 1.0]
+        yield from self.go(lambda: self.world.state()[:3] + rest + above - self.world.at(name), 1.0)
+        yield from self.go(lambda: self.world.state()[:3] + np.maximum(low - self.world.at(name), -AHEAD_M), 1.0)
         yield from self.grip(0.0)
         left = self.world.state()[:3] + above
         yield from self.go(lambda: left, 0.0)

@@ -78,11 +78,11 @@ class World:
 
     def expert(self, steps, offset=(0.0, 0.0, 0.0)):
         for _ in range(steps * ENV_STEPS):
-            hand = self.observation[:3]
-            if self.solved < SURE:
+            hand, acts = self.observation[:3], self.solved < SURE
+            if acts:
                 self.closing = float(self.policy.get_action(self.observation.copy())[3])
             target = hand + np.clip(self.aim[0] - hand, -REACH_M, REACH_M)
-            self.step(self.aim[0] + offset, self.aim[1])
+            self.step(self.aim[0] + acts * np.array(offset), self.aim[1])
         return {**self.seen(), "target": [*target, *self.state()[3:6], float(self.closing > 0)]}
 
     def seen(self):

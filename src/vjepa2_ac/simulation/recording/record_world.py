@@ -12,7 +12,7 @@ from vjepa2_ac.simulation.closed_loop.worlds import OtherWorld, WorldObservation
 from vjepa2_ac.storage import atomic_writer, user_can_write
 
 REST_S = 0.5  # after success an episode goes on for so long
-OFF_M, OFF_S, EVERY_S = 0.04, 0.3, 1.5  # of a disturbance: its standard deviation on each axis, length, and period
+OFF_M, OFF_S, EVERY_S = 0.02, 0.3, 1.5  # of a disturbance: its standard deviation on each axis, length, and period
 
 
 def record_world(world: OtherWorld, folder: Path, seeds: Sequence[int], progress: Progress = no_progress) -> int:
