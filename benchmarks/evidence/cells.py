@@ -55,7 +55,8 @@ PLANNING = PlanningConfig(
     limits=LimitsConfig(xyz=(0.075, 0.075, 0.075), gripper_mode="held"),
     energy=EnergyConfig(distance="l1"),
 )
-"""As the reach tasks of FACTS' prototype: 64 samples, 4 iterations, horizon 1, 7.5 cm an axis and model step."""
+"""As the reach tasks of FACTS' prototype: 64 samples, 4 iterations, horizon 1, 7.5 cm an axis and model step. In worlds
+that others made each goal on the way says what the gripper does."""
 
 
 @dataclass(frozen=True)

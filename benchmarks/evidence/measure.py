@@ -36,7 +36,15 @@ from vjepa2_ac.planning.model_setup import Axes, Fingerprints
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.checkpoint import NEWEST
 from vjepa2_ac.runs.loading import load_run
-from vjepa2_ac.simulation.closed_loop.policies import Image, Oracle, Planning, Policy, RandomActions, ZeroActions
+from vjepa2_ac.simulation.closed_loop.policies import (
+    GoalsOf,
+    Image,
+    Oracle,
+    Planning,
+    Policy,
+    RandomActions,
+    ZeroActions,
+)
 from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, run_task
 from vjepa2_ac.simulation.closed_loop.tasks import Problem, TaskProblem
 from vjepa2_ac.storage import write_atomically
@@ -87,7 +95,7 @@ def measure(cell: Cell, folder: Path, *, goals: int = GOALS, choosing: bool = Fa
     if model.adaptation is not None:
         merge_adapter(model)
     goals_seed = (VALIDATION_GOALS if choosing else TEST_GOALS) + cell.seed
-    settings = {"axes": file} if cell.shift in SHIFTS else {"config": other_worlds.PLANNING}
+    settings: dict[str, Any] = {"axes": file} if cell.shift in SHIFTS else {"goals_of": other_worlds.goals_of}
     figures["reach"] = {
         distance: closed_loop(cell, planner(model, distance, **settings), folder, seed=goals_seed, goals=goals)
         for distance in energies_of(cell)
@@ -151,13 +159,17 @@ def baselines(cell: Cell, folder: Path, *, goals: int = GOALS) -> dict[str, Any]
     return found
 
 
-def planner(model: WorldModel, distance: str, config: PlanningConfig = PLANNING, axes: str | None = None) -> Policy:
+def planner(
+    model: WorldModel,
+    distance: str,
+    config: PlanningConfig = PLANNING,
+    axes: str | None = None,
+    goals_of: GoalsOf | None = None,
+) -> Policy:
     """Return a policy that plans with a model, in calibrated axes where a file of them is given."""
     energy = config.energy.model_copy(update={"distance": distance})
     controller = Controller(model, config.model_copy(update={"energy": energy, "axes": axes}))
-    if config is other_worlds.PLANNING:
-        return Planning(controller, goals_of=other_worlds.goals_of)
-    return Watched(controller)
+    return Watched(controller) if goals_of is None else Planning(controller, goals_of=goals_of)
 
 
 class Watched(Planning):

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.episode import no_progress
 from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.simulation.closed_loop.benchmark import BenchmarkOptions
@@ -32,14 +31,6 @@ SIZE = 96  # pixels: those of the tiny encoder
 EPISODES_BEFORE, EPISODES_AFTER = 120, 120  # recorded in the world before and after its change
 CHANGED = ("--camera", "40", "--mount", "20", "--look", "dusk")  # robosuite: another camera, mounting and light
 FIRST = {"before": 0, "after": 10_000}  # seed of the recordings
-PLANNING = PlanningConfig(
-    samples=64,
-    iterations=4,
-    start_std=0.67,
-    limits=LimitsConfig(xyz=(0.075, 0.075, 0.075), gripper_mode="held"),
-    energy=EnergyConfig(distance="l1"),
-)
-"""As the reach tasks of our own arm; each goal on the way says what the gripper does."""
 
 
 @dataclass(frozen=True)
