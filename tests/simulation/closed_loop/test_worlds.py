@@ -86,16 +86,16 @@ def test_a_recording_is_a_data_set_and_goes_on_where_it_stopped(tmp_path: Path) 
     with OtherWorld(command()) as world:
         assert record_world(world, tmp_path, range(2)) == 2
         first = {file.name: file.stat().st_mtime_ns for file in tmp_path.iterdir()}
-        assert record_world(world, tmp_path, range(4)) == 4
+        assert record_world(world, tmp_path, range(4)) == 3, "play solves nothing"
     assert {file.name: file.stat().st_mtime_ns for file in tmp_path.iterdir() if file.name in first} == first
     source = NpzSource(DataConfig.model_validate({"source": "npz", "path": str(tmp_path)}))
     episodes = [source.read(number) for number in range(4)]
-    assert [episode.info.success for episode in episodes] == [True] * 4
+    assert [episode.info.success for episode in episodes] == [True, True, False, True]
     assert {(episode.control_rate_hz, episode.metadata["language"]) for episode in episodes} == {(10.0, "come here")}
     for number, episode in enumerate(episodes):
         targets = np.load(tmp_path / f"Come_{number:06d}.npz")["actions"]
         assert len(targets) == len(episode.states) < fake_world.ABOUT["steps"] + 1
-        assert (np.ptp(targets[:, :3], axis=0) > 0).any() == bool(number % 2), "every second one is disturbed"
+        assert (np.ptp(targets[:, :3], axis=0) > 0).any() == bool(number % 3), "one of three is the expert's alone"
         image = episode.read_frames([0])[0]
         assert image.shape == (24, 32, 3)
         assert image[..., 0].any()
