@@ -15,13 +15,12 @@ from vjepa2_ac.episode import no_progress
 from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.simulation.closed_loop.benchmark import BenchmarkOptions
 from vjepa2_ac.simulation.closed_loop.policies import Policy
-from vjepa2_ac.simulation.closed_loop.rollout import ClosedLoopResult
+from vjepa2_ac.simulation.closed_loop.rollout import ClosedLoopResult, run_trials
 from vjepa2_ac.simulation.closed_loop.worlds import (
     OtherWorld,
     WorldProblem,
     WorldTrials,
     find_problems,
-    run_trials,
 )
 from vjepa2_ac.simulation.recording.record_world import record_world
 
@@ -101,7 +100,7 @@ def closed_loop(folder: Path, task: str, policy: Policy, *, seed: int, goals: in
     """Return how a policy fares after the change; by `Trials` of the expert's own problems."""
     trials, _ = problems(folder, task, seed, goals)
     with OtherWorld(TASKS[task].command("after")) as world:
-        return figures_of(run_trials(world, policy, trials, 0, no_progress), seed)
+        return figures_of(run_trials(world, policy, trials), seed)
 
 
 def goals_of(problem: WorldProblem) -> tuple[SubGoal, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import Any, Protocol
@@ -80,12 +80,20 @@ class Trials(Protocol):
         """Of the problems."""
 
     @property
+    def stride(self) -> int:
+        """Control steps of a model step."""
+
+    @property
     def model_steps(self) -> int:
         """Model steps of an episode."""
 
     @property
     def seconds_per_step(self) -> float:
         """Length of a model step."""
+
+    @property
+    def problems(self) -> Iterable[Problem]:
+        """The problems: the same for every policy, so that metrics can be paired."""
 
     @property
     def task_name(self) -> str:
@@ -249,12 +257,30 @@ def run_task(
         UnreachableError: MuJoCo is not installed.
         ValueError: An action that is no action.
     """
-    arm, done = arm or arm_for(spec.task, spec.world), list[EpisodeResult]()
-    for problem in spec.problems:
-        is_filmed = problem.index < spec.films
-        done.append(run_episode(arm, policy, problem, spec.model_steps, spec.stride, keep_frames=is_filmed))
-        progress(len(done), spec.episodes)
-    return ClosedLoopResult(spec, policy.name, tuple(done))
+    world = SimulatedWorld(arm or arm_for(spec.task, spec.world))
+    return run_trials(world, policy, spec, spec.films, progress)
+
+
+def run_trials(
+    world: World, policy: Policy, trials: Trials, films: int = 0, progress: Progress = no_progress
+) -> ClosedLoopResult:
+    """Let a policy solve the problems of a world.
+
+    Args:
+        world: Where it acts.
+        policy: The policy.
+        trials: The problems.
+        films: Number of episodes, the first ones, whose frames are stored.
+        progress: Called with the number of finished episodes.
+
+    Raises:
+        ValueError: As `run_in`.
+    """
+    done, span = list[EpisodeResult](), Span(trials.model_steps, trials.stride)
+    for problem in trials.problems:
+        done.append(run_in(world, policy, problem, span, keep_frames=len(done) < films))
+        progress(len(done), trials.episodes)
+    return ClosedLoopResult(trials, policy.name, tuple(done))
 
 
 def run_episode(
@@ -417,8 +443,7 @@ def send_action(arm: SimulatedArm, action: State, stride: int) -> bool:
     Returns:
         Whether it can be reached.
     """
-    target = apply_action(arm.state, action)
-    target[6] = np.clip(target[6], 0.0, 1.0)
+    target = commanded(arm.state, action)
     with suppress(OutOfReachError):
         arm.command(target, stride)
         return True
@@ -428,6 +453,13 @@ def send_action(arm: SimulatedArm, action: State, stride: int) -> bool:
     else:
         arm.command_joints(arm.joints, target[6], stride)
     return False
+
+
+def commanded(state: State, action: State) -> State:
+    """Return the state after an action, its closedness within 0 .. 1."""
+    target = np.asarray(apply_action(state, action))
+    target[6] = np.clip(target[6], 0.0, 1.0)
+    return target
 
 
 def ways_along(state: State, action: State) -> Sequence[State]:

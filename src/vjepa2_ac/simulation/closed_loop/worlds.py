@@ -42,9 +42,16 @@ from vjepa2_ac.simulation.closed_loop.benchmark import (
     write_benchmark,
 )
 from vjepa2_ac.simulation.closed_loop.policies import GoalsOf, Image, Moves, Policy, RandomActions, ZeroActions
-from vjepa2_ac.simulation.closed_loop.rollout import ClosedLoopResult, EpisodeResult, Observation, Span, run_in
+from vjepa2_ac.simulation.closed_loop.rollout import (
+    ClosedLoopResult,
+    EpisodeResult,
+    Observation,
+    Span,
+    commanded,
+    run_trials,
+)
 from vjepa2_ac.simulation.closed_loop.tasks import Problem
-from vjepa2_ac.spaces import actions_from_states, apply_action
+from vjepa2_ac.spaces import actions_from_states
 from vjepa2_ac.storage import user_can_write
 from vjepa2_ac.storage.structured import record_of
 
@@ -100,7 +107,7 @@ class OtherWorld(ExitStack):
             )
         except (OSError, ValueError) as error:
             self.close()
-            raise self._refused(f"it cannot be started: {error}") from None
+            raise self.refused(f"it cannot be started: {error}") from None
         self.callback(self._end)
         try:
             self.about = record_of(AboutWorld, self._read(), where=self._where, needed="what it is", fix=_SAYS)
@@ -132,6 +139,31 @@ class OtherWorld(ExitStack):
         """
         return self._ask(do=EXPERT, steps=steps, offset=list(offset))
 
+    def begin(self, problem: Problem) -> tuple[Image, Observation]:
+        """Reset to a problem; return its goal image, and what is seen.
+
+        Raises:
+            InputError: As `reset`.
+            ValueError: It is a problem of another world.
+        """
+        if not isinstance(problem, WorldProblem):
+            raise ValueError(f"{problem} is no problem of {self.about.world}")  # noqa: TRY004 - a wrong argument
+        self._now = self.reset(problem.index)
+        return problem.goal_image, self._now
+
+    def act(self, action: Float[np.ndarray, " dim"], moves: Moves, stride: int) -> tuple[bool, Observation]:  # noqa: ARG002
+        """Hold the pose after an action for so many control steps; return True, and what is seen then.
+
+        Raises:
+            InputError: As `reset`.
+        """
+        self._now = self.move(commanded(self._now.state, action), stride)
+        return True, self._now
+
+    def refused(self, found: str, needed: str = "", fix: str = _SAYS) -> InputError:
+        """Return an error that says what is wrong with this world."""
+        return InputError(where=self._where, found=found, needed=needed, fix=fix)
+
     @property
     def _where(self) -> str:
         return f"--world {self.command!r}"
@@ -153,14 +185,14 @@ class OtherWorld(ExitStack):
             line = self._process.stdout.readline() if self._process.stdout else ""
             answer = json.loads(line) if line else None
         except ValueError:
-            raise self._refused(f"it wrote {line.strip()[:200]!r}", "a JSON object in a line") from None
+            raise self.refused(f"it wrote {line.strip()[:200]!r}", "a JSON object in a line") from None
         if answer is None:
             self._errors.seek(0)
             said = self._errors.read().decode(errors="replace").strip().splitlines()[-_LAST_LINES:]
-            raise self._refused("\n".join([f"it has ended with status {self._process.wait()}", *said]) + "\n")
+            raise self.refused("\n".join([f"it has ended with status {self._process.wait()}", *said]) + "\n")
         if not isinstance(answer, dict) or "error" in answer:
             found = answer["error"] if isinstance(answer, dict) else answer
-            raise self._refused(str(found))
+            raise self.refused(str(found))
         return answer
 
     def _observed(self, answer: dict[str, Any]) -> WorldObservation:
@@ -174,10 +206,7 @@ class OtherWorld(ExitStack):
             return WorldObservation(_image(answer["image"]), state, distance_m, is_done, target=held, goal=shown)
         except (KeyError, TypeError, ValueError) as error:
             found = f"no {error}" if isinstance(error, KeyError) else str(error)
-            raise self._refused(found, "image, state, distance_m and success") from None
-
-    def _refused(self, found: str, needed: str = "") -> InputError:
-        return InputError(where=self._where, found=found, needed=needed, fix=_SAYS)
+            raise self.refused(found, "image, state, distance_m and success") from None
 
     def _end(self) -> None:
         for stream in (self._process.stdin, self._process.stdout):
@@ -258,25 +287,6 @@ class WorldTrials:
         }
 
 
-class _Acting:
-    """A world while a policy acts in it."""
-
-    def __init__(self, world: OtherWorld) -> None:
-        self._world = world
-
-    def begin(self, problem: Problem) -> tuple[Image, Observation]:
-        if not isinstance(problem, WorldProblem):
-            raise ValueError(f"{problem} is no problem of {self._world.about.world}")  # noqa: TRY004 - a wrong argument
-        self._now = self._world.reset(problem.index)
-        return problem.goal_image, self._now
-
-    def act(self, action: Float[np.ndarray, " dim"], moves: Moves, stride: int) -> tuple[bool, Observation]:  # noqa: ARG002
-        target = apply_action(self._now.state, action)
-        target[6] = np.clip(target[6], 0.0, 1.0)
-        self._now = self._world.move(target, stride)
-        return True, self._now
-
-
 def run_world_benchmark(
     agent: Agent, world: OtherWorld, options: BenchmarkOptions, folder: Path, reporter: Reporter = SILENT
 ) -> tuple[ClosedLoopBenchmark, tuple[Path, ...]]:
@@ -317,21 +327,6 @@ def run_world_benchmark(
     return benchmark, write_benchmark(benchmark, folder)
 
 
-def run_trials(
-    world: OtherWorld, policy: Policy, trials: WorldTrials, films: int, progress: Progress
-) -> ClosedLoopResult:
-    """Let a policy solve the problems of a world.
-
-    Raises:
-        InputError: The world ends, or answers something else.
-    """
-    done, span = list[EpisodeResult](), Span(trials.model_steps, trials.stride)
-    for problem in trials.problems:
-        done.append(run_in(_Acting(world), policy, problem, span, keep_frames=len(done) < films))
-        progress(len(done), trials.episodes)
-    return ClosedLoopResult(trials, policy.name, tuple(done))
-
-
 def find_problems(
     world: OtherWorld, options: BenchmarkOptions, stride: int, progress: Progress
 ) -> tuple[WorldTrials, ClosedLoopResult]:
@@ -343,7 +338,7 @@ def find_problems(
     about = world.about
     if not about.expert:
         found, needed = f"{about.world} {about.task} has no expert", "one: it shows the goals, and what can be reached"
-        raise InputError(where=f"--world {world.command!r}", found=found, needed=needed, fix=_SAYS)
+        raise world.refused(found, needed)
     steps = options.steps or -(-about.steps // stride)
     problems, shown, left_out = list[WorldProblem](), list[EpisodeResult](), list[int]()
     for seed in range(options.seed, options.seed + _TRIES * options.episodes):
@@ -358,8 +353,7 @@ def find_problems(
             break
     else:
         found = f"the expert solves {len(problems)} of {len(problems) + len(left_out)} problems in {steps} model steps"
-        fix = "Allow more of them with --steps"
-        raise InputError(where=f"--world {world.command!r}", found=found, needed="half of them", fix=fix)
+        raise world.refused(found, "half of them", "Allow more of them with --steps")
     trials = WorldTrials(about, options.seed, stride, steps, tuple(problems), options, tuple(left_out))
     return trials, ClosedLoopResult(trials, EXPERT, tuple(shown))
 
