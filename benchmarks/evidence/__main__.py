@@ -24,6 +24,7 @@ def main() -> int:
     """Run what is not there yet, then write the table and the plot; return 1 where a cell failed."""
     options = _parse()
     from prepare import prepare
+    from results import read_results
     from table import place_in, write_tables
 
     folder, results = options.folder, options.folder / ("choosing" if options.choose else "results")
@@ -31,7 +32,7 @@ def main() -> int:
         place_in(options.page)  # before the hours, not after them
     results.mkdir(parents=True, exist_ok=True)
     if options.table:
-        write_tables(folder, options.out, options.page)
+        write_tables(folder, options.out, options.page, options.done)
         return 0
     cells = list(candidate_cells() if options.choose else all_cells(options.seeds))
     cells = [cell for cell in cells if options.only is None or options.only in cell.name]
@@ -40,12 +41,13 @@ def main() -> int:
             f"{task} is left out: make worlds/{TASKS[task].program} makes its environment (docs/worlds.md)", flush=True
         )
         cells = [cell for cell in cells if cell.shift != task]
-    prepare(folder, {cell.shift for cell in cells}, options.seeds)
-    missing = [cell for cell in cells if not _result(results, cell).exists()]
+    there = {one["cell"]["name"] for one in read_results(folder, options.done)} if not options.choose else set()
+    missing = [cell for cell in cells if cell.name not in there and not _result(results, cell).exists()]
+    prepare(folder, {cell.shift for cell in missing}, options.seeds)
     print(f"{len(cells)} cells, {len(cells) - len(missing)} of them done", flush=True)
     failed = _run(missing, results, options)
     if not options.choose:
-        write_tables(folder, options.out, options.page)
+        write_tables(folder, options.out, options.page, options.done)
     return 1 if failed else 0
 
 
@@ -59,6 +61,7 @@ def _parse() -> argparse.Namespace:
     parser.add_argument("--workers", type=int, default=2, help="cells at once, one thread each")
     parser.add_argument("--only", help="cells whose name has this in it")
     parser.add_argument("--choose", action="store_true", help="run what the learning rates were chosen from")
+    parser.add_argument("--done", type=Path, help="an evidence.json whose cells are not run again")
     parser.add_argument("--table", action="store_true", help="make table and plot again, run nothing")
     return parser.parse_args()
 

@@ -25,9 +25,10 @@ from vjepa2_ac.simulation.closed_loop.worlds import (
 from vjepa2_ac.simulation.recording.record_world import record_world
 
 ROOT = Path(__file__).resolve().parents[2]
-STRIDE = 4  # control steps of a model step
+STRIDE, EVERY = 4, 2  # control steps of a model step, and from one recorded frame to the next
 SIZE = 96  # pixels: those of the tiny encoder
-EPISODES_BEFORE, EPISODES_AFTER = 120, 120  # recorded in the world before and after its change
+EPISODES_BEFORE, EPISODES_AFTER = 120, 60  # recorded in the world before and after its change
+MANY = ("Lift",)  # tasks that are learned from 5 and 80 demonstrations, too: of these twice as many after the change
 CHANGED = ("--camera", "40", "--mount", "20", "--look", "dusk")  # robosuite: another camera, mounting and light
 FIRST = {"before": 0, "after": 10_000}  # seed of the recordings
 
@@ -39,6 +40,7 @@ class Task:
     program: str  # in examples/worlds, and the name of its environment
     before: tuple[str, ...]
     after: tuple[str, ...]
+    origin: str | None = None  # the task whose world before, and whose base, this one shares
 
     @property
     def is_there(self) -> bool:
@@ -58,29 +60,36 @@ class Task:
 
 TASKS = {
     **{name: Task("robosuite", (name,), (name, *CHANGED)) for name in ("Lift", "Door", "Stack", "PickPlaceCan")},
+    "Lift by a UR5e": Task("robosuite", ("Lift",), ("Lift", "--robot", "UR5e"), origin="Lift"),
     "LIBERO-swap": Task("libero", ("libero_object",), ("libero_object_swap",)),
     "LIBERO-object": Task("libero", ("libero_spatial",), ("libero_spatial_object",)),
 }
 
 
+def origin_of(task: str) -> str:
+    """Return the task whose world before the change, and whose base, a task has."""
+    return TASKS[task].origin or task
+
+
 def data_of(folder: Path, task: str, when: str) -> DataConfig:
-    """Return the data of a task; after the change half of the episodes may be trained on, the others are held out."""
+    """Return the data of a task; after the change two thirds of the episodes may be trained on."""
+    task = task if when == "after" else origin_of(task)
     held_out = {"validation_share": 0.1, "test_share": 0.1 if when == "before" else 0.25}
     latents = {"cache": "auto", "cache_dir": str(folder / "latents"), "workers": 0}
     path = str(folder / f"data-{task}-{when}")
     return DataConfig.model_validate(
-        {"source": "npz", "path": path, "frames": 4, "stride": STRIDE, **held_out, **latents}
+        {"source": "npz", "path": path, "frames": 4, "stride": STRIDE // EVERY, **held_out, **latents}
     )
 
 
 def record(folder: Path, task: str, when: str) -> None:
     """Record the demonstrations of a task that are not there yet."""
-    first, count = FIRST[when], EPISODES_BEFORE if when == "before" else EPISODES_AFTER
+    first, count = FIRST[when], EPISODES_BEFORE if when == "before" else EPISODES_AFTER * (1 + (task in MANY))
     path = Path(data_of(folder, task, when).path)
     if len(list(path.glob("*.npz"))) < count:
         print(f"recording {path}", flush=True)
         with OtherWorld(TASKS[task].command(when)) as world:
-            record_world(world, path, range(first, first + count))
+            record_world(world, path, range(first, first + count), every=EVERY)
 
 
 def problems(folder: Path, task: str, seed: int, goals: int) -> tuple[WorldTrials, ClosedLoopResult]:

@@ -29,7 +29,7 @@ _COLOURS = {"zero-shot": "#999999", "calibrated": "#9467bd", "LoRA": "#1f77b4", 
 
 
 def _bars(axes: Any, results: Sequence[Figures]) -> None:
-    names = list(METHODS)
+    names = [name for name in METHODS if any(main_cells(results, base, name) for base in (*BASES, "none"))]
     for side, base in enumerate(BASES):
         for place, name in enumerate(names):
             method = METHODS[name]

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from cells import SHIFTS, TRAINING, Base
-from other_worlds import TASKS, data_of, record
+from other_worlds import TASKS, data_of, origin_of, record
 
 from vjepa2_ac.config import Config, DataConfig, ModelConfig, RldsData
 from vjepa2_ac.config.loading import load_config
@@ -23,7 +23,10 @@ from vjepa2_ac.training.loop import train
 BUILTIN = "builtin:sim-tiny"
 EPISODES_A, EPISODES_SHIFTED = 400, 100
 SEED_A, SEED_SHIFTED = 11, 21  # of recordings; another than those of the demo and its base
-WORLD_STEPS = 4_000  # of the base of a world
+OF_A_WORLD = (
+    "training.steps=4000", "training.learning_rate=4e-3", "training.warmup_steps=50", "training.allow_weak_base=true",
+)  # fmt: skip
+"""How the base of a world is trained: as `configs/pick.yaml`."""
 BASE_CONFIG = Path(__file__).with_name("base_one_camera.yaml")
 
 
@@ -58,7 +61,7 @@ def base_model(folder: Path, base: Base, seed: int, shift: str = "look") -> str:
     """Return what `model.base` takes for a base, or for a predictor without a past."""
     if base == "many cameras":
         return BUILTIN
-    of_one = "base-one-camera" if shift in SHIFTS else f"base-{shift}"
+    of_one = "base-one-camera" if shift in SHIFTS else f"base-{origin_of(shift)}"
     return str(folder / (f"scratch-{seed}" if base == "none" else of_one))
 
 
@@ -70,13 +73,8 @@ def prepare_world(folder: Path, task: str, reporter: Reporter = SILENT) -> None:
     encode(data_of(folder, task, "before"), BUILTIN)  # all share its encoder
     encode(data_of(folder, task, "after"), BUILTIN)
     if not base.exists():
-        changes = [
-            f"run_dir={folder / f'run-{base.name}'}",
-            f"training.steps={WORLD_STEPS}",
-            "training.allow_weak_base=true",
-        ]
-        config = load_config(BASE_CONFIG, changes)
-        start = config.model.model_copy(update={"base": base_model(folder, "none", 0), "random": None})
+        config = load_config(BASE_CONFIG, [f"run_dir={folder / f'run-{base.name}'}", *OF_A_WORLD])
+        start = config.model.model_copy(update={"base": BUILTIN, "random": None})  # has seen an arm, no such world
         config = config.model_copy(update={"data": data_of(folder, task, "before"), "model": start})
         export_run(train(config, reporter), base)
 

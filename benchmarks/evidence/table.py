@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from cells import AXES, BASES, BEST, FEW_AND_MANY, IN_WORLDS, METHODS, SHIFTS, TURNS
+from cells import AXES, BASES, BEST, IN_EVERY_WORLD, IN_SOME_WORLDS, METHODS, SHIFTS, TURNS
 from offline import correlations
-from other_worlds import TASKS
+from other_worlds import MANY, TASKS
 from plot import draw
 from results import Figures, last, main_cells, of_policy, pick, reached, read_results, share_reached
 
@@ -39,13 +39,13 @@ NOTES = """Read it so:
   32 with in/out; all else inherits them."""
 
 
-def write_tables(folder: Path, out: Path, page: Path | None = None) -> None:
-    """Write evidence.md and evidence.png of what is there, print the table, and put the short one into a page.
+def write_tables(folder: Path, out: Path, page: Path | None = None, done: Path | None = None) -> None:
+    """Write evidence.md, .json and .png of what is there, print the table, and put the short one into a page.
 
     Raises:
         ValueError: The page has no place for it.
     """
-    results = read_results(folder)
+    results = read_results(folder, done)
     if not results:
         print(f"nothing to show: no cell is done in {folder / 'results'}")
         return
@@ -65,7 +65,7 @@ def write_tables(folder: Path, out: Path, page: Path | None = None) -> None:
     )
     text = f"{text}\n\n{NOTES}\n{_made_with(results)}"
     (out / TABLE).write_text(text + "\n")
-    (out / "evidence.json").write_text(json.dumps([_slim(one) for one in results], indent=None) + "\n")
+    (out / "evidence.json").write_text(json.dumps(results) + "\n")
     print(text)
     draw(results, out / PLOT)
     if page is not None:
@@ -106,6 +106,8 @@ def summary(results: Sequence[Figures]) -> str:
     for method in (one for one in METHODS.values() if one.kind != "cloned"):
         by_base = [main_cells(results, "none" if method.kind == "scratch" else base, method.name) for base in BASES]
         share = next((one["trained_share"] for found in by_base for one in found), 0.0)
+        if not any(by_base):
+            continue
         parts = []
         for found in by_base:
             parts += [*_short(found), f"{np.mean([last(one) for one in found]):.3f}" if found else ""]
@@ -209,7 +211,7 @@ def of_worlds(results: Sequence[Figures]) -> str:
     rows = [f"| {EPISODES} demonstrations | {' | '.join(tasks)} |", "|---|" + "---|" * len(tasks)]
     for name, label in (("do nothing", "do nothing"), ("random", "random"), ("oracle", "expert")):
         rows.append(f"| {label} | {' | '.join(_done(of_policy(results, BASES[0], name, task)) for task in tasks)} |")
-    for method in IN_WORLDS:
+    for method in (*IN_EVERY_WORLD, *IN_SOME_WORLDS):
         found = [pick(results, shift=task, method=method) for task in tasks]
         found = [[one for one in cells if one["cell"]["episodes"] in (0, EPISODES)] for cells in found]
         rows.append(f"| {method} | {' | '.join(map(_done, found))} |")
@@ -219,8 +221,8 @@ def of_worlds(results: Sequence[Figures]) -> str:
 
 def _few_and_many(results: Sequence[Figures]) -> list[str]:
     rows = ["| demonstrations | 5 | 20 | 80 |", "|---|---|---|---|"]
-    for task in FEW_AND_MANY:
-        for method in (BEST, "full", "scratch, 3x steps", "behaviour cloning"):
+    for task in MANY:
+        for method in IN_EVERY_WORLD[1:]:
             found = [pick(results, shift=task, method=method, episodes=count) for count in (5, EPISODES, 80)]
             rows += [f"| {task}: {method} | {' | '.join(map(_done, found))} |"] if any(found) else []
     return rows
@@ -346,11 +348,3 @@ def _forgotten(found: Sequence[Figures]) -> str:
         else ""
     )
     return f"{np.mean(on):.3f}{word}"
-
-
-def _slim(one: Figures) -> Figures:
-    """Return figures without the ways between start and end: what the table is made of."""
-    ends = {
-        key: {**value, "distance_cm": [row[-1] for row in value["distance_cm"]]} for key, value in one["reach"].items()
-    }
-    return {key: value for key, value in one.items() if key != "baselines"} | {"reach": ends}

@@ -19,6 +19,7 @@ sys.path.append(sys.path.pop(0))  # this folder last: its robosuite.py is no lib
 answers = os.fdopen(os.dup(1), "w")
 os.dup2(2, 1)  # what libraries print is no answer
 
+import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 import robosuite  # noqa: E402
 from robosuite.controllers import load_composite_controller_config  # noqa: E402
@@ -50,8 +51,14 @@ class World:
         pose = orbit * pose * Rotation.from_euler("x", TASKS[options.task][3], degrees=True)
         model.cam_quat[camera] = pose.as_quat(scalar_first=True)
         model.body_quat[base], self.origin = self.mount.as_quat(scalar_first=True), model.body_pos[base].copy()
+        model.light_castshadow[:], model.light_type[:] = True, 1  # a lamp far above: shadows tell how high a hand is
+        model.light_dir[:], model.light_diffuse[:], model.vis.headlight.diffuse[:] = (0.15, 0.1, -1.0), 0.5, 0.3
+        model.vis.quality.shadowsize = 1024
+        screen = self.env.sim._render_context_offscreen
+        screen.update_offscreen_size(options.size, options.size)
+        screen.scn.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0  # of the floor: a fifth of the time
         if options.look == "dusk":
-            model.light_diffuse[:], model.light_pos[:, 0] = (0.35, 0.25, 0.2), -1.5
+            model.light_dir[:], model.light_diffuse[:] = (-0.6, 0.3, -1.0), (0.35, 0.25, 0.2)
             model.mat_texid[:], model.mat_rgba[:, :3] = -1, model.mat_rgba[:, :3] * (0.4, 0.55, 0.5)
 
     def reset(self, seed):

@@ -41,11 +41,15 @@ def test_cells_have_names_of_their_own_and_hold_all_that_is_to_be_compared(evide
             cell.method for cell in cells if cell.shift == "look" and cell.base == base and cell.episodes in (0, 20)
         }
         methods = evidence.cells.METHODS.items()
-        assert main == {name for name, method in methods if method.kind not in {"scratch", "cloned"}}
+        of_arm = {name for name, method in methods if method.kind not in {"scratch", "cloned"}}
+        assert main == of_arm - {evidence.cells.LONGER}
     of_best = [cell for cell in cells if cell.method == evidence.cells.BEST]
     assert {cell.episodes for cell in of_best if cell.shift == "look"} == {10, 20, 40}
     assert {cell.episodes for cell in of_best if cell.shift == "Lift"} == {5, 20, 80}
-    assert {cell.method for cell in cells if cell.shift == "LIBERO-swap"} == set(evidence.cells.IN_WORLDS)
+    everywhere = set(evidence.cells.IN_EVERY_WORLD)
+    assert {cell.method for cell in cells if cell.shift == "LIBERO-swap"} == everywhere
+    assert {cell.method for cell in cells if cell.shift == "Lift"} == everywhere | set(evidence.cells.IN_SOME_WORLDS)
+    assert everywhere <= set(evidence.cells.METHODS) >= set(evidence.cells.IN_SOME_WORLDS)
     assert {cell.seed for cell in cells if cell.method == "full"} == {0, 1, 2}
 
 
@@ -172,6 +176,9 @@ def test_a_cell_is_trained_and_measured_and_its_base_comes_back(small: Any, tmp_
     assert "Made with not recorded (3 cells)" in text
     assert "oracle" in text
     assert (tmp_path / "out" / "evidence.png").stat().st_size > 5_000
+    made = tmp_path / "out" / "evidence.json"
+    small.table.write_tables(tmp_path / "empty", tmp_path / "again", done=made)  # elsewhere, from what was made here
+    assert (tmp_path / "again" / "evidence.md").read_text() == text
     new = page.read_text()
     assert new.startswith("before\n")
     assert new.endswith("\nafter\n")

@@ -74,7 +74,7 @@ def add_simulate(commands: cli.Commands) -> None:
     text = "what is to be done (reach); record: push, pick or place, with a block on the table (none: reaching around)"
     cli.add(parser, "--task", text, choices=["reach", "push", "pick", "place"])
     text = "A or B; record: or random, another world in every episode (A)"
-    cli.add(parser, "--domain", text, choices=["A", "B", "random"], default="A")
+    cli.add(parser, "--domain", text, choices=["A", "B", "random"])
     cli.add(parser, "--episodes N", "how many (50; record: 40)", cli.count)
     cli.add(parser, "--steps N", "model steps (8; pick 12, place 18); record: control steps (41; place 81)", cli.count)
     cli.add(parser, "--seed N", "which problems or demonstrations (0)", cli.whole_number(0, 2**31 - 1))
@@ -198,7 +198,8 @@ def _simulate(options: argparse.Namespace) -> int:
     demonstrations of the arm as a DROID data set. Status 1 where the model gave no finite energy in any decision.
     """
     if options.world is not None:
-        _refuse(options, ("task",), needed="none: the world has its own")
+        _refuse(options, ("task", "domain"), needed="none: the world has its own")
+    options.domain = options.domain or "A"
     if options.subject == "record":
         _refuse(options, _OF_A_MODEL, needed="a model that steers")
         return _record(options)
@@ -239,8 +240,9 @@ def _record_world(options: argparse.Namespace, target: Path) -> int:
 
     with OtherWorld(options.world) as world, cli.reporter() as reporter:
         seeds = range(options.seed or 0, (options.seed or 0) + (options.episodes or 40))
-        solved = record_world(world, target, seeds, reporter.task("recording"))
-    cli.show(f"{len(seeds)} episodes are in {target}; the expert solved {solved}. Next: vjepa2-ac init {target}")
+        solved, shown = record_world(world, target, seeds, reporter.task("recording"))
+    done = f"the expert solved {solved} of {shown}, the others are play"
+    cli.show(f"{len(seeds)} episodes are in {target}; {done}. Next: vjepa2-ac init {target}")
     return 0
 
 

@@ -85,9 +85,9 @@ def test_a_policy_that_knows_the_goal_reaches_it_in_any_world() -> None:
 
 def test_a_recording_is_a_data_set_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
     with OtherWorld(command()) as world:
-        assert record_world(world, tmp_path, range(2)) == 2
+        assert record_world(world, tmp_path, range(2)) == (2, 2)
         first = {file.name: file.stat().st_mtime_ns for file in tmp_path.iterdir()}
-        assert record_world(world, tmp_path, range(4)) == 3, "play solves nothing"
+        assert record_world(world, tmp_path, range(4)) == (3, 3), "play solves nothing"
     assert {file.name: file.stat().st_mtime_ns for file in tmp_path.iterdir() if file.name in first} == first
     source = NpzSource(DataConfig.model_validate({"source": "npz", "path": str(tmp_path)}))
     episodes = [source.read(number) for number in range(4)]
@@ -100,6 +100,18 @@ def test_a_recording_is_a_data_set_and_goes_on_where_it_stopped(tmp_path: Path) 
         image = episode.read_frames([0])[0]
         assert image.shape == (24, 32, 3)
         assert image[..., 0].any()
+
+
+def test_every_second_step_is_recorded_where_that_suffices(tmp_path: Path) -> None:
+    with OtherWorld(command()) as world:
+        for every in (1, 2):
+            record_world(world, tmp_path / str(every), range(1), every=every)
+    whole, half = (np.load(tmp_path / str(every) / "Come_000000.npz") for every in (1, 2))
+    steps = min(len(half["states"]), len(whole["states"]) // 2)
+    assert steps > 2
+    assert (float(whole["fps_hz"]), float(half["fps_hz"])) == (10.0, 5.0)
+    np.testing.assert_allclose(half["states"][:steps], whole["states"][::2][:steps])
+    np.testing.assert_allclose(half["actions"][:steps], whole["actions"][1::2][:steps])
 
 
 @pytest.mark.parametrize(
@@ -126,6 +138,8 @@ def test_what_a_world_does_wrong_is_said(model: str, tmp_path: Path, world: str,
 def test_options_of_our_arm_mean_nothing_in_a_world(model: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["simulate", model, "--world", command(), "--task", "reach"]) == 2
     assert "--task: simulate" in capsys.readouterr().err
+    assert main(["simulate", model, "--world", command(), "--domain", "B"]) == 2
+    assert "--domain: simulate" in capsys.readouterr().err
     assert main(["simulate", "record", "folder", "--world", command(), "--cameras", "3"]) == 2
     assert "a world has one camera" in capsys.readouterr().err
 
@@ -157,7 +171,7 @@ def test_a_real_world_is_driven_by_its_expert(name: str, tmp_path: Path) -> None
         np.testing.assert_array_equal(first.state, second.state)
         assert first.image.shape == (256, 256, 3)
         assert first.image.std() > 10
-        assert record_world(world, tmp_path, range(1)) == 1
+        assert record_world(world, tmp_path, range(1)) == (1, 1)
         still = world.move(world.reset(0).state, 4)
         assert np.linalg.norm(still.state[:3] - world.reset(0).state[:3]) < 0.02
         up = world.reset(0).state + np.array([0.0, 0.0, 0.05, 0.0, 0.0, 0.0, 0.0])

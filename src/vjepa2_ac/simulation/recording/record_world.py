@@ -19,7 +19,9 @@ LOOK = 4  # control steps of the expert from one look at where it is to the next
 DISTURBED, PLAY = 1, 2  # seeds that leave this, divided by three
 
 
-def record_world(world: OtherWorld, folder: Path, seeds: Sequence[int], progress: Progress = no_progress) -> int:
+def record_world(
+    world: OtherWorld, folder: Path, seeds: Sequence[int], progress: Progress = no_progress, *, every: int = 1
+) -> tuple[int, int]:
     """Record the episodes of some seeds; one that is there already is not recorded again.
 
     Of three episodes, one is the expert's. In one its targets are now and then a few centimetres off, so that there is
@@ -28,12 +30,13 @@ def record_world(world: OtherWorld, folder: Path, seeds: Sequence[int], progress
 
     Args:
         world: With an expert.
-        folder: One .npz file an episode (format: data/sources/npz.py), at the world's control rate.
+        folder: One .npz file an episode (format: data/sources/npz.py).
         seeds: Of the episodes.
         progress: Called with (episodes done, episodes in total).
+        every: Control steps from one frame to the next.
 
     Returns:
-        How many of them the expert has solved.
+        How many of them the expert has solved, and how many it was to solve: all that are no play.
 
     Raises:
         InputError: The folder cannot be written, or the world ends or answers something else.
@@ -47,14 +50,14 @@ def record_world(world: OtherWorld, folder: Path, seeds: Sequence[int], progress
             with np.load(file) as kept:
                 solved += bool(kept["success"])
         else:
-            solved += _record(world, file, seed)
+            solved += _record(world, file, seed, every)
         progress(done, len(seeds))
-    return solved
+    return solved, sum(seed % 3 != PLAY for seed in seeds)
 
 
-def _record(world: OtherWorld, file: Path, seed: int) -> bool:
-    about = world.about
-    ways = _played(world, seed) if seed % 3 == PLAY else _shown(world, seed, is_disturbed=seed % 3 == DISTURBED)
+def _record(world: OtherWorld, file: Path, seed: int, every: int) -> bool:
+    about, kind = world.about, seed % 3
+    ways = _played(world, seed, every) if kind == PLAY else _shown(world, seed, every, is_disturbed=kind == DISTURBED)
     steps = list(ways)
     seen, targets = [one for one, _ in steps], [target for _, target in steps]
     with user_can_write(file), atomic_writer(file) as stream:
@@ -63,7 +66,7 @@ def _record(world: OtherWorld, file: Path, seed: int) -> bool:
             states=np.stack([one.state for one in seen[:-1]]),
             actions=np.stack(targets[1:]),
             frames=np.stack([one.image for one in seen[:-1]]),
-            fps_hz=about.rate_hz,
+            fps_hz=about.rate_hz / every,
             success=seen[-1].is_done,
             language=about.instruction,
         )
@@ -73,31 +76,31 @@ def _record(world: OtherWorld, file: Path, seed: int) -> bool:
 Step = tuple[WorldObservation, Float[np.ndarray, " 7"]]  # what is seen, and the target that led there
 
 
-def _shown(world: OtherWorld, seed: int, *, is_disturbed: bool) -> Iterator[Step]:
+def _shown(world: OtherWorld, seed: int, every: int, *, is_disturbed: bool) -> Iterator[Step]:
     """Yield the steps of the expert until it rests."""
     about, rng, now = world.about, np.random.default_rng([seed, 0]), world.reset(seed)
     period, off, offset, rested = round(EVERY_S * about.rate_hz), round(OFF_S * about.rate_hz), np.zeros(3), 0
     yield now, now.state
-    for step in range(about.steps):
-        if step % period == 0 and is_disturbed:
+    for step in range(0, about.steps, every):
+        if step % period < every and is_disturbed:
             offset = OFF_M * rng.normal(size=3)
-        now = world.let_expert(1, offset.tolist() if step % period < off else (0.0, 0.0, 0.0))
+        now = world.let_expert(every, offset.tolist() if step % period < off else (0.0, 0.0, 0.0))
         yield now, now.state if now.target is None else now.target
-        rested = rested + 1 if now.is_done else 0
+        rested = rested + every if now.is_done else 0
         if rested >= REST_S * about.rate_hz:
             return
 
 
-def _played(world: OtherWorld, seed: int) -> Iterator[Step]:
+def _played(world: OtherWorld, seed: int, every: int) -> Iterator[Step]:
     """Yield the steps of play, where the expert of this seed moves."""
     about, rng, now = world.about, np.random.default_rng([seed, 1]), world.reset(seed)
     places = [now.state[:3], *(world.let_expert(LOOK).state[:3] for _ in range(about.steps // LOOK))]
     low, high = np.min(places, axis=0) - [WIDER_M, WIDER_M, 0.0], np.max(places, axis=0) + WIDER_M
     now, target, until = world.reset(seed), now.state.copy(), 0.0
     yield now, now.state
-    for step in range(about.steps):
+    for step in range(0, about.steps, every):
         if step >= until:
             until = step + rng.uniform(*HELD_S) * about.rate_hz
             target[:3], target[6] = rng.uniform(low, high), rng.integers(2) if rng.uniform() < GRIPS else target[6]
-        now = world.move(target, 1)
+        now = world.move(target, every)
         yield now, target.copy()
