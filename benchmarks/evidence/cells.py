@@ -72,6 +72,7 @@ class Method:
     dora: bool = False
     blocks: bool = True  # False: of the blocks one layer alone, by rank 1 (PEFT asks for one)
     times: int = 1  # so many times the steps
+    layer: int | None = None  # the block of the encoder after which features are taken; None: the last
     learning_rate: float = 1e-3
 
     @property
@@ -116,6 +117,7 @@ METHODS = {
         Method("DoRA r16", "LoRA", 16, dora=True, learning_rate=5e-3),
         Method("full", "full", learning_rate=8e-3),
         Method("scratch", "scratch", learning_rate=1.2e-2),
+        Method("scratch, features of block 3 of 4", "scratch", layer=3, learning_rate=1.2e-2),
         Method("scratch, 3x steps", "scratch", times=3, learning_rate=1.2e-2),
         Method("behaviour cloning", "cloned", times=3),
     )

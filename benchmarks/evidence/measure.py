@@ -140,7 +140,7 @@ def config_of(cell: Cell, folder: Path) -> Config:
         run_dir=str(folder / "runs" / cell.name),
         seed=cell.seed,
         data=data.model_copy(update={"exclude": left_out}),
-        model=ModelConfig(base=base_model(folder, cell.base, cell.seed, cell.shift), dtype="float32"),
+        model=ModelConfig(base=base_model(folder, cell.base, cell.seed, cell.shift, method.layer), dtype="float32"),
         adapter=method.adapter,
         training=method.training,
         validation=ValidationConfig(every=method.training.steps, clips=40, batch_size=20),
