@@ -88,7 +88,7 @@ class Method:
             "modules_to_save": whole,
             "dora": self.dora,
         }
-        return AdapterConfig.model_validate(given if self.blocks else {**given, "targets": ["blocks.0.attn.q"]})
+        return AdapterConfig.model_validate(given if self.blocks else {**given, "targets": ("blocks.0.attn.q",)})
 
     @property
     def training(self) -> TrainingConfig:

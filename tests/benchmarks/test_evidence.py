@@ -57,6 +57,9 @@ def test_methods_differ_only_in_what_is_trained_and_how_fast(evidence: Any) -> N
     def rest(name: str) -> Any:
         return evidence.cells.METHODS[name].training.model_copy(update={"learning_rate": 1.0})
 
+    adapters = {name: method.adapter for name, method in evidence.cells.METHODS.items()}
+    assert adapters["in/out only"].targets == ("blocks.0.attn.q",)
+    assert adapters["DoRA r16"] == adapters["LoRA r16"].model_copy(update={"dora": True})
     assert rest("LoRA r4") == rest("LoRA r32 + in/out") == rest("full") == rest("scratch")
     assert rest("scratch, 3x steps").steps == 3 * rest("scratch").steps
 
