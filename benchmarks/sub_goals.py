@@ -75,7 +75,8 @@ def main() -> None:
 def measure(way: str, agent: Agent, options: argparse.Namespace) -> ClosedLoopResult:
     """Let one way solve all problems."""
     domain = named_domain(options.domain)
-    arm, steps = arm_for(options.task, domain), STEPS[options.task] + MORE
+    arm = arm_for(options.task, domain, views=agent.planning.views)
+    steps = STEPS[options.task] + MORE
     spec = RolloutSpec(options.task, domain, options.episodes, options.seed, steps, agent.stride)
     policy: Policy
     if way == "oracle":
@@ -95,7 +96,7 @@ def goals_of(way: str, agent: Agent, options: argparse.Namespace) -> GoalsOf | N
     spec = DemonstrationSpec(agent.planning.limits, None, agent.stride, slack, share)
     if way == "every step":
         spec = every_step(spec)
-    demonstrated = DemonstratedGoals(options.task, named_domain(options.domain), spec)
+    demonstrated = DemonstratedGoals(options.task, named_domain(options.domain), spec, views=agent.planning.views)
     return without_grippers(demonstrated) if way.endswith("planned") else demonstrated
 
 

@@ -183,6 +183,10 @@ class PlanningConfig(Section):
     warm_start: bool = False
     """Whether a decision starts from the last one's plan, shifted by the steps executed. Not at horizon 1, where the
     plan is the last action only: the arm overshoots (docs/log.md)."""
+    views: Annotated[int, Field(ge=1, le=4)] = 1
+    """Cameras whose pictures stand side by side in every image, all of one width: the model sees each by itself, and
+    the energy is the mean over them. One view leaves a direction in which near and far look alike. The model has to
+    know all of them: `data.camera` of several."""
     context: PositiveInt = 1
     """Frames that the model sees, the current one included (upstream: 1); fewer at the start."""
     compile: Annotated[Literal["off", "blocks"], OFF] = "off"
@@ -221,5 +225,7 @@ class PlanningConfig(Section):
         return self.refused(
             (self.horizon % repeat, f"horizon {self.horizon} is not a multiple of action_repeat {repeat}"),
             (first % repeat, f"limits.gripper_from {first} is not a multiple of action_repeat {repeat}"),
+            (self.views > 1 and self.context > 1, f"views {self.views} need context 1, not {self.context}"),
+            (self.views > 1 and self.axes, f"axes are of one camera, and there are {self.views} views"),
             (elites > self.samples, f"{self.planner}.elites {elites} are more than {self.samples} samples"),
         )

@@ -6,15 +6,17 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from vjepa2_ac.data.transforms import frames_as_seen, view
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
-from vjepa2_ac.decoding.imagine import Film, Image, shown
+from vjepa2_ac.decoding.imagine import shown
 from vjepa2_ac.media.film import spread_with_ends
 from vjepa2_ac.planning.controller import Decision
 from vjepa2_ac.planning.decision import PlanResult
 
+Image = UInt8[np.ndarray, "height width 3"]  # as the encoder sees it; several views side by side
+Film = UInt8[np.ndarray, "steps height width 3"]
 _MOST_STEPS = 8
 
 
@@ -38,10 +40,11 @@ def imagine_plan(answer: PlanResult, decoder: TrainedDecoder) -> ImaginedPlan:
     controller, goal = answer.controller, answer.question.goals[answer.decision.goals[-1]].image
     decoder.to(controller.device)
     given = torch.stack([controller.encoded(image) for image in (answer.question.start, goal)])
-    start, decoded_goal = shown(decoder.decoder, given)
+    start, decoded_goal = _side_by_side(given, decoder, controller.config.views)
     frames = _rollout(answer.decision, decoder, steps=answer.space.steps)
     places = spread_with_ends(len(frames), _MOST_STEPS)
-    seen = frames_as_seen(view(goal[None], controller.crop), decoder.card.shape.image_size)[0]
+    views = np.split(goal, controller.config.views, axis=1)
+    seen = np.concatenate(frames_as_seen(view(np.stack(views), controller.crop), decoder.card.shape.image_size), axis=1)
     return ImaginedPlan(start, {place + 1: frames[place] for place in places}, seen, decoded_goal)
 
 
@@ -59,4 +62,11 @@ def _rollout(decision: Decision, decoder: TrainedDecoder, *, steps: int) -> Film
     if decision.plan is None or decision.cost is None:
         return none
     latents: Float[torch.Tensor, "steps tokens dim"] = decision.cost.imagine(decision.plan.actions[None, :steps])[0][0]
-    return shown(decoder.decoder, latents) if bool(torch.isfinite(latents).all()) else none
+    is_finite = bool(torch.isfinite(latents).all())
+    return _side_by_side(latents, decoder, decision.cost.views) if is_finite else none
+
+
+def _side_by_side(latents: Float[torch.Tensor, "steps tokens dim"], decoder: TrainedDecoder, views: int) -> Film:
+    """Return images of latents whose tokens are those of one view after another."""
+    images = shown(decoder.decoder, latents.reshape(len(latents) * views, -1, latents.shape[-1]))
+    return np.concatenate([images[number::views] for number in range(views)], axis=2)

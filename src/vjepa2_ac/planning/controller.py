@@ -95,6 +95,9 @@ class Controller:
             found, needed = f"{uses}, camera pose given: {not uses}", "a camera pose exactly where the model uses it"
             raise InputError(where="model: predictor.use_extrinsics", found=found, needed=needed)
         self.config = config or PlanningConfig()
+        if uses and self.config.views > 1:
+            found, needed = f"{self.config.views}, and a model that is told one camera's pose", "1"
+            raise InputError(where="planning.views", found=found, needed=needed)
         self._model, self.seed, self.crop = prepare_for_planning(world_model, self.config), seed, crop
         self._camera = None if extrinsics is None else torch.from_numpy(extrinsics.astype(np.float32))
         self.spaces, self._axes = spaces, None
@@ -245,8 +248,19 @@ class Controller:
         return state if is_needed or self.spaces.state.is_pose or state.shape == (width,) else np.zeros(width)
 
     def encoded(self, image: UInt8[np.ndarray, "height width 3"]) -> Float[Tensor, "tokens dim"]:
-        """Return the latents of what the model sees of an image, on its device."""
-        return encode_frames(self._model, image[None], self.crop)[0]
+        """Return the latents of what the model sees of an image, on its device; of several views one after another.
+
+        Raises:
+            InputError: Its width is not that of so many views.
+        """
+        return encode_frames(self._model, self._views(image), self.crop).flatten(0, 1)
+
+    def _views(self, image: UInt8[np.ndarray, "height all 3"]) -> UInt8[np.ndarray, "views height width 3"]:
+        count, width = self.config.views, image.shape[1]
+        if width % count:
+            needed = f"a width that {count} views share, side by side"
+            raise InputError(where="planning.views", found=f"an image {width} pixels wide", needed=needed)
+        return np.stack(np.split(image, count, axis=1))
 
     def _progressed(self, latents: Float[Tensor, "tokens dim"]) -> GoalProgress:
         """Return which goal applies to the current image."""
@@ -341,6 +355,7 @@ class Controller:
             actions=torch.from_numpy(actions).float(),
             extrinsics=self._camera,
             axes=self._axes,
+            views=self.config.views,
         )
 
     def _weights(self, mask: np.ndarray | None, like: np.ndarray) -> Float[Tensor, " tokens"] | None:
@@ -348,12 +363,12 @@ class Controller:
             return None
         require_mask(mask, where="mask", like=like)
         grid = self._model.image_size // self._model.sizes.patch_size
-        image = np.repeat((mask > 0).astype(np.uint8)[None, ..., None], 3, axis=-1)
-        seen = torch.from_numpy(np.ascontiguousarray(view(image, self.crop)[0, ..., 0]))
-        try:
-            return patch_weights(seen > 0, grid).to(self._model.device)
-        except ValueError:
-            raise InputError(where="mask", found="nothing of what the model sees counts") from None
+        image = self._views(np.repeat((mask > 0).astype(np.uint8)[..., None], 3, axis=-1))
+        seen = torch.from_numpy(np.ascontiguousarray(view(image, self.crop)[..., 0])) > 0
+        if not seen.any():
+            raise InputError(where="mask", found="nothing of what the model sees counts")
+        weights = [patch_weights(one, grid) if one.any() else torch.zeros(grid**2) for one in seen]
+        return torch.cat(weights).to(self._model.device)
 
 
 def _require_spaces(model: WorldModel, spaces: Spaces) -> None:

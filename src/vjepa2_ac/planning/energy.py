@@ -76,13 +76,14 @@ def patch_weights(mask: Bool[Tensor, "height width"] | Float[Tensor, "height wid
 
 @dataclass(frozen=True)
 class Scene:
-    """The input of a decision: the last frames, up to the current one."""
+    """The input of a decision: the last frames, up to the current one; of several views, one after another."""
 
     latents: Float[Tensor, "context tokens dim"]
     states: Float[Tensor, "context state_dim"]
     actions: Float[Tensor, "context-1 action_dim"]
     extrinsics: Float[Tensor, " 6"] | None = None  # of the camera, which does not move
     axes: Axes | None = None  # the model's, where they are not the robot's
+    views: int = 1
 
     def seen(
         self, actions: Float[Tensor, "*batch action_dim"], states: Float[Tensor, "*batch state_dim"]
@@ -135,7 +136,7 @@ class WorldModelCost:
         self._goal = Goal(goal.latents.to(device), goal.durations, weights)
         self._frame, self._state = scene.latents[-1].to(device), scene.states[-1].to(device)
         self._camera = None if scene.camera is None else scene.camera.to(device)
-        self._seen = scene.seen
+        self._seen, self.views = scene.seen, scene.views
         self._cache = self._past(scene)
         self.progress: Progress = no_progress  # after each part; it does not wait for the device
 
@@ -164,10 +165,13 @@ class WorldModelCost:
         states = states_along(self._state, actions, self._spaces.state)
         given = states[:, 1:] if self._spaces.action.follows == "target" else actions
         camera = None if self._camera is None else self._camera.expand(samples, steps, -1)
-        frame = self._frame.expand(samples, 1, -1, -1)
+        dim = self._frame.shape[-1]
+        views = self._frame.reshape(1, self.views, -1, dim)
+        frame = views.expand(samples, -1, -1, -1).flatten(0, 1)[:, None]
         cache = None if self._cache is None else self._cache.expanded(samples)
-        given, before = self._seen(given, states[:, :-1])
-        return self._model.rollout(frame, given, before, camera, cache=cache), states
+        given, before = (one.repeat_interleave(self.views, dim=0) for one in self._seen(given, states[:, :-1]))
+        predicted = self._model.rollout(frame, given, before, camera, cache=cache)
+        return predicted.reshape(samples, self.views, steps, -1, dim).transpose(1, 2).flatten(2, 3), states
 
     def _energies(self, actions: Float[Tensor, "samples steps action_dim"]) -> Float[Tensor, " samples"]:
         predicted, _ = self.imagine(actions)

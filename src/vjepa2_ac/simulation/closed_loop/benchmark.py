@@ -76,6 +76,7 @@ class DemonstratedGoals:
         domain: Its world, the same as of the arm that the model moves.
         spec: How it is demonstrated.
         size: Height and width of the images.
+        views: Of the cameras, side by side.
 
     Raises:
         UnreachableError: MuJoCo is not installed.
@@ -87,9 +88,10 @@ class DemonstratedGoals:
         domain: Domain,
         spec: DemonstrationSpec | None = None,
         size: tuple[int, int] = FRAME_SIZE,
+        views: int = 1,
     ) -> None:
         self.spec = spec or DemonstrationSpec()
-        self._arm, self._unseen = (arm_for(task, domain, size=one) for one in (size, _SMALL))
+        self._arm, self._unseen = (arm_for(task, domain, size=one, views=views) for one in (size, _SMALL))
 
     def __call__(self, problem: TaskProblem) -> tuple[SubGoal, ...]:
         """Return the goals of a problem.
@@ -189,7 +191,7 @@ def run_benchmark(
     with user_can_write(folder):
         folder.mkdir(parents=True, exist_ok=True)
     options, limits = replace(options, stride=agent.stride), agent.planning.limits
-    arm = arm_for(options.task, options.world)
+    arm = arm_for(options.task, options.world, views=agent.planning.views)
     model = agent.policy(arm, _goals_of(agent, options))
     policies: tuple[Policy, ...] = (ZeroActions(), RandomActions(limits, options.seed), Oracle(limits, arm))
     results = []
@@ -245,7 +247,7 @@ def _goals_of(agent: Agent, options: BenchmarkOptions) -> GoalsOf | None:
     spec = DemonstrationSpec(agent.planning.limits, steps, agent.stride)
     if options.sub_goals == "every-step":
         spec = every_step(spec)
-    goals_of = DemonstratedGoals(options.task, options.world, spec)
+    goals_of = DemonstratedGoals(options.task, options.world, spec, views=agent.planning.views)
     goals_of.require(options.problems)
     return goals_of
 

@@ -165,7 +165,11 @@ class Planning:
         """
         decision = self.controller.decision
         found = None if self._decoder is None or decision is None else imagined_next(decision, self._decoder)
-        return None if found is None else frame_of_seen(found, *self._size, self.controller.crop)
+        if found is None:
+            return None
+        height, width, views = *self._size, self.controller.config.views
+        parts = np.split(found, views, axis=1)
+        return np.hstack([frame_of_seen(part, height, width // views, self.controller.crop) for part in parts])
 
 
 def farthest(limits: LimitsConfig) -> Float[np.ndarray, " 7"]:

@@ -234,10 +234,12 @@ def _with(places: Float[np.ndarray, "places dim"], value: float) -> Float[np.nda
     return np.concatenate([places, np.full((len(places), 1), value)], axis=1)
 
 
-def arm_for(task: TaskName, domain: Domain, *, size: tuple[int, int] = FRAME_SIZE) -> SimulatedArm:
+def arm_for(task: TaskName, domain: Domain, *, size: tuple[int, int] = FRAME_SIZE, views: int = 1) -> SimulatedArm:
     """Return an arm for a task: `reach` needs no contacts, `place` a mark on the table.
 
     Raises:
         UnreachableError: MuJoCo is not installed.
     """
-    return SimulatedArm(domain, size=size) if task == "reach" else ContactArm(domain, size=size, mark=task == "place")
+    if task == "reach":
+        return SimulatedArm(domain, size=size, views=views)
+    return ContactArm(domain, size=size, mark=task == "place", views=views)

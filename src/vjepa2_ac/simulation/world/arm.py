@@ -38,13 +38,14 @@ class SimulatedArm:
     Args:
         domain: Its world.
         size: Height and width of the images.
+        views: How many of the cameras that stand still are seen side by side where none is named.
 
     Raises:
         UnreachableError: MuJoCo is not installed.
     """
 
-    def __init__(self, domain: Domain, *, size: tuple[int, int] = FRAME_SIZE) -> None:
-        self.domain = domain
+    def __init__(self, domain: Domain, *, size: tuple[int, int] = FRAME_SIZE, views: int = 1) -> None:
+        self.domain, self._views = domain, tuple(_EXTERIOR_TURNS_DEG)[:views]
         self._mujoco = load_mujoco()
         self._model = self._compiled(domain)
         self._data = self._mujoco.MjData(self._model)
@@ -133,13 +134,14 @@ class SimulatedArm:
         self.set_joints(joints, closedness + grip_left * (self._closedness - closedness))
         return self.state
 
-    def image(self, camera: str = "exterior_1") -> UInt8[np.ndarray, "height width 3"]:
-        """Return the current image of `exterior_1`, `exterior_2` or `wrist`.
+    def image(self, camera: str | None = None) -> UInt8[np.ndarray, "height width 3"]:
+        """Return the current image of `exterior_1`, `exterior_2` or `wrist`; None: what is seen of this arm.
 
         Raises:
             ValueError: No such camera.
         """
-        return self._camera(camera).image(self._data)
+        names = self._views if camera is None else (camera,)
+        return np.concatenate([self._camera(name).image(self._data) for name in names], axis=1)
 
     def silhouette(self, camera: str = "exterior_1") -> Bool[np.ndarray, "height width"]:
         """Return which pixels of the current image of a camera show the arm, or a block."""
@@ -192,11 +194,14 @@ class ContactArm(SimulatedArm):
         domain: Its world.
         size: Height and width of the images.
         mark: Whether a mark lies on the table: a flat disc that is seen, and touched by nothing.
+        views: As of `SimulatedArm`.
     """
 
-    def __init__(self, domain: Domain, *, size: tuple[int, int] = FRAME_SIZE, mark: bool = False) -> None:
+    def __init__(
+        self, domain: Domain, *, size: tuple[int, int] = FRAME_SIZE, mark: bool = False, views: int = 1
+    ) -> None:
         self._has_mark = mark
-        super().__init__(domain, size=size)
+        super().__init__(domain, size=size, views=views)
 
     @property
     def closedness(self) -> float:
