@@ -156,7 +156,9 @@ class Cell:
     def name(self) -> str:
         """What its files are called."""
         words = f"{self.shift}-{self.base}-{self.method}-k{self.episodes}-s{self.seed}"
-        return words.replace(" + in/out", "-io").replace(", 3x steps", "-3x").replace(",", "").replace(" ", "-")
+        for long, short in ((" + in/out", "-io"), ("in/out", "io"), (", 3x steps", "-3x"), (",", ""), (" ", "-")):
+            words = words.replace(long, short)
+        return words
 
 
 def all_cells(seeds: int = 3) -> Iterator[Cell]:

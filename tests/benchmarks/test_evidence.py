@@ -36,6 +36,7 @@ def evidence(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 def test_cells_have_names_of_their_own_and_hold_all_that_is_to_be_compared(evidence: Any) -> None:
     cells = list(evidence.cells.all_cells(seeds=3))
     assert len({cell.name for cell in cells}) == len(set(cells)) == len(cells)
+    assert not any("/" in cell.name for cell in cells), "names of files"
     for base in ("one camera", "many cameras"):
         main = {
             cell.method for cell in cells if cell.shift == "look" and cell.base == base and cell.episodes in (0, 20)

@@ -1,15 +1,25 @@
 """Several cameras side by side: the energy is the mean over views, each of which the model sees by itself."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
 from decisions import STATE, image
 from tiny_models import tiny_model
+from vjepa2_ac.config import RldsData
 from vjepa2_ac.config.planning import CemConfig, LimitsConfig, PlanningConfig
+from vjepa2_ac.decoding.decoder_folder import load_decoder
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.planning.demonstrations.make_goals import recording_of_episode
+from vjepa2_ac.planning.session import load_to_plan
+from vjepa2_ac.simulation.closed_loop.agent import agent_of_session
+from vjepa2_ac.simulation.closed_loop.benchmark import BenchmarkOptions, run_benchmark
 from vjepa2_ac.simulation.closed_loop.tasks import arm_for
+from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
+from vjepa2_ac.simulation.world.camera import FRAME_SIZE
 from vjepa2_ac.simulation.world.domains import DOMAIN_A
 
 QUICK = PlanningConfig(samples=12, iterations=2, horizon=2, cem=CemConfig(elites=4), limits=LimitsConfig(rotation=0.1))
@@ -60,7 +70,7 @@ def test_a_mask_may_leave_one_view_out() -> None:
 
 def test_what_cannot_be_split_is_refused() -> None:
     odd = np.zeros((64, 65, 3), dtype=np.uint8)
-    with pytest.raises(InputError, match="65 pixels wide.* 2 views share"):
+    with pytest.raises(InputError, match=r"65 pixels wide.* 2 views share"):
         decided(odd, odd, 2)
     with pytest.raises(ValueError, match="views 2 need context 1"):
         PlanningConfig(views=2, context=2)
@@ -72,3 +82,23 @@ def test_the_arm_is_seen_from_both_sides() -> None:
     arm = arm_for("reach", DOMAIN_A, size=(24, 32), views=2)
     np.testing.assert_array_equal(arm.image(), np.hstack([arm.image("exterior_1"), arm.image("exterior_2")]))
     assert (arm.image("exterior_1") != arm.image("exterior_2")).any()
+
+
+def test_goals_are_made_of_both_cameras_and_a_film_shows_both(tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    record_dataset(data, RecordingSpec("A", 9, seed=0, cameras=2), episodes=2)
+    config = RldsData(path=str(data), camera=("exterior_1_left", "exterior_2_left"))
+    one, two = (recording_of_episode(config, "0", views=views) for views in (1, 2))
+    both = two.read([0, 4])
+    np.testing.assert_array_equal(both[:, :, : both.shape[2] // 2], one.read([0, 4]))
+    assert (both[:, :, both.shape[2] // 2 :] != one.read([0, 4])).any()
+    with pytest.raises(InputError, match=r"data.camera: exterior_1_left. needed: 2 cameras"):
+        recording_of_episode(RldsData(path=str(data), camera="exterior_1_left"), "0", views=2)
+
+    quick = ["planning.views=2", "planning.samples=8", "planning.iterations=1", "planning.cem.elites=2"]
+    options = BenchmarkOptions(episodes=1, steps=2, films=1, sub_goals="demonstration")
+    agent = agent_of_session(load_to_plan("builtin:sim-tiny", overrides=quick), load_decoder("builtin:sim-tiny"))
+    benchmark, _ = run_benchmark(agent, options, tmp_path / "out")
+    episode = benchmark.results[0].episodes[0]
+    assert episode.frames.shape[2] == 2 * FRAME_SIZE[1]
+    assert episode.imagined[0].shape == episode.frames.shape[1:]

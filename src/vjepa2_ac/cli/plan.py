@@ -222,4 +222,5 @@ def _recording(options: argparse.Namespace) -> tuple[Recording, int]:
     from vjepa2_ac.reporter import INDEXING
 
     with cli.reporter() as reporter:
-        return recording_of_episode(config.data, options.episode or "0", reporter.task(INDEXING)), stride
+        progress, views = reporter.task(INDEXING), config.planning.views
+        return recording_of_episode(config.data, options.episode or "0", progress, views=views), stride

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from vjepa2_ac.config import AugmentConfig
 from vjepa2_ac.episode import Augmentation
+from vjepa2_ac.errors import InputError
 
 Crop = Literal["released", "square", "letterbox"]
 
@@ -69,6 +70,21 @@ def view(
         return _with_bars(frames)
     box = crop_box(frames.shape[1], frames.shape[2], kind)
     return frames[:, box.top : box.top + box.height, box.left : box.left + box.width]
+
+
+def split_views(
+    frames: UInt8[np.ndarray, "time height all 3"], views: int
+) -> UInt8[np.ndarray, "frames height width 3"]:
+    """Return the views that stand side by side in frames, those of a frame one after another.
+
+    Raises:
+        InputError: The width is not that of so many views.
+    """
+    time, height, width = frames.shape[:3]
+    if width % views:
+        needed = f"a width that {views} views share, side by side"
+        raise InputError(where="planning.views", found=f"an image {width} pixels wide", needed=needed)
+    return frames.reshape(time, height, views, -1, 3).swapaxes(1, 2).reshape(time * views, height, -1, 3)
 
 
 def _with_bars(frames: UInt8[np.ndarray, "time height width 3"]) -> UInt8[np.ndarray, "time side side 3"]:

@@ -17,7 +17,7 @@ from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.sources.latents.cache_files import unpack_latents
 from vjepa2_ac.data.sources.latents.cache_key import Encoding
 from vjepa2_ac.data.sources.latents.source import LatentSource, another_cache
-from vjepa2_ac.data.transforms import Crop, pixels_to_input, view
+from vjepa2_ac.data.transforms import Crop, pixels_to_input, split_views, view
 from vjepa2_ac.episode import Batch, LatentBatch, Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.world_model import WorldModel, heads_to_replace, widths_as_text
@@ -61,18 +61,31 @@ def encode_batch(world_model: WorldModel, batch: Batch, *, device: torch.device,
 
 @torch.no_grad()
 def encode_frames(
-    world_model: WorldModel, frames: UInt8[np.ndarray, "time height width 3"], crop: Crop, *, chunk: int = 16
+    world_model: WorldModel,
+    frames: UInt8[np.ndarray, "time height all 3"],
+    crop: Crop,
+    *,
+    chunk: int = 16,
+    views: int = 1,
 ) -> Float[Tensor, "time tokens dim"]:
     """Return the latents of camera frames, each encoded independently, on the model's device.
+
+    Of several views side by side each is encoded by itself; their tokens follow one after another.
 
     Args:
         world_model: The model whose frozen encoder is used.
         frames: RGB, uncropped, of any size.
         crop: The part of a frame that the model sees.
         chunk: Frames per encoder call.
+        views: Cameras side by side in each frame.
+
+    Raises:
+        InputError: The width is not that of so many views.
     """
-    pixels = torch.from_numpy(np.ascontiguousarray(view(frames, crop))).to(world_model.device)[None]
-    return world_model.encode(pixels_to_input(pixels, world_model.image_size), chunk=chunk)[0]
+    seen = view(split_views(frames, views), crop)
+    pixels = torch.from_numpy(np.ascontiguousarray(seen)).to(world_model.device)[None]
+    latents = world_model.encode(pixels_to_input(pixels, world_model.image_size), chunk=chunk)[0]
+    return latents.reshape(len(frames), -1, latents.shape[-1])
 
 
 def encoding_of(world_model: WorldModel, config: Config) -> Encoding:

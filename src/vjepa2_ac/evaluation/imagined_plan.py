@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
-from vjepa2_ac.data.transforms import frames_as_seen, view
+from vjepa2_ac.data.transforms import frames_as_seen, split_views, view
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
 from vjepa2_ac.decoding.imagine import shown
 from vjepa2_ac.media.film import spread_with_ends
@@ -43,8 +43,8 @@ def imagine_plan(answer: PlanResult, decoder: TrainedDecoder) -> ImaginedPlan:
     start, decoded_goal = _side_by_side(given, decoder, controller.config.views)
     frames = _rollout(answer.decision, decoder, steps=answer.space.steps)
     places = spread_with_ends(len(frames), _MOST_STEPS)
-    views = np.split(goal, controller.config.views, axis=1)
-    seen = np.concatenate(frames_as_seen(view(np.stack(views), controller.crop), decoder.card.shape.image_size), axis=1)
+    views = view(split_views(goal[None], controller.config.views), controller.crop)
+    seen = np.concatenate(frames_as_seen(views, decoder.card.shape.image_size), axis=1)
     return ImaginedPlan(start, {place + 1: frames[place] for place in places}, seen, decoded_goal)
 
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.sources.indexed_source import spaces_of
-from vjepa2_ac.data.transforms import Crop, view
+from vjepa2_ac.data.transforms import Crop, split_views, view
 from vjepa2_ac.encoding.batch import encode_frames
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import require_image, require_mask
@@ -253,14 +253,7 @@ class Controller:
         Raises:
             InputError: Its width is not that of so many views.
         """
-        return encode_frames(self._model, self._views(image), self.crop).flatten(0, 1)
-
-    def _views(self, image: UInt8[np.ndarray, "height all 3"]) -> UInt8[np.ndarray, "views height width 3"]:
-        count, width = self.config.views, image.shape[1]
-        if width % count:
-            needed = f"a width that {count} views share, side by side"
-            raise InputError(where="planning.views", found=f"an image {width} pixels wide", needed=needed)
-        return np.stack(np.split(image, count, axis=1))
+        return encode_frames(self._model, image[None], self.crop, views=self.config.views)[0]
 
     def _progressed(self, latents: Float[Tensor, "tokens dim"]) -> GoalProgress:
         """Return which goal applies to the current image."""
@@ -363,7 +356,7 @@ class Controller:
             return None
         require_mask(mask, where="mask", like=like)
         grid = self._model.image_size // self._model.sizes.patch_size
-        image = self._views(np.repeat((mask > 0).astype(np.uint8)[..., None], 3, axis=-1))
+        image = split_views(np.repeat((mask > 0).astype(np.uint8)[None, ..., None], 3, axis=-1), self.config.views)
         seen = torch.from_numpy(np.ascontiguousarray(view(image, self.crop)[..., 0])) > 0
         if not seen.any():
             raise InputError(where="mask", found="nothing of what the model sees counts")

@@ -69,18 +69,25 @@ class Recording:
             raise InputError(where=self.name, found=f"{self.frames} frames", needed="2 at least")
 
 
-def recording_of_episode(config: DataConfig, wanted: str, progress: Progress | None = None) -> Recording:
+def recording_of_episode(
+    config: DataConfig, wanted: str, progress: Progress | None = None, *, views: int = 1
+) -> Recording:
     """Return an episode of a data set.
 
     Args:
-        config: The data set, and which camera.
+        config: The data set, and which camera, or cameras.
         wanted: The episode's name in the data, or its number among the episodes, from 0.
         progress: Called with (done, total) while the data set is indexed for the first time.
+        views: How many of the cameras are seen side by side, from the first on.
 
     Raises:
-        InputError: There is no such episode, it cannot be read, or the data are latents without frames.
+        InputError: There is no such episode, it cannot be read, the data are latents without frames, or there are not
+            as many cameras.
     """
     require_frames(config, to="make goals of")
+    if len(config.cameras) < views:
+        found, needed = ", ".join(config.cameras), f"{views} cameras, from left to right, as planning.views says"
+        raise InputError(where="data.camera", found=found, needed=needed)
     dataset = open_dataset(config, progress=progress)
     table, index = dataset.table, dataset.table.find(wanted)
     if index is None and wanted.isdecimal() and len(wanted) < 10 and int(wanted) < len(table):
@@ -88,10 +95,14 @@ def recording_of_episode(config: DataConfig, wanted: str, progress: Progress | N
     if index is None:
         needed = f"a name such as {table.identity(int(dataset.episodes[0]))}, or a number from 0 to {len(table) - 1}"
         raise InputError(where=f"--episode {wanted}", found=f"no such episode in {config.path}", needed=needed)
-    episode, name = dataset.source.read(index), table.identity(index)
+    name, seen = table.identity(index), [dataset.source.read(index, camera) for camera in config.cameras[:views]]
     origin = {"data": config.path, "episode": name, "camera": config.camera}
-    states = episode.states if config.states == "pose" else None
-    return Recording(name, len(episode.states), episode.read_frames, states, origin)
+    states = seen[0].states if config.states == "pose" else None
+
+    def read(frames: Sequence[int]) -> UInt8[np.ndarray, "frames height width 3"]:
+        return np.concatenate([episode.read_frames(frames) for episode in seen], axis=2)
+
+    return Recording(name, len(seen[0].states), read, states, origin)
 
 
 def recording_of_film(path: Path) -> Recording:
@@ -244,7 +255,8 @@ def _latents(
     found = []
     for start in range(0, len(frames), _AT_ONCE):
         part = frames[start : start + _AT_ONCE]
-        found.append(encode_frames(session.world_model, read(part), session.config.data.crop))
+        views, crop = session.config.planning.views, session.config.data.crop
+        found.append(encode_frames(session.world_model, read(part), crop, views=views))
         progress(min(start + _AT_ONCE, len(frames)), len(frames))
     return torch.cat(found)
 

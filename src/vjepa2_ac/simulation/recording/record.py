@@ -64,7 +64,7 @@ class RecordingSpec:
     domain: str | Domain | DomainRanges  # or its name; ranges, or `random`: another world in every episode
     steps: Annotated[int, Field(ge=2, le=1_000_000)] = 41  # control steps (15 per second); see `default_steps`
     seed: Annotated[int, Field(ge=0)] = 0  # determines motion, outcome and worlds
-    cameras: Literal[1, 3] = 1  # 1: the three images of a step are the same one; 3: one image per camera
+    cameras: Literal[1, 2, 3] = 1  # so many have an image of their own, those that stand still first
     recipe: MotionRecipe = field(default_factory=MotionRecipe)  # ranges of the motion, without a task
     task: RecordedTask | None = None  # with a block: half of the episodes by script, half at random
 
