@@ -11,10 +11,12 @@ from tiny_models import tiny_model
 from vjepa2_ac.config import RldsData
 from vjepa2_ac.config.planning import CemConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.decoding.decoder_folder import load_decoder
+from vjepa2_ac.decoding.imagine import shown
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.demonstrations.make_goals import recording_of_episode
 from vjepa2_ac.planning.session import load_to_plan
+from vjepa2_ac.serving.about import warm_up
 from vjepa2_ac.simulation.closed_loop.agent import agent_of_session
 from vjepa2_ac.simulation.closed_loop.benchmark import BenchmarkOptions, run_benchmark
 from vjepa2_ac.simulation.closed_loop.tasks import arm_for
@@ -76,6 +78,16 @@ def test_what_cannot_be_split_is_refused() -> None:
         PlanningConfig(views=2, context=2)
     with pytest.raises(ValueError, match="axes are of one camera"):
         PlanningConfig(views=2, axes="axes.json")
+
+
+def test_a_server_warms_up_on_as_many_views_and_shows_what_they_imagine() -> None:
+    run = Controller(tiny_model(), QUICK.model_copy(update={"views": 3}))
+    assert warm_up(run) > 0
+    decoder, latents = load_decoder("builtin:sim-tiny").decoder, torch.randn(2, 2 * 36, 128)
+    both = shown(decoder, latents, 2)
+    np.testing.assert_array_equal(
+        both, np.concatenate([shown(decoder, one) for one in latents.split(36, dim=1)], axis=2)
+    )
 
 
 def test_the_arm_is_seen_from_both_sides() -> None:

@@ -118,9 +118,12 @@ def worth_knowing(card: DecoderCard, first: Image, decoded_first: Image) -> tupl
     return (note,)
 
 
-def shown(decoder: Decoder, latents: Float[Tensor, "steps tokens dim"]) -> Film:
-    """Return latents as images for people."""
-    return as_pixels(decoder.decode(latents.float()))
+def shown(
+    decoder: Decoder, latents: Float[Tensor, "steps tokens dim"], views: int = 1
+) -> UInt8[np.ndarray, "steps size all 3"]:
+    """Return latents as images for people; of several views, whose tokens follow one another, side by side."""
+    images = as_pixels(decoder.decode(latents.float().reshape(len(latents) * views, -1, latents.shape[-1])))
+    return np.concatenate([images[number::views] for number in range(views)], axis=2)
 
 
 def strip_of(imagination: Imagination) -> FilmStrip:

@@ -40,7 +40,7 @@ def imagine_plan(answer: PlanResult, decoder: TrainedDecoder) -> ImaginedPlan:
     controller, goal = answer.controller, answer.question.goals[answer.decision.goals[-1]].image
     decoder.to(controller.device)
     given = torch.stack([controller.encoded(image) for image in (answer.question.start, goal)])
-    start, decoded_goal = _side_by_side(given, decoder, controller.config.views)
+    start, decoded_goal = shown(decoder.decoder, given, controller.config.views)
     frames = _rollout(answer.decision, decoder, steps=answer.space.steps)
     places = spread_with_ends(len(frames), _MOST_STEPS)
     views = view(split_views(goal[None], controller.config.views), controller.crop)
@@ -63,10 +63,4 @@ def _rollout(decision: Decision, decoder: TrainedDecoder, *, steps: int) -> Film
         return none
     latents: Float[torch.Tensor, "steps tokens dim"] = decision.cost.imagine(decision.plan.actions[None, :steps])[0][0]
     is_finite = bool(torch.isfinite(latents).all())
-    return _side_by_side(latents, decoder, decision.cost.views) if is_finite else none
-
-
-def _side_by_side(latents: Float[torch.Tensor, "steps tokens dim"], decoder: TrainedDecoder, views: int) -> Film:
-    """Return images of latents whose tokens are those of one view after another."""
-    images = shown(decoder.decoder, latents.reshape(len(latents) * views, -1, latents.shape[-1]))
-    return np.concatenate([images[number::views] for number in range(views)], axis=2)
+    return shown(decoder.decoder, latents, decision.cost.views) if is_finite else none

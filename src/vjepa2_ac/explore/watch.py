@@ -175,7 +175,8 @@ class WatchPage:
         if self.decoder is None or decision is None or decision.cost is None or decision.plan is None:
             return []
         latents, _ = decision.cost.imagine(decision.plan.actions[None])
-        return [Image("imagined", shown(self.decoder.decoder, latents[0, -1:])[0], "the end of the plan, imagined")]
+        (end,) = shown(self.decoder.decoder, latents[0, -1:], decision.cost.views)
+        return [Image("imagined", end, "the end of the plan, imagined")]
 
 
 def _first_change(seen: _Seen, width: int) -> list[float]:

@@ -19,7 +19,7 @@ from vjepa2_ac.serving.session import Session
 
 PROTOCOL = 1  # incremented when a client would have to change
 _MOST_NAMES = 60  # of goals that are told
-_SIZE = 180, 320  # of the picture of the first decision
+_SIZE = 180, 320  # of a view in the picture of the first decision
 _SOMEWHERE = np.array([0.4, 0.0, 0.4, np.pi, 0.0, 0.0, 0.0])
 
 
@@ -81,7 +81,8 @@ def warm_up(controller: Controller) -> float:
         InputError: The model gives no finite energy: it is broken.
     """
     began, rng = time.perf_counter(), np.random.default_rng(0)
-    goal, frame = rng.integers(0, 256, (2, *_SIZE, 3), dtype=np.uint8)
+    height, width = _SIZE
+    goal, frame = rng.integers(0, 256, (2, height, width * controller.config.views, 3), dtype=np.uint8)
     space, box = controller.spaces.state, controller.config.limits.workspace
     state = _SOMEWHERE.copy() if space.is_pose else np.zeros(len(space))
     if space.is_base_pose and box is not None:
