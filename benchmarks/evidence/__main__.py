@@ -41,8 +41,8 @@ def main() -> int:
             f"{task} is left out: make worlds/{TASKS[task].program} makes its environment (docs/worlds.md)", flush=True
         )
         cells = [cell for cell in cells if cell.shift != task]
-    there = {one["cell"]["name"] for one in read_results(folder, options.done)} if not options.choose else set()
-    missing = [cell for cell in cells if cell.name not in there and not _result(results, cell).exists()]
+    there = {one["cell"]["name"] for one in read_results(results, options.done)}
+    missing = [cell for cell in cells if cell.name not in there]
     prepare(folder, {cell.shift for cell in missing}, options.seeds)
     print(f"{len(cells)} cells, {len(cells) - len(missing)} of them done", flush=True)
     failed = _run(missing, results, options)

@@ -15,11 +15,11 @@ REACHED_CM = 5.0
 Figures = dict[str, Any]
 
 
-def read_results(folder: Path, done: Path | None = None) -> list[Figures]:
+def read_results(results: Path, done: Path | None = None) -> list[Figures]:
     """Return the figures of every cell that is done: in a folder, or else in an evidence.json that was made before."""
     before = [] if done is None else json.loads(done.read_text())
     found = {one["cell"]["name"]: one for one in before}
-    files = (json.loads(path.read_text()) for path in (folder / "results").glob("*.json"))
+    files = (json.loads(path.read_text()) for path in results.glob("*.json"))
     found |= {one["cell"]["name"]: one for one in files}
     return [found[name] for name in sorted(found)]
 

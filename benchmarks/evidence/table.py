@@ -45,7 +45,7 @@ def write_tables(folder: Path, out: Path, page: Path | None = None, done: Path |
     Raises:
         ValueError: The page has no place for it.
     """
-    results = read_results(folder, done)
+    results = read_results(folder / "results", done)
     if not results:
         print(f"nothing to show: no cell is done in {folder / 'results'}")
         return
@@ -105,9 +105,9 @@ def summary(results: Sequence[Figures]) -> str:
         rows.append(f"| {name} | | {' | '.join(parts)} |")
     for method in (one for one in METHODS.values() if one.kind != "cloned"):
         by_base = [main_cells(results, "none" if method.kind == "scratch" else base, method.name) for base in BASES]
-        share = next((one["trained_share"] for found in by_base for one in found), 0.0)
         if not any(by_base):
             continue
+        share = next((one["trained_share"] for found in by_base for one in found), 0.0)
         parts = []
         for found in by_base:
             parts += [*_short(found), f"{np.mean([last(one) for one in found]):.3f}" if found else ""]

@@ -92,12 +92,8 @@ def add_simulate(commands: cli.Commands) -> None:
     cli.add(group, "--out FOLDER", "where figures and video go (closed_loop/TASK-DOMAIN, in the run's)", cli.as_path)
     cli.add(group, "--key-file FILE", "the key of a server that needs one", cli.as_path)
     group = parser.add_argument_group("to record data")
-    cli.add(
-        group,
-        "--cameras N",
-        "of 3 that have an image of their own, the others show the first (1)",
-        cli.whole_number(1, 3),
-    )
+    text = "of 3 that have an image of their own, the others show the first (1)"
+    cli.add(group, "--cameras N", text, cli.whole_number(1, 3))
     cli.add(group, "--workers N", "processes; the data are the same whatever their number (1)", cli.count)
 
 

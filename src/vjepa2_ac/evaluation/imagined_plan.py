@@ -62,5 +62,4 @@ def _rollout(decision: Decision, decoder: TrainedDecoder, *, steps: int) -> Film
     if decision.plan is None or decision.cost is None:
         return none
     latents: Float[torch.Tensor, "steps tokens dim"] = decision.cost.imagine(decision.plan.actions[None, :steps])[0][0]
-    is_finite = bool(torch.isfinite(latents).all())
-    return shown(decoder.decoder, latents, decision.cost.views) if is_finite else none
+    return shown(decoder.decoder, latents, decision.cost.views) if bool(torch.isfinite(latents).all()) else none

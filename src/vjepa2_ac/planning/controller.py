@@ -357,11 +357,11 @@ class Controller:
         require_mask(mask, where="mask", like=like)
         grid = self._model.image_size // self._model.sizes.patch_size
         image = split_views(np.repeat((mask > 0).astype(np.uint8)[None, ..., None], 3, axis=-1), self.config.views)
-        seen = torch.from_numpy(np.ascontiguousarray(view(image, self.crop)[..., 0])) > 0
-        if not seen.any():
-            raise InputError(where="mask", found="nothing of what the model sees counts")
-        weights = [patch_weights(one, grid) if one.any() else torch.zeros(grid**2) for one in seen]
-        return torch.cat(weights).to(self._model.device)
+        seen = torch.from_numpy(np.ascontiguousarray(view(image, self.crop)[..., 0]))
+        try:
+            return patch_weights(seen > 0, grid).to(self._model.device)
+        except ValueError:
+            raise InputError(where="mask", found="nothing of what the model sees counts") from None
 
 
 def _require_spaces(model: WorldModel, spaces: Spaces) -> None:

@@ -58,8 +58,10 @@ class Goal:
         return torch.stack([self.latents[place] for place in places])  # a list as an index would wait for the device
 
 
-def patch_weights(mask: Bool[Tensor, "height width"] | Float[Tensor, "height width"], grid: int) -> Weights:
-    """Return the weight of each patch: the mean of a mask over the patch, patches row by row.
+def patch_weights(
+    mask: Bool[Tensor, "*views height width"] | Float[Tensor, "*views height width"], grid: int
+) -> Weights:
+    """Return the weight of each patch: the mean of a mask over the patch, patches row by row, view after view.
 
     Args:
         mask: Over the image as the model sees it (cropped), of any resolution; 1 counts, 0 does not.
@@ -68,7 +70,7 @@ def patch_weights(mask: Bool[Tensor, "height width"] | Float[Tensor, "height wid
     Raises:
         ValueError: The mask is empty.
     """
-    weights = adaptive_avg_pool2d(mask.float()[None], grid).flatten()
+    weights = adaptive_avg_pool2d(mask.float().reshape(-1, *mask.shape[-2:]), grid).flatten()
     if weights.sum() <= 1e-12:
         raise ValueError("the mask leaves nothing of the image")
     return weights

@@ -252,10 +252,9 @@ def _latents(
     session: PlanningSession, read: FrameReader, frames: Sequence[int], progress: Progress = no_progress
 ) -> Float[Tensor, "frames tokens dim"]:
     """Return the latents of some frames, as the session's model sees them; few pixels at a time are in memory."""
-    found = []
+    found, crop, views = [], session.config.data.crop, session.config.planning.views
     for start in range(0, len(frames), _AT_ONCE):
         part = frames[start : start + _AT_ONCE]
-        views, crop = session.config.planning.views, session.config.data.crop
         found.append(encode_frames(session.world_model, read(part), crop, views=views))
         progress(min(start + _AT_ONCE, len(frames)), len(frames))
     return torch.cat(found)

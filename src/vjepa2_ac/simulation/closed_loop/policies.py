@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from vjepa2_ac.config.planning import LimitsConfig
-from vjepa2_ac.data.transforms import frame_of_seen
+from vjepa2_ac.data.transforms import frame_of_seen, split_views
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
 from vjepa2_ac.evaluation.imagined_plan import imagined_next
 from vjepa2_ac.planning.controller import Controller
@@ -168,7 +168,7 @@ class Planning:
         if found is None:
             return None
         height, width, views = *self._size, self.controller.config.views
-        parts = np.split(found, views, axis=1)
+        parts = split_views(found[None], views)
         return np.hstack([frame_of_seen(part, height, width // views, self.controller.crop) for part in parts])
 
 
