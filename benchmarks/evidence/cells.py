@@ -10,21 +10,26 @@ from other_worlds import MANY, TASKS
 
 from vjepa2_ac.config import AdapterConfig, TrainingConfig
 from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig, PlanningConfig
-from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B, Domain
+from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B, Domain, DomainRanges
 
 Base = Literal["one camera", "many cameras", "none"]
 
-SHIFTS: dict[str, Domain] = {
-    "look": replace(DOMAIN_B, name="look", base_yaw_deg=DOMAIN_A.base_yaw_deg, lag_s=DOMAIN_A.lag_s),
-    "motion": replace(DOMAIN_A, name="motion", base_yaw_deg=60.0, lag_s=DOMAIN_B.lag_s),
+_LOOK = replace(DOMAIN_B, name="look", base_yaw_deg=DOMAIN_A.base_yaw_deg, lag_s=DOMAIN_A.lag_s)
+_MOTION = replace(DOMAIN_A, name="motion", base_yaw_deg=60.0, lag_s=DOMAIN_B.lag_s)
+SHIFTS: dict[str, Domain | DomainRanges] = {
+    "look": _LOOK,
+    "motion": _MOTION,
+    "randomized": DomainRanges(azimuth_deg=(80.0, 130.0), textures=True, moving=3),
 }
 """look: camera turned by 43 degrees, other colours, light, table and things on it; the arm moves as in A. motion: looks
 like A, but the robot is mounted turned by 60 degrees, so that an action moves the arm elsewhere in the picture.
-Tasks of worlds that others made (`other_worlds.TASKS`) are shifts, too: of that world before and after its change."""
+randomized: in every episode another camera, from a side that no base has seen, colours, light and textures drawn anew,
+and three things that circle on the table. Tasks of worlds that others made (`other_worlds.TASKS`) are shifts, too: of
+that world before and after its change."""
 
 TURNS: dict[str, float] = {
-    "look": DOMAIN_A.camera.azimuth_deg - SHIFTS["look"].camera.azimuth_deg,
-    "motion": SHIFTS["motion"].base_yaw_deg,
+    "look": DOMAIN_A.camera.azimuth_deg - _LOOK.camera.azimuth_deg,
+    "motion": _MOTION.base_yaw_deg,
 }
 """By how many degrees what the robot does seems turned, to a base of domain A."""
 
@@ -171,6 +176,8 @@ def all_cells(seeds: int = 3) -> Iterator[Cell]:
         yield from _of("look", tuple(name for name in arm if name not in main), 20, seed)
     for seed in range(seeds):
         yield from _of("motion", (*main, LONGER), 20, seed)
+    for seed in range(seeds):
+        yield from _of("randomized", ("zero-shot", BEST, "full", "scratch", "scratch, 3x steps"), 20, seed)
     for seed in range(seeds):
         for episodes in (10, 40):
             yield from _of("look", (BEST, "full", "scratch"), episodes, seed)

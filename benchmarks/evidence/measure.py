@@ -5,6 +5,8 @@ from __future__ import annotations
 import shutil
 import subprocess
 import time
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, get_args
@@ -47,6 +49,7 @@ from vjepa2_ac.simulation.closed_loop.policies import (
 )
 from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, run_task
 from vjepa2_ac.simulation.closed_loop.tasks import Problem, TaskProblem
+from vjepa2_ac.simulation.world.domains import Domain, sample_domain
 from vjepa2_ac.storage import write_atomically
 from vjepa2_ac.storage.structured import json_text
 from vjepa2_ac.training.cost.memory import count_parameters
@@ -193,16 +196,27 @@ def closed_loop(cell: Cell, policy: Policy, folder: Path, *, seed: int, goals: i
     """Return distances to the goal (cm) before the first step and after each, and seconds of a decision."""
     if cell.shift not in SHIFTS:
         return other_worlds.closed_loop(folder, cell.shift, policy, seed=seed, goals=goals)
-    result = run_task(RolloutSpec("reach", SHIFTS[cell.shift], goals, seed), policy)
+    results = [run_task(spec, policy) for spec in _rollouts(cell.shift, seed, goals)]
     agreements = policy.agreements if isinstance(policy, Watched) else []
     return {
         **({"visited": float(np.mean(agreements))} if agreements else {}),
         "goals_seed": seed,
-        "distance_cm": np.round(result.distance_cm, 3).tolist(),
-        "seconds_per_decision": float(result.seconds.mean()),
-        "unreachable": int(result.unreachable.sum()),
-        "whys": result.why_counts,
+        "distance_cm": np.round(np.concatenate([one.distance_cm for one in results]), 3).tolist(),
+        "seconds_per_decision": float(np.mean([one.seconds.mean() for one in results])),
+        "unreachable": int(sum(one.unreachable.sum() for one in results)),
+        "whys": dict(sum((Counter(one.why_counts) for one in results), Counter())),
     }
+
+
+def _rollouts(shift: str, seed: int, goals: int) -> Iterator[RolloutSpec]:
+    """Yield what is to be reached: in one world, or each goal in another that no episode was recorded in."""
+    world = SHIFTS[shift]
+    if isinstance(world, Domain):
+        yield RolloutSpec("reach", world, goals, seed)
+        return
+    for goal in range(goals):
+        drawn = sample_domain(np.random.default_rng([seed, goal]), world)
+        yield RolloutSpec("reach", drawn, 1, seed * 100 + goal)
 
 
 def held_out(

@@ -19,6 +19,7 @@ from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.reports.export import export_run
 from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
+from vjepa2_ac.simulation.world.domains import DOMAIN_A
 from vjepa2_ac.training.loop import train
 
 BUILTIN = "builtin:sim-tiny"
@@ -124,8 +125,7 @@ def training_episodes(data: DataConfig, count: int, seed: int) -> tuple[str, ...
 
 def _record(data: DataConfig, domain: str, episodes: int, seed: int) -> None:
     if not Path(data.path).exists():
-        world = SHIFTS.get(domain, domain)  # type: ignore[call-overload]
-        record_dataset(data.path, RecordingSpec(world, seed=seed), episodes=episodes)
+        record_dataset(data.path, RecordingSpec(SHIFTS.get(domain, DOMAIN_A), seed=seed), episodes=episodes)
 
 
 def _base_config(folder: Path) -> Config:

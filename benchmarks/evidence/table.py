@@ -54,7 +54,8 @@ def write_tables(folder: Path, out: Path, page: Path | None = None, done: Path |
         part
         for part in (
             _main(results),
-            _motion(results),
+            _shifted(results, "motion"),
+            _shifted(results, "randomized"),
             _axes(results),
             _by_episodes(results),
             _lora(results),
@@ -138,16 +139,19 @@ def _main(results: Sequence[Figures]) -> str:
     return "\n\n".join(parts) if len(parts) > 1 else ""
 
 
-def _motion(results: Sequence[Figures]) -> str:
-    rows = _policies(results, BASES[0], "motion")
-    for base in BASES:
+_TITLES = {
+    "motion": "The robot mounted turned by 60 degrees",
+    "randomized": "Camera, colours, light and textures anew in every episode, and things that move",
+}
+
+
+def _shifted(results: Sequence[Figures], shift: str) -> str:
+    rows = _policies(results, BASES[0], shift)
+    for base in (*BASES, "none"):
         for method in METHODS.values():
-            if method.kind != "scratch":
-                found = pick(results, shift="motion", base=base, method=method.name)
-                rows += [_row(f"{method.name} ({base})", found)] if found else []
-    found = pick(results, shift="motion", base="none")
-    rows += [_row("scratch", found)] if found else []
-    return "### The robot mounted turned by 60 degrees (20 demonstrations)\n\n" + _table(rows) if rows else ""
+            found = pick(results, shift=shift, base=base, method=method.name)
+            rows += [_row(method.name if base == "none" else f"{method.name} ({base})", found)] if found else []
+    return f"### {_TITLES[shift]} (20 demonstrations)\n\n" + _table(rows) if rows else ""
 
 
 def _axes(results: Sequence[Figures]) -> str:

@@ -77,6 +77,14 @@ def test_the_looks_differ_and_the_motion_does_not_and_the_other_way_round(eviden
     )
 
 
+def test_each_goal_of_a_randomized_world_lies_in_another_one_and_a_plain_world_has_all(evidence: Any) -> None:
+    drawn = list(evidence.measure._rollouts("randomized", 9_000, 3))
+    assert len({spec.world.camera for spec in drawn}) == len({spec.seed for spec in drawn}) == len(drawn) == 3
+    assert all(spec.episodes == 1 and spec.world.moving == 3 for spec in drawn)
+    assert drawn == list(evidence.measure._rollouts("randomized", 9_000, 3))
+    assert [(spec.episodes, spec.seed) for spec in evidence.measure._rollouts("look", 9_000, 3)] == [(3, 9_000)]
+
+
 def test_every_table_has_who_needs_no_model_and_time_that_other_work_does_not_lengthen(evidence: Any) -> None:
     def figures(shift: str, base: str, method: str, **more: Any) -> dict[str, Any]:
         reach = {"distance_cm": [[20.0, 3.0], [20.0, 9.0]]}
@@ -88,7 +96,7 @@ def test_every_table_has_who_needs_no_model_and_time_that_other_work_does_not_le
     reach = {"distance_cm": [[20.0, 20.0], [20.0, 20.0]]}
     alone = {"baselines": dict.fromkeys(("do nothing", "random", "oracle"), reach)}
     results = [figures("motion", "one camera", "zero-shot", **alone), figures("motion", "one camera", "full")]
-    lines = evidence.table._motion(results).splitlines()
+    lines = evidence.table._shifted(results, "motion").splitlines()
     assert [line.split(" | ")[0] for line in lines[4:]] == [
         "| do nothing", "| random", "| oracle", "| zero-shot (one camera)", "| full (one camera)",
     ]  # fmt: skip

@@ -1,6 +1,7 @@
 """Camera images show the arm at its pose, in the domain's colours."""
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -29,7 +30,7 @@ from vjepa2_ac.spaces import matrices_from_euler
 
 mujoco = pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 
-from vjepa2_ac.simulation.world.arm import SimulatedArm  # noqa: E402
+from vjepa2_ac.simulation.world.arm import ContactArm, SimulatedArm  # noqa: E402
 from vjepa2_ac.simulation.world.camera import View  # noqa: E402
 
 REACHES = HOME + np.array([[0] * 7, [0.4, 0.3, 0.0, 0.4, 0.1, 0.2, 0.5], [-0.6, 0.2, 0.3, -0.2, 0.0, -0.3, 0.0]])
@@ -133,6 +134,35 @@ def test_sampled_domains_stay_in_their_ranges_and_differ() -> None:
         assert 40.0 <= domain.camera.azimuth_deg <= 60.0
         assert abs(np.mean(domain.look.arm) - np.mean(domain.look.table)) > 0.1
     assert sample_domain(np.random.default_rng(1)) == sample_domain(np.random.default_rng(1))
+
+
+def test_textures_are_drawn_anew_and_things_circle_while_time_passes_without_touching_anything() -> None:
+    ranges = DomainRanges(textures=True, moving=2)
+    domain, other = (sample_domain(np.random.default_rng(seed), ranges) for seed in (1, 2))
+    plain = replace(domain, texture_seed=0, moving=0)
+    assert plain == sample_domain(np.random.default_rng(1)), "all else is drawn as without"
+    assert domain.texture_seed != other.texture_seed
+
+    def walls(texture_seed: int) -> np.ndarray:
+        return SimulatedArm(replace(plain, texture_seed=texture_seed)).image()
+
+    assert (walls(0) != walls(3)).any(axis=2).mean() > 0.3
+    assert (walls(4) != walls(3)).any(axis=2).mean() > 0.3
+    images = []
+    beside_the_block = replace(domain, clutter_seed=7)  # four of its five things are outside the work area
+    for arm in (ContactArm(beside_the_block, mark=True), SimulatedArm(domain)):
+        before, block = arm.image(), arm.block
+        mark = arm.mark
+        arm.command_joints(arm.joints, 0.0, 4)
+        images.append(arm.image())
+        assert 0.001 < (before != images[-1]).any(axis=2).mean() < 0.1, "two small things have moved"
+        if block is not None:
+            np.testing.assert_allclose(arm.block, block, atol=1e-3)
+            np.testing.assert_array_equal(arm.mark, mark)
+    again = SimulatedArm(domain)
+    for _ in range(4):
+        again.command_joints(again.joints, 0.0)
+    np.testing.assert_array_equal(again.image(), images[-1])
 
 
 def test_domain_b_is_outside_the_training_domains_of_the_base() -> None:

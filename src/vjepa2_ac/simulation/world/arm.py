@@ -10,8 +10,9 @@ from jaxtyping import Bool, Float, UInt8
 from scipy.spatial.transform import Rotation
 
 from vjepa2_ac.simulation.world.camera import FRAME_SIZE, RayCamera
-from vjepa2_ac.simulation.world.domains import FINGER_TRAVEL_M, SUBSTEPS, Domain, compile_scene, load_mujoco
+from vjepa2_ac.simulation.world.domains import FINGER_TRAVEL_M, MOVING, SUBSTEPS, Domain, compile_scene, load_mujoco
 from vjepa2_ac.simulation.world.motion import (
+    CONTROL_RATE_HZ,
     GRIPPER_LAG_S,
     Joints,
     OutOfReachError,
@@ -51,6 +52,7 @@ class SimulatedArm:
         self._data = self._mujoco.MjData(self._model)
         self._size = size
         self._cameras: dict[str, RayCamera] = {}
+        self._circles, self._time_s = _Circles(self._model, domain), 0.0
         self.set_joints(rest_joints(domain), 0.0)
 
     @property
@@ -87,11 +89,12 @@ class SimulatedArm:
         if block is not None or mark is not None:
             raise ValueError("neither a block nor a mark can be put: this arm touches nothing")
 
-    def set_joints(self, joints: Joints, closedness: float) -> None:
-        """Put the arm at joint angles at once."""
+    def set_joints(self, joints: Joints, closedness: float, control_steps: int = 1) -> None:
+        """Put the arm at joint angles at once; what circles on the table goes on for so many control steps."""
         self._closedness = closedness
         self._data.qpos[:7] = joints
         self._data.qpos[7:9] = FINGER_TRAVEL_M * (1.0 - closedness)
+        self._pass_time(control_steps)
         self._mujoco.mj_kinematics(self._model, self._data)
 
     def joints_for(self, state: State) -> Joints:
@@ -131,7 +134,7 @@ class SimulatedArm:
         left = (1.0 - tracking_share(self.domain.lag_s)) ** control_steps
         grip_left = (1.0 - tracking_share(GRIPPER_LAG_S)) ** control_steps
         joints = goal + left * (self.joints - goal)
-        self.set_joints(joints, closedness + grip_left * (self._closedness - closedness))
+        self.set_joints(joints, closedness + grip_left * (self._closedness - closedness), control_steps)
         return self.state
 
     def image(self, camera: str | None = None) -> UInt8[np.ndarray, "height width 3"]:
@@ -164,6 +167,10 @@ class SimulatedArm:
     def _compiled(self, domain: Domain) -> Any:
         return compile_scene(domain)
 
+    def _pass_time(self, control_steps: int) -> None:
+        self._time_s += control_steps / CONTROL_RATE_HZ
+        self._circles.move(self._data, self._time_s)
+
     def _camera_pose(self, camera: str) -> Float[np.ndarray, "4 4"]:
         """Return the frame of a camera in the world; the one on the hand looks past the fingers."""
         if camera in _EXTERIOR_TURNS_DEG:
@@ -176,6 +183,24 @@ class SimulatedArm:
         mount[:3, 3] = mount[:3, :3] @ [0.0, -0.09, -0.02]
         flange[:3, :3], flange[:3, 3] = site.xmat.reshape(3, 3), site.xpos
         return np.asarray(flange @ mount)
+
+
+class _Circles:
+    """The bodies that circle on the table, each about where it was put, at a radius and a speed of its own."""
+
+    def __init__(self, model: Any, domain: Domain) -> None:
+        bodies = [body for body in map(model.body, range(model.nbody)) if body.name.startswith(MOVING)]
+        count, rng = len(bodies), np.random.default_rng([domain.clutter_seed, domain.moving])
+        self._places = [body.mocapid[0] for body in bodies]  # among all mocap bodies
+        self._middles_m = np.array([body.pos[:2] for body in bodies]).reshape(count, 2)
+        self._radii_m, self._phases = rng.uniform(0.05, 0.12, count), rng.uniform(0.0, 2 * np.pi, count)
+        self._speeds = rng.uniform(0.5, 2.0, count) * rng.choice([-1.0, 1.0], count)  # radians per second
+
+    def move(self, data: Any, seconds: float) -> None:
+        """Put them where they are at a moment; the kinematics are out of date then."""
+        angles = self._phases + self._speeds * seconds
+        ways = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        data.mocap_pos[self._places, :2] = self._middles_m + self._radii_m[:, None] * ways
 
 
 Look = Callable[[SimulatedArm], None]  # at every control step, at the time of its measurements
@@ -238,9 +263,9 @@ class ContactArm(SimulatedArm):
             self._data.mocap_pos[0, :2] = base[:2, :2] @ mark
         self._mujoco.mj_kinematics(self._model, self._data)
 
-    def set_joints(self, joints: Joints, closedness: float) -> None:
+    def set_joints(self, joints: Joints, closedness: float, control_steps: int = 1) -> None:
         """Put the arm at joint angles at once, at rest; it drops what it held."""
-        super().set_joints(joints, closedness)
+        super().set_joints(joints, closedness, control_steps)
         self._data.qvel[_MOVED] = 0.0
         self._data.qacc_warmstart[:] = 0.0
         self._wanted = self._data.qpos[_MOVED].copy()
@@ -256,6 +281,7 @@ class ContactArm(SimulatedArm):
             self._wanted += way
             self._data.ctrl[:] = self._wanted + self._ahead * way  # the servos have no lag of their own
             self._mujoco.mj_step(self._model, self._data)
+        self._pass_time(control_steps)
         self._mujoco.mj_kinematics(self._model, self._data)
         return self.state
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -138,7 +139,7 @@ class RayCamera:
         vertical_fov_deg: float,
         size: tuple[int, int] = FRAME_SIZE,
     ) -> None:
-        self._caster, self._colours = Caster(model), _Colours(model)
+        self._caster, self._colours = Caster(model), _Colours(model, domain.texture_seed)
         look = domain.look
         lamp = CameraPlace(look.light_azimuth_deg, look.light_elevation_deg, _LAMP_M, look_at_m=(0.0, 0.0, 0.0))
         self._lamp_pose, self._ambient = lamp.pose(), look.ambient
@@ -208,12 +209,16 @@ class RayCamera:
 class _Colours:
     """Colours by geom, and by position for those with a pattern, so that images have texture."""
 
-    def __init__(self, model: Any) -> None:
+    def __init__(self, model: Any, seed: int) -> None:
         self._colours = model.geom_rgba[:, :3].astype(np.float32)
         names = [model.geom(index).name for index in range(model.ngeom)]
-        patterns = {"table": _planks, "floor": _tiles, "wall": _panels}
+        patterns: list[Callable[[Any], Any]] = [_planks, _tiles, _panels]
+        if seed:
+            rng = np.random.default_rng(seed)
+            patterns = [_drawn(patterns[place], rng) for place in rng.permutation(3)]
         self._patterns = [
-            (np.array([name.startswith(start) for name in names]), pattern) for start, pattern in patterns.items()
+            (np.array([name.startswith(start) for name in names]), pattern)
+            for start, pattern in zip(("table", "floor", "wall"), patterns, strict=True)
         ]
 
     def at(self, geoms: Any, spots: Any) -> Any:
@@ -223,6 +228,13 @@ class _Colours:
             if len(index):
                 colour[index] *= pattern(spots[index])[:, None]
         return colour
+
+
+def _drawn(pattern: Callable[[Any], Any], rng: np.random.Generator) -> Callable[[Any], Any]:
+    """Return a pattern that is turned, larger or smaller, and stronger or fainter."""
+    turn, scale, strength = rng.uniform(0.0, np.pi), rng.uniform(0.5, 2.0), rng.uniform(0.5, 2.5)
+    ways = np.array([[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, scale]]) / scale
+    return lambda spots: 1.0 + strength * (pattern(spots @ ways) - 1.0)
 
 
 def _planks(spots: Any) -> Any:

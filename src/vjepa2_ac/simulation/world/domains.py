@@ -72,6 +72,8 @@ class Domain:
     base_yaw_deg: float = 0.0  # mounting of the robot: the same action moves the arm in another direction in the image
     lag_s: float = 0.08  # time constant with which the measured pose follows the commanded one
     clutter_seed: int = 0  # selects the objects on the table, and their positions
+    texture_seed: int = 0  # selects the patterns of table, floor and walls; 0: planks, tiles, panels
+    moving: int = 0  # so many of the five objects circle on the table, touching nothing
 
     def base_pose(self) -> Float[np.ndarray, "4 4"]:
         """Return the robot base frame in the world."""
@@ -95,6 +97,8 @@ class DomainRanges:
     light_azimuth_deg: Range = (0.0, 360.0)
     light_elevation_deg: Range = (40.0, 75.0)
     ambient: Range = (0.35, 0.6)
+    textures: bool = False  # whether patterns are drawn, too
+    moving: int = 0  # objects that circle
 
 
 DOMAIN_A = Domain(
@@ -169,6 +173,8 @@ def sample_domain(rng: np.random.Generator, ranges: DomainRanges = DomainRanges(
         base_yaw_deg=draw(ranges.base_yaw_deg),
         lag_s=draw(ranges.lag_s),
         clutter_seed=int(rng.integers(2**31)),
+        texture_seed=int(rng.integers(1, 2**31)) if ranges.textures else 0,
+        moving=ranges.moving,
     )
 
 
@@ -199,6 +205,7 @@ MARK_M = 0.055  # radius of the mark, a flat disc: it is seen on all sides of a 
 WORK_AREA_M = ((0.28, 0.74), (-0.38, 0.38))
 """Ranges of x and y in the world that are kept free of other objects, for the block."""
 SUBSTEPS = 32  # steps of physics per control step
+MOVING = "moving"  # how the names of bodies begin that circle
 
 _SCENE = "assets/simulation/arm.xml"
 _COLOURED = ("arm", "joints", "hand", "table", "floor", "wall")  # classes of geoms, and colours of a Look
@@ -235,8 +242,13 @@ def compile_scene(domain: Domain, *, block: bool = False, mark: bool = False) ->
             geom = one.find("geom")
             (ET.SubElement(one, "geom") if geom is None else geom).set("rgba", _text(*getattr(domain.look, name), 1.0))
     bodies["link0"].set("euler", _text(0.0, 0.0, np.deg2rad(domain.base_yaw_deg)))
-    for thing in _things(np.random.default_rng(domain.clutter_seed), avoid_work_area=block):
-        ET.SubElement(world, "geom", thing)
+    things = list(_things(np.random.default_rng(domain.clutter_seed), avoid_work_area=block))
+    for number, thing in enumerate(things):
+        if number < domain.moving:
+            body = ET.SubElement(world, "body", name=f"{MOVING}{number}", mocap="true", pos=thing.pop("pos"))
+            ET.SubElement(body, "geom", thing | {"group": str(ARM_GROUP), "contype": "0", "conaffinity": "0"})
+        else:
+            ET.SubElement(world, "geom", thing)
     for name, wanted in {"block": block, "mark": mark}.items():
         if not wanted:
             world.remove(bodies[name])
