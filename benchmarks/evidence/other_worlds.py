@@ -61,8 +61,8 @@ class Task:
 TASKS = {
     **{name: Task("robosuite", (name,), (name, *CHANGED)) for name in ("Lift", "Door", "Stack", "PickPlaceCan")},
     "Lift by a UR5e": Task("robosuite", ("Lift",), ("Lift", "--robot", "UR5e"), origin="Lift"),
-    "LIBERO-swap": Task("libero", ("libero_object",), ("libero_object_swap",)),
-    "LIBERO-object": Task("libero", ("libero_spatial",), ("libero_spatial_object",)),
+    "LIBERO-swap": Task("libero", ("libero_object", "--near"), ("libero_object_swap", "--near")),
+    "LIBERO-object": Task("libero", ("libero_spatial", "--near"), ("libero_spatial_object", "--near")),
 }
 
 

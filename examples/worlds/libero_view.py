@@ -1,0 +1,25 @@
+"""A closer view for `libero.py --near`: the whole table is too small a picture for a small model."""
+
+import mujoco
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+
+def come_near(world):
+    """Aim the camera at hand and things of the task, closer, and let one lamp throw shadows: they tell heights.
+
+    The first initial state decides, so that all have the same view.
+    """
+    world.whole.set_init_state(world.states[0])
+    names = dict.fromkeys(name for goal in world.goals for name in goal[1:])
+    middle = np.mean([world.state()[:3], *map(world.at, names)], axis=0) + world.base()
+    model, screen = world.sim.model, world.sim._render_context_offscreen
+    camera = model.camera_name2id("agentview")
+    back = (model.cam_pos[camera] - middle) / np.linalg.norm(model.cam_pos[camera] - middle)
+    side = np.cross([0.0, 0.0, 1.0], back) / np.linalg.norm(back[:2])
+    turn = Rotation.from_matrix(np.stack([side, np.cross(back, side), back], axis=1))
+    model.cam_quat[camera], model.cam_fovy[camera] = turn.as_quat(scalar_first=True), 32
+    model.light_castshadow[:], model.light_type[:], model.light_active[1:] = True, 1, False
+    model.light_dir[:], model.light_diffuse[:], model.vis.headlight.diffuse[:] = (0.15, 0.1, -1.0), 0.5, 0.25
+    model.vis.quality.shadowsize, screen.vopt.sitegroup[:] = 1024, 0  # what is hidden throws none
+    screen.scn.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
