@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from prepare import encoded
 from torch import Tensor, nn
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.data.loader import validation_batches
 from vjepa2_ac.data.transforms import Crop
-from vjepa2_ac.encoding.batch import encode_batch, encode_frames
-from vjepa2_ac.encoding.encode_dataset import with_latents_if_there
+from vjepa2_ac.encoding.batch import encode_frames
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.simulation.closed_loop.policies import Image, Moves
@@ -42,14 +40,9 @@ class Cloned(nn.Module):
 
 def clone(config: Config, model: WorldModel, steps: int, seed: int) -> Cloned:
     """Train on the demonstrations of a run's config: a frame, one that is 1 to 3 model steps later, and its action."""
-    dataset = with_latents_if_there(config, open_dataset(config.data), model)
-    count = min(MOST_CLIPS, len(dataset.windows("train")))
-    encoded = [
-        encode_batch(model, batch, device=torch.device("cpu"), chunk=64)
-        for batch in validation_batches(dataset, "train", clips=count, batch_size=32)
-    ]
+    clips = encoded(config, model, "train", MOST_CLIPS)
     latents, states, actions = (
-        torch.cat([getattr(one, name) for one in encoded]) for name in ("latents", "states", "actions")
+        torch.cat([getattr(one, name) for one in clips]) for name in ("latents", "states", "actions")
     )
     cloned, rng = Cloned(model, seed), np.random.default_rng([seed, 3])
     cloned.scale = actions.flatten(0, 1).std(dim=0).clamp_min(1e-3)

@@ -17,15 +17,12 @@ import torch
 from cells import PLANNING, SHIFTS, Cell, energies_of, method_of
 from cloning import Cloning, clone
 from offline import offline_figures, visited_correlation
-from prepare import base_model, data_before, data_shifted, training_episodes
+from prepare import base_model, data_before, data_shifted, encoded, training_episodes
 
 from vjepa2_ac.config import Config, ModelConfig, PlanningConfig, ValidationConfig
 from vjepa2_ac.config.data import DataConfig, Split
 from vjepa2_ac.config.training import CheckpointConfig
 from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.data.loader import validation_batches
-from vjepa2_ac.encoding.batch import encode_batch
-from vjepa2_ac.encoding.encode_dataset import with_latents_if_there
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.evaluation.calibration.axes import calibrate_axes
 from vjepa2_ac.evaluation.measure import prediction_errors
@@ -223,24 +220,15 @@ def held_out(
     model: WorldModel, config: Config, split: Split = "test", clips: int = CLIPS, axes: Axes | None = None
 ) -> PredictionErrors:
     """Return errors on clips of held-out episodes, from the latents that training used; in the model's own axes."""
-    dataset = with_latents_if_there(config, open_dataset(config.data), model)
-    batches = validation_batches(dataset, split, clips=clips, batch_size=32)
     model.eval()
-    encoded = (encode_batch(model, batch, device=torch.device("cpu"), chunk=64) for batch in batches)
-    return prediction_errors(model, encoded if axes is None else (_turned(batch, axes) for batch in encoded))
+    batches = encoded(config, model, split, clips)
+    return prediction_errors(model, batches if axes is None else (_turned(batch, axes) for batch in batches))
 
 
 def _offline(model: WorldModel, config: Config, split: Split) -> dict[str, float]:
     """Return what might tell how a model fares in closed loop."""
-    dataset = with_latents_if_there(config, open_dataset(config.data), model)
-    train, test = (
-        [
-            encode_batch(model, batch, device=torch.device("cpu"), chunk=64)
-            for batch in validation_batches(dataset, one, clips=CLIPS, batch_size=32)
-        ]
-        for one in ("train", split)
-    )
-    return offline_figures(model, dataset.spaces.action, train, test, PLANNING)
+    train, test = encoded(config, model, "train", CLIPS), encoded(config, model, split, CLIPS)
+    return offline_figures(model, open_dataset(config.data).spaces.action, train, test, PLANNING)
 
 
 def _turned(batch: LatentBatch, axes: Axes) -> LatentBatch:

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from cells import BASES, BEST, METHODS
-from results import REACHED_CM, Figures, last, main_cells, pick, share_reached
+from cells import BASES, BEST, SHIFTS
+from results import CHANGES, REACHED_CM, Figures, last, main_cells, pick, share_reached
 
 
 def draw(results: Sequence[Figures], path: Path) -> None:
@@ -25,30 +25,29 @@ def draw(results: Sequence[Figures], path: Path) -> None:
     figure.savefig(path, dpi=130)
 
 
-_COLOURS = {"zero-shot": "#999999", "calibrated": "#9467bd", "LoRA": "#1f77b4", "full": "#2ca02c", "scratch": "#d62728"}
+SHOWN = {
+    "zero-shot": "#999999",
+    BEST: "#1f77b4",
+    "full": "#2ca02c",
+    "scratch": "#f4a582",
+    "scratch, 3x steps": "#d62728",
+}
 
 
 def _bars(axes: Any, results: Sequence[Figures]) -> None:
-    names = [name for name in METHODS if any(main_cells(results, base, name) for base in (*BASES, "none"))]
-    for side, base in enumerate(BASES):
-        for place, name in enumerate(names):
-            method = METHODS[name]
-            of = "none" if method.kind == "scratch" else base
-            found = main_cells(results, of, name)
-            if not found or (of == "none" and side):
-                continue
-            share = share_reached(found)
-            at = place + (0.0 if of == "none" else 0.4 * side - 0.2)
-            error = [[share.value - share.low], [share.high - share.value]]
-            look = {"color": _COLOURS[method.kind], "alpha": 1.0 if side or of == "none" else 0.55}
-            axes.bar(at, share.value, 0.8 if of == "none" else 0.38, yerr=error, capsize=2, **look)
-    axes.set_xticks(range(len(names)), names, rotation=30, ha="right")
+    groups, shown = [(shift, base) for shift in SHIFTS for base in BASES], {}
+    for place, (name, colour) in enumerate(SHOWN.items()):
+        for group, (shift, base) in enumerate(groups):
+            found = main_cells(results, base, name, shift)
+            if found:
+                share, at = share_reached(found), group + 0.16 * (place - 2)
+                error = [[share.value - share.low], [share.high - share.value]]
+                shown[name] = axes.bar(at, share.value, 0.15, yerr=error, capsize=2, color=colour)
+    axes.set_xticks(range(len(groups)), [f"{CHANGES[shift]}\nbase of {base}" for shift, base in groups], fontsize=8)
     axes.set_ylim(0, 1.05)
     axes.set_ylabel("goals reached: within 5 cm at the end")
-    axes.set_title(
-        "Reach after a change of camera and look, 20 demonstrations (pale: base of one camera, full: of many)",
-        fontsize=11,
-    )
+    axes.set_title("Reach after a change of the world, 20 demonstrations", fontsize=11)
+    axes.legend(shown.values(), shown, fontsize=8, ncols=len(SHOWN), loc="upper center", bbox_to_anchor=(0.5, -0.14))
 
 
 def _ways(axes: Any, results: Sequence[Figures]) -> None:
@@ -56,9 +55,9 @@ def _ways(axes: Any, results: Sequence[Figures]) -> None:
         ("do nothing", "zero-shot", "#bbbbbb", lambda one: one["baselines"]["do nothing"]),
         ("random", "zero-shot", "#dddd88", lambda one: one["baselines"]["random"]),
         ("oracle", "zero-shot", "#000000", lambda one: one["baselines"]["oracle"]),
-        ("zero-shot", "zero-shot", _COLOURS["zero-shot"], lambda one: one["reach"]["l1"]),
-        (BEST, BEST, _COLOURS["LoRA"], lambda one: one["reach"]["l1"]),
-        ("full", "full", _COLOURS["full"], lambda one: one["reach"]["l1"]),
+        ("zero-shot", "zero-shot", SHOWN["zero-shot"], lambda one: one["reach"]["l1"]),
+        (BEST, BEST, SHOWN[BEST], lambda one: one["reach"]["l1"]),
+        ("full", "full", SHOWN["full"], lambda one: one["reach"]["l1"]),
     ]
     for label, method, colour, part in lines:
         found = main_cells(results, "many cameras", method)
@@ -87,7 +86,7 @@ def _counts(axes: Any, results: Sequence[Figures]) -> None:
                     list(points.values()),
                     style,
                     marker="o",
-                    color=_COLOURS[METHODS[method].kind],
+                    color=SHOWN[method],
                     label=label,
                 )
     axes.set_xscale("log", base=2)

@@ -7,13 +7,18 @@ from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
+import torch
 from cells import METHODS, SHIFTS, TRAINING, Base
 from other_worlds import TASKS, data_of, origin_of, record
 
 from vjepa2_ac.config import Config, DataConfig, ModelConfig, RldsData
+from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.loading import load_config
 from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.encoding.encode_dataset import encode_config
+from vjepa2_ac.data.loader import validation_batches
+from vjepa2_ac.encoding.batch import encode_batch
+from vjepa2_ac.encoding.encode_dataset import encode_config, with_latents_if_there
+from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import SILENT, Reporter
@@ -107,6 +112,13 @@ def encode(data: DataConfig, base: str) -> None:
     """Keep the latents of every episode: cells leave out different ones. Nothing to do where they are there."""
     model = ModelConfig(base=base, dtype="float32")
     encode_config(Config(run_dir="none", data=data, model=model, training=TRAINING))
+
+
+def encoded(config: Config, model: WorldModel, split: Split, clips: int) -> list[LatentBatch]:
+    """Return so many clips of a split, from the latents that training used."""
+    dataset = with_latents_if_there(config, open_dataset(config.data), model)
+    batches = validation_batches(dataset, split, clips=min(clips, len(dataset.windows(split))), batch_size=32)
+    return [encode_batch(model, batch, device=torch.device("cpu"), chunk=64) for batch in batches]
 
 
 def training_episodes(data: DataConfig, count: int, seed: int) -> tuple[str, ...]:

@@ -12,6 +12,11 @@ from cells import METHODS
 from vjepa2_ac.intervals import Estimate, share_of
 
 REACHED_CM = 5.0
+CHANGES = {
+    "look": "another camera and look",
+    "motion": "the robot turned by 60 degrees",
+    "randomized": "all anew in every episode",
+}
 Figures = dict[str, Any]
 
 
@@ -53,7 +58,8 @@ def last(one: Figures) -> float:
     return float(one["shifted"]["rollout_over_persistence"][-1])
 
 
-def main_cells(results: Sequence[Figures], base: str, method: str) -> list[Figures]:
-    """Return a row of the main table: zero-shot needs no demonstrations, the others have 20."""
+def main_cells(results: Sequence[Figures], base: str, method: str, shift: str = "look") -> list[Figures]:
+    """Return a row of a main table: zero-shot needs no demonstrations, the others have 20; from scratch, no base."""
     episodes = 0 if METHODS[method].kind == "zero-shot" else 20
-    return pick(results, shift="look", base=base, method=method, episodes=episodes)
+    base = "none" if METHODS[method].kind == "scratch" else base
+    return pick(results, shift=shift, base=base, method=method, episodes=episodes)

@@ -12,7 +12,7 @@ from cells import AXES, BASES, BEST, IN_EVERY_WORLD, IN_SOME_WORLDS, METHODS, SH
 from offline import correlations
 from other_worlds import MANY, TASKS
 from plot import draw
-from results import Figures, last, main_cells, of_policy, pick, reached, read_results, share_reached
+from results import CHANGES, Figures, last, main_cells, of_policy, pick, reached, read_results, share_reached
 
 from vjepa2_ac.intervals import mean_of, share_of
 
@@ -98,31 +98,27 @@ def place_in(page: Path) -> tuple[str, str, str, str]:
 
 
 def summary(results: Sequence[Figures]) -> str:
-    """Return the short table: what each method reaches and predicts after the change of camera and look."""
-    head = " | ".join(f"base of {base}: reached | left, cm | error 0.8 s ahead" for base in BASES)
-    rows = [f"| | trained | {head} |", "|---|---|" + "---|---|---|" * len(BASES)]
+    """Return the short table: the share of goals that each method reaches after each change, with Wilson's interval."""
+    columns = [(shift, base) for shift in SHIFTS for base in BASES]
+    heads = [f"{CHANGES[shift]}, base of {base}" for shift, base in columns]
+    rows = [f"| {EPISODES} demonstrations | trained | {' | '.join(heads)} |", "|---|---|" + "---|" * len(columns)]
     for name in ("do nothing", "random", "oracle"):
-        parts = [part for base in BASES for part in (*_short(of_policy(results, base, name)), "")]
-        rows.append(f"| {name} | | {' | '.join(parts)} |")
+        shares = [_share(of_policy(results, base, name, shift)) for shift, base in columns]
+        rows.append(f"| {name} | | {' | '.join(shares)} |")
     for method in (one for one in METHODS.values() if one.kind != "cloned"):
-        by_base = [main_cells(results, "none" if method.kind == "scratch" else base, method.name) for base in BASES]
-        if not any(by_base):
-            continue
-        share = next((one["trained_share"] for found in by_base for one in found), 0.0)
-        parts = []
-        for found in by_base:
-            parts += [*_short(found), f"{np.mean([last(one) for one in found]):.3f}" if found else ""]
-        rows.append(f"| {method.name} | {f'{share:.1%}' if share else ''} | {' | '.join(parts)} |")
+        found = [main_cells(results, base, method.name, shift) for shift, base in columns]
+        share = next((one["trained_share"] for cells in found for one in cells), 0.0)
+        if any(found):
+            rows.append(f"| {method.name} | {f'{share:.1%}' if share else ''} | {' | '.join(map(_share, found))} |")
     return "\n".join(rows)
 
 
-def _short(found: Sequence[Figures]) -> tuple[str, str]:
-    """Return the share of goals that were reached with its interval, and what is left on average in cm."""
+def _share(found: Sequence[Figures]) -> str:
+    """Return the share of all goals or problems of some cells that were reached, with its interval."""
     if not found:
-        return "", ""
+        return ""
     share = share_reached(found)
-    left = np.mean([row[-1] for one in found for row in one["reach"]["l1"]["distance_cm"]])
-    return f"{share.value:.0%} [{share.low:.0%}, {share.high:.0%}]", f"{left:.1f}"
+    return f"{share.value:.0%} [{share.low:.0%}, {share.high:.0%}]"
 
 
 def _main(results: Sequence[Figures]) -> str:
@@ -130,19 +126,12 @@ def _main(results: Sequence[Figures]) -> str:
     for base in BASES:
         rows = _policies(results, base)
         for method in METHODS.values():
-            name = "none" if method.kind == "scratch" else base
-            found = main_cells(results, name, method.name)
+            found = main_cells(results, base, method.name)
             if found:
                 rows.append(_row(method.name, found))
         if len(rows) > 3:
             parts.append(f"Base of **{base}**\n\n" + _table(rows))
     return "\n\n".join(parts) if len(parts) > 1 else ""
-
-
-_TITLES = {
-    "motion": "The robot mounted turned by 60 degrees",
-    "randomized": "Camera, colours, light and textures anew in every episode, and things that move",
-}
 
 
 def _shifted(results: Sequence[Figures], shift: str) -> str:
@@ -151,7 +140,7 @@ def _shifted(results: Sequence[Figures], shift: str) -> str:
         for method in METHODS.values():
             found = pick(results, shift=shift, base=base, method=method.name)
             rows += [_row(method.name if base == "none" else f"{method.name} ({base})", found)] if found else []
-    return f"### {_TITLES[shift]} (20 demonstrations)\n\n" + _table(rows) if rows else ""
+    return f"### {CHANGES[shift].capitalize()} ({EPISODES} demonstrations)\n\n" + _table(rows) if rows else ""
 
 
 def _axes(results: Sequence[Figures]) -> str:
@@ -236,9 +225,8 @@ def _done(found: Sequence[Figures]) -> str:
     """Return the share of all problems that were solved, with its interval, and the error at the farthest horizon."""
     if not found:
         return ""
-    share = share_reached(found)
     error = [last(one) for one in found if "shifted" in one]
-    return f"{share.value:.0%} [{share.low:.0%}, {share.high:.0%}]" + (f"; {np.mean(error):.3f}" if error else "")
+    return _share(found) + (f"; {np.mean(error):.3f}" if error else "")
 
 
 def trust(results: Sequence[Figures]) -> str:
