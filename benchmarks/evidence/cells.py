@@ -134,12 +134,14 @@ _RATES = {
     "full": (1e-3, 2e-3, 4e-3, 8e-3, 1.6e-2),
     "scratch": (1.5e-3, 3e-3, 6e-3, 1.2e-2, 2.4e-2),
 }
+_RATES_ELSEWHERE = {BEST: (1e-3, 3e-3, 8e-3), "full": (2e-3, 8e-3), "scratch": (3e-3, 1.2e-2)}
 CANDIDATES = {
     f"{name}, lr {rate:g}": replace(METHODS[name], name=f"{name}, lr {rate:g}", learning_rate=rate)
-    for name, rates in _RATES.items()
+    for of in (_RATES, _RATES_ELSEWHERE)
+    for name, rates in of.items()
     for rate in rates
 }
-"""What the learning rates were chosen from, on validation episodes and goals."""
+"""What the learning rates were chosen from, on validation episodes and goals: of `look`, then of the other shifts."""
 
 
 def method_of(name: str) -> Method:
@@ -202,8 +204,11 @@ IN_SOME_WORLDS = ("in/out only", "LoRA r4", "LoRA r16", "DoRA r16", "scratch")
 
 def candidate_cells() -> Iterator[Cell]:
     """Yield what the learning rates are chosen by: one base, one seed."""
-    for name, method in CANDIDATES.items():
-        yield Cell("look", "none" if method.kind == "scratch" else "many cameras", name, 20, 0)
+    for shift, of in {"look": _RATES, "motion": _RATES_ELSEWHERE, "randomized": _RATES_ELSEWHERE}.items():
+        for name, rates in of.items():
+            base: Base = "none" if METHODS[name].kind == "scratch" else "many cameras"
+            for rate in rates:
+                yield Cell(shift, base, f"{name}, lr {rate:g}", 20, 0)
 
 
 def _of(shift: str, methods: tuple[str, ...], episodes: int, seed: int) -> Iterator[Cell]:
