@@ -144,9 +144,16 @@ CANDIDATES = {
 """What the learning rates were chosen from, on validation episodes and goals: of `look`, then of the other shifts."""
 
 
-def method_of(name: str) -> Method:
-    """Return a method, or a candidate for one, by its name."""
-    return METHODS[name] if name in METHODS else CANDIDATES[name]
+CHOSEN = {
+    "randomized": {BEST: 1e-3, "full": 2e-3, "scratch": 3e-3, "scratch, 3x steps": 3e-3},
+}
+"""Learning rates of a shift where another than that of `look` was the best."""
+
+
+def method_of(name: str, shift: str = "look") -> Method:
+    """Return a method, or a candidate for one, by its name, with the learning rate that was chosen for a shift."""
+    method = METHODS[name] if name in METHODS else CANDIDATES[name]
+    return replace(method, learning_rate=CHOSEN.get(shift, {}).get(name, method.learning_rate))
 
 
 @dataclass(frozen=True)

@@ -133,7 +133,7 @@ def made_with() -> dict[str, str]:
 
 def config_of(cell: Cell, folder: Path) -> Config:
     """Return the run of a cell: the config that anybody would write."""
-    method = method_of(cell.method)
+    method = method_of(cell.method, cell.shift)
     data = data_shifted(folder, cell.shift)
     left_out = training_episodes(data, cell.episodes, cell.seed) if cell.episodes else ()
     return Config(
