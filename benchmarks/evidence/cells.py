@@ -184,7 +184,7 @@ def all_cells(seeds: int = 3) -> Iterator[Cell]:
     for seed in range(seeds):
         yield from _of("look", tuple(name for name in arm if name not in main), 20, seed)
     for seed in range(seeds):
-        yield from _of("motion", (*main, LONGER), 20, seed)
+        yield from _of("motion", (*main, LONGER, "scratch, 3x steps"), 20, seed)
     for seed in range(seeds):
         yield from _of("randomized", ("zero-shot", BEST, "full", "scratch", "scratch, 3x steps"), 20, seed)
     for seed in range(seeds):
