@@ -43,6 +43,8 @@ BEST = "LoRA r32 + in/out"
 """The LoRA that takes part in every comparison; not chosen by test goals (`--choose`)."""
 LONGER = f"{BEST}, 3x steps"
 """Of the turned robot alone, where the usual steps leave most to be done."""
+ROLLOUTS = {f"{BEST}, rollout of {steps}": steps for steps in (1, 3)}
+"""How many steps the loss rolls out, instead of 2: on the base of many cameras alone."""
 
 STEPS = 400
 TRAINING = TrainingConfig(
@@ -78,6 +80,7 @@ class Method:
     blocks: bool = True  # False: of the blocks one layer alone, by rank 1 (PEFT asks for one)
     times: int = 1  # so many times the steps
     layer: int | None = None  # the block of the encoder after which features are taken; None: the last
+    rollout: int = 2  # steps of the loss
     learning_rate: float = 1e-3
 
     @property
@@ -101,6 +104,7 @@ class Method:
         return TRAINING.model_copy(
             update={
                 "steps": STEPS * self.times,
+                "rollout_steps": self.rollout,
                 "learning_rate": self.learning_rate,
                 "allow_weak_base": True,
             }
@@ -118,6 +122,7 @@ METHODS = {
             for rank in (4, 8, 16, 32)
         ),
         Method(LONGER, "LoRA", 32, in_out=True, times=3, learning_rate=3e-3),
+        *(Method(name, "LoRA", 32, in_out=True, rollout=steps, learning_rate=3e-3) for name, steps in ROLLOUTS.items()),
         Method("in/out only", "LoRA", 1, in_out=True, blocks=False, learning_rate=5e-3),
         Method("DoRA r16", "LoRA", 16, dora=True, learning_rate=5e-3),
         Method("full", "full", learning_rate=8e-3),
@@ -178,15 +183,18 @@ class Cell:
 def all_cells(seeds: int = 3) -> Iterator[Cell]:
     """Yield every cell, those that matter most first."""
     main = ("zero-shot", AXES, BEST, "full", "scratch")
-    arm = tuple(name for name, method in METHODS.items() if method.kind != "cloned" and name != LONGER)
+    elsewhere = {LONGER, *ROLLOUTS, *main}
+    others = tuple(name for name, method in METHODS.items() if method.kind != "cloned" and name not in elsewhere)
     for seed in range(seeds):
         yield from _of("look", main, 20, seed)
     for seed in range(seeds):
-        yield from _of("look", tuple(name for name in arm if name not in main), 20, seed)
+        yield from _of("look", others, 20, seed)
     for seed in range(seeds):
         yield from _of("motion", (*main, LONGER, "scratch, 3x steps"), 20, seed)
     for seed in range(seeds):
         yield from _of("randomized", ("zero-shot", BEST, "full", "scratch", "scratch, 3x steps"), 20, seed)
+    for seed in range(seeds):
+        yield from (Cell("look", "many cameras", name, 20, seed) for name in ROLLOUTS)
     for seed in range(seeds):
         for episodes in (10, 40):
             yield from _of("look", (BEST, "full", "scratch"), episodes, seed)

@@ -43,7 +43,8 @@ def test_cells_have_names_of_their_own_and_hold_all_that_is_to_be_compared(evide
         }
         methods = evidence.cells.METHODS.items()
         of_arm = {name for name, method in methods if method.kind not in {"scratch", "cloned"}}
-        assert main == of_arm - {evidence.cells.LONGER}
+        elsewhere = {evidence.cells.LONGER} | (set(evidence.cells.ROLLOUTS) if base == "one camera" else set())
+        assert main == of_arm - elsewhere
     of_best = [cell for cell in cells if cell.method == evidence.cells.BEST]
     assert {cell.episodes for cell in of_best if cell.shift == "look"} == {10, 20, 40}
     assert {cell.episodes for cell in of_best if cell.shift == "Lift"} == {5, 20, 80}
@@ -63,6 +64,10 @@ def test_methods_differ_only_in_what_is_trained_and_how_fast(evidence: Any) -> N
     assert adapters["DoRA r16"] == adapters["LoRA r16"].model_copy(update={"dora": True})
     assert rest("LoRA r4") == rest("LoRA r32 + in/out") == rest("full") == rest("scratch")
     assert rest("scratch, 3x steps").steps == 3 * rest("scratch").steps
+    of_one, of_three = (rest(name) for name in evidence.cells.ROLLOUTS)
+    assert (of_one.rollout_steps, rest("full").rollout_steps, of_three.rollout_steps) == (1, 2, 3)
+    slower, usual = (evidence.cells.method_of("full", shift).learning_rate for shift in ("randomized", "motion"))
+    assert slower < usual == evidence.cells.METHODS["full"].learning_rate
 
 
 def test_the_looks_differ_and_the_motion_does_not_and_the_other_way_round(evidence: Any) -> None:
