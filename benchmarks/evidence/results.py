@@ -13,9 +13,9 @@ from vjepa2_ac.intervals import Estimate, share_of
 
 REACHED_CM = 5.0
 CHANGES = {
-    "look": "another camera and look",
-    "motion": "the robot turned by 60 degrees",
-    "randomized": "all anew in every episode",
+    "look": "camera and look",
+    "motion": "robot turned",
+    "randomized": "all anew",
 }
 Figures = dict[str, Any]
 
