@@ -147,7 +147,7 @@ class SimulatedArm:
         return np.concatenate([self._camera(name).image(self._data) for name in names], axis=1)
 
     def silhouette(self, camera: str = "exterior_1") -> Bool[np.ndarray, "height width"]:
-        """Return which pixels of the current image of a camera show the arm, or a block."""
+        """Return which pixels of the current image of a camera show the arm, a block, or things that circle."""
         return self._camera(camera).silhouette(self._data)
 
     def _camera(self, camera: str) -> RayCamera:

@@ -168,7 +168,7 @@ class RayCamera:
         return pixels.reshape(self._height, self._width, 3)
 
     def silhouette(self, data: Any) -> Bool[np.ndarray, "height width"]:
-        """Return which pixels of the image show the arm, or a block."""
+        """Return which pixels of the image show what can move: the arm, a block, things that circle."""
         behind = self._background = self._background or self._see_background(data)
         shown = np.zeros(self._height * self._width, dtype=bool)
         shown[self._see_arm(data, behind)[0]] = True
