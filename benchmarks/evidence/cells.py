@@ -133,20 +133,21 @@ METHODS = {
     )
 }
 
-_RATES = {
+_ELSEWHERE = {BEST: (1e-3, 3e-3, 8e-3), "full": (2e-3, 8e-3), "scratch": (3e-3, 1.2e-2)}
+_LOOK_RATES = {
     "LoRA r16 + in/out": (3e-3, 5e-3, 8e-3),
     BEST: (2e-3, 3e-3, 5e-3, 8e-3),
     "full": (1e-3, 2e-3, 4e-3, 8e-3, 1.6e-2),
     "scratch": (1.5e-3, 3e-3, 6e-3, 1.2e-2, 2.4e-2),
 }
-_RATES_ELSEWHERE = {BEST: (1e-3, 3e-3, 8e-3), "full": (2e-3, 8e-3), "scratch": (3e-3, 1.2e-2)}
+_RATES = {"look": _LOOK_RATES, "motion": _ELSEWHERE, "randomized": _ELSEWHERE}
 CANDIDATES = {
     f"{name}, lr {rate:g}": replace(METHODS[name], name=f"{name}, lr {rate:g}", learning_rate=rate)
-    for of in (_RATES, _RATES_ELSEWHERE)
+    for of in _RATES.values()
     for name, rates in of.items()
     for rate in rates
 }
-"""What the learning rates were chosen from, on validation episodes and goals: of `look`, then of the other shifts."""
+"""What the learning rates were chosen from, on validation episodes and goals of each shift."""
 
 
 CHOSEN = {
@@ -219,7 +220,7 @@ IN_SOME_WORLDS = ("in/out only", "LoRA r4", "LoRA r16", "DoRA r16", "scratch")
 
 def candidate_cells() -> Iterator[Cell]:
     """Yield what the learning rates are chosen by: one base, one seed."""
-    for shift, of in {"look": _RATES, "motion": _RATES_ELSEWHERE, "randomized": _RATES_ELSEWHERE}.items():
+    for shift, of in _RATES.items():
         for name, rates in of.items():
             base: Base = "none" if METHODS[name].kind == "scratch" else "many cameras"
             for rate in rates:

@@ -7,16 +7,14 @@ from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
-import torch
 from cells import METHODS, SHIFTS, TRAINING, Base
 from other_worlds import TASKS, data_of, origin_of, record
 
+from vjepa2_ac import encode, read_clips
 from vjepa2_ac.config import Config, DataConfig, ModelConfig, RldsData
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.loading import load_config
 from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.data.loader import validation_batches
-from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.encoding.encode_dataset import encode_config, with_latents_if_there
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.model.checkpoints.loading import load_base
@@ -79,8 +77,8 @@ def prepare_world(folder: Path, task: str, reporter: Reporter = SILENT) -> None:
     for when in ("before", "after"):
         record(folder, task, when)
     base = Path(base_model(folder, "one camera", 0, task))
-    encode(data_of(folder, task, "before"), BUILTIN)  # all share its encoder
-    encode(data_of(folder, task, "after"), BUILTIN)
+    keep_latents(data_of(folder, task, "before"), BUILTIN)  # all share its encoder
+    keep_latents(data_of(folder, task, "after"), BUILTIN)
     if not base.exists():
         config = load_config(BASE_CONFIG, [f"run_dir={folder / f'run-{base.name}'}", *OF_A_WORLD])
         start = config.model.model_copy(update={"base": BUILTIN, "random": None})  # has seen an arm, no such world
@@ -105,10 +103,10 @@ def prepare(folder: Path, shifts: Collection[str], seeds: int, reporter: Reporte
         export_run(run, Path(base_model(folder, "one camera", 0)))
     for data in (data_a(folder), *(data_shifted(folder, shift) for shift in SHIFTS)):
         for base in ("one camera", "many cameras"):
-            encode(data, base_model(folder, base, 0))
+            keep_latents(data, base_model(folder, base, 0))
 
 
-def encode(data: DataConfig, base: str) -> None:
+def keep_latents(data: DataConfig, base: str) -> None:
     """Keep the latents of every episode: cells leave out different ones. Nothing to do where they are there."""
     model = ModelConfig(base=base, dtype="float32")
     encode_config(Config(run_dir="none", data=data, model=model, training=TRAINING))
@@ -117,8 +115,7 @@ def encode(data: DataConfig, base: str) -> None:
 def encoded(config: Config, model: WorldModel, split: Split, clips: int) -> list[LatentBatch]:
     """Return so many clips of a split, from the latents that training used."""
     dataset = with_latents_if_there(config, open_dataset(config.data), model)
-    batches = validation_batches(dataset, split, clips=min(clips, len(dataset.windows(split))), batch_size=32)
-    return [encode_batch(model, batch, device=torch.device("cpu"), chunk=64) for batch in batches]
+    return [encode(model, batch, chunk=64) for batch in read_clips(dataset, split, clips=clips, batch_size=32)]
 
 
 def training_episodes(data: DataConfig, count: int, seed: int) -> tuple[str, ...]:

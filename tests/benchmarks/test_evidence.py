@@ -137,7 +137,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
             (prepare.data_shifted(modules.folder, "look"), "look"),
         ):
             prepare._record(data, domain, 11, 3)
-            prepare.encode(data, prepare.BUILTIN)
+            prepare.keep_latents(data, prepare.BUILTIN)
         yield modules
     for name in MODULES:
         sys.modules.pop(name, None)

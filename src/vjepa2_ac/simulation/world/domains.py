@@ -242,8 +242,7 @@ def compile_scene(domain: Domain, *, block: bool = False, mark: bool = False) ->
             geom = one.find("geom")
             (ET.SubElement(one, "geom") if geom is None else geom).set("rgba", _text(*getattr(domain.look, name), 1.0))
     bodies["link0"].set("euler", _text(0.0, 0.0, np.deg2rad(domain.base_yaw_deg)))
-    things = list(_things(np.random.default_rng(domain.clutter_seed), avoid_work_area=block))
-    for number, thing in enumerate(things):
+    for number, thing in enumerate(_things(np.random.default_rng(domain.clutter_seed), avoid_work_area=block)):
         if number < domain.moving:
             body = ET.SubElement(world, "body", name=f"{MOVING}{number}", mocap="true", pos=thing.pop("pos"))
             ET.SubElement(body, "geom", thing | {"group": str(ARM_GROUP), "contype": "0", "conaffinity": "0"})
