@@ -36,6 +36,7 @@ PAGES = {
     "docs/scaling.md": "[data]",
     "docs/decoding.md": "[sim]",
     "docs/planning.md": "[sim]",
+    "docs/policies.md": "[sim]",
     "docs/python.md": "[sim]",
     "docs/serving.md": "[serve]",
     "docs/troubleshooting.md": "[data]",
@@ -64,6 +65,7 @@ SHORTER = {  # by the first words of a command
     "simulate record": "--episodes 10 --steps 33",
     "simulate": f"--episodes 1 --steps 1 {FEW_SAMPLES}",
     "plan": FEW_SAMPLES,
+    "prior": "--steps 20",
     "data calibrate CONFIG --axes": "--limit 8 || test $? = 1",  # of so few pairs: not to plan by
     "data calibrate": "--limit 8",
     "python examples/finetune.py": "training.steps=2 training.warmup_steps=0 training.allow_weak_base=true",
@@ -104,6 +106,7 @@ NOT_WALKED = {  # pattern: why
     r"^torchrun|^accelerate|^sbatch|^ACCELERATE": "several GPUs; tests/distributed and tests/test_train_slurm.py",
     r"^python (mp4_and_csv|ros2_bag|lance_to_files)": "needs recordings; tests/init/test_converters.py runs it",
     r"^cd day1": "needs the record of a server; tests/serving/test_recording.py makes the decision again",
+    r"^vjepa2-ac score": "needs chunks of a policy; tests/evaluation/policies makes some",
     r"planning.axes=": "refused where the axes were fitted to so few pairs; tests/planning/test_axes.py",
     r"^vjepa2-ac serve": "walked last, with the simulated arm as its client",
 }

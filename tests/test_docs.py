@@ -44,6 +44,7 @@ GUIDES = (
     "decoding",
     "explore",
     "planning",
+    "policies",
     "serving",
     "scaling",
     "encoders",

@@ -129,7 +129,7 @@ METHODS = {
         Method("scratch", "scratch", learning_rate=1.2e-2),
         Method("scratch, features of block 3 of 4", "scratch", layer=3, learning_rate=1.2e-2),
         Method("scratch, 3x steps", "scratch", times=3, learning_rate=1.2e-2),
-        Method("behaviour cloning", "cloned", times=3),
+        Method("behaviour cloning", "cloned"),  # an action prior, as `vjepa2-ac prior` trains it
     )
 }
 
@@ -140,18 +140,20 @@ _LOOK_RATES = {
     "full": (1e-3, 2e-3, 4e-3, 8e-3, 1.6e-2),
     "scratch": (1.5e-3, 3e-3, 6e-3, 1.2e-2, 2.4e-2),
 }
-_RATES = {"look": _LOOK_RATES, "motion": _ELSEWHERE, "randomized": _ELSEWHERE}
+_RATES = {"look": _LOOK_RATES, "motion": _ELSEWHERE, "randomized": _ELSEWHERE, "Lift": _ELSEWHERE}
 CANDIDATES = {
     f"{name}, lr {rate:g}": replace(METHODS[name], name=f"{name}, lr {rate:g}", learning_rate=rate)
     for of in _RATES.values()
     for name, rates in of.items()
     for rate in rates
 }
-"""What the learning rates were chosen from, on validation episodes and goals of each shift."""
+"""What the learning rates were chosen from, on validation episodes and goals of each shift; of worlds that others made
+on Lift alone, for all their tasks."""
 
 
 CHOSEN = {
     "randomized": {BEST: 1e-3, "full": 2e-3, "scratch": 3e-3, "scratch, 3x steps": 3e-3},
+    "Lift": {"scratch": 3e-3, "scratch, 3x steps": 3e-3},
 }
 """Learning rates of a shift where another than that of `look` was the best."""
 
@@ -159,7 +161,8 @@ CHOSEN = {
 def method_of(name: str, shift: str = "look") -> Method:
     """Return a method, or a candidate for one, by its name, with the learning rate that was chosen for a shift."""
     method = METHODS[name] if name in METHODS else CANDIDATES[name]
-    return replace(method, learning_rate=CHOSEN.get(shift, {}).get(name, method.learning_rate))
+    chosen = CHOSEN.get(shift if shift in SHIFTS else "Lift", {})
+    return replace(method, learning_rate=chosen.get(name, method.learning_rate))
 
 
 @dataclass(frozen=True)
@@ -222,7 +225,9 @@ def candidate_cells() -> Iterator[Cell]:
     """Yield what the learning rates are chosen by: one base, one seed."""
     for shift, of in _RATES.items():
         for name, rates in of.items():
-            base: Base = "none" if METHODS[name].kind == "scratch" else "many cameras"
+            base: Base = (
+                "none" if METHODS[name].kind == "scratch" else "many cameras" if shift in SHIFTS else "one camera"
+            )
             for rate in rates:
                 yield Cell(shift, base, f"{name}, lr {rate:g}", 20, 0)
 

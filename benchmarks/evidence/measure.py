@@ -15,7 +15,6 @@ import numpy as np
 import other_worlds
 import torch
 from cells import PLANNING, SHIFTS, Cell, energies_of, method_of
-from cloning import Cloning, clone
 from offline import offline_figures, visited_correlation
 from prepare import base_model, data_before, data_shifted, encoded, training_episodes
 
@@ -32,6 +31,7 @@ from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.model_setup import Axes, Fingerprints
+from vjepa2_ac.planning.prior.train_prior import train_prior
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.checkpoint import NEWEST
 from vjepa2_ac.runs.loading import load_run
@@ -104,13 +104,16 @@ def measure(cell: Cell, folder: Path, *, goals: int = GOALS, choosing: bool = Fa
 
 
 def _cloned(cell: Cell, config: Config, folder: Path, goals: int, *, choosing: bool) -> dict[str, Any]:
-    """Return the figures of a policy that imitates: it predicts nothing."""
-    began, model = time.process_time(), load_base(config.model, seed=cell.seed)
-    policy = Cloning(clone(config, model, config.training.steps, cell.seed), config.data.crop)
+    """Return the figures of a policy that imitates: it predicts nothing, and does not search."""
+    began, place = time.process_time(), folder / "priors" / cell.name
+    found = train_prior(config, place).held_out
     minutes, seed = (time.process_time() - began) / 60, (VALIDATION_GOALS if choosing else TEST_GOALS) + cell.seed
-    found = closed_loop(cell, policy, folder, seed=seed, goals=goals)
-    trained = {"trained_share": 1.0, "adapter_mb": 0.0, "cpu_minutes": minutes, "minutes": minutes}
-    return {"cell": asdict(cell) | {"name": cell.name}, **trained, "reach": {"l1": found}}
+    acts = PLANNING.model_copy(update={"planner": "prior", "prior": str(place)})
+    model = load_base(config.model, seed=cell.seed)
+    policy = planner(model, "l1", acts, goals_of=None if cell.shift in SHIFTS else other_worlds.goals_of)
+    reached = closed_loop(cell, policy, folder, seed=seed, goals=goals)
+    trained = {"trained_share": 1.0, "adapter_mb": 0.0, "cpu_minutes": minutes, "minutes": minutes, "held_out": found}
+    return {"cell": asdict(cell) | {"name": cell.name}, **trained, "reach": {"l1": reached}}
 
 
 def measure_alone(cell: Cell, folder: Path, goals: int, choosing: bool) -> dict[str, Any]:

@@ -34,6 +34,7 @@ _REFERENCE = {  # page: what it has; below these, all that the code makes
 }
 _PROJECT = {
     "made/results": "tables that commands of the repository write",
+    "published_figures": "commands that repeat figures of others",
     "IMPLEMENTATION_NOTES": "how it works, and how exactness is checked",
     "made/changelog": "what changed for users",
     "made/contributing": "how to take part",

@@ -153,6 +153,7 @@ PLANNERS = Registry(
         "icem": "planning.solvers:IcemSolver",
         "mppi": "planning.solvers:MppiSolver",
         "gradient": "planning.solvers:GradientSolver",
+        "prior": "planning.solvers:PriorSolver",
     },
 )
 ENERGIES = Registry(

@@ -111,7 +111,12 @@ WRONG = {
     "5 and 1 numbers": {
         "observation/image": image(0), "observation/cartesian_position": STATE[:5], "observation/gripper_position": 0.5,
     },
-    "endpoint: 'kill'. needed: infer or reset": {**OURS, "endpoint": "kill"},
+    "endpoint: 'kill'. needed: infer or reset or score": {**OURS, "endpoint": "kill"},
+    "policy/chunks: None. needed: floats": {**OURS, "endpoint": "score"},
+    "policy/chunks: an array of shape \\(4, 7\\)": {**OURS, "policy/chunks": np.zeros((4, 7))},
+    "policy/chunks: an array of shape \\(0, 4, 7\\)": {**OURS, "policy/chunks": np.zeros((0, 4, 7))},
+    "policy/chunks: an array .* int64": {**OURS, "policy/chunks": np.zeros((1, 4, 7), dtype=np.int64)},
+    "policy/form: 'joints'. needed: targets or deltas or offsets": {**OURS, "policy/form": "joints"},
     "endpoint: an array": {**OURS, "endpoint": np.zeros(3)},
     "reset: 1. needed: True or False": {**OURS, "reset": 1},
     "session_id: 3. needed: a text": {**OURS, "session_id": 3},

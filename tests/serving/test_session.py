@@ -13,6 +13,7 @@ from hypothesis.extra.numpy import arrays
 from served import STATE, controller, image, request, session, vector_controller
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.planning.chunks import changes_of_chunks
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.serving.session import ActionForm, GoneError, Session, SessionOptions, has_black_bars
@@ -234,3 +235,33 @@ def test_of_vectors_changes_or_targets_are_sent_and_never_poses() -> None:
         np.testing.assert_array_equal(nothing["actions"], np.tile(state if joined == "last" else 0 * state, (2, 1)))
         with pytest.raises(InputError, match="--actions pose: a model whose states are not poses"):
             Session(own, None, SessionOptions("pose"))
+
+
+def test_a_policys_chunks_are_scored_without_a_decision() -> None:
+    one, own = session(), controller()
+    own.reset(image(100))
+    chunks = STATE + np.random.default_rng(0).normal(0, 0.01, (3, 8, 7)) * [1, 1, 1, 1, 1, 1, 0]
+    keys = {"endpoint": "score", "policy/chunks": chunks}
+    found = ask(one, **request(goal_image=image(100), **keys))
+    expected = own.score(image(0), STATE, changes_of_chunks(chunks, STATE, form="targets", control_steps=4))
+    np.testing.assert_array_equal(found["energies"], expected.energies)
+    assert (found["best"], found["tied"], found["is_blind"]) == (expected.best, expected.tied, False)
+    assert not one.counts.decisions
+    blind = session(SessionOptions(is_blind=True))
+    found = ask(blind, **request(goal_image=image(100), **keys))
+    assert (found["best"], found["is_blind"]) == (None, True)
+    assert "3 control steps" in refused(one, **request(**keys | {"policy/chunks": chunks[:, :3]}))
+    assert "no goal" in refused(session(), **request(**keys))
+
+
+def test_a_search_starts_from_what_a_policy_would_do() -> None:
+    own = controller()
+    own.reset(image(100))
+    chunks = np.tile(np.array([0.01, 0.0, -0.005, 0, 0, 0, 0.0]), (4, 8, 1))
+    changes = changes_of_chunks(chunks, STATE, form="deltas", control_steps=4)
+    action = own.act(image(0), STATE, samples=changes)
+    found = ask(session(), **request(goal_image=image(100), **{"policy/chunks": chunks, "policy/form": "deltas"}))
+    np.testing.assert_array_equal(found["actions"][0], action)
+    assert not np.array_equal(action, ask(session(), **request(goal_image=image(100)))["actions"][0])
+    short = {"policy/chunks": chunks[:, :4], "policy/form": "deltas"}
+    assert "samples of a policy" in refused(session(), **request(goal_image=image(100), **short))

@@ -162,6 +162,7 @@ def _loaded(
 ) -> Served:
     """Load the model, and make a first decision; runs in the planning thread."""
     from vjepa2_ac.data.windows import require_stride
+    from vjepa2_ac.evaluation.policies.score import is_blind, ranking_of_run
     from vjepa2_ac.serving.about import in_words, metadata_of, roboarena_metadata, warm_up
     from vjepa2_ac.serving.recording import Recorder
     from vjepa2_ac.serving.request import IMAGE_KEYS
@@ -179,6 +180,7 @@ def _loaded(
         image_keys=IMAGE_KEYS if options.image_key is None else (options.image_key,),
         deadline_s=options.deadline,
         dry_run=options.dry_run,
+        is_blind=(ranking := ranking_of_run(options.subject, loaded.checkpoint)) is not None and is_blind(ranking),
     )
     controller = loaded.controller(extrinsics=extrinsics)
     kept = {name: loaded.goals_of(folder) for name, folder in (goals or {}).items()}

@@ -12,7 +12,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 from vjepa2_ac import __version__, process
-from vjepa2_ac.cli import closed_loop, data, evaluate, explore, plan, setup, train
+from vjepa2_ac.cli import closed_loop, data, evaluate, explore, plan, policies, setup, train
 from vjepa2_ac.cli.options import Commands, Handler, Parser, add_commands, parsed, speaks
 from vjepa2_ac.errors import InputError, UserError, extra_of, in_words, is_out_of_memory, pip_install, printable
 from vjepa2_ac.process import EXIT_STATUS, StoppedError, tidy_end
@@ -107,8 +107,8 @@ def _parser(words: Sequence[str] = ()) -> Parser:
         "begin": [setup.add_demo, setup.add_init, setup.add_download, setup.add_doctor, setup.add_config_command],
         "look": [data.add_data, evaluate.add_imagine, explore.add_explore],
         "train": [train.add_encode, train.add_train, train.add_decoder_command],
-        "judge": [evaluate.add_evaluate, evaluate.add_compare, closed_loop.add_simulate],
-        "use": [plan.add_plan, plan.add_goals, closed_loop.add_serve, train.add_export],
+        "judge": [evaluate.add_evaluate, evaluate.add_compare, closed_loop.add_simulate, policies.add_score],
+        "use": [plan.add_plan, plan.add_goals, policies.add_prior, closed_loop.add_serve, train.add_export],
         "from other packages": [partial(_add_others, words)],
     }
     add_commands(parser, groups)

@@ -162,7 +162,8 @@ class PlanningConfig(Section):
     """One decision: from the current frame to an action."""
 
     planner: Annotated[str, AfterValidator(PLANNERS.known), PLANNERS.name_in_schema] = "cem"
-    """How actions are searched: cem, icem, mppi, gradient, or a planner of your own (docs/extending.md)."""
+    """How actions are searched: cem, icem, mppi, gradient, or a planner of your own (docs/extending.md). prior: not at
+    all, the mean of `prior` is taken."""
     planner_options: Annotated[dict[str, Any], PLANNERS.options_in_schema] = {}
     """Options of a planner of your own, where its class has some."""
     horizon: PositiveInt = 1
@@ -180,6 +181,11 @@ class PlanningConfig(Section):
     budget_s: Positive | None = None
     """Seconds of search after which the best plan so far is taken: no iteration begins that would not end by then. The
     first always runs. Encoding the frame is not counted. null: all iterations run."""
+    prior: Local | None = None
+    """Folder of an action prior (`vjepa2-ac prior`), of which every search starts: from its mean, as wide as it is
+    unsure. Not of `evaluate --planning`."""
+    prior_steps: PositiveInt = 3
+    """Model steps in which the prior is to reach a goal that says no bound of its own: fewer are bolder."""
     warm_start: bool = False
     """Whether a decision starts from the last one's plan, shifted by the steps executed. Not at horizon 1, where the
     plan is the last action only: the arm overshoots (docs/log.md)."""
@@ -215,6 +221,8 @@ class PlanningConfig(Section):
         """The action sequences that each iteration evaluates; without those that icem reuses."""
         if self.planner == "icem":
             return tuple(self.icem.new_samples(self.samples, number) for number in range(self.iterations))
+        if self.planner == "prior":
+            return (1,)
         return (self.gradient.starts if self.planner == "gradient" else self.samples,) * self.iterations
 
     @model_validator(mode="after")
@@ -227,5 +235,8 @@ class PlanningConfig(Section):
             (first % repeat, f"limits.gripper_from {first} is not a multiple of action_repeat {repeat}"),
             (self.views > 1 and self.context > 1, f"views {self.views} need context 1, not {self.context}"),
             (self.views > 1 and self.axes, f"axes are of one camera, and there are {self.views} views"),
+            (self.views > 1 and self.prior, f"a prior is of one camera, and there are {self.views} views"),
+            (self.prior and self.warm_start, "prior and warm_start are two starts of one search"),
+            (self.planner == "prior" and not self.prior, "planner prior needs a prior: `vjepa2-ac prior` trains one"),
             (elites > self.samples, f"{self.planner}.elites {elites} are more than {self.samples} samples"),
         )

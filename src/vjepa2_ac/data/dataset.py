@@ -100,6 +100,10 @@ class Dataset:
         found = f"no {split} episodes among {taking_part.sum()}{together} ({shares})"
         return InputError(where=f"data.path: {config.path}", found=found, fix=fix)
 
+    def with_frames(self, frames: int) -> Dataset:
+        """Return the data set with clips of another length; of a latent cache, where they need the same frames."""
+        return replace(self, config=self.config.model_copy(update={"frames": frames}))
+
     def with_stride(self, stride: int) -> Dataset:
         """Return the data set with another stride.
 

@@ -21,12 +21,14 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import require_image, require_mask
 from vjepa2_ac.model.network.world_model import WorldModel, heads_to_replace, widths_as_text, widths_of_model
 from vjepa2_ac.model.state_integration import states_along
+from vjepa2_ac.planning.chunks import ChunkScores
 from vjepa2_ac.planning.energy import Goal, Scene, WorldModelCost, distance, patch_weights
 from vjepa2_ac.planning.goals import REACHED, GoalProgress, GripperMode, SubGoal, timed, with_shares
 from vjepa2_ac.planning.model_setup import Axes, Fingerprints, prepare_for_planning
 from vjepa2_ac.planning.planner import Cancelled, Plan, Planner
 from vjepa2_ac.planning.search_space import SearchSpace, Workspace, is_allowed, search_space
 from vjepa2_ac.planning.settings import require_base_frame, warn_beyond_taught, with_taught_limits
+from vjepa2_ac.planning.solvers import PlanStart
 from vjepa2_ac.runs.loading import TrainedRun
 from vjepa2_ac.spaces import EXTRINSICS, POSES, Spaces
 
@@ -47,6 +49,7 @@ class Decision:
     states: Float[np.ndarray, "time dim"] | None = None  # states predicted along the plan, the current state first
     cost: WorldModelCost | None = None  # to evaluate other actions
     done: bool = False  # the last goal is reached: no motion
+    from_samples: bool = False  # the search started from what a policy would do
 
 
 class Controller:
@@ -104,6 +107,11 @@ class Controller:
         if self.config.axes is not None:
             require_base_frame(f"planning.axes: {self.config.axes}", is_base=spaces.state.is_base_pose)
             self._axes = Axes.read(self.config.axes, Fingerprints.of(world_model))
+        self._prior = None
+        if self.config.prior is not None:
+            from vjepa2_ac.planning.prior.action_prior import load_prior
+
+            self._prior = load_prior(self.config.prior, where="planning.prior").of(world_model, crop)
         self.space = search_space(self.config, spaces.state)  # the allowed changes of the state, of the last decision
         self.planner = Planner(self.config, self.space)
         self._workspace = Workspace.of(self.config.limits, spaces.state)
@@ -211,7 +219,12 @@ class Controller:
         self._seen, self._done, self.decision = [], 0, None
 
     def act(
-        self, frame: np.ndarray, state: np.ndarray, *, cancelled: Cancelled = lambda: False
+        self,
+        frame: np.ndarray,
+        state: np.ndarray,
+        *,
+        samples: Float[np.ndarray, "samples steps dim"] | None = None,
+        cancelled: Cancelled = lambda: False,
     ) -> Float[np.ndarray, " dim"]:
         """Return the action of the next model step: dx, dy, dz, three rotations, gripper (legend: `vjepa2_ac.episode`).
 
@@ -224,6 +237,8 @@ class Controller:
             frame: What the camera sees, of the goal image's size.
             state: Measured: pose and gripper, or the vector; a vector of any width where the model has no states and an
                 action is a change.
+            samples: What a policy would do, as changes of each model step (`planning.chunks`): the search starts from
+                their mean, as wide as they are apart. None: from `planning.prior`, if any.
             cancelled: Asked before every iteration: whether nobody waits for the action any more.
 
         Raises:
@@ -231,15 +246,44 @@ class Controller:
             SearchCancelledError: It was cancelled. After any error nothing has changed.
             ValueError: No goal was set.
         """
+        seen = self._with(frame, state)
+        decision = self._decided(seen, samples, cancelled)
+        self._seen, self._done, self.decision = seen, self._done + 1, decision  # after an error nothing has changed
+        return decision.action
+
+    @torch.no_grad()
+    def score(self, frame: np.ndarray, state: np.ndarray, chunks: Float[np.ndarray, "chunks steps dim"]) -> ChunkScores:
+        """Return the energy of what somebody else would do, beside doing nothing, towards the goal that applies now.
+
+        Nothing is remembered, and nothing is planned. Limits do not apply: of a chunk that leaves them the model may
+        know nothing.
+
+        Args:
+            frame: As of `act`.
+            state: As of `act`.
+            chunks: Changes of each model step (`planning.chunks.changes_of_chunks`), any number of steps.
+
+        Raises:
+            InputError: As of `act`; or the chunks have another shape.
+            ValueError: No goal was set.
+        """
+        seen = self._with(frame, state)
+        if chunks.ndim != 3 or 0 in chunks.shape or chunks.shape[2] != self.space.dim:
+            needed = f"chunks x model steps x {self.space.dim}"
+            raise InputError(where="chunks", found=f"an array of the shape {chunks.shape}", needed=needed)
+        progress = self._progressed(seen[-1][0])
+        cost, still, _ = self._towards(seen, progress, chunks.shape[1])
+        energies = cost(torch.from_numpy(np.concatenate([np.zeros_like(chunks[:1]), chunks])).float()).double()
+        return ChunkScores(energies[1:].numpy(), float(energies[0]), self._over_steps(still), progress.place)
+
+    def _with(self, frame: np.ndarray, state: np.ndarray) -> list[Seen]:
+        """Return what the model sees at a decision: the present, and what is remembered."""
         if not self._goals:
             raise ValueError("no goal: call reset first")
         require_image(frame, where="frame", like=self._goals[0].image)
         state = self._known(np.asarray(state, dtype=np.float64))
         self.spaces.state.require_state(state, "state")
-        seen = [*self._seen, (self.encoded(frame), state)][-self.config.context :]
-        decision = self._decided(seen, cancelled)
-        self._seen, self._done, self.decision = seen, self._done + 1, decision  # after an error nothing has changed
-        return decision.action
+        return [*self._seen, (self.encoded(frame), state)][-self.config.context :]
 
     def _known(self, state: np.ndarray) -> np.ndarray:
         """Return the state; zeros for a vector of another width than an action's, if the model takes no states."""
@@ -274,22 +318,31 @@ class Controller:
             durations.append(goal.at_most)
         return Goal(self._goal_latents[place : place + len(durations) + 1], tuple(durations), self._patch_weights)
 
-    def _decided(self, seen: Sequence[Seen], cancelled: Cancelled) -> Decision:
+    def _towards(
+        self, seen: Sequence[Seen], progress: GoalProgress, steps: int
+    ) -> tuple[WorldModelCost, Float[Tensor, " steps"], tuple[int, ...]]:
+        """Return the cost of so many actions; of each its goal, and how far the current image is from that."""
+        goal, done = self._goal_from(progress.place), self._done - progress.since
+        wanted = goal.ahead(done, steps)
+        still = distance(seen[-1][0].expand_as(wanted), wanted, self.config.energy, goal.weights)
+        cost = WorldModelCost(self._model, self._scene(seen), goal, self.config.energy, done=done, spaces=self.spaces)
+        return cost, still, tuple(progress.place + goal.place(done + step) for step in range(steps))
+
+    def _over_steps(self, distances: Float[Tensor, " steps"]) -> float:
+        return float(distances[-1] if self.config.energy.steps == "last" else distances.sum())
+
+    def _decided(self, seen: Sequence[Seen], samples: np.ndarray | None, cancelled: Cancelled) -> Decision:
         latents, state = seen[-1]
         progress = self._progressed(latents)
-        goal, done = self._goal_from(progress.place), self._done - progress.since
-        places = tuple(progress.place + goal.place(done + step) for step in range(self.config.horizon))
-        wanted = goal.ahead(done, self.config.horizon)
-        still = distance(latents.expand_as(wanted), wanted, self.config.energy, goal.weights)
-        energy = float(still[-1] if self.config.energy.steps == "last" else still.sum())
+        cost, still, places = self._towards(seen, progress, self.config.horizon)
+        energy = self._over_steps(still)
         nothing = Decision(self._command(state, np.zeros(len(state))), "at the goal", energy, places, progress)
         if progress.done or float(still.max()) <= REACHED:
             return replace(nothing, done=progress.place == len(self._goals) - 1)
         if self._workspace is not None and not is_allowed(self._workspace.way_back(state[:3]), self.config.limits):
             return replace(nothing, why="outside the workspace")
         self.space = self._searched[self._goals[progress.place].gripper]
-        cost = WorldModelCost(self._model, self._scene(seen), goal, self.config.energy, done=done, spaces=self.spaces)
-        plan = self._planned(state, cost, cancelled)
+        plan = self._planned(state, cost, self._start(cost, progress, samples), cancelled)
         return replace(
             nothing,
             action=self._command(state, plan.actions[0].double().numpy()),
@@ -297,13 +350,23 @@ class Controller:
             plan=plan,
             states=states_along(torch.from_numpy(state), plan.actions.double()[None], self.spaces.state)[0].numpy(),
             cost=cost,
+            from_samples=samples is not None,
         )
 
-    def _planned(self, state: np.ndarray, cost: WorldModelCost, cancelled: Cancelled) -> Plan:
+    def _start(self, cost: WorldModelCost, progress: GoalProgress, samples: np.ndarray | None) -> PlanStart | None:
+        """Return where a search starts: what a policy or the prior says, or what is left of the last plan."""
+        if samples is not None:
+            return PlanStart.of_samples(torch.from_numpy(np.array(samples, dtype=np.float64)), self.space)
+        if self._prior is not None:
+            bound = self._goals[progress.place].at_most
+            left = self.config.prior_steps if bound is None else bound - (self._done - progress.since)
+            return self._prior.start(cost, self._goal_latents[progress.place], left, self.space)
+        before = None if self.decision is None else self.decision.plan
+        return before.start_after(1) if before is not None and self.config.warm_start else None
+
+    def _planned(self, state: np.ndarray, cost: WorldModelCost, start: PlanStart | None, cancelled: Cancelled) -> Plan:
         """Return what a search finds, inside the workspace if there is one; the energy is of what is sent."""
         generator, box = torch.Generator().manual_seed(self.seed + self._done), self._workspace
-        before = None if self.decision is None else self.decision.plan
-        start = before.start_after(1) if before is not None and self.config.warm_start else None
         space = self.space if box is None else box.narrowed(self.space, state)
         plan = self.planner.plan(cost, generator, start, cancelled, space)
         if box is None or plan.stopped == "no finite energy":

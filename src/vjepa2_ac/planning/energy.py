@@ -158,6 +158,11 @@ class WorldModelCost:
             self.progress(done, len(actions))
         return torch.cat(energies).to(actions.device)
 
+    @property
+    def now(self) -> tuple[Float[Tensor, "tokens dim"], Float[Tensor, " state_dim"]]:
+        """Latents of the current frame, and the state."""
+        return self._frame, self._state
+
     def imagine(
         self, actions: Float[Tensor, "samples steps action_dim"]
     ) -> tuple[Float[Tensor, "samples steps tokens dim"], Float[Tensor, "samples steps+1 state_dim"]]:

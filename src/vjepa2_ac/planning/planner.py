@@ -178,13 +178,13 @@ class Planner:
         record: list[Iteration] = []
         shares, total = config.sequences, sum(config.sequences)
         self.progress(0, total)
-        while len(record) < config.iterations and self._has_time(began, record):
+        while len(record) < len(shares) and self._has_time(began, record):
             if cancelled():
                 raise SearchCancelledError
             done, share = sum(shares[: len(record)]), shares[len(record)]
             with reporting(cost, self.progress, done=done, share=share, total=total):
                 record.append(self._iterate(search, cost, space))
-        stopped: Stopped = "finished" if len(record) == config.iterations else "out of time"
+        stopped: Stopped = "finished" if len(record) == len(shares) else "out of time"
         actions, energy, evaluated = _chosen(search.result(), record, cost, space, lowest=stopped == "out of time")
         if actions is None:
             actions, stopped = torch.zeros(space.steps, space.dim), "no finite energy"

@@ -9,21 +9,41 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from einops import reduce
 from jaxtyping import Float
 from torch import Generator, Tensor
 
 from vjepa2_ac.config.planning import PlanningConfig
+from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.search_space import SearchSpace
 
+_NARROWEST = 0.1  # of the usual standard deviation: a prior is not as sure as it says
 Momentum = float | Float[Tensor, " dim"]  # share of the old mean or standard deviation in the new one
 
 
 @dataclass(frozen=True)
 class PlanStart:
-    """The start of a search: what the last decision left."""
+    """The start of a search: what the last decision left, or what a prior says."""
 
     mean: Float[Tensor, "decisions dim"]
     elites: Float[Tensor, "elites decisions dim"]
+    std: Float[Tensor, "decisions dim"] | None = None  # None: `planning.start_std`
+
+    @classmethod
+    def of_samples(cls, samples: Float[Tensor, "samples steps dim"], space: SearchSpace) -> PlanStart:
+        """Return what actions of a policy say: their mean, and how far they are apart.
+
+        Raises:
+            InputError: They have fewer model steps than a plan, or other numbers.
+        """
+        if samples.ndim != 3 or not len(samples) or samples.shape[1] < space.steps or samples.shape[2] != space.dim:
+            needed = f"one or more, of {space.steps} model steps or more and {space.dim} numbers"
+            raise InputError(where="samples of a policy", found=f"shape {tuple(samples.shape)}", needed=needed)
+        steps = samples[:, : space.steps].float()
+        decisions = reduce(
+            steps, "samples (decisions repeat) dim -> samples decisions dim", "mean", repeat=space.repeat
+        )
+        return cls(decisions.mean(dim=0), decisions, decisions.std(dim=0, correction=0))
 
 
 Before = PlanStart | None
@@ -63,6 +83,8 @@ class Solver:
         self._space, self._config, self._generator = space, config, generator
         self.mean = space.allowed(torch.zeros_like(space.lower) if start is None else start.mean)
         self.std = space.first_std
+        if start is not None and start.std is not None:
+            self.std = torch.minimum(torch.maximum(start.std, _NARROWEST * self.std), self.std)
 
     def sample(self) -> Samples:
         """Return the next decisions to evaluate, all allowed."""
@@ -220,6 +242,19 @@ class MppiSolver(Solver):
         return self.mean
 
 
+class PriorSolver(Solver):
+    """No search: what the prior says, once evaluated."""
+
+    elites = 1
+
+    def sample(self) -> Samples:
+        """Return the prior's mean."""
+        return self.mean[None]
+
+    def update(self, evaluated: EvaluatedPlans) -> None:
+        """Learn nothing."""
+
+
 class GradientSolver(Solver):
     """Adam on decisions in units of their limits, projected onto the allowed set after every step.
 
@@ -239,7 +274,7 @@ class GradientSolver(Solver):
             origin = start.elites[0] if len(start.elites) else start.mean
         half = (space.upper - space.lower) / 2
         self._unit = torch.where(half > 0, half, 1.0)
-        self._place = space.allowed(origin + space.first_std * noise) / self._unit
+        self._place = space.allowed(origin + self.std * noise) / self._unit
         self._adam = torch.optim.Adam([self._place], lr=config.gradient.learning_rate)
         self._fall = torch.optim.lr_scheduler.LambdaLR(self._adam, lambda step: max(0.0, 1 - step / config.iterations))
 

@@ -93,8 +93,12 @@ class Recorder:
         decision, config = controller.decision, controller.config
         if decision is None:
             raise ValueError("nothing was decided")
-        if decision.why == "out of time" or (number and (config.context > 1 or config.warm_start)):
-            return None  # it depends on the clock, or on decisions before it
+        if (
+            decision.why == "out of time"
+            or decision.from_samples
+            or (number and (config.context > 1 or config.warm_start))
+        ):
+            return None  # it depends on the clock, on a policy, or on decisions before it
         goals, durations, left = self._goals[decision.progress.place :], [], number - decision.progress.since
         words = ["--start", self._image(frame), "--state=" + ",".join(repr(float(one)) for one in state)]
         for goal in goals:

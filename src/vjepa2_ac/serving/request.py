@@ -6,12 +6,13 @@ import hashlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, get_args
+from typing import Any, cast, get_args
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.planning.chunks import ChunkForm
 from vjepa2_ac.planning.goals import GripperMode, SubGoal
 
 IMAGE_KEYS = ("observation/exterior_image_1_left", "observation/exterior_image_0_left", "observation/image")
@@ -25,7 +26,9 @@ _GOAL = "goal/"
 _WAYS = ("goal/image", "goal/images", "goal/name")
 _RULES = ("goal/durations", "goal/at_least", "goal/shares", "goal/floors", "goal/grippers", "goal/mask")
 _MODES = get_args(GripperMode)
-_ENDPOINTS = ("infer", "reset")
+_ENDPOINTS = ("infer", "reset", "score")
+_CHUNKS, _FORM, _FORMS = "policy/chunks", "policy/form", get_args(ChunkForm)
+MOST_CHUNK_NUMBERS = 1_000_000  # of one request
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +60,9 @@ class Request:
     goal: GivenGoal | None = None  # None: the one of before
     frame: UInt8[np.ndarray, "height width 3"] | None = None  # None: a reset, which asks for no action
     state: Float[np.ndarray, " dim"] | None = None  # likewise
+    chunks: Float[np.ndarray, "chunks steps dim"] | None = None  # what a policy would do, at control rate
+    form: ChunkForm = "targets"  # what their numbers mean
+    is_score: bool = False  # the chunks are to be scored; else a search starts from them
 
 
 def read_request(message: Mapping[str, Any], image_keys: Sequence[str] = IMAGE_KEYS) -> Request:
@@ -82,7 +88,19 @@ def read_request(message: Mapping[str, Any], image_keys: Sequence[str] = IMAGE_K
     key = next((key for key in image_keys if key in message), None)
     if key is None:
         raise _missing(message, f"the picture of the camera, as {' or '.join(image_keys)}")
-    return Request(episode, reset, goal, _image(message[key], key), _state(message))
+    chunks, form = message.get(_CHUNKS), message.get(_FORM, "targets")
+    if not isinstance(form, str) or form not in _FORMS:
+        raise _wrong(_FORM, form, " or ".join(_FORMS))
+    if (chunks is not None or endpoint == "score") and not _is_chunks(chunks):
+        raise _wrong(_CHUNKS, chunks, f"floats, chunks x control steps x numbers, {MOST_CHUNK_NUMBERS:,} at most")
+    frame, state = _image(message[key], key), _state(message)
+    chunks = None if chunks is None else chunks.astype(np.float64)
+    return Request(episode, reset, goal, frame, state, chunks, cast("ChunkForm", form), endpoint == "score")
+
+
+def _is_chunks(found: Any) -> bool:
+    is_array = isinstance(found, np.ndarray) and found.ndim == 3 and found.dtype.kind == "f"
+    return is_array and 0 < found.size <= MOST_CHUNK_NUMBERS
 
 
 def _image(found: Any, where: str) -> np.ndarray:

@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.planning.chunks import changes_of_chunks
 from vjepa2_ac.planning.controller import Controller, Decision
 from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.planning.planner import SearchCancelledError
@@ -51,6 +52,7 @@ class SessionOptions:
     image_keys: tuple[str, ...] = IMAGE_KEYS
     deadline_s: float = 60.0  # for a decision, its goal's encoding included; then the action is zero
     dry_run: bool = False  # plans, and sends zeros
+    is_blind: bool = False  # the model ranks true actions no better than chance: it names no best chunk
 
 
 @dataclass
@@ -159,15 +161,47 @@ class Session:
         if self._goal is None:
             needed = f"a goal first: goal/image, goal/images or goal/name{self._known_names()}"
             raise InputError(where="request", found="no goal in this episode", needed=needed)
-        return self._decided(request.frame, request.state, began, is_gone)
+        changes = None
+        if request.chunks is not None:
+            changes = changes_of_chunks(
+                request.chunks,
+                request.state,
+                form=request.form,
+                control_steps=self.options.control_steps,
+                space=self.controller.spaces.state,
+            )
+            if request.is_score:
+                return self._scored(request.frame, request.state, changes)
+        return self._decided(request.frame, request.state, changes, began, is_gone)
+
+    def _scored(self, frame: np.ndarray, state: np.ndarray, changes: np.ndarray) -> dict[str, Any]:
+        """Return the energies of what a policy would do; nobody moves, and no decision is counted."""
+        found = self.controller.score(frame, state, changes)
+        return {
+            "energies": found.energies,
+            "best": None if self.options.is_blind else found.best,
+            "is_blind": self.options.is_blind,
+            "doing_nothing": found.doing_nothing,
+            "now": found.now,
+            "spread": found.spread,
+            "tied": found.tied,
+            "goal": found.goal,
+        }
 
     def _decided(
-        self, frame: np.ndarray, state: np.ndarray, began: float, is_gone: Callable[[], bool]
+        self,
+        frame: np.ndarray,
+        state: np.ndarray,
+        samples: np.ndarray | None,
+        began: float,
+        is_gone: Callable[[], bool],
     ) -> dict[str, Any]:
         planning_began, until = self._clock(), began + self.options.deadline_s
         is_stopped = self.stopped.is_set
         try:
-            self.controller.act(frame, state, cancelled=lambda: is_gone() or is_stopped() or self._clock() > until)
+            self.controller.act(
+                frame, state, samples=samples, cancelled=lambda: is_gone() or is_stopped() or self._clock() > until
+            )
         except SearchCancelledError:
             if is_gone():
                 raise GoneError from None

@@ -1,0 +1,209 @@
+"""The commands score and prior: what a world model says of a policy's actions, and a policy that it learns itself."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vjepa2_ac.cli import options as cli
+from vjepa2_ac.errors import InputError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from vjepa2_ac.planning.session import PlanningSession
+
+_FORMS = ("targets", "deltas", "offsets")
+
+
+def add_score(commands: cli.Commands) -> None:
+    """Add `score` to a parser."""
+    example = "demo/run --policy mine.npz --policy other.npz"
+    parser = cli.command(commands, "score", _score, example)
+    cli.add_planner(parser, such_as="such as planning.energy.distance=l2")
+    given = parser.add_mutually_exclusive_group(required=True)
+    cli.add(given, "--chunks FILE", "what a policy would do now: .npy, chunks x control steps x numbers", cli.as_path)
+    text = "or what one would do at frames of the data's episodes: .npz; again for others"
+    cli.add(given, "--policy FILE", text, cli.as_path, action="append", dest="policies")
+    text = "numbers are poses to reach, changes from pose to pose, or of all poses from the present one (targets)"
+    cli.add(parser, "--form FORM", text, choices=_FORMS, default="targets")
+    cli.add(parser, "--control-steps N", "of a chunk, in a model step (data.stride)", cli.count)
+    text = "of joints: a function of yours from chunks x steps x joints to x,y,z,roll,pitch,yaw,gripper"
+    cli.add(parser, "--kinematics MODULE:FUNCTION", text)
+    cli.add(parser, "--out FILE", "where the figures go, as JSON (score.json)", cli.as_path, default=Path("score.json"))
+    group = parser.add_argument_group("with --chunks: the present, and the goal")
+    cli.add(group, "--start IMAGE", "what the camera sees now: PNG or JPEG", cli.as_local)
+    cli.add(group, "--state NUMBERS", "measured x,y,z,roll,pitch,yaw,gripper; or a vector")
+    cli.add(group, "--goal IMAGE", "what it is to see", cli.as_local)
+    cli.add(group, "--goals FOLDER", "goals that `vjepa2-ac goals` made; the first one counts", cli.as_path)
+
+
+def add_prior(commands: cli.Commands) -> None:
+    """Add `prior` to a parser."""
+    parser = cli.command(commands, "prior", _prior, "demo/run")
+    cli.add(parser, "subject RUN|CONFIG", "folder of a run, or a config, of whose data and encoder it is", cli.as_local)
+    cli.add(parser, "overrides key=value", "of the config, such as training.device=cpu", nargs="*")
+    cli.add(parser, "--out FOLDER", "where it goes (prior, in the run's folder)", cli.as_path)
+    cli.add(parser, "--steps N", "optimizer steps (2000)", cli.count)
+    cli.add(parser, "--ahead N", "most model steps from a frame to its goal (those of a clip)", cli.count)
+
+
+def _score(options: argparse.Namespace) -> int:
+    """Score what a policy would do, by the energy of its actions.
+
+    One chunk of actions is better than another if the model predicts that it leads nearer to the goal; both are shown
+    beside doing nothing. Or policies are put in order by what they would do at frames of held-out episodes. Status 1
+    where the model cannot tell: it ranks true actions no better than chance.
+    """
+    one_scene = options.chunks is not None
+    for name in ("start", "state", "goal", "goals"):
+        if getattr(options, name) is not None and not one_scene:
+            raise InputError(where=f"--{name}", found="--policy, whose frames are those of the data", needed="none")
+    if one_scene and (
+        options.start is None or options.state is None or (options.goal is None) == (options.goals is None)
+    ):
+        raise InputError(where="--chunks", found="no scene", needed="--start, --state, and one of --goal and --goals")
+    cli.require_goals(options.goals)
+    cli.require_to_plan(options)
+    to_poses = _kinematics(options.kinematics)
+    return (_score_chunks if one_scene else _score_policies)(options, to_poses)
+
+
+def _kinematics(words: str | None) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the user's function from joints to poses; one that changes nothing, where none is named."""
+    if words is None:
+        return lambda numbers: numbers
+    from vjepa2_ac.registry import import_plugins
+
+    module, _, name = words.partition(":")
+    import_plugins([module], where=f"--kinematics {words}")
+    found = getattr(import_module(module), name, None)
+    if not callable(found):
+        raise InputError(where=f"--kinematics {words}", found="no such function", needed="MODULE:FUNCTION")
+    return found  # type: ignore[no-any-return]  # the user's
+
+
+def _score_chunks(options: argparse.Namespace, to_poses: Callable[[np.ndarray], np.ndarray]) -> int:
+    from vjepa2_ac.cli.console.progress import MetricsTable
+    from vjepa2_ac.evaluation.policies.score import CHANCE, is_blind, ranking_of_run, read_chunks
+    from vjepa2_ac.media.images import read_image
+    from vjepa2_ac.planning.chunks import changes_of_chunks
+    from vjepa2_ac.planning.goals import SubGoal, read_goal_folder
+    from vjepa2_ac.storage import write_atomically
+    from vjepa2_ac.storage.structured import json_text
+
+    chunks, state = read_chunks(options.chunks), cli.as_numbers(options.state, "--state")
+    session = cli.load_planning_session(options)
+    controller = session.controller(extrinsics=cli.camera_pose(options.extrinsics))
+    if options.goals is None:
+        controller.follow((SubGoal(read_image(options.goal)),))
+    else:
+        controller.follow(session.goals_of(read_goal_folder(options.goals)))
+    steps, space = _control_steps(options, session), controller.spaces.state
+    changes = changes_of_chunks(to_poses(chunks), state, form=options.form, control_steps=steps, space=space)
+    found = controller.score(read_image(options.start), state, changes)
+    ranking = ranking_of_run(options.subject, session.checkpoint)
+    blind = ranking is not None and is_blind(ranking)
+    table = MetricsTable(f"Energy after {changes.shape[1]} model steps (now: {found.now:.4f})", ["chunk", "energy", ""])
+    for chunk in found.order.tolist():
+        beside = found.energies[chunk] / found.doing_nothing - 1
+        table.add_row(str(chunk), f"{found.energies[chunk]:.4f}", f"{beside:+.1%}")
+    table.add_row("doing nothing", f"{found.doing_nothing:.4f}", "")
+    notes = [f"Spread of the chunks: {found.spread:.1%} of the energy now."]
+    if found.tied > 1:
+        notes.append(f"{found.tied} chunks share the lowest energy: the model sees no difference between them.")
+    if ranking is None:
+        notes.append("Whether this model can tell actions apart is not known: `vjepa2-ac evaluate` measures it.")
+    elif blind:
+        notes.append(
+            f"No order: in validation {ranking.value:.0%} of other moves looked better than the true ones, where chance"
+            f" is {CHANCE:.0%}. These energies mean nothing."
+        )
+    about = session.as_dict() | {"start": options.start, "chunks": str(options.chunks), "form": options.form}
+    scores = {
+        "best": None if blind else found.best, "energies": found.energies.tolist(), "now": found.now,
+        "doing_nothing": found.doing_nothing, "spread": found.spread, "tied": found.tied, "is_blind": blind,
+        "others_better": None if ranking is None else ranking.as_dict(),
+    }  # fmt: skip
+    write_atomically(options.out, json_text(about | scores))
+    cli.show(table, *notes, files=[options.out])
+    return int(blind)
+
+
+def _score_policies(options: argparse.Namespace, to_poses: Callable[[np.ndarray], np.ndarray]) -> int:
+    from dataclasses import replace
+
+    from vjepa2_ac.cli.console.progress import MetricsTable
+    from vjepa2_ac.data.dataset import open_dataset
+    from vjepa2_ac.data.windows import require_frames
+    from vjepa2_ac.evaluation.policies.score import CHANCE, read_policy_chunks, score_policies
+    from vjepa2_ac.reporter import INDEXING
+    from vjepa2_ac.storage import write_atomically
+    from vjepa2_ac.storage.structured import json_text
+
+    policies = [read_policy_chunks(file) for file in options.policies]
+    policies = [replace(one, chunks=to_poses(one.chunks)) for one in policies]
+    session = cli.load_planning_session(options)
+    require_frames(session.config.data, to="score policies at")
+    with cli.reporter() as reporter:
+        found = score_policies(
+            session.controller(extrinsics=cli.camera_pose(options.extrinsics)),
+            open_dataset(session.config.data, progress=reporter.task(INDEXING)),
+            policies,
+            form=options.form,
+            control_steps=options.control_steps,
+            progress=reporter.task("scoring", "places"),
+        )
+    title = f"Energy over that of doing nothing, at {found.places} places of {found.episodes} episodes"
+    table = MetricsTable(title, ["policy", "all chunks", "its best", "behind the one before"])
+    for one in found.policies:
+        table.add_row(one.name, str(one.mean), str(one.best), "" if one.behind is None else str(one.behind))
+    table.add_row("demonstrated", str(found.demonstrated), "", "")
+    notes = [
+        f"Actions of other places look better than the true ones in {found.others_better:.0%} (chance {CHANCE:.0%})."
+    ]
+    if found.is_blind:
+        notes.append("No order: the model cannot tell actions apart on these data, and these energies mean nothing.")
+    if found.left_out:
+        notes.append(f"{found.left_out} places are left out: their episode ends before the goal.")
+    about = session.as_dict() | {"policies": [str(file) for file in options.policies], "form": options.form}
+    write_atomically(options.out, json_text(about | found.as_dict()))
+    cli.show(table, *notes, files=[options.out])
+    return int(found.is_blind)
+
+
+def _control_steps(options: argparse.Namespace, session: PlanningSession) -> int:
+    stride = options.control_steps or session.config.data.stride
+    if not isinstance(stride, int):
+        found, needed = "data.stride: auto", "how many control steps of a chunk are a model step"
+        raise InputError(where="--control-steps", found=found, needed=needed)
+    return stride
+
+
+def _prior(options: argparse.Namespace) -> None:
+    """Train what proposes actions to the planner, in minutes.
+
+    It learns from the demonstrations of a run which action leads from one image to another. Searches then start from
+    it (planning.prior=FOLDER) and need fewer samples, or none (planning.planner=prior).
+    """
+    from vjepa2_ac.runs.folder import CONFIG, is_run
+
+    run = is_run(options.subject)
+    file = Path(options.subject) / CONFIG if run else options.subject
+    config = cli.read_config(file, options.overrides, base=True, of_run=run)
+
+    from vjepa2_ac.planning.prior.train_prior import PriorOptions, train_prior
+
+    folder = options.out or Path(options.subject if run else config.run_dir) / "prior"
+    with cli.reporter() as reporter:
+        card = train_prior(config, folder, cli.record_of_options(PriorOptions, options), reporter)
+    if found := card.held_out:
+        true, others = (found[name]["value"] for name in ("true_goals", "goals_of_others"))
+        cli.show(
+            f"Its error on held-out clips is {true:.2f} of doing nothing; with goals of other clips {others:.2f}"
+            + (": it does not look at the goal." if others <= true else ".")
+        )
+    cli.show(f"The prior is in {folder}. Plan with it: planning.prior={folder} planning.samples=100")

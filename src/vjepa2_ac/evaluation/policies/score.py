@@ -1,0 +1,244 @@
+"""Which policy is better, without a robot: the energy of what each would do at frames of held-out episodes.
+
+The goal of a chunk is what the demonstration saw as many model steps later. So a policy that does what was shown is
+good, and one that finds a better way is not seen to be.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.episode import Progress, no_progress
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.intervals import Estimate, mean_of, ratio, ratio_difference
+from vjepa2_ac.planning.chunks import ChunkForm, changes_of_chunks
+from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.runs.checkpoint import step_of
+from vjepa2_ac.runs.folder import METRICS, is_run
+from vjepa2_ac.runs.metrics_log import read_metrics_log
+from vjepa2_ac.storage.structured import plain
+
+CHANCE = 0.5  # share of others' actions that look better than the true one, of a model that sees no actions
+_OTHERS = 16  # actions of other places, beside the true ones
+_NEEDED = "arrays `episodes` (names), `frames` (control steps) and `chunks` (places x chunks x control steps x numbers)"
+
+
+@dataclass(frozen=True, eq=False)
+class PolicyChunks:
+    """What a policy would do at some frames of episodes."""
+
+    name: str
+    places: tuple[tuple[str, int], ...]  # name of the episode, and the control step
+    chunks: Float[np.ndarray, "places chunks steps dim"]
+
+
+@dataclass(frozen=True)
+class PolicyScore:
+    """How a policy fares: mean energy over that of doing nothing, below 1 is better."""
+
+    name: str
+    mean: Estimate  # of all its chunks
+    best: Estimate  # of its chunk of lowest energy, as the model would choose
+    behind: Estimate | None  # `mean` minus that of the policy before it in the order; None: it is the first
+
+
+@dataclass(frozen=True)
+class PolicyScores:
+    """Policies, the best first, and whether the model can tell."""
+
+    policies: tuple[PolicyScore, ...]
+    demonstrated: Estimate  # what was done, over doing nothing: no policy is expected to be better
+    others_better: Estimate  # share of the actions of other places that look better than the true ones; chance: 0.5
+    places: int
+    episodes: int
+    left_out: int  # places whose goal would be after the episode's end
+
+    @property
+    def is_blind(self) -> bool:
+        """Whether the model ranks the true actions no better than chance, so that its order means nothing."""
+        return is_blind(self.others_better)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, for JSON."""
+        found: dict[str, Any] = plain(asdict(self) | {"is_blind": self.is_blind})
+        return found
+
+
+def read_policy_chunks(path: Path) -> PolicyChunks:
+    """Read what a policy would do from an .npz file; nothing in it is executed.
+
+    Raises:
+        InputError: It cannot be read, or an array is missing or has another shape.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            episodes, frames, chunks = (arrays[name] for name in ("episodes", "frames", "chunks"))
+    except (OSError, ValueError, KeyError, EOFError) as error:
+        raise InputError(where=str(path), found=f"cannot be read ({error})", needed=_NEEDED) from None
+    fits = episodes.shape == frames.shape == chunks.shape[:1] and chunks.ndim == 4 and len(episodes) > 0
+    if not fits or frames.dtype.kind not in "iu" or chunks.dtype.kind != "f":
+        shapes = ", ".join(f"{one.dtype} {one.shape}" for one in (episodes, frames, chunks))
+        raise InputError(where=str(path), found=f"arrays {shapes}", needed=_NEEDED)
+    places = tuple(zip(map(str, episodes.tolist()), map(int, frames.tolist()), strict=True))
+    return PolicyChunks(path.stem, places, chunks.astype(np.float64))
+
+
+def read_chunks(path: Path) -> Float[np.ndarray, "chunks steps dim"]:
+    """Read the chunks of one scene from an .npy file.
+
+    Raises:
+        InputError: It cannot be read, or holds another kind of array.
+    """
+    needed = "numbers, chunks x control steps x numbers of a state, as numpy.save writes them"
+    try:
+        found = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise InputError(where=str(path), found=f"cannot be read ({error})", needed=needed) from None
+    if not isinstance(found, np.ndarray) or found.ndim != 3 or found.dtype.kind not in "fiu":
+        raise InputError(where=str(path), found="another kind of array", needed=needed)
+    return found.astype(np.float64)
+
+
+def is_blind(others_better: Estimate) -> bool:
+    """Return whether a model ranks true actions no better than chance, so that its energies order nothing."""
+    return not (others_better.high if others_better.has_interval else others_better.value) < CHANCE
+
+
+def ranking_of_run(subject: str, checkpoint: str) -> Estimate | None:
+    """Return the share of other moves that looked better in the validation of a run's checkpoint; None: not measured.
+
+    Args:
+        subject: The folder of a run, or a model, of which nothing is known.
+        checkpoint: Which one, as text with its step.
+    """
+    if not is_run(subject):
+        return None
+    step = step_of(checkpoint.split(maxsplit=1)[0]) or 0
+    rows = [row for row in read_metrics_log(Path(subject) / METRICS) if "action_rank" in row and row["step"] <= step]
+    if not rows:
+        return None
+    numbers = (rows[-1][name] for name in ("action_rank", "action_rank_low", "action_rank_high"))
+    return Estimate(*(math.nan if one is None else float(one) for one in numbers))
+
+
+def score_policies(
+    controller: Controller,
+    dataset: Dataset,
+    policies: Sequence[PolicyChunks],
+    *,
+    form: ChunkForm = "targets",
+    control_steps: int | None = None,
+    progress: Progress = no_progress,
+) -> PolicyScores:
+    """Score policies at the places that all of them have.
+
+    Args:
+        controller: Plans with the model; it is reset.
+        dataset: Has the episodes.
+        policies: One or more.
+        form: What the numbers of their chunks mean.
+        control_steps: Of a model step, in steps of the chunks; None: as in the data.
+        progress: Called with (done, total) in places.
+
+    Raises:
+        InputError: There is no common place, an episode or a frame is not there, or chunks cannot be used.
+    """
+    places = sorted(set.intersection(*(set(one.places) for one in policies)))
+    if not places:
+        raise InputError(where="--policy", found="no frame that all of them have", needed="the same places in all")
+    stride = dataset.config.model_stride
+    control_steps = control_steps or stride
+    steps = min(one.chunks.shape[2] for one in policies) // control_steps
+    seen = [_Place.of(dataset, place, max(1, steps) * stride, controller) for place in places]
+    kept = [one for one in seen if one is not None]
+    if not kept:
+        needed = f"{steps * stride} control steps after it in the episode"
+        raise InputError(where="--policy", found="no place with a goal", needed=needed)
+    rng, energies = np.random.default_rng(0), list[np.ndarray]()
+    for number, place in enumerate(kept):
+        others = [kept[other].changes for other in _drawn(rng, number, [one.place[0] for one in kept])]
+        chunks = [
+            changes_of_chunks(
+                one.chunks[one.places.index(place.place)], place.state, form=form, control_steps=control_steps,
+                space=controller.spaces.state,
+            )[:, : len(place.changes)]
+            for one in policies
+        ]  # fmt: skip
+        frame, goal = place.frames(dataset)
+        controller.reset(goal)
+        found = controller.score(frame, place.state, np.concatenate([place.changes[None], others, *chunks]))
+        true, rest = found.energies[0], found.energies[1 + len(others) :]
+        worse = found.energies[1 : 1 + len(others)]
+        by_policy = np.split(rest, np.cumsum([len(one) for one in chunks])[:-1])
+        means, bests = ([float(take(one)) for one in by_policy] for take in (np.mean, np.min))
+        energies.append(np.array([found.doing_nothing, true, float((worse < true).mean()), *means, *bests]))
+        progress(number + 1, len(kept))
+    return _scores(policies, np.stack(energies), [one.place[0] for one in kept], left_out=len(places) - len(kept))
+
+
+def _scores(
+    policies: Sequence[PolicyChunks],
+    energies: Float[np.ndarray, "places columns"],
+    ids: Sequence[str],
+    *,
+    left_out: int,
+) -> PolicyScores:
+    nothing, true, better, *of_policies = energies.T
+    means, bests = of_policies[: len(policies)], of_policies[len(policies) :]
+    order = sorted(range(len(policies)), key=lambda number: float(means[number].mean()))
+    scores = [
+        PolicyScore(
+            name=policies[number].name,
+            mean=ratio(means[number], nothing, ids),
+            best=ratio(bests[number], nothing, ids),
+            behind=None if not place else ratio_difference(
+                (means[number], nothing), (means[order[place - 1]], nothing), ids
+            ),
+        )
+        for place, number in enumerate(order)
+    ]  # fmt: skip
+    counts = {"places": len(ids), "episodes": len(set(ids)), "left_out": left_out}
+    return PolicyScores(tuple(scores), ratio(true, nothing, ids), mean_of(better, ids), **counts)
+
+
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """A frame of an episode, what was done there, and where it led."""
+
+    place: tuple[str, int]
+    index: int  # of the episode
+    ahead: int  # control steps to the goal
+    state: Float[np.ndarray, " dim"]
+    changes: Float[np.ndarray, "steps dim"]
+
+    @classmethod
+    def of(cls, dataset: Dataset, place: tuple[str, int], ahead: int, controller: Controller) -> _Place | None:
+        """Return a place with its goal so many control steps later; None: the episode ends before that."""
+        name, step = place
+        index = dataset.table.find(name)
+        if index is None:
+            raise InputError(where=f"--policy: episode {name}", found=f"no such episode in {dataset.config.path}")
+        episode = dataset.source.read(index)
+        if not 0 <= step < len(episode.states) - ahead:
+            return None
+        states = episode.states[step : step + ahead + 1 : dataset.config.model_stride]
+        return cls(place, index, ahead, episode.states[step], controller.spaces.state.differences(states))
+
+    def frames(self, dataset: Dataset) -> np.ndarray:
+        """Return what is seen there, and the goal image."""
+        return dataset.source.read(self.index).read_frames([self.place[1], self.place[1] + self.ahead])
+
+
+def _drawn(rng: np.random.Generator, number: int, episodes: Sequence[str]) -> Int[np.ndarray, " others"]:
+    """Draw places of other episodes than that of one; of all others where there is one episode only."""
+    apart = [other for other, name in enumerate(episodes) if name != episodes[number]]
+    choices = apart or [other for other in range(len(episodes)) if other != number] or [number]
+    return rng.choice(np.array(choices), size=_OTHERS)

@@ -1,0 +1,195 @@
+"""Policies are put in order by the energy of what they would do, and not where the model cannot tell actions apart."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tiny_models import tiny_model
+from vjepa2_ac.api import open_dataset
+from vjepa2_ac.cli import main
+from vjepa2_ac.config.planning import PlanningConfig
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.policies.score import (
+    PolicyChunks,
+    is_blind,
+    ranking_of_run,
+    read_policy_chunks,
+    score_policies,
+)
+from vjepa2_ac.intervals import Estimate
+from vjepa2_ac.planning.chunks import ChunkScores
+from vjepa2_ac.planning.controller import Controller
+
+STRIDE, EPISODES, STEPS = 2, 4, 14
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    folder, rng = tmp_path_factory.mktemp("npz"), np.random.default_rng(0)
+    for number in range(EPISODES):
+        states = np.concatenate(
+            [rng.normal(0, 0.02, (STEPS, 6)).cumsum(0) * 0.3, rng.uniform(0, 1, (STEPS, 1))], axis=1
+        )
+        frames = rng.integers(0, 255, (STEPS, 48, 48, 3), dtype=np.uint8)
+        np.savez(folder / f"episode_{number}.npz", states=states, frames=frames, fps_hz=15.0)
+    return open_dataset(folder, source="npz", frames=3, stride=STRIDE, workers=0)
+
+
+def policy(dataset: Dataset, name: str, noise: float, chunks: int = 3, steps: int = 4) -> PolicyChunks:
+    """What was done, more or less: targets at control rate."""
+    rng, places, found = np.random.default_rng(1), [], []
+    for number in range(EPISODES):
+        states = dataset.source.read(number).states
+        for step in (0, 5, STEPS - 1):
+            places.append((dataset.table.identity(number), step))
+            true = states[np.minimum(step + 1 + np.arange(steps), STEPS - 1)]
+            off = rng.normal(0, 0.02, (chunks, steps, 7))
+            off[..., 6] = 0.0
+            found.append(true + noise * off)
+    return PolicyChunks(name, tuple(places), np.array(found))
+
+
+class Knowing(Controller):
+    """Its energy is the distance to the true actions, which are the first of all that it is asked for."""
+
+    is_blind = False
+
+    def score(self, frame: np.ndarray, state: np.ndarray, chunks: np.ndarray) -> ChunkScores:
+        del frame, state
+        far = np.linalg.norm((chunks - chunks[:1])[..., :6], axis=(1, 2))
+        still = float(np.linalg.norm(chunks[0, :, :6]))
+        if self.is_blind:
+            far = np.random.default_rng(int(1e6 * abs(chunks[1, 0, 0]))).uniform(1, 2, len(chunks))
+        return ChunkScores(far + 0.1, still + 0.1, 1.0, 0)
+
+
+def knowing(*, blind: bool = False) -> Controller:
+    run = Knowing(tiny_model(), PlanningConfig())
+    run.is_blind = blind
+    return run
+
+
+def test_policies_of_known_quality_come_out_in_their_order(dataset: Dataset) -> None:
+    policies = [policy(dataset, name, noise) for name, noise in (("bad", 1.0), ("good", 0.05), ("fair", 0.3))]
+    found = score_policies(knowing(), dataset, policies)
+    assert [one.name for one in found.policies] == ["good", "fair", "bad"]
+    assert (found.places, found.episodes, found.left_out) == (2 * EPISODES, EPISODES, EPISODES)
+    assert not found.is_blind
+    assert found.others_better.value == 0.0
+    assert found.policies[0].behind is None
+    assert all(one.behind.low > 0 for one in found.policies[1:] if one.behind is not None)
+    assert all(one.best.value <= one.mean.value for one in found.policies)
+    assert found.demonstrated.value < found.policies[0].mean.value
+    assert json.loads(json.dumps(found.as_dict()))["is_blind"] is False
+
+
+def test_a_model_at_chance_is_said_to_be_blind(dataset: Dataset) -> None:
+    found = score_policies(knowing(blind=True), dataset, [policy(dataset, "one", 0.1)])
+    assert found.is_blind
+    assert found.others_better.low < 0.5
+
+
+@pytest.mark.parametrize(
+    ("estimate", "blind"),
+    [((0.3, 0.2, 0.4), False), ((0.45, 0.3, 0.55), True), ((0.4, np.nan, np.nan), False), ((np.nan,) * 3, True)],
+)
+def test_blind_is_where_the_interval_reaches_chance(estimate: tuple[float, float, float], blind: bool) -> None:
+    assert is_blind(Estimate(*estimate)) is blind
+
+
+def test_the_real_controller_scores_the_same_places(dataset: Dataset) -> None:
+    found = score_policies(Controller(tiny_model()), dataset, [policy(dataset, "one", 0.1)], control_steps=4)
+    assert 0 < found.policies[0].mean.value < 10
+
+
+def test_places_that_not_all_have_are_left_out_and_unknown_episodes_refused(dataset: Dataset) -> None:
+    one, other = policy(dataset, "one", 0.1), policy(dataset, "other", 0.1)
+    fewer = PolicyChunks("other", other.places[:2], other.chunks[:2])
+    assert score_policies(knowing(), dataset, [one, fewer]).places == 2
+    with pytest.raises(InputError, match="no frame that all"):
+        score_policies(knowing(), dataset, [one, PolicyChunks("none", (("x", 0),), other.chunks[:1])])
+    with pytest.raises(InputError, match="no such episode"):
+        score_policies(knowing(), dataset, [PolicyChunks("none", (("x", 0),), other.chunks[:1])])
+
+
+def test_files_are_read_and_nothing_in_them_runs(tmp_path: Path) -> None:
+    good = {"episodes": np.array(["a", "b"]), "frames": np.array([0, 3]), "chunks": np.zeros((2, 1, 4, 7))}
+    np.savez(tmp_path / "good.npz", **good)
+    found = read_policy_chunks(tmp_path / "good.npz")
+    assert (found.name, found.places) == ("good", (("a", 0), ("b", 3)))
+    for name, change in {
+        "pickled": {"episodes": np.array(["a", None], dtype=object)},
+        "short": {"frames": np.array([0])},
+        "flat": {"chunks": np.zeros((2, 4, 7))},
+        "text": {"frames": np.array(["0", "3"])},
+    }.items():
+        np.savez(tmp_path / f"{name}.npz", **good | change)
+        with pytest.raises(InputError, match=f"{name}.npz"):
+            read_policy_chunks(tmp_path / f"{name}.npz")
+    with pytest.raises(InputError, match="cannot be read"):
+        read_policy_chunks(tmp_path / "absent.npz")
+
+
+def test_a_run_knows_from_its_validation_whether_it_can_tell(tmp_path: Path, whole_run: Path) -> None:
+    found = ranking_of_run(str(whole_run), "step-00000006 (the newest)")
+    assert found is not None
+    assert 0 <= found.value <= 1
+    assert ranking_of_run(str(tmp_path), "") is None
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> list[str]:
+    for seed, name in enumerate(("start", "goal")):
+        pixels = np.random.default_rng(seed).integers(0, 256, (36, 64, 3), dtype=np.uint8)
+        Image.fromarray(pixels).save(tmp_path / f"{name}.png")
+    np.save(tmp_path / "chunks.npy", np.random.default_rng(0).normal(0, 0.01, (3, 4, 7)))
+    state = "0.4,0.0,0.3,3.1,0.0,0.1,0.2"
+    images = ["--start", str(tmp_path / "start.png"), "--goal", str(tmp_path / "goal.png"), "--state", state]
+    return [
+        *images,
+        "--chunks",
+        str(tmp_path / "chunks.npy"),
+        "--form",
+        "deltas",
+        "--out",
+        str(tmp_path / "score.json"),
+    ]
+
+
+def test_the_command_scores_the_chunks_of_a_scene(
+    whole_run: Path, base_folder: Path, scene: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status = main(["score", str(whole_run), *scene])
+    found = json.loads((tmp_path / "score.json").read_text())
+    assert status == int(found["is_blind"])
+    assert (found["best"] is None) == found["is_blind"]
+    assert len(found["energies"]) == 3
+    capsys.readouterr()
+    assert main(["score", str(base_folder), *scene, "--control-steps", "2"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "is not known" in said
+    assert "doing nothing" in said
+
+
+def test_the_command_scores_policies_and_joints_through_the_users_kinematics(
+    whole_run: Path, data_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dataset = open_dataset(data_folder, frames=4, stride=2, workers=0)
+    name = dataset.table.identity(0)
+    poses = dataset.source.read(0).states[1:5]
+    np.savez(
+        tmp_path / "joints.npz", episodes=np.array([name]), frames=np.array([0]), chunks=poses[None, None, :, ::-1]
+    )
+    (tmp_path / "my_arm.py").write_text("def forward(joints):\n    return joints[..., ::-1]\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    words = ["score", str(whole_run), "--policy", "joints.npz", "--kinematics", "my_arm:forward"]
+    assert main(words) in {0, 1}
+    found = json.loads((tmp_path / "score.json").read_text())
+    assert found["places"] == 1
+    assert found["policies"][0]["mean"]["value"] == pytest.approx(found["demonstrated"]["value"], rel=1e-4)
+    assert main([*words[:-1], "my_arm:backward"]) == 2

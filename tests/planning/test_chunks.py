@@ -1,0 +1,98 @@
+"""Chunks of a policy become changes of model steps, in whatever form they come, and get the planner's energies."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from decisions import QUICK, STATE, image
+from tiny_models import tiny_model
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.planning.chunks import ChunkScores, changes_of_chunks
+from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.spaces import actions_from_states, apply_action, vector_states
+
+
+def walks(seed: int, steps: int = 12) -> np.ndarray:
+    """Return the states after each control step of three chunks; the gripper stays within its limits."""
+    rng = np.random.default_rng(seed)
+    found = []
+    for _ in range(3):
+        state, way = STATE, []
+        for step in rng.normal(0, [0.01] * 3 + [0.1] * 3 + [0.02], (steps, 7)):
+            state = apply_action(state, step)
+            way.append(state)
+        found.append(way)
+    return np.array(found)
+
+
+@settings(max_examples=15)
+@given(st.integers(0, 30), st.sampled_from([1, 3, 4]))
+def test_the_same_motion_in_every_form_is_the_same_change(seed: int, control_steps: int) -> None:
+    targets = walks(seed)
+    deltas = np.stack([actions_from_states(np.concatenate([STATE[None], one])) for one in targets])
+    offsets = np.array([[actions_from_states(np.stack([STATE, one]))[0] for one in way] for way in targets])
+    wanted = [
+        actions_from_states(np.concatenate([STATE[None], one[control_steps - 1 :: control_steps]])) for one in targets
+    ]
+    for form, chunks in (("targets", targets), ("deltas", deltas), ("offsets", offsets)):
+        found = changes_of_chunks(chunks, STATE, form=form, control_steps=control_steps)
+        np.testing.assert_allclose(found, wanted, atol=1e-9)
+
+
+def test_control_steps_that_fill_no_model_step_are_left_out_and_vectors_add() -> None:
+    chunks = np.arange(30.0).reshape(1, 10, 3)
+    found = changes_of_chunks(chunks, np.zeros(3), form="deltas", control_steps=4, space=vector_states(3))
+    np.testing.assert_allclose(found, [[chunks[0, :4].sum(0), chunks[0, 4:8].sum(0)]])
+
+
+@pytest.mark.parametrize(
+    ("chunks", "found"),
+    [
+        (np.zeros((2, 8, 6)), r"shape \(2, 8, 6\)"),
+        (np.full((2, 8, 7), np.nan), "finite"),
+        (np.zeros((2, 3, 7)), "3 control steps"),
+        (np.full((2, 8, 7), 400.0), "metres"),
+    ],
+)
+def test_what_is_no_chunk_is_refused(chunks: np.ndarray, found: str) -> None:
+    with pytest.raises(InputError, match=found):
+        changes_of_chunks(chunks, STATE, form="targets", control_steps=4)
+
+
+def test_scores_are_the_planners_energies_and_leave_no_trace() -> None:
+    run = Controller(tiny_model(), QUICK)
+    run.reset(image(100))
+    run.act(image(0), STATE)
+    before = run.decision
+    chunks = np.random.default_rng(0).normal(0, 0.03, (5, 2, 7))
+    found = run.score(image(0), STATE, chunks)
+    assert run.decision is before
+    with torch.no_grad():
+        expected = before.cost(torch.from_numpy(chunks).float())
+        still = before.cost(torch.zeros(1, 2, 7))
+    np.testing.assert_allclose(found.energies, expected, rtol=1e-5)
+    assert found.doing_nothing == pytest.approx(float(still), rel=1e-5)
+    assert found.now == pytest.approx(before.energy_now)
+    assert found.energies[found.order].tolist() == sorted(found.energies)
+    undisturbed = Controller(tiny_model(), QUICK)
+    undisturbed.reset(image(100))
+    undisturbed.act(image(0), STATE)
+    np.testing.assert_array_equal(run.act(image(1), STATE), undisturbed.act(image(1), STATE))
+
+
+def test_ties_and_spread_are_told() -> None:
+    scores = ChunkScores(np.array([0.3, 0.2, 0.2, 0.5]), 0.3, 0.4, 0)
+    assert (scores.best, scores.tied) == (1, 2)
+    assert scores.order.tolist() == [1, 2, 0, 3]
+    assert scores.spread == pytest.approx(np.std([0.3, 0.2, 0.2, 0.5]) / 0.4)
+
+
+def test_a_score_needs_a_goal_and_chunks_of_the_models_actions() -> None:
+    run = Controller(tiny_model(), QUICK)
+    with pytest.raises(ValueError, match="no goal"):
+        run.score(image(0), STATE, np.zeros((1, 1, 7)))
+    run.reset(image(100))
+    with pytest.raises(InputError, match="shape"):
+        run.score(image(0), STATE, np.zeros((1, 1, 6)))

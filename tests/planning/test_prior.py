@@ -1,0 +1,169 @@
+"""A prior proposes actions: searches start from it, it acts alone, and its training sees the goal."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from decisions import QUICK, STATE, image
+from run_fixtures import MakeConfig, SilentReporter
+from tiny_models import tiny_model
+from vjepa2_ac.cli import main
+from vjepa2_ac.config.loading import parse_config
+from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.planning.prior.action_prior import (
+    CARD,
+    WEIGHTS,
+    ActionPrior,
+    PriorCard,
+    PriorSizes,
+    load_prior,
+    save_prior,
+)
+from vjepa2_ac.planning.prior.train_prior import PriorOptions, _Pairs, train_prior
+
+SIZES = PriorSizes(grid=3, dim=24, state=7, action=7, ahead=3)
+MEAN = (0.03, -0.02, 0.01, 0.0, 0.0, 0.0, 0.3)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A prior that always says the same, of the tiny model's encoder."""
+    model, prior = tiny_model(), ActionPrior(SIZES)
+    with torch.no_grad():
+        prior.outer.weight.zero_()
+        prior.outer.bias.copy_(torch.tensor([*MEAN, *[-3.0] * 7]))
+    card = PriorCard("vjepa2-ac prior 1", SIZES, model.encoder_fingerprint(), "released", "nowhere", 0)
+    save_prior(tmp_path / "prior", card, prior)
+    return tmp_path / "prior"
+
+
+def acting(folder: Path | None, **changes: object) -> Controller:
+    config = QUICK.model_copy(update={"prior": folder and str(folder), **changes})
+    run = Controller(tiny_model(), config)
+    run.reset(image(100))
+    run.act(image(0), STATE)
+    return run
+
+
+def test_alone_it_acts_within_the_limits_without_a_search(folder: Path) -> None:
+    run = acting(folder, planner="prior", limits=LimitsConfig(xyz=(0.05, 0.01, 0.05)))
+    np.testing.assert_allclose(run.decision.action, [0.03, -0.01, 0.01, 0, 0, 0, 0.3], atol=1e-6)
+    assert run.decision.plan.evaluations == 1
+    assert run.decision.why == "planned"
+
+
+@pytest.mark.parametrize("planner", ["cem", "icem", "mppi", "gradient"])
+def test_every_search_starts_from_it_as_wide_as_it_is_unsure(folder: Path, planner: str) -> None:
+    run = acting(folder, planner=planner, iterations=1, horizon=1, samples=400)
+    first = run.decision.plan.iterations[0]
+    spread = np.sqrt(2) * np.exp(-3.0)
+    far = (first.elites[:, 0, :3] - torch.tensor(MEAN[:3])).abs().max()
+    assert far <= 5 * spread
+    if planner in {"cem", "icem"}:
+        assert not torch.allclose(first.mean, acting(None, planner=planner, iterations=1, horizon=1).space.lower)
+    again = acting(folder, planner=planner, iterations=1, horizon=1, samples=400)
+    np.testing.assert_array_equal(run.decision.action, again.decision.action)
+
+
+def test_a_plan_of_several_steps_follows_what_the_model_predicts(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    prior, model = ActionPrior(SIZES).eval().requires_grad_(False), tiny_model()
+    card = PriorCard("vjepa2-ac prior 1", SIZES, model.encoder_fingerprint(), "released", "nowhere", 0)
+    save_prior(tmp_path / "prior", card, prior)
+    run = acting(
+        tmp_path / "prior", planner="prior", horizon=3, limits=LimitsConfig(xyz=(1.0,) * 3, rotation=3.0, gripper=1.0)
+    )
+    cost, wanted = run.decision.cost, run.encoded(image(100))
+    seen, state = cost.now
+    for step, action in enumerate(run.decision.plan.actions):
+        left = torch.tensor([max(1, 3 - step)])
+        mean, _ = prior(seen[None], wanted[None], left, state[None])
+        np.testing.assert_allclose(action, run.space.allowed(mean.expand(3, -1))[0], atol=1e-5)
+        predicted, states = cost.imagine(run.decision.plan.actions[None, : step + 1])
+        seen, state = predicted[0, -1], states[0, -1]
+
+
+def test_it_is_refused_for_another_encoder_and_where_a_file_is_damaged(folder: Path) -> None:
+    card = json.loads((folder / CARD).read_text())
+    (folder / CARD).write_text(json.dumps(card | {"encoder": "0" * 64}))
+    with pytest.raises(InputError, match=r"prior of another encoder"):
+        acting(folder)
+    (folder / CARD).write_text(json.dumps(card | {"sizes": {**card["sizes"], "dim": -1}}))
+    with pytest.raises(InputError, match="dim"):
+        load_prior(folder, where="planning.prior")
+    (folder / CARD).write_text(json.dumps(card))
+    (folder / WEIGHTS).write_bytes(b"no tensors")
+    with pytest.raises(InputError, match=WEIGHTS):
+        load_prior(folder, where="planning.prior")
+
+
+@pytest.mark.parametrize(
+    ("changes", "found"),
+    [
+        ({"planner": "prior"}, "needs a prior"),
+        ({"prior": "x", "warm_start": True}, "two starts"),
+        ({"prior": "x", "views": 2}, "one camera"),
+    ],
+)
+def test_settings_that_contradict_are_refused(changes: dict[str, object], found: str) -> None:
+    with pytest.raises(InputError, match=found):
+        parse_config({"run_dir": "r", "data": {"path": "d"}, "model": {"base": "b"}, "planning": changes}, where="test")
+    assert PlanningConfig().prior is None
+
+
+def test_training_is_repeatable_beats_doing_nothing_and_sees_the_goal(make_config: MakeConfig, tmp_path: Path) -> None:
+    """On episodes whose actions are drawn at random, what leads to a goal is only to be seen in the goal."""
+    config, reporter = make_config(), SilentReporter()
+    first = train_prior(config, tmp_path / "a", PriorOptions(steps=60, batch_size=8), reporter)
+    again = train_prior(config, tmp_path / "b", PriorOptions(steps=60, batch_size=8))
+    assert (tmp_path / "a" / WEIGHTS).read_bytes() == (tmp_path / "b" / WEIGHTS).read_bytes()
+    assert first.held_out == again.held_out
+    assert set(first.held_out) == {"clips", "true_goals", "goals_of_others"}
+    assert reporter.tasks["training the prior"][-1] == (60, 60)
+    assert load_prior(tmp_path / "a", where="test").card.sizes.ahead == config.data.frames - 1
+
+
+def test_it_learns_an_action_that_only_the_goal_tells() -> None:
+    """The world is one bright patch, which an action moves: present and goal say by how much."""
+    torch.manual_seed(0)
+    drawn = torch.Generator().manual_seed(1)
+    prior = ActionPrior(PriorSizes(grid=4, dim=8, state=7, action=7, ahead=1))
+    optimizer = torch.optim.Adam(prior.parameters(), lr=3e-3)
+
+    def pairs(count: int) -> _Pairs:
+        from_x, to_x = torch.randint(4, (2, count), generator=drawn)
+        rows = torch.arange(count)
+        seen, wanted = torch.zeros(2, count, 16, 8).unbind()
+        seen[rows, from_x], wanted[rows, to_x] = 1.0, 1.0
+        changes = torch.zeros(count, 7)
+        changes[:, 0] = (to_x - from_x).float()
+        return _Pairs(seen, wanted, torch.ones(count, dtype=torch.long), torch.zeros(count, 7), changes)
+
+    for _ in range(150):
+        one = pairs(64)
+        mean, _ = prior(one.seen, one.wanted, one.remaining, one.states)
+        loss = (mean - one.changes).abs().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    one = pairs(200)
+    mean, _ = prior(one.seen, one.wanted, one.remaining, one.states)
+    blind, _ = prior(one.seen, one.wanted.roll(1, 0), one.remaining, one.states)
+    assert (mean - one.changes)[:, 0].abs().mean() < 0.25
+    assert (blind - one.changes)[:, 0].abs().mean() > 1.0
+
+
+def test_the_command_writes_it_beside_the_run_and_says_how_to_plan(
+    whole_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "prior"
+    assert main(["prior", str(whole_run), "--steps", "3", "--out", str(out)]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "of doing nothing" in said
+    assert "planning.prior=" in said
+    assert main(["prior", str(tmp_path)]) == 2
