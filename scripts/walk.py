@@ -66,6 +66,7 @@ SHORTER = {  # by the first words of a command
     "simulate": f"--episodes 1 --steps 1 {FEW_SAMPLES}",
     "plan": FEW_SAMPLES,
     "prior": "--steps 20",
+    "monitor": "--false-alarms 0.4 || test $? = 1",  # watched episodes of a hasty model
     "data calibrate CONFIG --axes": "--limit 8 || test $? = 1",  # of so few pairs: not to plan by
     "data calibrate": "--limit 8",
     "python examples/finetune.py": "training.steps=2 training.warmup_steps=0 training.allow_weak_base=true",

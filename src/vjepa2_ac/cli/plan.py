@@ -12,6 +12,7 @@ from vjepa2_ac.errors import InputError
 if TYPE_CHECKING:
     import numpy as np
 
+    from vjepa2_ac.config import Config
     from vjepa2_ac.config.planning import PlanningConfig
     from vjepa2_ac.planning.demonstrations.make_goals import Recording
     from vjepa2_ac.planning.goals import GoalFolder
@@ -30,6 +31,7 @@ def add_plan(commands: cli.Commands) -> None:
     goals = parser.add_mutually_exclusive_group(required=True)
     cli.add(goals, "--goal IMAGE", "what it is to see; again for goals in a row", cli.as_local, action="append")
     cli.add(goals, "--goals FOLDER", "goals with rules of their own, that `vjepa2-ac goals` made", cli.as_path)
+    cli.add(goals, "--goal-from EPISODE[:STEP]", "what the run's data show there (its last frame)")
     cli.add(parser, "--out FOLDER", "where both files go (plan)", cli.as_path, default=Path("plan"))
     group = parser.add_argument_group("the goals")
     cli.add(group, "--durations STEPS", "model steps of all goals but the last, as 2,1 (equal shares)")
@@ -48,6 +50,8 @@ def add_goals(commands: cli.Commands) -> None:
     cli.add(parser, "overrides key=value", "of the config, such as data.camera=wrist_left", nargs="*")
     cli.add(parser, "--out FOLDER", "where goals.json and the images go: new or empty", cli.as_path, required=True)
     cli.add(parser, "--episode ID|NUMBER", "which one: its name in the data, or its number, from 0 (0)")
+    text = "instead: the last frame of a successful episode of each language label with this text, for prompts"
+    cli.add(parser, "--task TEXT", text, nargs="?", const="")
     text = "gripper: where it changes or the arm stops; latent: by images; every N frames (gripper; of a film latent)"
     cli.add(parser, "--by gripper|latent|every", text, nargs="+")
     cli.add(parser, "--model RUN_OR_MODEL", "what will plan: for latents, energies and the noise floor", cli.as_model)
@@ -74,7 +78,7 @@ def _plan(options: argparse.Namespace) -> int:
     config = cli.require_to_plan(options)
     measured_space(config.data, len(state)).require_state(state, "--state")  # how wide, only the model knows
     cli.make_folder(options.out)
-    goals = _goals_of(options, config.planning.horizon)
+    goals = _goals_of(options, config)
     start, mask = _images(options, goals.goals[0].image)
 
     from vjepa2_ac.cli.console.tables import plan_table
@@ -93,7 +97,7 @@ def _plan(options: argparse.Namespace) -> int:
         controller = session.controller(seed=options.seed, extrinsics=extrinsics)
         controller.planner.progress = reporter.task("planning", "action sequences")
         found = decide(controller, request, nodes=options.nodes, reporter=reporter)
-    names = options.goal or [str(options.goals)]
+    names = options.goal or [str(options.goals or options.goal_from)]
     about = session.as_dict() | {"start": options.start, "goals": names, "mask": options.mask}
     about["decoder"] = None if decoder is None else decoder.as_dict()
     imagined = None if decoder is None else imagine_plan(found, decoder)
@@ -127,7 +131,7 @@ def _images(options: argparse.Namespace, goal: np.ndarray) -> tuple[np.ndarray, 
     return start, mask
 
 
-def _goals_of(options: argparse.Namespace, horizon: int) -> GoalFolder:
+def _goals_of(options: argparse.Namespace, config: Config) -> GoalFolder:
     """Return the goals of a folder; or images with the durations that were given, else with equal ones."""
     from vjepa2_ac.media.images import read_image, require_image
     from vjepa2_ac.planning.goals import GoalFolder, equal_durations, read_goal_folder, timed
@@ -137,6 +141,10 @@ def _goals_of(options: argparse.Namespace, horizon: int) -> GoalFolder:
             found, needed = f"--goals {options.goals}", "--goal: a folder says how long its goals apply"
             raise InputError(where="--durations", found=found, needed=needed)
         return read_goal_folder(options.goals)
+    if options.goal_from is not None:
+        from vjepa2_ac.planning.demonstrations.make_goals import frame_of_episode
+
+        return GoalFolder(timed([frame_of_episode(config.data, options.goal_from)], []))
     images, count = [read_image(path) for path in options.goal], len(options.goal)
     for path, image in zip(options.goal, images, strict=True):
         require_image(image, where=f"--goal {path}", like=images[0])
@@ -145,7 +153,7 @@ def _goals_of(options: argparse.Namespace, horizon: int) -> GoalFolder:
         found = f"{options.durations!r} for {count} goal{'s' * (count > 1)}"
         needed = f"{count - 1} whole numbers from 1, with commas between them: of each goal but the last"
         raise InputError(where="--durations", found=found, needed=needed)
-    return GoalFolder(timed(images, [int(word) for word in words] or equal_durations(horizon, count)))
+    return GoalFolder(timed(images, [int(word) for word in words] or equal_durations(config.planning.horizon, count)))
 
 
 def _goals(options: argparse.Namespace) -> None:
@@ -156,6 +164,9 @@ def _goals(options: argparse.Namespace) -> None:
     """
     by, every = _way(options)
     cli.require_new_place(options.out)
+    if options.task is not None:
+        _goals_by_label(options)
+        return
     recording, stride = _recording(options)
 
     from vjepa2_ac.cli.console.tables import goals_notes, goals_table
@@ -175,6 +186,16 @@ def _goals(options: argparse.Namespace) -> None:
     with user_can_write(options.out):
         written = [made.write(options.out), plot_goals(made, options.out / GOALS_IMAGE)]
     cli.show(goals_table(made), *goals_notes(made), files=written)
+
+
+def _goals_by_label(options: argparse.Namespace) -> None:
+    config = cli.read_config(options.source, options.overrides, of_run=True)
+
+    from vjepa2_ac.planning.demonstrations.make_goals import goals_by_label
+
+    with cli.reporter() as reporter:
+        found, folder = goals_by_label(config.data, options.task, options.out, reporter)
+    cli.show(*(f"{label}: {episode}" for label, episode in found.items()), f"Serve them as prompts: --goals {folder}")
 
 
 def _is_film(options: argparse.Namespace) -> bool:

@@ -1,4 +1,4 @@
-"""The commands score and prior: what a world model says of a policy's actions, and a policy that it learns itself."""
+"""The commands score, prior and monitor: a policy's actions judged, actions proposed, and a robot watched."""
 
 from __future__ import annotations
 
@@ -49,6 +49,29 @@ def add_prior(commands: cli.Commands) -> None:
     cli.add(parser, "--out FOLDER", "where it goes (prior, in the run's folder)", cli.as_path)
     cli.add(parser, "--steps N", "optimizer steps (2000)", cli.count)
     cli.add(parser, "--ahead N", "most model steps from a frame to its goal (those of a clip)", cli.count)
+
+
+def add_monitor(commands: cli.Commands) -> None:
+    """Add `monitor` to a parser."""
+    parser = cli.command(commands, "monitor", _monitor, "demo/run --episode 3")
+    cli.add_planner(parser, such_as="such as planning.context=1")
+    cli.add(parser, "--data CONFIG", "watch episodes of its data (those of the run)", cli.as_local)
+    cli.add(parser, "--episode ID|NUMBER", "watch this one of the data; repeatable", action="append", default=[])
+    text = "promised share of undisturbed episodes with an alarm (0.05)"
+    share = cli.number_between(0.0, 1.0, "a share")
+    cli.add(parser, "--false-alarms SHARE", text, share, default=0.05)
+    text = "what it is to be measured by: a monitor.json (made of the held-out episodes of the data)"
+    cli.add(parser, "--threshold FILE", text, cli.as_local)
+    cli.add(parser, "--out FOLDER", "where monitor.json and monitor.png go (the run's)", cli.as_path)
+
+
+def add_progress(commands: cli.Commands) -> None:
+    """Add `progress` to a parser."""
+    parser = cli.command(commands, "progress", _progress, "demo/run --out progress.parquet")
+    cli.add_planner(parser, such_as="such as planning.energy.distance=cosine")
+    cli.add(parser, "--out FILE", "the column, as Parquet", cli.as_path, default=Path("progress.parquet"))
+    cli.add(parser, "--data CONFIG", "of its data (those of the run)", cli.as_local)
+    cli.add(parser, "--every N", "control steps from one row to the next (1)", cli.count, default=1)
 
 
 def _score(options: argparse.Namespace) -> int:
@@ -173,6 +196,103 @@ def _score_policies(options: argparse.Namespace, to_poses: Callable[[np.ndarray]
     write_atomically(options.out, json_text(about | found.as_dict()))
     cli.show(table, *notes, files=[options.out])
     return int(found.is_blind)
+
+
+def _monitor(options: argparse.Namespace) -> int:
+    """Notice when reality departs from what the model predicts.
+
+    Each frame of an episode is predicted from the one before it. What held-out episodes show, where nothing was wrong,
+    gives the threshold; `planning.monitor` takes the file, and `serve` tells alarms. Status 1 where a watched episode
+    has one.
+    """
+    from vjepa2_ac.runs.folder import is_run
+
+    cli.require_to_plan(options)
+    if options.out is None and not is_run(options.subject):
+        raise InputError(where="--out", found=f"{options.subject}, a model, and no folder", needed="--out FOLDER")
+    data = None if options.data is None else cli.read_config(options.data)
+    folder = Path(options.out or options.subject)
+    cli.make_folder(folder)
+
+    from dataclasses import asdict
+
+    from vjepa2_ac.cli.console.progress import MetricsTable
+    from vjepa2_ac.data.dataset import open_dataset
+    from vjepa2_ac.evaluation.policies.monitor import calibrate_monitor, watch_episodes
+    from vjepa2_ac.planning.demonstrations.make_goals import number_of_episode
+    from vjepa2_ac.planning.surprise import MONITOR, Monitor
+    from vjepa2_ac.reporter import INDEXING
+    from vjepa2_ac.reports.figures.planning import MONITOR_IMAGE, most_surprising, plot_watched
+    from vjepa2_ac.storage import write_atomically
+    from vjepa2_ac.storage.structured import json_text
+
+    session = cli.load_planning_session(options)
+    model, files = session.world_model, []
+    with cli.reporter() as reporter:
+        dataset = open_dataset(session.config.data, progress=reporter.task(INDEXING))
+        seen = dataset if data is None else open_dataset(data.data, progress=reporter.task(INDEXING))
+        wanted = [number_of_episode(seen, one) for one in options.episode]
+        if options.threshold is None:
+            progress = reporter.task("held-out episodes", "episodes")
+            monitor = calibrate_monitor(model, dataset, options.false_alarms, progress)
+            write_atomically(folder / MONITOR, json_text(asdict(monitor)))
+            files.append(folder / MONITOR)
+        else:
+            monitor = Monitor.read(options.threshold, model, where="--threshold")
+        watched = list(watch_episodes(model, seen, wanted, reporter.task("watching", "episodes")))
+    note = f"An alarm is a surprise above {monitor.threshold:.4g}: of {len(monitor.scores)} held-out episodes of up to"
+    note += f" {monitor.steps} model steps. At most {monitor.false_alarms:.1%} of undisturbed ones have one."
+    table = MetricsTable("Surprise, over the threshold", ["episode", "highest", "first alarm at control step"])
+    alarms = 0
+    for one in watched:
+        first = one.first_alarm(monitor.threshold)
+        alarms += first is not None
+        step = "" if first is None else str(one.steps[first])
+        table.add_row(one.name, f"{one.scores.max() / monitor.threshold:.2f}", step)
+    if watched:
+        most = max(watched, key=lambda one: one.scores.max())
+        steps = [int(most.steps[place]) for place in most_surprising(most)]
+        frames, crop = seen.source.read(most.index).read_frames(steps), session.config.data.crop
+        files.append(plot_watched(most, frames, monitor.threshold, crop, folder / MONITOR_IMAGE))
+    cli.show(*([table] if watched else []), note, files=files)
+    return int(alarms > 0)
+
+
+def _progress(options: argparse.Namespace) -> None:
+    """Write how far each frame of the demonstrations has come.
+
+    1 - distance now over distance at the start, in latents, to what is seen at the end: a row a frame, by
+    episode_index and frame_index as LeRobot has them. Whether it grows as time passes says how far to trust it.
+    """
+    cli.require_to_plan(options)
+    data = None if options.data is None else cli.read_config(options.data).data
+
+    import numpy as np
+
+    from vjepa2_ac.data.dataset import open_dataset
+    from vjepa2_ac.data.sources.lerobot.parquet import write_columns
+    from vjepa2_ac.evaluation.policies.progress import monotony_of, progress_of_episodes
+    from vjepa2_ac.reporter import INDEXING
+
+    session = cli.load_planning_session(options)
+    energy = session.config.planning.energy
+    with cli.reporter() as reporter:
+        dataset = open_dataset(data or session.config.data, progress=reporter.task(INDEXING))
+        how = {"every": options.every, "report": reporter.task("episodes")}
+        found = list(progress_of_episodes(session.world_model, dataset, energy, **how))
+    lengths = [len(one.steps) for one in found]
+    columns = {
+        "episode_index": np.repeat([one.index for one in found], lengths),
+        "frame_index": np.concatenate([one.steps for one in found]),
+        "episode": np.repeat([one.name for one in found], lengths),
+        "progress": np.concatenate([one.progress for one in found]).astype(np.float32),
+    }
+    write_columns(options.out, columns)
+    held_out = dataset.members("validation") | dataset.members("test")
+    if unseen := [one for one in found if held_out[one.index]]:
+        note = "It grows with time by Spearman's {} on {} held-out episodes (1: always)."
+        cli.show(note.format(monotony_of(unseen), len(unseen)))
+    cli.show(files=[options.out])
 
 
 def _control_steps(options: argparse.Namespace, session: PlanningSession) -> int:

@@ -107,7 +107,14 @@ def _parser(words: Sequence[str] = ()) -> Parser:
         "begin": [setup.add_demo, setup.add_init, setup.add_download, setup.add_doctor, setup.add_config_command],
         "look": [data.add_data, evaluate.add_imagine, explore.add_explore],
         "train": [train.add_encode, train.add_train, train.add_decoder_command],
-        "judge": [evaluate.add_evaluate, evaluate.add_compare, closed_loop.add_simulate, policies.add_score],
+        "judge": [
+            evaluate.add_evaluate,
+            evaluate.add_compare,
+            closed_loop.add_simulate,
+            policies.add_score,
+            policies.add_monitor,
+            policies.add_progress,
+        ],
         "use": [plan.add_plan, plan.add_goals, policies.add_prior, closed_loop.add_serve, train.add_export],
         "from other packages": [partial(_add_others, words)],
     }

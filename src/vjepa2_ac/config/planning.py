@@ -186,6 +186,11 @@ class PlanningConfig(Section):
     unsure. Not of `evaluate --planning`."""
     prior_steps: PositiveInt = 3
     """Model steps in which the prior is to reach a goal that says no bound of its own: fewer are bolder."""
+    monitor: Local | None = None
+    """A monitor.json (`vjepa2-ac monitor`): each frame is compared with what the last decision predicted."""
+    replan: Literal["always", "on_surprise"] = "always"
+    """on_surprise: a plan of several steps is carried on, without a search, until it ends, another goal follows, or
+    `monitor` is surprised."""
     warm_start: bool = False
     """Whether a decision starts from the last one's plan, shifted by the steps executed. Not at horizon 1, where the
     plan is the last action only: the arm overshoots (docs/log.md)."""
@@ -237,6 +242,7 @@ class PlanningConfig(Section):
             (self.views > 1 and self.axes, f"axes are of one camera, and there are {self.views} views"),
             (self.views > 1 and self.prior, f"a prior is of one camera, and there are {self.views} views"),
             (self.prior and self.warm_start, "prior and warm_start are two starts of one search"),
+            (self.replan != "always" and not self.monitor, "replan on_surprise needs a monitor: `vjepa2-ac monitor`"),
             (self.planner == "prior" and not self.prior, "planner prior needs a prior: `vjepa2-ac prior` trains one"),
             (elites > self.samples, f"{self.planner}.elites {elites} are more than {self.samples} samples"),
         )

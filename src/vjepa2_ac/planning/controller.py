@@ -29,11 +29,12 @@ from vjepa2_ac.planning.planner import Cancelled, Plan, Planner
 from vjepa2_ac.planning.search_space import SearchSpace, Workspace, is_allowed, search_space
 from vjepa2_ac.planning.settings import require_base_frame, warn_beyond_taught, with_taught_limits
 from vjepa2_ac.planning.solvers import PlanStart
+from vjepa2_ac.planning.surprise import Monitor, Surprise
 from vjepa2_ac.runs.loading import TrainedRun
 from vjepa2_ac.spaces import EXTRINSICS, POSES, Spaces
 
 Seen = tuple[Tensor, np.ndarray]  # latents of an image, and the state
-Why = Literal["planned", "out of time", "at the goal", "no finite energy", "outside the workspace"]
+Why = Literal["planned", "as planned", "out of time", "at the goal", "no finite energy", "outside the workspace"]
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,9 @@ class Decision:
     """The decision, and its reason."""
 
     action: Float[np.ndarray, " dim"]  # for the next model step; nothing changes for some values of `why`
-    why: Why  # out of time: the best plan so far. at the goal, no finite energy, outside the workspace: do nothing
+    # as planned: the last plan is carried on. out of time: the best plan so far. at the goal, no finite energy, outside
+    # the workspace: do nothing
+    why: Why
     energy_now: float  # of the current image, if nothing changed: to compare with the plan's
     goals: tuple[int, ...]  # index of the goal that applies now, and after each model step of a plan
     progress: GoalProgress  # which goal that is, since when, and why it changed
@@ -50,6 +53,7 @@ class Decision:
     cost: WorldModelCost | None = None  # to evaluate other actions
     done: bool = False  # the last goal is reached: no motion
     from_samples: bool = False  # the search started from what a policy would do
+    surprise: Surprise | None = None  # how far the frame is from what was predicted; None: nothing was, or no monitor
 
 
 class Controller:
@@ -107,6 +111,9 @@ class Controller:
         if self.config.axes is not None:
             require_base_frame(f"planning.axes: {self.config.axes}", is_base=spaces.state.is_base_pose)
             self._axes = Axes.read(self.config.axes, Fingerprints.of(world_model))
+        self._monitor = None
+        if self.config.monitor is not None:
+            self._monitor = Monitor.read(self.config.monitor, world_model, where="planning.monitor")
         self._prior = None
         if self.config.prior is not None:
             from vjepa2_ac.planning.prior.action_prior import load_prior
@@ -336,22 +343,47 @@ class Controller:
         progress = self._progressed(latents)
         cost, still, places = self._towards(seen, progress, self.config.horizon)
         energy = self._over_steps(still)
-        nothing = Decision(self._command(state, np.zeros(len(state))), "at the goal", energy, places, progress)
+        command = self._command(state, np.zeros(len(state)))
+        nothing = Decision(command, "at the goal", energy, places, progress, surprise=self._surprise(latents))
         if progress.done or float(still.max()) <= REACHED:
             return replace(nothing, done=progress.place == len(self._goals) - 1)
         if self._workspace is not None and not is_allowed(self._workspace.way_back(state[:3]), self.config.limits):
             return replace(nothing, why="outside the workspace")
         self.space = self._searched[self._goals[progress.place].gripper]
-        plan = self._planned(state, cost, self._start(cost, progress, samples), cancelled)
+        carried_on = self._carried_on(nothing)
+        if carried_on is None:
+            plan = self._planned(state, cost, self._start(cost, progress, samples), cancelled)
+        else:
+            plan = self._inside(state, carried_on, cost)
+        why: Why = "planned" if plan.stopped == "finished" else plan.stopped
         return replace(
             nothing,
             action=self._command(state, plan.actions[0].double().numpy()),
-            why="planned" if plan.stopped == "finished" else plan.stopped,
+            why=why if carried_on is None else "as planned",
             plan=plan,
             states=states_along(torch.from_numpy(state), plan.actions.double()[None], self.spaces.state)[0].numpy(),
             cost=cost,
             from_samples=samples is not None,
         )
+
+    def _surprise(self, latents: Float[Tensor, "tokens dim"]) -> Surprise | None:
+        """Return how far what is seen is from what the last decision predicted."""
+        before = self.decision
+        if self._monitor is None or before is None or before.cost is None or before.plan is None:
+            return None
+        with torch.no_grad():
+            predicted, _ = before.cost.imagine(before.plan.actions[None, :1])
+        return Surprise.of(predicted[0, 0], latents, self._monitor.threshold)
+
+    def _carried_on(self, now: Decision) -> Plan | None:
+        """Return what is left of the last plan, where it is to be carried on and nothing departs from it."""
+        before = self.decision
+        if self.config.replan == "always" or before is None or before.plan is None or now.surprise is None:
+            return None
+        is_other = now.surprise.is_alarm or now.progress.place != before.progress.place
+        if is_other or len(before.plan.actions) < 2 or before.plan.stopped == "no finite energy":
+            return None
+        return replace(before.plan, actions=before.plan.actions[1:], iterations=(), evaluations=0, seconds=0.0)
 
     def _start(self, cost: WorldModelCost, progress: GoalProgress, samples: np.ndarray | None) -> PlanStart | None:
         """Return where a search starts: what a policy or the prior says, or what is left of the last plan."""
@@ -368,10 +400,14 @@ class Controller:
         """Return what a search finds, inside the workspace if there is one; the energy is of what is sent."""
         generator, box = torch.Generator().manual_seed(self.seed + self._done), self._workspace
         space = self.space if box is None else box.narrowed(self.space, state)
-        plan = self.planner.plan(cost, generator, start, cancelled, space)
-        if box is None or plan.stopped == "no finite energy":
+        return self._inside(state, self.planner.plan(cost, generator, start, cancelled, space), cost)
+
+    def _inside(self, state: np.ndarray, plan: Plan, cost: WorldModelCost) -> Plan:
+        """Return a plan whose targets are in the workspace, if there is one."""
+        if self._workspace is None or plan.stopped == "no finite energy":
             return plan
-        kept = torch.from_numpy(box.kept(state, plan.actions.double().numpy(), self.config.limits)).to(plan.actions)
+        actions = plan.actions.double().numpy()
+        kept = torch.from_numpy(self._workspace.kept(state, actions, self.config.limits)).to(plan.actions)
         if torch.equal(kept, plan.actions):
             return plan
         with torch.no_grad():

@@ -94,7 +94,7 @@ class Recorder:
         if decision is None:
             raise ValueError("nothing was decided")
         if (
-            decision.why == "out of time"
+            decision.why in {"out of time", "as planned"}
             or decision.from_samples
             or (number and (config.context > 1 or config.warm_start))
         ):

@@ -237,6 +237,8 @@ class PlanningServer:
             (counter, "requests_refused", "Requests that could not be used.", "", {"": counts.refused}),
             (counter, "requests_failed", "Requests at which the server failed.", "", {"": counts.failed}),
             (counter, "episodes", "Episodes that were begun.", "", {"": counts.episodes}),
+            (counter, "alarms", "Frames that departed from what was predicted.", "", {"": counts.alarms}),
+            (gauge, "surprise", "Of the last frame: its distance from the prediction.", "", {"": counts.surprise}),
             (counter, "decisions", "Decisions, by their reason.", "why", counts.decisions),
             (counter, "connections_refused", "Connections, by HTTP status.", "status", self._turned_away),
         ):

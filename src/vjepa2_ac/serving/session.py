@@ -40,6 +40,7 @@ Clock = Callable[[], float]  # seconds, from anywhere
 
 _MOST_NAMES = 20  # of goals in a message
 STOPPED = "stopped by the page"
+_ALARM = "what the camera sees departs from what was predicted: look at the robot"
 _BAR = 0.05  # share of an image's height, black at the top and at the bottom: a padded image
 
 
@@ -63,6 +64,8 @@ class Counts:
     refused: int = 0
     failed: int = 0
     episodes: int = 0
+    alarms: int = 0  # frames that departed from what was predicted
+    surprise: float = 0.0  # of the last frame that was compared
     seconds: list[float] = field(default_factory=list)  # of each decision since it was last read
 
 
@@ -209,6 +212,7 @@ class Session:
         else:
             decision, why = self._checked(state)
             self._note(frame)
+            self._watch(decision)
             if is_stopped():
                 decision, why = replace(decision, plan=None, states=None), STOPPED
         found = self._message(decision, state, why)
@@ -255,6 +259,10 @@ class Session:
             goal = {"index": progress.place, "name": name, "since": progress.since, "changed": progress.changed}
             energy = {"now": decision.energy_now, "plan": None if plan is None else plan.energy}
             found |= {"goal": goal, "done": decision.done, "energy": energy}
+            if (seen := decision.surprise) is not None:
+                found["surprise"] = {"score": seen.score, "is_alarm": seen.is_alarm}
+                if seen.is_alarm:
+                    found["notes"] = [*self._notes, _ALARM]
             planned = planned if decision.states is None else decision.states[1:]
             if plan is not None and not self.options.dry_run:
                 changes = plan.actions.double().numpy()
@@ -288,6 +296,13 @@ class Session:
         names = list(self.goals)
         more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
         return f" (this server keeps {', '.join(names[:_MOST_NAMES])}{more})" if names else ""
+
+    def _watch(self, decision: Decision) -> None:
+        if (found := decision.surprise) is not None:
+            self.counts.surprise = found.score
+            self.counts.alarms += found.is_alarm
+            if found.is_alarm:
+                logger.warning("surprise %.4g: what is seen departs from what was predicted", found.score)
 
     def _note(self, frame: np.ndarray) -> None:
         text = "black bars at the top and the bottom of the picture: send whole frames, not padded ones"

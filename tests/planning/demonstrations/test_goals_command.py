@@ -12,9 +12,11 @@ pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 pytest.importorskip("av", reason="the extra `video` is not installed")
 
 from tiny_models import tiny_model
+from vjepa2_ac.api import open_dataset
 from vjepa2_ac.cli import main
 from vjepa2_ac.media.video import write_video
 from vjepa2_ac.planning.goals import read_goal_folder
+from vjepa2_ac.serving.about import read_kept_goals
 from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
 
 QUICK = ["planning.samples=8", "planning.iterations=2", "planning.cem.elites=4"]
@@ -192,3 +194,29 @@ def test_of_a_long_film_every_so_many_frames_are_looked_at(
     frames = [goal["frame"] for goal in file["goals"]]
     assert frames[-1] == 23
     assert all(frame % 3 == 0 for frame in frames[:-1])
+
+
+def test_language_labels_become_goals_that_a_client_may_prompt(workshop: Path, tmp_path: Path) -> None:
+    status = main(["goals", str(workshop / "config.yaml"), "--task", "BLOCK", "--out", str(tmp_path / "goals")])
+    assert status == 0
+    kept = read_kept_goals(tmp_path / "goals")
+    assert list(kept) == ["pick up the block"]
+    source = open_dataset(workshop / "set", frames=4).source
+    ends = [source.read(number).read_frames([40])[0] for number in range(2)]
+    shown = kept["pick up the block"].goals[0].image
+    assert any(np.array_equal(shown, end) for end in ends)
+    assert main(["goals", str(workshop / "config.yaml"), "--task", "pour", "--out", str(tmp_path / "none")]) == 2
+    assert not list((tmp_path / "none").glob("*"))
+
+
+def test_a_plan_takes_its_goal_from_an_episode(whole_run: Path, data_folder: Path, tmp_path: Path) -> None:
+    dataset = open_dataset(data_folder, frames=4, stride=2)
+    last, third = dataset.source.read(1).read_frames([len(dataset.source.read(1).states) - 1, 3])
+    Image.fromarray(third).save(tmp_path / "third.png")
+    start = ["--start", str(tmp_path / "third.png"), "--state", STATE, "--nodes", "0", "--out", str(tmp_path)]
+    found = {}
+    for place in ("1", "1:3", "1:99", "nobody"):
+        status = main(["plan", str(whole_run), *QUICK, *start, "--goal-from", place])
+        found[place] = json.loads((tmp_path / "plan.json").read_text())["why"] if status < 2 else None
+    assert found == {"1": "planned", "1:3": "at the goal", "1:99": None, "nobody": None}
+    assert not np.array_equal(last, third)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -17,12 +18,13 @@ from torch import Tensor
 
 from vjepa2_ac import __version__
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.windows import require_frames
 from vjepa2_ac.encoding.batch import encode_frames
 from vjepa2_ac.episode import FrameReader, Progress, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.film import spread_with_ends
+from vjepa2_ac.media.images import encode_png
 from vjepa2_ac.media.video import count_frames, read_frames
 from vjepa2_ac.planning.demonstrations.key_frames import (
     KeyFrame,
@@ -38,7 +40,8 @@ from vjepa2_ac.planning.demonstrations.key_frames import (
 from vjepa2_ac.planning.energy import distance
 from vjepa2_ac.planning.goals import NoiseFloor, SubGoal, write_goals
 from vjepa2_ac.planning.session import PlanningSession
-from vjepa2_ac.reporter import SILENT, Reporter
+from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
+from vjepa2_ac.storage import user_can_write, write_atomically
 from vjepa2_ac.storage.structured import utc_now
 
 By = Literal["gripper", "latent", "every"]
@@ -47,6 +50,7 @@ _MOST_ENCODED = 600  # frames of a demonstration; of a longer one every second, 
 _APART = 4  # model steps from one goal to the next, by latents
 _AT_ONCE = 16  # frames that are read and encoded together
 _MOST_PAIRS = 64
+_LONGEST_LABEL = 120  # letters, in the name of a file
 _UPPER = 0.95  # quantile of the energies between resting frames that is their floor
 
 
@@ -89,13 +93,11 @@ def recording_of_episode(
         found, needed = ", ".join(config.cameras), f"{views} cameras, from left to right, as planning.views says"
         raise InputError(where="data.camera", found=found, needed=needed)
     dataset = open_dataset(config, progress=progress)
-    table, index = dataset.table, dataset.table.find(wanted)
-    if index is None and wanted.isdecimal() and len(wanted) < 10 and int(wanted) < len(table):
-        index = int(wanted)
-    if index is None:
-        needed = f"a name such as {table.identity(int(dataset.episodes[0]))}, or a number from 0 to {len(table) - 1}"
-        raise InputError(where=f"--episode {wanted}", found=f"no such episode in {config.path}", needed=needed)
-    name, seen = table.identity(index), [dataset.source.read(index, camera) for camera in config.cameras[:views]]
+    index = number_of_episode(dataset, wanted)
+    name, seen = (
+        dataset.table.identity(index),
+        [dataset.source.read(index, camera) for camera in config.cameras[:views]],
+    )
     origin = {"data": config.path, "episode": name, "camera": config.camera}
     states = seen[0].states if config.states == "pose" else None
 
@@ -103,6 +105,79 @@ def recording_of_episode(
         return np.concatenate([episode.read_frames(frames) for episode in seen], axis=2)
 
     return Recording(name, len(seen[0].states), read, states, origin)
+
+
+def number_of_episode(dataset: Dataset, wanted: str) -> int:
+    """Return which episode of a data set is meant by its name, or by its number, from 0.
+
+    Raises:
+        InputError: There is no such episode.
+    """
+    table, index = dataset.table, dataset.table.find(wanted)
+    if index is None and wanted.isdecimal() and len(wanted) < 10 and int(wanted) < len(table):
+        index = int(wanted)
+    if index is None:
+        found = f"no such episode in {dataset.config.path}"
+        needed = f"a name such as {table.identity(int(dataset.episodes[0]))}, or a number from 0 to {len(table) - 1}"
+        raise InputError(where=f"--episode {wanted}", found=found, needed=needed)
+    return index
+
+
+def frame_of_episode(config: DataConfig, place: str) -> UInt8[np.ndarray, "height width 3"]:
+    """Return the image at EPISODE:STEP of a data set, or the last one of EPISODE.
+
+    Raises:
+        InputError: There is no such episode or step, or it cannot be read.
+    """
+    name, _, step = place.rpartition(":") if re.fullmatch(r".+:\d+", place) else (place, "", "")
+    require_frames(config, to="take a goal from")
+    dataset = open_dataset(config)
+    episode = dataset.source.read(number_of_episode(dataset, name))
+    count = len(episode.states)
+    if step and int(step) >= count:
+        found = f"an episode of {count} steps"
+        raise InputError(where=f"--goal-from {place}", found=found, needed="one of them, from 0")
+    return np.asarray(episode.read_frames([int(step) if step else count - 1])[0])
+
+
+def goals_by_label(
+    config: DataConfig, text: str, folder: Path, reporter: Reporter = SILENT
+) -> tuple[dict[str, str], Path]:
+    """Write the last frame of a successful episode of each language label, a picture that has the label as its name.
+
+    `vjepa2-ac serve --goals FOLDER` then takes the label as a prompt. All episodes count where a set does not say which
+    succeeded.
+
+    Args:
+        config: The data set, and which camera.
+        text: Part of a label, in any case; empty: of all.
+        folder: New or empty.
+        reporter: Shows the progress.
+
+    Returns:
+        The episode of each label, and the folder.
+
+    Raises:
+        InputError: There is no such label, an episode cannot be read, or the folder cannot be written.
+    """
+    require_frames(config, to="make goals of")
+    dataset, found = open_dataset(config, progress=reporter.task(INDEXING)), dict[str, str]()
+    chosen = np.flatnonzero(dataset.taking_part & (dataset.table.success != 0)).tolist()
+    progress = reporter.task("looking for labels", "episodes")
+    with user_can_write(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        for done, index in enumerate(chosen, start=1):
+            episode = dataset.source.read(index)
+            label = re.sub(r"[^\w ,.'-]+", " ", episode.metadata.get("language", "")).strip(" .")[:_LONGEST_LABEL]
+            if label and label not in found and text.lower() in label.lower():
+                found[label] = dataset.table.identity(index)
+                pixels = episode.read_frames([len(episode.states) - 1])[0]
+                write_atomically(folder / f"{label}.png", encode_png(pixels))
+            progress(done, len(chosen))
+    if not found:
+        found_text = f"no successful episode with a language label that has {text!r}" if text else "no language labels"
+        raise InputError(where=config.path, found=found_text, fix="Take goals of one episode: --episode")
+    return found, folder
 
 
 def recording_of_film(path: Path) -> Recording:

@@ -11,7 +11,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.patches import Rectangle
 
-from vjepa2_ac.data.transforms import crop_box
+from vjepa2_ac.data.transforms import Crop, crop_box, view
 from vjepa2_ac.media.figure import BLUE, GREY, ORANGE, RED, headline, written_figure
 from vjepa2_ac.media.film import MEANING, Kind, show_framed
 from vjepa2_ac.planning.decision import PlanResult, summarize
@@ -20,6 +20,7 @@ from vjepa2_ac.spaces import POSE
 if TYPE_CHECKING:  # of other rooms, which the figure of one need not load
     from vjepa2_ac.evaluation.calibration.axes import AxisFit
     from vjepa2_ac.evaluation.imagined_plan import ImaginedPlan
+    from vjepa2_ac.evaluation.policies.monitor import WatchedEpisode
     from vjepa2_ac.planning.demonstrations.make_goals import EnergyCourse, MadeGoals
     from vjepa2_ac.planning.planner import Plan
 
@@ -254,3 +255,47 @@ def plot_axes(fit: AxisFit, path: Path) -> Path:
         for axes in (left, right):
             axes.set(xlabel="dx (cm)", ylabel="dy (cm)", xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
     return path
+
+
+MONITOR_IMAGE = "monitor.png"
+_SHOWN_STEPS = 4
+
+
+def plot_watched(episode: WatchedEpisode, frames: Any, threshold: float, crop: Crop, path: Path) -> Path:
+    """Write the figure of a watched episode as PNG: its scores, and where its most surprising frames are.
+
+    Args:
+        episode: Its surprise.
+        frames: The frames of its most surprising steps (`most_surprising`), uncropped.
+        threshold: Above which a score is an alarm.
+        crop: As the model sees them.
+        path: The file.
+    """
+    shown, most = most_surprising(episode), max(threshold, float(episode.errors.max()))
+    grid = round(episode.errors.shape[1] ** 0.5)
+    with written_figure(path, _WIDTH, 4.2, dpi=130) as figure:
+        first = episode.first_alarm(threshold)
+        headline(
+            figure, f"{episode.name}: " + ("no alarm" if first is None else f"alarm at step {episode.steps[first]}")
+        )
+        above, below = figure.subfigures(2, 1, height_ratios=[1.0, 1.2])
+        axes = above.subplots()
+        axes.plot(episode.steps, episode.scores, color=BLUE, marker=".")
+        axes.axhline(threshold, color=RED, linestyle="--", label=f"threshold {threshold:.3g}")
+        axes.set(xlabel="control step", ylabel="surprise", ylim=(0, None))
+        axes.legend(loc="upper left")
+        for axes, place, frame in zip(below.subplots(1, len(shown), squeeze=False)[0], shown, frames, strict=True):
+            seen = view(frame[None], crop)[0]
+            height, width = seen.shape[:2]
+            axes.imshow(seen)
+            errors = episode.errors[place].reshape(grid, grid)
+            box = (0, width, height, 0)
+            axes.imshow(errors, cmap="autumn_r", alpha=0.8 * errors / most, extent=box, vmin=0, vmax=most)
+            axes.set_title(f"step {episode.steps[place]}: {episode.scores[place]:.3g}")
+            axes.set_axis_off()
+    return path
+
+
+def most_surprising(episode: WatchedEpisode) -> list[int]:
+    """Return the steps of an episode that a figure shows, in their order: four at most, of the highest scores."""
+    return sorted(np.argsort(-episode.scores, kind="stable")[:_SHOWN_STEPS].tolist())

@@ -1,0 +1,107 @@
+"""A watchman for robots: the surprise of every step of episodes, and the threshold that undisturbed ones give."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.loader import batches_of
+from vjepa2_ac.data.windows import require_frames, require_stride
+from vjepa2_ac.encoding.batch import encode_batch
+from vjepa2_ac.episode import Progress, no_progress
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.planning.model_setup import Fingerprints
+from vjepa2_ac.planning.surprise import Monitor, conformal_threshold, error_by_patch, surprise_of
+
+MOST_EPISODES = 200  # that a threshold is of
+_AT_ONCE = 16
+
+
+@dataclass(frozen=True, eq=False)
+class WatchedEpisode:
+    """The surprise of each model step of an episode."""
+
+    name: str
+    index: int  # in the data set
+    steps: Int[np.ndarray, " time"]  # control step of the frame that was predicted
+    errors: Float[np.ndarray, "time tokens"]
+    scores: Float[np.ndarray, " time"]
+
+    def first_alarm(self, threshold: float) -> int | None:
+        """Return the first step of which the score is above the threshold; None: there is none."""
+        above = np.flatnonzero(~(self.scores <= threshold))
+        return int(above[0]) if len(above) else None
+
+
+@torch.no_grad()
+def watch_episodes(
+    model: WorldModel, dataset: Dataset, episodes: Iterable[int], progress: Progress = no_progress
+) -> Iterator[WatchedEpisode]:
+    """Yield the surprise of episodes: each frame is predicted from the one before it, as a planner does.
+
+    Args:
+        model: Merged, in eval mode.
+        dataset: Has the episodes, with their frames.
+        episodes: Their indices; those of one frame are left out.
+        progress: Called with (done, total) in episodes.
+
+    Raises:
+        InputError: An episode cannot be read.
+    """
+    config, chosen = dataset.config, list(episodes)
+    pairs = replace(dataset, config=config.model_copy(update={"camera": config.cameras[0]})).with_frames(2)
+    stride = config.model_stride
+    for done, index in enumerate(chosen, start=1):
+        length = len(dataset.source.read(index).states)
+        starts = range(0, length - stride, stride)
+        errors = []
+        for batch in batches_of(pairs, [(index, start) for start in starts], batch_size=_AT_ONCE):
+            seen = encode_batch(model, batch, device=model.device, chunk=_AT_ONCE)
+            camera = None if seen.extrinsics is None else seen.extrinsics[:, :1]
+            predicted = model.predict(seen.latents[:, :1], seen.actions, seen.states[:, :1], camera)
+            errors.append(error_by_patch(predicted[:, 0].float(), seen.latents[:, 1]).cpu())
+        if errors:
+            found = torch.cat(errors)
+            steps, scores = np.array(starts) + stride, surprise_of(found).double().numpy()
+            yield WatchedEpisode(dataset.table.identity(index), index, steps, found.double().numpy(), scores)
+        progress(done, len(chosen))
+
+
+def calibrate_monitor(
+    model: WorldModel, dataset: Dataset, false_alarms: float, progress: Progress = no_progress
+) -> Monitor:
+    """Return the threshold that at most a share of undisturbed episodes exceeds, from those that no training saw.
+
+    Args:
+        model: Merged, in eval mode.
+        dataset: Whose validation and test episodes count, 200 at most.
+        false_alarms: The share.
+        progress: Called with (done, total) in episodes.
+
+    Raises:
+        InputError: There are too few, or one cannot be read.
+    """
+    require_frames(dataset.config, to="watch")
+    require_stride(dataset.config, to="know how long a model step is")
+    held_out = np.flatnonzero(dataset.members("validation") | dataset.members("test"))
+    chosen = held_out[np.linspace(0, len(held_out), min(MOST_EPISODES, len(held_out)), endpoint=False).astype(int)]
+    if not len(chosen):
+        needed = "validation or test episodes, which the threshold is of"
+        raise InputError(where=f"data.path: {dataset.config.path}", found="no held-out episodes", needed=needed)
+    watched = list(watch_episodes(model, dataset, chosen.tolist(), progress))
+    scores, known = torch.tensor([one.scores.max() for one in watched]), Fingerprints.of(model)
+    return Monitor(
+        format="vjepa2-ac monitor 1",
+        threshold=conformal_threshold(scores, false_alarms),
+        false_alarms=false_alarms,
+        steps=max(len(one.scores) for one in watched),
+        scores=tuple(scores.tolist()),
+        encoder=known.encoder,
+        predictor=known.predictor,
+    )
