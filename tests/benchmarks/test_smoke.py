@@ -1,6 +1,8 @@
 """Every benchmark runs to its end, small: those that no other test runs."""
 
+import json
 import re
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -14,6 +16,7 @@ from paths import ROOT
 from vjepa2_ac.cli import main as command_line
 from vjepa2_ac.config import EncoderSizes, ModelSizes, PredictorSizes
 from vjepa2_ac.config.loading import load_config
+from vjepa2_ac.config.planning import CemConfig, PlanningConfig
 
 OTHERS = "\n".join(path.read_text() for path in Path(__file__).parent.glob("test_*.py"))
 
@@ -94,3 +97,31 @@ def test_no_benchmark_is_left_out() -> None:
     scripts = {path.stem for path in (ROOT / "benchmarks").glob("*.py") if "__main__" in path.read_text()}
     assert len(scripts) > 15
     assert not {name for name in scripts if not re.search(rf"\b{name}\b", OTHERS)}
+
+
+@pytest.mark.parametrize("part", ["prior", "judge", "order", "monitor"])
+def test_policies_are_measured_in_every_part(
+    part: str, whole_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
+    run = tmp_path / "run"
+    shutil.copytree(whole_run, run)
+    assert command_line(["prior", str(run), "--steps", "2"]) == 0
+    (module,) = imported("policies", monkeypatch)
+    few = PlanningConfig(samples=12, iterations=2, cem=CemConfig(elites=2))
+    loaded = module.load_to_plan
+
+    def quick(subject: str) -> object:
+        session = loaded(subject)
+        return replace(session, config=session.config.model_copy(update={"planning": few}))
+
+    monkeypatch.setattr(module, "load_to_plan", quick)
+    monkeypatch.setattr(module, "STEPS", {"reach": 1, "push": 1, "pick": 1})
+    words = [part, str(run), "--episodes", "1", "--false-alarms", "0.5", "--steps", "1", "2", "3"]
+    module.main([*words, "--out", str(tmp_path / "found.json")])
+    rows = json.loads((tmp_path / "found.json").read_text())
+    assert len(rows) == {"prior": 7, "judge": 4, "order": 1, "monitor": 5}[part]
+    assert all(key.startswith(f"{part} run reach A seed 7: ") for key in rows)
+    capsys.readouterr()
+    module.main([*words, "--out", str(tmp_path / "found.json")])  # nothing is run again
+    assert len(capsys.readouterr().out.splitlines()) == len(rows)
