@@ -52,6 +52,7 @@ def main(words: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("part", choices=PARTS)
     parser.add_argument("run", help="with RUN/prior beside it, but of `monitor`")
+    parser.add_argument("overrides", nargs="*", help="such as planning.samples=64")
     parser.add_argument("--task", default="reach", choices=["reach", "push", "pick"])
     parser.add_argument("--domain", default="A")
     parser.add_argument("--episodes", type=int, default=50)
@@ -59,9 +60,9 @@ def main(words: list[str] | None = None) -> None:
     parser.add_argument("--false-alarms", type=float, default=0.05, help="of `monitor`")
     parser.add_argument("--steps", type=int, nargs=3, default=[30, 200, 2000], help="of the priors of `order`")
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/policies.json"))
-    options = parser.parse_args(words)
+    options = parser.parse_intermixed_args(words)
     torch.set_num_threads(1)
-    session = load_to_plan(options.run)
+    session = load_to_plan(options.run, overrides=options.overrides)
     done: dict[str, Any] = json.loads(options.out.read_text()) if options.out.exists() else {}
     for name, measure in PARTS[options.part](session, options):
         key = f"{options.part} {Path(options.run).name} {options.task} {options.domain} seed {options.seed}: {name}"

@@ -110,7 +110,7 @@ def _cloned(cell: Cell, config: Config, folder: Path, goals: int, *, choosing: b
     minutes, seed = (time.process_time() - began) / 60, (VALIDATION_GOALS if choosing else TEST_GOALS) + cell.seed
     acts = PLANNING.model_copy(update={"planner": "prior", "prior": str(place)})
     model = load_base(config.model, seed=cell.seed)
-    policy = planner(model, "l1", acts, goals_of=None if cell.shift in SHIFTS else other_worlds.goals_of)
+    policy = planner(model, "l1", config=acts, goals_of=None if cell.shift in SHIFTS else other_worlds.goals_of)
     reached = closed_loop(cell, policy, folder, seed=seed, goals=goals)
     trained = {"trained_share": 1.0, "adapter_mb": 0.0, "cpu_minutes": minutes, "minutes": minutes, "held_out": found}
     return {"cell": asdict(cell) | {"name": cell.name}, **trained, "reach": {"l1": reached}}

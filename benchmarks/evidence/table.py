@@ -20,7 +20,7 @@ FEWEST = 20  # cells from which a correlation is told
 EPISODES = 20  # demonstrations of a cell of the main tables
 SHORT = ("zero-shot", AXES, BEST, LONGER, "full", "scratch", "scratch, 3x steps")  # of the short table
 TABLE, PLOT = "evidence.md", "evidence.png"
-_BEGIN, _END = "<!-- made by `make evidence`: begin -->", "<!-- made by `make evidence`: end -->"
+MARKS = {"": "made by `make evidence`", "worlds": "worlds, made by `make evidence`"}  # of the short tables in a page
 
 NOTES = """Read it so:
 
@@ -36,8 +36,9 @@ NOTES = """Read it so:
 - *L2 energy*: the same when plans are compared by squared error. *error on A, on*: 0.8 s ahead, in the world that the
   base was trained on, adapter on; off: whether switching it off gives the base's figures back to the last bit.
 - *scratch* keeps the frozen encoder of the bases and starts close to copying: a kind start. Learning rates were chosen
-  for the base of many cameras, 20 demonstrations, seed 0, on validation episodes (`--choose`), of LoRA for ranks 16 and
-  32 with in/out; all else inherits them."""
+  for every change apart (of other worlds on Lift, for all), with 20 demonstrations, seed 0, on validation goals
+  (`--choose`): of LoRA for ranks 16 and 32 with in/out, of full fine-tuning and of scratch; all else inherits them.
+- *behaviour cloning*: an action prior (`vjepa2-ac prior`), which does not search."""
 
 
 def write_tables(folder: Path, out: Path, page: Path | None = None, done: Path | None = None) -> None:
@@ -81,20 +82,22 @@ def write_summary(results: Sequence[Figures], page: Path) -> None:
     Raises:
         ValueError: The marks are not there.
     """
-    before, begin, end, after = place_in(page)
-    page.write_text(f"{before}{begin}\n{summary(results)}\n{end}{after}")
+    for part, text in (("", summary(results)), ("worlds", summary_of_worlds(results))):
+        before, begin, end, after = place_in(page, part)
+        page.write_text(f"{before}{begin}\n{text}\n{end}{after}")
 
 
-def place_in(page: Path) -> tuple[str, str, str, str]:
-    """Return what stands before the short table in a page, the marks around it, and what stands after it.
+def place_in(page: Path, part: str = "") -> tuple[str, str, str, str]:
+    """Return what stands before a short table in a page, the marks around it, and what stands after it.
 
     Raises:
         ValueError: The marks are not there.
     """
-    before, begin, rest = page.read_text().partition(_BEGIN)
-    _, end, after = rest.partition(_END)
+    marks = [f"<!-- {MARKS[part]}: {end} -->" for end in ("begin", "end")]
+    before, begin, rest = page.read_text().partition(marks[0])
+    _, end, after = rest.partition(marks[1])
     if not (begin and end):
-        raise ValueError(f"{page} has no {_BEGIN} ... {_END}")
+        raise ValueError(f"{page} has no {marks[0]} ... {marks[1]}")
     return before, begin, end, after
 
 
@@ -108,6 +111,18 @@ def summary(results: Sequence[Figures]) -> str:
         share = next((one["trained_share"] for cells in found for one in cells), 0.0)
         if any(found):
             rows.append(f"| {method.name} | {f'{share:.1%}' if share else ''} | {' | '.join(map(_share, found))} |")
+    return "\n".join(rows)
+
+
+def summary_of_worlds(results: Sequence[Figures]) -> str:
+    """Return the short table of worlds that others made: the share of problems that were solved, and how many seeds."""
+    tasks = [task for task in TASKS if pick(results, shift=task, method=BEST)]
+    heads = [f"{task} ({len(pick(results, shift=task, method=BEST, episodes=EPISODES))} seeds)" for task in tasks]
+    rows = [f"| {EPISODES} demonstrations | {' | '.join(heads)} |", "|---|" + "---|" * len(tasks)]
+    for method in IN_EVERY_WORLD:
+        found = [pick(results, shift=task, method=method) for task in tasks]
+        found = [[one for one in cells if one["cell"]["episodes"] in (0, EPISODES)] for cells in found]
+        rows.append(f"| {method} | {' | '.join(map(_share, found))} |")
     return "\n".join(rows)
 
 

@@ -15,13 +15,14 @@ import pytest
 from paths import ROOT
 from vjepa2_ac.config import ValidationConfig
 from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.planning.prior.train_prior import PriorOptions, train_prior
 from vjepa2_ac.simulation.recording.record import RecordingSpec
 from vjepa2_ac.simulation.world.domains import DOMAIN_A
 
 pytest.importorskip("mujoco")
 
 
-MODULES = ("other_worlds", "cells", "prepare", "cloning", "offline", "measure", "results", "plot", "table")
+MODULES = ("other_worlds", "cells", "prepare", "offline", "measure", "results", "plot", "table")
 
 
 @pytest.fixture
@@ -183,7 +184,8 @@ def test_a_cell_is_trained_and_measured_and_its_base_comes_back(small: Any, tmp_
         one["cell"]["episodes"] = one["cell"]["episodes"] and 20
         (results / f"{one['cell']['name']}.json").write_text(json.dumps(one))
     page = tmp_path / "evidence.md"
-    page.write_text(f"before\n{small.table._BEGIN}\nold\n{small.table._END}\nafter\n")
+    marked = [f"<!-- {mark}: begin -->\nold\n<!-- {mark}: end -->\n" for mark in small.table.MARKS.values()]
+    page.write_text("before\n" + "between\n".join(marked) + "after\n")
     small.table.write_tables(tmp_path, tmp_path / "out", page)
     text = (tmp_path / "out" / "evidence.md").read_text()
     assert "LoRA r4 + in/out" in text
@@ -200,7 +202,19 @@ def test_a_cell_is_trained_and_measured_and_its_base_comes_back(small: Any, tmp_
     assert new.startswith("before\n")
     assert new.endswith("\nafter\n")
     assert "old" not in new
-    assert "zero-shot" in new
+    assert "zero-shot" in new.partition("between")[0]
+    assert "20 demonstrations" in new.partition("between")[2]
+
+
+def test_a_policy_that_imitates_is_trained_and_acts_without_a_search(small: Any, monkeypatch: Any) -> None:
+    few = PriorOptions(steps=2)
+    monkeypatch.setattr(small.measure, "train_prior", partial(train_prior, options=few))
+    cell = small.cells.Cell("look", "none", "behaviour cloning", 4, 0)
+    figures = small.measure.measure(cell, small.folder, goals=1)
+    assert set(figures["held_out"]) == {"clips", "true_goals", "goals_of_others"}
+    assert len(figures["reach"]["l1"]["distance_cm"][0]) == 9
+    assert small.results.reached(figures) in ([True], [False])
+    assert figures["reach"]["l1"]["whys"] == {"planned": 8}
 
 
 def test_exactly_so_many_demonstrations_are_trained_on_and_seeds_draw_others(small: Any) -> None:

@@ -111,8 +111,8 @@ def test_policies_are_measured_in_every_part(
     few = PlanningConfig(samples=12, iterations=2, cem=CemConfig(elites=2))
     loaded = module.load_to_plan
 
-    def quick(subject: str) -> object:
-        session = loaded(subject)
+    def quick(subject: str, overrides: list[str]) -> object:
+        session = loaded(subject, overrides=overrides)
         return replace(session, config=session.config.model_copy(update={"planning": few}))
 
     monkeypatch.setattr(module, "load_to_plan", quick)
