@@ -33,7 +33,7 @@ from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.prior.action_prior import load_prior
 from vjepa2_ac.planning.prior.train_prior import PriorOptions, train_prior
 from vjepa2_ac.planning.session import PlanningSession, load_to_plan
-from vjepa2_ac.planning.surprise import conformal_threshold, error_by_patch, surprise_of
+from vjepa2_ac.planning.surprise import conformal_threshold, error_by_patch
 from vjepa2_ac.simulation.closed_loop.benchmark import DemonstratedGoals, DemonstrationSpec, every_step
 from vjepa2_ac.simulation.closed_loop.policies import GoalsOf, Planning
 from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, put, run_task, send_action
@@ -232,10 +232,17 @@ def _monitor_rows(session: PlanningSession, options: argparse.Namespace) -> Rows
     """Random moves with and without a disturbance: AUC and recall at the promised rate of false alarms."""
     domain, count = named_domain(options.domain), options.episodes
     calm = [_watched(session, domain, options, number, "") for number in range(2 * count)]
-    thresholds, fresh = {}, {name: [float(one[name].max()) for one in calm[count:]] for name in CONTROLS}
+    usual = {name: np.stack([one[name].mean(axis=0) for one in calm[:count]]) for name in CONTROLS}
+
+    def highest(name: str, one: dict[str, np.ndarray], left_out: int | None = None) -> float:
+        others = usual[name] if left_out is None or count == 1 else np.delete(usual[name], left_out, axis=0)
+        return float(np.maximum(one[name] - others.mean(axis=0), 0.0).mean(axis=1).max())
+
+    fresh = {name: [highest(name, one) for one in calm[count:]] for name in CONTROLS}
+    thresholds = {}
     for name in CONTROLS:
-        highest = torch.tensor([one[name].max() for one in calm[:count]])
-        thresholds[name] = conformal_threshold(highest, options.false_alarms)
+        known = torch.tensor([highest(name, one, place) for place, one in enumerate(calm[:count])])
+        thresholds[name] = conformal_threshold(known, options.false_alarms)
 
     def above(name: str, scores: list[float]) -> dict[str, float | None]:
         return share_of(sum(one > thresholds[name] for one in scores), len(scores)).as_dict()
@@ -244,7 +251,7 @@ def _monitor_rows(session: PlanningSession, options: argparse.Namespace) -> Rows
         bad = [_watched(session, domain, options, 10_000 + number, what) for number in range(count)]
         found = {}
         for name in CONTROLS:
-            disturbed = [float(one[name].max()) for one in bad]
+            disturbed = [highest(name, one) for one in bad]
             found[name] = {"auc": _auc(fresh[name], disturbed), "recall": above(name, disturbed)}
         return found
 
@@ -262,7 +269,7 @@ def _auc(calm: list[float], bad: list[float]) -> float:
 def _watched(
     session: PlanningSession, domain: Domain, options: argparse.Namespace, number: int, what: str
 ) -> dict[str, np.ndarray]:
-    """Return the scores of an episode of random moves, by what the watchman knows."""
+    """Return the errors of an episode of random moves by patch, by what the watchman knows."""
     rng = np.random.default_rng([options.seed, number])
     problem = make_problem(options.task, domain, options.seed, number)
     arm = put(arm_for(options.task, domain), problem.start, problem.block_start, problem.mark)
@@ -294,7 +301,7 @@ def _watched(
             for one in (given, given[torch.from_numpy(rng.permutation(len(given)))])
         )
     known = {CONTROLS[0]: predicted, CONTROLS[1]: latents[:-1], CONTROLS[2]: shuffled}
-    return {name: surprise_of(error_by_patch(one, latents[1:])).double().numpy() for name, one in known.items()}
+    return {name: error_by_patch(one, latents[1:]).double().numpy() for name, one in known.items()}
 
 
 def _disturb(arm: SimulatedArm, what: str, rng: np.random.Generator) -> None:

@@ -24,7 +24,8 @@ from vjepa2_ac.serving.wire import pack, unpack
 
 def written(folder: Path, threshold: float) -> str:
     known = Fingerprints.of(tiny_model())
-    monitor = Monitor("vjepa2-ac monitor 1", threshold, 0.1, 8, (threshold,), known.encoder, known.predictor)
+    usual = (0.0,) * tiny_model().num_tokens
+    monitor = Monitor("vjepa2-ac monitor 1", threshold, 0.1, 8, (threshold,), usual, known.encoder, known.predictor)
     (folder / MONITOR).write_text(json.dumps(asdict(monitor)))
     return str(folder / MONITOR)
 
@@ -54,13 +55,16 @@ def test_too_few_episodes_for_a_promise_are_refused(count: int, share: float) ->
         conformal_threshold(torch.rand(count), share)
 
 
-def test_the_score_is_of_the_patches_that_are_farthest_off() -> None:
-    errors = torch.zeros(2, 20)
-    errors[0, 3], errors[0, 7], errors[1] = 4.0, 2.0, 1.0
-    assert surprise_of(errors).tolist() == [3.0, 1.0]
-    still = torch.zeros(20, 5)
-    assert not Surprise.of(still, still, 0.0).is_alarm
-    assert Surprise.of(still, torch.full_like(still, float("nan")), 9.0).is_alarm
+def test_the_score_is_what_patches_are_farther_off_than_usual() -> None:
+    errors, usual = torch.zeros(2, 4), torch.tensor([1.0, 0.0, 0.0, 0.0])
+    errors[0, 0], errors[1, 0], errors[1, 3] = 1.0, 3.0, 2.0  # in a patch that is often far off, and in a calm one
+    assert surprise_of(errors, usual).tolist() == [0.0, 1.0]
+
+
+def test_what_is_not_a_number_is_an_alarm(tmp_path: Path) -> None:
+    monitor, still = Monitor.read(written(tmp_path, 9.0), tiny_model(), where="test"), torch.zeros(9, 5)
+    assert not Surprise.of(still, still, monitor).is_alarm
+    assert Surprise.of(still, torch.full_like(still, float("nan")), monitor).is_alarm
 
 
 def test_what_the_last_decision_predicted_is_compared_with_what_is_seen(tmp_path: Path) -> None:

@@ -243,17 +243,17 @@ def _monitor(options: argparse.Namespace) -> int:
     note = f"An alarm is a surprise above {monitor.threshold:.4g}: of {len(monitor.scores)} held-out episodes of up to"
     note += f" {monitor.steps} model steps. At most {monitor.false_alarms:.1%} of undisturbed ones have one."
     table = MetricsTable("Surprise, over the threshold", ["episode", "highest", "first alarm at control step"])
-    alarms = 0
+    alarms, most = 0, {one.name: one.scores(monitor.expected).max() for one in watched}
     for one in watched:
-        first = one.first_alarm(monitor.threshold)
+        first = one.first_alarm(monitor)
         alarms += first is not None
         step = "" if first is None else str(one.steps[first])
-        table.add_row(one.name, f"{one.scores.max() / monitor.threshold:.2f}", step)
+        table.add_row(one.name, f"{most[one.name] / monitor.threshold:.2f}", step)
     if watched:
-        most = max(watched, key=lambda one: one.scores.max())
-        steps = [int(most.steps[place]) for place in most_surprising(most)]
-        frames, crop = seen.source.read(most.index).read_frames(steps), session.config.data.crop
-        files.append(plot_watched(most, frames, monitor.threshold, crop, folder / MONITOR_IMAGE))
+        shown, crop = max(watched, key=lambda one: most[one.name]), session.config.data.crop
+        steps = [int(shown.steps[place]) for place in most_surprising(shown, monitor)]
+        frames = seen.source.read(shown.index).read_frames(steps)
+        files.append(plot_watched(shown, frames, monitor, crop, folder / MONITOR_IMAGE))
     cli.show(*([table] if watched else []), note, files=files)
     return int(alarms > 0)
 

@@ -373,7 +373,7 @@ class Controller:
             return None
         with torch.no_grad():
             predicted, _ = before.cost.imagine(before.plan.actions[None, :1])
-        return Surprise.of(predicted[0, 0], latents, self._monitor.threshold)
+        return Surprise.of(predicted[0, 0], latents, self._monitor)
 
     def _carried_on(self, now: Decision) -> Plan | None:
         """Return what is left of the last plan, where it is to be carried on and nothing departs from it."""

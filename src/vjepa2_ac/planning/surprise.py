@@ -18,7 +18,6 @@ from vjepa2_ac.planning.model_setup import Fingerprints
 from vjepa2_ac.storage.structured import read_json_object, record_of
 
 MONITOR = "monitor.json"
-_SHARE = 0.1  # of the patches: a hand that is pushed fills few of them
 _FIX = "Make it with `vjepa2-ac monitor RUN`"
 Number = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 
@@ -30,9 +29,11 @@ def error_by_patch(
     return absolute_difference(predicted, seen).mean(dim=-1)
 
 
-def surprise_of(errors: Float[Tensor, "*batch tokens"]) -> Float[Tensor, "*batch"]:
-    """Return the score of each step: the mean over the tenth of the patches that are farthest off."""
-    return errors.topk(max(1, round(_SHARE * errors.shape[-1])), dim=-1).values.mean(dim=-1)
+def surprise_of(
+    errors: Float[Tensor, "*batch tokens"], expected: Float[Tensor, "*batch tokens"] | Float[Tensor, " tokens"]
+) -> Float[Tensor, "*batch"]:
+    """Return the score of each step: by how much patches are farther off than is usual there, their mean."""
+    return (errors - expected).clamp(min=0.0).mean(dim=-1)
 
 
 @dataclass(frozen=True)
@@ -44,13 +45,11 @@ class Surprise:
     is_alarm: bool  # the score is above the threshold
 
     @classmethod
-    def of(
-        cls, predicted: Float[Tensor, "tokens dim"], seen: Float[Tensor, "tokens dim"], threshold: float
-    ) -> Surprise:
+    def of(cls, predicted: Float[Tensor, "tokens dim"], seen: Float[Tensor, "tokens dim"], by: Monitor) -> Surprise:
         """Compare a prediction with what is seen then."""
         errors = error_by_patch(predicted, seen).float().cpu()
-        score = float(surprise_of(errors))
-        return cls(score, errors, not score <= threshold)  # NaN is an alarm, too
+        score = float(surprise_of(errors, torch.tensor(by.expected)))
+        return cls(score, errors, not score <= by.threshold)  # NaN is an alarm, too
 
 
 @dataclass(frozen=True)
@@ -62,6 +61,7 @@ class Monitor:
     false_alarms: Number  # promised share of undisturbed episodes with an alarm, as long as those
     steps: int  # model steps of the longest of them
     scores: tuple[Number, ...]  # highest of each episode
+    expected: tuple[Number, ...]  # error of each patch, mean of all steps: the camera does not move
     encoder: str
     predictor: str
 
@@ -76,7 +76,8 @@ class Monitor:
         values = read_json_object(file, needed="a monitor.json", fix=_FIX)
         found = record_of(cls, values, where=f"{where}: {file}", needed="a monitor.json", fix=_FIX)
         known = Fingerprints.of(world_model)
-        if (found.encoder, found.predictor) != (known.encoder, known.predictor):
+        is_its = (found.encoder, found.predictor) == (known.encoder, known.predictor)
+        if not is_its or len(found.expected) != world_model.num_tokens:
             raise InputError(where=f"{where}: {file}", found="the threshold of another model", fix=_FIX)
         return found
 

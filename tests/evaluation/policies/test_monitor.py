@@ -2,17 +2,17 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from vjepa2_ac.api import load_run, open_dataset
 from vjepa2_ac.cli import main
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.evaluation.policies.monitor import calibrate_monitor, watch_episodes
-from vjepa2_ac.planning.surprise import MONITOR, surprise_of
+from vjepa2_ac.planning.surprise import MONITOR
 
 STRIDE = 2
 
@@ -27,18 +27,23 @@ def test_every_frame_is_predicted_from_the_one_before_it(whole_run: Path, datase
     (found,) = watch_episodes(model, dataset, [2])
     episode = dataset.source.read(2)
     assert found.steps.tolist() == list(range(STRIDE, len(episode.states), STRIDE))
-    np.testing.assert_allclose(found.scores, surprise_of(torch.from_numpy(found.errors)), rtol=1e-6)
     assert found.errors.shape == (len(found.steps), model.num_tokens)
-    assert found.first_alarm(found.scores.max()) is None
-    assert found.first_alarm(found.scores.max() - 1e-9) == int(found.scores.argmax())
+    usual = found.errors.mean(axis=0)
+    scores = found.scores(usual)
+    np.testing.assert_allclose(scores, np.maximum(found.errors - usual, 0).mean(axis=1), rtol=1e-6)
+    by = calibrate_monitor(model, dataset, 0.3)
+    for threshold, expected in ((scores.max(), None), (scores.max() - 1e-9, int(scores.argmax()))):
+        assert found.first_alarm(replace(by, expected=tuple(usual), threshold=threshold)) == expected
 
 
 def test_the_threshold_is_of_the_held_out_episodes_alone(whole_run: Path, dataset: Dataset) -> None:
     model = load_run(whole_run, device="cpu").world_model
     monitor = calibrate_monitor(model, dataset, 0.3)
     held_out = np.flatnonzero(dataset.members("validation") | dataset.members("test"))
-    expected = [one.scores.max() for one in watch_episodes(model, dataset, held_out.tolist())]
-    np.testing.assert_allclose(monitor.scores, expected, rtol=1e-5)
+    watched = list(watch_episodes(model, dataset, held_out.tolist()))
+    np.testing.assert_allclose(monitor.expected, np.concatenate([one.errors for one in watched]).mean(axis=0))
+    others = np.concatenate([one.errors for one in watched[1:]]).mean(axis=0)
+    assert monitor.scores[0] == pytest.approx(watched[0].scores(others).max())
     assert monitor.threshold in monitor.scores
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,11 +31,14 @@ class WatchedEpisode:
     index: int  # in the data set
     steps: Int[np.ndarray, " time"]  # control step of the frame that was predicted
     errors: Float[np.ndarray, "time tokens"]
-    scores: Float[np.ndarray, " time"]
 
-    def first_alarm(self, threshold: float) -> int | None:
-        """Return the first step of which the score is above the threshold; None: there is none."""
-        above = np.flatnonzero(~(self.scores <= threshold))
+    def scores(self, expected: Sequence[float] | np.ndarray) -> Float[np.ndarray, " time"]:
+        """Return the surprise of each step, by what is usual of each patch."""
+        return surprise_of(torch.from_numpy(self.errors), torch.tensor(np.asarray(expected))).numpy()
+
+    def first_alarm(self, by: Monitor) -> int | None:
+        """Return the first step of which the surprise is above the threshold; None: there is none."""
+        above = np.flatnonzero(~(self.scores(by.expected) <= by.threshold))
         return int(above[0]) if len(above) else None
 
 
@@ -68,8 +71,9 @@ def watch_episodes(
             errors.append(error_by_patch(predicted[:, 0].float(), seen.latents[:, 1]).cpu())
         if errors:
             found = torch.cat(errors)
-            steps, scores = np.array(starts) + stride, surprise_of(found).double().numpy()
-            yield WatchedEpisode(dataset.table.identity(index), index, steps, found.double().numpy(), scores)
+            yield WatchedEpisode(
+                dataset.table.identity(index), index, np.array(starts) + stride, found.double().numpy()
+            )
         progress(done, len(chosen))
 
 
@@ -95,13 +99,21 @@ def calibrate_monitor(
         needed = "validation or test episodes, which the threshold is of"
         raise InputError(where=f"data.path: {dataset.config.path}", found="no held-out episodes", needed=needed)
     watched = list(watch_episodes(model, dataset, chosen.tolist(), progress))
-    scores, known = torch.tensor([one.scores.max() for one in watched]), Fingerprints.of(model)
+    if len(watched) < 2:
+        raise InputError(where=f"data.path: {dataset.config.path}", found="one held-out episode", needed="two or more")
+    sums, steps = np.stack([one.errors.sum(axis=0) for one in watched]), np.array([len(one.errors) for one in watched])
+    highest = [  # what is usual, by the other episodes: else an episode would seem calmer than a new one
+        one.scores((sums.sum(axis=0) - sums[place]) / (steps.sum() - steps[place])).max()
+        for place, one in enumerate(watched)
+    ]
+    known = Fingerprints.of(model)
     return Monitor(
         format="vjepa2-ac monitor 1",
-        threshold=conformal_threshold(scores, false_alarms),
+        threshold=conformal_threshold(torch.tensor(highest), false_alarms),
         false_alarms=false_alarms,
-        steps=max(len(one.scores) for one in watched),
-        scores=tuple(scores.tolist()),
+        steps=int(steps.max()),
+        scores=tuple(map(float, highest)),
+        expected=tuple((sums.sum(axis=0) / steps.sum()).tolist()),
         encoder=known.encoder,
         predictor=known.predictor,
     )

@@ -23,6 +23,7 @@ if TYPE_CHECKING:  # of other rooms, which the figure of one need not load
     from vjepa2_ac.evaluation.policies.monitor import WatchedEpisode
     from vjepa2_ac.planning.demonstrations.make_goals import EnergyCourse, MadeGoals
     from vjepa2_ac.planning.planner import Plan
+    from vjepa2_ac.planning.surprise import Monitor
 
 PLAN_IMAGE, GOALS_IMAGE = "plan.png", "goals.png"
 
@@ -261,26 +262,28 @@ MONITOR_IMAGE = "monitor.png"
 _SHOWN_STEPS = 4
 
 
-def plot_watched(episode: WatchedEpisode, frames: Any, threshold: float, crop: Crop, path: Path) -> Path:
+def plot_watched(episode: WatchedEpisode, frames: Any, monitor: Monitor, crop: Crop, path: Path) -> Path:
     """Write the figure of a watched episode as PNG: its scores, and where its most surprising frames are.
 
     Args:
         episode: Its surprise.
         frames: The frames of its most surprising steps (`most_surprising`), uncropped.
-        threshold: Above which a score is an alarm.
+        monitor: What is usual, and above which surprise there is an alarm.
         crop: As the model sees them.
         path: The file.
     """
-    shown, most = most_surprising(episode), max(threshold, float(episode.errors.max()))
+    shown, scores, threshold = most_surprising(episode, monitor), episode.scores(monitor.expected), monitor.threshold
+    excess = np.maximum(episode.errors - np.array(monitor.expected), 0.0)
+    most = max(float(excess.max()), 1e-12)
     grid = round(episode.errors.shape[1] ** 0.5)
     with written_figure(path, _WIDTH, 4.2, dpi=130) as figure:
-        first = episode.first_alarm(threshold)
+        first = episode.first_alarm(monitor)
         headline(
             figure, f"{episode.name}: " + ("no alarm" if first is None else f"alarm at step {episode.steps[first]}")
         )
         above, below = figure.subfigures(2, 1, height_ratios=[1.0, 1.2])
         axes = above.subplots()
-        axes.plot(episode.steps, episode.scores, color=BLUE, marker=".")
+        axes.plot(episode.steps, scores, color=BLUE, marker=".")
         axes.axhline(threshold, color=RED, linestyle="--", label=f"threshold {threshold:.3g}")
         axes.set(xlabel="control step", ylabel="surprise", ylim=(0, None))
         axes.legend(loc="upper left")
@@ -288,14 +291,14 @@ def plot_watched(episode: WatchedEpisode, frames: Any, threshold: float, crop: C
             seen = view(frame[None], crop)[0]
             height, width = seen.shape[:2]
             axes.imshow(seen)
-            errors = episode.errors[place].reshape(grid, grid)
+            errors = excess[place].reshape(grid, grid)
             box = (0, width, height, 0)
             axes.imshow(errors, cmap="autumn_r", alpha=0.8 * errors / most, extent=box, vmin=0, vmax=most)
-            axes.set_title(f"step {episode.steps[place]}: {episode.scores[place]:.3g}")
+            axes.set_title(f"step {episode.steps[place]}: {scores[place]:.3g}")
             axes.set_axis_off()
     return path
 
 
-def most_surprising(episode: WatchedEpisode) -> list[int]:
+def most_surprising(episode: WatchedEpisode, monitor: Monitor) -> list[int]:
     """Return the steps of an episode that a figure shows, in their order: four at most, of the highest scores."""
-    return sorted(np.argsort(-episode.scores, kind="stable")[:_SHOWN_STEPS].tolist())
+    return sorted(np.argsort(-episode.scores(monitor.expected), kind="stable")[:_SHOWN_STEPS].tolist())
