@@ -117,7 +117,8 @@ def summary(results: Sequence[Figures]) -> str:
 def summary_of_worlds(results: Sequence[Figures]) -> str:
     """Return the short table of worlds that others made: the share of problems that were solved, and how many seeds."""
     tasks = [task for task in TASKS if pick(results, shift=task, method=BEST)]
-    heads = [f"{task} ({len(pick(results, shift=task, method=BEST, episodes=EPISODES))} seeds)" for task in tasks]
+    counts = [len(pick(results, shift=task, method=BEST, episodes=EPISODES)) for task in tasks]
+    heads = [f"{task} ({count} seed{'s' * (count > 1)})" for task, count in zip(tasks, counts, strict=True)]
     rows = [f"| {EPISODES} demonstrations | {' | '.join(heads)} |", "|---|" + "---|" * len(tasks)]
     for method in IN_EVERY_WORLD:
         found = [pick(results, shift=task, method=method) for task in tasks]
@@ -220,18 +221,19 @@ def of_worlds(results: Sequence[Figures]) -> str:
     for method in (*IN_EVERY_WORLD, *IN_SOME_WORLDS):
         found = [pick(results, shift=task, method=method) for task in tasks]
         found = [[one for one in cells if one["cell"]["episodes"] in (0, EPISODES)] for cells in found]
-        rows.append(f"| {method} | {' | '.join(map(_done, found))} |")
+        rows += [f"| {method} | {' | '.join(map(_done, found))} |"] if any(found) else []
     title = "### Worlds that others made: solved at the end; error 0.8 s ahead"
     return f"{title}\n\n" + "\n".join([*rows, "", *_few_and_many(results)])
 
 
 def _few_and_many(results: Sequence[Figures]) -> list[str]:
-    rows = ["| demonstrations | 5 | 20 | 80 |", "|---|---|---|---|"]
+    rows = []
     for task in MANY:
         for method in IN_EVERY_WORLD[1:]:
             found = [pick(results, shift=task, method=method, episodes=count) for count in (5, EPISODES, 80)]
-            rows += [f"| {task}: {method} | {' | '.join(map(_done, found))} |"] if any(found) else []
-    return rows
+            if found[0] or found[2]:
+                rows.append(f"| {task}: {method} | {' | '.join(map(_done, found))} |")
+    return ["| demonstrations | 5 | 20 | 80 |", "|---|---|---|---|", *rows] if rows else []
 
 
 def _done(found: Sequence[Figures]) -> str:
