@@ -31,7 +31,7 @@ def add_plan(commands: cli.Commands) -> None:
     goals = parser.add_mutually_exclusive_group(required=True)
     cli.add(goals, "--goal IMAGE", "what it is to see; again for goals in a row", cli.as_local, action="append")
     cli.add(goals, "--goals FOLDER", "goals with rules of their own, that `vjepa2-ac goals` made", cli.as_path)
-    cli.add(goals, "--goal-from EPISODE[:STEP]", "what the run's data show there (its last frame)")
+    cli.add(goals, "--goal-from EPISODE", "what the run's data show at its end; EPISODE:STEP: there")
     cli.add(parser, "--out FOLDER", "where both files go (plan)", cli.as_path, default=Path("plan"))
     group = parser.add_argument_group("the goals")
     cli.add(group, "--durations STEPS", "model steps of all goals but the last, as 2,1 (equal shares)")
