@@ -128,6 +128,17 @@ def test_training_is_repeatable_beats_doing_nothing_and_sees_the_goal(make_confi
     assert load_prior(tmp_path / "a", where="test").card.sizes.ahead == config.data.frames - 1
 
 
+def test_vectors_are_as_wide_as_the_data_whatever_the_bases_heads_are(make_config: MakeConfig, tmp_path: Path) -> None:
+    (tmp_path / "npz").mkdir()
+    rng = np.random.default_rng(0)
+    for number in range(4):
+        frames = rng.integers(0, 256, (12, 32, 32, 3), dtype=np.uint8)
+        np.savez(tmp_path / f"npz/{number}.npz", states=rng.normal(size=(12, 5)), frames=frames, fps_hz=15.0)
+    config = make_config(data__source="npz", data__path=str(tmp_path / "npz"), data__states="vector")
+    card = train_prior(config, tmp_path / "prior", PriorOptions(steps=2, batch_size=2))
+    assert (card.sizes.state, card.sizes.action) == (5, 5)
+
+
 def test_it_learns_an_action_that_only_the_goal_tells() -> None:
     """The world is one bright patch, which an action moves: present and goal say by how much."""
     torch.manual_seed(0)

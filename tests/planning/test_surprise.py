@@ -62,7 +62,8 @@ def test_the_score_is_what_patches_are_farther_off_than_usual() -> None:
 
 
 def test_what_is_not_a_number_is_an_alarm(tmp_path: Path) -> None:
-    monitor, still = Monitor.read(written(tmp_path, 9.0), tiny_model(), where="test"), torch.zeros(9, 5)
+    monitor = Monitor.read(written(tmp_path, 9.0), Fingerprints.of(tiny_model()), tokens=9, where="test")
+    still = torch.zeros(9, 5)
     assert not Surprise.of(still, still, monitor).is_alarm
     assert Surprise.of(still, torch.full_like(still, float("nan")), monitor).is_alarm
 

@@ -180,7 +180,7 @@ def _loaded(
         image_keys=IMAGE_KEYS if options.image_key is None else (options.image_key,),
         deadline_s=options.deadline,
         dry_run=options.dry_run,
-        is_blind=(ranking := ranking_of_run(options.subject, loaded.checkpoint)) is not None and is_blind(ranking),
+        is_blind=is_blind(ranking_of_run(options.subject, loaded.checkpoint)),
     )
     controller = loaded.controller(extrinsics=extrinsics)
     kept = {name: loaded.goals_of(folder) for name, folder in (goals or {}).items()}

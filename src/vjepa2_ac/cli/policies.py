@@ -14,8 +14,6 @@ from vjepa2_ac.errors import InputError
 if TYPE_CHECKING:
     import numpy as np
 
-    from vjepa2_ac.planning.session import PlanningSession
-
 _FORMS = ("targets", "deltas", "offsets")
 
 
@@ -111,6 +109,7 @@ def _kinematics(words: str | None) -> Callable[[np.ndarray], np.ndarray]:
 
 def _score_chunks(options: argparse.Namespace, to_poses: Callable[[np.ndarray], np.ndarray]) -> int:
     from vjepa2_ac.cli.console.progress import MetricsTable
+    from vjepa2_ac.data.windows import require_stride
     from vjepa2_ac.evaluation.policies.score import CHANCE, is_blind, ranking_of_run, read_chunks
     from vjepa2_ac.media.images import read_image
     from vjepa2_ac.planning.chunks import changes_of_chunks
@@ -125,11 +124,12 @@ def _score_chunks(options: argparse.Namespace, to_poses: Callable[[np.ndarray], 
         controller.follow((SubGoal(read_image(options.goal)),))
     else:
         controller.follow(session.goals_of(read_goal_folder(options.goals)))
-    steps, space = _control_steps(options, session), controller.spaces.state
+    fix, space = "Say how many control steps of a chunk are one: --control-steps 4", controller.spaces.state
+    steps = options.control_steps or require_stride(session.config.data, to="know a model step", fix=fix)
     changes = changes_of_chunks(to_poses(chunks), state, form=options.form, control_steps=steps, space=space)
     found = controller.score(read_image(options.start), state, changes)
     ranking = ranking_of_run(options.subject, session.checkpoint)
-    blind = ranking is not None and is_blind(ranking)
+    blind = is_blind(ranking)
     table = MetricsTable(f"Energy after {changes.shape[1]} model steps (now: {found.now:.4f})", ["chunk", "energy", ""])
     for chunk in found.order.tolist():
         beside = found.energies[chunk] / found.doing_nothing - 1
@@ -146,11 +146,8 @@ def _score_chunks(options: argparse.Namespace, to_poses: Callable[[np.ndarray], 
             f" is {CHANCE:.0%}. These energies mean nothing."
         )
     about = session.as_dict() | {"start": options.start, "chunks": str(options.chunks), "form": options.form}
-    scores = {
-        "best": None if blind else found.best, "energies": found.energies.tolist(), "now": found.now,
-        "doing_nothing": found.doing_nothing, "spread": found.spread, "tied": found.tied, "is_blind": blind,
-        "others_better": None if ranking is None else ranking.as_dict(),
-    }  # fmt: skip
+    scores = found.as_dict(is_blind=blind) | {"energies": found.energies.tolist()}
+    scores["others_better"] = None if ranking is None else ranking.as_dict()
     write_atomically(options.out, json_text(about | scores))
     cli.show(table, *notes, files=[options.out])
     return int(blind)
@@ -220,6 +217,7 @@ def _monitor(options: argparse.Namespace) -> int:
     from vjepa2_ac.data.dataset import open_dataset
     from vjepa2_ac.evaluation.policies.monitor import calibrate_monitor, watch_episodes
     from vjepa2_ac.planning.demonstrations.make_goals import number_of_episode
+    from vjepa2_ac.planning.model_setup import Fingerprints
     from vjepa2_ac.planning.surprise import MONITOR, Monitor
     from vjepa2_ac.reporter import INDEXING
     from vjepa2_ac.reports.figures.planning import MONITOR_IMAGE, most_surprising, plot_watched
@@ -238,7 +236,9 @@ def _monitor(options: argparse.Namespace) -> int:
             write_atomically(folder / MONITOR, json_text(asdict(monitor)))
             files.append(folder / MONITOR)
         else:
-            monitor = Monitor.read(options.threshold, model, where="--threshold")
+            monitor = Monitor.read(
+                options.threshold, Fingerprints.of(model), tokens=model.num_tokens, where="--threshold"
+            )
         watched = list(watch_episodes(model, seen, wanted, reporter.task("watching", "episodes")))
     note = f"An alarm is a surprise above {monitor.threshold:.4g}: of {len(monitor.scores)} held-out episodes of up to"
     note += f" {monitor.steps} model steps. At most {monitor.false_alarms:.1%} of undisturbed ones have one."
@@ -293,14 +293,6 @@ def _progress(options: argparse.Namespace) -> None:
         note = "It grows with time by Spearman's {} on {} held-out episodes (1: always)."
         cli.show(note.format(monotony_of(unseen), len(unseen)))
     cli.show(files=[options.out])
-
-
-def _control_steps(options: argparse.Namespace, session: PlanningSession) -> int:
-    stride = options.control_steps or session.config.data.stride
-    if not isinstance(stride, int):
-        found, needed = "data.stride: auto", "how many control steps of a chunk are a model step"
-        raise InputError(where="--control-steps", found=found, needed=needed)
-    return stride
 
 
 def _prior(options: argparse.Namespace) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -48,6 +48,11 @@ class ChunkScores:
     def spread(self) -> float:
         """Standard deviation of the energies over the energy now; 0: the model sees no difference."""
         return float(self.energies.std() / max(self.now, 1e-12))
+
+    def as_dict(self, *, is_blind: bool) -> dict[str, Any]:
+        """Return what is told of them; no best one of a model that cannot tell actions apart."""
+        told = {name: getattr(self, name) for name in ("energies", "doing_nothing", "now", "spread", "tied")}
+        return {**told, "best": None if is_blind else self.best, "is_blind": is_blind}
 
 
 def changes_of_chunks(

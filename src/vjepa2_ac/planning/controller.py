@@ -107,18 +107,8 @@ class Controller:
             raise InputError(where="planning.views", found=found, needed=needed)
         self._model, self.seed, self.crop = prepare_for_planning(world_model, self.config), seed, crop
         self._camera = None if extrinsics is None else torch.from_numpy(extrinsics.astype(np.float32))
-        self.spaces, self._axes = spaces, None
-        if self.config.axes is not None:
-            require_base_frame(f"planning.axes: {self.config.axes}", is_base=spaces.state.is_base_pose)
-            self._axes = Axes.read(self.config.axes, Fingerprints.of(world_model))
-        self._monitor = None
-        if self.config.monitor is not None:
-            self._monitor = Monitor.read(self.config.monitor, world_model, where="planning.monitor")
-        self._prior = None
-        if self.config.prior is not None:
-            from vjepa2_ac.planning.prior.action_prior import load_prior
-
-            self._prior = load_prior(self.config.prior, where="planning.prior").of(world_model, crop)
+        self.spaces = spaces
+        self._load_what_is_its(world_model)
         self.space = search_space(self.config, spaces.state)  # the allowed changes of the state, of the last decision
         self.planner = Planner(self.config, self.space)
         self._workspace = Workspace.of(self.config.limits, spaces.state)
@@ -127,6 +117,24 @@ class Controller:
         self._seen: list[Seen] = []  # the newest `planning.context`
         self._done = 0
         self.decision: Decision | None = None  # the last one
+
+    def _load_what_is_its(self, world_model: WorldModel) -> None:
+        """Read axes, monitor and prior, which belong to one model: its weights are hashed once for all of them."""
+        config, self._axes, self._monitor, self._prior = self.config, None, None, None
+        if config.axes is None and config.monitor is None and config.prior is None:
+            return
+        if config.axes is not None:
+            require_base_frame(f"planning.axes: {config.axes}", is_base=self.spaces.state.is_base_pose)
+        known = Fingerprints.of(world_model)
+        if config.axes is not None:
+            self._axes = Axes.read(config.axes, known)
+        if config.monitor is not None:
+            self._monitor = Monitor.read(config.monitor, known, tokens=world_model.num_tokens, where="planning.monitor")
+        if config.prior is not None:
+            from vjepa2_ac.planning.prior.action_prior import load_prior
+
+            prior = load_prior(config.prior, where="planning.prior")
+            self._prior = prior.of(known.encoder, self.crop).to(self._model.device)
 
     @classmethod
     def of_run(
@@ -279,8 +287,10 @@ class Controller:
             needed = f"chunks x model steps x {self.space.dim}"
             raise InputError(where="chunks", found=f"an array of the shape {chunks.shape}", needed=needed)
         progress = self._progressed(seen[-1][0])
-        cost, still, _ = self._towards(seen, progress, chunks.shape[1])
-        energies = cost(torch.from_numpy(np.concatenate([np.zeros_like(chunks[:1]), chunks])).float()).double()
+        still, _ = self._still(seen[-1][0], progress, chunks.shape[1])
+        energies = self._cost(seen, progress)(
+            torch.from_numpy(np.concatenate([np.zeros_like(chunks[:1]), chunks])).float()
+        ).double()
         return ChunkScores(energies[1:].numpy(), float(energies[0]), self._over_steps(still), progress.place)
 
     def _with(self, frame: np.ndarray, state: np.ndarray) -> list[Seen]:
@@ -325,15 +335,18 @@ class Controller:
             durations.append(goal.at_most)
         return Goal(self._goal_latents[place : place + len(durations) + 1], tuple(durations), self._patch_weights)
 
-    def _towards(
-        self, seen: Sequence[Seen], progress: GoalProgress, steps: int
-    ) -> tuple[WorldModelCost, Float[Tensor, " steps"], tuple[int, ...]]:
-        """Return the cost of so many actions; of each its goal, and how far the current image is from that."""
+    def _still(
+        self, latents: Float[Tensor, "tokens dim"], progress: GoalProgress, steps: int
+    ) -> tuple[Float[Tensor, " steps"], tuple[int, ...]]:
+        """Return how far the current image is from the goal of each of so many steps, and which goals these are."""
         goal, done = self._goal_from(progress.place), self._done - progress.since
         wanted = goal.ahead(done, steps)
-        still = distance(seen[-1][0].expand_as(wanted), wanted, self.config.energy, goal.weights)
-        cost = WorldModelCost(self._model, self._scene(seen), goal, self.config.energy, done=done, spaces=self.spaces)
-        return cost, still, tuple(progress.place + goal.place(done + step) for step in range(steps))
+        still = distance(latents.expand_as(wanted), wanted, self.config.energy, goal.weights)
+        return still, tuple(progress.place + goal.place(done + step) for step in range(steps))
+
+    def _cost(self, seen: Sequence[Seen], progress: GoalProgress) -> WorldModelCost:
+        goal, done = self._goal_from(progress.place), self._done - progress.since
+        return WorldModelCost(self._model, self._scene(seen), goal, self.config.energy, done=done, spaces=self.spaces)
 
     def _over_steps(self, distances: Float[Tensor, " steps"]) -> float:
         return float(distances[-1] if self.config.energy.steps == "last" else distances.sum())
@@ -341,7 +354,7 @@ class Controller:
     def _decided(self, seen: Sequence[Seen], samples: np.ndarray | None, cancelled: Cancelled) -> Decision:
         latents, state = seen[-1]
         progress = self._progressed(latents)
-        cost, still, places = self._towards(seen, progress, self.config.horizon)
+        still, places = self._still(latents, progress, self.config.horizon)
         energy = self._over_steps(still)
         command = self._command(state, np.zeros(len(state)))
         nothing = Decision(command, "at the goal", energy, places, progress, surprise=self._surprise(latents))
@@ -350,7 +363,7 @@ class Controller:
         if self._workspace is not None and not is_allowed(self._workspace.way_back(state[:3]), self.config.limits):
             return replace(nothing, why="outside the workspace")
         self.space = self._searched[self._goals[progress.place].gripper]
-        carried_on = self._carried_on(nothing)
+        cost, carried_on = self._cost(seen, progress), self._carried_on(nothing)
         if carried_on is None:
             plan = self._planned(state, cost, self._start(cost, progress, samples), cancelled)
         else:

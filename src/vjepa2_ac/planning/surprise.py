@@ -13,7 +13,6 @@ from torch import Tensor
 
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.distances import absolute_difference
-from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.model_setup import Fingerprints
 from vjepa2_ac.storage.structured import read_json_object, record_of
 
@@ -66,8 +65,14 @@ class Monitor:
     predictor: str
 
     @classmethod
-    def read(cls, path: str | Path, world_model: WorldModel, *, where: str) -> Monitor:
+    def read(cls, path: str | Path, known: Fingerprints, *, tokens: int, where: str) -> Monitor:
         """Read a monitor.json, or that of a folder.
+
+        Args:
+            path: Of either.
+            known: Of the model that is to be watched.
+            tokens: Of a frame, to it.
+            where: What names the file, for messages.
 
         Raises:
             InputError: There is none, or it is another model's.
@@ -75,9 +80,8 @@ class Monitor:
         file = Path(path) / MONITOR if Path(path).is_dir() else Path(path)
         values = read_json_object(file, needed="a monitor.json", fix=_FIX)
         found = record_of(cls, values, where=f"{where}: {file}", needed="a monitor.json", fix=_FIX)
-        known = Fingerprints.of(world_model)
         is_its = (found.encoder, found.predictor) == (known.encoder, known.predictor)
-        if not is_its or len(found.expected) != world_model.num_tokens:
+        if not is_its or len(found.expected) != tokens:
             raise InputError(where=f"{where}: {file}", found="the threshold of another model", fix=_FIX)
         return found
 

@@ -180,16 +180,7 @@ class Session:
     def _scored(self, frame: np.ndarray, state: np.ndarray, changes: np.ndarray) -> dict[str, Any]:
         """Return the energies of what a policy would do; nobody moves, and no decision is counted."""
         found = self.controller.score(frame, state, changes)
-        return {
-            "energies": found.energies,
-            "best": None if self.options.is_blind else found.best,
-            "is_blind": self.options.is_blind,
-            "doing_nothing": found.doing_nothing,
-            "now": found.now,
-            "spread": found.spread,
-            "tied": found.tied,
-            "goal": found.goal,
-        }
+        return {**found.as_dict(is_blind=self.options.is_blind), "goal": found.goal}
 
     def _decided(
         self,

@@ -107,8 +107,13 @@ def read_chunks(path: Path) -> Float[np.ndarray, "chunks steps dim"]:
     return found.astype(np.float64)
 
 
-def is_blind(others_better: Estimate) -> bool:
-    """Return whether a model ranks true actions no better than chance, so that its energies order nothing."""
+def is_blind(others_better: Estimate | None) -> bool:
+    """Return whether a model ranks true actions no better than chance, so that its energies order nothing.
+
+    Where nothing was measured (None) nothing is held against it.
+    """
+    if others_better is None:
+        return False
     return not (others_better.high if others_better.has_interval else others_better.value) < CHANCE
 
 
@@ -162,15 +167,16 @@ def score_policies(
     if not kept:
         needed = f"{steps * stride} control steps after it in the episode"
         raise InputError(where="--policy", found="no place with a goal", needed=needed)
-    rng, energies = np.random.default_rng(0), list[np.ndarray]()
+    rng, energies, ids = np.random.default_rng(0), list[np.ndarray](), [one.place[0] for one in kept]
+    rows = [{place: row for row, place in reversed([*enumerate(one.places)])} for one in policies]
     for number, place in enumerate(kept):
-        others = [kept[other].changes for other in _drawn(rng, number, [one.place[0] for one in kept])]
+        others = [kept[other].changes for other in _drawn(rng, number, ids)]
         chunks = [
             changes_of_chunks(
-                one.chunks[one.places.index(place.place)], place.state, form=form, control_steps=control_steps,
+                one.chunks[row[place.place]], place.state, form=form, control_steps=control_steps,
                 space=controller.spaces.state,
             )[:, : len(place.changes)]
-            for one in policies
+            for one, row in zip(policies, rows, strict=True)
         ]  # fmt: skip
         frame, goal = place.frames(dataset)
         controller.reset(goal)
@@ -181,7 +187,7 @@ def score_policies(
         means, bests = ([float(take(one)) for one in by_policy] for take in (np.mean, np.min))
         energies.append(np.array([found.doing_nothing, true, float((worse < true).mean()), *means, *bests]))
         progress(number + 1, len(kept))
-    return _scores(policies, np.stack(energies), [one.place[0] for one in kept], left_out=len(places) - len(kept))
+    return _scores(policies, np.stack(energies), ids, left_out=len(places) - len(kept))
 
 
 def _scores(

@@ -23,7 +23,6 @@ from torch.nn.functional import gelu
 from vjepa2_ac import __version__
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.pretrained_folder import read_tensors
-from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.energy import WorldModelCost
 from vjepa2_ac.planning.search_space import SearchSpace
 from vjepa2_ac.planning.solvers import PlanStart
@@ -72,18 +71,17 @@ class TrainedPrior:
     network: ActionPrior
     where: str  # what names it, for messages
 
-    def of(self, world_model: WorldModel, crop: str) -> ActionPrior:
-        """Return the network on a model's device.
+    def of(self, encoder: str, crop: str) -> ActionPrior:
+        """Return the network for a model's encoder, by its fingerprint, and crop.
 
         Raises:
-            InputError: The model has another encoder, or its frames are cut otherwise.
+            InputError: One of them is another.
         """
-        encoder = world_model.encoder_fingerprint()
         compared = (("encoder", self.card.encoder, encoder), ("data.crop", self.card.crop, crop))
         if differing := [f"{name} {ours}, not {theirs}" for name, ours, theirs in compared if ours != theirs]:
             found, needed = f"the prior of another {'; '.join(differing)}", "one that was trained on this model's"
             raise InputError(where=self.where, found=found, needed=needed, fix=_FIX)
-        return self.network.to(world_model.device)
+        return self.network
 
 
 class ActionPrior(nn.Module):

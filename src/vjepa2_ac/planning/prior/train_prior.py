@@ -17,16 +17,15 @@ from torch import Tensor
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import training_loader, validation_batches
-from vjepa2_ac.data.sources.indexed_source import spaces_of
 from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.distributed import computing_device
-from vjepa2_ac.encoding.batch import encode_batch, require_widths
+from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.encoding.encode_dataset import with_latents_if_there
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.intervals import Estimate, ratio
 from vjepa2_ac.model.checkpoints.loading import load_base
-from vjepa2_ac.model.network.world_model import WorldModel, widths_of_model
+from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.prior.action_prior import ActionPrior, PriorCard, PriorSizes, save_prior
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
 from vjepa2_ac.spaces import Spaces
@@ -78,14 +77,15 @@ def train_prior(
     options = options or PriorOptions()
     require_stride(config.data, to="know how long a model step is")
     device = computing_device(config.training)
-    data, own = config.data, open_dataset(config.data, progress=reporter.task(INDEXING))
-    model = load_base(config.model, seed=config.seed).to(device)
-    spaces = spaces_of(data, widths_of_model(model.sizes))
-    require_widths(model, spaces.widths, where=f"data.path: {data.path}")
+    data, frames = config.data, open_dataset(config.data, progress=reporter.task(INDEXING))
+    model, spaces = (
+        load_base(config.model, seed=config.seed).to(device),
+        frames.spaces,
+    )  # of it the encoder alone counts
     if spaces.action.follows == "unknown":
         found = "commands of which nobody knows what they do to the state"
         raise InputError(where="data.actions: recorded", found=found, needed="actions that a planner can search among")
-    dataset = with_latents_if_there(config, own, model)
+    dataset = with_latents_if_there(config, frames, model)
     if options.ahead is not None:
         dataset = dataset.with_frames(options.ahead + 1)
     prior = _trained(dataset, model, config, options, reporter)
@@ -106,14 +106,13 @@ def train_prior(
 def _trained(
     dataset: Dataset, model: WorldModel, config: Config, options: PriorOptions, reporter: Reporter
 ) -> ActionPrior:
-    drawn, device = torch.Generator().manual_seed(config.seed), model.device
-    spaces = spaces_of(dataset.config, widths_of_model(model.sizes))
+    drawn, spaces = torch.Generator().manual_seed(config.seed), dataset.spaces
     progress, steps = reporter.task("training the prior", "steps"), options.steps
     with closing(training_loader(dataset, seed=config.seed, batch_size=options.batch_size)) as batches:
         first = [_pairs(one, spaces, drawn) for one in itertools.islice(_encoded(batches, model), _FIRST)]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
-            prior = ActionPrior(_sizes(model, dataset.config.frames - 1)).to(device)
+            prior = ActionPrior(_sizes(model, dataset)).to(model.device)
         prior.scale.copy_(torch.cat([one.changes for one in first]).std(dim=0).clamp(min=1e-6))
         optimizer = torch.optim.AdamW(prior.parameters(), lr=options.learning_rate, weight_decay=0.01)
         pairs = (_pairs(one, spaces, drawn) for one in _encoded(batches, model))
@@ -135,10 +134,9 @@ def _trained(
     return prior.eval().requires_grad_(False)
 
 
-def _sizes(model: WorldModel, ahead: int) -> PriorSizes:
-    widths = widths_of_model(model.sizes)
-    grid = model.image_size // model.sizes.patch_size
-    return PriorSizes(grid, model.latent_dim, widths.state, widths.action, ahead)
+def _sizes(model: WorldModel, dataset: Dataset) -> PriorSizes:
+    grid, widths = model.image_size // model.sizes.patch_size, dataset.spaces.widths
+    return PriorSizes(grid, model.latent_dim, widths.state, widths.action, dataset.config.frames - 1)
 
 
 def _encoded(batches: Iterator[Batch], model: WorldModel) -> Iterator[LatentBatch]:
