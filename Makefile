@@ -81,7 +81,7 @@ docs: $(INSTALLED)  ## the site, into build/site: offline, searchable; a link th
 	@echo "build/site/index.html"
 
 soak: $(INSTALLED)  ## runs that are killed 20 times each (0 and 2 loader workers, with and without a best checkpoint)
-	VJEPA2_AC_SOAK=20 $(BIN)/pytest -q --log-cli-level=INFO tests/training/test_soak.py
+	VJEPA2_AC_SOAK=20 $(BIN)/pytest -q --log-cli-level=INFO tests/training/test_soak.py tests/distributed/test_nothing_hangs.py
 
 lint: $(INSTALLED)  ## style, types, spelling, and links within the project; needs no network
 	$(BIN)/ruff check .

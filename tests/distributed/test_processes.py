@@ -4,17 +4,20 @@ import os
 import signal
 import time
 from dataclasses import replace
+from itertools import chain, islice
 from pathlib import Path
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from paths import ROOT
 from ranks import Rank, finish, free_port, start_rank
 from run_fixtures import set_up
 from same_run import metrics, trained_weights
 from vjepa2_ac.config.loading import config_as_yaml
-from vjepa2_ac.data.loader import training_loader
+from vjepa2_ac.data.loader import ProcessShare, first_clips, training_loader
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.process import EXIT_STATUS, StoppedError
 from vjepa2_ac.runs.checkpoint import RunState, newest_checkpoint, read_state
@@ -111,37 +114,46 @@ def test_what_processes_say_to_each_other(tmp_path, without_dropout) -> None:
 
 
 @pytest.mark.parametrize(
-    ("before", "now", "micro_batches"), [(1, 1, 4), (1, 2, 2), (1, 4, 1), (2, 1, 8), (4, 2, 8), (2, 8, 1)]
+    ("before", "now", "each"), [(1, 1, None), (1, 2, "2"), (1, 3, "1 or 2"), (2, 1, "8"), (4, 2, "8"), (2, 5, "1 or 2")]
 )
 def test_a_step_has_the_clips_that_it_had_on_any_number_of_processes(
-    make_config, reporter, before: int, now: int, micro_batches: int
+    make_config, reporter, before: int, now: int, each: str | None
 ) -> None:
     config = make_config(training__batch_size=2, training__accumulation=4)
     state = RunState(step=3, processes=before, clips_per_step=8 * before, clips_asked=8)
-    assert micro_batches_of(config, state, now, reporter) == micro_batches
-    assert micro_batches * now * 2 == state.clips_per_step
-    assert bool(reporter.notes) == (before != now)
+    assert micro_batches_of(config, state, now, reporter) * 2 == state.clips_per_step
+    assert [f"{each} micro-batches of 2 in each" in note for note in reporter.notes] == [True] * (each is not None)
 
 
-@pytest.mark.parametrize("starts", [(2, 1, 1, 2), (1, 4, 4, 2), (4, 2, 8, 8, 1)])
+@pytest.mark.parametrize("starts", [(2, 1, 1, 2), (1, 4, 3, 2), (4, 3, 8, 5, 1)])
 def test_a_step_keeps_its_clips_however_often_the_run_goes_on(make_config, starts: tuple[int, ...], reporter) -> None:
     config, state = make_config(training__batch_size=2, training__accumulation=4), RunState(step=0)
     for processes in starts:
-        micro_batches = micro_batches_of(config, state, processes, reporter)
-        clips = micro_batches * processes * 2
+        clips = micro_batches_of(config, state, processes, reporter) * 2
         state = replace(state, processes=processes, clips_per_step=clips, clips_asked=8)
         assert clips == 8 * starts[0]
 
 
-def test_processes_that_cannot_share_a_step_are_refused(make_config, reporter) -> None:
+def test_more_processes_than_micro_batches_are_refused(make_config, reporter) -> None:
     config = make_config(training__batch_size=2, training__accumulation=4)
-    with pytest.raises(InputError, match="3 processes of 2 clips do not divide the 8 clips"):
-        micro_batches_of(config, RunState(step=3, clips_per_step=8, clips_asked=8), 3, reporter)
+    with pytest.raises(InputError, match=r"5 processes.*needed: 4 at most, for the 8 clips"):
+        micro_batches_of(config, RunState(step=3, clips_per_step=8, clips_asked=8), 5, reporter)
 
 
 def test_accumulation_changed_on_purpose_counts_as_it_is_written(make_config, reporter) -> None:
     config = make_config(training__batch_size=2, training__accumulation=3)
-    assert micro_batches_of(config, RunState(step=3, clips_per_step=8, clips_asked=4), 2, reporter) == 3
+    assert micro_batches_of(config, RunState(step=3, clips_per_step=8, clips_asked=4), 2, reporter) == 6
+
+
+@given(processes=st.integers(1, 6), of_step=st.integers(1, 9), batch_size=st.integers(1, 3), steps=st.integers(1, 3))
+def test_every_clip_of_a_step_has_one_process(processes: int, of_step: int, batch_size: int, steps: int) -> None:
+    """Also where the processes do not divide the micro-batches of a step: none twice, none left out, in every step."""
+    firsts = [
+        list(islice(first_clips(share, batch_size, start=5), steps * len(share.own)))
+        for rank in range(processes)
+        if (share := ProcessShare(rank, processes, of_step)).own
+    ]
+    assert sorted(chain(*firsts)) == list(range(5, 5 + steps * of_step * batch_size, batch_size))
 
 
 def test_a_run_whose_step_changes_goes_on_in_the_row_of_clips_where_it_stood(make_config, reporter) -> None:

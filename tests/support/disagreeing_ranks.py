@@ -4,6 +4,7 @@ Arguments: a config, and what happens (a function below).
 """
 
 import os
+import signal
 import sys
 import time
 from dataclasses import replace
@@ -14,6 +15,7 @@ from unittest import mock
 import numpy as np
 import torch
 
+from vjepa2_ac import distributed
 from vjepa2_ac.config.loading import load_config
 from vjepa2_ac.data.loader import training_loader
 from vjepa2_ac.encoding import encode_dataset
@@ -60,6 +62,27 @@ def checkpoint_cannot_be_read() -> None:
 def index_cannot_be_made() -> None:
     if RANK == 0:
         data_sets.open_dataset = mock.Mock(side_effect=InputError(where="data.path", found="no data set"))
+
+
+def all_lose_patience_soon() -> None:
+    distributed._SILENT_S = 12.0
+
+
+def one_is_killed_once() -> None:
+    """Under a launcher that starts all again."""
+    step = loop.training_step
+
+    def killed(run: object, batches: object, number: int, **given: object) -> object:
+        if RANK == 1 and number == 3 and os.environ["TORCHELASTIC_RESTART_COUNT"] == "0":
+            os.kill(os.getpid(), signal.SIGKILL)
+        return step(run, batches, number, **given)
+
+    loop.training_step = killed
+
+
+def one_has_a_bug() -> None:
+    if RANK == 1:
+        loop.training_step = mock.Mock(side_effect=ValueError("a bug"))
 
 
 def encoding_loses_its_connection() -> None:

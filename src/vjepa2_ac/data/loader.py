@@ -44,6 +44,12 @@ class ProcessShare:
 
     rank: int = 0
     processes: int = 1
+    of_step: int | None = None  # micro-batches of an optimizer step, of all processes; None: one of each
+
+    @property
+    def own(self) -> range:
+        """Which micro-batches of a step are its own: every so-many-th, one more than others' where that is uneven."""
+        return range(self.rank, self.processes if self.of_step is None else self.of_step, self.processes)
 
 
 WHOLE = ProcessShare()
@@ -69,10 +75,9 @@ def training_loader(
 ) -> Batches:
     """Yield the micro-batches of one process, endlessly, from any position of the run.
 
-    The run is one sequence of clips. Micro-batch m of rank r holds the `batch_size` clips from position
-    start_position + (m * processes + r) * batch_size, so after m micro-batches of every rank the position to resume
-    from is start_position + m * processes * batch_size. If `data.broken_episodes` is skip, clips that cannot be
-    read are missing from their micro-batch, which may even be empty; no other clip replaces them.
+    The run is one sequence of clips. Micro-batch m of it holds the `batch_size` clips from position
+    start_position + m * batch_size; the process has its own of each step. If `data.broken_episodes` is skip, clips that
+    cannot be read are missing from their micro-batch, which may even be empty; no other clip replaces them.
 
     Of two data sets each has its own sequence. Clip p of the run is the second one's if floor(p * share) grows after
     it, and that number is its position there: the share is exact in every stretch of the run, up to a clip.
@@ -87,10 +92,16 @@ def training_loader(
     clips = _training_clips(dataset, seed)
     if replayed is not None:
         clips = replace(clips, replayed=_training_clips(replayed, seed), share=Fraction(str(both.share)))
-    firsts = itertools.count(start_position + share.rank * batch_size, batch_size * share.processes)
+    firsts = first_clips(share, batch_size, start=start_position)
     rows = (list(range(first, first + batch_size)) for first in firsts)
     micro_batches = _micro_batches(clips, rows, dataset.config.workers, pinned=copies is not None)
     return Batches(micro_batches, dataset.broken, copies, replayed.broken if replayed else None)
+
+
+def first_clips(share: ProcessShare, batch_size: int, *, start: int) -> Iterator[int]:
+    """Yield the position of the first clip of each micro-batch of a process, endlessly."""
+    for before in itertools.count(0, share.of_step or share.processes):
+        yield from (start + (before + number) * batch_size for number in share.own)
 
 
 def _training_clips(dataset: Dataset, seed: int) -> _Clips:

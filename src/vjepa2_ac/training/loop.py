@@ -12,12 +12,13 @@ import math
 import signal
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict
-from vjepa2_ac.distributed import agreed, all_reduce_max, broadcast_object, first_only, make_accelerator, require_same
+from vjepa2_ac.distributed import agreed, all_reduce_max, broadcast_object, first_only, joined, require_same
 from vjepa2_ac.process import StoppedError, stop_on_signals
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.runs.folder import CALIBRATION, CHANGES, config_changes
@@ -33,7 +34,6 @@ from vjepa2_ac.training.step import gradients, training_step
 from vjepa2_ac.training.validation import is_done, record, validate_base, validate_if_due, validation_metrics
 
 if TYPE_CHECKING:
-    from vjepa2_ac.evaluation.result import Validation
     from vjepa2_ac.runs.mirror import Mirror
 
 _IN_PLACE = "Everything is in place: data, model, validation and gradients were checked; nothing was written."
@@ -55,12 +55,10 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow
         InputError: An input cannot be used; raised before the first step wherever possible.
         StoppedError: A signal asked the run to stop between its first and last step; see `process`.
     """
-    accelerator = make_accelerator(config)
-    require_same(accelerator, config_as_dict(config), what="the config", fix="Start all processes with one config")
-    require_optimizer(config.training)
-    reporter = reporter if accelerator.is_main_process else SILENT
-
-    with contextlib.ExitStack() as until_the_end:
+    with contextlib.ExitStack() as until_the_end, joined(config) as accelerator:
+        require_same(accelerator, config_as_dict(config), what="the config", fix="Start all processes with one config")
+        require_optimizer(config.training)
+        reporter = reporter if accelerator.is_main_process else SILENT
 
         def opening() -> OpenRun:
             require_installed(config.tracking)
@@ -79,33 +77,27 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow
             gradients(run, batches_from(run))
             reporter.note(_IN_PLACE)
         else:
-            _train(run, opened, first, reporter)
+            beginning = partial(_begun, run, opened, reporter, until_the_end)
+            metrics_log, mirror = agreed(accelerator, beginning) or (None, None)
+            if first is not None and record(run, validation_metrics(first), metrics_log):
+                _save(run, metrics_log)  # the base: nothing that is worse is ever selected
+            _loop(run, metrics_log, mirror, reporter)
     return run.folder
 
 
-def _train(run: Run, opened: OpenRun | None, first: Validation | None, reporter: Reporter) -> None:
-    with contextlib.ExitStack() as until_the_end:
-
-        def beginning() -> tuple[MetricsLog, Mirror | None] | None:
-            if opened is None:
-                return None
-            opened.begin(run.config, run.state)
-            _write_measured(run)
-            done, run_id = run.state.step, run.state.run_id
-            trackers = open_trackers(run.config, run.folder, run_id=run_id, first_step=done)
-            watched = WatchedMetricsLog(run.config, reporter, first_step=done, trackers=trackers)
-            metrics_log, mirror = until_the_end.enter_context(watched), opened.mirror(run_id)
-            return metrics_log, mirror and until_the_end.enter_context(mirror)
-
-        metrics_log, mirror = agreed(run.accelerator, beginning) or (None, None)
-        if first is not None and record(run, validation_metrics(first), metrics_log):
-            _save(run, metrics_log)  # the base: nothing that is worse is ever selected
-        try:
-            _loop(run, metrics_log, mirror, reporter)
-        except StoppedError:
-            run.accelerator.end_training()
-            raise
-    run.accelerator.end_training()
+def _begun(
+    run: Run, opened: OpenRun | None, reporter: Reporter, until_the_end: contextlib.ExitStack
+) -> tuple[MetricsLog, Mirror | None] | None:
+    """Open the metrics log and the mirror, in the first process; they end after all others have heard of an error."""
+    if opened is None:
+        return None
+    opened.begin(run.config, run.state)
+    _write_measured(run)
+    done, run_id = run.state.step, run.state.run_id
+    trackers = open_trackers(run.config, run.folder, run_id=run_id, first_step=done)
+    watched = WatchedMetricsLog(run.config, reporter, first_step=done, trackers=trackers)
+    metrics_log, mirror = until_the_end.enter_context(watched), opened.mirror(run_id)
+    return metrics_log, mirror and until_the_end.enter_context(mirror)
 
 
 def _write_measured(run: Run) -> None:

@@ -142,27 +142,30 @@ def best_so_far(state: RunState, now: Mapping[str, str], reporter: Reporter) -> 
 
 
 def micro_batches_of(config: Config, state: RunState, processes: int, reporter: Reporter) -> int:
-    """Return the number of micro-batches of a process per step.
+    """Return the number of micro-batches of a step, of all processes.
 
     It is the config's, at the first start and if batch_size * accumulation was changed on purpose; else the number that
-    keeps the clips per step, on any number of processes and after any number of restarts.
+    keeps the clips per step, on any number of processes and after any number of restarts. Where processes do not divide
+    it some have one more than others.
 
     Raises:
-        InputError: This number of processes cannot share a step's clips evenly.
+        InputError: There are more processes than micro-batches.
     """
     batch_size, accumulation = config.training.batch_size, config.training.accumulation
-    if state.clips_per_step is None:
-        return accumulation
-    if state.clips_asked != batch_size * accumulation or state.clips_per_step == batch_size * accumulation * processes:
-        return accumulation
-    micro_batches, rest = divmod(state.clips_per_step, batch_size * processes)
-    if rest or not micro_batches:
-        found = f"{processes} processes of {batch_size} clips do not divide the {state.clips_per_step} clips of a step"
-        fix = "Start another number of processes; or set training.batch_size and training.accumulation to what each"
-        fix += " is to do, with --allow-config-change"
-        raise InputError(where="training.batch_size", found=found, fix=fix)
-    reporter.note(
-        f"{processes} processes, before {state.processes}: {micro_batches} micro-batches of {batch_size} in each, so"
-        f" that a step has the same {state.clips_per_step} clips."
-    )
+    asked = accumulation * processes
+    if state.clips_per_step is None or state.clips_asked != batch_size * accumulation:
+        return asked
+    micro_batches = state.clips_per_step // batch_size
+    if micro_batches < processes:
+        found = f"{processes} processes, of which each computes {batch_size} clips at once"
+        needed = f"{micro_batches} at most, for the {state.clips_per_step} clips of a step of this run"
+        fix = "Start fewer; or set training.batch_size and training.accumulation to what each is to do, with"
+        raise InputError(where="training.batch_size", found=found, needed=needed, fix=f"{fix} --allow-config-change")
+    if micro_batches != asked:
+        least, rest = divmod(micro_batches, processes)
+        each = f"{least} or {least + 1}" if rest else f"{least}"
+        reporter.note(
+            f"{processes} processes, before {state.processes}: {each} micro-batches of {batch_size} in each, so"
+            f" that a step has the same {state.clips_per_step} clips."
+        )
     return micro_batches

@@ -54,7 +54,7 @@ class Run:
     scaler: torch.amp.GradScaler  # has no effect except with fp16
     dataset: Dataset
     state: RunState
-    micro_batches: int  # of this process, per optimizer step
+    micro_batches: int  # of an optimizer step, of all processes together
     calibration: Calibration | None = None  # if data.stride was auto and is now chosen
     replayed: Dataset | None = None  # the second data set, if there is one
     strip: ImaginedStrip | None = None  # of `validation.decoder`
@@ -88,7 +88,12 @@ class Run:
     @property
     def clips_per_step(self) -> int:
         """Clips of an optimizer step, of all processes together."""
-        return self.micro_batches * self.config.training.batch_size * int(self.accelerator.num_processes)
+        return self.micro_batches * self.config.training.batch_size
+
+    @property
+    def share(self) -> ProcessShare:
+        """The place of this process among those that share the clips."""
+        return ProcessShare(self.accelerator.process_index, self.accelerator.num_processes, self.micro_batches)
 
 
 def set_up(
@@ -168,7 +173,7 @@ def set_up(
         scaler=torch.amp.GradScaler(accelerator.device.type, enabled=config.training.precision == "fp16"),
         dataset=dataset,
         state=RunState(step=0),
-        micro_batches=config.training.accumulation,
+        micro_batches=config.training.accumulation * accelerator.num_processes,
         calibration=calibration,
         replayed=others[0] if others else None,
         strip=strip,
@@ -200,7 +205,7 @@ def batches_from(run: Run) -> Batches:
         seed=run.config.seed,
         batch_size=run.config.training.batch_size,
         start_position=run.state.clips_done,
-        share=ProcessShare(run.accelerator.process_index, run.accelerator.num_processes),
+        share=run.share,
         copies=copies_for(run.accelerator.device),
     )
 

@@ -135,7 +135,7 @@ def _accumulate(
 ) -> tuple[Float[Tensor, 2], list[str], int]:
     """Return this process's part of both losses, the names of its clips, and the bytes fetched for them."""
     totals, names, fetched = torch.zeros(2, device=run.accelerator.device), list[str](), 0
-    for _ in range(run.micro_batches):
+    for _ in run.share.own:
         batch = next(batches)
         fetched += batch.bytes_fetched
         if not batch.starts:

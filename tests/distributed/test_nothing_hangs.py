@@ -1,0 +1,110 @@
+"""A process that is killed, stopped or fails ends all others, which name it; and the run goes on, on any number."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from paths import ROOT
+from ranks import Rank, finish, free_port, start_rank
+from vjepa2_ac.config.loading import config_as_yaml
+from vjepa2_ac.runs.checkpoint import newest_checkpoint, read_state
+from vjepa2_ac.runs.metrics_log import read_metrics_log
+
+pytestmark = pytest.mark.usefixtures("default_signals")
+KILLS = int(os.environ.get("VJEPA2_AC_SOAK", "1"))  # `make soak`: 20
+TRAINS = "-m", "vjepa2_ac.cli", "train"
+SCRIPT = str(ROOT / "tests/support/disagreeing_ranks.py")
+
+
+@pytest.fixture
+def endless(make_config, tmp_path: Path):
+    """Write a config of more steps than anybody waits for, of 4 micro-batches for 4 processes."""
+    changes = {"training__steps": 100_000, "training__batch_size": 1, "training__accumulation": 1}
+    config = make_config(**changes, adapter__dropout=0.0, checkpoint__every=1, validation__every=1000)
+    (tmp_path / "config.yaml").write_text(config_as_yaml(config))
+    return config
+
+
+def started(config: object, processes: int, happens: str = "") -> list[Rank]:
+    """Start processes, and wait until they have made a step of their own."""
+    run, port = Path(config.run_dir), free_port()
+    before = len(steps_of(run))
+    path = str(run.parent / "config.yaml")
+    words = [SCRIPT, path, happens] if happens else [*TRAINS, path]
+    ranks = [start_rank(words, rank, processes, port) for rank in range(processes)]
+    deadline = time.monotonic() + 300
+    while len(steps_of(run)) <= before:
+        assert all(rank.poll() is None for rank in ranks), finish(ranks)
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    return ranks
+
+
+def steps_of(run: Path) -> list[int]:
+    rows = read_metrics_log(run / "metrics.jsonl") if (run / "metrics.jsonl").exists() else []
+    return [row["step"] for row in rows if row["kind"] == "train"]
+
+
+def errors_of(ranks: list[Rank]) -> list[str]:
+    """Return what they wrote to the error stream; all have ended."""
+    return [rank.communicate(timeout=300)[1] for rank in ranks]
+
+
+def test_a_process_killed_at_any_time_ends_all_which_name_it_and_fewer_go_on(endless) -> None:
+    """After 4 processes 3 go on, of which one has two micro-batches of a step; then 4 again, with the same clips."""
+    drawn, run = np.random.default_rng(0), Path(endless.run_dir)
+    for kill in range(KILLS):
+        ranks = started(endless, 4 - kill % 2)
+        victim = drawn.integers(len(ranks))
+        time.sleep(drawn.uniform(0.0, 1.0))
+        ranks[victim].kill()
+        survivors = [rank for rank in ranks if rank is not ranks[victim]]
+        for said in errors_of(survivors):
+            assert f"process {victim}" in said
+            assert "goes on from the newest checkpoint" in said
+        assert {rank.returncode for rank in survivors} == {2}
+    again = started(endless, 3 + KILLS % 2)
+    again[-1].send_signal(signal.SIGUSR1)
+    finish(again, 75, timeout=300)
+    state = read_state(newest_checkpoint(run / "checkpoints"))
+    assert (state.clips_per_step, state.clips_done) == (4, 4 * state.step)
+
+
+def test_a_process_that_stands_still_ends_all_and_learns_it_when_it_goes_on(endless) -> None:
+    ranks = started(endless, 2, "all_lose_patience_soon")
+    ranks[1].send_signal(signal.SIGSTOP)
+    (said,) = errors_of(ranks[:1])
+    assert "process 1" in said
+    assert "was killed or stopped: no sign of life for 12 s" in said
+    ranks[1].send_signal(signal.SIGCONT)
+    assert "another process of this run" in "".join(ranks[1].communicate(timeout=300))
+
+
+def test_a_launcher_starts_all_again_and_they_go_on(make_config, tmp_path: Path, popen) -> None:
+    path, run = tmp_path / "config.yaml", tmp_path / "run"
+    path.write_text(config_as_yaml(make_config(checkpoint__every=1)))
+    launcher = ["--nproc-per-node=2", "--max-restarts=1", "--rdzv-backend=c10d", "--rdzv-endpoint=127.0.0.1:0"]
+    words = [sys.executable, "-m", "torch.distributed.run", *launcher, SCRIPT, str(path), "one_is_killed_once"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
+    started = popen(words, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    said, _ = started.communicate(timeout=300)
+    assert started.returncode == 0, said
+    assert steps_of(run) == [1, 2, 3, 4, 5, 6]
+    assert read_state(newest_checkpoint(run / "checkpoints")).processes == 2
+
+
+def test_what_one_process_meets_outside_of_what_is_agreed_all_name(make_config, tmp_path: Path) -> None:
+    """A bug, or a library's error, in a single process: the others do not wait for it."""
+    path, port = tmp_path / "config.yaml", free_port()
+    path.write_text(config_as_yaml(make_config(training__accumulation=1)))
+    ranks = [start_rank([SCRIPT, str(path), "one_has_a_bug"], rank, 2, port) for rank in range(2)]
+    (first, _), (second, _) = finish(ranks, 3, timeout=300)
+    assert second == "ValueError: a bug\n"
+    assert first.startswith("UnreachableError: another process of this run: process 1 ")
+    assert "ended: ValueError: a bug" in first
