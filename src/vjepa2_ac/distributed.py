@@ -45,6 +45,7 @@ _CUDA_MATRIX, _CPU_MATRIX = 8192, 512
 _SLOW = 2.0  # times as long as in float32: of a CPU that computes bfloat16 without instructions for it
 
 _T = TypeVar("_T")
+_Result = TypeVar("_Result")
 
 _OTHER_LAUNCHES = ("FSDP", "DEEPSPEED", "MEGATRON_LM", "PARALLELISM_CONFIG")
 _LONGEST_STEP = timedelta(hours=2)  # until a process is given up that does not come to a sum: its disk may have stalled
@@ -248,10 +249,14 @@ def agreed(accelerator: Accelerator, work: Callable[[], _T]) -> _T:
 def raise_first(accelerator: Accelerator, error: Exception | None) -> None:
     """Raise, in all processes, the error of the first of them that has one. All have to call."""
     told = error if error is None or isinstance(error, UserError) else RuntimeError(f"{type(error).__name__}: {error}")
-    for rank, first in enumerate(all_gather_object(accelerator, told)):
-        if first is not None and error is not None and rank == accelerator.process_index:
-            raise error
-        if first is not None:
+    _raise_first_of(all_gather_object(accelerator, told), accelerator.process_index, error)
+
+
+def _raise_first_of(values: Iterable[object], own: int, error: Exception | None = None) -> None:
+    for rank, first in enumerate(values):
+        if isinstance(first, Exception):
+            if error is not None and rank == own:
+                raise error
             if isinstance(first, UserError):
                 first.is_told = True
             raise first
@@ -333,6 +338,78 @@ def _patient_group() -> torch.distributed.ProcessGroup:
     return group
 
 
+# ---- work that processes share ----
+
+_sharing: Accelerator | None = None
+
+
+@contextlib.contextmanager
+def sharing(accelerator: Accelerator) -> Iterator[None]:
+    """Let the processes share the work of `own_part` and `shared` within the context; they do the same otherwise.
+
+    Raises:
+        Exception: What the first process that failed raised; in all of them.
+    """
+    global _sharing
+    if accelerator.num_processes == 1:
+        yield
+        return
+    _sharing, error = accelerator, None
+    try:
+        yield
+    except _OthersError as others:  # all have it
+        raise others.error from None
+    except Exception as own:
+        error = own
+    finally:
+        _sharing = None
+    raise_first(accelerator, error)
+
+
+class _OthersError(Exception):
+    """What another process has raised where this one waited for its results."""
+
+    def __init__(self, error: Exception) -> None:
+        self.error = error
+        super().__init__(str(error))
+
+
+def own_part(count: int, at_once: int = 1) -> range:
+    """Return which of so many things this process does: neighbours, in whole batches of `at_once`."""
+    rank, processes = (_sharing.process_index, _sharing.num_processes) if _sharing else (0, 1)
+    batches = math.ceil(count / at_once)
+    first, last = (at_once * (batches * place // processes) for place in (rank, rank + 1))
+    return range(first, min(count, last))
+
+
+def gathered(values: Sequence[_T]) -> list[_T]:
+    """Return the values of all processes that share work, those of the first process first."""
+    if _sharing is None:
+        return list(values)
+    parts: list[Any] = all_gather_object(_sharing, list(values))
+    try:
+        _raise_first_of(parts, own=-1)
+    except Exception as error:
+        raise _OthersError(error) from None
+    return [value for part in parts for value in part]
+
+
+def shared(items: Sequence[_T], work: Callable[[_T], _Result], progress: Callable[[int, int], None]) -> list[_Result]:
+    """Return the result of some work on each item, in their order; processes that share it have every so-many-th.
+
+    Args:
+        items: The same in all processes.
+        work: What is done with one.
+        progress: Called with (done, total) in those of this process.
+    """
+    rank, processes = (_sharing.process_index, _sharing.num_processes) if _sharing else (0, 1)
+    own, found = range(rank, len(items), processes), list[tuple[int, _Result]]()
+    for done, number in enumerate(own, start=1):
+        found.append((number, work(items[number])))
+        progress(done, len(own))
+    return [result for _, result in sorted(gathered(found), key=lambda one: one[0])]
+
+
 # ---- nothing hangs ----
 
 
@@ -355,7 +432,7 @@ def joined(config: Config) -> Iterator[Accelerator]:
         yield accelerator
     except StoppedError:  # all at once
         watch.leave()
-        accelerator.end_training()
+        leave_processes()
         raise
     except BaseException as error:
         cause = watch.cause_of(error)
@@ -364,7 +441,17 @@ def joined(config: Config) -> Iterator[Accelerator]:
             raise _ended_by(cause) from error
         raise
     watch.leave()
-    accelerator.end_training()
+
+
+def is_first() -> bool:
+    """Return whether this is the only process, or the first of several."""
+    return os.environ.get("RANK", "0") == "0"
+
+
+def leave_processes() -> None:
+    """End what joins this process to others, if anything does; all call, after all has gone well."""
+    if torch.distributed.is_available() and torch.distributed.is_initialized():
+        torch.distributed.destroy_process_group()
 
 
 class _Watch:

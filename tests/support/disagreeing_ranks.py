@@ -31,8 +31,8 @@ def measures_otherwise() -> None:
     """The other rank's errors differ in the last digits: what is no better for one is better for the other."""
     measure, times = validation.prediction_errors, [0]
 
-    def measured(*given: object) -> object:
-        found = measure(*given)
+    def measured(*given: object, **named: object) -> object:
+        found = measure(*given, **named)
         times[0] += 1
         predicted = 0.5 * (1 - 1e-7 * RANK * times[0])
         arrays = {
@@ -78,6 +78,12 @@ def one_is_killed_once() -> None:
         return step(run, batches, number, **given)
 
     loop.training_step = killed
+
+
+def one_cannot_read_a_validation_clip() -> None:
+    if RANK == 1:
+        damaged = InputError(where="episode 3", found="its image is damaged")
+        validation.rank_actions = mock.Mock(side_effect=damaged)
 
 
 def one_has_a_bug() -> None:

@@ -93,15 +93,19 @@ def _evaluate(options: argparse.Namespace) -> None:
         cli.require_subject(subject)
 
     from vjepa2_ac.cli.console.tables import row_tables
+    from vjepa2_ac.distributed import leave_processes
     from vjepa2_ac.evaluation.answer import spread
     from vjepa2_ac.evaluation.rows import rows_of
+    from vjepa2_ac.reporter import SILENT
     from vjepa2_ac.reports.write import evaluate_subject
 
     evaluations = []
     for subject, how in asked:
         cli.say_places_elsewhere(subject)
         with cli.reporter() as reporter:
-            measured = evaluate_subject(subject, how, reporter)
+            measured = evaluate_subject(subject, how, reporter if cli.speaks() else SILENT)
+        if not cli.speaks():  # it shared the work of the first process, which reports
+            continue
         evaluations.append(measured.evaluation)
         if options.all:
             checkpoint, notes = measured.evaluation.about.checkpoint, measured.evaluation.notes
@@ -113,6 +117,7 @@ def _evaluate(options: argparse.Namespace) -> None:
         cli.show(f"Report with {film}all tables: {measured.report}")
     if len(evaluations) > 1:
         cli.show(spread(evaluations))
+    leave_processes()
 
 
 def _next(measured: Evaluated, data: str | None) -> str:

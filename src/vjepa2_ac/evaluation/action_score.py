@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from vjepa2_ac.config.planning import EnergyConfig, PlanningConfig
+from vjepa2_ac.distributed import shared
 from vjepa2_ac.episode import LatentBatch, Progress, no_progress
 from vjepa2_ac.evaluation.action_use import RolloutStart, start_of
 from vjepa2_ac.evaluation.measure import Predictor
@@ -109,12 +110,16 @@ def measure_plans(
     """
     energy = SCORED.energy.model_copy(update={"samples_at_once": config.energy.samples_at_once})
     planners = Planner(one_step_settings(config)), Planner(SCORED.model_copy(update={"energy": energy}))
-    plans: tuple[list[Plan], list[Plan]] = [], []
-    for done, start in enumerate(starts):
-        for way, goal in enumerate((start.following, start.goal)):
-            cost = WindowCost(model, start, goal, planners[way].config.energy)
-            plans[way].append(planners[way].plan(cost, torch.Generator().manual_seed(start.seeds[way])))
-            progress(2 * done + way + 1, 2 * len(starts))
+
+    def planned(start: PlanningStart) -> list[Plan]:
+        costs = [
+            WindowCost(model, start, goal, planner.config.energy)
+            for planner, goal in zip(planners, (start.following, start.goal), strict=True)
+        ]
+        drawn = (torch.Generator().manual_seed(seed) for seed in start.seeds)
+        return [planner.plan(cost, one) for planner, cost, one in zip(planners, costs, drawn, strict=False)]
+
+    plans = list(zip(*shared(starts, planned, progress), strict=True))
     one_step, three_steps = (
         np.stack([plan.actions.numpy().astype(np.float64) for plan in found])[None] for found in plans
     )

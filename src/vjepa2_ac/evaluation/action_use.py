@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from vjepa2_ac.distributed import gathered, shared
 from vjepa2_ac.episode import LatentBatch, Progress, no_progress
 from vjepa2_ac.evaluation.measure import Predictor
 from vjepa2_ac.evaluation.request import ProbeOptions
@@ -69,6 +70,19 @@ def start_of(
         action=batch.actions[row, step] if action is None else action,
         extrinsics=None if batch.extrinsics is None else batch.extrinsics[row, step],
     )
+
+
+_Start = TypeVar("_Start", bound=RolloutStart)
+
+
+def gathered_starts(starts: Sequence[_Start], device: torch.device) -> list[_Start]:
+    """Return the starts of all processes that share work, on the device of this one."""
+    return [_on(device, one) for one in gathered([_on("cpu", one) for one in starts])]
+
+
+def _on(device: torch.device | str, start: _Start) -> _Start:
+    moved: dict[str, Any] = {name: one.to(device) for name, one in vars(start).items() if isinstance(one, Tensor)}
+    return replace(start, **moved)
 
 
 def moves_of(batch: LatentBatch, row: int, clip: int, space: ActionSpace, reach: float) -> tuple[RolloutStart, ...]:
@@ -263,16 +277,17 @@ def _places(
         How many others have a lower energy and how many an equal one; of the first draw the mean change of the
         prediction and the standard deviation of the energy, and the error of persistence.
     """
-    places, numbers = [], []
-    for done, start in enumerate(starts, start=1):
+
+    def placed(start: RolloutStart) -> tuple[list[np.ndarray], tuple[float, float, float]]:
         generator = start.generator(pool.seed)
         drawn = [start.true[None], *(draw(start, generator) for draw in draws)]
         energies, changes = evaluate_actions(model, start, np.concatenate(drawn), at_once=pool.probes.at_once)
         own, others = energies[0], energies[1:].reshape(len(draws), -1)
         same = np.abs(others - own) <= _SAME * max(abs(own), 1e-12)
-        places.append([((others < own) & ~same).sum(axis=1), same.sum(axis=1)])
-        numbers.append((changes[1 : 1 + pool.probes.samples].mean(), others[0].std(), start.persistence))
-        progress(done, len(starts))
+        numbers = changes[1 : 1 + pool.probes.samples].mean(), others[0].std(), start.persistence
+        return [((others < own) & ~same).sum(axis=1), same.sum(axis=1)], numbers
+
+    places, numbers = zip(*shared(starts, placed, progress), strict=True)
     return np.moveaxis(np.array(places, dtype=np.float64), 2, 0), np.array(numbers).T
 
 
@@ -301,10 +316,12 @@ def measure_landscapes(
     trues = np.stack([start.true[_AXES] for start in starts])
     nodes, reach = probes.nodes, 0.0 if space.position is None else probes.reach_cm / 100
     half = max(reach, _ROOM * float(np.abs(trues).max())) or 1.0  # vectors that are all zero
-    maps = []
-    for done, (start, true) in enumerate(zip(starts, trues, strict=True), start=1):
-        maps.append(_landscape(model, start, grid_axes(true, half, nodes), true, space.shown_factor, probes.at_once))
-        progress(done, len(starts))
+
+    def landscape(start: RolloutStart) -> Landscape:
+        true = start.true[_AXES]
+        return _landscape(model, start, grid_axes(true, half, nodes), true, space.shown_factor, probes.at_once)
+
+    maps = shared(starts, landscape, progress)
     least = space.shown_factor * half / (nodes - 1)
     chance = np.mean([np.linalg.norm(_places_of(one.axes) - one.true, axis=1).mean() for one in maps])
     agreements, chances, counts = zip(*(_signs(maps, axis, least) for axis in range(3)), strict=True)

@@ -24,6 +24,7 @@ from torch import Tensor, nn
 
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
 from vjepa2_ac.decoding.network import as_images, as_pixels
+from vjepa2_ac.distributed import gathered
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.evaluate import ClipName, Contender, FramesOfRow, RepeatableClips
@@ -77,7 +78,9 @@ def measure_decoded(
             if clip in wanted:
                 strips[clip] = images.strip(row, wanted[clip], shown)
         progress(len(ids), clips.count)
-    arrays = {key: np.concatenate(parts) for key, parts in values.items()}
+    parts = gathered([values]) if ids else gathered([])
+    arrays = {key: np.concatenate([array for part in parts for array in part[key]]) for key in parts[0]}
+    ids, strips = gathered(ids), dict(gathered(list(strips.items())))
     left_out = {}
     for (source, name), array in arrays.items():
         count = int((~np.isfinite(array[:, -1])).sum())

@@ -42,18 +42,19 @@ class LatentSums:
     Stored are, by horizon: of each clip the mean over tokens [dim] and the squared norm; the sum over clips
     [tokens dim], in float64; and of each episode a sketch of its own sum. No clip's latents are stored: for 7 horizons
     of 256 x 1408 and 250 episodes some 20 MB of sums, 115 MB of sketches, and 0.08 MB a clip. A covariance does not
-    depend on where the origin is: norms and sums are of the distance to the mean of the first batch, so they are small.
+    depend on where the origin is: norms and sums are of the distance to an origin, so they are small; that of the first
+    batch by default. Sums that are `joined` have one.
 
     The sketch (a count sketch: each number is added, with a random sign, to one of 8,192 random places) preserves the
     inner products of episodes' sums up to about 1 %. Only intervals need them, estimates are exact. Latents of 8,192
     numbers or fewer are stored as they are, and intervals are exact, too.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, origin: Float[Tensor, "horizon tokens_dim"] | None = None) -> None:
         self.episode_ids: list[str] = []
         self._pooled: list[Float[np.ndarray, "batch horizon dim"]] = []
         self._squares: list[Float[np.ndarray, "batch horizon"]] = []
-        self._origin: Float[Tensor, "horizon tokens_dim"] | None = None
+        self._origin = origin
         self._total: Float[Tensor, "horizon tokens_dim"] | None = None
         self._sketches: dict[str, Float[np.ndarray, "horizon places"]] = {}
 
@@ -61,15 +62,27 @@ class LatentSums:
         """Add the latents of a batch of clips, in the order of all clips."""
         latents = latents.float()
         flat = latents.flatten(2)
-        self._origin = flat.mean(dim=0) if self._origin is None else self._origin
+        self._origin = flat.mean(dim=0) if self._origin is None else self._origin.to(flat)
         flat = flat - self._origin
         self.episode_ids += episode_ids
         self._pooled.append(latents.mean(dim=2).double().cpu().numpy())
         self._squares.append(flat.square().sum(dim=2, dtype=torch.float64).cpu().numpy())
-        total = flat.sum(dim=0, dtype=torch.float64)
+        total = flat.sum(dim=0, dtype=torch.float64).cpu()
         self._total = total if self._total is None else self._total + total
         for name, sketch in zip(episode_ids, _sketched(flat).cpu().numpy(), strict=True):
             self._sketches[name] = self._sketches[name] + sketch if name in self._sketches else sketch
+
+    @classmethod
+    def joined(cls, parts: Sequence[LatentSums]) -> LatentSums:
+        """Return the sums of all clips of some parts of one origin."""
+        whole = cls()
+        whole.episode_ids = [name for part in parts for name in part.episode_ids]
+        whole._pooled = [values for part in parts for values in part._pooled]
+        whole._squares = [values for part in parts for values in part._squares]
+        whole._total = sum(part._total for part in parts if part._total is not None)  # type: ignore[assignment]
+        for name, sketch in ((name, one) for part in parts for name, one in part._sketches.items()):
+            whole._sketches[name] = whole._sketches[name] + sketch if name in whole._sketches else sketch
+        return whole
 
     @property
     def pooled(self) -> Float[np.ndarray, "clips horizon dim"]:
@@ -87,7 +100,7 @@ class LatentSums:
         assert self._total is not None  # noqa: S101  # there are clips
         sketches = np.stack([self._sketches[name] for name in sorted(self._sketches)], axis=1)
         products = sketches @ sketches.swapaxes(1, 2)
-        exact = self._total.square().sum(dim=1).cpu().numpy()
+        exact = self._total.square().sum(dim=1).numpy()
         with np.errstate(divide="ignore", invalid="ignore"):
             scale = exact / products.sum(axis=(1, 2))
         return np.asarray(products * np.where(np.isfinite(scale), scale, 1)[:, None, None])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -15,11 +16,13 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from vjepa2_ac.data.windows import spread
+from vjepa2_ac.distributed import gathered
 from vjepa2_ac.episode import LatentBatch, Progress
 from vjepa2_ac.evaluation.action_score import PlanningStart, measure_plans, planning_start, study_of
 from vjepa2_ac.evaluation.action_use import (
     ActionPool,
     RolloutStart,
+    gathered_starts,
     measure_landscapes,
     measure_sensitivity,
     moves_of,
@@ -72,6 +75,8 @@ class RepeatableClips:
     count: int
     read: Callable[[Sequence[ClipName] | None], Iterable[tuple[LatentBatch, FramesOfRow]]]
     has_frames: bool = True  # False: of cached latents there are only small ones
+    first: int = 0  # of all clips the first that this process reads; others share the work
+    before: Float[Tensor, "1 time action_dim"] | None = None  # as of `with_other_actions`
 
 
 def evaluate(
@@ -133,9 +138,9 @@ class _Seen:
 
     errors: dict[str, list[PredictionErrors]]  # by model
     predicted: dict[str, LatentSums]  # rollouts with the true actions, by model
+    true: LatentSums
+    copies: LatentSums  # of frame 0
     actions: Float[np.ndarray, "clips horizon action_dim"] = field(default_factory=lambda: np.zeros((0, 0, 0)))
-    true: LatentSums = field(default_factory=LatentSums)
-    copies: LatentSums = field(default_factory=LatentSums)  # of frame 0
     ids: list[str] = field(default_factory=list)
     firsts: list[int] = field(default_factory=list)
     starts: list[RolloutStart] = field(default_factory=list)
@@ -151,8 +156,12 @@ def _collect(
     metrics: Sequence[Metric],
     progress: Progress,
 ) -> _Seen:
-    names, space = [contender.name for contender in contenders], about.space
-    seen, actions = _Seen({name: [] for name in names}, {name: LatentSums() for name in names}), []
+    names, space, device = [contender.name for contender in contenders], about.space, torch.device("cpu")
+    batches = with_other_actions((batch for batch, _ in clips.read(None)), clips.before)
+    first = list(itertools.islice(batches, 1))
+    origin, *_ = gathered([batch.latents[:, 1:].float().flatten(2).mean(dim=0).cpu() for batch, _ in first])
+    sums = {name: LatentSums(origin) for name in names}
+    seen, actions = _Seen({name: [] for name in names}, sums, LatentSums(origin), LatentSums(origin)), []
     probed = set(spread(clips.count, probes.sensitivity_clips))
     planned = set(spread(clips.count, probes.planning_clips if space.position is not None else 0))
 
@@ -160,14 +169,16 @@ def _collect(
         if (way, mode) == ("true", "rollout"):
             seen.predicted[name].add(predicted, ids)
 
-    for batch, others in with_other_actions(batch for batch, _ in clips.read(None)):
+    for batch, others in itertools.chain(first, batches):
+        device = batch.latents.device
         seen.true.add(batch.latents[:, 1:], batch.episode_ids)
         seen.copies.add(batch.latents[:, :1].expand_as(batch.latents[:, 1:]), batch.episode_ids)
         for contender in contenders:
             watch = partial(add, batch.episode_ids, contender.name)
             with contender.switched():
                 seen.errors[contender.name].append(measured(contender.model, batch, ALL, metrics, others, watch))
-        for row, clip in enumerate(range(len(seen.ids), len(seen.ids) + len(batch.starts))):
+        for row in range(len(batch.starts)):
+            clip = clips.first + len(seen.ids) + row
             if clip in probed:
                 largest = int(batch.actions[row][:, space.sized].norm(dim=-1).argmax())
                 seen.starts.append(start_of(batch, row, largest, clip))
@@ -178,8 +189,23 @@ def _collect(
         seen.ids += batch.episode_ids
         seen.firsts += batch.starts
         progress(len(seen.ids), clips.count)
-    seen.actions = np.concatenate(actions)
-    return seen
+    return _of_all(seen, gathered(actions), device)
+
+
+def _of_all(seen: _Seen, actions: Sequence[np.ndarray], device: torch.device) -> _Seen:
+    """Return what the clips of all processes that share the work gave."""
+    return _Seen(
+        errors={name: gathered(found) for name, found in seen.errors.items()},
+        predicted={name: LatentSums.joined(gathered([sums])) for name, sums in seen.predicted.items()},
+        true=LatentSums.joined(gathered([seen.true])),
+        copies=LatentSums.joined(gathered([seen.copies])),
+        actions=np.concatenate(actions),
+        ids=gathered(seen.ids),
+        firsts=gathered(seen.firsts),
+        starts=gathered_starts(seen.starts, device),
+        moves=gathered_starts(seen.moves, device),
+        planned=gathered_starts(seen.planned, device),
+    )
 
 
 def _measure(

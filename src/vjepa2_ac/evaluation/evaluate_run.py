@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from accelerate import Accelerator
 from jaxtyping import UInt8
 
 from vjepa2_ac import __version__
@@ -19,7 +20,7 @@ from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import batches_of, validation_windows
 from vjepa2_ac.data.transforms import frames_as_seen
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
-from vjepa2_ac.distributed import make_accelerator
+from vjepa2_ac.distributed import first_of_machine, joined, own_part, sharing
 from vjepa2_ac.encoding.batch import encode_batch, require_widths
 from vjepa2_ac.encoding.encode_dataset import with_latents_if_there
 from vjepa2_ac.episode import Batch, LatentBatch, Widths
@@ -27,7 +28,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.calibration.variants import calibrate_model
 from vjepa2_ac.evaluation.decoded import NEIGHBOURS, TRUE_FRAMES, load_lpips, measure_decoded
 from vjepa2_ac.evaluation.evaluate import ClipName, Contender, FramesOfRow, RepeatableClips, evaluate
-from vjepa2_ac.evaluation.measure import ClipSample
+from vjepa2_ac.evaluation.measure import ClipSample, actions_before
 from vjepa2_ac.evaluation.request import EvaluationOptions, settle
 from vjepa2_ac.evaluation.result import PERSISTENCE, About, Evaluation, Measurement, Role, TrainingCurve
 from vjepa2_ac.model.adapter.lora import base_only, unadapted_copy
@@ -153,10 +154,17 @@ def measure_subject(subject: str, asked: EvaluationOptions, *, reporter: Reporte
     with user_can_write(folder):
         folder.mkdir(parents=True, exist_ok=True)
         try_writing_at(folder)
+    with joined(config) as accelerator:
+        return _measured(subject, asked, config, reporter, accelerator)
+
+
+def _measured(
+    subject: str, asked: EvaluationOptions, config: Config, reporter: Reporter, accelerator: Accelerator
+) -> Evaluation:
     decoder = None if asked.decoder is None else load_decoder(asked.decoder)
     lpips = load_lpips(asked.lpips, asked.lpips_heads) if asked.lpips and asked.lpips_heads else None
-    accelerator = make_accelerator(config)
-    dataset = open_dataset(config.data, progress=reporter.task("looking through the data"))
+    progress = reporter.task("looking through the data")
+    dataset = first_of_machine(accelerator, lambda: open_dataset(config.data, progress=progress))
     chosen = validation_windows(dataset, asked.split, clips=asked.clips)
     loaded = load_subject(subject, config, asked, dataset, decoder)
     run, world_model, contenders = loaded.run, loaded.world_model, loaded.contenders
@@ -169,9 +177,9 @@ def measure_subject(subject: str, asked: EvaluationOptions, *, reporter: Reporte
         sample, progress = ClipSample(asked.split, asked.clips), reporter.task("calibrating strides")
         beside["strides"] = calibrate_model(world_model, dataset, config, accelerator, sample, progress)
     encode = partial(encode_batch, world_model, device=accelerator.device, chunk=config.model.encode_chunk)
-    clips = _clips(through_cache, chosen, config.validation.batch_size, encode, world_model.image_size)
     axis_clips = asked.probes.axis_clips if dataset.spaces.state.is_base_pose else 0
-    with accelerator.autocast():
+    with accelerator.autocast(), sharing(accelerator):
+        clips = _clips(through_cache, chosen, config.validation.batch_size, encode, world_model.image_size)
         evaluation = evaluate(
             contenders,
             clips,
@@ -215,17 +223,19 @@ def _clips(
     image_size: int,
 ) -> RepeatableClips:
     """Return the clips at these windows, with the frames as the encoder sees them; of cached latents, small ones."""
+    own = own_part(len(windows), batch_size)
     by_name = {(dataset.table.identity(episode), start): (episode, start) for episode, start in windows}
 
     def frames(batch: Batch, row: int) -> UInt8[np.ndarray, "time size size 3"]:
         return frames_as_seen(frames_of(dataset, batch, row), image_size)
 
     def read(names: Sequence[ClipName] | None) -> Iterable[tuple[LatentBatch, FramesOfRow]]:
-        wanted = windows if names is None else [by_name[name] for name in names]
-        for batch in batches_of(dataset, wanted, batch_size=batch_size):
+        wanted = windows[own.start : own.stop] if names is None else [by_name[name] for name in names]
+        for batch in batches_of(dataset, wanted, batch_size=batch_size) if wanted else ():
             yield encode(batch), partial(frames, batch)
 
-    return RepeatableClips(len(windows), read, has_frames=not dataset.config.is_cache)
+    before = actions_before(own, windows, partial(batches_of, dataset, batch_size=1))
+    return RepeatableClips(len(windows), read, not dataset.config.is_cache, own.start, before)
 
 
 def _about(subject: str, run: TrainedRun | None, config: Config, dataset: Dataset, asked: EvaluationOptions) -> About:

@@ -169,6 +169,7 @@ def imagine_clip(subject: str, asked: ImagineOptions, *, reporter: Reporter = SI
         InputError: Subject, data, decoder, clip or actions cannot be used.
     """
     decoder = load_decoder(asked.decoder)
+    require_one_process()
     config = settle(subject, asked.evaluation)
     config = config.model_copy(update={"data": config.data.model_copy(update={"frames": asked.steps + 1})})
     accelerator = make_accelerator(config)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, product
-from typing import Protocol, get_args, runtime_checkable
+from typing import Protocol, TypeVar, get_args, runtime_checkable
 
 import numpy as np
 import torch
@@ -18,9 +18,11 @@ from torch import Tensor
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.episode import LatentBatch
+from vjepa2_ac.distributed import gathered
+from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.evaluation.result import L1, MODES, Metric, Mode, PredictionErrors, Way
 
+_Window = TypeVar("_Window")
 ALL: tuple[tuple[Way, Mode], ...] = tuple(product(get_args(Way), MODES))
 VALIDATED: tuple[tuple[Way, Mode], ...] = (  # rollouts, which take longest, with the true actions only
     *(("true", mode) for mode in MODES),
@@ -100,20 +102,48 @@ def joined(parts: Sequence[PredictionErrors]) -> PredictionErrors:
 
 
 def prediction_errors(
-    model: Predictor, batches: Iterable[LatentBatch], metrics: Sequence[Metric] = (L1,)
+    model: Predictor,
+    batches: Iterable[LatentBatch],
+    metrics: Sequence[Metric] = (L1,),
+    before: Float[Tensor, "1 time action_dim"] | None = None,
 ) -> PredictionErrors:
-    """Measure a model as a validation does, batch after batch, so that no latents are stored."""
-    pairs = with_other_actions(batches)
-    return joined([measured(model, batch, VALIDATED, metrics, others) for batch, others in pairs])
+    """Measure a model as a validation does, batch after batch, so that no latents are stored.
+
+    Processes that share the work each have some batches, and `before` as of `with_other_actions`.
+    """
+    pairs = with_other_actions(batches, before)
+    return joined(gathered([measured(model, batch, VALIDATED, metrics, others) for batch, others in pairs]))
+
+
+def actions_before(
+    own: range, windows: Sequence[_Window], read: Callable[[list[_Window]], Iterator[Batch]]
+) -> Float[Tensor, "1 time action_dim"] | None:
+    """Return the actions that the first clip of a process's part is given as another's; None: it has all clips.
+
+    Args:
+        own: The part.
+        windows: Of all clips.
+        read: Reads some.
+    """
+    if len(own) in (0, len(windows)):
+        return None
+    other = own.start - 1 if own.start else 1
+    return next(read([windows[other]])).actions
 
 
 def with_other_actions(
-    batches: Iterable[LatentBatch],
+    batches: Iterable[LatentBatch], before: Float[Tensor, "1 time action_dim"] | None = None
 ) -> Iterator[tuple[LatentBatch, Float[Tensor, "batch time action_dim"]]]:
     """Yield each batch with other actions for its clips: those of the clip before, whatever the batch size.
 
-    The first clip gets those of the second; if it is alone, its own reversed.
+    The first clip gets `before`, where another process has the clips before it; else those of the second; if it is
+    alone, its own reversed.
     """
+    if before is not None:
+        for batch in batches:
+            yield batch, torch.cat([before.to(batch.actions), batch.actions[:-1]])
+            before = batch.actions[-1:]
+        return
     rest = iter(batches)
     head = [batch for _, batch in zip(range(1), rest, strict=False)]
     if head and len(head[0].actions) == 1:

@@ -94,7 +94,6 @@ def settle(subject: str, asked: EvaluationOptions) -> Config:
             missing, limits are those of data that nobody knows, or files of LPIPS are named without a decoder or
             incompletely.
     """
-    require_one_process()
     if (asked.lpips or asked.lpips_heads) and not (asked.decoder and asked.lpips and asked.lpips_heads):
         needed = "a --decoder, whose images LPIPS compares, and both files (docs/decoding.md says where to get them)"
         raise InputError(where="--lpips, --lpips-heads", found="one without the others", needed=needed)
@@ -116,13 +115,13 @@ def settle(subject: str, asked: EvaluationOptions) -> Config:
 
 
 def require_one_process(environment: Mapping[str, str] = os.environ) -> None:
-    """Refuse several processes: each would measure everything, and all would write the same files.
+    """Refuse several processes: each would do everything, and all would write the same files.
 
     Raises:
         InputError: torchrun or `accelerate launch` started several.
     """
     if (processes := environment.get("WORLD_SIZE", "1")) != "1":
-        needed = "one: only training shares its work among processes"
+        needed = "one: only train, encode and evaluate share their work among processes"
         fix = "Start the command without torchrun or accelerate launch"
         raise InputError(where="torchrun", found=f"{processes} processes", needed=needed, fix=fix)
 

@@ -20,6 +20,7 @@ from jaxtyping import UInt8
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from vjepa2_ac.distributed import is_first
 from vjepa2_ac.episode import short_names
 from vjepa2_ac.evaluation.answer import Answer, Question, answer, interval_of, percent, with_closed_loop
 from vjepa2_ac.evaluation.estimates import Curve, over_persistence
@@ -274,7 +275,7 @@ class Evaluated:
 
 
 def evaluate_subject(subject: str, asked: EvaluationOptions | None = None, reporter: Reporter = SILENT) -> Evaluated:
-    """Measure as `measure_subject` does, and write metrics.json, report and figure.
+    """Measure as `measure_subject` does, and write metrics.json, report and figure; of several processes the first.
 
     Raises:
         InputError: As `measure_subject`.
@@ -286,6 +287,8 @@ def evaluate_subject(subject: str, asked: EvaluationOptions | None = None, repor
     if about.checkpoint:
         found = with_closed_loop(found, Path(about.subject), about.checkpoint)
     folder = asked.out or Path(subject)
+    if not is_first():
+        return Evaluated(evaluation, found, ())
     files = (
         plot_evaluation(evaluation, folder / PLOT),
         write_metrics(evaluation, folder / METRICS_FILE),

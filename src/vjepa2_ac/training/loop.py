@@ -18,7 +18,15 @@ from typing import TYPE_CHECKING
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict
-from vjepa2_ac.distributed import agreed, all_reduce_max, broadcast_object, first_only, joined, require_same
+from vjepa2_ac.distributed import (
+    agreed,
+    all_reduce_max,
+    broadcast_object,
+    first_only,
+    joined,
+    leave_processes,
+    require_same,
+)
 from vjepa2_ac.process import StoppedError, stop_on_signals
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.runs.folder import CALIBRATION, CHANGES, config_changes
@@ -82,6 +90,7 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow
             if first is not None and record(run, validation_metrics(first), metrics_log):
                 _save(run, metrics_log)  # the base: nothing that is worse is ever selected
             _loop(run, metrics_log, mirror, reporter)
+    leave_processes()
     return run.folder
 
 

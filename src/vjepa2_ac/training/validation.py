@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from functools import partial
 from typing import Any
 
 from vjepa2_ac.data.loader import batches_of, validation_windows
 from vjepa2_ac.data.windows import spread
-from vjepa2_ac.distributed import agreed, broadcast_object
+from vjepa2_ac.distributed import broadcast_object, gathered, own_part, sharing
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.action_use import RolloutStart, moves_of, rank_actions
+from vjepa2_ac.evaluation.action_use import RolloutStart, gathered_starts, moves_of, rank_actions
 from vjepa2_ac.evaluation.estimates import cost_of_actions, one_step_over_persistence, over_persistence
-from vjepa2_ac.evaluation.measure import prediction_errors
+from vjepa2_ac.evaluation.measure import actions_before, prediction_errors
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import Validation
 from vjepa2_ac.reporter import Reporter
@@ -98,22 +99,29 @@ def validation_metrics(found: Validation) -> dict[str, Any]:
 def validate(run: Run, reporter: Reporter) -> Validation:
     """Measure the held-out clips, and rank the true actions of moves in some of them.
 
-    Each process measures, and what the first one found counts in all: with other kernels the last digits differ, and
-    processes that disagree about the best would not end together.
+    The processes share the clips, and what the first one computes from all results counts: processes that disagree in
+    the last digits about the best would not end together.
     """
     run.world_model.eval()
-    with run.accelerator.autocast():
-        found = broadcast_object(run.accelerator, agreed(run.accelerator, lambda: _measured(run)))
+    with run.accelerator.autocast(), sharing(run.accelerator):
+        found = _measured(run)
+    found = broadcast_object(run.accelerator, found)
     reporter.validated(run.state.step, found)
     return found
 
 
 def _measured(run: Run) -> Validation:
     windows = validation_windows(run.dataset, "validation", clips=run.config.validation.clips)
-    batches = batches_of(run.dataset, windows, batch_size=run.config.validation.batch_size)
+    own = own_part(len(windows), run.config.validation.batch_size)
+    read = partial(batches_of, run.dataset, batch_size=run.config.validation.batch_size)
+    batches = read(windows[own.start : own.stop]) if own else iter(())
     moves: list[RolloutStart] = []
     encoded = (run.strip.seen(batch, encode(run, batch)) if run.strip else encode(run, batch) for batch in batches)
-    errors = prediction_errors(run.world_model, _moves_kept(run, encoded, len(windows), moves))
+    kept = _moves_kept(run, encoded, own.start, len(windows), moves)
+    errors = prediction_errors(run.world_model, kept, before=actions_before(own, windows, read))
+    for name, reason in gathered(list(run.dataset.broken.reasons.items())):
+        run.dataset.broken.met(name, reason)
+    moves = gathered_starts(moves, run.accelerator.device)
     if not moves:
         return Validation(errors, None)
     config, space = run.config.validation, run.dataset.spaces.action
@@ -122,10 +130,10 @@ def _measured(run: Run) -> Validation:
 
 
 def _moves_kept(
-    run: Run, batches: Iterable[LatentBatch], count: int, moves: list[RolloutStart]
+    run: Run, batches: Iterable[LatentBatch], first: int, count: int, moves: list[RolloutStart]
 ) -> Iterator[LatentBatch]:
-    """Yield batches of `count` clips in all, and append the moves of those that are chosen for the ranking."""
-    config, space, first = run.config.validation, run.dataset.spaces.action, 0
+    """Yield batches from a `first` of `count` clips on, and append the moves of those chosen for the ranking."""
+    config, space = run.config.validation, run.dataset.spaces.action
     chosen = set(spread(count, config.ranking_clips)) if config.ranking_clips else set()
     for batch in batches:
         for row in range(len(batch.starts)):

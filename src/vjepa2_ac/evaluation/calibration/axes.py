@@ -25,7 +25,7 @@ from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.planning import CemConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.loader import validation_batches
-from vjepa2_ac.distributed import make_accelerator
+from vjepa2_ac.distributed import make_accelerator, shared
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.evaluation.action_use import RolloutStart, evaluate_actions, start_of
@@ -268,7 +268,11 @@ def infer_axes(
     # the motion.
     x, y = np.mean([_numbers(start.state)[:2] for start in starts], axis=0)
     places = ((0.0, 0.0), (float(x), float(y)))
-    tried = {place: np.stack([_turned_errors(model, start, place, at_once) for start in starts]) for place in places}
+
+    def turned(start: RolloutStart) -> list[np.ndarray]:
+        return [_turned_errors(model, start, place, at_once) for place in places]
+
+    tried = dict(zip(places, np.stack(shared(starts, turned, no_progress), axis=1), strict=True))
     centre_m = min(places, key=lambda place: tried[place].sum(axis=0).min())
     errors = tried[centre_m]
     axes = Axes(math.radians(_yaw_of_least_error(errors, names).value), centre_m)
@@ -276,10 +280,7 @@ def infer_axes(
     reach = min(1.0, max(_LEAST_M, _ROOM * float(np.linalg.norm(executed, axis=1).max())))
     limits = LimitsConfig(xyz=(reach, reach, reach), gripper_mode="held")
     planner = Planner(_SEARCH.model_copy(update={"limits": limits}))
-    inferred = []
-    for done, start in enumerate(starts, start=1):
-        inferred.append(_inferred(model, _turned(start, axes), planner, at_once))
-        progress(done, len(starts))
+    inferred = shared(starts, lambda start: _inferred(model, _turned(start, axes), planner, at_once), progress)
     return fit_axes(np.stack(inferred), executed, errors, names, centre_m)
 
 

@@ -1,0 +1,87 @@
+"""Processes that share an evaluation find what one process finds; a validation, too; and an error of one is of all."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from paths import ROOT
+from ranks import finish, free_port, start_rank
+from same_run import metrics
+from vjepa2_ac.cli import main
+from vjepa2_ac.config.loading import config_as_yaml
+from vjepa2_ac.distributed import gathered, own_part, shared
+from vjepa2_ac.training.loop import train
+
+pytestmark = pytest.mark.usefixtures("default_signals")
+PROBES = [
+    "--clips", "7", "--sensitivity-clips", "5", "--samples", "6", "--landscapes", "2", "--nodes", "3", "--axes", "3",
+    "--examples", "2", "--planning-clips", "3", "--planning", "planning.samples=12", "planning.iterations=2",
+    "planning.cem.elites=3",
+]  # fmt: skip
+
+
+def numbers_of(value: Any, name: str = "") -> dict[str, float]:
+    """Return every number of nested values, by its place."""
+    if isinstance(value, bool | str) or value is None:
+        return {}
+    if isinstance(value, int | float):
+        return {name: float(value)}
+    parts = value.items() if isinstance(value, dict) else enumerate(value)
+    return {place: one for key, part in parts for place, one in numbers_of(part, f"{name}/{key}").items()}
+
+
+def assert_same(one: dict[str, Any], other: dict[str, Any]) -> None:
+    first, second = numbers_of(one), numbers_of(other)
+    assert first.keys() == second.keys()
+    for name, value in first.items():
+        np.testing.assert_allclose(second[name], value, rtol=1e-6, atol=1e-9, err_msg=name)
+
+
+@pytest.mark.parametrize("processes", [2, 3])
+def test_processes_that_share_an_evaluation_find_what_one_finds(
+    make_config, tmp_path: Path, processes: int, reporter
+) -> None:
+    """7 clips in batches of 3: one process has one clip; of the shuffled actions some are the other process's."""
+    changes = {"frames": 6, "test_share": 0.4}
+    data = {f"data__{name}": value for name, value in changes.items()}
+    config = make_config(**data, training__steps=2, validation__batch_size=3, validation__every=2)
+    run = str(train(config, reporter))
+    assert main(["evaluate", run, "--out", str(tmp_path / "alone"), *PROBES]) == 0
+    words, port = ["-m", "vjepa2_ac.cli", "evaluate", run, "--out", str(tmp_path / "together"), *PROBES], free_port()
+    said = finish([start_rank(words, rank, processes, port) for rank in range(processes)], timeout=300)
+    assert "Did it become better?" in said[0][0] or "predicts" in said[0][0]
+    assert [out for out, _ in said[1:]] == [""] * (processes - 1), "only the first process speaks"
+    alone, together = (json.loads((tmp_path / name / "metrics.json").read_text()) for name in ("alone", "together"))
+    assert {row["key"] for row in alone["rows"]} >= {"plans.score", "ranking.rank"} or len(alone["rows"]) > 50
+    assert_same(alone["rows"], together["rows"])
+
+
+def test_a_shared_validation_is_that_of_one_process(make_config, tmp_path: Path, reporter) -> None:
+    changes = {"training__steps": 2, "validation__clips": 7, "validation__batch_size": 3, "validation__every": 2}
+    alone = train(make_config(**changes, run_dir=str(tmp_path / "alone"), adapter__dropout=0.0), reporter)
+    config = make_config(**changes, run_dir=str(tmp_path / "two"), adapter__dropout=0.0, training__accumulation=1)
+    (tmp_path / "two.yaml").write_text(config_as_yaml(config))
+    words, port = ["-m", "vjepa2_ac.cli", "train", str(tmp_path / "two.yaml")], free_port()
+    finish([start_rank(words, rank, 2, port) for rank in range(2)], timeout=300)
+    first, second = ([row for row in metrics(run) if row["kind"] == "validation"] for run in (alone, tmp_path / "two"))
+    np.testing.assert_array_equal(*(list(numbers_of(rows[0]).values()) for rows in (first, second)))
+
+
+def test_an_error_of_one_in_shared_work_is_raised_in_all(make_config, tmp_path: Path) -> None:
+    path, port = tmp_path / "config.yaml", free_port()
+    path.write_text(config_as_yaml(make_config()))
+    script = str(ROOT / "tests/support/disagreeing_ranks.py")
+    ranks = [start_rank([script, str(path), "one_cannot_read_a_validation_clip"], rank, 2, port) for rank in range(2)]
+    said = [out for out, _ in finish(ranks, 3, timeout=300)]
+    assert said == ["InputError: episode 3: its image is damaged.\n"] * 2
+
+
+def test_alone_a_process_has_all_the_work() -> None:
+    assert list(own_part(7, 3)) == list(range(7))
+    assert gathered([1, 2]) == [1, 2]
+    told: list[tuple[int, int]] = []
+    assert shared([3, 4], lambda item: item**2, lambda *given: told.append(given)) == [9, 16]
+    assert told == [(1, 2), (2, 2)]
