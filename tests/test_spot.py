@@ -24,7 +24,7 @@ from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.training.loop import train
 
 SKYPILOT, KUBERNETES = (ROOT / f"scripts/spot_{name}.yaml" for name in ("skypilot", "kubernetes"))
-PLACE, STEPS = "gs://bucket/run", 60
+PLACE, STEPS = "gs://bucket/run", 40
 
 
 def of_kubernetes() -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
@@ -144,6 +144,12 @@ class Pods:
         return max((row["step"] for row in rows if row["kind"] == "train"), default=0)
 
 
+def newest(folder: Path, machines: str) -> Path:
+    """Return the newest checkpoint on any of these machines."""
+    found = [newest_checkpoint(run / "checkpoints") for run in folder.glob(f"{machines}/run")]
+    return max(filter(None, found), key=lambda checkpoint: checkpoint.name)
+
+
 @pytest.mark.usefixtures("default_signals")
 @pytest.mark.parametrize("preempted", [0, 1])
 def test_a_preempted_pod_starts_anew_elsewhere_and_the_run_is_the_one_that_nobody_disturbed(
@@ -163,5 +169,8 @@ def test_a_preempted_pod_starts_anew_elsewhere_and_the_run_is_the_one_that_nobod
         for one in pods.running:
             one.kill()
     assert pods.started > 2
-    done = max(tmp_path.glob("machine-*/run"), key=lambda run: read_state(newest_checkpoint(run / "checkpoints")).step)
-    assert_equal_up_to_rounding(whole, done)
+    stopped, done = newest(tmp_path, "machine-[12]"), newest(tmp_path, "machine-*").parent
+    assert 2 <= read_state(stopped).step < STEPS
+    assert done != stopped.parent
+    assert (done / stopped.name).is_dir(), "a fresh machine began where the others had stopped"
+    assert_equal_up_to_rounding(whole, done.parent)
