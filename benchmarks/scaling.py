@@ -4,10 +4,9 @@
     python benchmarks/scaling.py --check [--processes 1 2 4]
 
 Sizes follow from the config: latents, trained parameters, FLOPs, memory by doctor's arithmetic. Speeds are options: the
-defaults are measured (an H100: docs/IMPLEMENTATION_NOTES.md; loader and bytes: docs/log.md) or, of links and prices, as
-published. The model, which no two GPUs have confirmed: every process takes the time of one alone, then gradients are
-summed in a ring, 2 (N-1) / N of their bytes through the slowest link, and each tensor costs 2 messages for a doubling
-of N. Nothing overlaps. Reading and decoding keep up: the columns say what that takes.
+defaults are measured (an H100: docs/IMPLEMENTATION_NOTES.md; loader and bytes: docs/log.md), or as published for links
+and prices. The model, not confirmed by two GPUs: a process takes its time alone; then gradients are summed in a ring,
+2 (N-1) / N of their bytes through the slowest link, and 2 messages a tensor and doubling of N. Nothing overlaps.
 
 --check trains a tiny model here (gloo, a thread a process): N processes on C cores take N / min(C, N) times as long.
 """
@@ -116,7 +115,8 @@ def check(options: argparse.Namespace) -> None:
 
     cores, alone = len(os.sched_getaffinity(0)), 0.0
     sizes = ModelSizes.model_validate({"image_size": 64, "encoder": ENCODER, "predictor": PREDICTOR})
-    print(f"{cores} cores\n\n| processes | predicted, ms | of it all-reduce | measured, ms | ratio |\n|{'---|' * 5}")
+    print(f"{cores} cores, load {os.getloadavg()[0]:.1f}\n")
+    print(f"| processes | predicted, ms | of it all-reduce | measured, ms | ratio |\n|{'---|' * 5}")
     with tempfile.TemporaryDirectory() as scratch:
         data = write_synthetic_droid(Path(scratch) / "set", episodes=8, steps=24, size=(36, 64))
         WorldModel.random(sizes, seed=3).save_pretrained(Path(scratch) / "model")

@@ -57,6 +57,8 @@ def test_it_runs_to_its_end(
             few = ModelSizes(encoder=EncoderSizes(depth=1), predictor=PredictorSizes(depth=1))
             monkeypatch.setattr(module, "SMALL", few)
             monkeypatch.setattr(subprocess, "run", lambda words, main=module.main, **_: main(words[2:]))
+        if name == "scaling":
+            monkeypatch.setattr(module, "PREDICTOR", {**module.PREDICTOR, "depth": 1})
         if name == "loader":
             monkeypatch.setattr(module, "DROID_EPISODES", 2_000)
             monkeypatch.setattr(module.measure_workers, "__defaults__", (2, 2))
