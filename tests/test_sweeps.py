@@ -64,6 +64,7 @@ def test_a_sweep_that_is_stopped_goes_on_with_the_trial_that_was_open(
         return step_of_the_loop(run, *given, **named)
 
     monkeypatch.setattr(loop, "training_step", stopping)
+    monkeypatch.chdir(tmp_path)  # where compare writes
     with pytest.raises(SystemExit, match="75"):
         sweep(str(folder), "3", config)
     assert read_state(newest_checkpoint(folder / "001/checkpoints")).step == 2
