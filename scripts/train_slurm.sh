@@ -5,6 +5,11 @@
 #     sbatch scripts/train_slurm.sh configs/default.yaml run_dir=/shared/runs/droid
 #
 # run_dir must be seen by the first node; checkpoint.remote makes any other machine able to go on.
+#
+# A sweep is an array: task N adds the overrides in line N of the file GRID (such as examples/sweeps/grid.txt), and trains
+# in the folder N of one beside that file.
+#
+#     GRID=/shared/sweep.txt sbatch --array=1-4 scripts/train_slurm.sh configs/default.yaml
 #SBATCH --job-name=vjepa2-ac
 #SBATCH --nodes=1
 #SBATCH --ntasks-per-node=1
@@ -18,6 +23,12 @@
 set -euo pipefail
 
 readonly STOPPED=75 # the run was asked to stop, and can go on
+
+if [[ -n ${SLURM_ARRAY_TASK_ID:-} ]]; then
+  read -ra overrides < <(sed -n "${SLURM_ARRAY_TASK_ID}p" "${GRID:?names the file of overrides}") || true  # a last line may lack its end
+  : "${overrides:?$GRID has no line $SLURM_ARRAY_TASK_ID}"
+  set -- "$@" "${overrides[@]}" "run_dir=${GRID%.*}/$SLURM_ARRAY_TASK_ID"
+fi
 
 MASTER_ADDR="$(scontrol show hostnames "$SLURM_JOB_NODELIST" | sed -n 1p)"  # reads to the end: `head` would leave, and break the pipe
 MASTER_PORT="$((20000 + SLURM_JOB_ID % 20000))"

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from paths import ROOT
+from vjepa2_ac.config.loading import load_config
 
 SCRIPT = ROOT / "scripts" / "train_slurm.sh"
 SRUN = """#!/bin/bash
@@ -27,15 +28,16 @@ exit $RUN_ENDS_WITH
 """
 
 
-def submit(folder: Path, run_ends_with: int) -> tuple[int, list[str]]:
+def submit(folder: Path, run_ends_with: int, **more: str) -> tuple[int, list[str]]:
     """Run the script as a job of two tasks, where Slurm and the run only note how they were called."""
     for name, text in {"srun": SRUN, "scontrol": SCONTROL, "vjepa2-ac": RUN}.items():
         (folder / name).write_text(text)
         (folder / name).chmod(0o755)
     job = {"SLURM_JOB_ID": "123456", "SLURM_NTASKS": "2", "SLURM_JOB_NODELIST": "node[7-8]"}
-    environment = {"PATH": f"{folder}:{os.environ['PATH']}", "RUN_ENDS_WITH": str(run_ends_with), **job}
+    environment = {"PATH": f"{folder}:{os.environ['PATH']}", "RUN_ENDS_WITH": str(run_ends_with), **job, **more}
     done = subprocess.run(["bash", str(SCRIPT), "my.yaml", "seed=1"], env=environment, cwd=folder, check=False)
-    return done.returncode, (folder / "calls").read_text().splitlines()
+    calls = folder / "calls"
+    return done.returncode, calls.read_text().splitlines() if calls.exists() else []
 
 
 def test_every_process_learns_its_place(tmp_path: Path) -> None:
@@ -53,3 +55,36 @@ def test_a_run_that_can_go_on_is_queued_again_and_no_other(tmp_path, ends_with: 
     found, calls = submit(tmp_path, ends_with)
     assert found == status
     assert (calls[-1] == "scontrol requeue 123456") == again
+
+
+def test_a_task_of_an_array_takes_its_line_of_the_grid_and_a_folder_of_its_own(tmp_path: Path) -> None:
+    grid = tmp_path / "sweep.txt"
+    grid.write_bytes((ROOT / "examples/sweeps/grid.txt").read_bytes())
+    runs = set()
+    for task, line in enumerate(grid.read_text().splitlines(), start=1):
+        status, calls = submit(tmp_path, run_ends_with=75, GRID=str(grid), SLURM_ARRAY_TASK_ID=str(task))
+        assert (status, calls[-1]) == (0, "scontrol requeue 123456"), "each task is queued again by itself"
+        command, *words = calls[-2].partition(": ")[2].split()
+        assert (command, words[0], words[2:-1]) == ("train", "my.yaml", line.split())
+        config = load_config(ROOT / "configs/default.yaml", words[1:])
+        runs.add(config.run_dir)
+    assert runs == {str(tmp_path / f"sweep/{task}") for task in range(1, task + 1)}
+
+
+@pytest.mark.parametrize(
+    ("more", "said"), [({}, "names the file of overrides"), ({"GRID": "sweep.txt"}, "sweep.txt has no line 2")]
+)
+def test_an_array_without_a_grid_or_a_line_trains_nothing(
+    tmp_path: Path, more: dict[str, str], said: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "sweep.txt").write_text("seed=1\n")
+    status, calls = submit(tmp_path, run_ends_with=0, SLURM_ARRAY_TASK_ID="2", **more)
+    assert status
+    assert calls == []
+    assert said in capfd.readouterr().err
+
+
+def test_a_last_line_without_its_end_is_a_line(tmp_path: Path) -> None:
+    (tmp_path / "sweep.txt").write_text("seed=1\nseed=2")
+    _, calls = submit(tmp_path, run_ends_with=0, SLURM_ARRAY_TASK_ID="2", GRID="sweep.txt")
+    assert calls[-1].endswith("train my.yaml seed=1 seed=2 run_dir=sweep/2")

@@ -31,6 +31,7 @@ OTHERS = "\n".join(path.read_text() for path in Path(__file__).parent.glob("test
         ("video", "--clips 1", "ours"),
         ("loader", "--clips 4", "index of 2,000 episodes"),
         ("explore", "builtin:sim-tiny --rounds 1", "p95"),
+        ("scaling", "--check --processes 1 2 --steps 4", "| 2 |"),
     ],
 )
 def test_it_runs_to_its_end(
@@ -56,11 +57,34 @@ def test_it_runs_to_its_end(
             few = ModelSizes(encoder=EncoderSizes(depth=1), predictor=PredictorSizes(depth=1))
             monkeypatch.setattr(module, "SMALL", few)
             monkeypatch.setattr(subprocess, "run", lambda words, main=module.main, **_: main(words[2:]))
+        if name == "scaling":
+            monkeypatch.setattr(module, "PREDICTOR", {**module.PREDICTOR, "depth": 1})
         if name == "loader":
             monkeypatch.setattr(module, "DROID_EPISODES", 2_000)
             monkeypatch.setattr(module.measure_workers, "__defaults__", (2, 2))
         module.main(options.format(folder=tmp_path).split())
     assert printed in capfd.readouterr().out
+
+
+def test_a_prediction_follows_from_the_config_and_from_what_was_measured(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (module,) = imported("scaling", monkeypatch)
+
+    def predicted(*words: str) -> list[list[float]]:
+        module.main(["builtin:default", "model.dtype=float32", *words])
+        rows = [line for line in capsys.readouterr().out.splitlines() if re.match(r"\| \d", line)]
+        return [[float(cell.strip().strip("%").replace(",", "")) for cell in row[1:-1].split("|")] for row in rows]
+
+    usual = predicted()
+    assert [row[0] for row in usual] == [2**power for power in range(10)]
+    assert usual[0][8:12] == [0, 0, 100, 100], "one process waits for nobody"
+    assert usual[9][5] == pytest.approx(512 * usual[0][5] * usual[9][10] / 100, rel=0.03)
+    other = predicted("data.cache_dtype=int8", "adapter.rank=32", "--encoder-fps=800")
+    assert other[9][6] / usual[9][6] == pytest.approx(0.5, abs=0.02), "latents have half the bytes"
+    assert other[3][8] > usual[3][8], "more is summed"
+    assert other[0][12] == pytest.approx(usual[0][12] / 2, abs=0.01)
+    assert [module.all_reduce_s(n, [10**9], gb_s=1.0, message_us=0.0) for n in (1, 2, 4)] == [0, 4, 6], "a ring"
 
 
 def test_two_trainings_at_once_are_commands_that_are_there(

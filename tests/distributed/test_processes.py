@@ -5,17 +5,15 @@ import signal
 import time
 from dataclasses import replace
 from itertools import chain, islice
-from pathlib import Path
 
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
 from paths import ROOT
 from ranks import Rank, finish, free_port, start_rank
 from run_fixtures import set_up
-from same_run import metrics, trained_weights
+from same_run import assert_equal_up_to_rounding
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.data.loader import ProcessShare, first_clips, training_loader
 from vjepa2_ac.errors import InputError
@@ -37,17 +35,6 @@ def without_dropout(make_config, tmp_path):
         return config
 
     return make
-
-
-def assert_equal_up_to_rounding(one: Path, other: Path) -> None:
-    first, second = trained_weights(one), trained_weights(other)
-    for name, value in first.items():
-        torch.testing.assert_close(second[name], value, rtol=1e-3, atol=1e-6, msg=name)
-    for row, same in zip(metrics(one), metrics(other), strict=True):
-        assert row["step"] == same["step"]
-        if row["kind"] == "train":
-            assert same["loss"] == pytest.approx(row["loss"], rel=1e-5)
-            assert same["grad_norm"] == pytest.approx(row["grad_norm"], rel=1e-4)
 
 
 def stopping_after(last_step: int, reporter):

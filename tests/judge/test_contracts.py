@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from installing import install
 from paths import ROOT
 from served import STATE, controller, image, serving, session
 from vjepa2_ac.planning.chunks import changes_of_chunks
@@ -17,17 +18,6 @@ from vjepa2_ac.serving.session import SessionOptions
 
 HERE = Path(__file__).parent
 EXAMPLES = ROOT / "examples/judge"
-
-
-def install(python: str | Path, *words: str) -> None:
-    """Install packages for a Python, or skip aloud."""
-    pip = [sys.executable, "-m", "pip", "--python", python, "install", "--quiet", "--disable-pip-version-check"]
-    try:
-        done = subprocess.run([*pip, *words], capture_output=True, text=True, timeout=180)
-    except subprocess.TimeoutExpired:
-        pytest.skip(f"{words} could not be installed within 3 minutes")
-    if done.returncode:
-        pytest.skip(f"{words} cannot be installed here: {done.stderr.strip().splitlines()[-1:]}")
 
 
 def ran(python: str | Path, script: str, folder: Path, **environment: str) -> dict:

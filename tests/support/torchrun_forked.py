@@ -13,7 +13,12 @@ def run() -> None:
     options = parse_args(sys.argv[1:])
     config, _, _ = config_from_args(options)
     config.start_method = "fork"
-    elastic_launch(config, main)(options.training_script_args)
+    elastic_launch(config, _as_a_process)(options.training_script_args)
+
+
+def _as_a_process(words: list[str]) -> None:
+    if status := main(words):
+        sys.exit(status)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,60 @@
+"""Search for hyperparameters with Optuna: each trial is a run of `vjepa2-ac train` in a folder of its own.
+
+    pip install optuna==5.0.0
+    python examples/sweeps/optuna_sweep.py FOLDER TRIALS CONFIG [key=value ...]
+    for run in FOLDER/*/; do vjepa2-ac evaluate "$run"; done
+    vjepa2-ac compare FOLDER/*/
+
+Started again, the study goes on, and a trial that was stopped resumes its run; one process at a time in a FOLDER.
+FIGURE is a column of RUN/metrics.jsonl, read at the checkpoint that the run has selected.
+"""
+
+import sys
+from pathlib import Path
+
+import optuna
+from optuna.distributions import CategoricalDistribution, FloatDistribution
+from optuna.storages import JournalStorage
+from optuna.storages.journal import JournalFileBackend
+from optuna.trial import TrialState
+
+from vjepa2_ac.cli import main as vjepa2_ac
+from vjepa2_ac.runs.checkpoint import select_checkpoint, step_of
+from vjepa2_ac.runs.folder import METRICS
+from vjepa2_ac.runs.metrics_log import read_metrics_log
+
+REFUSED = 2  # the status of an input that cannot be used
+FIGURE = "action_rank"  # lower is better; or rollout_over_persistence_last
+SPACE = {  # any key of a config
+    "training.learning_rate": FloatDistribution(1e-5, 1e-3, log=True),
+    "adapter.rank": CategoricalDistribution([8, 16, 32]),
+}
+
+
+def main(place: str, trials: str, *config: str) -> None:
+    """Do trials until there are so many."""
+    folder = Path(place)
+    folder.mkdir(parents=True, exist_ok=True)
+    if status := vjepa2_ac(["train", *config, f"run_dir={folder / 'check'}", "--check"]):
+        sys.exit(status)
+    storage = JournalStorage(JournalFileBackend(str(folder / "study.journal")))
+    study = optuna.create_study(storage=storage, study_name=FIGURE, load_if_exists=True)
+    open_trials = study.get_trials(states=[TrialState.RUNNING])
+    while open_trials or len(study.trials) < int(trials):
+        trial = open_trials.pop(0) if open_trials else study.ask(SPACE)
+        run = folder / f"{trial.number:03}"
+        overrides = [f"{key}={value}" for key, value in trial.params.items()]
+        status = vjepa2_ac(["train", *config, *overrides, f"run_dir={run}"])
+        if status == REFUSED:  # or its loss was not finite
+            study.tell(trial.number, state=TrialState.FAIL)
+        elif status:  # stopped: it can go on
+            sys.exit(status)
+        else:
+            step = step_of(select_checkpoint(run).path.name)
+            rows = [row for row in read_metrics_log(run / METRICS) if FIGURE in row and row["step"] <= step]
+            study.tell(trial.number, rows[-1][FIGURE])
+    print(f"{FIGURE} {study.best_value:.4f} in {folder / f'{study.best_trial.number:03}'}: {study.best_params}")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

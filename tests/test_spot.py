@@ -1,0 +1,176 @@
+"""Spot machines: the files for SkyPilot and Kubernetes are valid, and what they start survives preemption."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from gcs import Gcs
+from installing import install
+from paths import ROOT
+from ranks import Rank, free_port
+from same_run import assert_equal_up_to_rounding
+from vjepa2_ac.config import Config
+from vjepa2_ac.config.loading import config_as_yaml, load_config
+from vjepa2_ac.runs.checkpoint import newest_checkpoint, read_state
+from vjepa2_ac.runs.metrics_log import read_metrics_log
+from vjepa2_ac.training.loop import train
+
+SKYPILOT, KUBERNETES = (ROOT / f"scripts/spot_{name}.yaml" for name in ("skypilot", "kubernetes"))
+PLACE, STEPS = "gs://bucket/run", 40
+
+
+def of_kubernetes() -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
+    """Return the service, what the job says, and what each of its pods says."""
+    service, job = yaml.safe_load_all(KUBERNETES.read_text())
+    return service, job["spec"], job["spec"]["template"]["spec"]
+
+
+def words_in_a_pod() -> list[str]:
+    return [str(word) for word in of_kubernetes()[2]["containers"][0]["command"]]
+
+
+def words_on_a_machine_of_skypilot(folder: Path) -> list[str]:
+    """Run the file's script where torchrun only notes how it was called."""
+    (folder / "torchrun").write_text('#!/bin/bash\nprintf "%s\\n" torchrun "$@" >words\n')
+    (folder / "torchrun").chmod(0o755)
+    task = yaml.safe_load(SKYPILOT.read_text())
+    given = {**task["envs"], "REMOTE": PLACE, "SKYPILOT_NUM_NODES": "2", "SKYPILOT_NODE_RANK": "1"}
+    given |= {"SKYPILOT_NUM_GPUS_PER_NODE": "4", "SKYPILOT_NODE_IPS": "10.0.0.1\n10.0.0.2"}
+    environment = {**os.environ, **given, "PATH": f"{folder}:{os.environ['PATH']}"}
+    subprocess.run(["bash", "-e", "-c", task["run"]], env=environment, cwd=folder, check=True)
+    return (folder / "words").read_text().splitlines()
+
+
+@pytest.mark.parametrize("where", ["kubernetes", "skypilot"])
+def test_torchrun_and_train_take_what_the_file_starts_and_the_mirror_has_time(where: str, tmp_path: Path) -> None:
+    from torch.distributed.run import config_from_args, parse_args
+
+    words = words_in_a_pod() if where == "kubernetes" else words_on_a_machine_of_skypilot(tmp_path)
+    options = parse_args(words[1:])
+    launch, (command, config, *overrides) = config_from_args(options)[0], options.training_script_args
+    assert (words[0], options.training_script, command) == ("torchrun", "vjepa2_ac.cli", "train")
+    read = load_config(config if config.startswith("builtin:") else ROOT / config, overrides).checkpoint
+    assert str(read.remote).startswith("gs://")
+    notice_s = of_kubernetes()[2]["terminationGracePeriodSeconds"] if where == "kubernetes" else 30
+    assert read.remote_wait_seconds < launch.shutdown_timeout < notice_s
+    assert {"SIGTERM", "SIGUSR1"} <= set(launch.signals_to_handle.split(","))
+    assert launch.min_nodes == launch.max_nodes == 2
+    if where == "skypilot":
+        assert (options.node_rank, launch.nproc_per_node, options.master_addr) == (1, 4, "10.0.0.1")
+
+
+def test_pods_find_each_other_and_have_shared_memory() -> None:
+    service, job, pod = of_kubernetes()
+    words = words_in_a_pod()
+    name, port = service["metadata"]["name"], service["spec"]["ports"][0]["port"]
+    assert f"--rdzv-endpoint=vjepa2-ac-0.{name}:{port}" in words
+    assert (pod["subdomain"], service["spec"]["clusterIP"]) == (name, "None")
+    assert f"--nnodes={job['completions']}" in words
+    assert job["completions"] == job["parallelism"]
+    mounts = {mount["mountPath"]: mount["name"] for mount in pod["containers"][0]["volumeMounts"]}
+    volumes = {volume["name"]: volume["emptyDir"] for volume in pod["volumes"]}
+    assert volumes[mounts["/dev/shm"]]["medium"] == "Memory"  # noqa: S108 - the volume's place
+
+
+def test_kubernetes_takes_the_file_and_no_misspelt_key(tmp_path: Path) -> None:
+    words = ["--no-deps", "--target", str(tmp_path), "kubernetes-validate==1.37.0", "importlib_resources==7.1.0"]
+    install(sys.executable, *words)
+    (tmp_path / "wrong.yaml").write_text(KUBERNETES.read_text().replace("backoffLimit", "backofLimit"))
+    for file, said in ((KUBERNETES, "passed for resource job"), (tmp_path / "wrong.yaml", "'backofLimit' was unexp")):
+        command = [sys.executable, "-m", "kubernetes_validate", "--strict", str(file)]
+        environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+        assert (done.returncode == 0) == (file == KUBERNETES), done.stderr
+        assert said in done.stdout + done.stderr
+
+
+def test_skypilot_takes_the_file_and_asks_for_the_place() -> None:
+    sky = pytest.importorskip("sky", reason="skypilot (460 MB) is not installed: pip install skypilot==0.14.1")
+    text = SKYPILOT.read_text()
+    with pytest.raises(ValueError, match="REMOTE"):
+        sky.Task.from_yaml_str(text)
+    task = sky.Task.from_yaml_config(yaml.safe_load(text), env_overrides=[("REMOTE", PLACE)])
+    (resources,) = task.resources
+    assert resources.use_spot
+    with pytest.raises(ValueError, match="num_node"):
+        sky.Task.from_yaml_str(text.replace("num_nodes", "num_node"))
+
+
+# ---- preemption ----
+
+
+class Pods:
+    """The two pods of the job, on this machine: one that ends before its time starts anew, in an empty folder."""
+
+    def __init__(self, config: Path, folder: Path, chdir: Callable[[Path], None]) -> None:
+        self._config, self._folder, self._chdir, self.started = str(config), folder, chdir, 0
+        self._port = free_port()
+        self.running = [self._start(0), self._start(1)]
+
+    def _start(self, index: int) -> Rank:
+        self.started += 1
+        machine = self._folder / f"machine-{self.started}"
+        machine.mkdir()
+        self._chdir(machine)
+        given = {
+            "torchrun": str(ROOT / "tests/support/torchrun_forked.py"), "builtin:default": self._config,
+            "checkpoint.remote=gs://my-bucket/my-run": f"checkpoint.remote={PLACE}",
+            "--rdzv-endpoint=vjepa2-ac-0.vjepa2-ac:29500": f"--rdzv-endpoint=127.0.0.1:{self._port}",
+        }  # fmt: skip
+        words = [given.get(word, word) for word in words_in_a_pod()]
+        words[1:1] = ["--local-addr=127.0.0.1", f"--node-rank={index}"]
+        return Rank(words, {**os.environ, "OMP_NUM_THREADS": "1"})
+
+    def wait_until(self, happened: Callable[[], object]) -> None:
+        """Wait, and start anew whatever fails, as the job's controller does."""
+        until = time.monotonic() + 200
+        while not happened():
+            assert time.monotonic() < until, [one.written() for one in self.running]
+            for index, one in enumerate(self.running):
+                if one.poll():
+                    self.running[index] = self._start(index)
+            time.sleep(0.05)
+
+    def steps_done(self) -> int:
+        rows = [row for log in self._folder.glob("machine-*/run/metrics.jsonl") for row in read_metrics_log(log)]
+        return max((row["step"] for row in rows if row["kind"] == "train"), default=0)
+
+
+def newest(folder: Path, machines: str) -> Path:
+    """Return the newest checkpoint on any of these machines."""
+    found = [newest_checkpoint(run / "checkpoints") for run in folder.glob(f"{machines}/run")]
+    return max(filter(None, found), key=lambda checkpoint: checkpoint.name)
+
+
+@pytest.mark.usefixtures("default_signals")
+@pytest.mark.parametrize("preempted", [0, 1])
+def test_a_preempted_pod_starts_anew_elsewhere_and_the_run_is_the_one_that_nobody_disturbed(
+    preempted: int, gcs: Gcs, make_config: Callable[..., Config], reporter, tmp_path: Path, monkeypatch
+) -> None:
+    gcs.put("bucket/other", b"1")
+    changes = {"adapter__dropout": 0.0, "training__steps": STEPS, "validation__every": STEPS, "checkpoint__every": 20}
+    whole = train(make_config(training__accumulation=2, **changes), reporter)
+    config = make_config(run_dir="run", training__accumulation=1, **changes)
+    (tmp_path / "config.yaml").write_text(config_as_yaml(config))
+    pods = Pods(tmp_path / "config.yaml", tmp_path, monkeypatch.chdir)
+    try:
+        pods.wait_until(lambda: pods.steps_done() >= 2)
+        os.kill(pods.running[preempted].pid, signal.SIGTERM)  # as Kubernetes does, to the first process alone
+        pods.wait_until(lambda: all(one.poll() == 0 for one in pods.running))
+    finally:
+        for one in pods.running:
+            one.kill()
+    assert pods.started > 2
+    stopped, done = newest(tmp_path, "machine-[12]"), newest(tmp_path, "machine-*").parent
+    assert 2 <= read_state(stopped).step < STEPS
+    assert done != stopped.parent
+    assert (done / stopped.name).is_dir(), "a fresh machine began where the others had stopped"
+    assert_equal_up_to_rounding(whole, done.parent)

@@ -1,0 +1,100 @@
+"""A sweep is runs beside each other: Optuna chooses, goes on where it stopped, and `compare` reads the result."""
+
+import os
+import runpy
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from installing import install
+from paths import ROOT
+from run_fixtures import as_yaml
+from vjepa2_ac.cli import main as command_line
+from vjepa2_ac.runs.checkpoint import newest_checkpoint, read_state, select_checkpoint, step_of
+from vjepa2_ac.runs.metrics_log import read_metrics_log
+from vjepa2_ac.training import loop
+
+FEW = ["--clips=4", "--sensitivity-clips=2", "--samples=8", "--examples=1", "--landscapes=1", "--nodes=3", "--axes=2"]
+
+pytestmark = pytest.mark.usefixtures("default_signals")
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Optuna, without the databases that a study in a file does not need."""
+    folder = tmp_path_factory.mktemp("site")
+    install(sys.executable, "--no-deps", "--target", str(folder), "optuna==5.0.0", "colorlog", "tqdm", "packaging")
+    return folder
+
+
+@pytest.fixture
+def sweep(site: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    monkeypatch.syspath_prepend(site)
+    main: Callable[..., None] = runpy.run_path(str(ROOT / "examples/sweeps/optuna_sweep.py"))["main"]
+    return main
+
+
+@pytest.fixture
+def config(make_config, tmp_path: Path) -> str:
+    file = tmp_path / "config.yaml"
+    file.write_text(as_yaml(make_config(training__steps=4, validation__every=2)))
+    return str(file)
+
+
+def trials(main: Callable[..., None], folder: Path) -> list[Any]:
+    optuna, names = main.__globals__["optuna"], main.__globals__
+    storage = names["JournalStorage"](names["JournalFileBackend"](str(folder / "study.journal")))
+    found: list[Any] = optuna.load_study(study_name=None, storage=storage).trials
+    return found
+
+
+def test_a_sweep_that_is_stopped_goes_on_with_the_trial_that_was_open(
+    sweep: Callable[..., None], config: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    folder, step_of_the_loop, seen = tmp_path / "sweep", loop.training_step, []
+
+    def stopping(run: Any, *given: Any, **named: Any) -> Any:
+        seen.append(run.folder.name)
+        if seen == ["000"] * 4 + ["001"] * 2:
+            os.kill(os.getpid(), signal.SIGUSR1)
+        return step_of_the_loop(run, *given, **named)
+
+    monkeypatch.setattr(loop, "training_step", stopping)
+    monkeypatch.chdir(tmp_path)  # where compare writes
+    with pytest.raises(SystemExit, match="75"):
+        sweep(str(folder), "3", config)
+    assert read_state(newest_checkpoint(folder / "001/checkpoints")).step == 2
+    sweep(str(folder), "3", config)
+    assert seen == ["000"] * 4 + ["001"] * 4 + ["002"] * 4, "no step is done twice"
+    done = trials(sweep, folder)
+    assert [trial.state.name for trial in done] == ["COMPLETE"] * 3
+    assert len({str(trial.params) for trial in done}) == 3
+    runs = [folder / f"{trial.number:03}" for trial in done]
+    for run, trial in zip(runs, done, strict=True):
+        selected = step_of(select_checkpoint(run).path.name)
+        rows = [row for row in read_metrics_log(run / "metrics.jsonl") if row["kind"] == "validation"]
+        assert trial.value == next(row["action_rank"] for row in rows if row["step"] == selected)
+    assert f"in {min(zip(done, runs, strict=True), key=lambda one: one[0].value)[1]}" in capsys.readouterr().out
+    assert all(command_line(["evaluate", str(run), *FEW]) == 0 for run in runs[:2])
+    assert command_line(["compare", *map(str, runs[:2])]) == 0
+    assert "2 runs on the same" in capsys.readouterr().out
+
+
+def test_a_trial_that_is_refused_has_failed_and_the_sweep_goes_on(
+    sweep: Callable[..., None], config: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    space = {"adapter.rank": sweep.__globals__["CategoricalDistribution"]([0])}
+    monkeypatch.setitem(sweep.__globals__, "SPACE", space)
+    with pytest.raises(ValueError, match="No trials are completed"):
+        sweep(str(tmp_path / "sweep"), "2", config)
+    assert [trial.state.name for trial in trials(sweep, tmp_path / "sweep")] == ["FAIL", "FAIL"]
+
+
+def test_a_config_that_cannot_be_used_begins_no_trial(sweep: Callable[..., None], config: str, tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        sweep(str(tmp_path / "sweep"), "2", config, "training.stepz=3")
+    assert [path.name for path in (tmp_path / "sweep").iterdir()] == []
