@@ -127,10 +127,10 @@ def require_own_folder(folder: Path | str, name: str, key: CacheKey, *, where: s
         UnreachableError: It cannot be read now.
     """
     fix = "Name another folder, or delete this one"
+    others = [other for other in storage.list_names(folder) if other[0] != "."]  # first: another process may begin now
     try:
         there = read_json_object(storage.join(folder, name), fix=fix)
     except MissingFileError:
-        others = [other for other in storage.list_names(folder) if other[0] != "."]
         if others:
             found = f"a folder with other things in it, such as {others[0]}"
             raise InputError(where=where, found=found, needed="a new or empty one", fix=fix) from None
