@@ -12,8 +12,14 @@ Beside it the encoder alone on random frames: frames/s, which is what a loader m
 (`training.cost.flops` over what the device does in a product of matrices), and what share of that speed the whole
 `encode` has, with decoding and writing. Give a fast device enough --episodes to reach its pace.
 
+Then what a clip takes from a cache in a folder and from one in a bucket: reads or requests, and bytes, over those of
+the clip's latents. Nothing is kept on the disk between two clips, as where a data set is much larger than the disk.
+
 Then what storing latents in fewer bits costs: the one-step and rollout error of the shipped model on simulated
-episodes, predicted from latents as they are read back, against the true ones, over the error of persistence.
+episodes, predicted from latents as they are read back, against the true ones, over the error of persistence. And
+whether plans keep their order: for each clip 32 action sequences, its own among them, are ranked by the error of their
+rollout at its end. Printed are the rank correlation with the order from exact latents, how often the best is the same
+one, and how often it is the clip's own.
 
 --json is written after every row. A row that fails says so, and the exit status is 1 then, when all else was measured.
 """
@@ -26,24 +32,37 @@ import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
+import numpy as np
 import torch
+from fsspec.implementations.memory import MemoryFileSystem
 from memory import let_go
 from random_models import no_fingerprints
 from rows import Row, Rows, cell
 from timing import about, add_basics, add_repeats, clock_s, introduction, prepare, ratio, settle, timed
 from torch import Tensor
 
+from vjepa2_ac import storage
 from vjepa2_ac.config import Config, DataConfig, EncoderSizes, ModelConfig, ModelSizes, PredictorSizes
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.data.loader import validation_batches
-from vjepa2_ac.data.sources.latents.cache_files import DTYPES, bytes_per_frame, pack_latents, unpack_latents
+from vjepa2_ac.data.loader import training_loader, validation_batches
+from vjepa2_ac.data.sources.latents.cache_files import (
+    DTYPES,
+    EncodedEpisode,
+    bytes_per_frame,
+    pack_latents,
+    unpack_latents,
+)
+from vjepa2_ac.data.sources.latents.cache_key import Encoding
 from vjepa2_ac.distributed import autocast, matmul_speed
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.encoding.encode_dataset import encode_config
+from vjepa2_ac.encoding.latent_cache import LatentCache
 from vjepa2_ac.encoding.latent_cache import picture_bytes as small_frame_bytes
 from vjepa2_ac.episode import LatentBatch, Progress
 from vjepa2_ac.model.checkpoints.loading import load_base
@@ -55,6 +74,7 @@ from vjepa2_ac.training.setup import Run, batches_from, set_up
 from vjepa2_ac.training.step import training_step
 
 RATE_HZ, STRIDE = 15, 4
+READ_CLIPS = 16
 PAST_WARM_UP = 1001  # a step at which the learning rate is what it mostly is
 QUICK = {
     "encoder_layers": 1, "predictor_layers": 1, "width": 128, "latent_dim": 128, "image_size": 64, "frames": [4],
@@ -73,6 +93,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         rows.attempt(partial(measure_speed, options, Path(folder), rows), measured="speed")
         let_go(options.device)
         print_sizes(options, rows)
+    with tempfile.TemporaryDirectory() as folder:
+        rows.attempt(partial(measure_reads, options, Path(folder), rows), measured="reads of a clip")
     with tempfile.TemporaryDirectory() as folder:
         rows.attempt(partial(measure_error, options, Path(folder), rows), measured="added error")
     rows.finish()
@@ -223,6 +245,60 @@ def print_sizes(options: argparse.Namespace, rows: Rows) -> None:
         rows.add({"measured": "size", "stored_as": kind, "frame_mb": frame / 1e6, "hour_gb": hour})
 
 
+# ---- reads of a clip ---------------------------------------------------------------------------------------------
+
+
+def measure_reads(options: argparse.Namespace, folder: Path, rows: Rows) -> None:
+    """Print and add what the clips of an epoch take from a cache of random latents, here and behind a URL."""
+    frames = max(options.frames)
+    spec = RecordingSpec("A", 2 * frames * STRIDE, seed=1)
+    record_dataset(folder / "data", spec, episodes=2, workers=max(1, options.workers))
+    print(f"{'stored as':>10}{'start_every':>13}{'place':>8}{'reads a clip':>14}{'MB a clip':>11}{'of its own':>12}")
+    for kind in ("bf16", "int8"):
+        for every in (1, STRIDE):
+            for place in ("folder", "bucket"):
+                url = str(folder / "latents") if place == "folder" else "memory://latents"
+                knobs = {"cache_dtype": kind, "start_every": every, "cache_dir": url}
+                row = {"measured": "reads of a clip", "place": place, "stored_as": kind, "start_every": every}
+                row |= reads_of_a_clip(options, folder, frames, knobs)
+                rows.add(row)
+                numbers = f"{row['reads']:14.1f}{row['mb']:11.2f}{row['ratio']:11.3f}x"
+                print(f"{kind:>10}{every:13}{place:>8}{numbers}", flush=True)
+
+
+def reads_of_a_clip(options: argparse.Namespace, folder: Path, frames: int, knobs: dict[str, Any]) -> Row:
+    """Write a cache of random latents, and count what reading clips of it takes."""
+    disk = {"dir": str(folder / "kept"), "limit_gb": 0.0}
+    values = {"path": str(folder / "data"), "frames": frames, "stride": STRIDE, "workers": 0, "disk_cache": disk}
+    dataset = open_dataset(DataConfig.model_validate({**values, "validation_share": 0.0, "test_share": 0.0, **knobs}))
+    tokens = (options.image_size // 16) ** 2
+    encoding = Encoding("random", options.image_size, 16, tokens, options.latent_dim, "bfloat16", "bf16")
+    cache = LatentCache.of(dataset, encoding)
+    cache.begin()
+    files = cache.files
+    for one in cache.wanted:
+        latents = pack_latents(torch.randn(len(one.steps), tokens, options.latent_dim), dataset.config.cache_dtype)
+        episode, black = dataset.source.read(one.episode), np.zeros((len(one.steps), 16, 16, 3), np.uint8)
+        files.write(one.episode, EncodedEpisode(episode, one.camera, one.steps.tolist(), latents, black))
+    counted: list[int] = []
+
+    def counting(read: Any) -> Any:
+        def reading(*given: Any, **more: Any) -> Any:
+            found = read(*given, **more)
+            counted.extend([len(found)] if isinstance(found, bytes) else map(len, found))
+            return found
+
+        return reading
+
+    here, there = counting(storage.read_ranges), counting(MemoryFileSystem.cat_file)
+    loader = training_loader(cache.opened(), seed=0, batch_size=1)
+    with patch.object(storage, "read_ranges", here), patch.object(MemoryFileSystem, "cat_file", there):
+        clips = [batch.latents for batch in islice(loader, READ_CLIPS) if batch.latents is not None]
+    own = sum(part.nbytes for clip in clips for part in (clip.values, clip.scales) if part is not None)
+    total, count = sum(counted), len(clips)
+    return {"clips": count, "reads": len(counted) / count, "mb": total / count / 1e6, "ratio": total / own}
+
+
 # ---- added error -------------------------------------------------------------------------------------------------
 
 
@@ -231,6 +307,7 @@ def measure_error(options: argparse.Namespace, folder: Path, rows: Rows) -> None
     model = load_base(ModelConfig(base="builtin:sim-tiny", dtype="float32"), seed=0).eval()
     print(
         f"{'domain':>8}{'stored as':>11}{'one step':>10}{'added':>10}{'rollout':>10}{'added':>10}{'stored error':>14}"
+        f"{'order':>9}{'same best':>11}{'own best':>10}"
     )
     for number, domain in enumerate(options.domains):
         named = {"measured": "added error", "domain": domain}
@@ -246,18 +323,26 @@ def measure_domain(options: argparse.Namespace, folder: Path, model: WorldModel,
     record_dataset(place, spec, episodes=options.test_episodes, workers=workers)
     batches = list(latents_of(model, place, folder / "kept"))
     true: tuple[float, float] | None = None
+    exact = ranks_of(model, batches, "fp32")
     for kind in ("fp32", "bf16", "int8"):
         one_step, rollout = errors(model, batches, kind)
         true = true or (one_step, rollout)
         off = statistics.mean(float((read(b.latents, kind) - b.latents).abs().mean()) for b in batches)
         added = one_step / true[0] - 1, rollout / true[1] - 1
+        ranks = ranks_of(model, batches, kind)
+        pairs = zip(ranks, exact, strict=True)
+        order = statistics.mean(float(torch.corrcoef(torch.stack(pair))[0, 1]) for pair in pairs)
+        same = float((ranks.argmin(1) == exact.argmin(1)).float().mean())
+        own = float((ranks[:, 0] == 0).float().mean())
         print(
-            f"{domain:>8}{kind:>11}{one_step:10.5f}{added[0]:+10.3%}{rollout:10.5f}{added[1]:+10.3%}{off:14.5f}",
+            f"{domain:>8}{kind:>11}{one_step:10.5f}{added[0]:+10.3%}{rollout:10.5f}{added[1]:+10.3%}{off:14.5f}"
+            f"{order:9.4f}{same:11.0%}{own:10.0%}",
             flush=True,
         )
         rows.add({
             "measured": "added error", "domain": domain, "stored_as": kind, "one_step": one_step, "rollout": rollout,
             "added_one_step": added[0], "added_rollout": added[1], "stored_error": off,
+            "order": order, "same_best": same, "own_best": own,
         })  # fmt: skip
 
 
@@ -285,6 +370,20 @@ def errors(model: WorldModel, batches: list[LatentBatch], kind: Any) -> tuple[fl
         ]  # fmt: skip
         sums += torch.stack([len(true) * (a - b).abs().mean().double() for a, b in pairs])
     return float(sums[0] / sums[1]), float(sums[2] / sums[3])
+
+
+@torch.no_grad()
+def ranks_of(model: WorldModel, batches: list[LatentBatch], kind: Any) -> Tensor:
+    """Return how action sequences (columns; the first is its own) rank for the way from a clip's start to its end."""
+    found = []
+    for batch in batches:
+        given, count = read(batch.latents, kind), len(batch.latents)
+        for one in range(count if count == len(batches[0].latents) else 0):
+            actions, states = batch.actions.roll(-one, 0), batch.states[one, :-1].expand(count, -1, -1)
+            rolled = model.rollout(given[one, :1].expand(count, -1, -1, -1), actions, states)
+            error = (rolled[:, -1] - given[one, -1]).abs().mean((1, 2))
+            found.append(error.argsort().argsort().float())
+    return torch.stack(found)
 
 
 def read(latents: Tensor, kind: Any) -> Tensor:

@@ -3,6 +3,7 @@
 import json
 import re
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -127,10 +128,10 @@ def test_latents_that_cannot_be_timed_are_a_row_and_sizes_and_errors_follow(
 
     monkeypatch.setattr(latents, "record_dataset", fails)
     file = tmp_path / "latents.json"
-    with pytest.raises(SystemExit, match="2 of 5 rows failed"):
+    with pytest.raises(SystemExit, match="3 of 6 rows failed"):
         latents.main(["--quick", "--json", str(file)])
     found = json.loads(file.read_text())["rows"]
-    assert [row["measured"] for row in found] == ["speed", "size", "size", "size", "added error"]
+    assert [row["measured"] for row in found] == ["speed", *["size"] * 3, "reads of a clip", "added error"]
     assert {row.get("problem") for row in found} == {None, "failed: OSError: disk full"}
 
 
@@ -141,8 +142,14 @@ def test_quick_benchmark_of_latents_tells_speed_size_and_added_error(
     file = tmp_path / "latents.json"
     latents.main(["--quick", "--json", str(file)])
     printed = capsys.readouterr().out
-    kinds = [row["measured"] for row in json.loads(file.read_text())["rows"]]
-    assert kinds == ["encoder alone", "speed", *["size"] * 3, *["added error"] * 3]
+    rows = json.loads(file.read_text())["rows"]
+    parts = {"encoder alone": 1, "speed": 1, "size": 3, "reads of a clip": 8, "added error": 3}
+    assert Counter(row["measured"] for row in rows) == parts
+    reads = [row for row in rows if row["measured"] == "reads of a clip"]
+    for here, there in zip(reads[::2], reads[1::2], strict=True):
+        assert (here["place"], there["place"], there["mb"]) == ("folder", "bucket", here["mb"])
+        assert 0 < there["reads"] <= here["reads"], "neighbouring frames are one request"
+    assert all(row["order"] == 1 for row in rows if row.get("stored_as") == "fp32" and "order" in row)
     speed = r"^ +4 +\d+\.\d+ +\d+\.\d% +\d+\.\d+ +\d+%( +\d+ +\d+ +\d+ +\d+) +\d+\.\d\dx$"
     (times,) = re.findall(speed, printed, re.MULTILINE)
     pictures, least, latents, least_of_latents = map(int, times.split())

@@ -1,6 +1,7 @@
 """Frames and latents of the decoder: what the encoder saw, of the right episodes; what is fitted to them."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -84,7 +85,7 @@ def test_an_episode_that_could_not_be_encoded_is_left_out_and_a_damaged_file_is_
     make_config: MakeConfig, encode_split: EncodeSplit
 ) -> None:
     pairs = encode_split(make_config())
-    gone, damaged = (pairs.files.path(one.episode, one.camera) for one in pairs.frames[:2])
+    gone, damaged = (Path(pairs.files.path(one.episode, one.camera)) for one in pairs.frames[:2])
     gone.unlink()
     dataset = open_dataset(make_config().data)
     rest = FramePairs.of(dataset, pairs.frames, pairs.files)

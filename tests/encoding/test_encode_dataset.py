@@ -116,7 +116,7 @@ def test_a_kill_costs_one_episode_at_most(
     encode(config, tmp_path / "whole")
     expected, out, before = contents(tmp_path / "whole"), tmp_path / "out", 0
     words = ("encode", str(tmp_path / "config.yaml"), "--out", str(out))
-    for die_at in (2, 9, 17, 25):
+    for die_at in (2, 9, 13, 16):
         assert nursery.start(*words, folder=out, die_at=die_at).wait() == KILLED
         done = [path for path in latents_in(out) if not path.name.startswith(".")]
         assert all(opened(path) == expected[str(path.relative_to(out))] for path in done)

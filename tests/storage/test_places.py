@@ -16,13 +16,12 @@ from vjepa2_ac.errors import InputError
 
 ON_THIS_MACHINE = (
     "run_dir",
-    "data.cache_dir",
     "data.disk_cache.dir",
     "model.base",
     "model.encoder.path",
     "decoder.folder",
 )
-ANYWHERE = ("data.path", "data.idle.ranges", "checkpoint.remote")
+ANYWHERE = ("data.path", "data.cache_dir", "data.idle.ranges", "checkpoint.remote")
 LOOK_LIKE_PATHS = ("dir", "path", "folder", "base", "remote", "ranges")  # last part of a key
 
 

@@ -33,7 +33,7 @@ _NOTHING = (
 class Request:
     """One request that came in, and how it was answered."""
 
-    target: str  # "METHOD /address", unquoted
+    target: str  # "METHOD /address", unquoted; of an upload with the object's name behind it
     object: str  # "bucket/name" of the object whose bytes were asked for; else ""
     sent: int  # bytes of the body
 
@@ -201,13 +201,16 @@ class _Proxy:
 
     def __init__(self, gcs: Gcs) -> None:
         self._gcs, self._one_at_a_time = gcs, asyncio.Semaphore(1)
+        self._serving = set[object]()  # the loop forgets a task whose client was killed
 
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Answer the requests of one connection."""
+        self._serving.add(task := asyncio.current_task())
         with suppress(ConnectionError, asyncio.IncompleteReadError, asyncio.CancelledError):
             while await self._answer(*await _read_message(reader), reader, writer):
                 pass
         writer.close()
+        self._serving.discard(task)
 
     async def _answer(
         self, head: bytes, body: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
@@ -215,7 +218,8 @@ class _Proxy:
         """Answer one request; return whether the connection stays."""
         gcs = self._gcs
         method, address, _ = head.split(b"\r\n", 1)[0].decode().split(" ")
-        target = f"{method} {unquote(address)}"
+        named = re.search(rb'"name": *"([^"]*)"', body[:1000]) if address.startswith("/upload/") else None
+        target = f"{method} {unquote(address)}" + (f" {named[1].decode()}" if named else "")
         gcs._count(1)
         try:
             if re.search(gcs._meeting.match, target):

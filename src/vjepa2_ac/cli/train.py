@@ -22,7 +22,7 @@ def add_encode(commands: cli.Commands) -> None:
     """Add `encode` to a parser."""
     parser = cli.command(commands, "encode", _encode, "my_robot.yaml")
     cli.add_config(parser, such_as="data.cache_dtype=int8")
-    cli.add(parser, "--out FOLDER", "the cache, for data.source: latents (where data.cache finds it)", cli.as_path)
+    cli.add(parser, "--out FOLDER", "the cache, for data.source: latents (where data.cache finds it)", cli.as_place)
 
 
 def add_decoder_command(commands: cli.Commands) -> None:

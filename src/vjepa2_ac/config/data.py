@@ -20,7 +20,6 @@ from vjepa2_ac.config.section import (
     Section,
     Share,
 )
-from vjepa2_ac.storage.places import is_url
 
 # A serial number is a name, also where YAML takes it for a number.
 _CameraName = Annotated[str, BeforeValidator(lambda name: str(name) if type(name) is int else name)]
@@ -124,7 +123,7 @@ class DataConfig(Section):
 
     kinds: ClassVar[dict[str, type[DataConfig]]] = {}  # of the forms that there are, by the name of their source
     reader: ClassVar[str]  # the class that reads the episodes, as module:class; imported when the data are opened
-    is_cache: ClassVar[bool] = False  # of latents, by a LatentSource; no frames, one stride, on this machine
+    is_cache: ClassVar[bool] = False  # of latents, by a LatentSource; no frames, one stride
     has_camera_poses: ClassVar[bool] = True
     has_vectors: ClassVar[bool] = True  # states may be other numbers than a pose
     same_identity_fix: ClassVar[str] = ""  # the way out where two episodes are named alike
@@ -188,8 +187,9 @@ class DataConfig(Section):
     that are not there yet are encoded before the first step. require: refuse to start where they are not there."""
     cache_dtype: Annotated[Literal["bf16", "fp32", "int8"], Affects.LATENTS | Affects.RUN] = "bf16"
     """Storage type of latents: bf16; fp32, which takes twice as much room; int8 with a scale per token, half."""
-    cache_dir: Annotated[Local | None, Affects.NOTHING] = None
-    """Folder for latent caches, one folder in it for each; null: `latents` in the folder of `disk_cache`."""
+    cache_dir: Annotated[Place | None, Affects.NOTHING] = None
+    """Folder for latent caches, on this machine or a URL such as gs://bucket/folder, one folder in it for each; null:
+    `latents` in the folder of `disk_cache`."""
     check_crc: Annotated[Literal["once", "always", "never"], Affects.NOTHING] = "once"
     """When the CRC-32C of a local TFRecord's data is checked: the first time that it is read on this machine, every
     time, or never. The CRC of a record's length is always checked."""
@@ -228,7 +228,6 @@ class DataConfig(Section):
             (not cameras, "camera: an empty list; name one or more, or null for the source's first"),
             (unknown, f"camera: source {self.source} has no {unknown[:1]}; it has {', '.join(known or ())}"),
             (self.is_cache and self.stride == "auto", "stride auto: a latent cache has one stride; give its number"),
-            (self.is_cache and is_url(self.path), "path: a latent cache is a folder on this machine"),
             (self.is_cache and self.cache != "off", f"source {self.source} is itself a cache: set cache: off"),
             (
                 self.augment.is_on and self.takes_latents,

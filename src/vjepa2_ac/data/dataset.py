@@ -233,7 +233,7 @@ def open_dataset(config: DataConfig, *, progress: Progress | None = None) -> Dat
     return _settled(dataset)
 
 
-def through_latents(dataset: Dataset, folder: Path) -> Dataset:
+def through_latents(dataset: Dataset, folder: Path | str) -> Dataset:
     """Return the same data set, with the same clips in the same order, read from its latent cache.
 
     Raises:

@@ -176,7 +176,7 @@ def _setup(config: Config, reporter: Reporter) -> Setup:
         "latents": dict(LatentCache.of(dataset, encoding).key.parts),
         "data": config.data.model_dump(mode="json", include={"validation_share", "test_share", "split_by"}),
     })  # fmt: skip
-    require_own_folder(folder / KEY, key, where=f"decoder.folder {folder}")
+    require_own_folder(folder, KEY, key, where=f"decoder.folder {folder}")
     shape = DecoderShape(decoder.size, model.latent_dim, size // patch, patch)
     return Setup(config, folder, shape, encoding, key, dataset, EncoderOnDevice.of(config, model, device), wanted)
 

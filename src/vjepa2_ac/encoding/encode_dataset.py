@@ -16,6 +16,7 @@ from pathlib import Path
 
 from accelerate import Accelerator
 
+from vjepa2_ac import storage
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import ProcessShare
@@ -38,7 +39,7 @@ _LONGEST_UNSEEN_S = 60.0  # of a new file in a folder of the network
 class EncodedSet:
     """The result of encoding a cache."""
 
-    folder: Path
+    folder: Path | str
     episodes: int  # of the data set
     encoded: int  # episodes, of all cameras
     frames: int  # of all cameras
@@ -47,7 +48,7 @@ class EncodedSet:
     is_finished: bool  # else other processes are still at work
 
 
-def encode_config(config: Config, reporter: Reporter = SILENT, *, out: Path | None = None) -> EncodedSet:
+def encode_config(config: Config, reporter: Reporter = SILENT, *, out: Path | str | None = None) -> EncodedSet:
     """Write the latents of every frame that the clips of a config need, or this process's share of them.
 
     Episodes that could not be read are tried again.
@@ -72,8 +73,8 @@ def encode_config(config: Config, reporter: Reporter = SILENT, *, out: Path | No
     else:
         cache.begin()
         reporter.note(f"Everything is encoded already, in {cache.folder}")
-    table, broken = cache.dataset.table, cache.broken
-    sizes = [(one, cache.files.size(one.episode, one.camera)) for one in cache.wanted]
+    table, broken, files = cache.dataset.table, cache.broken, cache.files
+    sizes = [(one, files.size(one.episode, one.camera)) for one in cache.wanted]
     absent = {one.episode for one, size in sizes if not size}
     return EncodedSet(
         folder=cache.folder,
@@ -109,15 +110,20 @@ def encode_share(
     share: ProcessShare,
     reporter: Reporter,
 ) -> None:
-    """Report the work, check the disk space, and encode the share of one process: every so-many-th episode.
+    """Report the work, check the disk space or the URL, and encode the share of a process: every so-many-th episode.
 
     Raises:
         InputError: As of `encode_files`; or too many episodes are broken, by all processes together.
+        UnreachableError: As of `encode_files`; or the URL cannot be written.
     """
     dataset, config = cache.dataset, cache.dataset.config
     reporter.note(f"Encoding {config.path} as {config.cache_dtype}: {cache.summary(left)}")
-    free = free_bytes(cache.folder) / 1e9
-    reporter.note(f"The latents go into {cache.folder}, with {free:.4g} GB free on its disk")
+    if isinstance(cache.folder, Path):
+        free = f", with {free_bytes(cache.folder) / 1e9:.4g} GB free on its disk"
+    else:
+        free = ""
+        storage.try_writing(cache.folder)
+    reporter.note(f"The latents go into {cache.folder}{free}")
     cache.require_space(left)
     cache.begin()
     mine = [one for one in left if one.episode % share.processes == share.rank]
@@ -206,7 +212,7 @@ def _require_shared(cache: LatentCache, sees: Callable[[], bool]) -> None:
         if time.monotonic() > end:
             found = "a folder in which a process of the run does not see what another one wrote"
             fix = "Set it to one that all machines of the run share; or run `vjepa2-ac encode` once on every machine"
-            raise InputError(where=f"data.cache_dir: {cache.folder.parent}", found=found, fix=fix)
+            raise InputError(where=f"data.cache_dir: {cache.folder}", found=found, fix=fix)
         time.sleep(_LOOKS_EVERY_S)
 
 

@@ -10,14 +10,16 @@ from pathlib import Path
 
 import numpy as np
 
+from vjepa2_ac import storage
 from vjepa2_ac.data.dataset import Dataset, through_latents
+from vjepa2_ac.data.files import fetched_data, in_parallel
 from vjepa2_ac.data.idle import find_ranges
 from vjepa2_ac.data.index import cache_folder, fingerprint_of
 from vjepa2_ac.data.sources.latents.cache_files import CACHE, EPISODES, KEPT, LatentFiles, bytes_per_frame, read_key
 from vjepa2_ac.data.sources.latents.cache_key import CacheKey, Encoding, key_of_cache, require_own_folder
 from vjepa2_ac.encoding.pipeline import FramesToEncode
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage import free_bytes, user_can_write, write_atomically
+from vjepa2_ac.storage import free_bytes
 
 _GIGABYTE = 10**9
 
@@ -50,10 +52,10 @@ class LatentCache:
     dataset: Dataset
     encoding: Encoding
     key: CacheKey
-    folder: Path
+    folder: Path | str  # here, or a URL
 
     @classmethod
-    def of(cls, dataset: Dataset, encoding: Encoding, folder: Path | None = None) -> LatentCache:
+    def of(cls, dataset: Dataset, encoding: Encoding, folder: Path | str | None = None) -> LatentCache:
         """Return the cache of a data set and an encoder.
 
         Args:
@@ -63,13 +65,15 @@ class LatentCache:
         """
         config = dataset.config
         key = key_of_cache(config, fingerprint_of(dataset.table), encoding)
-        parent = cache_folder(config.disk_cache) / "latents" if config.cache_dir is None else Path(config.cache_dir)
-        return cls(dataset, encoding, key, parent / key.digest if folder is None else folder)
+        parent = config.cache_dir or cache_folder(config.disk_cache) / "latents"
+        place = storage.join(parent, key.digest) if folder is None else str(folder)
+        return cls(dataset, encoding, key, storage.folder_at(place))
 
-    @cached_property
+    @property
     def files(self) -> LatentFiles:
-        """Its files."""
-        return LatentFiles(self.folder, self.key.digest)
+        """Its files; behind a URL they are listed anew."""
+        cache = fetched_data(self.dataset.config.disk_cache) if storage.is_url(self.folder) else None
+        return LatentFiles(self.folder, self.key.digest, cache)
 
     @cached_property
     def wanted(self) -> tuple[FramesToEncode, ...]:
@@ -77,16 +81,19 @@ class LatentCache:
         return tuple(needed_frames(self.dataset))
 
     def missing(self, *, retry: bool = False) -> list[FramesToEncode]:
-        """Return what is not there; with `retry`, also what could not be read."""
+        """Return what is not there; with `retry`, also what could not be read, or is damaged behind a URL."""
         if not self.is_begun:
             return list(self.wanted)
-        is_there = self.files.has if retry else self.files.is_done
-        return [one for one in self.wanted if not is_there(one.episode, one.camera)]
+        files = self.files
+        is_there = files.has if retry else files.is_done
+        connections = self.dataset.config.connections if storage.is_url(self.folder) else 1
+        there = in_parallel(lambda one: is_there(one.episode, one.camera), self.wanted, connections)
+        return [one for one, is_whole in zip(self.wanted, there, strict=True) if not is_whole]
 
     @property
     def is_begun(self) -> bool:
         """Whether its folder says what it is."""
-        return (self.folder / CACHE).is_file() and (self.folder / EPISODES).is_file()
+        return all(storage.exists(storage.join(self.folder, name)) for name in (CACHE, EPISODES))
 
     @property
     def broken(self) -> dict[int, str]:
@@ -114,13 +121,14 @@ class LatentCache:
         Raises:
             InputError: Says how the other cache differs.
         """
-        require_own_folder(self.folder / CACHE, self.key, where=f"latent cache {self.folder}")
+        require_own_folder(self.folder, CACHE, self.key, where=f"latent cache {self.folder}")
 
     def begin(self) -> None:
         """Write what the cache is, if the folder does not say so yet.
 
         Raises:
             InputError: The folder has another cache or other things, or cannot be written.
+            UnreachableError: It cannot be written at the URL.
         """
         self.require_own()
         if self.is_begun:
@@ -128,19 +136,20 @@ class LatentCache:
         dataset = self.dataset
         texts = {"control_rate_hz": str(dataset.control_rate_hz), "widths": " ".join(map(str, dataset.widths))}
         table = replace(dataset.table, texts={**dataset.table.texts, **texts}, locators={})
-        with user_can_write(self.folder):
-            write_atomically(self.folder / CACHE, json.dumps({"key": dict(self.key.parts)}, indent=1) + "\n")
-            if dataset.config.idle.rule != "none":
-                kept = find_ranges(dataset.source, dataset.table, dataset.config, None)
-                write_atomically(self.folder / KEPT, kept.to_bytes())
-            write_atomically(self.folder / EPISODES, table.to_bytes())
+        content: dict[str, bytes | str] = {CACHE: json.dumps({"key": dict(self.key.parts)}, indent=1) + "\n"}
+        if dataset.config.idle.rule != "none":
+            content[KEPT] = find_ranges(dataset.source, dataset.table, dataset.config, None).to_bytes()
+        for name, data in {**content, EPISODES: table.to_bytes()}.items():
+            storage.write(storage.join(self.folder, name), data)
 
     def require_space(self, left: Sequence[FramesToEncode]) -> None:
-        """Refuse to start if the disk has too little space for what is left.
+        """Refuse to start if the disk has too little space for what is left; what is behind a URL has no end.
 
         Raises:
             InputError: Says how much is free, how much is needed, and what to do.
         """
+        if not isinstance(self.folder, Path):
+            return
         fix = (
             f"Set data.cache_dtype: int8, or data.start_every: {self.dataset.config.model_stride}; take fewer episodes"
             " (data.outcome, data.idle, data.exclude); or name a folder on a larger disk (data.cache_dir)"
@@ -155,11 +164,11 @@ class LatentCache:
         """
         if self.is_begun:
             return through_latents(self.dataset, self.folder)
-        parent, others = self.folder.parent, []
-        for other in sorted(parent.iterdir()) if parent.is_dir() else ():
-            if (other / CACHE).is_file():
+        parent, others = str(self.folder).rpartition("/")[0], []
+        for name in storage.list_names(parent):
+            if storage.exists(storage.join(other := storage.join(parent, name), CACHE)):
                 differing = read_key(other).differences(self.key.parts)
-                others.append((len(differing), f"{other.name} was made otherwise: {'; '.join(differing)}"))
+                others.append((len(differing), f"{name} was made otherwise: {'; '.join(differing)}"))
         nearest = f". Other caches there: {len(others)}; {min(others)[1]}" if others else ""
         where = f"data.cache: {self.dataset.config.cache}: {self.folder}"
         found = f"no latent cache of this model and these settings{nearest}"

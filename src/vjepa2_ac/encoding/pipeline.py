@@ -1,4 +1,4 @@
-"""Encoding of frames into files: threads decode ahead, the encoder computes, and a thread writes file after file."""
+"""Encoding of frames into files: threads decode ahead, the encoder computes, and threads write whole files."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from einops import rearrange
 from jaxtyping import Float, Int32, UInt8
 from torch import Tensor
 
+from vjepa2_ac import storage
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.clips import joined_latents
 from vjepa2_ac.data.dataset import Dataset, require_widths
@@ -107,7 +108,8 @@ def encode_files(
     threads, writes = max(1, dataset.config.workers), deque[Future[None]]()
     done, total = 0, sum(len(one.steps) for one in wanted)
     progress(done, total)
-    with ThreadPoolExecutor(threads, "decode") as decoders, ThreadPoolExecutor(1, "write") as writer:
+    writers = _WRITES_UNDER_WAY if storage.is_url(files.folder) else 1
+    with ThreadPoolExecutor(threads, "decode") as decoders, ThreadPoolExecutor(writers, "write") as writer:
         parts_ahead = _parts(decoders, dataset, wanted, encoder, threads * _PREFETCHED_PARTS)
         try:
             for one, parts in groupby(parts_ahead, itemgetter(0)):

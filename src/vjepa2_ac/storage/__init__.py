@@ -18,6 +18,7 @@ from vjepa2_ac.storage.files import (
     read_bounded,
     read_bytes,
     read_range,
+    read_ranges,
     require_new_folder,
     sha256_of_file,
     sync,
@@ -27,6 +28,15 @@ from vjepa2_ac.storage.files import (
     user_can_write,
     write_atomically,
 )
-from vjepa2_ac.storage.places import is_url
-from vjepa2_ac.storage.remote import FileInfo, ShortReadError, bytes_fetched, read_ranges
-from vjepa2_ac.storage.transfer import download, file_sizes, remove, remove_folder, try_writing, upload
+from vjepa2_ac.storage.places import folder_at, is_url
+from vjepa2_ac.storage.remote import FileInfo, ShortReadError, bytes_fetched
+from vjepa2_ac.storage.transfer import (
+    download,
+    file_sizes,
+    files_below,
+    remove,
+    remove_folder,
+    try_writing,
+    upload,
+    write,
+)

@@ -14,9 +14,8 @@ import secrets
 import time
 import zlib
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from itertools import groupby
 from pathlib import Path
 
 from vjepa2_ac.storage import remote
@@ -222,32 +221,43 @@ class BlockCachedFile(RangedFile):
 
     def _fetched(self, start: int, length: int) -> bytes:
         """Return whole blocks: no others are requested."""
+        blocks = [(at, min(BLOCK_BYTES, self._bytes - at)) for at in range(start, start + length, BLOCK_BYTES)]
         try:
-            return b"".join(self._blocks_of(start // BLOCK_BYTES, (start + length - 1) // BLOCK_BYTES))
+            return b"".join(cached_ranges(self._path, blocks, key=self._key, cache=self._cache))
         except Exception as error:
             self.failure = error
             raise
 
-    def _blocks_of(self, first: int, last: int) -> list[bytes]:
-        """Return blocks from the disk; missing ones are fetched, adjacent ones together."""
-        found = {number: self._cached(number) for number in range(first, last + 1)}
-        lacking = [number for number, block in found.items() if not block]
-        runs = [
-            [number for _, number in run] for _, run in groupby(enumerate(lacking), key=lambda pair: pair[1] - pair[0])
-        ]
-        ranges = [(run[0] * BLOCK_BYTES, sum(map(self._length_of, run))) for run in runs]
-        for run, data in zip(runs, remote.read_ranges(self._path, ranges), strict=True):
-            for place, number in enumerate(run):
-                found[number] = data[place * BLOCK_BYTES :][: self._length_of(number)]
-                self._cache.write(f"{self._key} {number}", found[number])
-        return list(found.values())
 
-    def _cached(self, number: int) -> bytes:
-        block = self._cache.read(f"{self._key} {number}") or b""
-        return block if len(block) == self._length_of(number) else b""
+def cached_ranges(url: str, ranges: Sequence[tuple[int, int]], *, key: str, cache: DiskCache) -> list[bytes]:
+    """Return several (start, length) pieces of a file behind a URL, each complete, from the disk where they are there.
 
-    def _length_of(self, number: int) -> int:
-        return min(BLOCK_BYTES, self._bytes - number * BLOCK_BYTES)
+    Missing ones are fetched concurrently, adjacent ones together.
+
+    Args:
+        url: The file.
+        ranges: None of them empty.
+        key: Of the file's content.
+        cache: Keeps each piece by itself.
+
+    Raises:
+        OSError: There is no such file, or it ends within a piece.
+        UnreachableError: It cannot be reached.
+    """
+    found = {one: cache.read(f"{key} {one}") or b"" for one in ranges}
+    lacking = sorted(one for one, data in found.items() if len(data) != one[1])
+    runs = list[list[tuple[int, int]]]()
+    for start, length in lacking:
+        if runs and sum(runs[-1][-1]) == start:
+            runs[-1].append((start, length))
+        else:
+            runs.append([(start, length)])
+    fetched = remote.read_ranges(url, [(run[0][0], sum(run[-1]) - run[0][0]) for run in runs])
+    for run, data in zip(runs, fetched, strict=True):
+        for start, length in run:
+            found[start, length] = data[start - run[0][0] :][:length]
+            cache.write(f"{key} {(start, length)}", found[start, length])
+    return [found[one] for one in ranges]
 
 
 def open_remote(url: str) -> RangedFile:

@@ -21,7 +21,7 @@ import shutil
 import stat
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
@@ -199,6 +199,25 @@ def read_range(path: str | Path, start: int, length: int) -> bytes:
     with Path(path).open("rb") as file:
         file.seek(start)
         return file.read(length)
+
+
+def read_ranges(path: str | Path, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
+    """Return several (start, length) pieces of a file, each complete; behind a URL they are fetched concurrently.
+
+    Raises:
+        OSError: There is no such file, it cannot be read, or it ends within a piece.
+        UnreachableError: It cannot be reached.
+    """
+    if is_url(path):
+        return remote.read_ranges(str(path), ranges)
+    pieces = []
+    with Path(path).open("rb") as file:
+        for start, length in ranges:
+            file.seek(start)
+            pieces.append(file.read(length))
+            if len(pieces[-1]) < length:
+                raise ShortReadError(f"{path}: {len(pieces[-1])} of {length} bytes at {start}")
+    return pieces
 
 
 def sha256_of_file(path: Path) -> str:

@@ -23,6 +23,12 @@ def is_url(path: str | Path) -> bool:
     return "://" in str(path)
 
 
+def folder_at(place: str) -> Path | str:
+    """Return a folder of this machine as a path, also one at `file://`; any other as its URL."""
+    local = place.removeprefix("file://")
+    return local if is_url(local) else Path(local)
+
+
 def anywhere(path: str) -> str:
     """Return a local path, with `~` expanded, or a URL; without a trailing slash.
 

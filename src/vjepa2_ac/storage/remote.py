@@ -89,8 +89,8 @@ def list_folder(url: str) -> list[FileInfo]:
     ]
 
 
-def sizes_below(url: str) -> dict[str, int]:
-    """Return the sizes of all files below a folder by their relative paths; one request, not cached.
+def files_below(url: str) -> dict[str, FileInfo]:
+    """Return all files below a folder by their relative paths: one listing, one request per page, not cached.
 
     Raises:
         FileNotFoundError: There is no such folder; of Google's, no such bucket.
@@ -104,7 +104,8 @@ def sizes_below(url: str) -> dict[str, int]:
         return _once(filesystem, "find", timeout_s, root, detail=True)
 
     found = _persist(url, find)
-    return {name.removeprefix(root): int(about.get("size") or 0) for name, about in found.items() if name != root}
+    names = {name.removeprefix(root): about for name, about in found.items() if name != root}
+    return {name: FileInfo(name, int(about.get("size") or 0), _version_of(about)) for name, about in names.items()}
 
 
 def send(source: Path, url: str) -> None:

@@ -16,8 +16,9 @@ from pathlib import Path
 
 from vjepa2_ac.errors import InputError, RefusedError, UnreachableError
 from vjepa2_ac.storage import remote
-from vjepa2_ac.storage.files import atomic_writer, join, try_writing_at
+from vjepa2_ac.storage.files import atomic_writer, join, try_writing_at, user_can_write, write_atomically
 from vjepa2_ac.storage.places import HUB, is_url
+from vjepa2_ac.storage.remote import FileInfo
 
 _AWAY = frozenset({
     errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.ENOTCONN, errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.ENOSPC,
@@ -43,6 +44,23 @@ def upload(source: Path, target: str) -> None:
         if not source.is_file():
             raise
         raise _no_bucket(target) from None
+
+
+def write(path: str, data: bytes | str) -> None:
+    """Write a file whole, on this machine or behind a URL, replacing any file there; text is written as UTF-8.
+
+    Raises:
+        InputError: This machine's disk is full, or cannot be written.
+        UnreachableError: It cannot be written there; a RefusedError if that is permanent.
+    """
+    if not is_url(path):
+        with user_can_write(path):
+            write_atomically(path, data)
+        return
+    with user_can_write(tempfile.gettempdir()), tempfile.NamedTemporaryFile() as source:
+        source.write(data.encode() if isinstance(data, str) else data)
+        source.flush()
+        upload(Path(source.name), path)
 
 
 def download(source: str, target: Path) -> None:
@@ -101,11 +119,20 @@ def file_sizes(folder: str) -> dict[str, int]:
         with _explained(folder):
             files = [path for path in Path(folder).rglob("*") if path.is_file()]
             return {path.relative_to(folder).as_posix(): path.stat().st_size for path in files}
+    return {name: file.size for name, file in files_below(folder).items()}
+
+
+def files_below(url: str) -> dict[str, FileInfo]:
+    """Return all files below a folder behind a URL, by their relative paths: one listing; none if there is no folder.
+
+    Raises:
+        UnreachableError: It cannot be listed; a RefusedError if that is permanent.
+    """
     try:
-        return remote.sizes_below(folder)
+        return remote.files_below(url)
     except FileNotFoundError:
-        if folder.startswith(("gs://", "gcs://")):  # which has no folders: only buckets can be missing
-            raise _no_bucket(folder) from None
+        if url.startswith(("gs://", "gcs://")):  # which has no folders: only buckets can be missing
+            raise _no_bucket(url) from None
         return {}
 
 
@@ -120,10 +147,7 @@ def try_writing(folder: str) -> None:
             try_writing_at(Path(folder))
         return
     trial = join(folder, f".write-check-{secrets.token_hex(8)}")
-    with tempfile.NamedTemporaryFile() as source:
-        source.write(b"This file of vjepa2-ac may be removed.\n")
-        source.flush()
-        upload(Path(source.name), trial)
+    write(trial, "This file of vjepa2-ac may be removed.\n")
     remove(trial)
 
 

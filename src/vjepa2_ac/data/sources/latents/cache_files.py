@@ -6,8 +6,9 @@ kept.npz       the steps that `data.idle` leaves, as `StepSelection.to_bytes` wr
 episodes/000/000123-CAMERA.safetensors   the latents of an episode, by its index, and a camera
 episodes/000/000123-CAMERA.broken        in its place: why the episode could not be read (`data.broken_episodes`)
 
-Every file gets its name when it is complete. A cache is finished when each episode that clips need has its file, of
-each camera. The tensors of such a file (control steps as in `episode`; `frames` are the steps that were encoded):
+Every file gets its name when it is complete, behind a URL, too. A cache is finished when each episode that clips need
+has its file, of each camera. The tensors of such a file (control steps as in `episode`; `frames` are the steps that
+were encoded):
 
 latents        [frames, tokens, dim] bfloat16, float32 or int8
 scales         [frames, tokens] float32, with int8 only: a latent is its value times the scale of its token
@@ -23,18 +24,17 @@ The header's metadata (texts): id, camera, metadata (JSON), key (the digest of t
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 from urllib.parse import quote
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
@@ -42,9 +42,11 @@ from vjepa2_ac import storage
 from vjepa2_ac.data.index import EpisodeTable, NotATableError
 from vjepa2_ac.data.selection import StepSelection
 from vjepa2_ac.data.sources.latents.cache_key import FORMAT, CacheKey
+from vjepa2_ac.data.sources.latents.tensor_file import Ranges, TensorFile
 from vjepa2_ac.episode import Episode, StoredLatents
 from vjepa2_ac.errors import InputError, MissingFileError
 from vjepa2_ac.media.images import decode_jpegs, encode_jpeg
+from vjepa2_ac.storage.block_file import DiskCache, cached_ranges
 from vjepa2_ac.storage.structured import json_object, read_json_object
 
 CacheType = Literal["bf16", "fp32", "int8"]
@@ -56,6 +58,7 @@ OPTIONAL = ("commands", "extrinsics", "joint_velocities")
 _LARGEST = 127  # of int8
 _JPEG_QUALITY = 85
 _MOST_BYTES = 1 << 30  # of a table
+_WHOLE, _BROKEN = ".safetensors", ".broken"
 _FIX = "Delete this file, and then run `vjepa2-ac encode` again, as the cache was made; or copy the file again"
 _ENCODE = "Run `vjepa2-ac encode`, which goes on where it was stopped; or copy the cache again"
 
@@ -86,34 +89,35 @@ def bytes_per_frame(tokens: int, dim: int, kind: CacheType) -> int:
     return tokens * dim * DTYPES[kind].itemsize + (tokens * 4 if kind == "int8" else 0)
 
 
-def read_key(folder: Path) -> CacheKey:
+def read_key(folder: Path | str) -> CacheKey:
     """Return the key of a cache: what it is.
 
     Raises:
         InputError: The folder has none, or one of another format.
     """
-    where, needed = str(folder / CACHE), f"a folder with the {CACHE} of a latent cache, format {FORMAT}"
+    where, needed = storage.join(folder, CACHE), f"a folder with the {CACHE} of a latent cache, format {FORMAT}"
     try:
-        key = read_json_object(folder / CACHE, fix=_ENCODE).get("key")
+        key = read_json_object(where, fix=_ENCODE).get("key")
     except MissingFileError:
-        found = "no latent cache" if folder.is_dir() else f"no such folder, seen from {Path.cwd()}"
+        is_folder = storage.is_url(folder) or Path(folder).is_dir()
+        found = "no latent cache" if is_folder else f"no such folder, seen from {Path.cwd()}"
         raise InputError(where=str(folder), found=found, needed=needed, fix=_ENCODE) from None
     if not isinstance(key, dict) or key.get("format") != FORMAT or not isinstance(key.get("data.camera"), list):
         raise InputError(where=where, found="another file, or another format", needed=needed, fix=_ENCODE)
     return CacheKey(key)
 
 
-def read_tables(folder: Path, *, has_idle_rule: bool) -> tuple[EpisodeTable, StepSelection | None]:
+def read_tables(folder: Path | str, *, has_idle_rule: bool) -> tuple[EpisodeTable, StepSelection | None]:
     """Read the episodes of a cache and, if it has an idle rule, the ranges that the rule keeps.
 
     Raises:
         InputError: One of the files is missing or damaged.
     """
     try:
-        table = EpisodeTable.from_bytes(storage.read_bounded(folder / EPISODES, _MOST_BYTES))
+        table = EpisodeTable.from_bytes(storage.read_bounded(storage.join(folder, EPISODES), _MOST_BYTES))
         if not has_idle_rule:
             return table, None
-        return table, StepSelection.from_bytes(storage.read_bounded(folder / KEPT, _MOST_BYTES))
+        return table, StepSelection.from_bytes(storage.read_bounded(storage.join(folder, KEPT), _MOST_BYTES))
     except (OSError, NotATableError) as error:
         found = f"{EPISODES} or {KEPT} cannot be read ({error})"
         raise InputError(where=str(folder), found=found, fix=_ENCODE) from None
@@ -132,52 +136,62 @@ class EncodedEpisode:
 
 @dataclass(frozen=True)
 class LatentFiles:
-    """The files of the episodes in a cache's folder. Several processes may write into it."""
+    """The files of the episodes in a cache's folder. Several processes may write into it.
 
-    folder: Path
+    Which files there are behind a URL is known from one listing, made when the first is looked for.
+    """
+
+    folder: Path | str  # here, or a URL
     key: str  # digest of the cache's key
+    cache: DiskCache | None = None  # of what is read at a URL; there it is needed
 
-    def path(self, number: int, camera: str) -> Path:
+    def path(self, number: int, camera: str) -> str:
         """Return the file of an episode, by its index in the data set, and a camera."""
-        name = f"{number:06d}-{quote(camera, safe='')}.safetensors"
-        return self.folder / "episodes" / f"{number // 1000:03d}" / name
+        return storage.join(self.folder, _name(number, camera))
 
     def has(self, number: int, camera: str) -> bool:
-        """Return whether a file is there, whole, and of this cache."""
+        """Return whether a file is there, whole, and of this cache; its header is read.
+
+        Raises:
+            UnreachableError: It cannot be read now.
+        """
         try:
-            with safe_open(str(self.path(number, camera)), framework="pt") as file:
-                return bool((file.metadata() or {}).get("key") == self.key)
-        except (SafetensorError, OSError):
+            self._opened(_name(number, camera))
+        except InputError:
             return False
+        return True
 
     def size(self, number: int, camera: str) -> int:
         """Return the size of a file in bytes; 0 if there is none."""
-        path = self.path(number, camera)
-        return path.stat().st_size if path.is_file() else 0
+        found = self._found(_name(number, camera))
+        return 0 if found is None else found.size
 
     def is_done(self, number: int, camera: str) -> bool:
-        """Return whether a file is there, or in its place the reason why it cannot be."""
-        return self.has(number, camera) or self._note(number, camera).is_file()
+        """Return whether a file is there, or in its place the reason why it cannot be; of a URL as it is listed."""
+        is_there = self.size(number, camera) > 0 if storage.is_url(self.folder) else self.has(number, camera)
+        return is_there or self._found(_name(number, camera, _BROKEN)) is not None
 
     def open(self, number: int, camera: str) -> EpisodeFile:
         """Open a file.
 
         Raises:
             InputError: It is missing, damaged, or belongs to another cache; or the episode could not be read.
+            UnreachableError: It cannot be read now.
         """
-        path, note = self.path(number, camera), self._note(number, camera)
-        if not path.is_file() and note.is_file():
-            found = f"no latents: it could not be read when they were encoded ({_text_of(note).rstrip('.')})"
-            raise InputError(where=str(path), found=found)
-        return EpisodeFile(path, self.key)
+        name, note = _name(number, camera), _name(number, camera, _BROKEN)
+        if self._found(name) is None and self._found(note) is not None:
+            found = f"no latents: it could not be read when they were encoded ({self._reason(note).rstrip('.')})"
+            raise InputError(where=self.path(number, camera), found=found)
+        return self._opened(name)
 
     def write(self, number: int, encoded: EncodedEpisode, *, exact_pictures: bool = False) -> None:
         """Write the file of an episode and camera.
 
         Raises:
             InputError: The file cannot be written, or the disk is full.
+            UnreachableError: It cannot be written to the URL.
         """
-        episode, latents, path = encoded.episode, encoded.latents, self.path(number, encoded.camera)
+        episode, latents, camera = encoded.episode, encoded.latents, encoded.camera
         arrays = {
             "frame_steps": np.array(encoded.steps, np.int32),
             "states": episode.states,
@@ -195,29 +209,48 @@ class LatentFiles:
             tensors["scales"] = latents.scales.contiguous()
         metadata = json.dumps(dict(episode.metadata), sort_keys=True)
         about = {"id": episode.info.id, "camera": encoded.camera, "metadata": metadata, "key": self.key}
-        with storage.user_can_write(path):
-            storage.write_atomically(path, save(tensors, metadata=about))
-            self._note(number, encoded.camera).unlink(missing_ok=True)
+        storage.write(self.path(number, camera), save(tensors, metadata=about))
+        if self._found(note := _name(number, camera, _BROKEN)) is not None:
+            storage.remove(storage.join(self.folder, note))
 
     def note_broken(self, number: int, camera: str, reason: str) -> None:
         """Record that an episode cannot be read, for the other processes and for whoever reads the cache."""
-        path = self._note(number, camera)
-        with storage.user_can_write(path):
-            storage.write_atomically(path, reason)
+        storage.write(storage.join(self.folder, _name(number, camera, _BROKEN)), reason)
 
     @property
     def broken(self) -> dict[int, str]:
         """The episodes that could not be read, by their index, and why."""
-        notes = sorted(self.folder.glob("episodes/*/*.broken"))
-        broken = [note for note in notes if not note.with_suffix(".safetensors").is_file()]  # else mended, and killed
-        return {int(note.name.partition("-")[0]): _text_of(note) for note in broken}
+        paths = () if storage.is_url(self.folder) else Path(self.folder).glob(f"episodes/*/*{_BROKEN}")
+        names = self._listed if storage.is_url(self.folder) else [str(one.relative_to(self.folder)) for one in paths]
+        notes = sorted(name for name in names if name.endswith(_BROKEN))
+        broken = [note for note in notes if self._found(note.removesuffix(_BROKEN) + _WHOLE) is None]  # else mended
+        return {int(note.rpartition("/")[2].partition("-")[0]): self._reason(note) for note in broken}
 
-    def _note(self, number: int, camera: str) -> Path:
-        return self.path(number, camera).with_suffix(".broken")
+    @cached_property
+    def _listed(self) -> Mapping[str, storage.FileInfo]:
+        return storage.files_below(str(self.folder))
+
+    def _found(self, name: str) -> storage.FileInfo | None:
+        if storage.is_url(self.folder):
+            return self._listed.get(name)
+        path = Path(self.folder, name)
+        return storage.FileInfo(name, path.stat().st_size, "") if path.is_file() else None
+
+    def _reason(self, note: str) -> str:
+        return storage.read_bytes(storage.join(self.folder, note)).decode(errors="replace")
+
+    def _opened(self, name: str) -> EpisodeFile:
+        place, found = storage.join(self.folder, name), self._found(name)
+        if found is None:
+            raise InputError(where=place, found="no such file", needed="latents of an episode", fix=_FIX)
+        if self.cache is None:
+            return EpisodeFile(place, self.key, found.size, partial(storage.read_ranges, place))
+        key = f"{place} {found.version} {found.size}"
+        return EpisodeFile(place, self.key, found.size, partial(cached_ranges, place, key=key, cache=self.cache))
 
 
-def _text_of(note: Path) -> str:
-    return note.read_text(encoding="utf-8", errors="replace")
+def _name(number: int, camera: str, ending: str = _WHOLE) -> str:
+    return f"episodes/{number // 1000:03d}/{number:06d}-{quote(camera, safe='')}{ending}"
 
 
 class EpisodeFile:
@@ -226,18 +259,20 @@ class EpisodeFile:
     Args:
         path: The file.
         key: Digest of the key of its cache.
+        size: Of the file, in bytes.
+        read: Returns several (start, length) pieces of it.
 
     Raises:
         InputError: The file is missing, damaged, or belongs to another cache.
+        UnreachableError: It cannot be read now.
     """
 
-    def __init__(self, path: Path, key: str) -> None:
-        self.path = str(path)
+    def __init__(self, path: str, key: str, size: int, read: Callable[[Ranges], list[bytes]]) -> None:
+        self.path = path
         with self._reading():
-            self._file: Any = safe_open(self.path, framework="pt").__enter__()  # type: ignore[no-untyped-call] # mapped until nobody has it any more
-            about = self._file.metadata() or {}
-            self.names = frozenset(self._file.keys())
-            self.metadata = {name: str(text) for name, text in json_object(about["metadata"], where=self.path).items()}
+            self._file = TensorFile(read, size, path)
+            about, self.names = self._file.metadata, self._file.names
+            self.metadata = {name: str(text) for name, text in json_object(about["metadata"], where=path).items()}
         if about.get("key") != key:
             raise self._damaged("a file of another cache", "a file that was made with this one's cache.json")
 
@@ -253,7 +288,7 @@ class EpisodeFile:
             InputError: There is none of this name.
         """
         with self._reading():
-            return np.array(self._file.get_tensor(name).numpy())
+            return np.asarray(self._file.tensor(name).numpy())
 
     def places_of(self, steps: Sequence[int]) -> list[int]:
         """Return the indices of the frames at these control steps.
@@ -273,8 +308,9 @@ class EpisodeFile:
         Raises:
             InputError: There are no such latents.
         """
-        scales = self._rows("scales", places) if "scales" in self.names else None
-        return StoredLatents(self._rows("latents", places), scales)
+        names = [name for name in ("latents", "scales") if name == "latents" or name in self.names]
+        with self._reading():
+            return StoredLatents(*self._file.rows(names, places))
 
     def pictures(self, places: Sequence[int]) -> UInt8[np.ndarray, "frames size size 3"]:
         """Return frames as the encoder saw them, by their index.
@@ -283,26 +319,19 @@ class EpisodeFile:
             InputError: One is damaged.
         """
         with self._reading():
-            data = self._file.get_slice("pictures")
-            if len(data.get_shape()) > 1:
-                return np.asarray(self._rows("pictures", places).numpy())
-            ends = [0, *self._file.get_tensor("picture_ends").tolist()]
-            jpegs = [bytes(data[ends[place] : ends[place + 1]].numpy()) for place in places]
+            if len(self._file.shape("pictures")) > 1:
+                return np.asarray(self._file.rows(["pictures"], places)[0].numpy())
+            ends = [0, *self._file.tensor("picture_ends").tolist()]
+            jpegs = self._file.slices("pictures", [(ends[place], ends[place + 1]) for place in places])
         return decode_jpegs(jpegs, self.frame_steps[list(places)].tolist(), self.path)
-
-    def _rows(self, name: str, places: Sequence[int]) -> Tensor:
-        with self._reading():
-            rows = self._file.get_slice(name)
-            return torch.stack([rows[place] for place in places])
 
     @contextmanager
     def _reading(self) -> Iterator[None]:
         """Raise an error for the user if the file is missing, truncated, no safetensors file, or lacks something."""
         try:
-            yield
-        except FileNotFoundError:
-            raise InputError(where=self.path, found="no such file", needed="latents of an episode", fix=_FIX) from None
-        except (SafetensorError, OSError, KeyError, IndexError, ValueError, TypeError) as error:
+            with storage.user_can_read(self.path, needed="latents of an episode", fix=_FIX):
+                yield
+        except (AttributeError, KeyError, IndexError, RuntimeError, ValueError, TypeError) as error:
             raise self._damaged(f"not a whole file of latents ({error})") from None
 
     def _damaged(self, found: str, needed: str = "") -> InputError:

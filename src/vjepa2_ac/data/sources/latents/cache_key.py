@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.section import Affects, knobs_that_affect
 from vjepa2_ac.errors import InputError, MissingFileError
@@ -112,22 +113,24 @@ def clip_parts(config: DataConfig) -> dict[str, Any]:
     }
 
 
-def require_own_folder(path: Path, key: CacheKey, *, where: str) -> None:
+def require_own_folder(folder: Path | str, name: str, key: CacheKey, *, where: str) -> None:
     """Refuse a folder that was begun with another key, or that holds other files; one that is not there passes.
 
     Args:
-        path: Its JSON file with the key.
+        folder: The folder, or its URL.
+        name: Its JSON file with the key.
         key: Of what is about to be written there.
         where: The folder, for messages.
 
     Raises:
         InputError: Names what differs.
+        UnreachableError: It cannot be read now.
     """
-    folder, fix = path.parent, "Name another folder, or delete this one"
+    fix = "Name another folder, or delete this one"
+    others = [other for other in storage.list_names(folder) if other[0] != "."]  # first: another process may begin now
     try:
-        there = read_json_object(path, fix=fix)
+        there = read_json_object(storage.join(folder, name), fix=fix)
     except MissingFileError:
-        others = sorted(one.name for one in folder.iterdir() if one.name[0] != ".") if folder.is_dir() else []
         if others:
             found = f"a folder with other things in it, such as {others[0]}"
             raise InputError(where=where, found=found, needed="a new or empty one", fix=fix) from None

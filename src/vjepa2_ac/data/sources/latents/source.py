@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int
 
+from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.files import fetched_data
 from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.data.selection import StepSelection
 from vjepa2_ac.data.sources.indexed_source import IndexedSource
@@ -56,6 +58,7 @@ class LatentSource(IndexedSource[DataConfig, _Cache]):
 
         Raises:
             InputError: The file is missing or damaged, or the episode could not be read while encoding.
+            UnreachableError: It cannot be read now.
         """
         table, opened = self._open()
         camera = camera or self.cameras[0]
@@ -75,8 +78,8 @@ class LatentSource(IndexedSource[DataConfig, _Cache]):
         """Return the config with the names of the cameras.
 
         Raises:
-            InputError: Some of these episodes have no whole files: the cache is unfinished, damaged, or was made of
-                others.
+            InputError: Some of these episodes have no files, or here no whole ones: the cache is unfinished, damaged,
+                or was made of others.
         """
         table, opened = self._open()
         wanted = np.unique(episodes).tolist()
@@ -89,7 +92,7 @@ class LatentSource(IndexedSource[DataConfig, _Cache]):
         return self._config.model_copy(update={"camera": self.cameras})
 
     def _look(self, progress: Progress) -> tuple[EpisodeTable, _Cache]:  # noqa: ARG002 - at once
-        folder = Path(self._config.path)
+        folder = storage.folder_at(self._config.path)
         key = read_key(folder)
         parts = clip_parts(self._config)
         differing = key.differences(parts, parts)
@@ -99,10 +102,11 @@ class LatentSource(IndexedSource[DataConfig, _Cache]):
         if differing:  # of other clips than the config's
             raise another_cache(folder, differing)
         table, kept = read_tables(folder, has_idle_rule=self._config.idle.rule != "none")
-        return table, _Cache(key, LatentFiles(folder, key.digest), kept)
+        cache = fetched_data(self._config.disk_cache) if storage.is_url(folder) else None
+        return table, _Cache(key, LatentFiles(folder, key.digest, cache), kept)
 
 
-def another_cache(folder: Path, differing: Sequence[str]) -> InputError:
+def another_cache(folder: Path | str, differing: Sequence[str]) -> InputError:
     """Return the error of a cache with other settings than those in use."""
     found = f"a latent cache that was made otherwise: {'; '.join(differing)}"
     needed = "one that was made with this model and these settings"
