@@ -66,6 +66,15 @@ def test_it_runs_to_its_end(
     assert printed in capfd.readouterr().out
 
 
+def test_two_processes_that_share_an_evaluation_find_the_same(
+    whole_run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (module,) = imported("shared_evaluation", monkeypatch)
+    module.main([str(whole_run), "--clips", "4", "--sensitivity-clips", "2", "--samples", "4", "--landscapes", "0"])
+    *_, last = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(r"\| 2 \| [\d.]+ \| [\d.]+ \| [\d.]+e-(0[6-9]|1\d) \||\| 2 \|.* 0.0e\+00 \|", last)
+
+
 def test_a_prediction_follows_from_the_config_and_from_what_was_measured(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -40,22 +40,19 @@ def assert_same(one: dict[str, Any], other: dict[str, Any]) -> None:
         np.testing.assert_allclose(second[name], value, rtol=1e-6, atol=1e-9, err_msg=name)
 
 
-@pytest.mark.parametrize("processes", [2, 3])
-def test_processes_that_share_an_evaluation_find_what_one_finds(
-    make_config, tmp_path: Path, processes: int, reporter
-) -> None:
-    """7 clips in batches of 3: one process has one clip; of the shuffled actions some are the other process's."""
+def test_processes_that_share_an_evaluation_find_what_one_finds(make_config, tmp_path: Path, reporter) -> None:
+    """7 clips in batches of 3: one process has one clip; of the shuffled actions some are the other processes'."""
     changes = {"frames": 6, "test_share": 0.4}
     data = {f"data__{name}": value for name, value in changes.items()}
     config = make_config(**data, training__steps=2, validation__batch_size=3, validation__every=2)
     run = str(train(config, reporter))
     assert main(["evaluate", run, "--out", str(tmp_path / "alone"), *PROBES]) == 0
     words, port = ["-m", "vjepa2_ac.cli", "evaluate", run, "--out", str(tmp_path / "together"), *PROBES], free_port()
-    said = finish([start_rank(words, rank, processes, port) for rank in range(processes)], timeout=300)
-    assert "Did it become better?" in said[0][0] or "predicts" in said[0][0]
-    assert [out for out, _ in said[1:]] == [""] * (processes - 1), "only the first process speaks"
+    said = finish([start_rank(words, rank, 3, port) for rank in range(3)], timeout=300)
+    assert "uses actions" in said[0][0]
+    assert [out for out, _ in said[1:]] == ["", ""], "only the first process speaks"
     alone, together = (json.loads((tmp_path / name / "metrics.json").read_text()) for name in ("alone", "together"))
-    assert {row["key"] for row in alone["rows"]} >= {"plans.score", "ranking.rank"} or len(alone["rows"]) > 50
+    assert {"plans.score", "axes.residual_cm"} <= {row["key"] for row in alone["rows"]}
     assert_same(alone["rows"], together["rows"])
 
 
