@@ -26,7 +26,7 @@ from vjepa2_ac.reporter import Reporter
 
 _MOST_AT_ONCE = 16  # requests in a task: the next one is decoded while one is encoded
 _FEWEST_TASKS = 64  # if there are as many requests: the last ones end at about the same time
-_MOST_DEATHS = 10  # of actors at one task: then it is what kills them
+_MOST_DEATHS = 10  # of actors one after the other before they have begun: nothing is installed on their nodes
 _AGAIN = "The same command goes on with what is missing"
 
 
@@ -40,7 +40,10 @@ def ray_engine(address: str) -> Iterator[RayEngine]:
     Raises:
         UnreachableError: Ray is not installed, or there is no cluster at the address.
     """
-    os.environ |= {"RAY_USAGE_STATS_ENABLED": "0", "RAY_BACKEND_LOG_LEVEL": "fatal"}
+    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+    os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")
+    if address:
+        os.environ.setdefault("RAY_NUM_REDIS_GET_RETRIES", "1")  # 40 s, not 13 minutes, where nobody answers
     where = f"--engine ray={address}" if address else "--engine ray"
     ray = require_library("ray", where=where, called="Ray, which shares work on a cluster", extra="cluster")
     require_library("ray.data", where=where, called="Ray Data, which shares work on a cluster", extra="cluster")
@@ -52,7 +55,7 @@ def ray_engine(address: str) -> Iterator[RayEngine]:
         raise UnreachableError(where=where, found=found, fix="`ray status` on its head node shows it") from None
     try:
         yield RayEngine(where)
-    except ray.exceptions.RayError as error:
+    except (ray.exceptions.RayError, ray.data.exceptions.ExecutionTimeoutError) as error:
         raise UnreachableError(where=where, found=f"Ray has given up ({error})", fix=_AGAIN) from error
     finally:
         ray.shutdown()
@@ -89,7 +92,6 @@ class RayEngine:
             compute=ray.data.ActorPoolStrategy(min_size=1, initial_size=max(1, int(devices.get(kind, 1)))),
             num_cpus=int(kind == "CPU"),
             num_gpus=int(kind == "GPU"),
-            ray_remote_args_fn=lambda: {"max_task_retries": _MOST_DEATHS},
         )
         progress, done, total = reporter.task("encoding frames", "frames"), 0, frames_in(left)
         progress(done, total)
