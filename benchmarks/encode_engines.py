@@ -22,8 +22,8 @@ import psutil
 import torch
 import yaml
 from safetensors.torch import load_file
-
 from synthetic_droid import draw_episodes
+
 from vjepa2_ac.config import EncoderSizes, ModelSizes, PredictorSizes
 from vjepa2_ac.data.sources.rlds.droid_writer import write_droid_rlds
 from vjepa2_ac.model.network.world_model import WorldModel
@@ -133,12 +133,15 @@ class Nodes:
             self.add()
 
     def add(self) -> None:
+        """Add a node."""
         self._nodes.append(self._cluster.add_node(num_cpus=1))
 
     def remove(self) -> None:
+        """Kill the newest node."""
         self._cluster.remove_node(self._nodes.pop(), allow_graceful=False)
 
     def end_with(self, job: Job) -> Job:
+        """Wait for a job, and end."""
         job.processes[0].wait()
         self._cluster.shutdown()
         return job

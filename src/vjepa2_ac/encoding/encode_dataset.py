@@ -135,7 +135,7 @@ def encode_share(
     """Begin, and encode the share of one process: every so-many-th episode.
 
     Raises:
-        InputError: As of `begin_encoding` and `encode_files`; or too many episodes are broken, by all processes together.
+        InputError: As of `begin_encoding` and `encode_files`; or too many are broken, by all processes together.
     """
     dataset = cache.dataset
     begin_encoding(cache, left, reporter)

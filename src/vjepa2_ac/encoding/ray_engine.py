@@ -41,7 +41,6 @@ def ray_engine(address: str) -> Iterator[RayEngine]:
         UnreachableError: Ray is not installed, or there is no cluster at the address.
     """
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
-    os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")
     if address:
         os.environ.setdefault("RAY_NUM_REDIS_GET_RETRIES", "1")  # 40 s, not 13 minutes, where nobody answers
     where = f"--engine ray={address}" if address else "--engine ray"
