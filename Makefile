@@ -1,13 +1,14 @@
-# make demo · make evidence · make trap · make encoders · make test · make test-oldest · make lint · make docs · make links · make audit · make soak · make walk · make bench · make base: each creates the environment it needs.
+# make demo · make evidence · make trap · make encoders · make test · make cluster · make test-oldest · make lint · make docs · make links · make audit · make soak · make walk · make bench · make base: each creates the environment it needs.
 PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
 SIMULATION := .venv/sim-installed
 INSTALLED := .venv/installed
+CLUSTER := .venv/cluster-installed
 OLDEST := .venv-oldest
 AUDIT := .venv-audit
 
-.PHONY: demo demo-seeds base evidence trap encoders test test-oldest walk docs soak lint links audit format bench clean
+.PHONY: demo demo-seeds base evidence trap encoders cluster test test-oldest walk docs soak lint links audit format bench clean
 
 # Half of what tests need, in the same environment.
 $(SIMULATION): pyproject.toml constraints.txt
@@ -47,6 +48,14 @@ encoders: $(SIMULATION)  ## what each published encoder costs, by doctor's arith
 
 test: $(INSTALLED)  ## the whole test suite, on all cores (8 at most), a thread each; a folder in one process: .venv/bin/pytest tests/data
 	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/pytest -q -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder --durations 10
+
+# Ray, whose tests are skipped without it: 600 MB, in the same environment.
+$(CLUSTER): $(INSTALLED)
+	$(PIP) -e ".[cluster]"
+	touch $@
+
+cluster: $(CLUSTER)  ## the tests of encode --engine ray
+	OMP_NUM_THREADS=1 $(BIN)/pytest -q tests/encoding/test_ray_engine.py
 
 # Environments of worlds that others made (docs/worlds.md): make worlds/robosuite · worlds/libero · worlds/metaworld
 WORLD_robosuite := robosuite==1.5.2 mujoco==3.9.0

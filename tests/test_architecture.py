@@ -121,6 +121,7 @@ HOMES = {
     "peft": ["model/adapter/"],
     "prometheus_client": ["serving/server.py"],
     "pyarrow": ["data/sources/lerobot/"],
+    "ray": ["encoding/ray_engine.py"],
     "rich": ["cli/console/"],
     "simplejpeg": ["media/", "data/sources/rlds/droid_writer.py"],
     "tensorflow": [],
@@ -275,7 +276,7 @@ def test_heavy_libraries_stay_in_their_homes() -> None:
 
 EXTRAS: dict[str, list[str]] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
 BROUGHT = {  # the libraries that each extra of the program brings, by name
-    extra: {re.split("[<>=]", one)[0] for one in needed}
+    extra: {re.split(r"[\[<>=]", one)[0] for one in needed}
     for extra, needed in EXTRAS.items() if extra not in {"data", "dev", "docs"}
 }  # fmt: skip
 

@@ -29,6 +29,7 @@ OTHERS = "\n".join(path.read_text() for path in Path(__file__).parent.glob("test
         ("image_metrics", "--starts 3 --futures 3 --draws 2", "smoothed"),
         ("load_memory", "{folder}/new --small", "bfloat16"),
         ("video", "--clips 1", "ours"),
+        ("encode_engines", "--episodes 4 --ways plain shares", "cores; plain 1.00x, shares"),
         ("loader", "--clips 4", "index of 2,000 episodes"),
         ("explore", "builtin:sim-tiny --rounds 1", "p95"),
         ("scaling", "--check --processes 1 2 --steps 4", "| 2 |"),

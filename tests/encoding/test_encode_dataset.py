@@ -13,7 +13,7 @@ import torch
 from safetensors import safe_open
 
 from killable import KILLED, Nursery
-from latent_sets import NUMBERS, write_cache
+from latent_sets import NUMBERS, contents, files_of, latents_in, opened, write_cache
 from ranks import finish, free_port, start_rank
 from run_fixtures import MakeConfig, SilentReporter, as_yaml, set_up
 from same_run import assert_same_run
@@ -31,29 +31,6 @@ from vjepa2_ac.storage import files as writing
 from vjepa2_ac.training.loop import train
 
 CAMERA = "exterior_1_left"
-
-
-def files_of(folder: Path) -> dict[str, bytes]:
-    whole = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.suffix != ".partial"]
-    return {str(path.relative_to(folder)): path.read_bytes() for path in whole}
-
-
-def contents(folder: Path) -> dict[str, object]:
-    """Return everything in a cache; the order in the header of a file with latents is no matter."""
-    return {
-        name: opened(folder / name) if name.endswith(".safetensors") else data
-        for name, data in files_of(folder).items()
-    }
-
-
-def opened(path: Path) -> object:
-    with safe_open(path, framework="pt") as file:
-        tensors = {name: file.get_tensor(name).flatten().view(torch.uint8).tolist() for name in file.keys()}  # noqa: SIM118
-        return tensors, file.metadata()
-
-
-def latents_in(folder: Path) -> list[Path]:
-    return sorted(folder.rglob("*.safetensors"))
 
 
 def encode(

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import UInt8
+from safetensors import safe_open
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import Dataset
@@ -64,3 +65,26 @@ def _squashed(frames: Frames, side: int) -> Frames:
     """Return every so-many-th pixel of frames: square and small."""
     rows, columns = (np.arange(side) * length // side for length in frames.shape[1:3])
     return frames[:, rows][:, :, columns]
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    whole = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.suffix != ".partial"]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in whole}
+
+
+def contents(folder: Path) -> dict[str, object]:
+    """Return everything in a cache; the order in the header of a file with latents is no matter."""
+    return {
+        name: opened(folder / name) if name.endswith(".safetensors") else data
+        for name, data in files_of(folder).items()
+    }
+
+
+def opened(path: Path) -> object:
+    with safe_open(path, framework="pt") as file:
+        tensors = {name: file.get_tensor(name).flatten().view(torch.uint8).tolist() for name in file.keys()}  # noqa: SIM118
+        return tensors, file.metadata()
+
+
+def latents_in(folder: Path) -> list[Path]:
+    return sorted(folder.rglob("*.safetensors"))

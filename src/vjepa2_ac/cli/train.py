@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 from pathlib import Path
 
 from vjepa2_ac.cli import options as cli
@@ -23,6 +24,8 @@ def add_encode(commands: cli.Commands) -> None:
     parser = cli.command(commands, "encode", _encode, "my_robot.yaml")
     cli.add_config(parser, such_as="data.cache_dtype=int8")
     cli.add(parser, "--out FOLDER", "the cache, for data.source: latents (where data.cache finds it)", cli.as_place)
+    text = "ray: an actor on each GPU, or each core without one, of this machine; ray=ADDRESS: of a Ray cluster"
+    cli.add(parser, "--engine ENGINE", text, _as_engine)
 
 
 def add_decoder_command(commands: cli.Commands) -> None:
@@ -81,10 +84,16 @@ def _encode(options: argparse.Namespace) -> None:
     from vjepa2_ac.encoding.encode_dataset import encode_config
     from vjepa2_ac.reporter import SILENT
 
-    with cli.reporter() as reporter:
-        encoded = encode_config(config, reporter if cli.speaks() else SILENT, out=options.out)
+    with contextlib.ExitStack() as closing:
+        engine = None
+        if options.engine is not None:
+            from vjepa2_ac.encoding.ray_engine import ray_engine
+
+            engine = closing.enter_context(ray_engine(options.engine))
+        reporter = closing.enter_context(cli.reporter()) if cli.speaks() else SILENT
+        encoded = encode_config(config, reporter, out=options.out, engine=engine)
         if config.replay is not None and options.out is None and not config.replay.data.is_cache:
-            encode_config(config.for_replay(), reporter if cli.speaks() else SILENT)
+            encode_config(config.for_replay(), reporter, engine=engine)
     if not encoded.is_finished:
         cli.show(f"This process has done its share; others are still at work on {encoded.folder}")
         return
@@ -95,6 +104,14 @@ def _encode(options: argparse.Namespace) -> None:
         f"{episodes}, {encoded.frames:,} frames, {encoded.bytes / 1e9:.3g} GB are in {encoded.folder}",
         f"Train on them with {knobs}",
     )
+
+
+def _as_engine(text: str) -> str:
+    """Return the address in `ray=ADDRESS`; empty in `ray`."""
+    name, separator, address = text.partition("=")
+    if name != "ray" or bool(separator) != bool(address):
+        raise argparse.ArgumentTypeError(f"{text!r} is neither ray nor ray=ADDRESS")
+    return address
 
 
 def _decoder(options: argparse.Namespace) -> None:

@@ -14,6 +14,7 @@ from datetime import timedelta
 from functools import partial
 from pathlib import Path
 
+import torch
 from accelerate import Accelerator
 
 from vjepa2_ac import storage
@@ -30,6 +31,8 @@ from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
 from vjepa2_ac.storage import free_bytes
+
+Engine = Callable[[Config, LatentCache, Sequence[FramesToEncode], Reporter], None]  # encodes what is left
 
 _LOOKS_EVERY_S = 1.0  # for the files of other processes
 _LONGEST_UNSEEN_S = 60.0  # of a new file in a folder of the network
@@ -48,7 +51,9 @@ class EncodedSet:
     is_finished: bool  # else other processes are still at work
 
 
-def encode_config(config: Config, reporter: Reporter = SILENT, *, out: Path | str | None = None) -> EncodedSet:
+def encode_config(
+    config: Config, reporter: Reporter = SILENT, *, out: Path | str | None = None, engine: Engine | None = None
+) -> EncodedSet:
     """Write the latents of every frame that the clips of a config need, or this process's share of them.
 
     Episodes that could not be read are tried again.
@@ -57,17 +62,21 @@ def encode_config(config: Config, reporter: Reporter = SILENT, *, out: Path | st
         config: The data, the model whose encoder is used, device and precision.
         reporter: Receives messages, and the progress of indexing and encoding.
         out: The folder of the cache; None: the one of `data.cache`.
+        engine: What encodes; None: this process, on its device.
 
     Raises:
         InputError: Some input cannot be used, or the disk space is too small.
     """
     require_encodable(config)
-    device = computing_device(config.training)
+    device = computing_device(config.training) if engine is None else torch.device("cpu")
     dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
     model = load_base(config.model, seed=config.seed)
     cache = LatentCache.of(dataset, encoding_of(model, config), out)
     cache.require_own()
-    if left := cache.missing(retry=True):
+    left = cache.missing(retry=True)
+    if left and engine is not None:
+        engine(config, cache, left, reporter)
+    elif left:
         share = ProcessShare(int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1")))
         encode_share(cache, left, EncoderOnDevice.of(config, model, device), share, reporter)
     else:
@@ -103,20 +112,14 @@ def require_encodable(config: Config) -> None:
         raise InputError(where="data.augment", found=found, fix="Leave data.augment out")
 
 
-def encode_share(
-    cache: LatentCache,
-    left: Sequence[FramesToEncode],
-    encoder: EncoderOnDevice,
-    share: ProcessShare,
-    reporter: Reporter,
-) -> None:
-    """Report the work, check the disk space or the URL, and encode the share of a process: every so-many-th episode.
+def begin_encoding(cache: LatentCache, left: Sequence[FramesToEncode], reporter: Reporter) -> None:
+    """Report the work, check the disk space or the URL, and write what the cache is.
 
     Raises:
-        InputError: As of `encode_files`; or too many episodes are broken, by all processes together.
-        UnreachableError: As of `encode_files`; or the URL cannot be written.
+        InputError: The space is too small, or the folder cannot be used.
+        UnreachableError: The URL cannot be written.
     """
-    dataset, config = cache.dataset, cache.dataset.config
+    config = cache.dataset.config
     reporter.note(f"Encoding {config.path} as {config.cache_dtype}: {cache.summary(left)}")
     if isinstance(cache.folder, Path):
         free = f", with {free_bytes(cache.folder) / 1e9:.4g} GB free on its disk"
@@ -126,6 +129,22 @@ def encode_share(
     reporter.note(f"The latents go into {cache.folder}{free}")
     cache.require_space(left)
     cache.begin()
+
+
+def encode_share(
+    cache: LatentCache,
+    left: Sequence[FramesToEncode],
+    encoder: EncoderOnDevice,
+    share: ProcessShare,
+    reporter: Reporter,
+) -> None:
+    """Begin, and encode the share of one process: every so-many-th episode.
+
+    Raises:
+        InputError: As of `begin_encoding` and `encode_files`; or too many are broken, by all processes together.
+    """
+    dataset = cache.dataset
+    begin_encoding(cache, left, reporter)
     mine = [one for one in left if one.episode % share.processes == share.rank]
     encode_files(dataset, mine, encoder, cache.files, reporter.task("encoding frames", "frames"))
     for number, reason in cache.broken.items():
@@ -190,7 +209,7 @@ def _encode_together(
     share = ProcessShare(accelerator.process_index, accelerator.num_processes)
     if share.processes > 1:
         first_only(accelerator, cache.begin)
-        agreed(accelerator, lambda: _require_shared(cache, lambda: cache.is_begun))
+        agreed(accelerator, lambda: require_shared(cache, lambda: cache.is_begun))
 
     def encode() -> None:
         if left := cache.missing():
@@ -198,10 +217,10 @@ def _encode_together(
 
     agreed(accelerator, encode)
     if share.processes > 1:
-        agreed(accelerator, lambda: _require_shared(cache, lambda: not cache.missing()))
+        agreed(accelerator, lambda: require_shared(cache, lambda: not cache.missing()))
 
 
-def _require_shared(cache: LatentCache, sees: Callable[[], bool]) -> None:
+def require_shared(cache: LatentCache, sees: Callable[[], bool]) -> None:
     """Wait until this process sees what another one has written, and refuse a folder in which it does not.
 
     Raises:

@@ -1,0 +1,185 @@
+"""Encoding by Ray: the same files as by one process, whatever dies, and the same errors."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from latent_sets import contents
+from missing import is_installed
+from run_fixtures import MakeConfig, Popen, as_yaml
+from vjepa2_ac.cli import main
+from vjepa2_ac.config.loading import config_as_dict
+from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.encoding import encode_dataset
+from vjepa2_ac.encoding.encode_dataset import encode_config
+from vjepa2_ac.encoding.latent_cache import needed_frames
+from vjepa2_ac.encoding.ray_engine import _Actor, _Task
+from vjepa2_ac.errors import InputError
+
+needs_ray = pytest.mark.skipif(
+    not is_installed("ray"), reason='Ray is not tested: pip install -c constraints.txt -e ".[cluster]"'
+)
+
+# A plug-in of the config, which actors import, too: from the third file on the encoder waits for a word, or fails.
+ACCIDENT = """
+import time
+from pathlib import Path
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.network.world_model import WorldModel
+
+here, encode = Path(__file__).parent, WorldModel.encode
+
+def waiting(*given, **named):
+    while len(list(here.rglob("*.safetensors"))) >= 2 and not (here / "go").exists():
+        time.sleep(0.02)
+    if (here / "fail").exists():
+        raise InputError(where="a frame", found="it is damaged")
+    return encode(*given, **named)
+
+WorldModel.encode = waiting
+"""
+
+
+@pytest.fixture
+def start(make_config: MakeConfig, tmp_path: Path, popen: Popen) -> Callable[[str], "subprocess.Popen[str]"]:
+    """Starts the command with an engine on 8 episodes; it stops after two."""
+    (tmp_path / "accident.py").write_text(ACCIDENT)
+    (tmp_path / "config.yaml").write_text(
+        as_yaml(make_config(data__start_every=2)).replace("plugins: []", "plugins: [accident]")
+    )
+    path = os.pathsep.join([str(tmp_path), *sys.path])
+
+    def starting(engine: str) -> "subprocess.Popen[str]":
+        return popen(
+            [sys.executable, "-m", "vjepa2_ac.cli", "encode", "config.yaml", "--out", "out", "--engine", engine],
+            cwd=tmp_path, env={**os.environ, "PYTHONPATH": path}, start_new_session=True, text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        )  # fmt: skip
+
+    return starting
+
+
+def until(is_so: Callable[[], object], job: "subprocess.Popen[str]") -> None:
+    end = time.monotonic() + 240
+    while not is_so():
+        assert job.poll() is None, job.communicate()
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def two_files(folder: Path) -> Callable[[], bool]:
+    return lambda: len(list(folder.rglob("*.safetensors"))) >= 2
+
+
+def actors(process: psutil.Process) -> list[psutil.Process]:
+    return [one for one in process.children(recursive=True) if one.cmdline()[:1] and "MapWorker" in one.cmdline()[0]]
+
+
+def assert_finished(job: "subprocess.Popen[str]", folder: Path, config: MakeConfig) -> None:
+    said, errors = job.communicate(timeout=120)
+    assert job.returncode == 0, errors
+    assert "8 of 8 episodes, 96 frames" in said
+    encode_config(config(data__start_every=2), out=folder / "whole")
+    assert contents(folder / "out") == contents(folder / "whole")
+
+
+@needs_ray
+def test_an_interrupted_command_leaves_nothing_behind_and_a_killed_actor_loses_nothing(
+    start: Callable, make_config: MakeConfig, tmp_path: Path
+) -> None:
+    job = start("ray")
+    until(two_files(tmp_path), job)
+    started = psutil.Process(job.pid).children(recursive=True)
+    assert len(started) > 2
+    os.killpg(job.pid, signal.SIGINT)  # Ctrl-C
+    _, errors = job.communicate(timeout=60)
+    assert job.returncode == 130
+    assert "Traceback" not in errors
+    assert not psutil.wait_procs(started, timeout=60)[1]
+    job = start("ray")
+    until(lambda: actors(psutil.Process(job.pid)), job)
+    actors(psutil.Process(job.pid))[0].kill()
+    (tmp_path / "go").touch()
+    assert_finished(job, tmp_path, make_config)
+
+
+@pytest.fixture
+def cluster(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[object]:
+    """A head without a core for actors."""
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *sys.path]))
+    from ray.cluster_utils import Cluster
+
+    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
+    yield made
+    made.shutdown()
+
+
+@needs_ray
+@pytest.mark.filterwarnings("ignore")
+def test_a_node_that_joins_late_goes_on_alone_where_the_first_one_is_lost(
+    start: Callable, make_config: MakeConfig, tmp_path: Path, cluster: object
+) -> None:
+    first = cluster.add_node(num_cpus=1)
+    job = start(f"ray={cluster.address}")
+    until(two_files(tmp_path), job)
+    before = {one.pid for one in actors(psutil.Process())}
+    late = cluster.add_node(num_cpus=1)
+    assert before
+    until(lambda: {one.pid for one in actors(psutil.Process())} - before, job)
+    cluster.remove_node(first, allow_graceful=False)
+    (tmp_path / "go").touch()
+    assert_finished(job, tmp_path, make_config)
+    assert late in cluster.list_all_nodes()
+
+
+@needs_ray
+def test_an_error_of_an_actor_is_the_error_that_one_process_would_end_with(start: Callable, tmp_path: Path) -> None:
+    for word in ("go", "fail"):
+        (tmp_path / word).touch()
+    job = start("ray")
+    said, errors = job.communicate(timeout=120)
+    assert job.returncode == 2, said + errors
+    assert "error: a frame: it is damaged" in errors
+    assert "data.exclude" in errors
+    assert "Traceback" not in errors
+
+
+def test_an_actor_that_does_not_see_the_folder_or_sees_another_cache_there_says_so(
+    make_config: MakeConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(encode_dataset, "_LONGEST_UNSEEN_S", 0.0)
+    config = make_config()
+    wanted = _Task(list(needed_frames(open_dataset(config.data))))
+    encode_config(make_config(data__crop="square"), out=tmp_path / "other")
+    for folder, words in (("none", "does not see what another one wrote"), ("other", "data.crop: square, not")):
+        found = _Actor(config_as_dict(config), tmp_path / folder, Path.cwd())({"wanted": wanted})["found"]
+        assert isinstance(found.error, InputError)
+        assert words in str(found.error)
+
+
+@pytest.mark.parametrize(
+    ("engine", "words"),
+    [("dask", "neither ray nor ray=ADDRESS"), ("ray=", "neither ray nor"), ("ray", r"Ray.*is not installed.*cluster")],
+)
+def test_an_engine_that_is_not_there_is_one_plain_error(
+    engine: str, words: str, make_config: MakeConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    monkeypatch.setitem(sys.modules, "ray", None)
+    (tmp_path / "config.yaml").write_text(as_yaml(make_config()))
+    try:
+        status = main(["encode", str(tmp_path / "config.yaml"), "--engine", engine])
+    except SystemExit as ended:
+        status = ended.code
+    assert status == 2
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
+    assert re.search(words, line)
