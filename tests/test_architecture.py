@@ -105,6 +105,7 @@ HOMES = {
         "training/",
         "encoding/encode_dataset.py",
         "evaluation/calibration/variants.py",
+        "evaluation/evaluate_run.py",
     ],
     "av": ["media/"],
     "decord": [],

@@ -7,10 +7,10 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from accelerate import Accelerator
 from jaxtyping import UInt8
 
 from vjepa2_ac import __version__
@@ -42,9 +42,6 @@ from vjepa2_ac.runs.metrics_log import read_metrics_log, warnings_of
 from vjepa2_ac.storage import try_writing_at, user_can_write
 from vjepa2_ac.storage.places import BUILTIN
 from vjepa2_ac.storage.structured import utc_now
-
-if TYPE_CHECKING:
-    from accelerate import Accelerator
 
 BASE = "base"
 _NO_BASE = "There is no base to compare with: it takes states or actions of other widths than this robot's."
