@@ -6,6 +6,7 @@
     python benchmarks/policies.py judge demo/push-run --task push      # best of 8 noisy proposals, beside their mean
     python benchmarks/policies.py order demo/push-run                  # three policies of known quality, by energy
     python benchmarks/policies.py monitor demo/push-run --task push    # disturbances, and promised false alarms
+    python benchmarks/policies.py replan demo/push-run --task push     # searches saved where nothing surprises
 
 A row that is done stands in --out as JSON and is not run again. Settings were looked at on seed 3.
 """
@@ -16,7 +17,7 @@ import argparse
 import json
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ import torch
 
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.encoding.batch import encode_frames
+from vjepa2_ac.evaluation.policies.monitor import calibrate_monitor
 from vjepa2_ac.evaluation.policies.score import PolicyChunks, score_policies
 from vjepa2_ac.intervals import share_of
 from vjepa2_ac.model.network.world_model import WorldModel
@@ -33,7 +35,7 @@ from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.prior.action_prior import load_prior
 from vjepa2_ac.planning.prior.train_prior import PriorOptions, train_prior
 from vjepa2_ac.planning.session import PlanningSession, load_to_plan
-from vjepa2_ac.planning.surprise import conformal_threshold, error_by_patch
+from vjepa2_ac.planning.surprise import MONITOR, conformal_threshold, error_by_patch
 from vjepa2_ac.simulation.closed_loop.benchmark import DemonstratedGoals, DemonstrationSpec, every_step
 from vjepa2_ac.simulation.closed_loop.policies import GoalsOf, Planning
 from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, put, run_task, send_action
@@ -119,6 +121,7 @@ def _solved(policy: Planning, options: argparse.Namespace) -> dict[str, Any]:
         "solved": found.success_rate.as_dict(),
         "left_cm": found.final_distance_cm.as_dict(),
         "ms": round(1e3 * float(found.seconds.mean()), 1),
+        "searches": found.why_counts.get("planned", 0) / found.seconds.size,
         "by_episode": found.successes.tolist(),
     }
 
@@ -221,6 +224,18 @@ def _chunks_of(name: str, folder: Path, session: PlanningSession, dataset: Any, 
         places += [(dataset.table.identity(index), step) for step in steps]
         chunks.append((mean * prior.scale).double().numpy()[:, None, None])
     return PolicyChunks(name, tuple(places), np.concatenate(chunks))
+
+
+def _replan_rows(session: PlanningSession, options: argparse.Namespace) -> Rows:
+    """Plans of several steps, made anew at each or carried on until something surprises."""
+    threshold = Path(tempfile.mkdtemp()) / MONITOR
+    found = calibrate_monitor(session.world_model, open_dataset(session.config.data), options.false_alarms)
+    threshold.write_text(json.dumps(asdict(found)))
+    ahead = {"horizon": session.config.data.frames - 1}
+    carried = {**ahead, "monitor": str(threshold), "replan": "on_surprise"}
+    ways: dict[str, dict[str, Any]] = {"one step, at each": {}, "at each step": ahead, "on surprise": carried}
+    for name, changes in ways.items():
+        yield name, partial(_planned, session, options, changes)
 
 
 DISTURBED_FROM, STEPS_WATCHED = (4, 8), 12
@@ -333,6 +348,7 @@ PARTS: dict[str, Callable[[PlanningSession, argparse.Namespace], Rows]] = {
     "judge": _judge_rows,
     "order": _order_rows,
     "monitor": _monitor_rows,
+    "replan": _replan_rows,
 }
 
 if __name__ == "__main__":

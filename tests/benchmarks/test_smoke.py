@@ -133,7 +133,7 @@ def test_no_benchmark_is_left_out() -> None:
     assert not {name for name in scripts if not re.search(rf"\b{name}\b", OTHERS)}
 
 
-@pytest.mark.parametrize("part", ["prior", "judge", "order", "monitor"])
+@pytest.mark.parametrize("part", ["prior", "judge", "order", "monitor", "replan"])
 def test_policies_are_measured_in_every_part(
     part: str, whole_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -154,7 +154,7 @@ def test_policies_are_measured_in_every_part(
     words = [part, str(run), "--episodes", "1", "--false-alarms", "0.5", "--steps", "1", "2", "3"]
     module.main([*words, "--out", str(tmp_path / "found.json")])
     rows = json.loads((tmp_path / "found.json").read_text())
-    assert len(rows) == {"prior": 7, "judge": 4, "order": 1, "monitor": 5}[part]
+    assert len(rows) == {"prior": 7, "judge": 4, "order": 1, "monitor": 5, "replan": 3}[part]
     assert all(key.startswith(f"{part} run reach A seed 7: ") for key in rows)
     capsys.readouterr()
     module.main([*words, "--out", str(tmp_path / "found.json")])  # nothing is run again
