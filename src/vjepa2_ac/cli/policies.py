@@ -63,15 +63,6 @@ def add_monitor(commands: cli.Commands) -> None:
     cli.add(parser, "--out FOLDER", "where monitor.json and monitor.png go (the run's)", cli.as_path)
 
 
-def add_progress(commands: cli.Commands) -> None:
-    """Add `progress` to a parser."""
-    parser = cli.command(commands, "progress", _progress, "demo/run --out progress.parquet")
-    cli.add_planner(parser, such_as="such as planning.energy.distance=cosine")
-    cli.add(parser, "--out FILE", "the column, as Parquet", cli.as_path, default=Path("progress.parquet"))
-    cli.add(parser, "--data CONFIG", "of its data (those of the run)", cli.as_local)
-    cli.add(parser, "--every N", "control steps from one row to the next (1)", cli.count, default=1)
-
-
 def _score(options: argparse.Namespace) -> int:
     """Score what a policy would do, by the energy of its actions.
 
@@ -256,43 +247,6 @@ def _monitor(options: argparse.Namespace) -> int:
         files.append(plot_watched(shown, frames, monitor, crop, folder / MONITOR_IMAGE))
     cli.show(*([table] if watched else []), note, files=files)
     return int(alarms > 0)
-
-
-def _progress(options: argparse.Namespace) -> None:
-    """Write how far each frame of the demonstrations has come.
-
-    1 - distance now over distance at the start, in latents, to what is seen at the end: a row a frame, by
-    episode_index and frame_index as LeRobot has them. Whether it grows as time passes says how far to trust it.
-    """
-    cli.require_to_plan(options)
-    data = None if options.data is None else cli.read_config(options.data).data
-
-    import numpy as np
-
-    from vjepa2_ac.data.dataset import open_dataset
-    from vjepa2_ac.data.sources.lerobot.parquet import write_columns
-    from vjepa2_ac.evaluation.policies.progress import monotony_of, progress_of_episodes
-    from vjepa2_ac.reporter import INDEXING
-
-    session = cli.load_planning_session(options)
-    energy = session.config.planning.energy
-    with cli.reporter() as reporter:
-        dataset = open_dataset(data or session.config.data, progress=reporter.task(INDEXING))
-        how = {"every": options.every, "report": reporter.task("episodes")}
-        found = list(progress_of_episodes(session.world_model, dataset, energy, **how))
-    lengths = [len(one.steps) for one in found]
-    columns = {
-        "episode_index": np.repeat([one.index for one in found], lengths),
-        "frame_index": np.concatenate([one.steps for one in found]),
-        "episode": np.repeat([one.name for one in found], lengths),
-        "progress": np.concatenate([one.progress for one in found]).astype(np.float32),
-    }
-    write_columns(options.out, columns)
-    held_out = dataset.members("validation") | dataset.members("test")
-    if unseen := [one for one in found if held_out[one.index]]:
-        note = "It grows with time by Spearman's {} on {} held-out episodes (1: always)."
-        cli.show(note.format(monotony_of(unseen), len(unseen)))
-    cli.show(files=[options.out])
 
 
 def _prior(options: argparse.Namespace) -> None:

@@ -113,7 +113,6 @@ def _parser(words: Sequence[str] = ()) -> Parser:
             closed_loop.add_simulate,
             policies.add_score,
             policies.add_monitor,
-            policies.add_progress,
         ],
         "use": [plan.add_plan, plan.add_goals, policies.add_prior, closed_loop.add_serve, train.add_export],
         "from other packages": [partial(_add_others, words)],

@@ -10,7 +10,6 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from math import inf
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -245,17 +244,6 @@ def _bytes_in(value: Any) -> int:
     if isinstance(value, dict):
         return sum(map(_bytes_in, value.values()))
     return sum(map(_bytes_in, value)) if isinstance(value, list) else 8
-
-
-def write_columns(path: Path, columns: Mapping[str, Any]) -> None:
-    """Write columns of one length as a Parquet file, atomically.
-
-    Raises:
-        UnreachableError: pyarrow is missing.
-    """
-    library = _library(str(path))
-    with storage.atomic_writer(path) as file:
-        library.parquet.write_table(library.table(dict(columns)), file)
 
 
 def _library(where: str) -> Any:

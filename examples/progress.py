@@ -1,0 +1,57 @@
+"""How far has each frame of the demonstrations come? A column for a LeRobot set, and whether to trust it.
+
+    python examples/progress.py RUN progress.parquet [EVERY]
+
+1 - distance now over distance at the start, in latents, to what is seen at the end: 0 at its start, 1 at its end. A row
+for every EVERY-th frame (1) and the last, by episode_index and frame_index as LeRobot has them. Spearman's correlation
+with time on held-out episodes says how far it grows.
+"""
+
+import sys
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet
+from scipy.stats import spearmanr
+
+from vjepa2_ac import load_run
+from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.encoding.batch import encode_frames
+from vjepa2_ac.intervals import mean_of
+from vjepa2_ac.planning.energy import distance
+
+AT_ONCE = 64  # frames
+
+
+def main(run: str, out: str, every: str = "1") -> None:
+    """Write the column, and print its monotony."""
+    trained = load_run(run)
+    model, config = trained.world_model, trained.config
+    dataset = open_dataset(config.data)
+    held_out = dataset.members("validation") | dataset.members("test")
+    columns: dict[str, list[object]] = {"episode_index": [], "frame_index": [], "episode": [], "progress": []}
+    monotony: dict[str, float] = {}
+    for index in np.flatnonzero(dataset.taking_part).tolist():
+        name, episode = dataset.table.identity(index), dataset.source.read(index)
+        last = len(episode.states) - 1
+        steps = np.unique([*range(0, last, int(every)), last]).tolist()
+        goal = encode_frames(model, episode.read_frames([last]), config.data.crop)[0]
+        far = []
+        for first in range(0, len(steps), AT_ONCE):
+            frames = episode.read_frames(steps[first : first + AT_ONCE])
+            far += distance(encode_frames(model, frames, config.data.crop), goal, config.planning.energy).tolist()
+        progress = 1.0 - np.array(far) / max(far[0], 1e-12)
+        for column, values in zip(
+            columns.values(), ([index] * len(steps), steps, [name] * len(steps), progress.tolist()), strict=True
+        ):
+            column.extend(values)
+        if held_out[index] and np.ptp(progress):
+            monotony[name] = spearmanr(steps, progress).statistic
+    pyarrow.parquet.write_table(pa.table(columns), out)
+    if monotony:
+        found = mean_of(np.array(list(monotony.values())), list(monotony))
+        print(f"It grows with time by Spearman's {found} on {len(monotony)} held-out episodes (1: always).")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
