@@ -76,7 +76,7 @@ def files_of(folder: Path) -> dict[str, bytes]:
 def test_an_empty_place_is_tried_and_left_empty(bucket: Gcs, config: Config) -> None:
     assert open_remote(config, SILENT) == config
     assert bucket.names("bucket") == ["other"]
-    assert [r.target.split("/")[0] for r in bucket.requests if "write-check" in r.target] == ["DELETE "]
+    assert [r.target.split("/")[0] for r in bucket.requests if "write-check" in r.target] == ["POST ", "DELETE "]
     assert len(bucket.uploads()) == 1
     assert not local(config).exists()
 

@@ -13,7 +13,7 @@ def test_progress_is_0_at_the_start_and_1_at_the_end(
     whole_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], every: int
 ) -> None:
     parquet = pytest.importorskip("pyarrow.parquet", reason="the extra `lerobot` is not installed")
-    example = runpy.run_path(str(ROOT / "examples/progress.py"))
+    example = runpy.run_path(str(ROOT / "examples/judge/progress.py"))
     example["main"](str(whole_run), str(tmp_path / "progress.parquet"), str(every))
     rows = parquet.read_table(tmp_path / "progress.parquet").to_pylist()
     assert {tuple(row) for row in rows} == {("episode_index", "frame_index", "episode", "progress")}

@@ -1,6 +1,6 @@
 """How far has each frame of the demonstrations come? A column for a LeRobot set, and whether to trust it.
 
-    python examples/progress.py RUN progress.parquet [EVERY]
+    python examples/judge/progress.py RUN progress.parquet [EVERY]
 
 1 - distance now over distance at the start, in latents, to what is seen at the end: 0 at its start, 1 at its end. A row
 for every EVERY-th frame (1) and the last, by episode_index and frame_index as LeRobot has them. Spearman's correlation
