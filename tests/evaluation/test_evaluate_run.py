@@ -199,11 +199,12 @@ def test_invalid_input_is_reported_before_a_model_is_loaded(
         evaluate_subject(run, make(config))
 
 
-def test_several_processes_are_refused_where_all_would_write_the_same_files(
-    run: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("command", ["imagine", "explore"])
+def test_several_processes_are_refused_where_all_would_do_the_same(
+    command: str, run: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("WORLD_SIZE", "2")
-    assert main(["imagine", run, "--decoder", "builtin:sim-tiny"]) == 2
+    assert main([command, run, "--decoder", "builtin:sim-tiny"]) == 2
     assert "torchrun: 2 processes" in capsys.readouterr().err
 
 

@@ -23,7 +23,7 @@ from vjepa2_ac.distributed import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.evaluate_run import Subject, load_subject
-from vjepa2_ac.evaluation.request import EvaluationOptions, settle
+from vjepa2_ac.evaluation.request import EvaluationOptions, require_one_process, settle
 from vjepa2_ac.explore.messages import MOST_STEPS, GoalFrame
 from vjepa2_ac.model.distances import absolute_difference
 from vjepa2_ac.model.network.predictor_network import KeyValueCache
@@ -275,6 +275,7 @@ class ExploreOptions:
             InputError: Subject, data or decoder cannot be used.
         """
         decoder = load_decoder(self.decoder)
+        require_one_process()
         config = settle(self.subject, self.evaluation)
         one = {"frames": 2, "camera": config.data.cameras[0], "workers": 0}
         config = config.model_copy(update={"data": config.data.model_copy(update=one)})
