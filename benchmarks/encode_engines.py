@@ -103,19 +103,19 @@ def killed_actor(config: Path, out: Path, episodes: int) -> Job:
 
 def killed_node(config: Path, out: Path, episodes: int) -> Job:
     """Take one of a cluster's two nodes away after a third of the episodes."""
-    cluster = Nodes(2)
-    job = Job(config, out, "--engine", f"ray={cluster.address}")
-    job.wait_for(episodes // 3)
-    cluster.remove()
-    return cluster.end_with(job)
+    return _on_nodes(Nodes(2), Nodes.remove, config, out, episodes)
 
 
 def late_node(config: Path, out: Path, episodes: int) -> Job:
     """Give a cluster of one node a second one after a third of the episodes."""
-    cluster = Nodes(1)
+    return _on_nodes(Nodes(1), Nodes.add, config, out, episodes)
+
+
+def _on_nodes(cluster: Nodes, change: Callable[[Nodes], None], config: Path, out: Path, episodes: int) -> Job:
+    """Encode on a cluster that is changed after a third of the episodes."""
     job = Job(config, out, "--engine", f"ray={cluster.address}")
     job.wait_for(episodes // 3)
-    cluster.add()
+    change(cluster)
     return cluster.end_with(job)
 
 

@@ -29,7 +29,7 @@ def main(run: str, out: str, every: str = "1") -> None:
     model, config = trained.world_model, trained.config
     dataset = open_dataset(config.data)
     held_out = dataset.members("validation") | dataset.members("test")
-    columns: dict[str, list[object]] = {"episode_index": [], "frame_index": [], "episode": [], "progress": []}
+    rows: list[dict[str, object]] = []
     monotony: dict[str, float] = {}
     for index in np.flatnonzero(dataset.taking_part).tolist():
         name, episode = dataset.table.identity(index), dataset.source.read(index)
@@ -41,13 +41,13 @@ def main(run: str, out: str, every: str = "1") -> None:
             frames = episode.read_frames(steps[first : first + AT_ONCE])
             far += distance(encode_frames(model, frames, config.data.crop), goal, config.planning.energy).tolist()
         progress = 1.0 - np.array(far) / max(far[0], 1e-12)
-        for column, values in zip(
-            columns.values(), ([index] * len(steps), steps, [name] * len(steps), progress.tolist()), strict=True
-        ):
-            column.extend(values)
+        rows += [
+            {"episode_index": index, "frame_index": step, "episode": name, "progress": one}
+            for step, one in zip(steps, progress.tolist(), strict=True)
+        ]
         if held_out[index] and np.ptp(progress):
             monotony[name] = spearmanr(steps, progress).statistic
-    pyarrow.parquet.write_table(pa.table(columns), out)
+    pyarrow.parquet.write_table(pa.Table.from_pylist(rows), out)
     if monotony:
         found = mean_of(np.array(list(monotony.values())), list(monotony))
         print(f"It grows with time by Spearman's {found} on {len(monotony)} held-out episodes (1: always).")

@@ -374,9 +374,14 @@ class _OthersError(Exception):
         super().__init__(str(error))
 
 
+def _place() -> tuple[int, int]:
+    """Return the rank of this process among those that share work, and how many they are."""
+    return (_sharing.process_index, _sharing.num_processes) if _sharing else (0, 1)
+
+
 def own_part(count: int, at_once: int = 1) -> range:
     """Return which of so many things this process does: neighbours, in whole batches of `at_once`."""
-    rank, processes = (_sharing.process_index, _sharing.num_processes) if _sharing else (0, 1)
+    rank, processes = _place()
     batches = math.ceil(count / at_once)
     first, last = (at_once * (batches * place // processes) for place in (rank, rank + 1))
     return range(first, min(count, last))
@@ -402,7 +407,7 @@ def shared(items: Sequence[_T], work: Callable[[_T], _Result], progress: Callabl
         work: What is done with one.
         progress: Called with (done, total) in those of this process.
     """
-    rank, processes = (_sharing.process_index, _sharing.num_processes) if _sharing else (0, 1)
+    rank, processes = _place()
     own, found = range(rank, len(items), processes), list[tuple[int, _Result]]()
     for done, number in enumerate(own, start=1):
         found.append((number, work(items[number])))
@@ -441,11 +446,6 @@ def joined(config: Config) -> Iterator[Accelerator]:
             raise _ended_by(cause) from error
         raise
     watch.leave()
-
-
-def is_first() -> bool:
-    """Return whether this is the only process, or the first of several."""
-    return os.environ.get("RANK", "0") == "0"
 
 
 def leave_processes() -> None:

@@ -36,6 +36,11 @@ _LEFT = frozenset({errno.EPIPE, errno.ECONNRESET})  # the reader has closed the 
 _NAMES = ("stdout", "stderr")
 
 
+def is_first() -> bool:
+    """Return whether this is the only process, or the first of several: the one that speaks and writes."""
+    return os.environ.get("RANK", "0") == "0"
+
+
 # ---- output ----
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
 from vjepa2_ac.errors import InputError, UserError
+from vjepa2_ac.process import is_first
 
 if TYPE_CHECKING:
     from vjepa2_ac.decoding.imagine import Imagination
@@ -103,8 +104,8 @@ def _evaluate(options: argparse.Namespace) -> None:
     for subject, how in asked:
         cli.say_places_elsewhere(subject)
         with cli.reporter() as reporter:
-            measured = evaluate_subject(subject, how, reporter if cli.speaks() else SILENT)
-        if not cli.speaks():  # it shared the work of the first process, which reports
+            measured = evaluate_subject(subject, how, reporter if is_first() else SILENT)
+        if not is_first():  # it shared the work of the first process, which reports
             continue
         evaluations.append(measured.evaluation)
         if options.all:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import inspect
-import os
 import re
 import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias, TypeVar
 
 from vjepa2_ac.errors import InputError, did_you_mean, printable
+from vjepa2_ac.process import is_first
 from vjepa2_ac.storage import places
 
 if TYPE_CHECKING:
@@ -214,16 +214,11 @@ def reporter() -> ConsoleReporter:
     return ConsoleReporter()
 
 
-def speaks() -> bool:
-    """Return whether this is the only process, or the first of several."""
-    return os.environ.get("RANK", "0") == "0"
-
-
 def say_places_elsewhere(subject: str) -> None:
     """Print the addresses that the config of a run names, before any of them is contacted; nothing for a model."""
     from vjepa2_ac.runs.folder import is_run, places_elsewhere, read_run_config
 
-    if is_run(subject) and speaks():
+    if is_run(subject) and is_first():
         for place in places_elsewhere(read_run_config(Path(subject))):
             show(f"{subject} names a place elsewhere: {place}")
 

@@ -13,9 +13,9 @@ from pathlib import Path
 
 from vjepa2_ac import __version__, process
 from vjepa2_ac.cli import closed_loop, data, evaluate, explore, plan, policies, setup, train
-from vjepa2_ac.cli.options import Commands, Handler, Parser, add_commands, parsed, speaks
+from vjepa2_ac.cli.options import Commands, Handler, Parser, add_commands, parsed
 from vjepa2_ac.errors import InputError, UserError, extra_of, in_words, is_out_of_memory, pip_install, printable
-from vjepa2_ac.process import EXIT_STATUS, StoppedError, tidy_end
+from vjepa2_ac.process import EXIT_STATUS, StoppedError, is_first, tidy_end
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -61,7 +61,7 @@ def _run(arguments: Sequence[str] | None) -> int:
             _complain(in_words(error))
         return 2
     except StoppedError as stopped:
-        if speaks():
+        if is_first():
             print(printable(str(stopped)), file=sys.stderr)
         return EXIT_STATUS
     except KeyboardInterrupt:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from vjepa2_ac.cli import options as cli
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.process import is_first
 
 
 def add_train(commands: cli.Commands) -> None:
@@ -69,7 +70,7 @@ def _train(options: argparse.Namespace) -> None:
 
     with TrainingConsole() as reporter:
         folder = train(config, reporter, check_only=options.check, allow_config_change=options.allow_config_change)
-    if cli.speaks() and not options.check:
+    if is_first() and not options.check:
         cli.show(f"The run is in {folder}; see how good it is: vjepa2-ac evaluate {folder}")
 
 
@@ -90,7 +91,7 @@ def _encode(options: argparse.Namespace) -> None:
             from vjepa2_ac.encoding.ray_engine import ray_engine
 
             engine = closing.enter_context(ray_engine(options.engine))
-        reporter = closing.enter_context(cli.reporter()) if cli.speaks() else SILENT
+        reporter = closing.enter_context(cli.reporter()) if is_first() else SILENT
         encoded = encode_config(config, reporter, out=options.out, engine=engine)
         if config.replay is not None and options.out is None and not config.replay.data.is_cache:
             encode_config(config.for_replay(), reporter, engine=engine)

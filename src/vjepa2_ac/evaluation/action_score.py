@@ -112,12 +112,10 @@ def measure_plans(
     planners = Planner(one_step_settings(config)), Planner(SCORED.model_copy(update={"energy": energy}))
 
     def planned(start: PlanningStart) -> list[Plan]:
-        costs = [
-            WindowCost(model, start, goal, planner.config.energy)
-            for planner, goal in zip(planners, (start.following, start.goal), strict=True)
+        return [
+            planner.plan(WindowCost(model, start, goal, planner.config.energy), torch.Generator().manual_seed(seed))
+            for planner, goal, seed in zip(planners, (start.following, start.goal), start.seeds[:2], strict=True)
         ]
-        drawn = (torch.Generator().manual_seed(seed) for seed in start.seeds)
-        return [planner.plan(cost, one) for planner, cost, one in zip(planners, costs, drawn, strict=False)]
 
     plans = list(zip(*shared(starts, planned, progress), strict=True))
     one_step, three_steps = (

@@ -78,7 +78,7 @@ def measure_decoded(
             if clip in wanted:
                 strips[clip] = images.strip(row, wanted[clip], shown)
         progress(len(ids), clips.count)
-    parts = gathered([values]) if ids else gathered([])
+    parts = gathered([values] if ids else [])
     arrays = {key: np.concatenate([array for part in parts for array in part[key]]) for key in parts[0]}
     ids, strips = gathered(ids), dict(gathered(list(strips.items())))
     left_out = {}

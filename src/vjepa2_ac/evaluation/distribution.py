@@ -70,7 +70,7 @@ class LatentSums:
         total = flat.sum(dim=0, dtype=torch.float64).cpu()
         self._total = total if self._total is None else self._total + total
         for name, sketch in zip(episode_ids, _sketched(flat).cpu().numpy(), strict=True):
-            self._sketches[name] = self._sketches[name] + sketch if name in self._sketches else sketch
+            self._add_sketch(name, sketch)
 
     @classmethod
     def joined(cls, parts: Sequence[LatentSums]) -> LatentSums:
@@ -80,9 +80,13 @@ class LatentSums:
         whole._pooled = [values for part in parts for values in part._pooled]
         whole._squares = [values for part in parts for values in part._squares]
         whole._total = sum(part._total for part in parts if part._total is not None)  # type: ignore[assignment]
-        for name, sketch in ((name, one) for part in parts for name, one in part._sketches.items()):
-            whole._sketches[name] = whole._sketches[name] + sketch if name in whole._sketches else sketch
+        for part in parts:
+            for name, sketch in part._sketches.items():
+                whole._add_sketch(name, sketch)
         return whole
+
+    def _add_sketch(self, name: str, sketch: Float[np.ndarray, "horizon places"]) -> None:
+        self._sketches[name] = self._sketches[name] + sketch if name in self._sketches else sketch
 
     @property
     def pooled(self) -> Float[np.ndarray, "clips horizon dim"]:

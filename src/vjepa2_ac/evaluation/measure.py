@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import chain, product
+from itertools import chain, islice, product
 from typing import Protocol, TypeVar, get_args, runtime_checkable
 
 import numpy as np
@@ -139,22 +139,15 @@ def with_other_actions(
     The first clip gets `before`, where another process has the clips before it; else those of the second; if it is
     alone, its own reversed.
     """
-    if before is not None:
-        for batch in batches:
-            yield batch, torch.cat([before.to(batch.actions), batch.actions[:-1]])
-            before = batch.actions[-1:]
-        return
     rest = iter(batches)
-    head = [batch for _, batch in zip(range(1), rest, strict=False)]
-    if head and len(head[0].actions) == 1:
-        head += [batch for _, batch in zip(range(1), rest, strict=False)]
-    first_ones = [batch.actions for batch in head]
-    before = None
+    head = list(islice(rest, 1))
+    if before is None and head:
+        head += islice(rest, 1 if len(head[0].actions) == 1 else 0)
+        known = torch.cat([batch.actions for batch in head])
+        before = known[1:2] if len(known) > 1 else known.flip(1)
     for batch in chain(head, rest):
-        if before is None:
-            known = torch.cat(first_ones)
-            before = known[1:2] if len(known) > 1 else known.flip(1)
-        yield batch, torch.cat([before, batch.actions[:-1]])
+        assert before is not None  # noqa: S101  # there is a first batch
+        yield batch, torch.cat([before.to(batch.actions), batch.actions[:-1]])
         before = batch.actions[-1:]
 
 

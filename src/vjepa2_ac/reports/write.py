@@ -20,7 +20,6 @@ from jaxtyping import UInt8
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from vjepa2_ac.distributed import is_first
 from vjepa2_ac.episode import short_names
 from vjepa2_ac.evaluation.answer import Answer, Question, answer, interval_of, percent, with_closed_loop
 from vjepa2_ac.evaluation.estimates import Curve, over_persistence
@@ -31,6 +30,7 @@ from vjepa2_ac.evaluation.rows import rows_of
 from vjepa2_ac.media.figure import svg_of, visible
 from vjepa2_ac.media.film import draw_strip
 from vjepa2_ac.media.images import encode_webp
+from vjepa2_ac.process import is_first
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.reports.figures.evaluation import decoded_strip, drawings, example_strip, plot_evaluation
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, write_metrics

@@ -220,9 +220,11 @@ class LatentFiles:
     @property
     def broken(self) -> dict[int, str]:
         """The episodes that could not be read, by their index, and why."""
-        paths = () if storage.is_url(self.folder) else Path(self.folder).glob(f"episodes/*/*{_BROKEN}")
-        names = self._listed if storage.is_url(self.folder) else [str(one.relative_to(self.folder)) for one in paths]
-        notes = sorted(name for name in names if name.endswith(_BROKEN))
+        if storage.is_url(self.folder):
+            notes = sorted(name for name in self._listed if name.endswith(_BROKEN))
+        else:
+            found = Path(self.folder).glob(f"episodes/*/*{_BROKEN}")
+            notes = sorted(str(one.relative_to(self.folder)) for one in found)
         broken = [note for note in notes if self._found(note.removesuffix(_BROKEN) + _WHOLE) is None]  # else mended
         return {int(note.rpartition("/")[2].partition("-")[0]): self._reason(note) for note in broken}
 
