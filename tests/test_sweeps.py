@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -14,6 +15,7 @@ from installing import install
 from paths import ROOT
 from run_fixtures import as_yaml
 from vjepa2_ac.cli import main as command_line
+from vjepa2_ac.errors import UnreachableError
 from vjepa2_ac.runs.checkpoint import newest_checkpoint, read_state, select_checkpoint, step_of
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.training import loop
@@ -92,6 +94,15 @@ def test_a_trial_that_is_refused_has_failed_and_the_sweep_goes_on(
     with pytest.raises(ValueError, match="No trials are completed"):
         sweep(str(tmp_path / "sweep"), "2", config)
     assert [trial.state.name for trial in trials(sweep, tmp_path / "sweep")] == ["FAIL", "FAIL"]
+
+
+def test_an_outage_ends_the_sweep_and_its_trial_is_open(
+    sweep: Callable[..., None], config: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(loop, "training_step", Mock(side_effect=UnreachableError(where="gs://data", found="no answer")))
+    with pytest.raises(UnreachableError):
+        sweep(str(tmp_path / "sweep"), "2", config)
+    assert [trial.state.name for trial in trials(sweep, tmp_path / "sweep")] == ["RUNNING"]
 
 
 def test_a_config_that_cannot_be_used_begins_no_trial(sweep: Callable[..., None], config: str, tmp_path: Path) -> None:

@@ -53,11 +53,9 @@ def offline_figures(
     rows = [(batch, row) for batch in held_out for row in range(len(batch.starts))]
     chosen = [rows[place] for place in np.linspace(0, len(rows) - 1, MOVES).astype(int)]
     probes = ProbeOptions(samples=32)
-    moves = [move for clip, (batch, row) in enumerate(chosen) for move in moves_of(batch, row, clip, space, 0.075)]
+    moves = [move for batch, row in chosen for move in moves_of(batch, row, space, 0.075)]
     ranking = rank_actions(model, moves, space, probes, seed=0)
-    starts = [
-        planning_start(batch, row, clip, 0) for clip, (batch, row) in enumerate(chosen[:: MOVES // PLANS][:PLANS])
-    ]
+    starts = [planning_start(batch, row, 0) for batch, row in chosen[:: MOVES // PLANS][:PLANS]]
     with patch.object(action_score, "SCORED", SCORED.model_copy(update=FEWER)):
         plans = metrics_of(study_of(starts, planning), measure_plans(model, starts, planning))
     return {

@@ -18,12 +18,14 @@ from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState
 
+from vjepa2_ac import load_config, train
 from vjepa2_ac.cli import main as vjepa2_ac
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.process import EXIT_STATUS, StoppedError
 from vjepa2_ac.runs.checkpoint import select_checkpoint, step_of
 from vjepa2_ac.runs.folder import METRICS
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 
-REFUSED = 2  # the status of an input that cannot be used
 FIGURE = "action_rank"  # lower is better; or rollout_over_persistence_last
 SPACE = {  # any key of a config
     "training.learning_rate": FloatDistribution(1e-5, 1e-3, log=True),
@@ -44,11 +46,13 @@ def main(place: str, trials: str, *config: str) -> None:
         trial = open_trials.pop(0) if open_trials else study.ask(SPACE)
         run = folder / f"{trial.number:03}"
         overrides = [f"{key}={value}" for key, value in trial.params.items()]
-        status = vjepa2_ac(["train", *config, *overrides, f"run_dir={run}"])
-        if status == REFUSED:  # or its loss was not finite
+        try:
+            train(load_config(config[0], [*config[1:], *overrides, f"run_dir={run}"]), note=print)
+        except InputError as error:  # it is refused, or its loss was not finite; of an outage or a stop it can go on
+            print(f"trial {trial.number}: {error}")
             study.tell(trial.number, state=TrialState.FAIL)
-        elif status:  # stopped: it can go on
-            sys.exit(status)
+        except StoppedError:
+            sys.exit(EXIT_STATUS)
         else:
             step = step_of(select_checkpoint(run).path.name)
             rows = [row for row in read_metrics_log(run / METRICS) if FIGURE in row and row["step"] <= step]

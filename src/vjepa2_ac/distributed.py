@@ -44,6 +44,8 @@ _CEILING_S = 0.2
 _CUDA_MATRIX, _CPU_MATRIX = 8192, 512
 _SLOW = 2.0  # times as long as in float32: of a CPU that computes bfloat16 without instructions for it
 
+_SHARED_STORE = "TORCH_DISABLE_SHARE_RDZV_TCP_STORE"
+
 _T = TypeVar("_T")
 _Result = TypeVar("_Result")
 
@@ -194,12 +196,17 @@ def make_accelerator(config: Config) -> Accelerator:
 
     Raises:
         InputError: CUDA was requested and there is none, the device does not compute so (fp16 on a CPU, bf16 on an old
-            GPU), or the launch would share weights.
+            GPU), the launch would share weights, or processes that it starts again would wait for those before.
     """
     for name in _OTHER_LAUNCHES:
         if os.environ.get(f"ACCELERATE_USE_{name}", "false").lower() in {"1", "true", "yes", "on"}:
             found, needed = f"{name} is asked for", "processes that share the clips, each with the whole model"
             raise InputError(where="accelerate launch", found=found, needed=needed, fix="Start it without that")
+    keeps_store = os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
+    if keeps_store and os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0") != "0":
+        found = "--max-restarts, and one store for all starts: a next one would wait for processes that have ended"
+        fix = f"Set {_SHARED_STORE}=1 in the environment of torchrun, which needs --rdzv-backend=c10d"
+        raise InputError(where="torchrun", found=found, needed="a store for each start", fix=fix)
     training, on_cpu = config.training, computing_device(config.training).type == "cpu"
     _patient_group.cache_clear()
     AcceleratorState._reset_state(reset_partial_state=False)  # or a second run keeps the first's precision
@@ -248,8 +255,12 @@ def agreed(accelerator: Accelerator, work: Callable[[], _T]) -> _T:
 
 def raise_first(accelerator: Accelerator, error: Exception | None) -> None:
     """Raise, in all processes, the error of the first of them that has one. All have to call."""
-    told = error if error is None or isinstance(error, UserError) else RuntimeError(f"{type(error).__name__}: {error}")
+    told = error if error is None or isinstance(error, UserError) else _ToldError(f"{type(error).__name__}: {error}")
     _raise_first_of(all_gather_object(accelerator, told), accelerator.process_index, error)
+
+
+class _ToldError(RuntimeError):
+    """What another process, which has told it, met unexpectedly."""
 
 
 def _raise_first_of(values: Iterable[object], own: int, error: Exception | None = None) -> None:
@@ -383,7 +394,7 @@ def own_part(count: int, at_once: int = 1) -> range:
     """Return which of so many things this process does: neighbours, in whole batches of `at_once`."""
     rank, processes = _place()
     batches = math.ceil(count / at_once)
-    first, last = (at_once * (batches * place // processes) for place in (rank, rank + 1))
+    first, last = (at_once * -(-batches * place // processes) for place in (rank, rank + 1))
     return range(first, min(count, last))
 
 
@@ -448,6 +459,19 @@ def joined(config: Config) -> Iterator[Accelerator]:
     watch.leave()
 
 
+_last_works: list[Callable[[], object]] = []
+
+
+@contextlib.contextmanager
+def before_exit(work: Callable[[], object]) -> Iterator[None]:
+    """Within the context, do this before the watch of `joined` ends this process, whose main thread stands still."""
+    _last_works.append(work)
+    try:
+        yield
+    finally:
+        _last_works.remove(work)
+
+
 def leave_processes() -> None:
     """End what joins this process to others, if anything does; all call, after all has gone well."""
     if torch.distributed.is_available() and torch.distributed.is_initialized():
@@ -472,7 +496,7 @@ class _Watch:
 
     def cause_of(self, error: BaseException) -> str:
         """Return what ended another process before this one met an error; empty: nothing. Tell the others of it."""
-        is_plain = isinstance(error, UserError)  # else it may be a connection to a process that is dead
+        is_plain = isinstance(error, _ToldError) or not isinstance(error, RuntimeError)  # of a lost connection
         with contextlib.suppress(RuntimeError):
             if not is_plain:
                 self._store.set("is broken", "yes")
@@ -499,11 +523,15 @@ class _Watch:
                 self._look(seen)
                 self._cause = self._store.get("cause").decode()
             except RuntimeError:  # torch's DistError
+                if seen.get(0, (b"", 0.0))[0] == b"left":  # all has gone well there
+                    return
                 self._cause = "process 0, at which the others meet, is gone"
             if self._cause:
                 self._is_known.set()
                 if not self._leaves.wait(_GRACE_S):  # the main thread waits for a process that will not come
                     sys.stderr.write(f"error: {printable(str(_ended_by(self._cause)))}\n")
+                    for work in _last_works[::-1]:
+                        work()
                     os._exit(2)
                 return
 

@@ -10,12 +10,12 @@ import pytest
 from paths import ROOT
 from ranks import finish, free_port, start_rank
 from same_run import metrics
-from vjepa2_ac.cli import main
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.distributed import gathered, own_part, shared
 from vjepa2_ac.training.loop import train
 
 pytestmark = pytest.mark.usefixtures("default_signals")
+BROKEN = str(ROOT / "tests/support/broken_clips.py")
 PROBES = [
     "--clips", "7", "--sensitivity-clips", "5", "--samples", "6", "--landscapes", "2", "--nodes", "3", "--axes", "3",
     "--examples", "2", "--planning-clips", "3", "--planning", "planning.samples=12", "planning.iterations=2",
@@ -41,29 +41,33 @@ def assert_same(one: dict[str, Any], other: dict[str, Any]) -> None:
 
 
 def test_processes_that_share_an_evaluation_find_what_one_finds(make_config, tmp_path: Path, reporter) -> None:
-    """7 clips in batches of 3: one process has one clip; of the shuffled actions some are the other processes'."""
-    changes = {"frames": 6, "test_share": 0.4}
+    """7 clips in batches of 3, of which two are broken: one process has one clip; some actions are the others'."""
+    changes = {"frames": 6, "test_share": 0.4, "broken_episodes": "skip"}
     data = {f"data__{name}": value for name, value in changes.items()}
     config = make_config(**data, training__steps=2, validation__batch_size=3, validation__every=2)
     run = str(train(config, reporter))
-    assert main(["evaluate", run, "--out", str(tmp_path / "alone"), *PROBES]) == 0
-    words, port = ["-m", "vjepa2_ac.cli", "evaluate", run, "--out", str(tmp_path / "together"), *PROBES], free_port()
-    said = finish([start_rank(words, rank, 3, port) for rank in range(3)], timeout=300)
+    words = [BROKEN, "evaluate", run, *PROBES, "--out"]
+    finish([start_rank([*words, str(tmp_path / "alone")], 0, 1, 0)], timeout=300)
+    port = free_port()
+    said = finish([start_rank([*words, str(tmp_path / "together")], rank, 3, port) for rank in range(3)], timeout=300)
     assert "uses actions" in said[0][0]
     assert [out for out, _ in said[1:]] == ["", ""], "only the first process speaks"
     alone, together = (json.loads((tmp_path / name / "metrics.json").read_text()) for name in ("alone", "together"))
     assert {"plans.score", "axes.residual_cm"} <= {row["key"] for row in alone["rows"]}
     assert_same(alone["rows"], together["rows"])
+    assert alone["clips"]["count"] == together["clips"]["count"] == 5
 
 
-def test_a_shared_validation_is_that_of_one_process(make_config, tmp_path: Path, reporter) -> None:
-    changes = {"training__steps": 2, "validation__clips": 7, "validation__batch_size": 3, "validation__every": 2}
-    alone = train(make_config(**changes, run_dir=str(tmp_path / "alone"), adapter__dropout=0.0), reporter)
-    config = make_config(**changes, run_dir=str(tmp_path / "two"), adapter__dropout=0.0, training__accumulation=1)
-    (tmp_path / "two.yaml").write_text(config_as_yaml(config))
-    words, port = ["-m", "vjepa2_ac.cli", "train", str(tmp_path / "two.yaml")], free_port()
-    finish([start_rank(words, rank, 2, port) for rank in range(2)], timeout=300)
-    first, second = ([row for row in metrics(run) if row["kind"] == "validation"] for run in (alone, tmp_path / "two"))
+@pytest.mark.parametrize("program", [("-m", "vjepa2_ac.cli"), (BROKEN,)], ids=["whole", "broken clips"])
+def test_a_shared_validation_is_that_of_one_process(program: tuple[str, ...], make_config, tmp_path: Path) -> None:
+    changes = {"training__steps": 2, "validation__clips": 7, "validation__batch_size": 2, "validation__every": 2}
+    changes |= {"adapter__dropout": 0.0, "data__broken_episodes": "skip", "training__accumulation": 1}
+    for processes in (1, 2):
+        config = make_config(**changes, run_dir=str(tmp_path / f"{processes}"))
+        (tmp_path / f"{processes}.yaml").write_text(config_as_yaml(config))
+        words, port = [*program, "train", str(tmp_path / f"{processes}.yaml")], free_port()
+        finish([start_rank(words, rank, processes, port) for rank in range(processes)], timeout=300)
+    first, second = ([row for row in metrics(tmp_path / one) if row["kind"] == "validation"] for one in ("1", "2"))
     np.testing.assert_array_equal(*(list(numbers_of(rows[0]).values()) for rows in (first, second)))
 
 

@@ -104,7 +104,7 @@ def test_a_clips_plans_depend_on_neither_the_batch_nor_the_order_nor_on_the_clip
     expected = measure_plans(Oracle(), starts_of_a_world(), FEW)
     for order in ([3, 2, 0], [1]):
         some = rows(batch, order)
-        starts = [planning_start(part, 0, place, seed=0) for place, part in enumerate(in_batches(some, 1))]
+        starts = [planning_start(part, 0, seed=0) for part in in_batches(some, 1)]
         found = measure_plans(Oracle(), starts, FEW)
         np.testing.assert_array_equal(found.one_step, expected.one_step[:, order])
         np.testing.assert_array_equal(found.three_steps, expected.three_steps[:, order])
@@ -197,7 +197,7 @@ def test_poses_stay_exact_where_the_model_computes_in_bfloat16() -> None:
 
 def test_planning_begins_anywhere_in_a_clip_and_aims_three_steps_on() -> None:
     batch = clips_batch(24)
-    starts = [planning_start(batch, row, row, seed=3) for row in range(24)]
+    starts = [planning_start(batch, row, seed=3) for row in range(24)]
     assert {start.place for start in starts} == set(range(TIME - 3))
     for row, start in enumerate(starts):
         frames = batch.latents[row, start.place :]

@@ -46,7 +46,7 @@ def walked(actions: Tensor) -> LatentBatch:
 
 
 def moves(batch: LatentBatch, space: ActionSpace = POSE_CHANGE, reach: float = REACH) -> list[RolloutStart]:
-    return [move for clip in range(CLIPS) for move in moves_of(batch, clip, clip, space, reach)]
+    return [move for clip in range(CLIPS) for move in moves_of(batch, clip, space, reach)]
 
 
 def ranked(model: Predictor, batch: LatentBatch, samples: int = 40) -> ActionRanking:
@@ -170,7 +170,7 @@ def test_what_others_are_drawn_does_not_depend_on_the_moves_beside_it() -> None:
 
 def starts(step: int = 0) -> list[RolloutStart]:
     batch = clips_batch(FEW)
-    return [start_of(batch, clip, step, clip) for clip in range(FEW)]
+    return [replace(start_of(batch, clip, step), clip=clip) for clip in range(FEW)]
 
 
 def pool(
@@ -296,7 +296,7 @@ def test_clips_that_hardly_move_along_an_axis_have_no_sign_to_agree_with() -> No
     actions = batch.actions.clone()
     actions[..., 2] = 0.0
     still = clips_batch(FEW, actions=actions)
-    begun = [start_of(still, clip, 0, clip) for clip in range(FEW)]
+    begun = [start_of(still, clip, 0) for clip in range(FEW)]
     found = measure_landscapes(Oracle(), begun, POSE_CHANGE, ProbeOptions(nodes=5, at_once=99))
     assert found.sign_clips[2] == 0
     assert np.isnan(found.sign_agreement[2].value)

@@ -1,13 +1,17 @@
 """Errors equal those computed by hand; shuffled actions are those of the clip before, for any batch size."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 import torch
 
+from vjepa2_ac import distributed
+from vjepa2_ac.distributed import own_part
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persistence
 from vjepa2_ac.evaluation.evaluate import Contender, evaluate
-from vjepa2_ac.evaluation.measure import ALL, VALIDATED, measured, prediction_errors, with_other_actions
+from vjepa2_ac.evaluation.measure import ALL, VALIDATED, actions_before, measured, prediction_errors, with_other_actions
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import ACTIONS, L1, L2
 from worlds import TIME, Copier, Halfway, Oracle, about, again, clips_batch, in_batches, rows
@@ -69,6 +73,28 @@ def test_other_actions_are_those_of_the_clip_before_whatever_the_batch(size: int
     batch = clips_batch()
     others = torch.cat([tried for _, tried in with_other_actions(in_batches(batch, size))])
     assert torch.equal(others, batch.actions[[1, *range(11)]]), "the first clip has those of the second"
+
+
+@pytest.mark.parametrize("processes", [2, 3, 4])
+def test_processes_that_share_clips_give_each_the_same_actions_whatever_clips_are_broken(
+    processes: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    batch = clips_batch()
+    for whole in product([True, False], repeat=7):
+        readable = [place for place in range(7) if whole[place]]
+
+        def read(windows, readable=readable):  # type: ignore[no-untyped-def]
+            return (rows(batch, [place]) for place in windows if place in readable)
+
+        found = [torch.zeros(0, *batch.actions.shape[1:])]
+        for process in range(processes):
+            monkeypatch.setattr(distributed, "_place", lambda process=process: (process, processes))
+            own = own_part(7, 2)
+            before = actions_before(own, range(7), read)
+            found += [others for _, others in with_other_actions(read(own), before)]
+        alone = rows(batch, readable).actions
+        expected = alone.flip(1) if len(alone) == 1 else torch.cat([alone[1:2], alone[:-1]])
+        assert torch.equal(torch.cat(found), expected), whole
 
 
 def test_a_clip_alone_gets_its_own_actions_backwards() -> None:

@@ -40,7 +40,7 @@ def clips(batch: LatentBatch, trained: TrainedDecoder, size: int = 4, noise: flo
         for number, part in enumerate(in_batches(rows(batch, chosen), size)):
             yield part, lambda row, first=number * size: frames[chosen[first + row]]
 
-    return RepeatableClips(len(places), read)
+    return RepeatableClips(tuple(places), read)
 
 
 class Known:

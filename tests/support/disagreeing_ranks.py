@@ -68,6 +68,17 @@ def all_lose_patience_soon() -> None:
     distributed._SILENT_S = 12.0
 
 
+def one_leaves_late() -> None:
+    """When the first process, at which they meet, is gone."""
+    distributed._BEAT_S, leave = 0.2, distributed._Watch.leave
+
+    def late(watch: distributed._Watch) -> None:
+        time.sleep(3.0 * RANK)
+        leave(watch)
+
+    distributed._Watch.leave = late
+
+
 def one_is_killed_once() -> None:
     """Under a launcher that starts all again."""
     step = loop.training_step

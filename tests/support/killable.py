@@ -7,6 +7,7 @@ has one thread; it forks a child per start, which runs the command line as any p
 from __future__ import annotations
 
 import atexit
+import faulthandler
 import gc
 import json
 import os
@@ -160,7 +161,6 @@ def _become(wish: dict, main: Callable[[list[str]], int]) -> None:
     status = 1
     try:
         os.setsid()  # its workers are in its session, and known by it when it is dead
-        signal.alarm(300)  # no test waits for ever
         for number in (signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP):  # as from a terminal, even under `nohup`
             signal.signal(number, signal.SIG_DFL)
         signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -169,6 +169,7 @@ def _become(wish: dict, main: Callable[[list[str]], int]) -> None:
         os.dup2(os.open(wish["out"], os.O_WRONLY | os.O_NOCTTY), 1)
         if wish["err"] is not None:
             os.dup2(os.open(wish["err"], os.O_WRONLY | os.O_NOCTTY), 2)
+        faulthandler.dump_traceback_later(900, exit=True)  # no test waits for ever, and it says for what
         if wish["die_at"] is not None:
             _die_at(wish["die_at"], wish["folder"])
         if "environment" in wish:

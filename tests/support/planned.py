@@ -54,7 +54,7 @@ def study(demonstrated: np.ndarray, ids: tuple[str, ...] | None = None) -> Plann
 def starts_of_a_world() -> list[PlanningStart]:
     """Return the starts of four clips."""
     batch = clips_batch(4, actions=small_actions())
-    return [planning_start(batch, row, row, seed=0) for row in range(4)]
+    return [planning_start(batch, row, seed=0) for row in range(4)]
 
 
 def with_plans(evaluation: Evaluation, seed: int = 0, starts: int = 8) -> Evaluation:

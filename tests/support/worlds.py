@@ -104,7 +104,7 @@ def again(batch: LatentBatch, size: int = 4) -> RepeatableClips:
         for part in in_batches(rows(batch, chosen), size):
             yield part, lambda _: np.full((TIME, 8, 8, 3), 128, np.uint8)
 
-    return RepeatableClips(len(places), read)
+    return RepeatableClips(tuple(places), read)
 
 
 def about(**changes: object) -> About:

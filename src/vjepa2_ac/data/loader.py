@@ -137,15 +137,17 @@ def validation_windows(dataset: Dataset, split: Split, *, clips: int) -> list[tu
     return [windows[index] for index in far_neighbours(spread(len(windows), clips))]
 
 
-def batches_of(dataset: Dataset, windows: Sequence[tuple[int, int]], *, batch_size: int) -> Iterator[Batch]:
+def batches_of(
+    dataset: Dataset, windows: Sequence[tuple[int, int]], *, batch_size: int, may_be_none: bool = False
+) -> Iterator[Batch]:
     """Yield the clips that start at these (episode, first control step), in this order, in batches.
 
     If `data.broken_episodes` is skip, a batch may be smaller; none is empty. Many clips are read by workers.
 
     Raises:
-        InputError: A clip cannot be read; or, by policy, none of them.
+        InputError: A clip cannot be read; or, by policy, none of them, unless that may be.
     """
-    count, empty = len(windows), True
+    count, empty = len(windows), not may_be_none
     rows = [list(range(first, min(first + batch_size, count))) for first in range(0, count, batch_size)]
     workers = dataset.config.workers if count >= CLIPS_WORTH_WORKERS else 0
     clips = _Clips(dataset, partial(_chosen_clip, dataset, windows))

@@ -77,13 +77,13 @@ class WindowCost:
         return distance(frames[:, -1].float(), self.goal.float(), self.config)
 
 
-def planning_start(batch: LatentBatch, row: int, clip: int, seed: int) -> PlanningStart:
+def planning_start(batch: LatentBatch, row: int, seed: int) -> PlanningStart:
     """Return a frame of a clip with three steps after it; it is drawn from the seed and the clip's name."""
-    generator = start_of(batch, row, 0, clip).generator(seed)
+    generator = start_of(batch, row, 0).generator(seed)
     place = int(generator.integers(batch.latents.shape[1] - STEPS))
     one, scored, drawn = generator.integers(2**62, size=3).tolist()
     return PlanningStart(
-        **vars(start_of(batch, row, place, clip)),
+        **vars(start_of(batch, row, place)),
         place=place,
         goal=batch.latents[row, place + STEPS].clone(),
         demonstrated=batch.actions[row, place : place + STEPS].cpu().numpy().astype(np.float64),

@@ -27,11 +27,11 @@ _ROOM = 1.25  # extent of a landscape's grid relative to the largest true action
 _AXES = slice(0, 3)  # of the grid: of poses, the position
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RolloutStart:
     """One frame of a held-out clip, and the true next frame: the state of a planner before an action."""
 
-    clip: int  # index into the evaluation's clips
+    clip: int = -1  # index into the evaluation's clips, once these are known
     episode_id: str
     first_step: int  # control step at which the clip begins
     frame: Float[Tensor, "tokens dim"]
@@ -57,11 +57,10 @@ class RolloutStart:
 
 
 def start_of(
-    batch: LatentBatch, row: int, step: int, clip: int, *, end: int | None = None, action: Tensor | None = None
+    batch: LatentBatch, row: int, step: int, *, end: int | None = None, action: Tensor | None = None
 ) -> RolloutStart:
     """Return a step of a clip in a batch as a start; or two of its frames, and the action that leads to the second."""
     return RolloutStart(
-        clip=clip,
         episode_id=batch.episode_ids[row],
         first_step=batch.starts[row],
         frame=batch.latents[row, step].clone(),
@@ -75,9 +74,13 @@ def start_of(
 _Start = TypeVar("_Start", bound=RolloutStart)
 
 
-def gathered_starts(starts: Sequence[_Start], device: torch.device) -> list[_Start]:
-    """Return the starts of all processes that share work, on the device of this one."""
-    return [_on(device, one) for one in gathered([_on("cpu", one) for one in starts])]
+def gathered_starts(
+    starts: Sequence[_Start], device: torch.device, names: Sequence[tuple[str, int]] = ()
+) -> list[_Start]:
+    """Return the starts of all processes that share work, on the device of this one, with their indices of `names`."""
+    numbers = {name: number for number, name in enumerate(names)}
+    known = gathered([_on("cpu", one) for one in starts])
+    return [replace(_on(device, one), clip=numbers.get((one.episode_id, one.first_step), -1)) for one in known]
 
 
 def _on(device: torch.device | str, start: _Start) -> _Start:
@@ -85,7 +88,7 @@ def _on(device: torch.device | str, start: _Start) -> _Start:
     return replace(start, **moved)
 
 
-def moves_of(batch: LatentBatch, row: int, clip: int, space: ActionSpace, reach: float) -> tuple[RolloutStart, ...]:
+def moves_of(batch: LatentBatch, row: int, space: ActionSpace, reach: float) -> tuple[RolloutStart, ...]:
     """Return two moves of a clip as starts: the longest within reach, from one of its frames to another, and back.
 
     The world around an arm that moves slowly is what its pose makes it: frames that are several steps apart show what
@@ -96,12 +99,11 @@ def moves_of(batch: LatentBatch, row: int, clip: int, space: ActionSpace, reach:
     Args:
         batch: Of clips.
         row: The clip's, in the batch.
-        clip: Its index.
         space: Of its actions.
         reach: Of a move, in metres; of vectors every move is within it.
     """
     if space.follows != "change":
-        return (start_of(batch, row, int(batch.actions[row].norm(dim=-1).argmax()), clip),)
+        return (start_of(batch, row, int(batch.actions[row].norm(dim=-1).argmax())),)
     states = batch.states[row].cpu().numpy().astype(np.float64)
     kind = vector_states(states.shape[1]) if space.position is None else POSE
     pairs = [(first, last) for first in range(len(states)) for last in range(first + 1, len(states))]
@@ -112,7 +114,7 @@ def moves_of(batch: LatentBatch, row: int, clip: int, space: ActionSpace, reach:
     found = []
     for first, last in (ends, ends[::-1]):
         change = torch.from_numpy(kind.differences(states[[first, last]])[0]).to(batch.actions)
-        found.append(start_of(batch, row, first, clip, end=last, action=change))
+        found.append(start_of(batch, row, first, end=last, action=change))
     return tuple(found)
 
 

@@ -77,7 +77,7 @@ def measure_decoded(
         for row, clip in enumerate(zip(batch.episode_ids, batch.starts, strict=True)):
             if clip in wanted:
                 strips[clip] = images.strip(row, wanted[clip], shown)
-        progress(len(ids), clips.count)
+        progress(len(ids), len(clips.names))
     parts = gathered([values] if ids else [])
     arrays = {key: np.concatenate([array for part in parts for array in part[key]]) for key in parts[0]}
     ids, strips = gathered(ids), dict(gathered(list(strips.items())))

@@ -62,8 +62,9 @@ class LatentSums:
         """Add the latents of a batch of clips, in the order of all clips."""
         latents = latents.float()
         flat = latents.flatten(2)
-        self._origin = flat.mean(dim=0) if self._origin is None else self._origin.to(flat)
-        flat = flat - self._origin
+        if self._origin is None:
+            self._origin = flat.mean(dim=0).cpu()
+        flat = flat - self._origin.to(flat)
         self.episode_ids += episode_ids
         self._pooled.append(latents.mean(dim=2).double().cpu().numpy())
         self._squares.append(flat.square().sum(dim=2, dtype=torch.float64).cpu().numpy())

@@ -32,7 +32,7 @@ from vjepa2_ac.evaluation.action_use import (
 from vjepa2_ac.evaluation.calibration.axes import infer_axes
 from vjepa2_ac.evaluation.distribution import LatentSums, distribution_of, noise_floor
 from vjepa2_ac.evaluation.estimates import episode_scores
-from vjepa2_ac.evaluation.measure import ALL, Predictor, joined, measured, prediction, with_other_actions
+from vjepa2_ac.evaluation.measure import ALL, Predictor, joined, measured, no_clips, prediction, with_other_actions
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import (
     L1,
@@ -53,6 +53,7 @@ from vjepa2_ac.model.distances import absolute_difference
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.spaces import ActionSpace, matrices_from_euler
 
+_CPU = torch.device("cpu")
 ClipName = tuple[str, int]  # id of the episode, first control step
 FramesOfRow = Callable[[int], UInt8[np.ndarray, "time height width 3"] | None]  # of a row of the current batch
 
@@ -72,11 +73,11 @@ class Contender:
 class RepeatableClips:
     """Clips that can be read repeatedly: all of them, or some by name; batches of latents with their frames."""
 
-    count: int
+    names: Sequence[ClipName]  # of all
     read: Callable[[Sequence[ClipName] | None], Iterable[tuple[LatentBatch, FramesOfRow]]]
     has_frames: bool = True  # False: of cached latents there are only small ones
-    first: int = 0  # of all clips the first that this process reads; others share the work
-    before: Float[Tensor, "1 time action_dim"] | None = None  # as of `with_other_actions`
+    before: Float[Tensor, "1 time action_dim"] | None = None  # of the part of this process, as of `with_other_actions`
+    device: torch.device = _CPU  # of the latents
 
 
 def evaluate(
@@ -156,55 +157,58 @@ def _collect(
     metrics: Sequence[Metric],
     progress: Progress,
 ) -> _Seen:
-    names, space, device = [contender.name for contender in contenders], about.space, torch.device("cpu")
+    names, space = [contender.name for contender in contenders], about.space
     batches = with_other_actions((batch for batch, _ in clips.read(None)), clips.before)
     first = list(itertools.islice(batches, 1))
-    origin, *_ = gathered([batch.latents[:, 1:].float().flatten(2).mean(dim=0).cpu() for batch, _ in first])
-    sums = {name: LatentSums(origin) for name in names}
-    seen, actions = _Seen({name: [] for name in names}, sums, LatentSums(origin), LatentSums(origin)), []
-    probed = set(spread(clips.count, probes.sensitivity_clips))
-    planned = set(spread(clips.count, probes.planning_clips if space.position is not None else 0))
+    if not (origins := gathered([batch.latents[:, 1:].float().flatten(2).mean(dim=0).cpu() for batch, _ in first])):
+        raise no_clips()
+    sums = {name: LatentSums(origins[0]) for name in names}
+    seen, actions = _Seen({name: [] for name in names}, sums, LatentSums(origins[0]), LatentSums(origins[0])), []
+    probed, planned = (
+        {clips.names[place] for place in spread(len(clips.names), count)}
+        for count in (probes.sensitivity_clips, probes.planning_clips if space.position is not None else 0)
+    )
 
     def add(ids: Sequence[str], name: str, way: Way, mode: Mode, predicted: torch.Tensor) -> None:
         if (way, mode) == ("true", "rollout"):
             seen.predicted[name].add(predicted, ids)
 
     for batch, others in itertools.chain(first, batches):
-        device = batch.latents.device
         seen.true.add(batch.latents[:, 1:], batch.episode_ids)
         seen.copies.add(batch.latents[:, :1].expand_as(batch.latents[:, 1:]), batch.episode_ids)
         for contender in contenders:
             watch = partial(add, batch.episode_ids, contender.name)
             with contender.switched():
                 seen.errors[contender.name].append(measured(contender.model, batch, ALL, metrics, others, watch))
-        for row in range(len(batch.starts)):
-            clip = clips.first + len(seen.ids) + row
-            if clip in probed:
+        for row, name in enumerate(zip(batch.episode_ids, batch.starts, strict=True)):
+            if name in probed:
                 largest = int(batch.actions[row][:, space.sized].norm(dim=-1).argmax())
-                seen.starts.append(start_of(batch, row, largest, clip))
-                seen.moves += moves_of(batch, row, clip, space, probes.reach_cm / 100)
-            if clip in planned:
-                seen.planned.append(planning_start(batch, row, clip, about.seed))
+                seen.starts.append(start_of(batch, row, largest))
+                seen.moves += moves_of(batch, row, space, probes.reach_cm / 100)
+            if name in planned:
+                seen.planned.append(planning_start(batch, row, about.seed))
         actions.append(batch.actions.cpu().numpy().astype(np.float64))
         seen.ids += batch.episode_ids
         seen.firsts += batch.starts
-        progress(len(seen.ids), clips.count)
-    return _of_all(seen, gathered(actions), device)
+        progress(len(seen.ids), len(clips.names))
+    return _of_all(seen, gathered(actions), clips.device)
 
 
 def _of_all(seen: _Seen, actions: Sequence[np.ndarray], device: torch.device) -> _Seen:
     """Return what the clips of all processes that share the work gave."""
+    ids, firsts = gathered(seen.ids), gathered(seen.firsts)
+    of_starts = partial(gathered_starts, device=device, names=list(zip(ids, firsts, strict=True)))
     return _Seen(
         errors={name: gathered(found) for name, found in seen.errors.items()},
         predicted={name: LatentSums.joined(gathered([sums])) for name, sums in seen.predicted.items()},
         true=LatentSums.joined(gathered([seen.true])),
         copies=LatentSums.joined(gathered([seen.copies])),
         actions=np.concatenate(actions),
-        ids=gathered(seen.ids),
-        firsts=gathered(seen.firsts),
-        starts=gathered_starts(seen.starts, device),
-        moves=gathered_starts(seen.moves, device),
-        planned=gathered_starts(seen.planned, device),
+        ids=ids,
+        firsts=firsts,
+        starts=of_starts(seen.starts),
+        moves=of_starts(seen.moves),
+        planned=of_starts(seen.planned),
     )
 
 

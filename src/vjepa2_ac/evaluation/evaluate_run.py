@@ -20,7 +20,7 @@ from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import batches_of, validation_windows
 from vjepa2_ac.data.transforms import frames_as_seen
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
-from vjepa2_ac.distributed import first_of_machine, joined, own_part, sharing
+from vjepa2_ac.distributed import first_of_machine, first_only, own_part, sharing
 from vjepa2_ac.encoding.batch import encode_batch, require_widths
 from vjepa2_ac.encoding.encode_dataset import with_latents_if_there
 from vjepa2_ac.episode import Batch, LatentBatch, Widths
@@ -136,31 +136,23 @@ def _like(subject: str, world_model: WorldModel, other: str, config: Config, wid
     return loaded
 
 
-def measure_subject(subject: str, asked: EvaluationOptions, *, reporter: Reporter = SILENT) -> Evaluation:
+def measure_subject(
+    subject: str, asked: EvaluationOptions, accelerator: Accelerator, *, reporter: Reporter = SILENT
+) -> Evaluation:
     """Measure a run or a model on held-out episodes. Cheap failures first.
 
     Args:
         subject: The folder of a run; or a model, as in `model.base`.
         asked: The options.
+        accelerator: Of the processes that share the work: `joined` by the settled config.
         reporter: Shows the progress of each part of the work.
 
     Raises:
         InputError: The subject, the data, the decoder, a file of a metric, or a model to compare with cannot be used;
             the split is empty; the folder of the output cannot be written.
     """
-    config, folder = settle(subject, asked), asked.out or Path(subject)
-    if is_run(subject):
-        select_checkpoint(Path(subject), asked.checkpoint)
-    with user_can_write(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        try_writing_at(folder)
-    with joined(config) as accelerator:
-        return _measured(subject, asked, config, reporter, accelerator)
-
-
-def _measured(
-    subject: str, asked: EvaluationOptions, config: Config, reporter: Reporter, accelerator: Accelerator
-) -> Evaluation:
+    config = settle(subject, asked)
+    first_only(accelerator, partial(_require_places, subject, asked))
     decoder = None if asked.decoder is None else load_decoder(asked.decoder)
     lpips = load_lpips(asked.lpips, asked.lpips_heads) if asked.lpips and asked.lpips_heads else None
     progress = reporter.task("looking through the data")
@@ -179,7 +171,8 @@ def _measured(
     encode = partial(encode_batch, world_model, device=accelerator.device, chunk=config.model.encode_chunk)
     axis_clips = asked.probes.axis_clips if dataset.spaces.state.is_base_pose else 0
     with accelerator.autocast(), sharing(accelerator):
-        clips = _clips(through_cache, chosen, config.validation.batch_size, encode, world_model.image_size)
+        size, device = config.validation.batch_size, accelerator.device
+        clips = _clips(through_cache, chosen, size, encode, device, world_model.image_size)
         evaluation = evaluate(
             contenders,
             clips,
@@ -202,6 +195,16 @@ def _measured(
     )
 
 
+def _require_places(subject: str, asked: EvaluationOptions) -> None:
+    """Check that a run has the checkpoint, and that the folder of the output can be written."""
+    folder = asked.out or Path(subject)
+    if is_run(subject):
+        select_checkpoint(Path(subject), asked.checkpoint)
+    with user_can_write(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        try_writing_at(folder)
+
+
 def _training_curves(folder: Path) -> tuple[TrainingCurve, ...]:
     """Return all scalar metrics of a run's metrics.jsonl, over optimizer steps."""
     points: dict[str, list[tuple[int, float]]] = {}
@@ -220,22 +223,24 @@ def _clips(
     windows: Sequence[tuple[int, int]],
     batch_size: int,
     encode: Callable[[Batch], LatentBatch],
+    device: torch.device,
     image_size: int,
 ) -> RepeatableClips:
     """Return the clips at these windows, with the frames as the encoder sees them; of cached latents, small ones."""
     own = own_part(len(windows), batch_size)
     by_name = {(dataset.table.identity(episode), start): (episode, start) for episode, start in windows}
+    some = partial(batches_of, dataset, may_be_none=True)
 
     def frames(batch: Batch, row: int) -> UInt8[np.ndarray, "time size size 3"]:
         return frames_as_seen(frames_of(dataset, batch, row), image_size)
 
     def read(names: Sequence[ClipName] | None) -> Iterable[tuple[LatentBatch, FramesOfRow]]:
         wanted = windows[own.start : own.stop] if names is None else [by_name[name] for name in names]
-        for batch in batches_of(dataset, wanted, batch_size=batch_size) if wanted else ():
+        for batch in some(wanted, batch_size=batch_size):
             yield encode(batch), partial(frames, batch)
 
-    before = actions_before(own, windows, partial(batches_of, dataset, batch_size=1))
-    return RepeatableClips(len(windows), read, not dataset.config.is_cache, own.start, before)
+    before = actions_before(own, windows, partial(some, batch_size=1))
+    return RepeatableClips(tuple(by_name), read, not dataset.config.is_cache, before, device)
 
 
 def _about(subject: str, run: TrainedRun | None, config: Config, dataset: Dataset, asked: EvaluationOptions) -> About:

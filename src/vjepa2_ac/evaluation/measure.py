@@ -20,6 +20,7 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.distributed import gathered
 from vjepa2_ac.episode import Batch, LatentBatch
+from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.result import L1, MODES, Metric, Mode, PredictionErrors, Way
 
 _Window = TypeVar("_Window")
@@ -96,9 +97,21 @@ def measured(
 
 
 def joined(parts: Sequence[PredictionErrors]) -> PredictionErrors:
-    """Return the errors of all clips of some batches; of one or more."""
+    """Return the errors of all clips of some batches.
+
+    Raises:
+        InputError: There are none.
+    """
+    if not parts:
+        raise no_clips()
     arrays = {key: np.concatenate([part.arrays[key] for part in parts]) for key in parts[0].arrays}
     return PredictionErrors(tuple(name for part in parts for name in part.episode_ids), arrays)
+
+
+def no_clips() -> InputError:
+    """Return the error of clips of which no process can read one."""
+    fix = "Repair or fetch these episodes again, or add them to data.exclude"
+    return InputError(where="data.path", found="none of the clips can be read: their episodes are broken", fix=fix)
 
 
 def prediction_errors(
@@ -118,17 +131,20 @@ def prediction_errors(
 def actions_before(
     own: range, windows: Sequence[_Window], read: Callable[[list[_Window]], Iterator[Batch]]
 ) -> Float[Tensor, "1 time action_dim"] | None:
-    """Return the actions that the first clip of a process's part is given as another's; None: it has all clips.
+    """Return the actions that the first clip of a process's part is given as another's; None: there is none before it.
 
     Args:
         own: The part.
         windows: Of all clips.
-        read: Reads some.
+        read: Reads some; those that are broken are left out.
     """
     if len(own) in (0, len(windows)):
         return None
-    other = own.start - 1 if own.start else 1
-    return next(read([windows[other]])).actions
+    before = (batch.actions for window in reversed(windows[: own.start]) for batch in read([window]))
+    if (nearest := next(before, None)) is not None:
+        return nearest
+    first = (batch.actions for window in windows for batch in read([window]))  # the second, as of one process
+    return next(islice(first, 1, None), None)
 
 
 def with_other_actions(

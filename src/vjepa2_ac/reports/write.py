@@ -11,6 +11,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import NamedTuple
@@ -20,17 +21,17 @@ from jaxtyping import UInt8
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from vjepa2_ac.distributed import first_only, joined
 from vjepa2_ac.episode import short_names
 from vjepa2_ac.evaluation.answer import Answer, Question, answer, interval_of, percent, with_closed_loop
 from vjepa2_ac.evaluation.estimates import Curve, over_persistence
 from vjepa2_ac.evaluation.evaluate_run import measure_subject
-from vjepa2_ac.evaluation.request import EvaluationOptions
+from vjepa2_ac.evaluation.request import EvaluationOptions, settle
 from vjepa2_ac.evaluation.result import L1, DecodedStrip, EpisodeScore, Evaluation, Example, Row, RowTable, sections
 from vjepa2_ac.evaluation.rows import rows_of
 from vjepa2_ac.media.figure import svg_of, visible
 from vjepa2_ac.media.film import draw_strip
 from vjepa2_ac.media.images import encode_webp
-from vjepa2_ac.process import is_first
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.reports.figures.evaluation import decoded_strip, drawings, example_strip, plot_evaluation
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, write_metrics
@@ -281,19 +282,21 @@ def evaluate_subject(subject: str, asked: EvaluationOptions | None = None, repor
         InputError: As `measure_subject`.
     """
     asked = asked or EvaluationOptions()
-    evaluation = measure_subject(subject, asked, reporter=reporter)
-    about, rows = evaluation.about, rows_of(evaluation)
-    found = answer(evaluation, rows)
-    if about.checkpoint:
-        found = with_closed_loop(found, Path(about.subject), about.checkpoint)
-    folder = asked.out or Path(subject)
-    if not is_first():
-        return Evaluated(evaluation, found, ())
-    files = (
+    with joined(settle(subject, asked)) as accelerator:
+        evaluation = measure_subject(subject, asked, accelerator, reporter=reporter)
+        rows = rows_of(evaluation)
+        found, about = answer(evaluation, rows), evaluation.about
+        if about.checkpoint:
+            found = with_closed_loop(found, Path(about.subject), about.checkpoint)
+        files = first_only(accelerator, partial(_written, evaluation, found, rows, asked.out or Path(subject)))
+    return Evaluated(evaluation, found, files or ())
+
+
+def _written(evaluation: Evaluation, found: Answer, rows: Sequence[Row], folder: Path) -> tuple[Path, ...]:
+    write_atomically(folder / REPORT, report_page(evaluation, found))
+    return (
         plot_evaluation(evaluation, folder / PLOT),
         write_metrics(evaluation, folder / METRICS_FILE),
         *write_tables(rows, folder / METRICS_FILE),
         folder / REPORT,
     )
-    write_atomically(folder / REPORT, report_page(evaluation, found))
-    return Evaluated(evaluation, found, files)

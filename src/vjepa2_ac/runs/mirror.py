@@ -334,7 +334,8 @@ class Mirror:
         self._remote, self._run_id = RemoteCheckpoints(storage.absolute(place)), run_id
         self._folder, self._config, self._outage_reported = Path(config.run_dir), config.checkpoint, False
         self._thread: threading.Thread | None = None
-        self._is_ending = self._has_ended = self._is_lost = False
+        self._is_ending = self._has_ended = self._is_lost = self._is_hurried = False
+        self._finishing = threading.Lock()
         self._begun_s = -float("inf")
         self._aim: str | None = None  # the newest local checkpoint when the thread started
         self._sent: str | None = None  # the newest remote one
@@ -355,6 +356,11 @@ class Mirror:
         """Whether a pass is in progress."""
         return self._thread is not None and self._thread.is_alive()
 
+    def finish_soon(self) -> None:
+        """As `finish` on a machine that is about to stop; waits for one in another thread, which is short then."""
+        self._is_hurried = True
+        self.finish(lambda: True)
+
     def finish(self, is_asked_to_stop: Callable[[], bool]) -> None:
         """Upload the newest files, and wait for that; warn if the place is not up to date then.
 
@@ -362,13 +368,18 @@ class Mirror:
             is_asked_to_stop: Whether the machine is about to stop: then the wait is `checkpoint.remote_wait_seconds`,
                 else an hour.
         """
+        with self._finishing:
+            if not self._has_ended:
+                self._finish(is_asked_to_stop)
+
+    def _finish(self, is_asked_to_stop: Callable[[], bool]) -> None:
         self._is_ending = True
         is_short, until_s = False, time.monotonic() + LONGEST_WAIT_S
         for is_last in (False, True):  # the current pass ends, or breaks off if there is a newer checkpoint
             if is_last and not self.is_sending:
                 self._begin()
             while self._thread and self.is_sending and time.monotonic() < until_s:
-                if not is_short and is_asked_to_stop():
+                if not is_short and (self._is_hurried or is_asked_to_stop()):
                     is_short, until_s = True, time.monotonic() + self._config.remote_wait_seconds
                 self._thread.join(_LOOK_EVERY_S)
         in_time = not self.is_sending
@@ -386,8 +397,8 @@ class Mirror:
 
     def __exit__(self, _kind: object, error: object, _traceback: object) -> None:
         """Stop uploading; if the run ends with an error, upload what exists first."""
-        if isinstance(error, Exception) and not self._has_ended:
-            self.finish(lambda: True)
+        if isinstance(error, Exception):
+            self.finish_soon()
         self._has_ended = True
 
     def _begin(self) -> None:

@@ -1,6 +1,7 @@
 """The film strip of a validation: what base and model imagine of one held-out clip, beside what happened.
 
-It is always the same clip: of the validation's, the one with the most motion. Nothing that fails here ends a run: a
+It is always the same clip: of the validation's (with several processes, of the first one's part), the one with the
+most motion. Nothing that fails here ends a run: a
 strip is left out, and a warning says why.
 """
 

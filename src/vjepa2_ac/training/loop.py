@@ -21,6 +21,7 @@ from vjepa2_ac.config.loading import config_as_dict
 from vjepa2_ac.distributed import (
     agreed,
     all_reduce_max,
+    before_exit,
     broadcast_object,
     first_only,
     joined,
@@ -106,7 +107,10 @@ def _begun(
     trackers = open_trackers(run.config, run.folder, run_id=run_id, first_step=done)
     watched = WatchedMetricsLog(run.config, reporter, first_step=done, trackers=trackers)
     metrics_log, mirror = until_the_end.enter_context(watched), opened.mirror(run_id)
-    return metrics_log, mirror and until_the_end.enter_context(mirror)
+    if mirror is not None:
+        until_the_end.enter_context(mirror)
+        until_the_end.enter_context(before_exit(mirror.finish_soon))
+    return metrics_log, mirror
 
 
 def _write_measured(run: Run) -> None:

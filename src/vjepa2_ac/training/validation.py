@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator
 from functools import partial
 from typing import Any
 
@@ -113,11 +113,12 @@ def validate(run: Run, reporter: Reporter) -> Validation:
 def _measured(run: Run) -> Validation:
     windows = validation_windows(run.dataset, "validation", clips=run.config.validation.clips)
     own = own_part(len(windows), run.config.validation.batch_size)
-    read = partial(batches_of, run.dataset, batch_size=run.config.validation.batch_size)
-    batches = read(windows[own.start : own.stop]) if own else iter(())
-    moves: list[RolloutStart] = []
+    read = partial(batches_of, run.dataset, batch_size=run.config.validation.batch_size, may_be_none=True)
+    batches, moves = read(windows[own.start : own.stop]), list[RolloutStart]()
     encoded = (run.strip.seen(batch, encode(run, batch)) if run.strip else encode(run, batch) for batch in batches)
-    kept = _moves_kept(run, encoded, own.start, len(windows), moves)
+    names = [(run.dataset.table.identity(episode), start) for episode, start in windows]
+    chosen = {names[place] for place in spread(len(names), run.config.validation.ranking_clips or 0)}
+    kept = _moves_kept(run, encoded, chosen, moves)
     errors = prediction_errors(run.world_model, kept, before=actions_before(own, windows, read))
     for name, reason in gathered(list(run.dataset.broken.reasons.items())):
         run.dataset.broken.met(name, reason)
@@ -130,16 +131,14 @@ def _measured(run: Run) -> Validation:
 
 
 def _moves_kept(
-    run: Run, batches: Iterable[LatentBatch], first: int, count: int, moves: list[RolloutStart]
+    run: Run, batches: Iterable[LatentBatch], chosen: Container[tuple[str, int]], moves: list[RolloutStart]
 ) -> Iterator[LatentBatch]:
-    """Yield batches from a `first` of `count` clips on, and append the moves of those chosen for the ranking."""
+    """Yield batches, and append the moves of the clips that are chosen for the ranking."""
     config, space = run.config.validation, run.dataset.spaces.action
-    chosen = set(spread(count, config.ranking_clips)) if config.ranking_clips else set()
     for batch in batches:
-        for row in range(len(batch.starts)):
-            if first + row in chosen:
-                moves += moves_of(batch, row, first + row, space, config.ranking_reach_cm / 100)
-        first += len(batch.starts)
+        for row, name in enumerate(zip(batch.episode_ids, batch.starts, strict=True)):
+            if name in chosen:
+                moves += moves_of(batch, row, space, config.ranking_reach_cm / 100)
         yield batch
 
 

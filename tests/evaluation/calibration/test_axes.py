@@ -36,7 +36,7 @@ def turn(degrees: float, gain: float = 1.0) -> np.ndarray:
 
 def starts(**changes: object) -> list[RolloutStart]:
     batch = clips_batch(CLIPS, **changes)  # type: ignore[arg-type]
-    return [start_of(batch, clip, 1, clip) for clip in range(CLIPS)]
+    return [start_of(batch, clip, 1) for clip in range(CLIPS)]
 
 
 def fitted(model: object, **changes: object) -> AxisFit:
@@ -84,7 +84,7 @@ def test_a_turn_that_predicts_no_better_than_none_and_one_of_a_wide_interval_are
 def test_mirrored_axes_and_one_episode_are_refused_by_name() -> None:
     assert "mirrored" in (fitted(Turned(0.0, mirrored=True)).problem or "")
     batch = clips_batch(2)
-    alone = infer_axes(Oracle(), [start_of(batch, clip, step, 0) for clip in (0, 1) for step in range(TIME - 1)],
+    alone = infer_axes(Oracle(), [start_of(batch, clip, step) for clip in (0, 1) for step in range(TIME - 1)],
                        at_once=64)  # fmt: skip
     assert "1 episode" in (alone.problem or "")
 

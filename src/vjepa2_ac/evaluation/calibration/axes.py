@@ -334,7 +334,7 @@ def calibrate_axes(
     with torch.no_grad():
         for batch in validation_batches(dataset, split, clips=pairs, batch_size=config.validation.batch_size):
             latents = encode(batch)
-            starts += [start_of(latents, row, 0, len(starts) + row) for row in range(len(batch.starts))]
+            starts += [start_of(latents, row, 0) for row in range(len(batch.starts))]
     fit = infer_axes(world_model, starts, config.planning.energy.samples_at_once, reporter.task("inferring moves"))
     data = config.data
     return fit, {
