@@ -1,4 +1,4 @@
-# make demo · make evidence · make trap · make encoders · make test · make cluster · make test-oldest · make lint · make docs · make links · make audit · make soak · make walk · make bench · make base: each creates the environment it needs.
+# make demo · make evidence · make trap · make encoders · make test · make test-slow · make cluster · make test-oldest · make lint · make docs · make links · make audit · make soak · make walk · make bench · make base: each creates the environment it needs.
 PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
@@ -8,7 +8,7 @@ CLUSTER := .venv/cluster-installed
 OLDEST := .venv-oldest
 AUDIT := .venv-audit
 
-.PHONY: demo demo-seeds base evidence trap encoders cluster test test-oldest walk docs soak lint links audit format bench clean
+.PHONY: demo demo-seeds base evidence trap encoders cluster test test-slow test-oldest walk docs soak lint links audit format bench clean
 
 # Half of what tests need, in the same environment.
 $(SIMULATION): pyproject.toml constraints.txt
@@ -46,8 +46,14 @@ trap: $(SIMULATION)  ## does a lower error plan better? narrow and varied demons
 encoders: $(SIMULATION)  ## what each published encoder costs, by doctor's arithmetic; replaces the table
 	$(BIN)/python benchmarks/encoders.py
 
-test: $(INSTALLED)  ## the whole test suite, on all cores (8 at most), a thread each; a folder in one process: .venv/bin/pytest tests/data
-	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/pytest -q -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder --durations 10
+# On all cores (8 at most), a thread each.
+PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/pytest -q -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder --durations 10
+
+test: $(INSTALLED)  ## the test suite; a folder in one process: .venv/bin/pytest tests/data
+	$(PYTEST) -m "not slow"
+
+test-slow: $(INSTALLED)  ## whole programs: benchmarks, several machines, a browser, the notebook, the wheel
+	$(PYTEST) -m slow
 
 # Ray, whose tests are skipped without it: 600 MB, in the same environment.
 $(CLUSTER): $(INSTALLED)

@@ -57,9 +57,21 @@ LONGEST = (
 )  # fmt: skip
 
 
+SLOW = (
+    "benchmarks/", "distributed/test_nothing_hangs", "distributed/test_shared_work", "explore/test_page_in_browser",
+    "explore/test_postcard", "reports/test_page_in_browser", "test_extending", "test_notebook", "test_quickstart",
+    "test_site", "test_spot", "test_wheel",
+)  # fmt: skip
+"""Whole programs: `make test-slow`."""
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the files first that take longest."""
+    """Put the files first that take longest, and mark what is slow."""
     places = {name: place for place, name in enumerate(LONGEST)}
+    for item in items:
+        name = item.path.relative_to(ROOT / "tests").as_posix()
+        if name.startswith(SLOW) or "test_a_real_world" in item.name:
+            item.add_marker(pytest.mark.slow)
     items.sort(key=lambda item: places.get(item.path.name, len(places)))
 
 
@@ -94,6 +106,14 @@ def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("VJEPA2_AC_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield
+
+
+@pytest.fixture(autouse=True)
+def _ordinary_scheduling() -> Iterator[None]:
+    """No test leaves this process before all others (as SVT-AV1 does, as root): what it starts would starve them."""
+    yield
+    if hasattr(os, "sched_getscheduler"):
+        assert os.sched_getscheduler(0) == os.SCHED_OTHER
 
 
 @pytest.fixture(autouse=True, scope="session")

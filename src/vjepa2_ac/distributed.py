@@ -31,6 +31,7 @@ from accelerate import Accelerator
 from accelerate.state import AcceleratorState
 from accelerate.utils import InitProcessGroupKwargs
 from torch import Tensor, nn
+from torch.distributed.rendezvous import rendezvous
 
 from vjepa2_ac.config import Config, ModelConfig, TrainingConfig
 from vjepa2_ac.errors import InputError, UnreachableError, UserError, in_words, printable
@@ -50,6 +51,7 @@ _T = TypeVar("_T")
 _Result = TypeVar("_Result")
 
 _OTHER_LAUNCHES = ("FSDP", "DEEPSPEED", "MEGATRON_LM", "PARALLELISM_CONFIG")
+_MEETING = timedelta(minutes=10)  # of all processes, before any work
 _LONGEST_STEP = timedelta(hours=2)  # until a process is given up that does not come to a sum: its disk may have stalled
 _AS_LONG_AS_IT_TAKES = timedelta(days=7)
 _BEAT_S = 2.0  # from one sign of life of a process to the next
@@ -197,6 +199,7 @@ def make_accelerator(config: Config) -> Accelerator:
     Raises:
         InputError: CUDA was requested and there is none, the device does not compute so (fp16 on a CPU, bf16 on an old
             GPU), the launch would share weights, or processes that it starts again would wait for those before.
+        UnreachableError: Not all processes have come.
     """
     for name in _OTHER_LAUNCHES:
         if os.environ.get(f"ACCELERATE_USE_{name}", "false").lower() in {"1", "true", "yes", "on"}:
@@ -209,10 +212,30 @@ def make_accelerator(config: Config) -> Accelerator:
         raise InputError(where="torchrun", found=found, needed="a store for each start", fix=fix)
     training, on_cpu = config.training, computing_device(config.training).type == "cpu"
     _patient_group.cache_clear()
+    _meet("gloo" if on_cpu else "nccl")
     AcceleratorState._reset_state(reset_partial_state=False)  # or a second run keeps the first's precision
     precision = "no" if training.precision == "fp32" else training.precision
     waits = InitProcessGroupKwargs(timeout=_LONGEST_STEP)
     return Accelerator(mixed_precision=precision, cpu=on_cpu, kwargs_handlers=[waits])
+
+
+def _meet(backend: str) -> None:
+    """Wait for all processes, but less long than for one that is slow later.
+
+    Raises:
+        UnreachableError: Not all have come.
+    """
+    is_alone = os.environ.get("WORLD_SIZE", "1") == "1" or "MASTER_PORT" not in os.environ  # Accelerate knows others
+    if is_alone or torch.distributed.is_initialized():
+        return
+    try:
+        store, rank, processes = next(rendezvous("env://", timeout=_MEETING))
+    except RuntimeError as error:  # torch's DistError
+        found = f"not all {os.environ['WORLD_SIZE']} have come within {_MEETING.total_seconds():.0f} s: {error}"
+        fix = "Look at what the others said, and whether they reach MASTER_ADDR"
+        raise UnreachableError(where="processes of this run", found=found, fix=fix) from None
+    store.set_timeout(_LONGEST_STEP)
+    torch.distributed.init_process_group(backend, store=store, rank=rank, world_size=processes, timeout=_LONGEST_STEP)
 
 
 def first_only(accelerator: Accelerator, work: Callable[[], _T]) -> _T | None:

@@ -159,3 +159,9 @@ def test_policies_are_measured_in_every_part(
     capsys.readouterr()
     module.main([*words, "--out", str(tmp_path / "found.json")])  # nothing is run again
     assert len(capsys.readouterr().out.splitlines()) == len(rows)
+
+
+def test_the_figures_of_policies_are_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (module,) = imported("policies_plot", monkeypatch)
+    module.draw(json.loads((ROOT / "benchmarks/results/policies.json").read_text()), tmp_path / "policies.png")
+    assert (tmp_path / "policies.png").read_bytes().startswith(b"\x89PNG")

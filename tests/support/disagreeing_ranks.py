@@ -65,7 +65,11 @@ def index_cannot_be_made() -> None:
 
 
 def all_lose_patience_soon() -> None:
-    distributed._SILENT_S = 12.0
+    distributed._SILENT_S, distributed._GRACE_S = 6.0, 2.0
+
+
+def another_never_comes() -> None:
+    distributed._MEETING = timedelta(seconds=3)
 
 
 def one_leaves_late() -> None:
