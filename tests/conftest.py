@@ -69,7 +69,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put the files first that take longest, and mark what is slow."""
     places = {name: place for place, name in enumerate(LONGEST)}
     for item in items:
-        name = item.path.relative_to(ROOT / "tests").as_posix()
+        name = os.path.relpath(item.path, ROOT / "tests")
         if name.startswith(SLOW) or "test_a_real_world" in item.name:
             item.add_marker(pytest.mark.slow)
     items.sort(key=lambda item: places.get(item.path.name, len(places)))
