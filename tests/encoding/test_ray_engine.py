@@ -92,6 +92,7 @@ def assert_finished(job: "subprocess.Popen[str]", folder: Path, config: MakeConf
 
 
 @needs_ray
+@pytest.mark.usefixtures("default_signals")
 def test_an_interrupted_command_leaves_nothing_behind_and_a_killed_actor_loses_nothing(
     start: Callable, make_config: MakeConfig, tmp_path: Path
 ) -> None:
