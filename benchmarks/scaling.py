@@ -6,7 +6,8 @@
 Sizes follow from the config: latents, trained parameters, FLOPs, memory by doctor's arithmetic. Speeds are options: the
 defaults are measured (an H100: docs/IMPLEMENTATION_NOTES.md; loader and bytes: docs/log.md), or as published for links
 and prices. The model, not confirmed by two GPUs: a process takes its time alone; then gradients are summed in a ring,
-2 (N-1) / N of their bytes through the slowest link, and 2 messages a tensor and doubling of N. Nothing overlaps.
+2 (N-1) / N of their bytes through the slowest link, and 2 messages a tensor and doubling of N, small tensors as one.
+Nothing overlaps.
 
 --check trains a tiny model here (gloo, a thread a process): N processes on C cores take N / min(C, N) times as long.
 """
@@ -25,6 +26,7 @@ from pathlib import Path
 from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.config.loading import config_as_yaml, load_config
 from vjepa2_ac.data.sources.latents.cache_files import bytes_per_frame
+from vjepa2_ac.distributed import LARGE
 from vjepa2_ac.training.cost.flops import clip_flops, frame_flops
 from vjepa2_ac.training.cost.memory import count_parameters, estimate_memory
 
@@ -67,9 +69,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def all_reduce_s(processes: int, tensors: Sequence[int], gb_s: float, message_us: float) -> float:
-    """Return the seconds in which gradients are summed, a tensor after the other."""
+    """Return the seconds in which gradients are summed, a large tensor after the other."""
     moved = 2 * (processes - 1) / processes * FLOAT32 * sum(tensors)
-    return moved / gb_s / 1e9 + len(tensors) * 2 * math.ceil(math.log2(processes)) * message_us / 1e6
+    messages = 1 + sum(one >= LARGE for one in tensors)
+    return moved / gb_s / 1e9 + messages * 2 * math.ceil(math.log2(processes)) * message_us / 1e6
 
 
 def predict(config: Config, options: argparse.Namespace) -> None:

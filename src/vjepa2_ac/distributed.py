@@ -52,6 +52,7 @@ _Result = TypeVar("_Result")
 
 _OTHER_LAUNCHES = ("FSDP", "DEEPSPEED", "MEGATRON_LM", "PARALLELISM_CONFIG")
 _MEETING = timedelta(minutes=10)  # of all processes, before any work
+LARGE = 1_000_000  # numbers of a gradient that is a message of its own
 _LONGEST_STEP = timedelta(hours=2)  # until a process is given up that does not come to a sum: its disk may have stalled
 _AS_LONG_AS_IT_TAKES = timedelta(days=7)
 _BEAT_S = 2.0  # from one sign of life of a process to the next
@@ -315,14 +316,27 @@ def all_reduce_max(accelerator: Accelerator, values: Sequence[int | bool]) -> li
 
 
 def all_reduce_gradients(accelerator: Accelerator, parameters: Iterable[nn.Parameter]) -> None:
-    """Replace the gradient of each parameter by its sum over all processes; no gradient counts as zero."""
+    """Replace the gradient of each parameter by its sum over all processes; no gradient counts as zero.
+
+    Small ones go together: hundreds of messages would each wait for the network.
+    """
     if accelerator.num_processes == 1:
         return
+    small: list[Tensor] = []
     under_way = []
     for parameter in parameters:
         if parameter.grad is None:
             parameter.grad = torch.zeros_like(parameter)
-        under_way.append(torch.distributed.all_reduce(parameter.grad, async_op=True))
+        if parameter.numel() < LARGE:
+            small.append(parameter.grad)
+        else:
+            under_way.append(torch.distributed.all_reduce(parameter.grad, async_op=True))
+    if small:
+        together = torch.cat([gradient.flatten() for gradient in small])
+        torch.distributed.all_reduce(together)
+        parts = together.split([one.numel() for one in small])  # type: ignore[no-untyped-call]  # torch
+        for gradient, summed in zip(small, parts, strict=True):
+            gradient.copy_(summed.view_as(gradient))
     for work in under_way:
         work.wait()
 
