@@ -52,7 +52,7 @@ from vjepa2_ac.storage.structured import json_text
 from vjepa2_ac.training.cost.memory import count_parameters
 from vjepa2_ac.training.loop import train
 
-TEST_GOALS, VALIDATION_GOALS = 9_000, 4_000  # seeds of problems, to which a cell adds its own
+TEST_GOALS, VALIDATION_GOALS = 9_000, 4_000  # seeds of problems, to which a cell adds its own (`goals_seed`)
 PAIRS = 200  # of frames, that axes are fitted to
 GOALS, CLIPS = 20, 128  # of one run; a row of the table pools its seeds, each with other goals
 
@@ -94,10 +94,10 @@ def measure(cell: Cell, folder: Path, *, goals: int = GOALS, choosing: bool = Fa
         figures["forgetting"] = _forgetting(model, data_before(folder, cell.shift), config)
     if model.adaptation is not None:
         merge_adapter(model)
-    goals_seed = (VALIDATION_GOALS if choosing else TEST_GOALS) + cell.seed
+    seed = goals_seed(cell, choosing=choosing)
     settings: dict[str, Any] = {"axes": file} if cell.shift in SHIFTS else {"goals_of": other_worlds.goals_of}
     figures["reach"] = {
-        distance: closed_loop(cell, planner(model, distance, **settings), folder, seed=goals_seed, goals=goals)
+        distance: closed_loop(cell, planner(model, distance, **settings), folder, seed=seed, goals=goals)
         for distance in energies_of(cell)
     }
     return figures
@@ -107,7 +107,7 @@ def _cloned(cell: Cell, config: Config, folder: Path, goals: int, *, choosing: b
     """Return the figures of a policy that imitates: it predicts nothing, and does not search."""
     began, place = time.process_time(), folder / "priors" / cell.name
     found = train_prior(config, place).held_out
-    minutes, seed = (time.process_time() - began) / 60, (VALIDATION_GOALS if choosing else TEST_GOALS) + cell.seed
+    minutes, seed = (time.process_time() - began) / 60, goals_seed(cell, choosing=choosing)
     acts = PLANNING.model_copy(update={"planner": "prior", "prior": str(place)})
     model = load_base(config.model, seed=cell.seed)
     policy = planner(model, "l1", config=acts, goals_of=None if cell.shift in SHIFTS else other_worlds.goals_of)
@@ -151,9 +151,16 @@ def config_of(cell: Cell, folder: Path) -> Config:
     )
 
 
+def goals_seed(cell: Cell, *, choosing: bool = False) -> int:
+    """Return the seed of a cell's problems. Our own arm draws other ones from each; in worlds of others it is the first
+    of their seeds, of which a cell takes up to twice as many as there are problems."""
+    apart = 1 if cell.shift in SHIFTS else 100
+    return (VALIDATION_GOALS if choosing else TEST_GOALS) + apart * cell.seed
+
+
 def baselines(cell: Cell, folder: Path, *, goals: int = GOALS) -> dict[str, Any]:
     """Return how far those get who need no model, on the same goals."""
-    limits, seed = PLANNING.limits, TEST_GOALS + cell.seed
+    limits, seed = PLANNING.limits, goals_seed(cell)
     policies: list[Policy] = [ZeroActions(), RandomActions(limits, cell.seed)]
     policies += [Oracle(limits)] if cell.shift in SHIFTS else []
     found = {policy.name: closed_loop(cell, policy, folder, seed=seed, goals=goals) for policy in policies}

@@ -4,8 +4,8 @@
     vjepa2-ac simulate RUN --world "worlds/libero/bin/python examples/worlds/libero.py libero_object --task butter"
 
 docs/worlds.md has the protocol. State and targets: the grip site in the frame of the
-robot's base: metres, extrinsic xyz Euler angles in radians, closedness of the gripper from 0 (open) to 1. A seed takes
-one of the benchmark's fixed initial states; `--list` prints the suites. distance_m is summed over a task's goals; for
+robot's base: metres, extrinsic xyz Euler angles in radians, closedness of the gripper from 0 (open) to 1. A seed below 50 takes
+that one of the benchmark's fixed initial states, another draws one; `--list` prints the suites. distance_m is summed over a task's goals; for
 what has to be opened, closed or turned it is how far the joint has to go (radians where it turns).
 """
 
@@ -50,12 +50,12 @@ class World:
         )
 
     def reset(self, seed):
-        np.random.seed(seed)  # noqa: NPY002 - by which LIBERO moves fixed furniture a little
+        np.random.seed(seed)  # noqa: NPY002 - by which LIBERO places things
         self.env.reset()
-        self.sim, self.robot, self.closing = self.env.sim, self.env.robots[0], -1.0
+        self.sim, self.robot, self.closing, drawn = self.env.sim, self.env.robots[0], -1.0, self.whole.get_sim_state()
         if self.near:
             come_near(self)
-        self.whole.set_init_state(self.states[seed % len(self.states)])
+        self.whole.set_init_state(self.states[seed] if seed < len(self.states) else drawn)
         for _ in range(10):  # things settle
             self.env.step([0.0] * 6 + [self.closing])
         self.script = expert_of(self)

@@ -1,5 +1,6 @@
 """The evidence compares what it says it compares, and its table says what was measured."""
 
+import itertools
 import json
 import sys
 from collections.abc import Iterator
@@ -16,6 +17,7 @@ from paths import ROOT
 from vjepa2_ac.config import ValidationConfig
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.planning.prior.train_prior import PriorOptions, train_prior
+from vjepa2_ac.simulation.closed_loop.worlds import TRIES
 from vjepa2_ac.simulation.recording.record import RecordingSpec
 from vjepa2_ac.simulation.world.domains import DOMAIN_A
 
@@ -89,6 +91,16 @@ def test_each_goal_of_a_randomized_world_lies_in_another_one_and_a_plain_world_h
     assert all(spec.episodes == 1 and spec.world.moving == 3 for spec in drawn)
     assert drawn == list(evidence.measure._rollouts("randomized", 9_000, 3))
     assert [(spec.episodes, spec.seed) for spec in evidence.measure._rollouts("look", 9_000, 3)] == [(3, 9_000)]
+
+
+def test_no_two_seeds_of_a_world_share_a_problem_or_a_demonstration(evidence: Any) -> None:
+    worlds, cells = evidence.other_worlds, evidence.cells
+    used = [range(first, first + 1_000) for first in worlds.FIRST.values()]
+    for seed, choosing in itertools.product(range(3), (True, False)):
+        cell = cells.Cell("Lift", "none", "scratch", 20, seed)
+        first = evidence.measure.goals_seed(cell, choosing=choosing)
+        used.append(range(first, first + TRIES * evidence.measure.GOALS))
+    assert not any(one.start in other or other.start in one for one, other in itertools.combinations(used, 2))
 
 
 def test_every_table_has_who_needs_no_model_and_time_that_other_work_does_not_lengthen(evidence: Any) -> None:

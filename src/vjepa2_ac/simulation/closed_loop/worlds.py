@@ -58,7 +58,7 @@ from vjepa2_ac.storage.structured import record_of
 EXPERT = "expert"
 _ENDS_S = 10.0  # a world that is told to end may take as long
 _LAST_LINES = 5  # of what it wrote about an error
-_TRIES = 2  # so many times the problems are drawn, until the expert has solved enough of them
+TRIES = 2  # so many times the problems are drawn, until the expert has solved enough of them
 _SAYS = "docs/worlds.md has the protocol; examples/worlds programs that follow it"
 
 
@@ -341,7 +341,7 @@ def find_problems(
         raise world.refused(found, needed)
     steps = options.steps or -(-about.steps // stride)
     problems, shown, left_out = list[WorldProblem](), list[EpisodeResult](), list[int]()
-    for seed in range(options.seed, options.seed + _TRIES * options.episodes):
+    for seed in range(options.seed, options.seed + TRIES * options.episodes):
         problem, episode = _demonstrated(world, seed, Span(steps, stride), options)
         if episode.success:
             problems.append(problem)
