@@ -152,8 +152,10 @@ def config_of(cell: Cell, folder: Path) -> Config:
 
 
 def goals_seed(cell: Cell, *, choosing: bool = False) -> int:
-    """Return the seed of a cell's problems. Our own arm draws other ones from each; in worlds of others it is the first
-    of their seeds, of which a cell takes up to twice as many as there are problems."""
+    """Return the seed of a cell's problems.
+
+    Our own arm draws other ones from each; in worlds of others it is the first of twice as many as there are problems.
+    """
     apart = 1 if cell.shift in SHIFTS else 100
     return (VALIDATION_GOALS if choosing else TEST_GOALS) + apart * cell.seed
 
