@@ -5,8 +5,8 @@
 
 docs/worlds.md has the protocol. State and targets: the grip site in the frame of the robot's base: metres, extrinsic
 xyz Euler angles in radians, closedness of the gripper from 0 (open) to 1. A seed below 50 takes that one of the
-benchmark's fixed initial states, another draws one; `--list` prints the suites. distance_m is summed over a task's goals; for
-what has to be opened, closed or turned it is how far the joint has to go (radians where it turns).
+benchmark's fixed initial states, another draws one; `--list` prints the suites. distance_m is summed over a task's
+goals; for what has to be opened, closed or turned it is how far the joint has to go (radians where it turns).
 """
 
 import argparse
