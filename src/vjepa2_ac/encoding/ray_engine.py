@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import threading
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -27,6 +28,7 @@ from vjepa2_ac.reporter import Reporter
 _MOST_AT_ONCE = 16  # requests in a task: the next one is decoded while one is encoded
 _FEWEST_TASKS = 64  # if there are as many requests: the last ones end at about the same time
 _MOST_DEATHS = 10  # of actors one after the other before they have begun: nothing is installed on their nodes
+_LONGEST_END_S = 30.0
 _AGAIN = "The same command goes on with what is missing"
 
 
@@ -57,6 +59,9 @@ def ray_engine(address: str) -> Iterator[RayEngine]:
     except (ray.exceptions.RayError, ray.data.exceptions.ExecutionTimeoutError) as error:
         raise UnreachableError(where=where, found=f"Ray has given up ({error})", fix=_AGAIN) from error
     finally:
+        for thread in threading.enumerate():
+            if thread.name == "iter_threaded":  # of Ray Data: one that asks Ray after its end ends us without an error
+                thread.join(_LONGEST_END_S)
         ray.shutdown()
 
 
