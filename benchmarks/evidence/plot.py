@@ -13,11 +13,9 @@ from results import CHANGES, REACHED_CM, Figures, last, main_cells, pick, share_
 
 def draw(results: Sequence[Figures], path: Path) -> None:
     """Draw reach against error for the main table, the way to the goal, and error by demonstrations."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+    from vjepa2_ac.media.figure import new_figure
 
-    figure = Figure(figsize=(9.2, 8.0), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(9.2, 8.0, layout="constrained")
     places: dict[str, Any] = figure.subplot_mosaic([["bars", "bars"], ["ways", "counts"]])
     _bars(places["bars"], results)
     _ways(places["ways"], results)

@@ -172,11 +172,9 @@ def _spearman(pairs: np.ndarray) -> float:
 
 def draw(cells: Sequence[Figures], path: Path) -> None:
     """Draw error, ranking and closed loop over steps, a line for each seed: narrow above, varied below."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
+    from vjepa2_ac.media.figure import new_figure
 
-    figure = Figure(figsize=(9.2, 5.4), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(9.2, 5.4, layout="constrained")
     panels = figure.subplots(2, 3, sharex=True)
     shown: dict[str, Callable[[Figures], float]] = {
         "error / persistence": lambda one: one["validation"]["rollout_over_persistence_last"],
