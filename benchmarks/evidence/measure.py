@@ -167,7 +167,8 @@ def baselines(cell: Cell, folder: Path, *, goals: int = GOALS) -> dict[str, Any]
     policies += [Oracle(limits)] if cell.shift in SHIFTS else []
     found = {policy.name: closed_loop(cell, policy, folder, seed=seed, goals=goals) for policy in policies}
     if cell.shift not in SHIFTS:
-        found["oracle"] = other_worlds.figures_of(other_worlds.problems(folder, cell.shift, seed, goals)[1], seed)
+        _, shown = other_worlds.problems(folder, cell.shift, seed, goals)
+        found["oracle"] = other_worlds.figures_of(shown, seed, shown)
     return found
 
 

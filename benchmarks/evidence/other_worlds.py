@@ -108,9 +108,9 @@ def problems(folder: Path, task: str, seed: int, goals: int) -> tuple[WorldTrial
 
 def closed_loop(folder: Path, task: str, policy: Policy, *, seed: int, goals: int) -> dict[str, Any]:
     """Return how a policy fares after the change; by `Trials` of the expert's own problems."""
-    trials, _ = problems(folder, task, seed, goals)
+    trials, shown = problems(folder, task, seed, goals)
     with OtherWorld(TASKS[task].command("after")) as world:
-        return figures_of(run_trials(world, policy, trials), seed)
+        return figures_of(run_trials(world, policy, trials), seed, shown)
 
 
 def goals_of(problem: WorldProblem) -> tuple[SubGoal, ...]:
@@ -118,11 +118,16 @@ def goals_of(problem: WorldProblem) -> tuple[SubGoal, ...]:
     return problem.goals
 
 
-def figures_of(result: ClosedLoopResult, seed: int) -> dict[str, Any]:
-    """Return distances (cm) before the first step and after each, and which problems were solved."""
+def figures_of(result: ClosedLoopResult, seed: int, shown: ClosedLoopResult) -> dict[str, Any]:
+    """Return what was solved, how far the things were from where they have to be, and the hand from the expert's (cm).
+
+    Distances of the things are those before the first step and after each; those of the hand are at the end.
+    """
+    ends = [np.stack([episode.states[-1, :3] for episode in each.episodes]) for each in (result, shown)]
     return {
         "goals_seed": seed,
         "distance_cm": np.round(result.distance_cm, 3).tolist(),
+        "hand_cm": np.round(100 * np.linalg.norm(ends[0] - ends[1], axis=1), 3).tolist(),
         "solved": result.successes.tolist(),
         "solved_ever": [episode.success_ever for episode in result.episodes],
         "seconds_per_decision": float(result.seconds.mean()),

@@ -53,6 +53,11 @@ def share_reached(found: Sequence[Figures]) -> Estimate:
     return share_of(sum(flags), len(flags))
 
 
+def arrived(one: Figures) -> list[bool]:
+    """Return in which problems of a world of others the hand ended where the expert's does; none: not measured."""
+    return [distance < REACHED_CM for distance in one["reach"]["l1"].get("hand_cm", ())]
+
+
 def last(one: Figures) -> float:
     """Return the error at the farthest horizon over persistence."""
     return float(one["shifted"]["rollout_over_persistence"][-1])
