@@ -12,7 +12,7 @@ from cells import AXES, BASES, BEST, IN_EVERY_WORLD, IN_SOME_WORLDS, LONGER, MET
 from offline import correlations
 from other_worlds import MANY, TASKS
 from plot import draw
-from results import CHANGES, Figures, last, main_cells, of_policy, pick, reached, read_results, share_reached
+from results import CHANGES, Figures, arrived, last, main_cells, of_policy, pick, reached, read_results, share_reached
 
 from vjepa2_ac.intervals import mean_of, share_of
 
@@ -115,7 +115,7 @@ def summary(results: Sequence[Figures]) -> str:
 
 
 def summary_of_worlds(results: Sequence[Figures]) -> str:
-    """Return the short table of worlds that others made: the share of problems that were solved, and how many seeds."""
+    """Return the short table of worlds that others made: problems that were solved, hands that arrived, seeds."""
     tasks = [task for task in TASKS if pick(results, shift=task, method=BEST)]
     counts = [len(pick(results, shift=task, method=BEST, episodes=EPISODES)) for task in tasks]
     heads = [f"{task} ({count} seed{'s' * (count > 1)})" for task, count in zip(tasks, counts, strict=True)]
@@ -123,8 +123,14 @@ def summary_of_worlds(results: Sequence[Figures]) -> str:
     for method in IN_EVERY_WORLD:
         found = [pick(results, shift=task, method=method) for task in tasks]
         found = [[one for one in cells if one["cell"]["episodes"] in (0, EPISODES)] for cells in found]
-        rows.append(f"| {method} | {' | '.join(map(_share, found))} |")
+        rows.append(f"| {method} | {' | '.join(_share(cells) + _hand(cells) for cells in found)} |")
     return "\n".join(rows)
+
+
+def _hand(found: Sequence[Figures]) -> str:
+    """Return in which share of all problems of some cells the hand arrived."""
+    flags = [flag for one in found for flag in arrived(one)]
+    return f"; hand {np.mean(flags):.0%}" if flags else ""
 
 
 def _share(found: Sequence[Figures]) -> str:
@@ -222,7 +228,7 @@ def of_worlds(results: Sequence[Figures]) -> str:
         found = [pick(results, shift=task, method=method) for task in tasks]
         found = [[one for one in cells if one["cell"]["episodes"] in (0, EPISODES)] for cells in found]
         rows += [f"| {method} | {' | '.join(map(_done, found))} |"] if any(found) else []
-    title = "### Worlds that others made: solved at the end; error 0.8 s ahead"
+    title = "### Worlds that others made: solved at the end; hand within 5 cm of the expert's; error 0.8 s ahead"
     return f"{title}\n\n" + "\n".join([*rows, "", *_few_and_many(results)])
 
 
@@ -237,11 +243,11 @@ def _few_and_many(results: Sequence[Figures]) -> list[str]:
 
 
 def _done(found: Sequence[Figures]) -> str:
-    """Return the share of all problems that were solved, with its interval, and the error at the farthest horizon."""
+    """Return problems that were solved, with their interval, hands that arrived, and the error 0.8 s ahead."""
     if not found:
         return ""
     error = [last(one) for one in found if "shifted" in one]
-    return _share(found) + (f"; {np.mean(error):.3f}" if error else "")
+    return _share(found) + _hand(found) + (f"; {np.mean(error):.3f}" if error else "")
 
 
 def trust(results: Sequence[Figures]) -> str:

@@ -11,6 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from paths import ROOT
@@ -101,6 +102,28 @@ def test_no_two_seeds_of_a_world_share_a_problem_or_a_demonstration(evidence: An
         first = evidence.measure.goals_seed(cell, choosing=choosing)
         used.append(range(first, first + TRIES * evidence.measure.GOALS))
     assert not any(one.start in other or other.start in one for one, other in itertools.combinations(used, 2))
+
+
+def test_in_a_world_of_others_a_hand_arrives_that_ends_where_the_expert_s_does(evidence: Any) -> None:
+    def ended(*ends: tuple[float, float, float]) -> Any:
+        episodes = [
+            SimpleNamespace(states=np.array([[9.0] * 7, [*end, 0, 0, 0, 1]]), success_ever=True) for end in ends
+        ]
+        distance, seconds = np.array([[4.0, 0.0]] * len(ends)), np.ones(2)
+        return SimpleNamespace(
+            episodes=episodes,
+            distance_cm=distance,
+            successes=np.array([True] * len(ends)),
+            seconds=seconds,
+            why_counts={},
+        )
+
+    expert = ended((0.3, 0.0, 0.2), (0.4, 0.1, 0.2))
+    found = evidence.other_worlds.figures_of(ended((0.3, 0.0, 0.24), (0.4, 0.1, 0.26)), 0, expert)
+    assert found["hand_cm"] == pytest.approx([4.0, 6.0])
+    one = {"cell": {"shift": "Lift", "method": evidence.cells.BEST, "episodes": 20, "seed": 0}, "reach": {"l1": found}}
+    assert evidence.results.arrived(one) == [True, False]
+    assert "100% [34, 100]; hand 50%" in evidence.table.summary_of_worlds([one])
 
 
 def test_every_table_has_who_needs_no_model_and_time_that_other_work_does_not_lengthen(evidence: Any) -> None:
