@@ -208,13 +208,13 @@ def all_cells(seeds: int = 3) -> Iterator[Cell]:
 def world_cells(seeds: int) -> Iterator[Cell]:
     """Yield the cells of worlds that others made."""
     for seed in range(seeds):
-        for task in TASKS:
-            yield from _of(task, IN_EVERY_WORLD, 20, seed)
-    for seed in range(seeds):
-        for task in MANY:
-            yield from _of(task, IN_SOME_WORLDS, 20, seed)
-            for episodes in (5, 80):
-                yield from _of(task, IN_EVERY_WORLD[1:], episodes, seed)
+        for task, about in TASKS.items():
+            if seed < about.seeds:
+                yield from _of(task, IN_EVERY_WORLD, 20, seed)
+    for task in MANY:
+        yield from _of(task, IN_SOME_WORLDS, 20, 0)
+        for episodes in (5, 80):
+            yield from _of(task, IN_EVERY_WORLD[1:], episodes, 0)
 
 
 IN_EVERY_WORLD = ("zero-shot", BEST, "full", "scratch, 3x steps", "behaviour cloning")

@@ -20,7 +20,17 @@ FEWEST = 20  # cells from which a correlation is told
 EPISODES = 20  # demonstrations of a cell of the main tables
 SHORT = ("zero-shot", AXES, BEST, LONGER, "full", "scratch", "scratch, 3x steps")  # of the short table
 TABLE, PLOT = "evidence.md", "evidence.png"
-MARKS = {"": "made by `make evidence`", "worlds": "worlds, made by `make evidence`"}  # of the short tables in a page
+MARKS = {  # of the short tables in a page
+    "": "made by `make evidence`",
+    "trust": "which figure, made by `make evidence`",
+    "worlds": "worlds, made by `make evidence`",
+}
+TOLD = {  # offline figures in the short table
+    "energy and distance over visited plans, negative": "energy and true distance over visited plans",
+    "cost of wrong actions, negative": "**cost of wrong actions** (growth with shuffled ones)",
+    "moves that look better": "moves that look better",
+    "error over persistence, 3 steps": "error over persistence, 0.8 s ahead",
+}
 
 NOTES = """Read it so:
 
@@ -82,7 +92,8 @@ def write_summary(results: Sequence[Figures], page: Path) -> None:
     Raises:
         ValueError: The marks are not there.
     """
-    for part, text in (("", summary(results)), ("worlds", summary_of_worlds(results))):
+    texts = {"": summary(results), "trust": summary_of_trust(results), "worlds": summary_of_worlds(results)}
+    for part, text in texts.items():
         before, begin, end, after = place_in(page, part)
         page.write_text(f"{before}{begin}\n{text}\n{end}{after}")
 
@@ -250,21 +261,46 @@ def _done(found: Sequence[Figures]) -> str:
     return _share(found) + _hand(found) + (f"; {np.mean(error):.3f}" if error else "")
 
 
+def summary_of_trust(results: Sequence[Figures]) -> str:
+    """Return the short table of offline figures: over all cells of our own arm, and where all is anew."""
+    told = {label: found for label, found in _correlations(results).items() if label in {"all", "randomized"}}
+    heads = [f"{CHANGES.get(label, 'all changes')}, {count} cells" for label, (count, _) in told.items()]
+    rows = [
+        f"| {words} | {' | '.join(_interval(found[name]) for _, found in told.values())} |"
+        for name, words in TOLD.items()
+        if told
+    ]
+    return "\n".join([f"| | {' | '.join(heads)} |", "|---|" + "---|" * len(told), *rows])
+
+
 def trust(results: Sequence[Figures]) -> str:
     """Return which offline figure goes with closed-loop success, over the cells of our own arm."""
-    cells = [one for one in results if "offline" in one and "visited" in one["reach"]["l1"]]
-    if len(cells) < FEWEST:
-        return ""
-    groups = {"all": cells, **{shift: [one for one in cells if one["cell"]["shift"] == shift] for shift in SHIFTS}}
-    lines = []
-    for label, some in groups.items():
-        if len(some) >= FEWEST:
-            found = correlations([_offline_row(one) for one in some], [-float(np.mean(reached(one))) for one in some])
-            for name, one in sorted(found.items(), key=lambda pair: -pair[1]["value"]):
-                value = f"{one['value']:.2f} [{one['low']:.2f}, {one['high']:.2f}]"
-                lines.append(f"| {label}, {len(some)} cells | {name} | {value} |")
+    lines = [
+        f"| {label}, {count} cells | {name} | {_interval(one)} |"
+        for label, (count, found) in _correlations(results).items()
+        for name, one in sorted(found.items(), key=lambda pair: -pair[1]["value"])
+    ]
     head = "| cells | offline figure, lower is better | Spearman with goals missed |\n|---|---|---|"
-    return "### Which offline figure predicts closed-loop success?\n\n" + "\n".join([head, *lines])
+    title = "### Which offline figure predicts closed-loop success?"
+    return f"{title}\n\n" + "\n".join([head, *lines]) if lines else ""
+
+
+def _correlations(results: Sequence[Figures]) -> dict[str, tuple[int, dict[str, dict[str, float]]]]:
+    """Return how many cells there are, of all changes and of each that has enough of them, and what was found."""
+    cells = [one for one in results if "offline" in one and "visited" in one["reach"]["l1"]]
+    groups = {"all": cells, **{shift: [one for one in cells if one["cell"]["shift"] == shift] for shift in SHIFTS}}
+    return {
+        label: (
+            len(some),
+            correlations([_offline_row(one) for one in some], [-float(np.mean(reached(one))) for one in some]),
+        )
+        for label, some in groups.items()
+        if len(some) >= FEWEST
+    }
+
+
+def _interval(one: dict[str, float]) -> str:
+    return f"{one['value']:.2f} [{one['low']:.2f}, {one['high']:.2f}]"
 
 
 def _offline_row(one: Figures) -> dict[str, float]:
