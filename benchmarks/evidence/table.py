@@ -87,13 +87,15 @@ def write_tables(folder: Path, out: Path, page: Path | None = None, done: Path |
 
 
 def write_summary(results: Sequence[Figures], page: Path) -> None:
-    """Put the short table between the marks in a page, which stays as it is otherwise.
+    """Put the short tables between their marks in a page, which stays as it is otherwise; also where none is done yet.
 
     Raises:
         ValueError: The marks are not there.
     """
     texts = {"": summary(results), "trust": summary_of_trust(results), "worlds": summary_of_worlds(results)}
     for part, text in texts.items():
+        if not text:
+            continue
         before, begin, end, after = place_in(page, part)
         page.write_text(f"{before}{begin}\n{text}\n{end}{after}")
 
@@ -128,6 +130,8 @@ def summary(results: Sequence[Figures]) -> str:
 def summary_of_worlds(results: Sequence[Figures]) -> str:
     """Return the short table of worlds that others made: problems that were solved, hands that arrived, seeds."""
     tasks = [task for task in TASKS if pick(results, shift=task, method=BEST)]
+    if not tasks:
+        return ""
     counts = [len(pick(results, shift=task, method=BEST, episodes=EPISODES)) for task in tasks]
     heads = [f"{task} ({count} seed{'s' * (count > 1)})" for task, count in zip(tasks, counts, strict=True)]
     rows = [f"| {EPISODES} demonstrations | {' | '.join(heads)} |", "|---|" + "---|" * len(tasks)]
@@ -265,10 +269,11 @@ def summary_of_trust(results: Sequence[Figures]) -> str:
     """Return the short table of offline figures: over all cells of our own arm, and where all is anew."""
     told = {label: found for label, found in _correlations(results).items() if label in {"all", "randomized"}}
     heads = [f"{CHANGES.get(label, 'all changes')}, {count} cells" for label, (count, _) in told.items()]
+    if not told:
+        return ""
     rows = [
         f"| {words} | {' | '.join(_interval(found[name]) for _, found in told.values())} |"
         for name, words in TOLD.items()
-        if told
     ]
     return "\n".join([f"| | {' | '.join(heads)} |", "|---|" + "---|" * len(told), *rows])
 
