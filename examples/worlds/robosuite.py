@@ -41,7 +41,7 @@ class World:
         controller = load_composite_controller_config(controller="BASIC", robot=options.robot)
         self.env = robosuite.make(
             options.task, robots=options.robot, gripper_types="PandaGripper", controller_configs=controller, **more,
-            control_freq=RATE_HZ, ignore_done=True, has_renderer=False, use_camera_obs=False, hard_reset=False,
+            control_freq=RATE_HZ, ignore_done=True, has_renderer=False, use_camera_obs=False, hard_reset=False, seed=0,
         )  # fmt: skip
         self.data, self.robot, model = self.env.sim.data, self.env.robots[0], self.env.sim.model
         camera, base = model.camera_name2id("agentview"), model.body_name2id("robot0_base")
