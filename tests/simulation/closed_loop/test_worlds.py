@@ -165,10 +165,15 @@ def test_a_real_world_is_driven_by_its_expert(name: str, tmp_path: Path) -> None
     if not python.exists():
         pytest.skip(f"no environment of {name} (docs/worlds.md): make worlds/{name}")
     task = {"robosuite": ["Lift"], "libero": ["libero_object", "--near"], "metaworld": ["reach-v3"]}[name]
-    with OtherWorld(shlex.join([str(python), str(ROOT / "examples" / "worlds" / f"{name}.py"), *task])) as world:
+    words = shlex.join([str(python), str(ROOT / "examples" / "worlds" / f"{name}.py"), *task])
+    with OtherWorld(words) as world:
+        elsewhere = world.reset(3)
+    with OtherWorld(words) as world:
         first, second = world.reset(3), world.reset(3)
-        np.testing.assert_array_equal(first.image, second.image)
-        np.testing.assert_array_equal(first.state, second.state)
+        for other in (second, elsewhere):
+            np.testing.assert_array_equal(first.image, other.image)
+            np.testing.assert_array_equal(first.state, other.state)
+            assert first.distance_m == other.distance_m
         assert first.image.shape == (256, 256, 3)
         assert first.image.std() > 10
         assert record_world(world, tmp_path, range(1)) == (1, 1)
