@@ -43,6 +43,8 @@ BEST = "LoRA r32 + in/out"
 """The LoRA that takes part in every comparison; not chosen by test goals (`--choose`)."""
 LONGER = f"{BEST}, 3x steps"
 """Of the turned robot alone, where the usual steps leave most to be done."""
+FROM_PRIOR = f"{BEST}, from a prior"
+"""What both know, the model and who imitates; in worlds of others alone."""
 ROLLOUTS = {f"{BEST}, rollout of {steps}": steps for steps in (1, 3)}
 """How many steps the loss rolls out, instead of 2: on the base of many cameras alone."""
 
@@ -81,6 +83,7 @@ class Method:
     times: int = 1  # so many times the steps
     layer: int | None = None  # the block of the encoder after which features are taken; None: the last
     rollout: int = 2  # steps of the loss
+    prior: bool = False  # whether its search starts from an action prior of the same demonstrations
     learning_rate: float = 1e-3
 
     @property
@@ -122,6 +125,7 @@ METHODS = {
             for rank in (4, 8, 16, 32)
         ),
         Method(LONGER, "LoRA", 32, in_out=True, times=3, learning_rate=3e-3),
+        Method(FROM_PRIOR, "LoRA", 32, in_out=True, prior=True, learning_rate=3e-3),
         *(Method(name, "LoRA", 32, in_out=True, rollout=steps, learning_rate=3e-3) for name, steps in ROLLOUTS.items()),
         Method("in/out only", "LoRA", 1, in_out=True, blocks=False, learning_rate=5e-3),
         Method("DoRA r16", "LoRA", 16, dora=True, learning_rate=5e-3),
@@ -187,7 +191,7 @@ class Cell:
 def all_cells(seeds: int = 3) -> Iterator[Cell]:
     """Yield every cell, those that matter most first."""
     main = ("zero-shot", AXES, BEST, "full", "scratch")
-    elsewhere = {LONGER, *ROLLOUTS, *main}
+    elsewhere = {LONGER, FROM_PRIOR, *ROLLOUTS, *main}
     others = tuple(name for name, method in METHODS.items() if method.kind != "cloned" and name not in elsewhere)
     for seed in range(seeds):
         yield from _of("look", main, 20, seed)
@@ -211,6 +215,8 @@ def world_cells(seeds: int) -> Iterator[Cell]:
         for task, about in TASKS.items():
             if seed < about.seeds:
                 yield from _of(task, IN_EVERY_WORLD, 20, seed)
+            if seed < about.seeds > 1:
+                yield Cell(task, "one camera", FROM_PRIOR, 20, seed)
     for task in MANY:
         yield from _of(task, IN_SOME_WORLDS, 20, 0)
         for episodes in (5, 80):

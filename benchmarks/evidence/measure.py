@@ -94,10 +94,14 @@ def measure(cell: Cell, folder: Path, *, goals: int = GOALS, choosing: bool = Fa
         figures["forgetting"] = _forgetting(model, data_before(folder, cell.shift), config)
     if model.adaptation is not None:
         merge_adapter(model)
+    acts = PLANNING
+    if method_of(cell.method).prior:
+        train_prior(config, place := folder / "priors" / cell.name)
+        acts = acts.model_copy(update={"prior": str(place)})
     seed = goals_seed(cell, choosing=choosing)
     settings: dict[str, Any] = {"axes": file} if cell.shift in SHIFTS else {"goals_of": other_worlds.goals_of}
     figures["reach"] = {
-        distance: closed_loop(cell, planner(model, distance, **settings), folder, seed=seed, goals=goals)
+        distance: closed_loop(cell, planner(model, distance, acts, **settings), folder, seed=seed, goals=goals)
         for distance in energies_of(cell)
     }
     return figures
@@ -110,7 +114,7 @@ def _cloned(cell: Cell, config: Config, folder: Path, goals: int, *, choosing: b
     minutes, seed = (time.process_time() - began) / 60, goals_seed(cell, choosing=choosing)
     acts = PLANNING.model_copy(update={"planner": "prior", "prior": str(place)})
     model = load_base(config.model, seed=cell.seed)
-    policy = planner(model, "l1", config=acts, goals_of=None if cell.shift in SHIFTS else other_worlds.goals_of)
+    policy = planner(model, "l1", acts, goals_of=None if cell.shift in SHIFTS else other_worlds.goals_of)
     reached = closed_loop(cell, policy, folder, seed=seed, goals=goals)
     trained = {"trained_share": 1.0, "adapter_mb": 0.0, "cpu_minutes": minutes, "minutes": minutes, "held_out": found}
     return {"cell": asdict(cell) | {"name": cell.name}, **trained, "reach": {"l1": reached}}
@@ -175,7 +179,7 @@ def baselines(cell: Cell, folder: Path, *, goals: int = GOALS) -> dict[str, Any]
 def planner(
     model: WorldModel,
     distance: str,
-    config: PlanningConfig = PLANNING,
+    config: PlanningConfig,
     axes: str | None = None,
     goals_of: GoalsOf | None = None,
 ) -> Policy:

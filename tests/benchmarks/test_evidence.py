@@ -47,14 +47,17 @@ def test_cells_have_names_of_their_own_and_hold_all_that_is_to_be_compared(evide
         }
         methods = evidence.cells.METHODS.items()
         of_arm = {name for name, method in methods if method.kind not in {"scratch", "cloned"}}
-        elsewhere = {evidence.cells.LONGER} | (set(evidence.cells.ROLLOUTS) if base == "one camera" else set())
+        elsewhere = {evidence.cells.LONGER, evidence.cells.FROM_PRIOR} | (
+            set(evidence.cells.ROLLOUTS) if base == "one camera" else set()
+        )
         assert main == of_arm - elsewhere
     of_best = [cell for cell in cells if cell.method == evidence.cells.BEST]
     assert {cell.episodes for cell in of_best if cell.shift == "look"} == {10, 20, 40}
     assert {cell.episodes for cell in of_best if cell.shift == "Lift"} == {5, 20, 80}
     everywhere = set(evidence.cells.IN_EVERY_WORLD)
     assert {cell.method for cell in cells if cell.shift == "LIBERO-swap"} == everywhere
-    assert {cell.method for cell in cells if cell.shift == "Lift"} == everywhere | set(evidence.cells.IN_SOME_WORLDS)
+    in_lift = everywhere | {evidence.cells.FROM_PRIOR} | set(evidence.cells.IN_SOME_WORLDS)
+    assert {cell.method for cell in cells if cell.shift == "Lift"} == in_lift
     assert everywhere <= set(evidence.cells.METHODS) >= set(evidence.cells.IN_SOME_WORLDS)
     for shift, seeds in (("look", {0, 1, 2}), ("Lift", {0, 1, 2}), ("Door", {0})):
         assert {cell.seed for cell in cells if (cell.shift, cell.method) == (shift, "full")} == seeds
@@ -158,7 +161,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
         short = partial(ValidationConfig, ranking_samples=2)
         patch.setattr(measure, "ValidationConfig", lambda clips, **given: short(clips=clips // 10, **given))
         few = cells.PLANNING.model_copy(update={"samples": 12, "iterations": 1})
-        patch.setattr(measure, "planner", partial(measure.planner, config=few))
+        patch.setattr(measure, "PLANNING", few)
         patch.setattr(measure, "CLIPS", 6)
         for name, value in (("MOVES", 2), ("PLANS", 1), ("FEWER", {"samples": 12, "iterations": 1})):
             patch.setattr(modules.offline, name, value)
@@ -253,6 +256,16 @@ def test_a_policy_that_imitates_is_trained_and_acts_without_a_search(small: Any,
     assert len(figures["reach"]["l1"]["distance_cm"][0]) == 9
     assert small.results.reached(figures) in ([True], [False])
     assert figures["reach"]["l1"]["whys"] == {"planned": 8}
+
+
+def test_a_search_can_start_from_a_policy_that_imitates(small: Any, monkeypatch: Any) -> None:
+    few = PriorOptions(steps=2)
+    monkeypatch.setattr(small.measure, "train_prior", partial(train_prior, options=few))
+    cell = small.cells.Cell("look", "many cameras", small.cells.FROM_PRIOR, 4, 0)
+    alone = small.measure.measure(replace(cell, method=small.cells.BEST), small.folder, goals=1)
+    figures = small.measure.measure(cell, small.folder, goals=1)
+    assert figures["shifted"] == alone["shifted"], "the same model"
+    assert figures["reach"]["l1"]["distance_cm"] != alone["reach"]["l1"]["distance_cm"]
 
 
 def test_exactly_so_many_demonstrations_are_trained_on_and_seeds_draw_others(small: Any) -> None:
