@@ -128,7 +128,7 @@ def summary(results: Sequence[Figures]) -> str:
 
 
 def summary_of_worlds(results: Sequence[Figures]) -> str:
-    """Return the short table of worlds that others made: problems that were solved, hands that arrived, seeds."""
+    """Return the short table of worlds that others made: the share of problems that were solved, and how many seeds."""
     tasks = [task for task in TASKS if pick(results, shift=task, method=BEST)]
     if not tasks:
         return ""
@@ -138,7 +138,7 @@ def summary_of_worlds(results: Sequence[Figures]) -> str:
     for method in (*IN_EVERY_WORLD, FROM_PRIOR):
         found = [pick(results, shift=task, method=method) for task in tasks]
         found = [[one for one in cells if one["cell"]["episodes"] in (0, EPISODES)] for cells in found]
-        rows.append(f"| {method} | {' | '.join(_share(cells) + _hand(cells) for cells in found)} |")
+        rows.append(f"| {method} | {' | '.join(map(_share, found))} |")
     return "\n".join(rows)
 
 

@@ -127,7 +127,7 @@ def test_in_a_world_of_others_a_hand_arrives_that_ends_where_the_expert_s_does(e
     assert found["hand_cm"] == pytest.approx([4.0, 6.0])
     one = {"cell": {"shift": "Lift", "method": evidence.cells.BEST, "episodes": 20, "seed": 0}, "reach": {"l1": found}}
     assert evidence.results.arrived(one) == [True, False]
-    assert "100% [34, 100]; hand 50%" in evidence.table.summary_of_worlds([one])
+    assert "100% [34, 100]; hand 50%" in evidence.table.of_worlds([one])
 
 
 def test_every_table_has_who_needs_no_model_and_time_that_other_work_does_not_lengthen(evidence: Any) -> None:
