@@ -4,7 +4,7 @@ import itertools
 import json
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -125,7 +125,8 @@ def test_in_a_world_of_others_a_hand_arrives_that_ends_where_the_expert_s_does(e
     expert = ended((0.3, 0.0, 0.2), (0.4, 0.1, 0.2))
     found = evidence.other_worlds.figures_of(ended((0.3, 0.0, 0.24), (0.4, 0.1, 0.26)), 0, expert)
     assert found["hand_cm"] == pytest.approx([4.0, 6.0])
-    one = {"cell": {"shift": "Lift", "method": evidence.cells.BEST, "episodes": 20, "seed": 0}, "reach": {"l1": found}}
+    cell = evidence.cells.Cell("Lift", "one camera", evidence.cells.BEST, 20, 0)
+    one = {"cell": asdict(cell), "reach": {"l1": found}}
     assert evidence.results.arrived(one) == [True, False]
     assert "100% [34, 100]; hand 50%" in evidence.table.of_worlds([one])
 
