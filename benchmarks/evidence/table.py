@@ -20,6 +20,7 @@ FEWEST = 20  # cells from which a correlation is told
 EPISODES = 20  # demonstrations of a cell of the main tables
 SHORT = ("zero-shot", AXES, BEST, LONGER, "full", "scratch", "scratch, 3x steps")  # of the short table
 TABLE, PLOT = "evidence.md", "evidence.png"
+Correlated = dict[str, tuple[int, dict[str, dict[str, float]]]]  # by change: number of cells, and by figure an interval
 MARKS = {  # of the short tables in a page
     "": "made by `make evidence`",
     "trust": "which figure, made by `make evidence`",
@@ -62,6 +63,7 @@ def write_tables(folder: Path, out: Path, page: Path | None = None, done: Path |
         print(f"nothing to show: no cell is done in {folder / 'results'}")
         return
     out.mkdir(parents=True, exist_ok=True)
+    correlated = correlated_figures(results)
     text = "\n\n".join(
         part
         for part in (
@@ -72,7 +74,7 @@ def write_tables(folder: Path, out: Path, page: Path | None = None, done: Path |
             _by_episodes(results),
             _lora(results),
             of_worlds(results),
-            trust(results),
+            trust(correlated),
         )
         if part
     )
@@ -82,17 +84,17 @@ def write_tables(folder: Path, out: Path, page: Path | None = None, done: Path |
     print(text)
     draw(results, out / PLOT)
     if page is not None:
-        write_summary(results, page)
+        write_summary(results, correlated, page)
     print(f"\n{out / TABLE}\n{out / PLOT}")
 
 
-def write_summary(results: Sequence[Figures], page: Path) -> None:
+def write_summary(results: Sequence[Figures], correlated: Correlated, page: Path) -> None:
     """Put the short tables between their marks in a page, which stays as it is otherwise; also where none is done yet.
 
     Raises:
         ValueError: The marks are not there.
     """
-    texts = {"": summary(results), "trust": summary_of_trust(results), "worlds": summary_of_worlds(results)}
+    texts = {"": summary(results), "trust": summary_of_trust(correlated), "worlds": summary_of_worlds(results)}
     for part, text in texts.items():
         if not text:
             continue
@@ -265,9 +267,9 @@ def _done(found: Sequence[Figures]) -> str:
     return _share(found) + _hand(found) + (f"; {np.mean(error):.3f}" if error else "")
 
 
-def summary_of_trust(results: Sequence[Figures]) -> str:
+def summary_of_trust(correlated: Correlated) -> str:
     """Return the short table of offline figures: over all cells of our own arm, and where all is anew."""
-    told = {label: found for label, found in _correlations(results).items() if label in {"all", "randomized"}}
+    told = {label: found for label, found in correlated.items() if label in {"all", "randomized"}}
     heads = [f"{CHANGES.get(label, 'all changes')}, {count} cells" for label, (count, _) in told.items()]
     if not told:
         return ""
@@ -278,11 +280,11 @@ def summary_of_trust(results: Sequence[Figures]) -> str:
     return "\n".join([f"| | {' | '.join(heads)} |", "|---|" + "---|" * len(told), *rows])
 
 
-def trust(results: Sequence[Figures]) -> str:
+def trust(correlated: Correlated) -> str:
     """Return which offline figure goes with closed-loop success, over the cells of our own arm."""
     lines = [
         f"| {label}, {count} cells | {name} | {_interval(one)} |"
-        for label, (count, found) in _correlations(results).items()
+        for label, (count, found) in correlated.items()
         for name, one in sorted(found.items(), key=lambda pair: -pair[1]["value"])
     ]
     head = "| cells | offline figure, lower is better | Spearman with goals missed |\n|---|---|---|"
@@ -290,7 +292,7 @@ def trust(results: Sequence[Figures]) -> str:
     return f"{title}\n\n" + "\n".join([head, *lines]) if lines else ""
 
 
-def _correlations(results: Sequence[Figures]) -> dict[str, tuple[int, dict[str, dict[str, float]]]]:
+def correlated_figures(results: Sequence[Figures]) -> Correlated:
     """Return how many cells there are, of all changes and of each that has enough of them, and what was found."""
     cells = [one for one in results if "offline" in one and "visited" in one["reach"]["l1"]]
     groups = {"all": cells, **{shift: [one for one in cells if one["cell"]["shift"] == shift] for shift in SHIFTS}}

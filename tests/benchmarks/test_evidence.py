@@ -129,6 +129,7 @@ def test_in_a_world_of_others_a_hand_arrives_that_ends_where_the_expert_s_does(e
     one = {"cell": asdict(cell), "reach": {"l1": found}}
     assert evidence.results.arrived(one) == [True, False]
     assert "100% [34, 100]; hand 50%" in evidence.table.of_worlds([one])
+    assert "20 demonstrations" in evidence.table.summary_of_worlds([one])
 
 
 def test_every_table_has_who_needs_no_model_and_time_that_other_work_does_not_lengthen(evidence: Any) -> None:
@@ -284,7 +285,7 @@ def test_a_page_without_a_place_for_the_table_is_left_alone(small: Any, tmp_path
     page = tmp_path / "evidence.md"
     page.write_text("nothing")
     with pytest.raises(ValueError, match="made by"):
-        small.table.write_summary([], page)
+        small.table.write_summary([], {}, page)
     assert page.read_text() == "nothing"
 
 
