@@ -56,7 +56,7 @@ def _parse() -> argparse.Namespace:
     parser.add_argument("--folder", type=Path, default=Path("evidence"), help="data, bases, runs, results")
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results"), help="where table and plot go")
     parser.add_argument("--page", type=Path, help="a page whose short table is to be made anew")
-    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--seeds", type=int, default=5, help="at most; docs/evidence.md has those of each change")
     parser.add_argument("--goals", type=int, default=20, help="of each run; a row pools its seeds")
     parser.add_argument("--workers", type=int, default=2, help="cells at once, one thread each")
     parser.add_argument("--only", help="cells whose name has this in it")

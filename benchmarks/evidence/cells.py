@@ -33,6 +33,9 @@ TURNS: dict[str, float] = {
 }
 """By how many degrees what the robot does seems turned, to a base of domain A."""
 
+SEEDS, MORE_SEEDS = 3, 5
+"""Of our own arm: more where all is anew, since intervals of three overlap there that matter."""
+
 BASES: tuple[Base, ...] = ("one camera", "many cameras")
 """one camera: trained on domain A alone. many cameras: on 800 worlds, each seen by another camera (the demo's base)."""
 
@@ -43,6 +46,8 @@ BEST = "LoRA r32 + in/out"
 """The LoRA that takes part in every comparison; not chosen by test goals (`--choose`)."""
 LONGER = f"{BEST}, 3x steps"
 """Of the turned robot alone, where the usual steps leave most to be done."""
+BEFORE = "zero-shot, before the change"
+"""The base in the scene that it was trained on, in worlds of others alone: what is there to lose?"""
 FROM_PRIOR = f"{BEST}, from a prior"
 """What both know, the model and who imitates; in worlds of others alone."""
 ROLLOUTS = {f"{BEST}, rollout of {steps}": steps for steps in (1, 3)}
@@ -118,6 +123,7 @@ METHODS = {
     method.name: method
     for method in (
         Method("zero-shot", "zero-shot"),
+        Method(BEFORE, "zero-shot"),
         Method(AXES, "calibrated"),
         *(
             Method(f"LoRA r{rank}{' + in/out' * both}", "LoRA", rank, both, learning_rate=3e-3 if rank > 16 else 5e-3)
@@ -188,10 +194,11 @@ class Cell:
         return words
 
 
-def all_cells(seeds: int = 3) -> Iterator[Cell]:
-    """Yield every cell, those that matter most first."""
+def all_cells(at_most: int) -> Iterator[Cell]:
+    """Yield every cell, those that matter most first; of each change so many seeds, and no more than `at_most`."""
+    seeds = min(at_most, SEEDS)
     main = ("zero-shot", AXES, BEST, "full", "scratch")
-    elsewhere = {LONGER, FROM_PRIOR, *ROLLOUTS, *main}
+    elsewhere = {BEFORE, LONGER, FROM_PRIOR, *ROLLOUTS, *main}
     others = tuple(name for name, method in METHODS.items() if method.kind != "cloned" and name not in elsewhere)
     for seed in range(seeds):
         yield from _of("look", main, 20, seed)
@@ -199,20 +206,23 @@ def all_cells(seeds: int = 3) -> Iterator[Cell]:
         yield from _of("look", others, 20, seed)
     for seed in range(seeds):
         yield from _of("motion", (*main, LONGER, "scratch, 3x steps"), 20, seed)
-    for seed in range(seeds):
+    for seed in range(min(at_most, MORE_SEEDS)):
         yield from _of("randomized", ("zero-shot", BEST, "full", "scratch", "scratch, 3x steps"), 20, seed)
     for seed in range(seeds):
         yield from (Cell("look", "many cameras", name, 20, seed) for name in ROLLOUTS)
+        yield from (Cell("randomized", "many cameras", name, 20, seed) for name in WHERE_ALL_VARIES)
     for seed in range(seeds):
         for episodes in (10, 40):
             yield from _of("look", (BEST, "full", "scratch"), episodes, seed)
-    yield from world_cells(seeds)
+    yield from world_cells(at_most)
 
 
-def world_cells(seeds: int) -> Iterator[Cell]:
+def world_cells(at_most: int) -> Iterator[Cell]:
     """Yield the cells of worlds that others made."""
-    for seed in range(seeds):
+    for seed in range(at_most):
         for task, about in TASKS.items():
+            if seed == 0 and about.origin is None:
+                yield Cell(task, "one camera", BEFORE, 0, seed)
             if seed < about.seeds:
                 yield from _of(task, IN_EVERY_WORLD, 20, seed)
             if seed < about.seeds > 1:
@@ -225,6 +235,7 @@ def world_cells(seeds: int) -> Iterator[Cell]:
 
 IN_EVERY_WORLD = ("zero-shot", BEST, "full", "scratch, 3x steps", "behaviour cloning")
 IN_SOME_WORLDS = ("in/out only", "LoRA r4", "LoRA r16", "DoRA r16", "scratch")
+WHERE_ALL_VARIES = ("in/out only", "LoRA r4 + in/out", "LoRA r16", "DoRA r16")
 
 
 def candidate_cells() -> Iterator[Cell]:
@@ -244,7 +255,7 @@ def _of(shift: str, methods: tuple[str, ...], episodes: int, seed: int) -> Itera
         if METHODS[name].kind in {"scratch", "cloned"}:
             bases = ("none",)
         for base in bases:
-            yield Cell(shift, base, name, 0 if name == "zero-shot" else episodes, seed)
+            yield Cell(shift, base, name, 0 if METHODS[name].kind == "zero-shot" else episodes, seed)
 
 
 def energies_of(cell: Cell) -> tuple[Literal["l1", "l2"], ...]:

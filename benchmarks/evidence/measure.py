@@ -14,7 +14,7 @@ from typing import Any, get_args
 import numpy as np
 import other_worlds
 import torch
-from cells import PLANNING, SHIFTS, Cell, energies_of, method_of
+from cells import BEFORE, PLANNING, SHIFTS, Cell, energies_of, method_of
 from offline import offline_figures, visited_correlation
 from prepare import base_model, data_before, data_shifted, encoded, training_episodes
 
@@ -124,7 +124,7 @@ def measure_alone(cell: Cell, folder: Path, goals: int, choosing: bool) -> dict[
     """Measure a cell in a process of its own, on one thread; beside a zero-shot base, those who need no model, too."""
     torch.set_num_threads(1)
     figures = measure(cell, folder, goals=goals, choosing=choosing) | {"made_with": made_with()}
-    if method_of(cell.method).kind == "zero-shot":
+    if cell.method == "zero-shot":
         figures["baselines"] = baselines(cell, folder, goals=goals)
     return figures
 
@@ -141,7 +141,7 @@ def made_with() -> dict[str, str]:
 def config_of(cell: Cell, folder: Path) -> Config:
     """Return the run of a cell: the config that anybody would write."""
     method = method_of(cell.method, cell.shift)
-    data = data_shifted(folder, cell.shift)
+    data = (data_before if cell.method == BEFORE else data_shifted)(folder, cell.shift)
     left_out = training_episodes(data, cell.episodes, cell.seed) if cell.episodes else ()
     return Config(
         run_dir=str(folder / "runs" / cell.name),
@@ -209,7 +209,8 @@ class Watched(Planning):
 def closed_loop(cell: Cell, policy: Policy, folder: Path, *, seed: int, goals: int) -> dict[str, Any]:
     """Return distances to the goal (cm) before the first step and after each, and seconds of a decision."""
     if cell.shift not in SHIFTS:
-        return other_worlds.closed_loop(folder, cell.shift, policy, seed=seed, goals=goals)
+        when = "before" if cell.method == BEFORE else "after"
+        return other_worlds.closed_loop(folder, cell.shift, policy, seed=seed, goals=goals, when=when)
     results = [run_task(spec, policy) for spec in _rollouts(cell.shift, seed, goals)]
     agreements = policy.agreements if isinstance(policy, Watched) else []
     return {

@@ -60,7 +60,7 @@ class Task:
 
 
 TASKS = {
-    "Lift": Task("robosuite", ("Lift",), ("Lift", *CHANGED), seeds=3),
+    "Lift": Task("robosuite", ("Lift",), ("Lift", *CHANGED), seeds=5),
     **{name: Task("robosuite", (name,), (name, *CHANGED)) for name in ("Door", "Stack")},
     "Lift by a UR5e": Task("robosuite", ("Lift",), ("Lift", "--robot", "UR5e"), origin="Lift"),
     "LIBERO-swap": Task("libero", ("libero_object", "--near"), ("libero_object_swap", "--near")),
@@ -95,12 +95,15 @@ def record(folder: Path, task: str, when: str) -> None:
             record_world(world, path, range(first, first + count), every=EVERY)
 
 
-def problems(folder: Path, task: str, seed: int, goals: int) -> tuple[WorldTrials, ClosedLoopResult]:
-    """Return the problems after the change, with a goal for each model step; kept, since the expert takes its time."""
-    path = folder / "problems" / f"{task}-{seed}-{goals}.pickle"
+def problems(
+    folder: Path, task: str, seed: int, goals: int, when: str = "after"
+) -> tuple[WorldTrials, ClosedLoopResult]:
+    """Return the problems, with a goal for each model step; kept, since the expert takes its time."""
+    word = "-before" if when == "before" else ""
+    path = folder / "problems" / f"{task}{word}-{seed}-{goals}.pickle"
     if not path.exists():
         options = BenchmarkOptions(episodes=goals, seed=seed, sub_goals="every-step")
-        with OtherWorld(TASKS[task].command("after")) as world:
+        with OtherWorld(TASKS[task].command(when)) as world:
             found = find_problems(world, options, STRIDE, no_progress)
         path.parent.mkdir(exist_ok=True)
         path.with_suffix(".part").write_bytes(pickle.dumps(found))
@@ -108,10 +111,12 @@ def problems(folder: Path, task: str, seed: int, goals: int) -> tuple[WorldTrial
     return pickle.loads(path.read_bytes())  # type: ignore[no-any-return]  # noqa: S301 - our own
 
 
-def closed_loop(folder: Path, task: str, policy: Policy, *, seed: int, goals: int) -> dict[str, Any]:
-    """Return how a policy fares after the change; by `Trials` of the expert's own problems."""
-    trials, shown = problems(folder, task, seed, goals)
-    with OtherWorld(TASKS[task].command("after")) as world:
+def closed_loop(
+    folder: Path, task: str, policy: Policy, *, seed: int, goals: int, when: str = "after"
+) -> dict[str, Any]:
+    """Return how a policy fares before or after the change; by `Trials` of the expert's own problems."""
+    trials, shown = problems(folder, task, seed, goals, when)
+    with OtherWorld(TASKS[task].command(when)) as world:
         return figures_of(run_trials(world, policy, trials), seed, shown)
 
 

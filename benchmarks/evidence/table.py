@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from cells import AXES, BASES, BEST, FROM_PRIOR, IN_EVERY_WORLD, IN_SOME_WORLDS, LONGER, METHODS, SHIFTS, TURNS
+from cells import AXES, BASES, BEFORE, BEST, FROM_PRIOR, IN_EVERY_WORLD, IN_SOME_WORLDS, LONGER, METHODS, SHIFTS, TURNS
 from offline import correlations
 from other_worlds import MANY, TASKS
 from plot import draw
@@ -137,7 +137,7 @@ def summary_of_worlds(results: Sequence[Figures]) -> str:
     counts = [len(pick(results, shift=task, method=BEST, episodes=EPISODES)) for task in tasks]
     heads = [f"{task} ({count} seed{'s' * (count > 1)})" for task, count in zip(tasks, counts, strict=True)]
     rows = [f"| {EPISODES} demonstrations | {' | '.join(heads)} |", "|---|" + "---|" * len(tasks)]
-    for method in (*IN_EVERY_WORLD, FROM_PRIOR):
+    for method in (BEFORE, *IN_EVERY_WORLD, FROM_PRIOR):
         found = [pick(results, shift=task, method=method) for task in tasks]
         found = [[one for one in cells if one["cell"]["episodes"] in (0, EPISODES)] for cells in found]
         rows.append(f"| {method} | {' | '.join(map(_share, found))} |")
@@ -241,7 +241,7 @@ def of_worlds(results: Sequence[Figures]) -> str:
     rows = [f"| {EPISODES} demonstrations | {' | '.join(tasks)} |", "|---|" + "---|" * len(tasks)]
     for name, label in (("do nothing", "do nothing"), ("random", "random"), ("oracle", "expert")):
         rows.append(f"| {label} | {' | '.join(_done(of_policy(results, BASES[0], name, task)) for task in tasks)} |")
-    for method in (*IN_EVERY_WORLD, FROM_PRIOR, *IN_SOME_WORLDS):
+    for method in (BEFORE, *IN_EVERY_WORLD, FROM_PRIOR, *IN_SOME_WORLDS):
         found = [pick(results, shift=task, method=method) for task in tasks]
         found = [[one for one in cells if one["cell"]["episodes"] in (0, EPISODES)] for cells in found]
         rows += [f"| {method} | {' | '.join(map(_done, found))} |"] if any(found) else []

@@ -38,7 +38,7 @@ def evidence(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
 
 
 def test_cells_have_names_of_their_own_and_hold_all_that_is_to_be_compared(evidence: Any) -> None:
-    cells = list(evidence.cells.all_cells(seeds=3))
+    cells = list(evidence.cells.all_cells(at_most=5))
     assert len({cell.name for cell in cells}) == len(set(cells)) == len(cells)
     assert not any("/" in cell.name for cell in cells), "names of files"
     for base in ("one camera", "many cameras"):
@@ -47,7 +47,7 @@ def test_cells_have_names_of_their_own_and_hold_all_that_is_to_be_compared(evide
         }
         methods = evidence.cells.METHODS.items()
         of_arm = {name for name, method in methods if method.kind not in {"scratch", "cloned"}}
-        elsewhere = {evidence.cells.LONGER, evidence.cells.FROM_PRIOR} | (
+        elsewhere = {evidence.cells.BEFORE, evidence.cells.LONGER, evidence.cells.FROM_PRIOR} | (
             set(evidence.cells.ROLLOUTS) if base == "one camera" else set()
         )
         assert main == of_arm - elsewhere
@@ -55,11 +55,13 @@ def test_cells_have_names_of_their_own_and_hold_all_that_is_to_be_compared(evide
     assert {cell.episodes for cell in of_best if cell.shift == "look"} == {10, 20, 40}
     assert {cell.episodes for cell in of_best if cell.shift == "Lift"} == {5, 20, 80}
     everywhere = set(evidence.cells.IN_EVERY_WORLD)
-    assert {cell.method for cell in cells if cell.shift == "LIBERO-swap"} == everywhere
-    in_lift = everywhere | {evidence.cells.FROM_PRIOR} | set(evidence.cells.IN_SOME_WORLDS)
+    before = {evidence.cells.BEFORE}
+    assert {cell.method for cell in cells if cell.shift == "LIBERO-swap"} == everywhere | before
+    assert {cell.method for cell in cells if cell.shift == "Lift by a UR5e"} == everywhere, "its base is Lift's"
+    in_lift = everywhere | before | {evidence.cells.FROM_PRIOR} | set(evidence.cells.IN_SOME_WORLDS)
     assert {cell.method for cell in cells if cell.shift == "Lift"} == in_lift
     assert everywhere <= set(evidence.cells.METHODS) >= set(evidence.cells.IN_SOME_WORLDS)
-    for shift, seeds in (("look", {0, 1, 2}), ("Lift", {0, 1, 2}), ("Door", {0})):
+    for shift, seeds in (("look", {0, 1, 2}), ("randomized", set(range(5))), ("Lift", set(range(5))), ("Door", {0})):
         assert {cell.seed for cell in cells if (cell.shift, cell.method) == (shift, "full")} == seeds
 
 
@@ -101,11 +103,23 @@ def test_each_goal_of_a_randomized_world_lies_in_another_one_and_a_plain_world_h
 def test_no_two_seeds_of_a_world_share_a_problem_or_a_demonstration(evidence: Any) -> None:
     worlds, cells = evidence.other_worlds, evidence.cells
     used = [range(first, first + 1_000) for first in worlds.FIRST.values()]
-    for seed, choosing in itertools.product(range(3), (True, False)):
+    for seed, choosing in itertools.product(range(5), (True, False)):
         cell = cells.Cell("Lift", "none", "scratch", 20, seed)
         first = evidence.measure.goals_seed(cell, choosing=choosing)
         used.append(range(first, first + TRIES * evidence.measure.GOALS))
     assert not any(one.start in other or other.start in one for one, other in itertools.combinations(used, 2))
+
+
+def test_a_base_before_the_change_is_measured_there_and_all_others_after_it(
+    evidence: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    asked = []
+    monkeypatch.setattr(evidence.other_worlds, "closed_loop", lambda *_, when, **__: asked.append(when) or {})
+    for method in (evidence.cells.BEFORE, "zero-shot"):
+        cell = evidence.cells.Cell("Lift", "one camera", method, 0, 0)
+        evidence.measure.closed_loop(cell, None, tmp_path, seed=0, goals=1)
+        asked.append(Path(evidence.measure.config_of(cell, tmp_path).data.path).name)
+    assert asked == ["before", "data-Lift-before", "after", "data-Lift-after"]
 
 
 def test_in_a_world_of_others_a_hand_arrives_that_ends_where_the_expert_s_does(evidence: Any) -> None:
