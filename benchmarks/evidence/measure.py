@@ -6,7 +6,7 @@ import shutil
 import subprocess
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, get_args
@@ -79,6 +79,9 @@ def measure(cell: Cell, folder: Path, *, goals: int = GOALS, choosing: bool = Fa
     else:
         run = train(config, SILENT)
         model, trained = _trained(run)
+    acts = PLANNING
+    if method_of(cell.method).prior:
+        acts = acts.model_copy(update={"prior": _prior(cell, config, folder)[0]})
     seconds = time.process_time() - started[0], time.perf_counter() - started[1]
     split: Split = "validation" if choosing else "test"
     figures = {
@@ -94,10 +97,6 @@ def measure(cell: Cell, folder: Path, *, goals: int = GOALS, choosing: bool = Fa
         figures["forgetting"] = _forgetting(model, data_before(folder, cell.shift), config)
     if model.adaptation is not None:
         merge_adapter(model)
-    acts = PLANNING
-    if method_of(cell.method).prior:
-        train_prior(config, place := folder / "priors" / cell.name)
-        acts = acts.model_copy(update={"prior": str(place)})
     seed = goals_seed(cell, choosing=choosing)
     settings: dict[str, Any] = {"axes": file} if cell.shift in SHIFTS else {"goals_of": other_worlds.goals_of}
     figures["reach"] = {
@@ -109,15 +108,21 @@ def measure(cell: Cell, folder: Path, *, goals: int = GOALS, choosing: bool = Fa
 
 def _cloned(cell: Cell, config: Config, folder: Path, goals: int, *, choosing: bool) -> dict[str, Any]:
     """Return the figures of a policy that imitates: it predicts nothing, and does not search."""
-    began, place = time.process_time(), folder / "priors" / cell.name
-    found = train_prior(config, place).held_out
+    began = time.process_time()
+    place, found = _prior(cell, config, folder)
     minutes, seed = (time.process_time() - began) / 60, goals_seed(cell, choosing=choosing)
-    acts = PLANNING.model_copy(update={"planner": "prior", "prior": str(place)})
+    acts = PLANNING.model_copy(update={"planner": "prior", "prior": place})
     model = load_base(config.model, seed=cell.seed)
     policy = planner(model, "l1", acts, goals_of=None if cell.shift in SHIFTS else other_worlds.goals_of)
     reached = closed_loop(cell, policy, folder, seed=seed, goals=goals)
     trained = {"trained_share": 1.0, "adapter_mb": 0.0, "cpu_minutes": minutes, "minutes": minutes, "held_out": found}
     return {"cell": asdict(cell) | {"name": cell.name}, **trained, "reach": {"l1": reached}}
+
+
+def _prior(cell: Cell, config: Config, folder: Path) -> tuple[str, Mapping[str, Any]]:
+    """Train an action prior on a cell's demonstrations; return its folder, and how it does on held-out clips."""
+    place = folder / "priors" / cell.name
+    return str(place), train_prior(config, place).held_out
 
 
 def measure_alone(cell: Cell, folder: Path, goals: int, choosing: bool) -> dict[str, Any]:

@@ -137,11 +137,17 @@ def summary_of_worlds(results: Sequence[Figures]) -> str:
     counts = [len(pick(results, shift=task, method=BEST, episodes=EPISODES)) for task in tasks]
     heads = [f"{task} ({count} seed{'s' * (count > 1)})" for task, count in zip(tasks, counts, strict=True)]
     rows = [f"| {EPISODES} demonstrations | {' | '.join(heads)} |", "|---|" + "---|" * len(tasks)]
-    for method in (BEFORE, *IN_EVERY_WORLD, FROM_PRIOR):
-        found = [pick(results, shift=task, method=method) for task in tasks]
-        found = [[one for one in cells if one["cell"]["episodes"] in (0, EPISODES)] for cells in found]
-        rows.append(f"| {method} | {' | '.join(map(_share, found))} |")
+    rows += [
+        f"| {method} | {' | '.join(_share(_of_task(results, task, method)) for task in tasks)} |"
+        for method in (BEFORE, *IN_EVERY_WORLD, FROM_PRIOR)
+    ]
     return "\n".join(rows)
+
+
+def _of_task(results: Sequence[Figures], task: str, method: str) -> list[Figures]:
+    """Return a row's cells of a world of others: with the demonstrations of the main tables, or none."""
+    episodes = 0 if METHODS[method].kind == "zero-shot" else EPISODES
+    return pick(results, shift=task, method=method, episodes=episodes)
 
 
 def _hand(found: Sequence[Figures]) -> str:
@@ -242,8 +248,7 @@ def of_worlds(results: Sequence[Figures]) -> str:
     for name, label in (("do nothing", "do nothing"), ("random", "random"), ("oracle", "expert")):
         rows.append(f"| {label} | {' | '.join(_done(of_policy(results, BASES[0], name, task)) for task in tasks)} |")
     for method in (BEFORE, *IN_EVERY_WORLD, FROM_PRIOR, *IN_SOME_WORLDS):
-        found = [pick(results, shift=task, method=method) for task in tasks]
-        found = [[one for one in cells if one["cell"]["episodes"] in (0, EPISODES)] for cells in found]
+        found = [_of_task(results, task, method) for task in tasks]
         rows += [f"| {method} | {' | '.join(map(_done, found))} |"] if any(found) else []
     title = "### Worlds that others made: solved at the end; hand within 5 cm of the expert's; error 0.8 s ahead"
     return f"{title}\n\n" + "\n".join([*rows, "", *_few_and_many(results)])
