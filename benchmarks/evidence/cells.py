@@ -175,7 +175,7 @@ CHOSEN = {
         "full": 2e-3,
         **dict.fromkeys(("scratch", "scratch, 3x steps"), 3e-3),
     },
-    "Lift": {"scratch": 3e-3, "scratch, 3x steps": 3e-3},
+    "Lift": {"scratch": 3e-3, "scratch, 3x steps": 6e-3},
 }
 """Learning rates of a shift where another than that of `look` was the best; other ranks have LoRA's share of theirs."""
 
@@ -226,6 +226,7 @@ def all_cells(at_most: int) -> Iterator[Cell]:
     for seed in range(seeds):
         for episodes in (10, 40):
             yield from _of("look", (BEST, "full", "scratch"), episodes, seed)
+        yield Cell("look", "none", "scratch, 3x steps", 10, seed)  # steps or demonstrations: which does a base save?
     yield from world_cells(at_most)
 
 

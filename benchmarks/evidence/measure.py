@@ -91,7 +91,7 @@ def measure(cell: Cell, folder: Path, *, goals: int = GOALS, choosing: bool = Fa
         **trained,
         "shifted": _as_dict(held_out(model, config, split, axes=axes)),
     }
-    if axes is None and cell.shift in SHIFTS:
+    if cell.shift in SHIFTS and method_of(cell.method).kind != "calibrated":  # no other model than zero-shot
         figures["offline"] = _offline(model, config, split)
     if cell.base != "none":
         figures["forgetting"] = _forgetting(model, data_before(folder, cell.shift), config)

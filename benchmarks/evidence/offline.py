@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from typing import Any
 from unittest.mock import patch
 
@@ -140,13 +140,26 @@ def visited_correlation(controller: Controller, wanted: np.ndarray, seed: int) -
     return float(spearmanr(energies, np.linalg.norm(ends[:, :3] - wanted, axis=1)).statistic)
 
 
-def correlations(rows: Sequence[dict[str, Any]], success: Sequence[float], draws: int = 2000) -> dict[str, Any]:
-    """Return Spearman's correlation of each figure with a success, over cells, with a bootstrap interval over them."""
+def correlations(
+    rows: Sequence[dict[str, Any]], success: Sequence[float], of: Sequence[Hashable], draws: int = 2000
+) -> dict[str, Any]:
+    """Return Spearman's correlation of each figure with a success, over cells, with a bootstrap interval.
+
+    Cells of one kind, which differ in their seed alone, are drawn together: they are no news of each other.
+
+    Args:
+        rows: The figures of each cell.
+        success: How it fared.
+        of: Its kind.
+        draws: Of the bootstrap.
+    """
     names, rng, found = sorted(set.intersection(*(set(row) for row in rows))), np.random.default_rng(0), {}
-    wins = np.array(success)
+    wins, kinds = np.array(success), list(dict.fromkeys(of))
+    places = [np.flatnonzero([one == kind for one in of]) for kind in kinds]
     for name in names:
         values = np.array([row[name] for row in rows])
-        picks = rng.integers(len(rows), size=(draws, len(rows)))
+        drawn = rng.integers(len(kinds), size=(draws, len(kinds)))
+        picks = (np.concatenate([places[kind] for kind in one]) for one in drawn)
         resampled = np.array([spearmanr(values[one], wins[one]).statistic for one in picks])
         low, high = np.nanpercentile(resampled, [2.5, 97.5])
         found[name] = {"value": float(spearmanr(values, wins).statistic), "low": float(low), "high": float(high)}

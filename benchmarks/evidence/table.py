@@ -30,6 +30,7 @@ TOLD = {  # offline figures in the short table
     "energy and distance over visited plans, negative": "energy and true distance over visited plans",
     "cost of wrong actions, negative": "**cost of wrong actions** (growth with shuffled ones)",
     "moves that look better": "moves that look better",
+    "Action Score, cm missed": "Action Score of three steps",
     "error over persistence, 3 steps": "error over persistence, 0.8 s ahead",
 }
 
@@ -204,7 +205,8 @@ def _axes(results: Sequence[Figures]) -> str:
 
 def _by_episodes(results: Sequence[Figures]) -> str:
     rows = []
-    for base, method in [(base, method) for base in BASES for method in (BEST, "full")] + [("none", "scratch")]:
+    with_base = [(base, method) for base in BASES for method in (BEST, "full")]
+    for base, method in [*with_base, ("none", "scratch"), ("none", "scratch, 3x steps")]:
         for episodes in (10, 20, 40):
             found = pick(results, shift="look", base=base, method=method, episodes=episodes)
             if found:
@@ -301,14 +303,13 @@ def correlated_figures(results: Sequence[Figures]) -> Correlated:
     """Return how many cells there are, of all changes and of each that has enough of them, and what was found."""
     cells = [one for one in results if "offline" in one and "visited" in one["reach"]["l1"]]
     groups = {"all": cells, **{shift: [one for one in cells if one["cell"]["shift"] == shift] for shift in SHIFTS}}
-    return {
-        label: (
-            len(some),
-            correlations([_offline_row(one) for one in some], [-float(np.mean(reached(one))) for one in some]),
-        )
-        for label, some in groups.items()
-        if len(some) >= FEWEST
-    }
+    return {label: (len(some), _correlations(some)) for label, some in groups.items() if len(some) >= FEWEST}
+
+
+def _correlations(cells: Sequence[Figures]) -> dict[str, dict[str, float]]:
+    missed, kinds = [-float(np.mean(reached(one))) for one in cells], [one["cell"] for one in cells]
+    of = [(kind["shift"], kind["base"], kind["method"], kind["episodes"]) for kind in kinds]
+    return correlations([_offline_row(one) for one in cells], missed, of)
 
 
 def _interval(one: dict[str, float]) -> str:

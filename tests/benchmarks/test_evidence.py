@@ -305,6 +305,18 @@ def test_a_page_without_a_place_for_the_table_is_left_alone(small: Any, tmp_path
 
 def test_a_figure_that_orders_models_as_their_success_does_is_found(evidence: Any) -> None:
     rows = [{"good": -float(one), "useless": float(one % 3), "backwards": float(one)} for one in range(24)]
-    found = evidence.offline.correlations(rows, [-float(one) for one in range(24)], draws=50)
+    missed = [-float(one) for one in range(24)]
+    found = evidence.offline.correlations(rows, missed, range(24), draws=50)
     assert [found[name]["value"] for name in ("good", "backwards")] == pytest.approx([1.0, -1.0])
     assert found["useless"]["low"] < 0 < found["useless"]["high"]
+
+
+def test_cells_that_differ_in_their_seed_alone_do_not_narrow_an_interval(evidence: Any) -> None:
+    rng = np.random.default_rng(0)
+    figures, missed = rng.normal(size=8), rng.normal(size=8)
+    once = evidence.offline.correlations([{"figure": one} for one in figures], missed, range(8), draws=200)
+    rows = [{"figure": one} for one in figures for _ in range(5)]
+    again = evidence.offline.correlations(rows, np.repeat(missed, 5), np.repeat(np.arange(8), 5).tolist(), draws=200)
+    apart = evidence.offline.correlations(rows, np.repeat(missed, 5), range(40), draws=200)
+    assert again["figure"] == pytest.approx(once["figure"])
+    assert apart["figure"]["high"] - apart["figure"]["low"] < 0.7 * (again["figure"]["high"] - again["figure"]["low"])

@@ -295,10 +295,10 @@ def _adapter(model: ModelChoice, found: FoundData) -> Knobs:
     if model.kind == "scratch":
         return {"kind": Knob("none", "a fresh predictor has nothing to adapt: all of it is trained")}
     whole = ["state_encoder", "action_encoder"] if found.states == "vector" else _IN_AND_OUT
-    why = "fresh: other numbers than a pose" if found.states == "vector" else "whole: helps at every rank (sim)"
+    why = "fresh: other numbers than a pose" if found.states == "vector" else "whole: less error at every rank (sim)"
     return {
         "kind": Knob("lora"),
-        "rank": Knob(32, "with in/out whole as good as full fine-tuning; 4 to 16 less (sim)"),
+        "rank": Knob(32, "the error of full fine-tuning with in/out whole; 8 plans as well, 4 less (sim)"),
         "alpha": Knob(32, "at any rank"),
         "rslora": Knob(True),
         "targets": Knob(["q", "k", "v", "o", "fc1", "fc2"]),
