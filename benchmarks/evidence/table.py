@@ -4,15 +4,29 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from cells import AXES, BASES, BEFORE, BEST, FROM_PRIOR, IN_EVERY_WORLD, IN_SOME_WORLDS, LONGER, METHODS, SHIFTS, TURNS
+from cells import (
+    AXES,
+    BASES,
+    BEFORE,
+    BEST,
+    FROM_PRIOR,
+    IN_EVERY_WORLD,
+    IN_SOME_WORLDS,
+    LONGER,
+    METHODS,
+    SHIFTS,
+    TURNS,
+    Method,
+)
 from offline import correlations
 from other_worlds import MANY, TASKS
 from plot import draw
 from results import CHANGES, Figures, arrived, last, main_cells, of_policy, pick, reached, read_results, share_reached
+from scipy.stats import binomtest
 
 from vjepa2_ac.intervals import mean_of, share_of
 
@@ -75,6 +89,7 @@ def write_tables(folder: Path, out: Path, page: Path | None = None, done: Path |
             _by_episodes(results),
             _lora(results),
             of_worlds(results),
+            goal_by_goal(results),
             trust(correlated),
         )
         if part
@@ -264,6 +279,41 @@ def _few_and_many(results: Sequence[Figures]) -> list[str]:
             if found[0] or found[2]:
                 rows.append(f"| {task}: {method} | {' | '.join(map(_done, found))} |")
     return ["| demonstrations | 5 | 20 | 80 |", "|---|---|---|---|", *rows] if rows else []
+
+
+def goal_by_goal(results: Sequence[Figures]) -> str:
+    """Return against whom LoRA wins: goals that it alone reached, those that the other alone did, and how likely it is.
+
+    All methods of a change and a seed have the same goals. Source of the test: McNemar (1947), the exact form.
+    """
+    rows = []
+    for shift in (*SHIFTS, *TASKS):
+        for base in BASES if shift in SHIFTS else BASES[:1]:
+            for other in METHODS.values():
+                pairs = list(_pairs(results, shift, base, other))
+                won = sum(ours and not theirs for ours, theirs in pairs)
+                lost = sum(theirs and not ours for ours, theirs in pairs)
+                if won + lost:
+                    chance = binomtest(won, won + lost).pvalue
+                    where = f"{CHANGES.get(shift, shift)}{f'; {base}' * (shift in SHIFTS)}"
+                    rows.append(f"| {where} | {other.name} | {len(pairs)} | {won} | {lost} | {_p(chance)} |")
+    head = f"### {BEST} against others, goal by goal\n\n| change | against | goals | won | lost | p |\n|" + "---|" * 6
+    return "\n".join([head, *rows]) if rows else ""
+
+
+def _p(chance: float) -> str:
+    return f"{chance:.3f}" if chance >= 0.0005 else "< 0.001"
+
+
+def _pairs(results: Sequence[Figures], shift: str, base: str, other: Method) -> Iterator[tuple[bool, bool]]:
+    """Yield which goals LoRA and another method reached, with the demonstrations of the main tables."""
+    for ours in pick(results, shift=shift, base=base, method=BEST, episodes=EPISODES):
+        of_none = "none" if other.kind in {"scratch", "cloned"} else base
+        episodes = 0 if other.kind == "zero-shot" else EPISODES
+        wanted = {"shift": shift, "base": of_none, "method": other.name, "episodes": episodes}
+        for theirs in pick(results, **wanted, seed=ours["cell"]["seed"]):
+            if other.name not in {BEST, BEFORE}:
+                yield from zip(reached(ours), reached(theirs), strict=True)
 
 
 def _done(found: Sequence[Figures]) -> str:

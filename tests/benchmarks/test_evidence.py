@@ -295,6 +295,19 @@ def test_exactly_so_many_demonstrations_are_trained_on_and_seeds_draw_others(sma
     assert drawn[0] != drawn[1]
 
 
+def test_methods_are_compared_on_the_goals_that_both_had(evidence: Any) -> None:
+    def cell(method: str, seed: int, ends: list[float]) -> dict[str, Any]:
+        of = {"shift": "look", "base": "many cameras", "method": method, "episodes": 20, "seed": seed}
+        return {"cell": of, "reach": {"l1": {"distance_cm": [[20.0, end] for end in ends]}}}
+
+    best, near, far = evidence.cells.BEST, 1.0, 9.0
+    results = [
+        cell(best, 0, [near] * 9 + [far]), cell("full", 0, [far] * 8 + [near, near]), cell(best, 1, [near])
+    ]  # fmt: skip
+    row = evidence.table.goal_by_goal(results).splitlines()[-1]
+    assert row == "| camera and look; many cameras | full | 10 | 8 | 1 | 0.039 |"
+
+
 def test_a_page_without_a_place_for_the_table_is_left_alone(small: Any, tmp_path: Path) -> None:
     page = tmp_path / "evidence.md"
     page.write_text("nothing")
