@@ -155,7 +155,12 @@ _LOOK_RATES = {
 _RATES: dict[str, dict[str, tuple[float, ...]]] = {
     "look": _LOOK_RATES,
     "motion": {**_ELSEWHERE, "scratch": (3e-3, 1.2e-2, 2.4e-2)},
-    "randomized": {BEST: (3e-4, 1e-3, 3e-3, 8e-3), "full": (1e-3, 2e-3, 8e-3), "scratch": (1e-3, 3e-3, 1.2e-2)},
+    "randomized": {
+        BEST: (1e-4, 3e-4, 1e-3, 3e-3, 8e-3),
+        "full": (5e-4, 1e-3, 2e-3, 8e-3),
+        "scratch": (1e-3, 3e-3, 1.2e-2),
+        "scratch, 3x steps": (1e-3, 3e-3),
+    },
     "Lift": {**_ELSEWHERE, "scratch, 3x steps": (3e-3, 6e-3, 1.2e-2)},
 }
 CANDIDATES = {
