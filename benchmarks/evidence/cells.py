@@ -175,10 +175,9 @@ on Lift alone, for all their tasks."""
 
 CHOSEN = {
     "randomized": {
-        BEST: 1e-3,
-        **dict.fromkeys(WHERE_ALL_VARIES, 1.7e-3),
-        "full": 2e-3,
-        **dict.fromkeys(("scratch", "scratch, 3x steps"), 3e-3),
+        BEST: 3e-4,
+        **dict.fromkeys(WHERE_ALL_VARIES, 5e-4),
+        **dict.fromkeys(("full", "scratch", "scratch, 3x steps"), 1e-3),
     },
     "Lift": {"scratch": 3e-3, "scratch, 3x steps": 6e-3},
 }
