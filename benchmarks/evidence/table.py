@@ -41,9 +41,9 @@ MARKS = {  # of the short tables in a page
     "worlds": "worlds, made by `make evidence`",
 }
 TOLD = {  # offline figures in the short table
-    "energy and distance over visited plans, negative": "energy and true distance over visited plans",
-    "cost of wrong actions, negative": "**cost of wrong actions** (growth with shuffled ones)",
-    "moves that look better": "moves that look better",
+    "energy and distance over visited plans, negative": "energy and distance over visited plans",
+    "cost of wrong actions, negative": "cost of shuffled actions",
+    "moves that look better": "**moves that look better**",
     "Action Score, cm missed": "Action Score of three steps",
     "error over persistence, 3 steps": "error over persistence, 0.8 s ahead",
 }
@@ -151,7 +151,7 @@ def summary_of_worlds(results: Sequence[Figures]) -> str:
     if not tasks:
         return ""
     counts = [len(pick(results, shift=task, method=BEST, episodes=EPISODES)) for task in tasks]
-    heads = [f"{task} ({count} seed{'s' * (count > 1)})" for task, count in zip(tasks, counts, strict=True)]
+    heads = [f"{task} ({count} seeds)" if count > 1 else task for task, count in zip(tasks, counts, strict=True)]
     rows = [f"| {EPISODES} demonstrations | {' | '.join(heads)} |", "|---|" + "---|" * len(tasks)]
     rows += [
         f"| {method} | {' | '.join(_share(_of_task(results, task, method)) for task in tasks)} |"
