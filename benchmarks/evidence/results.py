@@ -64,7 +64,7 @@ def last(one: Figures) -> float:
 
 
 def main_cells(results: Sequence[Figures], base: str, method: str, shift: str = "look") -> list[Figures]:
-    """Return a row of a main table: zero-shot needs no demonstrations, the others have 20; from scratch, no base."""
+    """Return a row of a main table: zero-shot needs no demonstrations, the others have 20; some have no base."""
     episodes = 0 if METHODS[method].kind == "zero-shot" else 20
-    base = "none" if METHODS[method].kind == "scratch" else base
+    base = "none" if METHODS[method].kind in {"scratch", "cloned"} else base
     return pick(results, shift=shift, base=base, method=method, episodes=episodes)

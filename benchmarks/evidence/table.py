@@ -20,7 +20,6 @@ from cells import (
     METHODS,
     SHIFTS,
     TURNS,
-    Method,
 )
 from offline import correlations
 from other_worlds import MANY, TASKS
@@ -154,16 +153,10 @@ def summary_of_worlds(results: Sequence[Figures]) -> str:
     heads = [f"{task} ({count} seeds)" if count > 1 else task for task, count in zip(tasks, counts, strict=True)]
     rows = [f"| {EPISODES} demonstrations | {' | '.join(heads)} |", "|---|" + "---|" * len(tasks)]
     rows += [
-        f"| {method} | {' | '.join(_share(_of_task(results, task, method)) for task in tasks)} |"
+        f"| {method} | {' | '.join(_share(main_cells(results, BASES[0], method, task)) for task in tasks)} |"
         for method in (BEFORE, *IN_EVERY_WORLD, FROM_PRIOR)
     ]
     return "\n".join(rows)
-
-
-def _of_task(results: Sequence[Figures], task: str, method: str) -> list[Figures]:
-    """Return a row's cells of a world of others: with the demonstrations of the main tables, or none."""
-    episodes = 0 if METHODS[method].kind == "zero-shot" else EPISODES
-    return pick(results, shift=task, method=method, episodes=episodes)
 
 
 def _hand(found: Sequence[Figures]) -> str:
@@ -265,7 +258,7 @@ def of_worlds(results: Sequence[Figures]) -> str:
     for name, label in (("do nothing", "do nothing"), ("random", "random"), ("oracle", "expert")):
         rows.append(f"| {label} | {' | '.join(_done(of_policy(results, BASES[0], name, task)) for task in tasks)} |")
     for method in (BEFORE, *IN_EVERY_WORLD, FROM_PRIOR, *IN_SOME_WORLDS):
-        found = [_of_task(results, task, method) for task in tasks]
+        found = [main_cells(results, BASES[0], method, task) for task in tasks]
         rows += [f"| {method} | {' | '.join(map(_done, found))} |"] if any(found) else []
     title = "### Worlds that others made: solved at the end; hand within 5 cm of the expert's; error 0.8 s ahead"
     return f"{title}\n\n" + "\n".join([*rows, "", *_few_and_many(results)])
@@ -289,14 +282,14 @@ def goal_by_goal(results: Sequence[Figures]) -> str:
     rows = []
     for shift in (*SHIFTS, *TASKS):
         for base in BASES if shift in SHIFTS else BASES[:1]:
-            for other in METHODS.values():
+            for other in [name for name in METHODS if name not in {BEST, BEFORE}]:
                 pairs = list(_pairs(results, shift, base, other))
                 won = sum(ours and not theirs for ours, theirs in pairs)
                 lost = sum(theirs and not ours for ours, theirs in pairs)
                 if won + lost:
                     chance = binomtest(won, won + lost).pvalue
                     where = f"{CHANGES.get(shift, shift)}{f'; {base}' * (shift in SHIFTS)}"
-                    rows.append(f"| {where} | {other.name} | {len(pairs)} | {won} | {lost} | {_p(chance)} |")
+                    rows.append(f"| {where} | {other} | {len(pairs)} | {won} | {lost} | {_p(chance)} |")
     head = f"### {BEST} against others, goal by goal\n\n| change | against | goals | won | lost | p |\n|" + "---|" * 6
     return "\n".join([head, *rows]) if rows else ""
 
@@ -305,15 +298,12 @@ def _p(chance: float) -> str:
     return f"{chance:.3f}" if chance >= 0.0005 else "< 0.001"
 
 
-def _pairs(results: Sequence[Figures], shift: str, base: str, other: Method) -> Iterator[tuple[bool, bool]]:
+def _pairs(results: Sequence[Figures], shift: str, base: str, other: str) -> Iterator[tuple[bool, bool]]:
     """Yield which goals LoRA and another method reached, with the demonstrations of the main tables."""
-    for ours in pick(results, shift=shift, base=base, method=BEST, episodes=EPISODES):
-        of_none = "none" if other.kind in {"scratch", "cloned"} else base
-        episodes = 0 if other.kind == "zero-shot" else EPISODES
-        wanted = {"shift": shift, "base": of_none, "method": other.name, "episodes": episodes}
-        for theirs in pick(results, **wanted, seed=ours["cell"]["seed"]):
-            if other.name not in {BEST, BEFORE}:
-                yield from zip(reached(ours), reached(theirs), strict=True)
+    ours = {one["cell"]["seed"]: one for one in main_cells(results, base, BEST, shift)}
+    for theirs in main_cells(results, base, other, shift):
+        if one := ours.get(theirs["cell"]["seed"]):
+            yield from zip(reached(one), reached(theirs), strict=True)
 
 
 def _done(found: Sequence[Figures]) -> str:
