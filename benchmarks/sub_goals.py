@@ -1,4 +1,4 @@
-"""Which goals does a planner need to pick up a block? One model, the same problems, six ways to give it its goals.
+"""Which goals does a planner need to pick up a block? One model, the same problems, seven ways to give it its goals.
 
     vjepa2-ac simulate record demo/pick-data --task pick --episodes 300 --seed 1
     vjepa2-ac train configs/pick.yaml
@@ -8,11 +8,12 @@
 Goals on the way are key frames of one demonstration of the same problem, by the oracle (`simulate --sub-goals
 demonstration`). A way that is done stands in --folder as JSON and is not run again.
 
-*single goal*: the image of the end. *durations*: each key frame applies for as many model steps as in the
-demonstration. *slack*: for three more. *advance*: the next one follows when the energy has fallen below a share of its
-first value, at the earliest three steps sooner and at the latest three later. *every step*: each model step of the
-demonstration is a goal, for one step more than it took there (`--sub-goals every-step`). *gripper planned*: the planner
-opens and closes; else it is scripted: each goal says what the gripper does.
+*single goal*: the image of the end. *alike*: by that image and the one at the start the most similar demonstration of
+the run's data is found (`simulate --sub-goals alike`); its key frames apply as with *slack*. *durations*: each key
+frame applies for as many model steps as in the demonstration. *slack*: for three more. *advance*: the next one follows
+when the energy has fallen below a share of its first value, at the earliest three steps sooner and at the latest three
+later. *every step*: each model step of the demonstration is a goal, for one step more than it took there (`--sub-goals
+every-step`). *gripper planned*: the planner opens and closes; else each goal says what the gripper does.
 """
 
 from __future__ import annotations
@@ -30,9 +31,14 @@ from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.planning.session import load_to_plan
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.simulation.closed_loop.agent import Agent, agent_of_session
-from vjepa2_ac.simulation.closed_loop.benchmark import DemonstratedGoals, DemonstrationSpec, every_step
+from vjepa2_ac.simulation.closed_loop.benchmark import (
+    DemonstratedGoals,
+    DemonstrationSpec,
+    every_step,
+    of_demonstrations_alike,
+)
 from vjepa2_ac.simulation.closed_loop.policies import GoalsOf, Oracle, Policy
-from vjepa2_ac.simulation.closed_loop.rollout import ClosedLoopResult, RolloutSpec, run_task
+from vjepa2_ac.simulation.closed_loop.rollout import ClosedLoopResult, RolloutSpec, SimulatedWorld, run_task
 from vjepa2_ac.simulation.closed_loop.tasks import STEPS, TaskProblem, arm_for
 from vjepa2_ac.simulation.world.domains import named_domain
 from vjepa2_ac.storage import write_atomically
@@ -40,7 +46,7 @@ from vjepa2_ac.storage import write_atomically
 SLACK, SHARE = 3, 0.2  # model steps; UVD's share
 MORE = 6  # model steps that an episode may take beyond the task's default
 WAYS = (
-    "single goal", "durations, gripper planned", "durations", "slack", f"advance at {SHARE:.0%}", "every step",
+    "single goal", "alike", "durations, gripper planned", "durations", "slack", f"advance at {SHARE:.0%}", "every step",
     "oracle",
 )  # fmt: skip
 
@@ -83,7 +89,13 @@ def measure(way: str, agent: Agent, options: argparse.Namespace) -> ClosedLoopRe
         free = agent.planning.limits.model_copy(update={"gripper_mode": "free"})
         policy = Oracle(free, arm)
     else:
-        policy = agent.policy(arm, goals_of(way, agent, options))
+        is_alike = way == "alike"
+        goals = (
+            of_demonstrations_alike(agent, SimulatedWorld(arm), spec.problems)
+            if is_alike
+            else goals_of(way, agent, options)
+        )
+        policy = agent.policy(arm, goals)
     return run_task(spec, policy, arm, SILENT.task(way))
 
 

@@ -84,8 +84,9 @@ def add_simulate(commands: cli.Commands) -> None:
     cli.add_all(group)
     cli.add_checkpoint(group, default=None)
     cli.add(group, "--config CONFIG", "for a model: the config whose `planning` is used", cli.as_local)
-    text = "goals on the way, of the oracle's solution: where gripper or arm stop, or each model step of it (none)"
-    cli.add(group, "--sub-goals", text, choices=["none", "demonstration", "every-step"])
+    text = "goals on the way, of the oracle's solution: where gripper or arm stop, or each model step of it; alike: of"
+    text += " that episode of the model's data which begins and ends most like the problem (none)"
+    cli.add(group, "--sub-goals", text, choices=["none", "demonstration", "every-step", "alike"])
     cli.add(group, "--goals FOLDER", "goals on the way, that `vjepa2-ac goals` made, of a fixed scene", cli.as_local)
     cli.add(group, "--films N", "episodes in the video; 0: none (6)", cli.whole_number(0))
     cli.add_decoder(group, "in the video what the model imagined of each frame, a step ago")

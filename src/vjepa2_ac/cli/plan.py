@@ -14,7 +14,6 @@ if TYPE_CHECKING:
 
     from vjepa2_ac.config import Config
     from vjepa2_ac.config.planning import PlanningConfig
-    from vjepa2_ac.planning.demonstrations.make_goals import Recording
     from vjepa2_ac.planning.goals import GoalFolder
 
 _QUICK, _QUICK_SEQUENCES = "planning.samples=64 planning.iterations=4", 256  # docs/planning.md says how good it is
@@ -50,6 +49,7 @@ def add_goals(commands: cli.Commands) -> None:
     cli.add(parser, "overrides key=value", "of the config, such as data.camera=wrist_left", nargs="*")
     cli.add(parser, "--out FOLDER", "where goals.json and the images go: new or empty", cli.as_path, required=True)
     cli.add(parser, "--episode ID|NUMBER", "which one: its name in the data, or its number, from 0 (0)")
+    cli.add(parser, "--alike IMAGE", "instead: what is seen now, and the goal; the episode that is most alike", nargs=2)
     text = "instead: the last frame of a successful episode of each language label with this text, for prompts"
     cli.add(parser, "--task TEXT", text, nargs="?", const="")
     text = "gripper: where it changes or the arm stops; latent: by images; every N frames (gripper; of a film latent)"
@@ -162,16 +162,24 @@ def _goals(options: argparse.Namespace) -> None:
     They are key frames of an episode or a film, with durations and gripper, in a folder that `plan --goals` and
     `simulate --goals` take, with a contact sheet.
     """
-    by, every = _way(options)
+    (by, every), photographs = _way(options), _photographs(options)
     cli.require_new_place(options.out)
     if options.task is not None:
         _goals_by_label(options)
         return
-    recording, stride = _recording(options)
+    config = None if _is_film(options) else cli.read_config(options.source, options.overrides, of_run=True)
+    stride = _stride(options, config)
 
     from vjepa2_ac.cli.console.tables import goals_notes, goals_table
-    from vjepa2_ac.planning.demonstrations.make_goals import KeyFrameOptions, make_goals, recording_of_film
+    from vjepa2_ac.planning.demonstrations.alike import demonstrations_alike, ending_with
+    from vjepa2_ac.planning.demonstrations.make_goals import (
+        KeyFrameOptions,
+        make_goals,
+        recording_of_episode,
+        recording_of_film,
+    )
     from vjepa2_ac.planning.session import load_to_plan
+    from vjepa2_ac.reporter import INDEXING
     from vjepa2_ac.reports.figures.planning import GOALS_IMAGE, plot_goals
     from vjepa2_ac.storage import user_can_write
 
@@ -182,7 +190,16 @@ def _goals(options: argparse.Namespace) -> None:
         session = load_to_plan(options.model, checkpoint=options.checkpoint or "selected")
     chosen = cli.record_of_options(KeyFrameOptions, options, by=by, every=every, stride=stride)
     with cli.reporter() as reporter:
+        if config is None:
+            recording = recording_of_film(Path(options.source))
+        elif photographs is not None and session is not None:
+            (recording,) = demonstrations_alike(config.data, session, [photographs], reporter)
+        else:
+            progress, views = reporter.task(INDEXING), config.planning.views
+            recording = recording_of_episode(config.data, options.episode or "0", progress, views=views)
         made = make_goals(recording, chosen, session, still=still, reporter=reporter)
+    if photographs is not None:
+        made = ending_with(made, photographs[1])
     with user_can_write(options.out):
         written = [made.write(options.out), plot_goals(made, options.out / GOALS_IMAGE)]
     cli.show(goals_table(made), *goals_notes(made), files=written)
@@ -211,7 +228,12 @@ def _way(options: argparse.Namespace) -> tuple[str, int | None]:
     if not is_every and (way not in {"gripper", "latent"} or rest):
         needed = "gripper, latent, or every N, with a number of frames"
         raise InputError(where="--by", found=" ".join(words), needed=needed)
-    needs_model = {"--by latent": way == "latent", "--still": options.still, "--checkpoint": options.checkpoint}
+    needs_model = {
+        "--by latent": way == "latent",
+        "--still": options.still,
+        "--alike": options.alike,
+        "--checkpoint": options.checkpoint,
+    }
     for name, given in needs_model.items():
         if given and options.model is None:
             raise InputError(where=name, found="no model", needed="--model RUN_OR_MODEL")
@@ -220,11 +242,9 @@ def _way(options: argparse.Namespace) -> tuple[str, int | None]:
     return way, int(rest[0]) if is_every else None
 
 
-def _recording(options: argparse.Namespace) -> tuple[Recording, int]:
-    """Return the demonstration, and the frames of a model step."""
-    if _is_film(options):
-        from vjepa2_ac.planning.demonstrations.make_goals import recording_of_film
-
+def _stride(options: argparse.Namespace, config: Config | None) -> int:
+    """Return the frames of a model step; of a film, which has no config, they are given."""
+    if config is None:
         for name, given in {"--episode": options.episode, "key=value": options.overrides}.items():
             if given:
                 raise InputError(where=name, found=f"{options.source}, a film", needed="a config, of whose data it is")
@@ -232,16 +252,25 @@ def _recording(options: argparse.Namespace) -> tuple[Recording, int]:
             found = "a film, which has no model steps of its own"
             fix = "Of 30 frames a second, 8 last 0.27 s, as a model step of the released weights does: --stride 8"
             raise InputError(where="--stride", found=found, needed="how many frames are a model step", fix=fix)
-        return recording_of_film(Path(options.source)), options.stride
-    config = cli.read_config(options.source, options.overrides, of_run=True)
+        return int(options.stride)
     stride = options.stride or config.data.stride
     if stride == "auto":
         found, fix = "auto", "Say how many control steps a model step has: --stride 4"
         raise InputError(where="data.stride", found=found, needed="a number", fix=fix)
+    return int(stride)
 
-    from vjepa2_ac.planning.demonstrations.make_goals import recording_of_episode
-    from vjepa2_ac.reporter import INDEXING
 
-    with cli.reporter() as reporter:
-        progress, views = reporter.task(INDEXING), config.planning.views
-        return recording_of_episode(config.data, options.episode or "0", progress, views=views), stride
+def _photographs(options: argparse.Namespace) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return start and goal to which a demonstration is to be alike; None: other ways to choose one are given."""
+    if options.alike is None:
+        return None
+    others = {"a film": _is_film(options), "--episode": options.episode, "--task": options.task is not None}
+    for name, given in others.items():
+        if given:
+            raise InputError(where="--alike", found=f"{name}, too", needed="a config alone, among whose data it looks")
+
+    from vjepa2_ac.media.images import read_image, require_image
+
+    start, goal = (read_image(path) for path in options.alike)
+    require_image(start, where=f"--alike {options.alike[0]}", like=goal)
+    return start, goal

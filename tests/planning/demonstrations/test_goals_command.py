@@ -95,6 +95,31 @@ def test_an_episode_is_named_or_numbered_and_every_so_many_frames_are_taken(work
     assert named["origin"]["every"] == 10
 
 
+def test_two_photographs_find_the_episode_that_they_are_alike(
+    workshop: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    dataset = open_dataset(workshop / "set", frames=4)
+    for index in range(2):
+        seen = np.array(dataset.source.read(index).read_frames([0, 40]))
+        seen = np.clip(seen + np.random.default_rng(0).normal(0, 4, seen.shape), 0, 255).astype(np.uint8)
+        for name, image in zip(("now", "goal"), seen, strict=True):
+            Image.fromarray(image).save(tmp_path / f"{name}.png")
+        model = ["--model", str(workshop / "model"), "--alike", str(tmp_path / "now.png"), str(tmp_path / "goal.png")]
+        status, file = goals(workshop, tmp_path / f"{index}", *model)
+        assert status == 0
+        assert file["origin"]["episode"] == dataset.table.identity(index)
+        assert [goal["name"] for goal in file["goals"]] == ["before closing", "closed", "the photograph"]
+        *_, last = read_goal_folder(tmp_path / f"{index}").goals
+        np.testing.assert_array_equal(last.image, seen[1])
+    Image.fromarray(seen[0, ::2]).save(tmp_path / "now.png")
+    capsys.readouterr()
+    assert goals(workshop, tmp_path / "small", *model)[0] == 2
+    assert "now.png: 320 x 90 pixels" in capsys.readouterr().err
+    Image.fromarray(seen[1, ::2]).save(tmp_path / "goal.png")
+    assert goals(workshop, tmp_path / "small", *model)[0] == 2
+    assert "320 x 90 pixels (width x height). needed: 320 x 180" in capsys.readouterr().err
+
+
 def test_a_film_without_states_becomes_goals_by_latents(workshop: Path, tmp_path: Path) -> None:
     model = ["--model", str(workshop / "model")]
     status, file = goals(
@@ -156,6 +181,9 @@ def test_a_folder_that_cannot_be_followed_is_told_before_anything_is_planned(
         (["config.yaml", "--by", "every"], "--by: every. needed: gripper, latent, or every N"),
         (["config.yaml", "--by", "sound"], "--by: sound"),
         (["config.yaml", "--by", "latent"], "--by latent: no model"),
+        (["config.yaml", "--alike", "a.png", "b.png"], "--alike: no model"),
+        (["config.yaml", "--alike", "a.png", "b.png", "--model", "m", "--episode", "0"], "--alike: --episode, too"),
+        (["film.mp4", "--alike", "a.png", "b.png", "--model", "m", "--stride", "4"], "--alike: a film, too"),
         (["config.yaml", "--still", "still.mp4"], "--still: no model"),
         (["config.yaml", "--episode", "9"], "--episode 9: no such episode"),
         (["config.yaml", "--by", "every", "9", "--apart", "3"], "--apart"),

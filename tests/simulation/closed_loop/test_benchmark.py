@@ -35,6 +35,7 @@ from vjepa2_ac.simulation.closed_loop.benchmark import (
     run_benchmark,
 )
 from vjepa2_ac.simulation.closed_loop.policies import Planning
+from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
 
 SMALL = ["planning.samples=6", "planning.iterations=2", "planning.cem.elites=3", "planning.limits.xyz=[0.03,0.03,0.03]"]
 TWICE = ["--episodes", "2", "--steps", "2", "--films", "1"]
@@ -217,6 +218,24 @@ def test_goals_on_the_way_come_from_one_demonstration_of_the_same_problem(model:
     for name in ("do nothing", "oracle"):
         one, *others = (run["policies"][name]["by_episode"]["distance_cm"] for run in found.values())
         assert others == [one, one], "only the model has goals on the way"
+
+
+def test_goals_come_from_the_demonstration_that_looks_like_the_problem(
+    model: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record_dataset(tmp_path / "set", RecordingSpec("A", 41, seed=3, task="pick"), episodes=3)
+    data = {"path": str(tmp_path / "set"), "frames": 4, "stride": 4, "validation_share": 0.0, "test_share": 0.0}
+    config = {"run_dir": str(tmp_path / "run"), "data": data, "model": {"base": model}}
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(config))
+    given = ["--task", "pick", "--episodes", "2", "--steps", "2", "--films", "0", "--sub-goals", "alike"]
+    where = ["--config", str(tmp_path / "config.yaml"), "--out", str(tmp_path / "out")]
+    assert main(["simulate", model, *given, *where, *SMALL]) == 0
+    assert metrics(tmp_path / "out")["about"]["sub_goals"] == "alike"
+    assert "looking for a demonstration alike 3/3" in capsys.readouterr().out
+    loaded = load_to_plan(model, config=tmp_path / "config.yaml", overrides=SMALL)
+    with serving(lambda: Session(loaded.controller()), told=partial(metadata_of, loaded)) as running:
+        assert main(["simulate", running.url, *given, "--out", str(tmp_path / "there")]) == 2
+    assert "needed: the model itself: its server knows no demonstrations" in capsys.readouterr().err
 
 
 def test_a_problem_that_cannot_be_demonstrated_is_told_before_any_is_worked_on(

@@ -93,11 +93,17 @@ def recording_of_episode(
         found, needed = ", ".join(config.cameras), f"{views} cameras, from left to right, as planning.views says"
         raise InputError(where="data.camera", found=found, needed=needed)
     dataset = open_dataset(config, progress=progress)
-    index = number_of_episode(dataset, wanted)
-    name, seen = (
-        dataset.table.identity(index),
-        [dataset.source.read(index, camera) for camera in config.cameras[:views]],
-    )
+    return recording_of(dataset, number_of_episode(dataset, wanted), views)
+
+
+def recording_of(dataset: Dataset, index: int, views: int = 1) -> Recording:
+    """Return an episode of an open data set, with so many of its cameras side by side.
+
+    Raises:
+        InputError: It cannot be read.
+    """
+    config, name = dataset.config, dataset.table.identity(index)
+    seen = [dataset.source.read(index, camera) for camera in config.cameras[:views]]
     origin = {"data": config.path, "episode": name, "camera": config.camera}
     states = seen[0].states if config.states == "pose" else None
 
@@ -298,14 +304,14 @@ class _Encoded:
     def of(cls, session: PlanningSession, recording: Recording, reporter: Reporter) -> _Encoded:
         step = math.ceil(recording.frames / _MOST_ENCODED)
         frames = np.unique(np.append(np.arange(0, recording.frames, step), recording.frames - 1))
-        latents = _latents(session, recording.read, frames.tolist(), reporter.task("encoding frames"))
+        latents = latents_of(session, recording.read, frames.tolist(), reporter.task("encoding frames"))
         return cls(session, recording, frames, latents)
 
     def key_frames(self, apart: int) -> tuple[KeyFrame, ...]:
         least = max(1, math.ceil(apart / int(self.frames[1] - self.frames[0])))
 
         def distances(goal: int) -> Float[np.ndarray, " frames"]:
-            return _energies(self.session, self.latents, itertools.repeat(self.latents[goal]))
+            return energies_of(self.session, self.latents, itertools.repeat(self.latents[goal]))
 
         found = latent_key_frames(len(self.frames), distances, least)
         frames = [int(self.frames[key.frame]) for key in found]
@@ -315,15 +321,15 @@ class _Encoded:
         """Return the energies of all frames to the goal that applies then: the next key frame."""
         begins = [0, *goals[:-1]]
         before = [max(begin, goal - stride) for begin, goal in zip(begins, goals, strict=True)]
-        taken = _latents(self.session, self.recording.read, [*begins, *before, *goals])
+        taken = latents_of(self.session, self.recording.read, [*begins, *before, *goals])
         began, step_before, wanted = taken.split(len(goals))  # type: ignore[no-untyped-call]  # torch
         places = np.searchsorted(goals, self.frames).clip(max=len(goals) - 1)
-        energy = _energies(self.session, self.latents, (wanted[place] for place in places.tolist()))
-        ends = (_energies(self.session, one, wanted) for one in (began, step_before))
+        energy = energies_of(self.session, self.latents, (wanted[place] for place in places.tolist()))
+        ends = (energies_of(self.session, one, wanted) for one in (began, step_before))
         return EnergyCourse(self.frames, energy, *(tuple(one.tolist()) for one in ends))
 
 
-def _latents(
+def latents_of(
     session: PlanningSession, read: FrameReader, frames: Sequence[int], progress: Progress = no_progress
 ) -> Float[Tensor, "frames tokens dim"]:
     """Return the latents of some frames, as the session's model sees them; few pixels at a time are in memory."""
@@ -335,7 +341,7 @@ def _latents(
     return torch.cat(found)
 
 
-def _energies(
+def energies_of(
     session: PlanningSession, seen: Iterable[Tensor], wanted: Iterable[Tensor]
 ) -> Float[np.ndarray, " frames"]:
     """Return the energy of latents of each frame to those of the wanted one: without a mask."""
@@ -358,8 +364,8 @@ def _noise_floor(
         return None
     taken = pairs[list(spread_with_ends(len(pairs), _MOST_PAIRS))]
     frames, places = np.unique(taken, return_inverse=True)
-    latents = _latents(session, shown.read, frames.tolist(), reporter.task("encoding frames of a resting arm"))
+    latents = latents_of(session, shown.read, frames.tolist(), reporter.task("encoding frames of a resting arm"))
     one, other = latents[torch.from_numpy(places.reshape(taken.shape).T)]
-    energies = _energies(session, one, other)
+    energies = energies_of(session, one, other)
     kind = session.config.planning.energy.distance
     return NoiseFloor(float(np.quantile(energies, _UPPER)), len(taken), session.encoder, kind)

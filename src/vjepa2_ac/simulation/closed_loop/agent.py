@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,10 @@ from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.planning.demonstrations.alike import StartAndGoal, goals_alike
 from vjepa2_ac.planning.goals import GoalFolder, SubGoal
 from vjepa2_ac.planning.session import PlanningSession
+from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.serving.wire import PlanningClient, goal_keys
 from vjepa2_ac.simulation.closed_loop.policies import (
     GoalsOf,
@@ -48,6 +51,8 @@ class Agent:
     warnings: tuple[str, ...]
     policy: Callable[[SimulatedArm | None, GoalsOf | None], Policy]  # None: in another world, which tells no cameras
     goals_of: Callable[[GoalFolder], tuple[SubGoal, ...]]  # of a folder, for this model
+    goals_alike: Callable[[Sequence[StartAndGoal], Reporter], Sequence[Sequence[SubGoal]]] | None = None
+    """Of demonstrations that are alike; None: it is behind a server, which has none."""
     decoder: str | None = None  # by which videos show what was imagined
 
 
@@ -118,6 +123,7 @@ def agent_of_session(session: PlanningSession, decoder: TrainedDecoder | None = 
         warnings=session.warnings,
         policy=policy,
         goals_of=session.goals_of,
+        goals_alike=partial(goals_alike, session),
         decoder=None if decoder is None else decoder.name,
     )
 

@@ -34,11 +34,13 @@ from vjepa2_ac.simulation.closed_loop.rollout import (
     ClosedLoopResult,
     EpisodeResult,
     RolloutSpec,
+    SimulatedWorld,
     Trials,
+    World,
     run_episode,
     run_task,
 )
-from vjepa2_ac.simulation.closed_loop.tasks import STEPS, TaskName, TaskProblem, arm_for
+from vjepa2_ac.simulation.closed_loop.tasks import STEPS, Problem, TaskName, TaskProblem, arm_for
 from vjepa2_ac.simulation.world.arm import SimulatedArm
 from vjepa2_ac.simulation.world.camera import FRAME_SIZE
 from vjepa2_ac.simulation.world.domains import Domain
@@ -149,8 +151,8 @@ class BenchmarkOptions(RolloutSpec):
     """The problems of a benchmark, and the goals on the way. The stride is the model's, the films are of the model."""
 
     films: int = 6  # episodes in the video; 0: no video
-    # demonstration: key frames of the oracle's solution; every-step: all of it
-    sub_goals: Literal["none", "demonstration", "every-step"] = "none"
+    # demonstration: key frames of the oracle's solution; every-step: all of it; alike: of the demonstration most alike
+    sub_goals: Literal["none", "demonstration", "every-step", "alike"] = "none"
     goals: str | None = None  # a folder of goals, the same in every problem
 
 
@@ -192,7 +194,7 @@ def run_benchmark(
         folder.mkdir(parents=True, exist_ok=True)
     options, limits = replace(options, stride=agent.stride), agent.planning.limits
     arm = arm_for(options.task, options.world, views=agent.planning.views)
-    model = agent.policy(arm, _goals_of(agent, options))
+    model = agent.policy(arm, _goals_of(agent, options, arm, reporter))
     policies: tuple[Policy, ...] = (ZeroActions(), RandomActions(limits, options.seed), Oracle(limits, arm))
     results = []
     for policy in (model, *policies):
@@ -236,13 +238,15 @@ def benchmark_as_dict(benchmark: ClosedLoopBenchmark) -> dict[str, Any]:
     }
 
 
-def _goals_of(agent: Agent, options: BenchmarkOptions) -> GoalsOf | None:
+def _goals_of(agent: Agent, options: BenchmarkOptions, arm: SimulatedArm, reporter: Reporter) -> GoalsOf | None:
     """Return what makes the goals on the way; each problem has been demonstrated once when this returns."""
     if options.goals is not None:
         goals = agent.goals_of(read_goal_folder(Path(options.goals)))
         return lambda _: goals
     if options.sub_goals == "none":
         return None
+    if options.sub_goals == "alike":
+        return of_demonstrations_alike(agent, SimulatedWorld(arm), options.problems, reporter)
     steps = max(options.model_steps, STEPS[options.task])
     spec = DemonstrationSpec(agent.planning.limits, steps, agent.stride)
     if options.sub_goals == "every-step":
@@ -250,6 +254,23 @@ def _goals_of(agent: Agent, options: BenchmarkOptions) -> GoalsOf | None:
     goals_of = DemonstratedGoals(options.task, options.world, spec, views=agent.planning.views)
     goals_of.require(options.problems)
     return goals_of
+
+
+def of_demonstrations_alike(
+    agent: Agent, world: World, problems: Iterable[Problem], reporter: Reporter = SILENT
+) -> GoalsOf:
+    """Return what makes goals of the image at the start and that of the goal alone, by the agent's demonstrations.
+
+    Raises:
+        InputError: The agent has none, since it is behind a server; or as `goals_alike`.
+    """
+    if agent.goals_alike is None:
+        needed = "the model itself: its server knows no demonstrations"
+        raise InputError(where="--sub-goals alike", found=agent.subject, needed=needed)
+    begun = {problem.index: world.begin(problem) for problem in problems}
+    made = agent.goals_alike([(now.image, goal) for goal, now in begun.values()], reporter)
+    goals = dict(zip(begun, made, strict=True))
+    return lambda problem: goals[problem.index]
 
 
 def _metrics(result: ClosedLoopResult) -> dict[str, Any]:

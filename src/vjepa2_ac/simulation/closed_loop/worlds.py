@@ -39,6 +39,7 @@ from vjepa2_ac.simulation.closed_loop.benchmark import (
     ClosedLoopBenchmark,
     DemonstrationSpec,
     every_step,
+    of_demonstrations_alike,
     write_benchmark,
 )
 from vjepa2_ac.simulation.closed_loop.policies import GoalsOf, Image, Moves, Policy, RandomActions, ZeroActions
@@ -312,11 +313,13 @@ def run_world_benchmark(
     if options.goals is not None:
         goals = agent.goals_of(read_goal_folder(Path(options.goals)))
         goals_of = lambda _: goals  # noqa: E731
-    elif options.sub_goals != "none":
+    elif options.sub_goals in {"demonstration", "every-step"}:
         goals_of = lambda problem: problem.goals  # noqa: E731
     model = agent.policy(None, goals_of)
     name = world.about.task
     trials, shown = find_problems(world, options, agent.stride, reporter.task(f"{name}: {EXPERT}"))
+    if options.sub_goals == "alike":
+        model = agent.policy(None, of_demonstrations_alike(agent, world, trials.problems, reporter))
     limits, results = agent.planning.limits, []
     policies: tuple[Policy, ...] = (model, ZeroActions(), RandomActions(limits, options.seed))
     for policy in policies:
@@ -366,7 +369,7 @@ def _demonstrated(
     seen = [first, *(world.let_expert(span.stride) for _ in range(span.steps))]
     states, images = np.stack([one.state for one in seen]), [one.image for one in seen]
     problem = WorldProblem(seed, images[-1] if first.goal is None else first.goal)
-    if options.sub_goals != "none":
+    if options.sub_goals in {"demonstration", "every-step"}:
         spec = every_step(DemonstrationSpec()) if options.sub_goals == "every-step" else DemonstrationSpec()
         keys = gripper_key_frames(states, OF_MODEL_STEPS) if spec.every is None else every_key_frame(len(seen), 1)
         timing = Timing(1, spec.slack, spec.share)
