@@ -94,6 +94,11 @@ class Method:
     learning_rate: float = 1e-3
 
     @property
+    def has_base(self) -> bool:
+        """Whether it begins with the weights of a base."""
+        return self.kind not in {"scratch", "cloned"}
+
+    @property
     def adapter(self) -> AdapterConfig:
         """The adapter section of its config."""
         if self.kind != "LoRA":
@@ -258,9 +263,7 @@ def candidate_cells() -> Iterator[Cell]:
     """Yield what the learning rates are chosen by: one base, one seed."""
     for shift, of in _RATES.items():
         for name, rates in of.items():
-            base: Base = (
-                "none" if METHODS[name].kind == "scratch" else "many cameras" if shift in SHIFTS else "one camera"
-            )
+            base: Base = "none" if not METHODS[name].has_base else "many cameras" if shift in SHIFTS else "one camera"
             for rate in rates:
                 yield Cell(shift, base, f"{name}, lr {rate:g}", 20, 0)
 
@@ -268,7 +271,7 @@ def candidate_cells() -> Iterator[Cell]:
 def _of(shift: str, methods: tuple[str, ...], episodes: int, seed: int) -> Iterator[Cell]:
     for name in methods:
         bases: tuple[Base, ...] = BASES if shift in SHIFTS else BASES[:1]
-        if METHODS[name].kind in {"scratch", "cloned"}:
+        if not METHODS[name].has_base:
             bases = ("none",)
         for base in bases:
             yield Cell(shift, base, name, 0 if METHODS[name].kind == "zero-shot" else episodes, seed)

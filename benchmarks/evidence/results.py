@@ -66,5 +66,5 @@ def last(one: Figures) -> float:
 def main_cells(results: Sequence[Figures], base: str, method: str, shift: str = "look") -> list[Figures]:
     """Return a row of a main table: zero-shot needs no demonstrations, the others have 20; some have no base."""
     episodes = 0 if METHODS[method].kind == "zero-shot" else 20
-    base = "none" if METHODS[method].kind in {"scratch", "cloned"} else base
+    base = base if METHODS[method].has_base else "none"
     return pick(results, shift=shift, base=base, method=method, episodes=episodes)

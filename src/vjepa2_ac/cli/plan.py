@@ -49,7 +49,8 @@ def add_goals(commands: cli.Commands) -> None:
     cli.add(parser, "overrides key=value", "of the config, such as data.camera=wrist_left", nargs="*")
     cli.add(parser, "--out FOLDER", "where goals.json and the images go: new or empty", cli.as_path, required=True)
     cli.add(parser, "--episode ID|NUMBER", "which one: its name in the data, or its number, from 0 (0)")
-    cli.add(parser, "--alike IMAGE", "instead: what is seen now, and the goal; the episode that is most alike", nargs=2)
+    text = "instead: two images, for the successful episode that begins and ends most like them; it then ends in GOAL"
+    cli.add(parser, "--alike", text, nargs=2, metavar=("NOW", "GOAL"))
     text = "instead: the last frame of a successful episode of each language label with this text, for prompts"
     cli.add(parser, "--task TEXT", text, nargs="?", const="")
     text = "gripper: where it changes or the arm stops; latent: by images; every N frames (gripper; of a film latent)"
