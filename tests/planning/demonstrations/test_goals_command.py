@@ -1,6 +1,7 @@
 """`vjepa2-ac goals` makes a folder of goals of an episode or a film, and `plan` and `simulate` take it."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -108,16 +109,37 @@ def test_two_photographs_find_the_episode_that_they_are_alike(
         status, file = goals(workshop, tmp_path / f"{index}", *model)
         assert status == 0
         assert file["origin"]["episode"] == dataset.table.identity(index)
-        assert [goal["name"] for goal in file["goals"]] == ["before closing", "closed", "the photograph"]
-        *_, last = read_goal_folder(tmp_path / f"{index}").goals
-        np.testing.assert_array_equal(last.image, seen[1])
+        first, second, *_, last = (goal["name"] for goal in file["goals"])
+        assert (first, second, last) == ("before closing", "closed", "the photograph")
+        photograph = read_goal_folder(tmp_path / f"{index}").goals[-1].image
+        np.testing.assert_array_equal(photograph, seen[1])
     Image.fromarray(seen[0, ::2]).save(tmp_path / "now.png")
     capsys.readouterr()
     assert goals(workshop, tmp_path / "small", *model)[0] == 2
     assert "now.png: 320 x 90 pixels" in capsys.readouterr().err
     Image.fromarray(seen[1, ::2]).save(tmp_path / "goal.png")
     assert goals(workshop, tmp_path / "small", *model)[0] == 2
-    assert "320 x 90 pixels (width x height). needed: 320 x 180" in capsys.readouterr().err
+    assert "320 x 180 pixels (width x height). needed: 320 x 90" in capsys.readouterr().err
+
+
+def test_a_demonstration_that_cannot_be_read_is_left_out_of_those_alike(
+    workshop: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    copy = shutil.copytree(workshop / "set", tmp_path / "set")
+    (records,) = copy.glob("*.tfrecord*")
+    content = bytearray(records.read_bytes())
+    content[len(content) // 4] ^= 255  # within the first episode
+    records.write_bytes(content)
+    model = ["--model", str(workshop / "model"), f"data.path={copy}"]
+    dataset = open_dataset(workshop / "set", frames=4)
+    seen = np.array(dataset.source.read(0).read_frames([0, 40]))
+    for name, image in zip(("now", "goal"), seen, strict=True):
+        Image.fromarray(image).save(tmp_path / f"{name}.png")
+    photographs = ["--alike", str(tmp_path / "now.png"), str(tmp_path / "goal.png")]
+    status, file = goals(workshop, tmp_path / "goals", *model, *photographs)
+    assert status == 0
+    assert file["origin"]["episode"] == dataset.table.identity(1)
+    assert "1 of 2 episodes were left out" in caplog.text
 
 
 def test_a_film_without_states_becomes_goals_by_latents(workshop: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -26,6 +27,8 @@ from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.planning.session import PlanningSession
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
 
+logger = logging.getLogger(__name__)
+
 Image = UInt8[np.ndarray, "height width 3"]
 StartAndGoal = tuple[Image, Image]
 
@@ -36,7 +39,8 @@ def demonstrations_alike(
     """Return for each start and goal the demonstration that is most alike.
 
     It has the least sum of two energies: of its first image to the start, and of its last one to the goal. All episodes
-    count where the data do not say which succeeded. Two images of each are read; their latents are not kept.
+    count where the data do not say which succeeded; one that cannot be read, or whose images have another size, is left
+    out with a warning. Two images of each are read; their latents are not kept.
 
     Args:
         config: The demonstrations.
@@ -45,24 +49,34 @@ def demonstrations_alike(
         reporter: Shows the progress.
 
     Raises:
-        InputError: No episode succeeded, or one cannot be read, or the data are latents without frames.
+        InputError: No episode is left, or the data are latents without frames.
     """
     require_frames(config, to="make goals of")
-    views = session.config.planning.views
+    views, both = (
+        session.config.planning.views,
+        [latents_of(session, np.stack(pair).__getitem__, [0, 1]) for pair in wanted],
+    )
     dataset = open_dataset(config, progress=reporter.task(INDEXING))
     chosen = np.flatnonzero(dataset.taking_part & (dataset.table.success != 0)).tolist()
-    if not chosen:
-        raise InputError(where=config.path, found="no successful episode", needed="one: its key frames become goals")
-    both = [latents_of(session, np.stack(pair).__getitem__, [0, 1]) for pair in wanted]
-    first = recording_of(dataset, chosen[0], views).read([0])[0]
-    require_image(wanted[0][0], where="a start", like=first)
-    progress, apart = reporter.task("looking for a demonstration alike", "episodes"), list[list[float]]()
+    progress, apart, unusable = reporter.task("looking for a demonstration alike", "episodes"), {}, list[InputError]()
     for done, index in enumerate(chosen, start=1):
-        shown = recording_of(dataset, index, views)
-        seen = latents_of(session, shown.read, [0, shown.frames - 1])
-        apart.append([float(energies_of(session, seen, ends).sum()) for ends in both])
+        try:
+            shown = recording_of(dataset, index, views)
+            ends = shown.read([0, shown.frames - 1])
+            require_image(ends[0], where=shown.name, like=wanted[0][0])
+        except InputError as error:
+            unusable.append(error)
+        else:
+            seen = latents_of(session, ends.__getitem__, [0, 1])
+            apart[index] = [float(energies_of(session, seen, pair).sum()) for pair in both]
         progress(done, len(chosen))
-    return tuple(recording_of(dataset, chosen[place], views) for place in np.argmin(apart, axis=0).tolist())
+    if not apart:
+        needed = "a successful episode, of the size of the images: its key frames become goals"
+        raise InputError(where=config.path, found=str(unusable[0]) if unusable else "none", needed=needed)
+    if unusable:
+        logger.warning("%d of %d episodes were left out, the first since %s", len(unusable), len(chosen), unusable[0])
+    nearest = np.argmin(list(apart.values()), axis=0).tolist()
+    return tuple(recording_of(dataset, list(apart)[place], views) for place in nearest)
 
 
 def ending_with(made: MadeGoals, photograph: Image) -> MadeGoals:
