@@ -258,6 +258,9 @@ def _run_benchmark(options: argparse.Namespace) -> int:
     if options.goals is not None and options.sub_goals is not None:
         found = f"--sub-goals {options.sub_goals}, too"
         raise InputError(where=f"--goals {options.goals}", found=found, needed="one of the two")
+    if options.sub_goals == "alike" and not is_run(options.subject) and options.config is None:
+        needed = "a run; or a model with --config, whose data has the demonstrations"
+        raise InputError(where="--sub-goals alike", found=options.subject, needed=needed)
     if not cli.is_server(options.subject):
         _refuse(options, ("key_file",), needed="a server: ws://HOST:PORT")
         options.checkpoint = options.checkpoint or "selected"

@@ -119,7 +119,7 @@ def test_two_photographs_find_the_episode_that_they_are_alike(
     assert "now.png: 320 x 90 pixels" in capsys.readouterr().err
     Image.fromarray(seen[1, ::2]).save(tmp_path / "goal.png")
     assert goals(workshop, tmp_path / "small", *model)[0] == 2
-    assert "320 x 180 pixels (width x height). needed: 320 x 90" in capsys.readouterr().err
+    assert "the image of the start: 320 x 90 pixels (width x height). needed: 320 x 180" in capsys.readouterr().err
 
 
 def test_a_demonstration_that_cannot_be_read_is_left_out_of_those_alike(

@@ -1,6 +1,7 @@
 """The closed-loop benchmark: table, metrics and video agree."""
 
 import json
+import re
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -231,11 +232,15 @@ def test_goals_come_from_the_demonstration_that_looks_like_the_problem(
     where = ["--config", str(tmp_path / "config.yaml"), "--out", str(tmp_path / "out")]
     assert main(["simulate", model, *given, *where, *SMALL]) == 0
     assert metrics(tmp_path / "out")["about"]["sub_goals"] == "alike"
-    assert "looking for a demonstration alike 3/3" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "looking for a demonstration alike 3/3" in shown
+    assert re.search(
+        r"Start and goal are [\d.]+ from those of the demonstration most alike, [\d.]+ of the median", shown
+    )
     loaded = load_to_plan(model, config=tmp_path / "config.yaml", overrides=SMALL)
     with serving(lambda: Session(loaded.controller()), told=partial(metadata_of, loaded)) as running:
         assert main(["simulate", running.url, *given, "--out", str(tmp_path / "there")]) == 2
-    assert "needed: the model itself: its server knows no demonstrations" in capsys.readouterr().err
+    assert "needed: a run; or a model with --config" in capsys.readouterr().err
 
 
 def test_a_problem_that_cannot_be_demonstrated_is_told_before_any_is_worked_on(

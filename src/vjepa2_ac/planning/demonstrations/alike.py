@@ -11,7 +11,7 @@ from jaxtyping import UInt8
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.data.windows import require_frames, require_stride
+from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import require_image
 from vjepa2_ac.planning.demonstrations.make_goals import (
@@ -22,6 +22,7 @@ from vjepa2_ac.planning.demonstrations.make_goals import (
     latents_of,
     make_goals,
     recording_of,
+    require_views,
 )
 from vjepa2_ac.planning.goals import SubGoal
 from vjepa2_ac.planning.session import PlanningSession
@@ -49,34 +50,39 @@ def demonstrations_alike(
         reporter: Shows the progress.
 
     Raises:
-        InputError: No episode is left, or the data are latents without frames.
+        InputError: No episode is left, the data are latents without frames, or of fewer cameras than are planned with.
     """
-    require_frames(config, to="make goals of")
-    views, both = (
-        session.config.planning.views,
-        [latents_of(session, np.stack(pair).__getitem__, [0, 1]) for pair in wanted],
-    )
+    views = session.config.planning.views
+    require_views(config, views)
+    both = [latents_of(session, np.stack(pair).__getitem__, [0, 1]) for pair in wanted]
     dataset = open_dataset(config, progress=reporter.task(INDEXING))
     chosen = np.flatnonzero(dataset.taking_part & (dataset.table.success != 0)).tolist()
-    progress, apart, unusable = reporter.task("looking for a demonstration alike", "episodes"), {}, list[InputError]()
+    progress = reporter.task("looking for a demonstration alike", "episodes")
+    apart, unusable = dict[int, list[float]](), list[str]()
     for done, index in enumerate(chosen, start=1):
+        progress(done, len(chosen))
         try:
             shown = recording_of(dataset, index, views)
             ends = shown.read([0, shown.frames - 1])
-            require_image(ends[0], where=shown.name, like=wanted[0][0])
+            require_image(ends[0], where=shown.name, like=wanted[0][0] if apart else None)
         except InputError as error:
-            unusable.append(error)
-        else:
-            seen = latents_of(session, ends.__getitem__, [0, 1])
-            apart[index] = [float(energies_of(session, seen, pair).sum()) for pair in both]
-        progress(done, len(chosen))
+            unusable.append(str(error))
+            continue
+        if not apart:  # before thousands are read
+            require_image(wanted[0][0], where="the image of the start", like=ends[0])
+        seen = latents_of(session, ends.__getitem__, [0, 1])
+        apart[index] = [float(energies_of(session, seen, pair).sum()) for pair in both]
     if not apart:
-        needed = "a successful episode, of the size of the images: its key frames become goals"
-        raise InputError(where=config.path, found=str(unusable[0]) if unusable else "none", needed=needed)
+        found = unusable[0] if unusable else "no successful episode"
+        raise InputError(where=config.path, found=found, needed="one that can be read: its key frames become goals")
     if unusable:
         logger.warning("%d of %d episodes were left out, the first since %s", len(unusable), len(chosen), unusable[0])
-    nearest = np.argmin(list(apart.values()), axis=0).tolist()
-    return tuple(recording_of(dataset, list(apart)[place], views) for place in nearest)
+    energies = np.array(list(apart.values()))
+    least, usual = energies.min(axis=0).mean(), np.median(energies, axis=0).mean()
+    reporter.note(
+        f"Start and goal are {least:.3g} from those of the demonstration most alike, {usual:.3g} of the median one."
+    )
+    return tuple(recording_of(dataset, list(apart)[place], views) for place in energies.argmin(axis=0).tolist())
 
 
 def ending_with(made: MadeGoals, photograph: Image) -> MadeGoals:
@@ -90,9 +96,11 @@ def goals_alike(
     """Return for each start and goal the key frames of the demonstration that is most alike, and the goal itself.
 
     Raises:
-        InputError: As `demonstrations_alike`; or it has no poses, or a model step has no known length.
+        InputError: As `demonstrations_alike`; or there are no poses, or a model step has no known length.
     """
     config = session.config.data
+    if config.states != "pose":
+        raise InputError(where="data.states", found=config.states, needed="pose: of it key frames are found")
     options = KeyFrameOptions(stride=require_stride(config, to="make goals of"))
     alike = demonstrations_alike(config, session, wanted, reporter)
     return tuple(

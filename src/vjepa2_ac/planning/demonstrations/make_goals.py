@@ -88,12 +88,21 @@ def recording_of_episode(
         InputError: There is no such episode, it cannot be read, the data are latents without frames, or there are not
             as many cameras.
     """
+    require_views(config, views)
+    dataset = open_dataset(config, progress=progress)
+    return recording_of(dataset, number_of_episode(dataset, wanted), views)
+
+
+def require_views(config: DataConfig, views: int) -> None:
+    """Refuse data without frames, or of fewer cameras than are seen side by side.
+
+    Raises:
+        InputError: They are.
+    """
     require_frames(config, to="make goals of")
     if len(config.cameras) < views:
         found, needed = ", ".join(config.cameras), f"{views} cameras, from left to right, as planning.views says"
         raise InputError(where="data.camera", found=found, needed=needed)
-    dataset = open_dataset(config, progress=progress)
-    return recording_of(dataset, number_of_episode(dataset, wanted), views)
 
 
 def recording_of(dataset: Dataset, index: int, views: int = 1) -> Recording:
