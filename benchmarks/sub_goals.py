@@ -88,14 +88,10 @@ def measure(way: str, agent: Agent, options: argparse.Namespace) -> ClosedLoopRe
     if way == "oracle":
         free = agent.planning.limits.model_copy(update={"gripper_mode": "free"})
         policy = Oracle(free, arm)
+    elif way == "alike":
+        policy = agent.policy(arm, of_demonstrations_alike(agent, SimulatedWorld(arm), spec.problems))
     else:
-        is_alike = way == "alike"
-        goals = (
-            of_demonstrations_alike(agent, SimulatedWorld(arm), spec.problems)
-            if is_alike
-            else goals_of(way, agent, options)
-        )
-        policy = agent.policy(arm, goals)
+        policy = agent.policy(arm, goals_of(way, agent, options))
     return run_task(spec, policy, arm, SILENT.task(way))
 
 

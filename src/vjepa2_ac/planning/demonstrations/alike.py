@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import UInt8
@@ -12,6 +13,7 @@ from jaxtyping import UInt8
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.windows import require_stride
+from vjepa2_ac.encoding.batch import encode_frames
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import require_image
 from vjepa2_ac.planning.demonstrations.make_goals import (
@@ -19,7 +21,6 @@ from vjepa2_ac.planning.demonstrations.make_goals import (
     MadeGoals,
     Recording,
     energies_of,
-    latents_of,
     make_goals,
     recording_of,
     require_views,
@@ -54,7 +55,8 @@ def demonstrations_alike(
     """
     views = session.config.planning.views
     require_views(config, views)
-    both = [latents_of(session, np.stack(pair).__getitem__, [0, 1]) for pair in wanted]
+    encoded = partial(encode_frames, session.world_model, crop=session.config.data.crop, views=views)
+    both = [encoded(np.stack(pair)) for pair in wanted]
     dataset = open_dataset(config, progress=reporter.task(INDEXING))
     chosen = np.flatnonzero(dataset.taking_part & (dataset.table.success != 0)).tolist()
     progress = reporter.task("looking for a demonstration alike", "episodes")
@@ -70,7 +72,7 @@ def demonstrations_alike(
             continue
         if not apart:  # before thousands are read
             require_image(wanted[0][0], where="the image of the start", like=ends[0])
-        seen = latents_of(session, ends.__getitem__, [0, 1])
+        seen = encoded(ends)
         apart[index] = [float(energies_of(session, seen, pair).sum()) for pair in both]
     if not apart:
         found = unusable[0] if unusable else "no successful episode"

@@ -313,7 +313,7 @@ class _Encoded:
     def of(cls, session: PlanningSession, recording: Recording, reporter: Reporter) -> _Encoded:
         step = math.ceil(recording.frames / _MOST_ENCODED)
         frames = np.unique(np.append(np.arange(0, recording.frames, step), recording.frames - 1))
-        latents = latents_of(session, recording.read, frames.tolist(), reporter.task("encoding frames"))
+        latents = _latents(session, recording.read, frames.tolist(), reporter.task("encoding frames"))
         return cls(session, recording, frames, latents)
 
     def key_frames(self, apart: int) -> tuple[KeyFrame, ...]:
@@ -330,7 +330,7 @@ class _Encoded:
         """Return the energies of all frames to the goal that applies then: the next key frame."""
         begins = [0, *goals[:-1]]
         before = [max(begin, goal - stride) for begin, goal in zip(begins, goals, strict=True)]
-        taken = latents_of(self.session, self.recording.read, [*begins, *before, *goals])
+        taken = _latents(self.session, self.recording.read, [*begins, *before, *goals])
         began, step_before, wanted = taken.split(len(goals))  # type: ignore[no-untyped-call]  # torch
         places = np.searchsorted(goals, self.frames).clip(max=len(goals) - 1)
         energy = energies_of(self.session, self.latents, (wanted[place] for place in places.tolist()))
@@ -338,7 +338,7 @@ class _Encoded:
         return EnergyCourse(self.frames, energy, *(tuple(one.tolist()) for one in ends))
 
 
-def latents_of(
+def _latents(
     session: PlanningSession, read: FrameReader, frames: Sequence[int], progress: Progress = no_progress
 ) -> Float[Tensor, "frames tokens dim"]:
     """Return the latents of some frames, as the session's model sees them; few pixels at a time are in memory."""
@@ -373,7 +373,7 @@ def _noise_floor(
         return None
     taken = pairs[list(spread_with_ends(len(pairs), _MOST_PAIRS))]
     frames, places = np.unique(taken, return_inverse=True)
-    latents = latents_of(session, shown.read, frames.tolist(), reporter.task("encoding frames of a resting arm"))
+    latents = _latents(session, shown.read, frames.tolist(), reporter.task("encoding frames of a resting arm"))
     one, other = latents[torch.from_numpy(places.reshape(taken.shape).T)]
     energies = energies_of(session, one, other)
     kind = session.config.planning.energy.distance

@@ -239,7 +239,7 @@ def benchmark_as_dict(benchmark: ClosedLoopBenchmark) -> dict[str, Any]:
 
 
 def _goals_of(agent: Agent, options: BenchmarkOptions, arm: SimulatedArm, reporter: Reporter) -> GoalsOf | None:
-    """Return what makes the goals on the way; each problem has been demonstrated once when this returns."""
+    """Return what makes the goals on the way; a problem without them has been refused when this returns."""
     if options.goals is not None:
         goals = agent.goals_of(read_goal_folder(Path(options.goals)))
         return lambda _: goals

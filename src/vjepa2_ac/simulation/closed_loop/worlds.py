@@ -313,13 +313,14 @@ def run_world_benchmark(
     if options.goals is not None:
         goals = agent.goals_of(read_goal_folder(Path(options.goals)))
         goals_of = lambda _: goals  # noqa: E731
-    elif options.sub_goals in {"demonstration", "every-step"}:
+    elif options.sub_goals != "none":
         goals_of = lambda problem: problem.goals  # noqa: E731
     model = agent.policy(None, goals_of)
     name = world.about.task
     trials, shown = find_problems(world, options, agent.stride, reporter.task(f"{name}: {EXPERT}"))
     if options.sub_goals == "alike":
-        model = agent.policy(None, of_demonstrations_alike(agent, world, trials.problems, reporter))
+        alike = of_demonstrations_alike(agent, world, trials.problems, reporter)
+        trials = replace(trials, problems=tuple(replace(one, goals=tuple(alike(one))) for one in trials.problems))
     limits, results = agent.planning.limits, []
     policies: tuple[Policy, ...] = (model, ZeroActions(), RandomActions(limits, options.seed))
     for policy in policies:
