@@ -31,7 +31,7 @@ ORDERS: dict[str, list[str]] = {
         "cli",
     ],
     "data": [
-        "streams",
+        "poses streams",
         "index",
         "selection files transforms",
         "idle windows",

@@ -81,11 +81,11 @@ def test_a_resolved_config_reads_back_equal(tmp_path: Path) -> None:
 def test_overrides_reach_nested_keys_and_read_numbers_as_people_write_them(tmp_path: Path) -> None:
     path = write(tmp_path, yaml.safe_dump(MINIMAL))
     config = load_config(
-        path, ["training.learning_rate=3e-4", "adapter.targets=[q, v]", "data.fields.gripper=openness"]
+        path, ["training.learning_rate=3e-4", "adapter.targets=[q, v]", "data.fields.gripper_open=0.5"]
     )
     assert config.training.learning_rate == 3e-4
     assert config.adapter.targets == ("q", "v")
-    assert config.data.fields.gripper == "openness"
+    assert config.data.fields.gripper_open == 0.5
 
 
 @pytest.mark.parametrize("written", ["22008760", '"22008760"'])
@@ -193,3 +193,11 @@ def test_text_prints_the_file_with_its_comments(capsys: pytest.CaptureFixture[st
     assert capsys.readouterr().out == (ROOT / "configs/own_robot.yaml").read_text()
     assert main(["config", "list"]) == 0
     assert capsys.readouterr().out.count("builtin:") >= 14
+
+
+@pytest.mark.parametrize(("older", "values"), [("closedness", (0.0, 1.0)), ("openness", (1.0, 0.0))])
+def test_gripper_key_of_an_older_run_is_read(older: str, values: tuple[float, float]) -> None:
+    data = {"source": "rlds", "path": "x", "fields": {"gripper": older, "control_rate_hz": 5.0}}
+    config = parse_config({"run_dir": "none", "data": data, "model": {"base": "builtin:sim-tiny"}}, where="x").data
+    assert (config.fields.gripper_open, config.fields.gripper_closed) == values
+    assert config.fields.control_rate_hz == 5.0

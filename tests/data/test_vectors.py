@@ -171,14 +171,14 @@ def test_an_index_of_poses_is_not_taken_for_one_of_vectors(tmp_path: Path) -> No
         ({"source": "droid_raw"}, "source droid_raw: a matter of poses"),
         ({"pose_frame": "camera"}, "pose_frame camera: a matter of poses"),
         ({"idle": {"rule": "motion"}}, "idle.rule motion: a matter of poses"),
-        ({"source": "rlds", "fields": {"gripper": "openness"}}, "fields.gripper"),
+        ({"source": "rlds", "fields": {"gripper_open": 0.5}}, "fields.gripper_open"),
         ({"source": "lerobot", "lerobot": {"rotation": "quaternion_wxyz"}}, "lerobot.rotation"),
         ({"source": "lerobot", "lerobot": {"gripper_open": 0.08}}, "lerobot.gripper_open"),
         ({"actions": "recorded"}, "set join_actions to sum"),
         ({"actions": "recorded", "stride": "auto"}, "set join_actions to sum"),
         ({"states": "pose", "actions": "recorded", "join_actions": "sum"}, "needs states vector"),
         ({"join_actions": "sum"}, "join_actions belongs to actions recorded"),
-        ({"fields": {"gripper": "openness"}}, "data.fields: a section of source rlds, and this is source npz"),
+        ({"fields": {"gripper_open": 0.5}}, "data.fields: a section of source rlds, and this is source npz"),
     ],
 )
 def test_what_needs_poses_or_says_too_little_is_refused_with_the_config(

@@ -88,6 +88,7 @@ def parse_config(values: Mapping[str, Any], overrides: Iterable[str] = (), *, wh
         if not separator or not key:
             raise InputError(where="overrides", found=f"{override!r}", needed="key=value, such as training.steps=100")
         _set(given, key.split("."), parse_yaml(text, where=f"override {key}"), override)
+    _replace_older_keys(given)
     try:
         return Config.model_validate_json(_as_json(with_plugins(given, where=where, here=here), where))
     except ValidationError as error:
@@ -182,6 +183,18 @@ def _set(values: dict[str, Any], keys: list[str], value: Any, override: str) -> 
         for section in {section for kind in others for section in kind.own_sections()}:
             values.pop(section, None)  # of the form of data that it replaces
     values[keys[-1]] = value
+
+
+_OLDER_GRIPPERS = {"closedness": {}, "openness": {"gripper_open": 1.0, "gripper_closed": 0.0}}
+
+
+def _replace_older_keys(values: dict[str, Any]) -> None:
+    """Replace `data.fields.gripper`, which configs of older runs have, by `gripper_open` and `gripper_closed`."""
+    for section, inner in values.items():
+        if section == "fields" and isinstance(inner, dict) and inner.get("gripper") in _OLDER_GRIPPERS:
+            inner.update(_OLDER_GRIPPERS[inner.pop("gripper")])
+        elif isinstance(inner, dict):
+            _replace_older_keys(inner)
 
 
 # ---- plug-ins: modules that are imported before a config is checked; what they register may be named in it ----

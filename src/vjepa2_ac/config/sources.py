@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -11,21 +11,49 @@ from vjepa2_ac.config.section import Affects, Count, Section
 
 RAW_CAMERAS = ("left", "right", "wrist", "ext1", "ext2")
 
+RotationFormat = Literal["euler_xyz", "euler_xyz_degrees", "rotation_vector", "quaternion_wxyz", "quaternion_xyzw"]
+
 _Names = Annotated[tuple[str, ...], Field(min_length=1)]
 
 
-class RldsFields(Section):
+class PoseFields(Section):
+    """How the numbers of a data set form a pose: which of them, in which units, and with which rotation."""
+
+    select: Annotated[tuple[Count, ...] | None, Affects.EPISODES] = None
+    """Which numbers of `state`, in this order, are x, y, z, rotation (3 or 4), gripper; or the vector; null: all."""
+    rotation: Annotated[RotationFormat, Affects.EPISODES] = "euler_xyz"
+    """Rotation format: extrinsic xyz Euler angles in radians or degrees; a rotation vector (axis times angle in
+    radians); or a unit quaternion with w first or last."""
+    position_unit: Annotated[Literal["m", "cm", "mm"], Affects.EPISODES] = "m"
+    """Unit of the position. The model's states and actions are in metres."""
+    gripper_open: Annotated[float, Affects.EPISODES] = 0.0
+    """The gripper's value when it is open."""
+    gripper_closed: Annotated[float, Affects.EPISODES] = 1.0
+    """The gripper's value when it is closed; smaller than gripper_open if the sign is inverted."""
+
+    @model_validator(mode="after")
+    def _gripper_moves(self) -> Self:
+        is_broken = self.gripper_open == self.gripper_closed
+        return self.refused((is_broken, "gripper_open and gripper_closed are the same number"))
+
+    @property
+    def pose_keys(self) -> list[str]:
+        """The keys that have a meaning for poses only and differ from their defaults."""
+        keys = ("rotation", "position_unit", "gripper_open", "gripper_closed")
+        return [key for key in keys if getattr(self, key) != type(self).model_fields[key].default]
+
+
+class RldsFields(PoseFields):
     """Where an RLDS data set stores what the model needs; the defaults are DROID's."""
 
     state: Annotated[_Names, Affects.EPISODES] = (
         "steps/observation/cartesian_position",
         "steps/observation/gripper_position",
     )
-    """Features that are, concatenated, the 7 numbers of the *measured* state (episode.py); for `states: vector` any."""
+    """Features whose numbers, concatenated, hold position, rotation and gripper of the *measured* state; for
+    `states: vector` any numbers."""
     action: Annotated[_Names, Affects.INDEX | Affects.CLIPS] = ("steps/action",)
     """For `actions: recorded`: features that form, concatenated, the *commanded* action of each control step."""
-    gripper: Annotated[Literal["closedness", "openness"], Affects.IDLE | Affects.CLIPS] = "closedness"
-    """Meaning of the state's last number: 0 open .. 1 closed (DROID), or 0 closed .. 1 open (BridgeData)."""
     identity: Annotated[_Names, Affects.EPISODES] = (
         "episode_metadata/recording_folderpath",
         "episode_metadata/file_path",
@@ -54,7 +82,7 @@ class RawDroidOptions(Section):
     """Control steps per second; the MP4 holds one frame for each, whatever its header says."""
 
 
-class LeRobotFields(Section):
+class LeRobotFields(PoseFields):
     """Where a LeRobot data set stores what the model needs; the defaults are those of DROID's ports."""
 
     state: Annotated[_Names, Affects.EPISODES] = (
@@ -64,14 +92,6 @@ class LeRobotFields(Section):
     """Columns that hold position, rotation and gripper of the *measured* state; for `states: vector` any numbers."""
     action: Annotated[_Names, Affects.INDEX | Affects.CLIPS] = ("action",)
     """For `actions: recorded`: columns that form, concatenated, the *commanded* action of each control step."""
-    select: Annotated[tuple[Count, ...] | None, Affects.EPISODES] = None
-    """Which of these numbers, in this order, are x, y, z, rotation (3 or 4), gripper; or are the vector; null: all."""
-    rotation: Annotated[Literal["euler_xyz", "quaternion_wxyz", "quaternion_xyzw"], Affects.EPISODES] = "euler_xyz"
-    """How the rotation is written: extrinsic xyz Euler angles in radians, or a unit quaternion, w first or last."""
-    gripper_open: Annotated[float, Affects.EPISODES] = 0.0
-    """The gripper's value when it is open."""
-    gripper_closed: Annotated[float, Affects.EPISODES] = 1.0
-    """The gripper's value when it is closed; smaller than gripper_open if the sign is inverted."""
     cameras: Annotated[dict[str, str], Field(min_length=1), Affects.EPISODES] = {
         "exterior_1_left": "observation.images.exterior_1_left",
         "exterior_2_left": "observation.images.exterior_2_left",
@@ -85,18 +105,13 @@ class LeRobotFields(Section):
     fps: Annotated[Annotated[float, Field(gt=0.0, le=1000.0)] | None, Affects.EPISODES] = None
     """Control steps per second; null: what meta/info.json says."""
 
-    @model_validator(mode="after")
-    def _gripper_moves(self) -> LeRobotFields:
-        is_broken = self.gripper_open == self.gripper_closed
-        return self.refused((is_broken, "gripper_open and gripper_closed are the same number"))
-
 
 class RldsData(DataConfig):
     """TFRecord shards with a dataset_info.json, as TFDS writes them."""
 
     reader: ClassVar[str] = "vjepa2_ac.data.sources.rlds.source:RldsSource"
     has_camera_poses: ClassVar[bool] = False
-    gripper_fix: ClassVar[str] = "set data.fields.gripper to the other convention"
+    gripper_fix: ClassVar[str] = "exchange data.fields.gripper_open and gripper_closed"
     same_identity_fix: ClassVar[str] = "Add a feature to data.fields.identity that differs between them"
 
     source: Annotated[Literal["rlds"], Affects.FORM] = "rlds"
@@ -111,8 +126,8 @@ class RldsData(DataConfig):
 
     @property
     def own_knobs_of_poses(self) -> list[str]:
-        """The gripper's convention."""
-        return ["fields.gripper"] if self.fields.gripper != "closedness" else []
+        """Formats of position, rotation and gripper."""
+        return [f"fields.{key}" for key in self.fields.pose_keys]
 
 
 class RawDroidData(DataConfig):
@@ -152,9 +167,8 @@ class LeRobotData(DataConfig):
 
     @property
     def own_knobs_of_poses(self) -> list[str]:
-        """Conventions of rotation and gripper."""
-        turned, gripper = self.lerobot.rotation != "euler_xyz", (self.lerobot.gripper_open, self.lerobot.gripper_closed)
-        return ["lerobot.rotation"] * turned + ["lerobot.gripper_open and gripper_closed"] * (gripper != (0, 1))
+        """Formats of position, rotation and gripper."""
+        return [f"lerobot.{key}" for key in self.lerobot.pose_keys]
 
 
 class NpzData(DataConfig):

@@ -26,7 +26,8 @@ Features = dict[str, tuple[Any, Any]]
 Spoil = Callable[[Callable[[Features], None]], Path]
 BRIDGE = RldsFields(
     state=("steps/observation/state",),
-    gripper="openness",
+    gripper_open=1.0,
+    gripper_closed=0.0,
     identity=("episode_metadata/file_path", "episode_metadata/episode_id"),
     cameras={"image_0": "steps/observation/image_0"},
     control_rate_hz=5.0,
@@ -115,9 +116,9 @@ def test_real_robot_episodes_of_another_schema_are_read_by_mapped_names(shared: 
         assert episode.metadata["language"]
 
 
-def test_openness_becomes_closedness(droid: Path) -> None:
+def test_inverted_gripper_becomes_closedness(droid: Path) -> None:
     closedness = open_droid(droid).read(1).states
-    openness = open_droid(droid, fields=RldsFields(gripper="openness")).read(1).states
+    openness = open_droid(droid, fields=RldsFields(gripper_open=1.0, gripper_closed=0.0)).read(1).states
     assert np.array_equal(openness[:, 6], 1 - closedness[:, 6])
     assert np.array_equal(openness[:, :6], closedness[:, :6])
 
@@ -169,7 +170,7 @@ def test_where_no_episode_can_be_used_the_first_says_why(tmp_path: Path, droid: 
     table = open_droid(folder).infos()
     assert ([info.id for info in table], len(table.problems)) == ([table.identity(0)], 2)
     every_one = write_droid_rlds(tmp_path / "every", bad, shards=1)
-    with pytest.raises(InputError, match=r"within 5 m.*Check data\.fields\.state\.$"):
+    with pytest.raises(InputError, match=r"within 5 m.*Check data\.fields: state, .*gripper_closed\.$"):
         open_droid(every_one).infos()
     with pytest.raises(InputError, match="no feature steps/nothing"):
         open_droid(droid, fields=RldsFields(state=("steps/nothing",))).infos()

@@ -13,6 +13,7 @@ from typing import Any
 from vjepa2_ac import storage
 from vjepa2_ac.config import LeRobotData, LeRobotFields
 from vjepa2_ac.data.files import in_parallel
+from vjepa2_ac.data.poses import require_selection
 from vjepa2_ac.errors import InputError, MissingFileError, did_you_mean
 from vjepa2_ac.media.video import is_deep_grey
 from vjepa2_ac.storage import FileInfo
@@ -109,23 +110,12 @@ class DatasetInfo:
         return key
 
     def _require_state(self, config: LeRobotData) -> None:
-        fields, described = config.lerobot, []
-        for name in fields.state:
-            of = self.features[name]
-            described.append(f"{name} [{', '.join(of.names) if len(of.names) == of.width else of.width}]")
-        source, where = " + ".join(described), "data.lerobot.state"
-        count = width = sum(self.features[name].width for name in fields.state)
-        if fields.select is not None:
-            where, count = "data.lerobot.select", len(fields.select)
-            if beyond := [number for number in fields.select if number >= width]:
-                found = f"{beyond[0]}, of {width} numbers in {source}"
-                raise InputError(where=where, found=found, needed=f"0 to {width - 1}")
-        needed, rotation = (7, "3 Euler angles") if fields.rotation == "euler_xyz" else (8, "a quaternion's 4")
-        if config.states == "pose" and count != needed:
-            found = f"{count} numbers a step from {source}"
-            wanted = f"{needed}: x, y, z, {rotation} (data.lerobot.rotation: {fields.rotation}), the gripper"
-            fix = "Name other columns in data.lerobot.state, or choose among their numbers with data.lerobot.select"
-            raise InputError(where=where, found=found, needed=wanted, fix=fix)
+        columns = {}
+        for name in config.lerobot.state:
+            feature = self.features[name]
+            described = ", ".join(feature.names) if len(feature.names) == feature.width else feature.width
+            columns[f"{name} [{described}]"] = feature.width
+        require_selection(columns, config.lerobot, "data.lerobot", is_pose=config.states == "pose")
 
 
 def missing(where: str, kind: str, name: str, place: str, known: Iterable[str]) -> InputError:

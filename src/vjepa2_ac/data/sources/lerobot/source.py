@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Shaped, UInt8
-from scipy.spatial.transform import Rotation
 
 from vjepa2_ac import storage
-from vjepa2_ac.config import LeRobotData, LeRobotFields
+from vjepa2_ac.config import LeRobotData
 from vjepa2_ac.config.section import Affects, knobs_that_affect
 from vjepa2_ac.data.files import connections_to, in_parallel
 from vjepa2_ac.data.index import EpisodeTable, get_or_build, hash_of_states, index_key
+from vjepa2_ac.data.poses import poses_from
 from vjepa2_ac.data.selection import as_problem
 from vjepa2_ac.data.sources.indexed_source import Found, FramesByStep, IndexedSource, Scanned, table_of
 from vjepa2_ac.data.sources.lerobot.episodes import TABLES, EpisodeRow, read_episodes, require_files, row_of
@@ -25,16 +25,14 @@ from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import decode_image, require_bounded
 from vjepa2_ac.media.video import Clock, read_frames, video_library
-from vjepa2_ac.spaces import POSE, require_finite
+from vjepa2_ac.spaces import require_finite
 from vjepa2_ac.storage.block_file import BlockCachedFile
 
 FRAME, TIME = "frame_index", "timestamp"
 
 _FIX = "Copy the file again, or leave the episode out"
-_FIX_STATES = "Check data.lerobot: state, select, rotation, gripper_open and gripper_closed"
+_FIX_STATES = "Check data.lerobot: state, select, rotation, position_unit, gripper_open and gripper_closed"
 _FIX_VECTORS = "Leave the episode out, check data.lerobot: state, action, or set data.lerobot.joint_velocity: null"
-_UNIT_TOLERANCE = 1e-2
-
 
 Content = dict[str, Any]
 """The data of an episode except its frames, by the names of `Episode`: states, commands, joint_velocities."""
@@ -233,35 +231,11 @@ def content_of(
     if fields.select is not None:
         states = states[:, list(fields.select)]
     content = {
-        "states": _poses(states, fields, where) if config.states == "pose" else states,
+        "states": poses_from(states, fields, where, fix=_FIX_STATES) if config.states == "pose" else states,
         "commands": joined(fields.action) if config.actions == "recorded" else None,
         "joint_velocities": joined([str(fields.joint_velocity)]) if has(fields.joint_velocity) else None,
     }
     return content, bool(rows[str(fields.success)].any()) if has(fields.success) else None
-
-
-def _poses(numbers: Float[np.ndarray, "steps _"], fields: LeRobotFields, where: str) -> Float[np.ndarray, "steps 7"]:
-    """Return states (legend: `vjepa2_ac.episode`) from the numbers of an episode.
-
-    Raises:
-        InputError: They are implausible under these settings: no unit quaternion, out of reach.
-    """
-    gripper = (numbers[:, -1:] - fields.gripper_open) / (fields.gripper_closed - fields.gripper_open)
-    states = np.concatenate([numbers[:, POSE.position], _euler(numbers[:, 3:-1], fields, where), gripper], axis=1)
-    POSE.require_plausible(states, where, fix=_FIX_STATES)
-    return states
-
-
-def _euler(rotation: Float[np.ndarray, "steps _"], fields: LeRobotFields, where: str) -> Float[np.ndarray, "steps 3"]:
-    if fields.rotation == "euler_xyz":
-        return rotation
-    lengths = np.linalg.norm(rotation, axis=1)
-    if (wrong := abs(lengths - 1) > _UNIT_TOLERANCE).any():
-        step = int(wrong.argmax())
-        found = f"the quaternion {np.array2string(rotation[step], precision=4)} of length {lengths[step]:.4g}"
-        raise InputError(where=f"{where}: step {step}", found=found, needed="a unit quaternion", fix=_FIX_STATES)
-    x_first = rotation if fields.rotation == "quaternion_xyzw" else np.roll(rotation, -1, axis=1)
-    return np.asarray(Rotation.from_quat(x_first).as_euler("xyz"))
 
 
 def _require_rows(rows: Columns, length: int, fps: float, where: str) -> None:

@@ -15,12 +15,13 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32, Int64
+from jaxtyping import Float, Int64
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import RldsData, RldsFields
 from vjepa2_ac.data.files import in_parallel
 from vjepa2_ac.data.index import UNKNOWN, EpisodeProblem, EpisodeTable, hash_of_states
+from vjepa2_ac.data.poses import num_rotation_numbers, poses_from, require_selection
 from vjepa2_ac.data.selection import as_problem
 from vjepa2_ac.data.sources.indexed_source import Found, Scanned, require_as_indexed, table_of
 from vjepa2_ac.data.sources.rlds.shards import Shard, open_shard
@@ -36,15 +37,17 @@ from vjepa2_ac.data.sources.rlds.tfrecord import (
     require_intact,
     span_at,
 )
-from vjepa2_ac.episode import STATE_DIM, Episode, EpisodeInfo, FrameReader, Progress
+from vjepa2_ac.episode import Episode, EpisodeInfo, FrameReader, Progress
 from vjepa2_ac.errors import InputError, did_you_mean
-from vjepa2_ac.spaces import POSE, require_finite, zero_steps
+from vjepa2_ac.spaces import require_finite, zero_steps
 
 IDENTITY_SEPARATOR = "--"  # as in the published lists of DROID's idle ranges
 STEP_FLAG = "steps/is_first"
 _MOST_BYTES = 1 << 28  # of a feature that is read whole: numbers and texts
 FEWEST_IN_FLIGHT = 128  # reads behind a URL: they are small, and sequential within a shard
 _SAMPLES = 4
+_NUMBERS: tuple[Kind, ...] = ("float_list", "int64_list")  # booleans are stored as integers
+_FIX_STATES = "Check data.fields: state, select, rotation, position_unit, gripper_open and gripper_closed"
 _PLACE = ("shard", "record", "offset", "length")  # columns of the table
 _LENGTH_BYTES = 5  # lengths that grow with a name: of text, list, feature, entry of the map, and all of them
 
@@ -97,14 +100,6 @@ class Record:
             raise InputError(where=str(self._span), found=found, fix=f"{did_you_mean(name, known)}Set data.fields")
         return self.located[name]
 
-    def floats(self, name: str) -> Float32[np.ndarray, " values"]:
-        """Return the numbers of a feature.
-
-        Raises:
-            InputError: There is no such feature, or it has no floats.
-        """
-        return np.asarray(self.values(name, "float_list"), np.float32)
-
     def values(self, name: str, *kinds: Kind, texts: int | None = None) -> Sequence[Any] | np.ndarray:
         """Return a feature's values; of texts the first so many.
 
@@ -152,16 +147,18 @@ def step_features(config: RldsData) -> tuple[str, ...]:
 
 
 def num_steps_of(record: Record, config: RldsData) -> int:
-    """Count the steps by their first flag; without it by the states, if these are poses.
+    """Count the steps by their first flag; without it by the states, if all of their numbers form poses.
 
     Raises:
         InputError: There is neither.
     """
-    if config.states == "vector":  # of any width: only the flag gives the count
+    fields = config.fields
+    if config.states == "vector" or fields.select is not None:  # only the flag gives the count
         record.place_of(STEP_FLAG)
     if STEP_FLAG in record.located:
         return len(record.values(STEP_FLAG, "int64_list"))
-    return sum(len(record.floats(name)) for name in config.fields.state) // STATE_DIM
+    count = sum(len(record.values(name, *_NUMBERS)) for name in fields.state)
+    return count // (4 + num_rotation_numbers(fields.rotation))
 
 
 def episode_of(record: Record, config: RldsData, info: EpisodeInfo, read_frames: FrameReader, where: str) -> Episode:
@@ -201,18 +198,16 @@ def states_of(record: Record, config: RldsData, steps: int, where: str) -> Float
         raise zero_steps(where)
     fields = config.fields
     columns = [_of_every_step(record, name, steps, where) for name in fields.state]
-    states = np.concatenate(columns, axis=1)
+    widths = {name: column.shape[1] for name, column in zip(fields.state, columns, strict=True)}
+    described = {f"{name} [{width}]": width for name, width in widths.items()}
+    require_selection(described, fields, "data.fields", is_pose=config.states == "pose", episode=where)
+    numbers = np.concatenate(columns, axis=1)
+    if fields.select is not None:
+        numbers = numbers[:, list(fields.select)]
     if config.states == "vector":
-        require_finite(states, where, fix="Check data.fields.state, or leave the episode out")
-        return states
-    if states.shape[1] != STATE_DIM:
-        found = " + ".join(f"{name} [{column.shape[1]}]" for name, column in zip(fields.state, columns, strict=True))
-        needed = f"{STATE_DIM} numbers a step: xyz, Euler, gripper"
-        raise InputError(where=f"{where}: data.fields.state", found=found, needed=needed)
-    POSE.require_plausible(states, where, fix="Check data.fields.state")
-    if fields.gripper == "openness":
-        states[:, POSE.gripper] = 1.0 - states[:, POSE.gripper]
-    return states
+        require_finite(numbers, where, fix="Check data.fields.state, or leave the episode out")
+        return numbers
+    return poses_from(numbers, fields, where, fix=_FIX_STATES)
 
 
 def commands_of(
@@ -231,7 +226,7 @@ def commands_of(
 
 
 def _of_every_step(record: Record, name: str, steps: int, where: str) -> Float[np.ndarray, "steps width"]:
-    values = record.floats(name).astype(np.float64)
+    values = np.asarray(record.values(name, *_NUMBERS), np.float64)
     if len(values) == 0 or len(values) % steps:
         found, needed = f"{len(values)} numbers", f"as many for each of {steps} steps"
         raise InputError(where=f"{where}: {name}", found=found, needed=needed)
