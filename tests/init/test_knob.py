@@ -23,4 +23,4 @@ def test_text_reads_back(knobs: dict[str, object], head: list[str]) -> None:
 def test_guesses_are_marked_and_listed() -> None:
     knobs = {"data": {"camera": Knob("front", "of two", is_guess=True), "frames": Knob(8, "enough")}}
     assert f"# {GUESSED}of two" in as_yaml([], knobs)
-    assert guesses(knobs) == {"data.camera": "of two"}
+    assert guesses(knobs) == {"data.camera": "front: of two"}

@@ -120,14 +120,14 @@ def test_the_grippers_range_is_read_from_the_statistics(
 
 def test_a_set_is_known_by_its_own_name_and_not_by_its_folders(tmp_path: Path) -> None:
     data, guessed, text = drafted(write_like_bridge(tmp_path / "x_droid/a/1.0.0", "bridge_dataset"))
-    assert (data["fields"]["control_rate_hz"], data["fields"]["gripper"], data["stride"]) == (5.0, "openness", 1)
-    assert not {"data.fields.control_rate_hz", "data.fields.gripper", "data.stride"} & set(guessed)
+    assert (data["fields"]["control_rate_hz"], data["fields"]["gripper_open"], data["stride"]) == (5.0, 1.0, 1)
+    assert not {"data.fields.control_rate_hz", "data.fields.gripper_open", "data.stride"} & set(guessed)
     assert "5 steps a second" in text
     assert "as DROID" not in text
 
     data, guessed, text = drafted(write_like_bridge(tmp_path / "bridge_dataset/droid/1.0.0", "my_kitchen"))
-    assert (data["fields"]["control_rate_hz"], data["fields"]["gripper"]) == (10.0, "closedness")
-    assert {"data.fields.control_rate_hz", "data.fields.gripper", "data.stride"} <= set(guessed)
+    assert (data["fields"]["control_rate_hz"], data["fields"]["gripper_open"]) == (10.0, 0.0)
+    assert {"data.fields.control_rate_hz", "data.fields.gripper_open", "data.stride"} <= set(guessed)
     assert "10 steps a second (guessed)" in text
 
 
@@ -140,8 +140,8 @@ def test_a_set_in_droids_schema_is_droid_if_it_says_so(tmp_path: Path) -> None:
         assert "DROID, 3 episodes, 15 steps a second" in text
 
     data, guessed, text = drafted(rename(folder, "my_droid_like"))
-    assert (data["fields"]["control_rate_hz"], data["fields"]["gripper"], data["stride"]) == (15.0, "closedness", 4)
-    assert {"data.fields.control_rate_hz", "data.fields.gripper", "data.stride", "data.camera"} <= set(guessed)
+    assert (data["fields"]["control_rate_hz"], data["fields"]["gripper_open"], data["stride"]) == (15.0, 0.0, 4)
+    assert {"data.fields.control_rate_hz", "data.fields.gripper_open", "data.stride", "data.camera"} <= set(guessed)
     assert data["idle"]["rule"] == "commands"
     assert "the released weights saw" not in text
 

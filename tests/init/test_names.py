@@ -2,7 +2,8 @@
 
 import pytest
 
-from vjepa2_ac.init.found import Column, find_pose, pick_camera, short_name
+from vjepa2_ac.init.found import camera_names, pick_camera
+from vjepa2_ac.init.poses import Column, find_pose
 
 JOINTS = Column(
     7, ("shoulder_pan.pos", "shoulder_lift.pos", "elbow_flex.pos", "wrist_flex.pos", "a.pos", "b.pos", "g.pos")
@@ -42,11 +43,12 @@ def test_numbers_that_have_names_are_chosen_by_them(names: str, rotation: str, s
     assert (pose.rotation, pose.select, pose.is_guess) == (rotation, select, False)
 
 
-def test_three_numbers_of_an_axis_times_an_angle_are_a_guess() -> None:
+def test_rx_ry_rz_alone_is_a_guess_that_names_both_formats() -> None:
     names = ("x", "y", "z", "rx", "ry", "rz", "gripper")
     pose = find_pose({"observation.state": Column(7, names)})
     assert pose is not None
-    assert pose.is_guess
+    assert (pose.rotation, pose.is_guess, pose.is_rotation_guess) == ("rotation_vector", False, True)
+    assert "euler_xyz" in pose.why_rotation
 
 
 @pytest.mark.parametrize(
@@ -92,6 +94,18 @@ def test_a_camera_that_looks_on_is_preferred(cameras: list[str], chosen: str) ->
     assert pick_camera(cameras) == chosen
 
 
-def test_short_names_are_words() -> None:
-    assert short_name("observation.images.front left") == "front_left"
-    assert short_name("steps/observation/image_0") == "image_0"
+@pytest.mark.parametrize(
+    ("features", "names"),
+    [
+        (["observation.images.front left"], ["front_left"]),
+        (["steps/observation/image_0", "steps/observation/image_1"], ["image_0", "image_1"]),
+        (["steps/observation/front/rgb", "steps/observation/wrist/rgb"], ["front_rgb", "wrist_rgb"]),
+        (["a.b.rgb", "a-b.rgb"], ["a_b_rgb", "a-b.rgb"]),
+    ],
+)
+def test_cameras_have_short_distinct_names(features: list[str], names: list[str]) -> None:
+    found = camera_names(features)
+    assert list(found) == features
+    assert len(set(found.values())) == len(features)
+    if "-" not in features[-1]:
+        assert list(found.values()) == names

@@ -108,7 +108,7 @@ def _init(options: argparse.Namespace) -> int:
     draft = make_draft(found, machine, model, run_dir=f"runs/{name}")
     with user_can_write(f"--out {out}"):
         write_atomically(out, draft.text(found, machine).encode())
-    guessed = [f"  guessed  {key}{': ' if why else ''}{why}" for key, why in guesses(draft.knobs).items()]
+    guessed = [f"  GUESSED  {key} = {value_and_why}" for key, value_and_why in guesses(draft.knobs).items()]
     cli.show(*draft.costs, f"Written: {out}", *guessed)
     status = 0 if is_missing else _check(draft, out)
     if status:

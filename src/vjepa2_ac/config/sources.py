@@ -11,6 +11,7 @@ from vjepa2_ac.config.section import Affects, Count, Section
 
 RAW_CAMERAS = ("left", "right", "wrist", "ext1", "ext2")
 
+RECORD: Literal["record"] = "record"  # as an identity
 RotationFormat = Literal["euler_xyz", "euler_xyz_degrees", "rotation_vector", "quaternion_wxyz", "quaternion_xyzw"]
 
 _Names = Annotated[tuple[str, ...], Field(min_length=1)]
@@ -54,11 +55,12 @@ class RldsFields(PoseFields):
     `states: vector` any numbers."""
     action: Annotated[_Names, Affects.INDEX | Affects.CLIPS] = ("steps/action",)
     """For `actions: recorded`: features that form, concatenated, the *commanded* action of each control step."""
-    identity: Annotated[_Names, Affects.EPISODES] = (
+    identity: Annotated[_Names | Literal["record"], Affects.EPISODES] = (
         "episode_metadata/recording_folderpath",
         "episode_metadata/file_path",
     )
-    """Features that name an episode; the split into train, validation and test is a hash of them."""
+    """Features that name an episode; the split into train, validation and test is a hash of them. record: split, file
+    and number of the record, for sets without such features; the split then changes if the set is written again."""
     cameras: Annotated[dict[str, str], Field(min_length=1), Affects.EPISODES] = {
         "exterior_1_left": "steps/observation/exterior_image_1_left",
         "exterior_2_left": "steps/observation/exterior_image_2_left",
@@ -71,6 +73,11 @@ class RldsFields(PoseFields):
     """Feature with the *commanded* joint velocities, read by the idle filter; null: there is none."""
     control_rate_hz: Annotated[float, Field(gt=0.0, le=1000.0), Affects.IDLE | Affects.CLIPS] = 15.0
     """Control steps per second (RLDS does not say)."""
+
+    @property
+    def identity_features(self) -> tuple[str, ...]:
+        """The features that name an episode; none if the record does."""
+        return () if self.identity == RECORD else self.identity
 
 
 class RawDroidOptions(Section):
@@ -112,7 +119,9 @@ class RldsData(DataConfig):
     reader: ClassVar[str] = "vjepa2_ac.data.sources.rlds.source:RldsSource"
     has_camera_poses: ClassVar[bool] = False
     gripper_fix: ClassVar[str] = "exchange data.fields.gripper_open and gripper_closed"
-    same_identity_fix: ClassVar[str] = "Add a feature to data.fields.identity that differs between them"
+    same_identity_fix: ClassVar[str] = (
+        "Add a feature to data.fields.identity that differs between them, or set data.fields.identity: record"
+    )
 
     source: Annotated[Literal["rlds"], Affects.FORM] = "rlds"
     """rlds: TFRecord shards with a dataset_info.json, as TFDS writes them."""

@@ -6,19 +6,24 @@ import contextlib
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+import numpy as np
+
 from vjepa2_ac import storage
-from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, read_info
+from vjepa2_ac.config import LeRobotData
+from vjepa2_ac.data.files import EpisodeFiles
+from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, filled, list_by_template, read_info
+from vjepa2_ac.data.sources.lerobot.parquet import ParquetRows
 from vjepa2_ac.errors import InputError, UserError
-from vjepa2_ac.init.found import Column, FoundData, Knob, Knobs, Pose, find_pose, idle_rule, pick_camera, short_name
+from vjepa2_ac.init.found import FoundData, Knob, Knobs, camera_names, idle_rule, is_no_camera, pick_camera
+from vjepa2_ac.init.poses import Column, Pose, Samples, find_pose, gripper_knobs, measured_columns, range_in
 from vjepa2_ac.storage.structured import json_object
 
 _STATISTICS = ("meta/stats.json", "meta/episodes_stats.jsonl")
 _MOST_BYTES = 256 << 20  # of statistics
-_NUMBERS = ("float", "int", "uint")
 _OURS = frozenset({"timestamp", "frame_index", "episode_index", "index", "task_index", "subtask_index"})
 _DROID_GRIPPER = "observation.state.gripper_position"
 _OF_DROID = frozenset({"building", "collector_id"})  # columns of its ports to LeRobot
-_METRES, _UNIT = 0.15, 1.05  # largest values of a gripper's opening in metres, and of a share
+_SAMPLED = 24  # episodes whose numbers are compared with the names
 
 
 def look_at_lerobot(path: str) -> FoundData:
@@ -28,33 +33,32 @@ def look_at_lerobot(path: str) -> FoundData:
         InputError: It cannot be used, or has no camera or no numbers of the robot.
     """
     info = read_info(path)
-    cameras = {name: one for name, one in info.features.items() if one.is_camera}
-    depth = [name for name, one in info.features.items() if one.is_depth]
+    cameras = [name for name, one in info.features.items() if one.is_camera and not is_no_camera(name)]
+    depth = [name for name, one in info.features.items() if one.is_depth or (one.is_camera and is_no_camera(name))]
     if not cameras:
         found = f"no camera, only depth maps ({', '.join(depth)})" if depth else "no camera"
         raise InputError(where=info.where, found=found, needed="videos or images of the robot")
     columns = {
         name: Column(one.width, one.names)
         for name, one in info.features.items()
-        if one.dtype.startswith(_NUMBERS) and name not in _OURS
+        if one.is_numbers and name not in _OURS
     }
-    pose = find_pose(columns)
-    first = pick_camera(list(cameras))
-    short = {name: short_name(name) for name in cameras}
-    used = list(short.values())
-    names = {name: one if used.count(one) == 1 else name for name, one in short.items()}
-    among = f"of {', '.join(names.values())}; the released weights saw DROID's exterior_1_left"
-    fields = _pose_fields(info, pose) if pose else _vector_fields(info, columns)
+    samples = _sampled(info, measured_columns(columns))
+    pose = find_pose(columns, samples, control_rate_hz=info.fps)
+    names = camera_names(cameras)
+    first = names[pick_camera(cameras)]
+    among = f"of {', '.join(names.values())}; the released weights were trained on DROID's exterior_1_left"
+    fields = pose.knobs(_gripper(info, pose, samples)) if pose else _vector_fields(info, columns)
     velocity = next((name for name in columns if "joint_vel" in name and name.startswith("action")), None)
     success = next((name for name in info.features if "success" in name), None)
     return FoundData(
         source="lerobot",
         path=path,
         knobs={
-            "camera": Knob(names[first], among if len(names) > 1 else "", is_guess=len(cameras) > 1),
+            "camera": Knob(first, among if len(names) > 1 else "", is_guess=len(names) > 1),
             "lerobot": {
                 **fields,
-                "cameras": Knob({short: name for name, short in names.items()}),
+                "cameras": Knob({name: feature for feature, name in names.items()}),
                 "joint_velocity": Knob(velocity),
                 "success": Knob(success),
             },
@@ -69,31 +73,29 @@ def look_at_lerobot(path: str) -> FoundData:
     )
 
 
-def _pose_fields(info: DatasetInfo, pose: Pose) -> Knobs:
-    reason = pose.why + ("" if not pose.is_guess else "; docs/data.md says what a pose is")
-    return {
-        "state": Knob(list(pose.columns), reason, pose.is_guess),
-        **({} if pose.select is None else {"select": Knob(list(pose.select))}),
-        "rotation": Knob(pose.rotation, "the same guess" if pose.is_guess else "", pose.is_guess),
-        **_gripper(info, pose),
-    }
+def _sampled(info: DatasetInfo, columns: Mapping[str, Column]) -> Samples:
+    """Return the numbers of the first episodes; nothing if they cannot be read, which `data check` will explain."""
+    read: dict[str, list[np.ndarray]] = {name: [] for name in columns}
+    with contextlib.suppress(UserError, OSError, KeyError):
+        files = list_by_template(info.root, info.data_path)
+        first = next(iter(files.values()))
+        rows_in = ParquetRows(EpisodeFiles(LeRobotData(path=info.root)), list(columns), f"{first.version} {first.size}")
+        for number in range(min(_SAMPLED, info.episodes)):
+            file = filled(info.data_path, number // info.chunk_episodes, number if info.version == "v2.1" else 0)
+            rows = rows_in.rows(storage.join(info.root, file), number)
+            for name in columns:
+                read[name].append(rows[name].astype(np.float64))
+    return {name: episodes for name, episodes in read.items() if episodes}
 
 
-def _gripper(info: DatasetInfo, pose: Pose) -> Knobs:
-    """Return which values are open and closed, by the range of the gripper's numbers."""
+def _gripper(info: DatasetInfo, pose: Pose, samples: Samples) -> Knobs:
+    """Return which values are open and closed, by the range in the statistics or in the sampled episodes."""
     column, number = pose.gripper
     if column == _DROID_GRIPPER and info.features.keys() >= _OF_DROID:
         return {"gripper_open": Knob(0.0, "DROID's"), "gripper_closed": Knob(1.0)}
-    opened, closed, why = 0.0, 1.0, "no statistics say its range"
-    if found := _range_of(info.root, column, number):
-        low, high = found
-        why = f"its numbers go from {low:.3g} to {high:.3g}"
-        if 0 < high <= _METRES:
-            opened, closed, why = round(high, 4), 0.0, f"{why}: metres apart?"
-        elif high > _UNIT:
-            opened, closed, why = round(high, 1), max(0.0, round(low, 1)), f"{why}: percent open?"
-    why = f"{why}; `data check CONFIG --model` finds out whether it is inverted"
-    return {"gripper_open": Knob(opened, why, is_guess=True), "gripper_closed": Knob(closed, "likewise", is_guess=True)}
+    names = info.features[column].names
+    name = names[number] if len(names) > number else column.rsplit(".", 1)[-1]
+    return gripper_knobs(name, _range_of(info.root, column, number) or range_in(samples, column, number))
 
 
 def _range_of(root: str, column: str, number: int) -> tuple[float, float] | None:

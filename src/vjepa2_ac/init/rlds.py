@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import prod
-from typing import Any
+from typing import Any, Literal
+
+import numpy as np
 
 from vjepa2_ac import storage
-from vjepa2_ac.data.sources.rlds.shards import dataset_name, find_shards
-from vjepa2_ac.errors import InputError, MissingFileError
-from vjepa2_ac.init.found import Column, FoundData, Knob, Knobs, find_pose, idle_rule, pick_camera, short_name
+from vjepa2_ac.data.sources.rlds.episode import Record
+from vjepa2_ac.data.sources.rlds.shards import Shard, dataset_name, find_shards, open_shard
+from vjepa2_ac.data.sources.rlds.tfrecord import HEADER_BYTES, Kind, span_at
+from vjepa2_ac.errors import InputError, MissingFileError, UserError
+from vjepa2_ac.init.found import FoundData, Knob, Knobs, camera_names, idle_rule, is_no_camera, pick_camera
+from vjepa2_ac.init.poses import Column, Samples, find_pose, gripper_knobs, measured_columns, range_in
 from vjepa2_ac.storage.structured import read_json_object
 
 DROID = "gs://gresearch/robotics/droid/1.0.1"
@@ -25,11 +32,18 @@ _SIMULATION = "simulation.json"  # beside the shards of `vjepa2-ac simulate reco
 _VELOCITIES = "steps/action_dict/joint_velocity"
 
 
+_SAMPLED = 24  # records whose values are looked at
+_ALL_KINDS: tuple[Kind, ...] = ("bytes_list", "float_list", "int64_list")
+_PATHS = frozenset({"file_path", "episode_id", "recording_folderpath"})
+_FLAG = re.compile(r"/(is_|discount|reward)")
+
+
 @dataclass(frozen=True)
 class _Feature:
     kind: str  # image, text, tensor
     dtype: str = ""
     width: int = 1
+    channels: int = 0  # of an image; 0: not said
 
 
 def droid() -> FoundData:
@@ -56,32 +70,39 @@ def look_at_rlds(path: str) -> FoundData:
     if name in _DROID_NAMES and _DROID_FEATURE in features:
         is_simulated = storage.exists(storage.join(path, _SIMULATION))
         return like_droid(path, episodes, is_simulated=is_simulated)
-    images = [name for name, one in features.items() if one.kind == "image" and name.startswith("steps/")]
+    images, depth = _cameras(features)
     if not images:
         where = storage.join(path, "features.json")
-        raise InputError(where=where, found="no images among its features", needed="images of the robot at each step")
+        found = f"no camera, only depth maps ({', '.join(depth)})" if depth else "no images among its features"
+        raise InputError(where=where, found=found, needed="images of the robot at each step")
     is_bridge = name in _BRIDGE_NAMES and _BRIDGE_FEATURE in features
     rate = _rate(features, is_bridge=is_bridge)
     has_velocities = _VELOCITIES in features
-    first, texts = pick_camera(images), [name for name, one in features.items() if one.kind == "text"]
+    names, texts = camera_names(images), [name for name, one in features.items() if one.kind == "text"]
+    columns, texts_of_episode = _columns(features), _identity_features(features)
+    records = _sampled(shards, [*columns, *texts_of_episode])
+    samples = _samples(records, columns)
+    states, fields = _state(path, columns, samples, rate.value, is_bridge=is_bridge)
     return FoundData(
         source="rlds",
         path=path,
         knobs={
-            "camera": Knob(short_name(first), f"of {', '.join(map(short_name, images))}", is_guess=len(images) > 1),
+            "camera": Knob(names[pick_camera(images)], f"of {', '.join(names.values())}", is_guess=len(images) > 1),
             "fields": {
-                **_state(path, features, is_bridge=is_bridge),
-                "identity": Knob(_identity(features), "what tells episodes apart", is_guess=True),
-                "cameras": Knob({short_name(name): name for name in images}),
+                **fields,
+                "identity": _identity(records, texts_of_episode),
+                "cameras": Knob({name: feature for feature, name in names.items()}),
                 "language": Knob(next((name for name in texts if "instruction" in name), None)),
                 "joint_velocity": Knob(_VELOCITIES if has_velocities else None),
                 "control_rate_hz": rate,
             },
         },
         rate_hz=rate,
+        states=states,
         episodes=episodes,
-        idle=idle_rule(has_velocities=has_velocities),
-        about=(f"RLDS {name}, {episodes:,} episodes, {rate.value:g} steps a second{' (guessed)' * rate.is_guess}",),
+        idle=idle_rule(has_velocities=has_velocities) if states == "pose" else None,
+        about=(f"RLDS {name}, {episodes:,} episodes, {rate.value:g} steps a second{' (guessed)' * rate.is_guess}",)
+        + ((f"depth maps are not used: {', '.join(depth)}",) if depth else ()),
     )
 
 
@@ -135,30 +156,86 @@ def _inside(content: Any, name: str) -> Iterator[tuple[str, _Feature]]:
         kind = next((one for one in ("image", "text", "tensor") if one in content), "")
         about = content.get(kind) or {}
         sizes = [int(size) for size in about.get("shape", {}).get("dimensions", [])]
-        yield name, _Feature(kind, str(about.get("dtype", "")), prod(sizes))
+        yield name, _Feature(kind, str(about.get("dtype", "")), prod(sizes), sizes[-1] if len(sizes) == 3 else 0)
 
 
-def _state(path: str, features: Mapping[str, _Feature], *, is_bridge: bool) -> Knobs:
-    columns = {
+def _cameras(features: Mapping[str, _Feature]) -> tuple[list[str], list[str]]:
+    """Return the features with images of a camera, and those with depth maps or segmentations."""
+    images = {name: one for name, one in features.items() if one.kind == "image" and name.startswith("steps/")}
+    depth = [name for name, one in images.items() if is_no_camera(name) or one.dtype not in {"", "uint8"}]
+    colour = [name for name, one in images.items() if name not in depth and one.channels != 1]
+    return colour or [name for name in images if name not in depth], depth
+
+
+def _sampled(shards: Sequence[Shard], names: Sequence[str]) -> list[dict[str, tuple[Any, ...]]]:
+    """Return the values of features in the first records; of a record that cannot be read `data check` says why."""
+    records: list[dict[str, tuple[Any, ...]]] = []
+    with suppress(UserError, OSError):
+        for shard in shards[:_SAMPLED]:
+            with open_shard(shard) as read:
+                offset = 0
+                for number in range(min(shard.episodes, -(-_SAMPLED // len(shards)))):
+                    span = span_at(read(offset, HEADER_BYTES), shard.path, number, offset, shard.size)
+                    record, offset = Record(read, span), span.end
+                    present = [name for name in names if name in record.located]
+                    records.append({name: tuple(record.values(name, *_ALL_KINDS)) for name in present})
+    return records
+
+
+def _columns(features: Mapping[str, _Feature]) -> dict[str, Column]:
+    """Return the features that are numbers of the robot at each step."""
+    numbers = {
         name: Column(one.width)
         for name, one in features.items()
-        if name.startswith("steps/") and one.kind == "tensor" and one.dtype.startswith("float")
+        if name.startswith("steps/") and one.kind == "tensor" and one.dtype.startswith(("float", "int", "bool"))
     }
-    pose = find_pose(columns)
-    if pose is None or pose.rotation != "euler_xyz":
-        found = ", ".join(f"{name} [{one.width}]" for name, one in columns.items()) or "no numbers"
-        fix = "If others are the robot's numbers, name them in a config with `states: vector` (builtin:joints)"
-        needed = "x, y, z, three angles and the gripper, measured"
-        raise InputError(where=storage.join(path, "features.json"), found=found, needed=needed, fix=fix)
-    state = Knob(list(pose.columns), pose.why, pose.is_guess)
-    gripper = Knob("closedness", "whether 1 is closed or open: `data check CONFIG --model` tells", is_guess=True)
+    return measured_columns({name: one for name, one in numbers.items() if not _FLAG.search(name)})
+
+
+def _samples(records: Sequence[Mapping[str, tuple[Any, ...]]], columns: Mapping[str, Column]) -> Samples:
+    """Return the numbers of each record, by column; without columns that a record does not have as described."""
+    return {
+        name: [np.array(record[name], np.float64).reshape(-1, one.width) for record in records]
+        for name, one in columns.items()
+        if records and all(record.get(name) and len(record[name]) % one.width == 0 for record in records)
+    }
+
+
+def _identity_features(features: Mapping[str, _Feature]) -> list[str]:
+    """Return the texts and integers that describe an episode."""
+    return [
+        name
+        for name, one in features.items()
+        if name.startswith("episode_metadata/") and (one.kind == "text" or one.dtype.startswith(("int", "uint", "str")))
+    ]
+
+
+def _state(
+    path: str, columns: Mapping[str, Column], samples: Samples, control_rate_hz: float, *, is_bridge: bool
+) -> tuple[Literal["pose", "vector"], Knobs]:
+    """Return the kind of state, and the keys that read it."""
     if is_bridge:
-        state = Knob(list(pose.columns), "x, y, z, three angles, the gripper")
-        gripper = Knob("openness", "1 is open in BridgeData")
-    return {"state": state, "gripper": gripper}
+        gripper = {"gripper_open": Knob(1.0, "BridgeData's"), "gripper_closed": Knob(0.0)}
+        return "pose", {"state": Knob([_BRIDGE_FEATURE], "x, y, z, three angles, the gripper"), **gripper}
+    if pose := find_pose(columns, samples, control_rate_hz=control_rate_hz):
+        column, number = pose.gripper
+        return "pose", pose.knobs(gripper_knobs(column.rsplit("/", 1)[-1], range_in(samples, column, number)))
+    if not columns:
+        needed = "numbers of the robot at each step, as float, int or bool"
+        raise InputError(where=storage.join(path, "features.json"), found="no such feature", needed=needed)
+    name = next((name for name in columns if name.endswith("/state")), next(iter(columns)))
+    why = f"{columns[name].width} numbers, of which no pose could be recognised; others: {', '.join(columns)}"
+    return "vector", {"state": Knob([name], why, is_guess=True)}
 
 
-def _identity(features: Mapping[str, _Feature]) -> list[str]:
-    found = [name for name, one in features.items() if name.startswith("episode_metadata/") and one.kind != "image"]
-    paths = [name for name in found if name.rsplit("/", 1)[-1] in {"file_path", "episode_id", "recording_folderpath"}]
-    return paths or found or ["episode_metadata/file_path"]
+def _identity(records: Sequence[Mapping[str, tuple[Any, ...]]], names: Sequence[str]) -> Knob:
+    """Return the features that tell the sampled episodes apart; or `record`, where none do."""
+    paths = [name for name in names if name.rsplit("/", 1)[-1] in _PATHS]
+    for some in (paths, names):
+        values = [tuple(record.get(name, ()) for name in some) for record in records]
+        if some and all(map(any, values)) and len(set(values)) == len(values):
+            return Knob(list(some), "what tells episodes apart", is_guess=True)
+    if not records and names:
+        return Knob(list(paths or names), "what tells episodes apart; no record could be read", is_guess=True)
+    why = "no feature tells the episodes apart; writing the set again may move episodes between train and test"
+    return Knob("record", why, is_guess=True)

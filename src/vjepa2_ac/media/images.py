@@ -99,6 +99,34 @@ def decode_jpegs(images: Sequence[bytes], steps: Sequence[int], where: str) -> U
     return frames
 
 
+def decode_images(
+    images: Sequence[bytes], steps: Sequence[int], where: str
+) -> UInt8[np.ndarray, "time height width 3"]:
+    """Return PNG or JPEG images as RGB, by their content; JPEG bit for bit as TensorFlow's decoder.
+
+    Args:
+        images: One or more, all of one size.
+        steps: Control step of each, for messages.
+        where: File, episode and camera, for messages.
+
+    Raises:
+        InputError: An image is neither PNG nor JPEG, has more than 8 bits a channel, is too large, or has another size
+            than the first.
+    """
+    if not any(image.startswith(_PNG) for image in images):
+        return decode_jpegs(images, steps, where)
+    frames: list[UInt8[np.ndarray, "height width 3"]] = []
+    for image, step in zip(images, steps, strict=True):
+        at = f"{where}: step {step}"
+        frame = decode_image(image, at) if image.startswith(_PNG) else decode_jpegs([image], [step], where)[0]
+        require_bounded(frame.shape[0], frame.shape[1], at, count=len(images))
+        if frames and frame.shape != frames[0].shape:
+            found, needed = (f"an image of {one.shape[0]}x{one.shape[1]}" for one in (frame, frames[0]))
+            raise InputError(where=at, found=found, needed=f"{needed}, as at step {steps[0]}")
+        frames.append(frame)
+    return np.stack(frames)
+
+
 def _size_of(image: bytes, step: int, where: str) -> tuple[int, int]:
     try:
         height, width, _, _ = simplejpeg.decode_jpeg_header(image)
@@ -109,7 +137,7 @@ def _size_of(image: bytes, step: int, where: str) -> tuple[int, int]:
 
 def _no_jpeg(image: bytes, step: int, where: str, error: ValueError) -> InputError:
     found = f"{len(image)} bytes that are not a JPEG, starting with {bytes(image[:4])!r} ({error})"
-    return InputError(where=f"{where}: step {step}", found=found, needed="a JPEG image")
+    return InputError(where=f"{where}: step {step}", found=found, needed="a JPEG or PNG image")
 
 
 def encode_jpeg(frame: UInt8[np.ndarray, "height width 3"], *, quality: int = 95) -> bytes:
@@ -119,6 +147,7 @@ def encode_jpeg(frame: UInt8[np.ndarray, "height width 3"], *, quality: int = 95
     )
 
 
+_PNG = b"\x89PNG"
 _EIGHT_BIT = {"1", "L", "LA", "P", "RGB", "RGBA"}  # Pillow's modes of at most 8 bits a channel
 
 

@@ -19,6 +19,7 @@ from jaxtyping import Float, Int64
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import RldsData, RldsFields
+from vjepa2_ac.config.sources import RECORD
 from vjepa2_ac.data.files import in_parallel
 from vjepa2_ac.data.index import UNKNOWN, EpisodeProblem, EpisodeTable, hash_of_states
 from vjepa2_ac.data.poses import num_rotation_numbers, poses_from, require_selection
@@ -47,6 +48,7 @@ _MOST_BYTES = 1 << 28  # of a feature that is read whole: numbers and texts
 FEWEST_IN_FLIGHT = 128  # reads behind a URL: they are small, and sequential within a shard
 _SAMPLES = 4
 _NUMBERS: tuple[Kind, ...] = ("float_list", "int64_list")  # booleans are stored as integers
+_FIX_IDENTITY = "Name text or integer features in data.fields.identity, or set data.fields.identity: record"
 _FIX_STATES = "Check data.fields: state, select, rotation, position_unit, gripper_open and gripper_closed"
 _PLACE = ("shard", "record", "offset", "length")  # columns of the table
 _LENGTH_BYTES = 5  # lengths that grow with a name: of text, list, feature, entry of the map, and all of them
@@ -65,6 +67,11 @@ class Record:
         self._read, self._span = read, span
         if located is not None:
             self.located = located
+
+    @property
+    def place(self) -> str:
+        """The record's file, whose name has split and number of the shard, and its number in the file."""
+        return f"{self._span.path.rsplit('/', 1)[-1]}: record {self._span.number}"
 
     @cached_property
     def located(self) -> dict[str, Place]:
@@ -123,15 +130,23 @@ class Record:
 
 
 def identity_of(record: Record, fields: RldsFields) -> str:
-    """Return the identity of an episode, which does not depend on the order of records.
+    """Return the identity of an episode, which does not depend on the order of records unless that is the identity.
 
     Raises:
-        InputError: A feature of the identity is missing, or neither text nor integers.
+        InputError: A feature of the identity is missing, empty, or neither text nor integers.
     """
+    if fields.identity == RECORD:
+        return record.place
     parts: list[str] = []
     for name in fields.identity:
-        values = record.values(name, "bytes_list", "int64_list")
+        try:
+            values = record.values(name, "bytes_list", "int64_list")
+        except InputError as error:
+            raise InputError(where=error.where, found=error.found, needed=error.needed, fix=_FIX_IDENTITY) from None
         parts += [value.decode(errors="replace") if isinstance(value, bytes) else str(value) for value in values]
+    if not any(parts):
+        found = f"empty: {', '.join(fields.identity)}"
+        raise InputError(where=record.place, found=found, needed="the identity of the episode", fix=_FIX_IDENTITY)
     return IDENTITY_SEPARATOR.join(parts)
 
 
@@ -299,8 +314,8 @@ def _examine(read: Read, span: RecordSpan, shard: int, name: str, config: RldsDa
     is_far, fields, record = storage.is_url(span.path), config.fields, Record(read, span)
     try:
         if is_far:
-            by_states = [{*fields.identity, *fields.state}] if config.states == "pose" else []
-            record = Record(read, span, record.locate([{*fields.identity, STEP_FLAG}, *by_states]))
+            by_states = [{*fields.identity_features, *fields.state}] if config.states == "pose" else []
+            record = Record(read, span, record.locate([{*fields.identity_features, STEP_FLAG}, *by_states]))
         name = identity_of(record, fields)
         states = None if is_far else _checked_states(record, config, cameras, f"{span} ({name})")
         steps = num_steps_of(record, config) if states is None else len(states)
@@ -320,7 +335,7 @@ def _checked_states(
     Raises:
         InputError: A feature is missing, has no uniform shape over all steps, or has implausible numbers.
     """
-    for name in (*config.fields.identity, *step_features(config), *cameras):
+    for name in (*config.fields.identity_features, *step_features(config), *cameras):
         record.place_of(name)
     states = states_of(record, config, num_steps_of(record, config), where)
     commands_of(record, config, len(states), where)
@@ -368,7 +383,7 @@ def _with_hashes_of_copies(
             return UNKNOWN  # reported when the episode is read
 
     found = np.full(len(table), UNKNOWN, np.uint64)
-    chosen = _possible_copies(table, tolerance=_LENGTH_BYTES * len(config.fields.identity))
+    chosen = _possible_copies(table, tolerance=_LENGTH_BYTES * len(config.fields.identity_features))
     found[chosen] = np.fromiter(in_parallel(look, chosen.tolist(), threads), np.uint64)
     return replace(table, state_hash=found)
 

@@ -30,7 +30,7 @@ from vjepa2_ac.data.sources.rlds.shards import NEEDED, Shard, find_shards, open_
 from vjepa2_ac.data.sources.rlds.tfrecord import NotAnExampleError, Place, Read, RecordSpan, item_places, require_intact
 from vjepa2_ac.episode import Episode, Progress, StepRanges
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.images import decode_jpegs
+from vjepa2_ac.media.images import decode_images
 from vjepa2_ac.storage.block_file import DiskCache
 
 _CHECKED = b"\xc3"  # not all bits equal, so that a damaged file seldom contains false marks
@@ -125,7 +125,7 @@ def images_here(shard: Shard, feature: Place, num_steps: int, where: str) -> Fra
     def decode(steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
         with open_shard(shard) as read:
             places = _places_of(read, feature, num_steps, where)
-            return decode_jpegs([read(*places[step]) for step in steps], steps, where)
+            return decode_images([read(*places[step]) for step in steps], steps, where)
 
     return FramesByStep(num_steps, where, decode)
 
@@ -196,7 +196,7 @@ class RemoteEpisode:
                 else:
                     places = np.frombuffer(stored, np.uint32).reshape(-1, 2) + np.array([feature[0], 0])
                     images = self._some(key, list(map(tuple, places.tolist())), steps)
-            return decode_jpegs([images[step] for step in steps], steps, where)
+            return decode_images([images[step] for step in steps], steps, where)
 
         return FramesByStep(num_steps, where, decode)
 

@@ -1,0 +1,213 @@
+"""States of other robots: the right numbers in the right format, or a guess that names what is left out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from synthetic import synthetic_states
+from vjepa2_ac.config import LeRobotFields
+from vjepa2_ac.data.poses import poses_from
+from vjepa2_ac.init.found import guesses, plain
+from vjepa2_ac.init.poses import Column, Pose, Samples, find_pose, gripper_knobs
+
+STATE = "observation.state"
+EPISODES = [synthetic_states(80, seed=seed) for seed in range(8)]
+
+Numbers = Float[np.ndarray, "steps _"]
+
+
+def written(states: Numbers, rotation: str) -> Numbers:
+    """Return states with the rotation in another format."""
+    turned = Rotation.from_euler("xyz", states[:, 3:6])
+    numbers = {
+        "euler_xyz": states[:, 3:6],
+        "euler_xyz_degrees": np.rad2deg(states[:, 3:6]),
+        "rotation_vector": turned.as_rotvec(),
+        "quaternion_xyzw": turned.as_quat(),
+        "quaternion_wxyz": turned.as_quat(scalar_first=True),
+    }[rotation]
+    return np.concatenate([states[:, :3], numbers, states[:, 6:]], axis=1)
+
+
+def proposed(names: str, numbers: list[Numbers] | None) -> Pose:
+    columns = {STATE: Column(len(names.split()), tuple(names.split()))}
+    pose = find_pose(columns, None if numbers is None else {STATE: numbers})
+    assert pose is not None
+    return pose
+
+
+def degrees_off(pose: Pose, numbers: Numbers, states: Numbers) -> float:
+    """Return the largest angle between the rotations that a proposal reads and the true ones."""
+    fields = LeRobotFields(rotation=pose.rotation, select=pose.select, position_unit=pose.position_unit)
+    chosen = numbers if pose.select is None else numbers[:, list(pose.select)]
+    read = poses_from(chosen, fields, "episode", fix="")
+    assert np.allclose(read[:, :3], states[:, :3])
+    away = Rotation.from_euler("xyz", read[:, 3:6]) * Rotation.from_euler("xyz", states[:, 3:6]).inv()
+    return float(np.rad2deg(away.magnitude()).max())
+
+
+@pytest.mark.parametrize(
+    ("names", "rotation", "is_guess"),
+    [
+        ("x y z roll pitch yaw gripper", "euler_xyz", False),
+        ("x y z euler_x euler_y euler_z gripper", "euler_xyz", False),
+        ("x y z roll_deg pitch_deg yaw_deg gripper", "euler_xyz_degrees", False),
+        ("x y z rx ry rz rw gripper", "quaternion_xyzw", False),
+        ("x y z qx qy qz qw gripper", "quaternion_xyzw", False),
+        ("x y z qw qx qy qz gripper", "quaternion_wxyz", False),
+        ("ee.pos.x ee.pos.y ee.pos.z ee.rot.w ee.rot.x ee.rot.y ee.rot.z gripper.pos", "quaternion_wxyz", False),
+        ("eef_x eef_y eef_z eef_quat_x eef_quat_y eef_quat_z eef_quat_w gripper_width", "quaternion_xyzw", False),
+        ("x y z orientation_x orientation_y orientation_z orientation_w gripper", "quaternion_xyzw", False),
+        ("x y z quat_0 quat_1 quat_2 quat_3 gripper", "quaternion_xyzw", True),
+        ("ee.x ee.y ee.z ee.wx ee.wy ee.wz ee.gripper_pos", "rotation_vector", False),
+        ("x y z axis_angle1 axis_angle2 axis_angle3 gripper", "rotation_vector", False),
+        ("x y z rotvec_x rotvec_y rotvec_z gripper", "rotation_vector", False),
+        ("pos_0 pos_1 pos_2 axis_angle_0 axis_angle_1 axis_angle_2 gripper", "rotation_vector", False),
+        ("tcp.x tcp.y tcp.z tcp.rx tcp.ry tcp.rz gripper.pos", "rotation_vector", True),
+        ("tcp.x tcp.y tcp.z tcp.rx tcp.ry tcp.rz gripper.pos", "euler_xyz", True),
+        ("x y z rot_x rot_y rot_z gripper", "rotation_vector", True),
+    ],
+)
+def test_rotation_is_read_as_it_is_written(names: str, rotation: str, is_guess: bool) -> None:
+    numbers = [written(states, rotation) for states in EPISODES]
+    pose = proposed(names, numbers)
+    assert degrees_off(pose, numbers[0], EPISODES[0]) < 0.1
+    assert pose.is_rotation_guess == is_guess
+    assert not pose.is_guess
+
+
+@pytest.mark.parametrize(
+    ("names", "rotation", "other"),
+    [
+        ("x y z roll pitch yaw gripper", "rotation_vector", "rotation_vector"),
+        ("x y z wx wy wz gripper", "euler_xyz", "euler_xyz"),
+    ],
+)
+def test_numbers_that_contradict_their_names_win_and_are_a_guess(names: str, rotation: str, other: str) -> None:
+    numbers = [written(states, rotation) for states in EPISODES]
+    pose = proposed(names, numbers)
+    assert (pose.rotation, pose.is_rotation_guess) == (other, True)
+    assert "which the names say" in pose.why_rotation
+
+
+def test_names_of_a_quaternion_over_a_rotation_vector_and_two_fingers_are_a_guess() -> None:
+    fingers = [np.stack([0.04 * (1 - one[:, 6]), -0.04 * (1 - one[:, 6])], axis=1) for one in EPISODES]
+    parts = zip(EPISODES, fingers, strict=True)
+    numbers = [np.concatenate([written(one, "rotation_vector")[:, :6], two], 1) for one, two in parts]
+    pose = proposed("x y z rx ry rz rw gripper", numbers)
+    assert (pose.rotation, pose.select, pose.is_guess) == ("rotation_vector", (0, 1, 2, 3, 4, 5, 6), True)
+    knobs = plain({"gripper": gripper_knobs("gripper", (0.0, 0.04))})["gripper"]
+    assert knobs == {"gripper_open": 0.04, "gripper_closed": 0.0}
+
+
+def test_degrees_and_millimetres_are_recognised_by_their_size() -> None:
+    numbers = [written(one, "euler_xyz_degrees") * [1000, 1000, 1000, 1, 1, 1, 1] for one in EPISODES]
+    pose = proposed("x y z roll pitch yaw gripper", numbers)
+    assert (pose.rotation, pose.position_unit) == ("euler_xyz_degrees", "mm")
+    assert "position_unit" in guesses(pose.knobs({}))
+    assert "too much for radians" in pose.why_rotation
+    assert degrees_off(pose, numbers[0], EPISODES[0]) < 0.1
+
+
+def test_without_numbers_the_guess_says_so() -> None:
+    pose = proposed("x y z rot_x rot_y rot_z gripper", None)
+    assert pose.is_rotation_guess
+    assert "rotation_vector" in pose.why_rotation
+    assert "not read" in pose.why_rotation
+
+
+ONE_ARM = ["x", "y", "z", "roll", "pitch", "yaw"]
+
+
+@pytest.mark.parametrize(
+    ("names", "chosen", "left_out"),
+    [
+        ([f"{side}_{name}" for side in ("left", "right") for name in (*ONE_ARM, "gripper")], "left", "right_x"),
+        (
+            [f"{side}_{name}" for side in ("left", "right") for name in ONE_ARM] + ["right_gripper", "left_gripper"],
+            "left",
+            "right_x",
+        ),
+        ([f"arm{arm}.{name}" for arm in (0, 1) for name in (*ONE_ARM, "gripper")], "arm0", "arm1.x"),
+        ([f"robot{arm}_{name}" for name in (*ONE_ARM, "gripper") for arm in (0, 1)], "robot0", "robot1_x"),
+        (["target.x", "target.y", "target.z", *ONE_ARM, "gripper"], "", "target.x"),
+        (["base_x", "base_y", "base_z", *(f"ee_{name}" for name in ONE_ARM), "gripper"], "ee", "base_x"),
+        ([*ONE_ARM, "gripper", *ONE_ARM, "gripper"], "", "x"),
+    ],
+)
+def test_of_two_arms_one_is_taken_as_a_guess_that_says_what_is_left_out(
+    names: list[str], chosen: str, left_out: str
+) -> None:
+    pose = proposed(" ".join(names), None)
+    select = pose.select or ()
+    taken = [names[place] for place in select]
+    parts = [name.removeprefix(chosen).strip("._") for name in taken]
+    assert parts == [*ONE_ARM, "gripper"], taken
+    assert pose.is_guess
+    assert left_out in pose.why.split("left out:")[1]
+    assert "states: vector" in pose.why
+
+
+def test_columns_of_two_arms_are_not_mixed() -> None:
+    columns = {
+        "observation.left_ee_pose": 6, "observation.right_ee_pose": 6,
+        "observation.right_gripper": 1, "observation.left_gripper": 1,
+    }  # fmt: skip
+    pose = find_pose({name: Column(width) for name, width in columns.items()})
+    assert pose is not None
+    assert pose.columns == ("observation.left_ee_pose", "observation.left_gripper")
+    assert "observation.right_ee_pose" in pose.why
+
+
+def test_a_measured_arm_without_rivals_is_no_guess() -> None:
+    assert not proposed(" ".join([*ONE_ARM, "gripper"]), None).is_guess
+    assert not proposed(" ".join(f"robot0_{name}" for name in [*ONE_ARM, "gripper"]), None).is_guess
+    assert proposed(" ".join(f"target_{name}" for name in [*ONE_ARM, "gripper"]), None).is_guess
+
+
+def test_columns_of_position_rotation_and_fingers_are_joined() -> None:
+    samples: Samples = {
+        "steps/observation/eef_pos": [one[:, :3] for one in EPISODES],
+        "steps/observation/eef_quat": [written(one, "quaternion_xyzw")[:, 3:7] for one in EPISODES],
+        "steps/observation/gripper_position": [one[:, 6:] for one in EPISODES],
+    }
+    pose = find_pose({name: Column(one[0].shape[1]) for name, one in samples.items()}, samples)
+    assert pose is not None
+    assert pose.columns == tuple(samples)
+    assert (pose.rotation, pose.is_guess) == ("quaternion_xyzw", True)
+
+
+@pytest.mark.parametrize(
+    ("rotation", "found"), [("quaternion_xyzw", "quaternion_xyzw"), ("rotation_vector", "rotation_vector")]
+)
+def test_eight_numbers_without_names_are_told_apart_by_their_length(rotation: str, found: str) -> None:
+    numbers = [written(one, rotation) for one in EPISODES]
+    numbers = [one if one.shape[1] == 8 else np.concatenate([one, -one[:, 6:]], axis=1) for one in numbers]
+    pose = find_pose({STATE: Column(8)}, {STATE: numbers})
+    assert pose is not None
+    assert (pose.rotation, pose.is_guess) == (found, True)
+    assert pose.gripper == (STATE, 7 if rotation.startswith("quaternion") else 6)
+
+
+@pytest.mark.parametrize(
+    ("name", "ranges", "expected", "is_guess"),
+    [
+        ("gripper", (0.0, 1.0), (0.0, 1.0), True),
+        ("gripper_closed", (0.0, 1.0), (0.0, 1.0), False),
+        ("gripper_open", (0.0, 1.0), (1.0, 0.0), False),
+        ("gripper_width", (0.0, 0.08), (0.08, 0.0), True),
+        ("finger", (-0.04, 0.0), (-0.04, 0.0), True),
+        ("gripper", (-1.0, 1.0), (-1.0, 1.0), True),
+        ("gripper", (0.0, 85.0), (85.0, 0.0), True),
+        ("gripper", None, (0.0, 1.0), True),
+    ],
+)
+def test_open_and_closed_follow_from_range_and_name(
+    name: str, ranges: tuple[float, float] | None, expected: tuple[float, float], is_guess: bool
+) -> None:
+    knobs = gripper_knobs(name, ranges)
+    assert tuple(plain(knobs).values()) == expected
+    assert bool(guesses(knobs)) == is_guess
