@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from copied_sets import WRITERS, write_lerobot, write_npz
+from rlds_sets import write_rlds_set
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.init.draft import Machine, choose_model, make_draft
-from vjepa2_ac.init.found import guesses, plain
+from vjepa2_ac.init.found import guesses, pick_camera, plain
 from vjepa2_ac.init.look import look_at, measured
 from vjepa2_ac.simulation.recording.record import SIMULATION_FILE
 
@@ -79,6 +80,40 @@ def test_numbers_that_are_no_pose_become_a_vector(tmp_path: Path) -> None:
     assert found.states == "vector"
     assert plain(found.knobs)["lerobot"]["state"] == ["observation.state"]
     assert "data.lerobot.state" in guesses({"data": found.knobs})
+
+
+@pytest.mark.parametrize("form", ["rlds", "lerobot"])
+@pytest.mark.parametrize("features", [["front/rgb", "wrist/rgb"], ["wrist/rgb", "front/rgb"], ["a/wrist", "b/side"]])
+def test_camera_of_the_config_is_the_chosen_feature(form: str, features: list[str], tmp_path: Path) -> None:
+    keys = [f"steps/observation/{name}" for name in features]
+    if form == "rlds":
+        kinds = dict.fromkeys(keys, ("uint8", (24, 32, 3), "jpeg"))
+        state = {"steps/observation/state": ("float32", (7,)), "episode_metadata/file_path": "text"}
+        folder = write_rlds_set(tmp_path / "set", [{}], {**kinds, **state})
+    else:
+        keys = [f"observation.images.{name.replace('/', '.')}" for name in features]
+        folder = write_lerobot(tmp_path / "set", range(2))
+        info = json.loads((folder / "meta/info.json").read_text())
+        video = info["features"]["observation.images.wrist_left"]
+        numbers = {name: one for name, one in info["features"].items() if one["dtype"] != "video"}
+        info["features"] = numbers | dict.fromkeys(keys, video)
+        (folder / "meta/info.json").write_text(json.dumps(info))
+    data, guessed, _ = drafted(folder)
+    cameras = data["fields" if form == "rlds" else "lerobot"]["cameras"]
+    assert cameras[data["camera"]] == pick_camera(keys)
+    assert sorted(cameras.values()) == sorted(keys)
+    assert "data.camera" in guessed
+
+
+def test_depth_without_a_mark_is_not_offered_as_a_camera(tmp_path: Path) -> None:
+    folder = write_lerobot(tmp_path / "set", range(2))
+    info = json.loads((folder / "meta/info.json").read_text())
+    info["features"]["observation.images.depth"] = info["features"]["observation.images.exterior_1_left"]
+    del info["features"]["observation.images.exterior_1_left"]
+    (folder / "meta/info.json").write_text(json.dumps(info))
+    found = look_at(str(folder))
+    assert plain(found.knobs)["lerobot"]["cameras"] == {"wrist_left": "observation.images.wrist_left"}
+    assert "observation.images.depth" in found.about[1]
 
 
 def test_depth_maps_are_not_offered_as_cameras(tmp_path: Path) -> None:

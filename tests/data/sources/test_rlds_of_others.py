@@ -1,0 +1,208 @@
+"""RLDS as other people write it: `init` proposes a config for it, and the config reads the true frames and states."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from rlds_sets import encoded, write_rlds_set
+from synthetic import draw_frame, synthetic_states
+from vjepa2_ac.config import DataConfig, DiskCacheConfig
+from vjepa2_ac.config.loading import parse_config
+from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.data.sources.indexed_source import open_source
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.init.found import guesses, plain
+from vjepa2_ac.init.look import look_at
+
+STEPS, EPISODES, SIZE = 12, 6, (24, 32)
+IMAGE, STATE, NAME = "steps/observation/image", "steps/observation/state", "episode_metadata/file_path"
+TRUE = [synthetic_states(STEPS, seed=seed) for seed in range(EPISODES)]
+FRAMES = [np.stack([draw_frame(state, size=SIZE) for state in states]) for states in TRUE]
+
+
+def write(folder: Path, *, images: Any = None, states: Any = None, kinds: Any = None, names: Any = None) -> Path:
+    """Write six episodes; each argument replaces the values of one kind of feature: a function of the episode."""
+    records = []
+    for number in range(EPISODES):
+        record = {"steps/is_first": np.arange(STEPS) == 0, IMAGE: [encoded(one) for one in FRAMES[number]]}
+        record |= {STATE: TRUE[number]} if states is None else states(TRUE[number])
+        record |= {} if images is None else images(number)
+        record |= {NAME: [f"/data/{number}".encode()]} if names is None else names(number)
+        records.append(record)
+    features: dict[str, Any] = {"steps/is_first": ("bool", ()), IMAGE: ("uint8", (*SIZE, 3), "png")}
+    features |= {STATE: ("float32", (7,))} if kinds is None else kinds
+    features |= {name: "text" for name in records[0] if name == NAME}
+    return write_rlds_set(folder, records, features)
+
+
+def proposed(folder: Path) -> tuple[DataConfig, dict[str, str]]:
+    """Return the data config that `init` proposes, and its guesses."""
+    found = look_at(str(folder))
+    data = {"source": "rlds", "path": str(folder), "states": found.states, **plain(found.knobs), "workers": 0}
+    values = {"run_dir": "none", "data": data, "model": {"base": "builtin:sim-tiny"}}
+    return parse_config(values, where="init").data, guesses(found.knobs)
+
+
+def require_true(config: DataConfig, *, tolerance: float = 1e-5) -> None:
+    source = open_source(config)
+    assert len(source.infos()) == EPISODES
+    for number in range(EPISODES):
+        read = source.read(number).states
+        away = Rotation.from_euler("xyz", read[:, 3:6]) * Rotation.from_euler("xyz", TRUE[number][:, 3:6]).inv()
+        assert np.abs(read[:, [0, 1, 2, 6]] - TRUE[number][:, [0, 1, 2, 6]]).max() < tolerance
+        assert away.magnitude().max() < 1e-3
+
+
+@pytest.mark.parametrize("mode", [None, "RGBA", "P", "L"])
+def test_png_images_are_read_by_their_content(mode: str | None, tmp_path: Path) -> None:
+    folder = write(tmp_path / "set", images=lambda number: {IMAGE: [encoded(one, mode=mode) for one in FRAMES[number]]})
+    config, _ = proposed(folder)
+    read = open_source(config).read(2).read_frames([5, 0])
+    expected = FRAMES[2][[5, 0]]
+    if mode == "L":
+        assert (read[..., 0] == read[..., 1]).all()
+        assert (read[..., 0] == read[..., 2]).all()
+    tolerance = {None: 0, "RGBA": 0, "P": 60, "L": 255}[mode]
+    assert abs(read.astype(int) - expected).max() <= tolerance
+
+
+def test_png_and_jpeg_may_be_mixed_and_other_sizes_are_refused(tmp_path: Path) -> None:
+    def mixed(number: int) -> dict[str, list[bytes]]:
+        images = [encoded(one, "JPEG" if step % 2 else "PNG") for step, one in enumerate(FRAMES[number])]
+        return {IMAGE: [*images[:-1], encoded(FRAMES[number][-1][:-4])]}
+
+    source = open_source(proposed(write(tmp_path / "set", images=mixed))[0])
+    assert abs(source.read(0).read_frames([0, 1]).astype(int) - FRAMES[0][:2]).mean() < 8
+    with pytest.raises(InputError, match="20x32"):
+        source.read(0).read_frames([0, STEPS - 1])
+
+
+def test_sixteen_bits_are_refused_by_name(tmp_path: Path) -> None:
+    deep = lambda number: {IMAGE: [encoded(np.full(SIZE, 900 + number, np.uint16))] * STEPS}  # noqa: E731
+    with pytest.raises(InputError, match="8 bits a channel"):
+        open_source(proposed(write(tmp_path / "set", images=deep))[0]).read(0).read_frames([0])
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("depth", ("uint8", (*SIZE, 3), "png")),
+        ("a_second", ("uint16", (*SIZE, 1), "png")),
+        ("grey", ("uint8", (*SIZE, 1), "png")),
+    ],
+)
+def test_depth_and_single_channels_are_not_proposed_as_the_camera(name: str, kind: Any, tmp_path: Path) -> None:
+    kinds = {STATE: ("float32", (7,)), f"steps/observation/{name}": kind}
+    config, _ = proposed(write(tmp_path / "set", kinds=kinds))
+    assert config.cameras == ("image",)
+    assert config.fields.cameras == {"image": IMAGE}
+
+
+@pytest.mark.parametrize(
+    "names",
+    [lambda _: {}, lambda _: {NAME: [b""]}, lambda _: {NAME: [b"same"]}],
+    ids=["without metadata", "empty names", "equal names"],
+)
+def test_records_without_a_usable_name_are_numbered(names: Any, tmp_path: Path) -> None:
+    config, guessed = proposed(write(tmp_path / "set", names=names))
+    assert config.fields.identity == "record"
+    assert "written again" in guessed["fields.identity"] or "writing the set again" in guessed["fields.identity"]
+    require_true(config)
+    assert len({info.id for info in open_source(config).infos()}) == EPISODES
+    assert len(open_dataset(config.model_copy(update={"frames": 3, "stride": 1})).windows("train"))
+
+
+def test_errors_of_unusable_names_say_how_records_are_numbered(tmp_path: Path) -> None:
+    folder = write(tmp_path / "set", names=lambda _: {NAME: [b""]})
+    fields = {**proposed(folder)[0].fields.model_dump(), "identity": (NAME,)}
+    for identity in ((NAME,), ("episode_metadata/none",)):
+        with pytest.raises(InputError, match=r"data\.fields\.identity: record"):
+            open_source(DataConfig(path=str(folder), camera="image", fields={**fields, "identity": identity})).infos()
+
+
+def in_format(states: Float[np.ndarray, "steps 7"], rotation: str) -> Float[np.ndarray, "steps _"]:
+    turned = Rotation.from_euler("xyz", states[:, 3:6])
+    numbers = {
+        "quaternion_xyzw": turned.as_quat(),
+        "rotation_vector": turned.as_rotvec(),
+        "euler_xyz_degrees": np.rad2deg(states[:, 3:6]),
+    }
+    return np.concatenate([states[:, :3], numbers[rotation], states[:, 6:]], axis=1)
+
+
+@pytest.mark.parametrize(
+    ("states", "kinds", "expected"),
+    [
+        (
+            lambda s: {"steps/observation/ee_pose": s[:, :6], "steps/observation/gripper_closed": s[:, 6] > 0.5},
+            {"steps/observation/ee_pose": ("float32", (6,)), "steps/observation/gripper_closed": ("bool", ())},
+            {"gripper_open": 0.0, "gripper_closed": 1.0},
+        ),
+        (lambda s: {STATE: np.c_[s[:, :6], 2 * s[:, 6] - 1]}, None, {"gripper_open": -1.0, "gripper_closed": 1.0}),
+        (lambda s: {STATE: np.c_[s[:, :6], 0.08 * (1 - s[:, 6])]}, None, {"gripper_closed": 0.0}),
+        (lambda s: {STATE: np.c_[1000 * s[:, :3], s[:, 3:]]}, None, {"position_unit": "mm"}),
+        (lambda s: {STATE: in_format(s, "euler_xyz_degrees")}, None, {"rotation": "euler_xyz_degrees"}),
+        (
+            lambda s: {STATE: in_format(s, "quaternion_xyzw")},
+            {STATE: ("float32", (8,))},
+            {"rotation": "quaternion_xyzw"},
+        ),
+        (
+            lambda s: {STATE: np.c_[s[:, :6], 0.04 * (1 - s[:, 6]), -0.04 * (1 - s[:, 6])]},
+            {STATE: ("float32", (8,))},
+            {"select": (0, 1, 2, 3, 4, 5, 6)},
+        ),
+    ],
+    ids=["bool gripper", "gripper -1 to 1", "gripper in metres", "millimetres", "degrees", "quaternion", "LIBERO"],
+)
+def test_formats_of_states_are_proposed_and_read(
+    states: Any, kinds: Any, expected: Mapping[str, Any], tmp_path: Path
+) -> None:
+    config, guessed = proposed(write(tmp_path / "set", states=states, kinds=kinds))
+    for key, value in expected.items():
+        assert getattr(config.fields, key) == value, guessed
+    if "bool" in str(kinds):
+        closed = open_source(config).read(0).states[:, 6]
+        assert np.array_equal(closed, TRUE[0][:, 6] > 0.5)
+    elif "gripper_closed" in expected or "select" in expected:  # the width at full opening is what was recorded
+        closed, true = open_source(config).read(0).states[:, 6], TRUE[0][:, 6]
+        assert np.corrcoef(closed, true)[0, 1] > 0.999
+    else:
+        require_true(config, tolerance=1e-3)
+
+
+def test_a_rotation_vector_is_read_from_rlds(tmp_path: Path) -> None:
+    folder = write(tmp_path / "set", states=lambda s: {STATE: in_format(s, "rotation_vector")})
+    config, _ = proposed(folder)
+    fields = config.fields.model_copy(update={"rotation": "rotation_vector"})
+    require_true(config.model_copy(update={"fields": fields}))
+
+
+def test_numbers_that_are_no_pose_become_a_vector(tmp_path: Path) -> None:
+    joints = lambda s: {STATE: np.concatenate([s, s], axis=1)[:, :9]}  # noqa: E731
+    config, guessed = proposed(write(tmp_path / "set", states=joints, kinds={STATE: ("float32", (9,))}))
+    assert (config.states, config.fields.state) == ("vector", (STATE,))
+    assert "fields.state" in guessed
+    assert open_source(config).read(0).states.shape == (STEPS, 9)
+
+
+def test_the_same_frames_and_states_are_read_from_a_url(tmp_path: Path) -> None:
+    fsspec = pytest.importorskip("fsspec")
+    folder = write(tmp_path / "set", states=lambda s: {STATE: in_format(s, "rotation_vector")}, names=lambda _: {})
+    memory = fsspec.filesystem("memory")
+    for file in folder.iterdir():
+        memory.pipe(f"/of_others/{file.name}", file.read_bytes())
+    here, _ = proposed(folder)
+    cache = DiskCacheConfig(dir=str(tmp_path / "cache"))
+    there = here.model_copy(update={"path": "memory://of_others", "disk_cache": cache})
+    for number in range(EPISODES):
+        local, remote = open_source(here).read(number), open_source(there).read(number)
+        assert np.array_equal(local.states, remote.states)
+        assert np.array_equal(local.read_frames([0, 3]), remote.read_frames([0, 3]))
