@@ -118,9 +118,8 @@ def test_modules_that_are_named_are_there() -> None:
 
 
 @pytest.mark.parametrize("name", GUIDES)
-def test_a_guide_is_short_begins_with_one_command_and_leads_on(name: str) -> None:
+def test_a_guide_begins_with_one_command_and_leads_on(name: str) -> None:
     text = (ROOT / f"docs/{name}.md").read_text()
-    assert len(text.split()) <= 1_500
     first = re.search(r"```sh\n(.*?)```", text, flags=re.DOTALL)
     assert first
     assert first[1].replace("\\\n", "").count("\n") == 1
@@ -128,19 +127,6 @@ def test_a_guide_is_short_begins_with_one_command_and_leads_on(name: str) -> Non
     assert f"]({name}.md" in (ROOT / "docs/start.md").read_text(), "one click from the start page"
     if (ROOT / f"docs/{name}_reference.md").exists():
         assert f"]({name}_reference.md)" in text
-
-
-def words_of(path: Path) -> int:
-    """Count what is read: no marks of tables and lists, and no comments."""
-    text = re.sub(r"<!--.*?-->", "", path.read_text(), flags=re.DOTALL)
-    return sum(bool(re.search(r"\w", word)) for word in text.split())
-
-
-def test_the_pages_are_short_together() -> None:
-    """Without the log, which tells of how things were."""
-    pages = [ROOT / "README.md", *(path for path in (ROOT / "docs").glob("*.md") if path.name != "log.md")]
-    assert sum(map(words_of, pages)) <= 25_500
-    assert len((ROOT / "README.md").read_text().split()) <= 1_200
 
 
 def test_pictures_are_at_most_twice_as_wide_as_high_and_the_readmes_film_is_a_short_loop() -> None:

@@ -189,7 +189,7 @@ _OLDER_GRIPPERS = {"closedness": {}, "openness": {"gripper_open": 1.0, "gripper_
 
 
 def _replace_older_keys(values: dict[str, Any]) -> None:
-    """Replace `data.fields.gripper`, which configs of older runs have, by `gripper_open` and `gripper_closed`."""
+    """Replace the key gripper of `data.fields`, which configs of older runs have, by its two values."""
     for section, inner in values.items():
         if section == "fields" and isinstance(inner, dict) and inner.get("gripper") in _OLDER_GRIPPERS:
             inner.update(_OLDER_GRIPPERS[inner.pop("gripper")])

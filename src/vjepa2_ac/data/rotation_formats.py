@@ -120,7 +120,7 @@ def _step_angles(numbers: Float[np.ndarray, "steps 3"], written_as: RotationForm
 def _relative_to_neighbours(
     angles: Float[np.ndarray, " changes"], is_jump: Bool[np.ndarray, " changes"]
 ) -> Float[np.ndarray, " jumps"]:
-    """Return the angle at each jump, over the mean angle of the steps around it without jumps (NaN if there are none)."""
+    """Return the angle at each jump, relative to the mean of the steps around it without jumps; NaN: there are none."""
     calm = np.stack([np.where(is_jump, 0.0, angles), ~is_jump])
     sums = np.cumsum(np.pad(calm, ((0, 0), (_STEPS_AROUND + 1, _STEPS_AROUND))), axis=1)
     total, count = (sums[:, 2 * _STEPS_AROUND + 1 :] - sums[:, : -2 * _STEPS_AROUND - 1])[:, is_jump]

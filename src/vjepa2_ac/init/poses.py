@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -89,15 +90,31 @@ class Pose:
 
 @dataclass(frozen=True)
 class _Number:
+    """One number of a column, and what its name says."""
+
     column: str
     index: int
     name: str
     kind: Kind
-    axis: str  # within its kind: x, y, z, w, a digit, roll, pitch, yaw
-    group: str  # the rest of its name, which tells arms apart
-    is_commanded: bool
+    axis: str = ""  # within its kind: x, y, z, w, a digit, roll, pitch, yaw
+    rest: str = ""  # of its name
     unit: str = ""
     is_named: bool = True  # False: recognised by the width of its column
+
+    @cached_property
+    def _tokens(self) -> list[str]:
+        tokens = f"{_words(self.column)}_{self.rest}".split("_")
+        return [token for token in dict.fromkeys(tokens) if token and not _NEUTRAL.fullmatch(token)]
+
+    @property
+    def group(self) -> str:
+        """The part of its name that tells arms apart; empty: nothing does."""
+        return "_".join(self._tokens)
+
+    @property
+    def is_commanded(self) -> bool:
+        """Whether it is a target rather than a measurement."""
+        return any(map(_COMMANDED.fullmatch, self._tokens))
 
 
 @dataclass(frozen=True)
@@ -167,20 +184,14 @@ def _named(column: str, index: int, name: str) -> _Number | None:
     unit = next(iter(_UNIT_AT_END.findall(words)), "")
     words = _UNIT_AT_END.sub("", words) or words
     if _GRIPPER.search(words):
-        return _number(column, index, name, "gripper", "", words.rstrip("_0123456789"))
+        return _Number(column, index, name, "gripper", rest=words.rstrip("_0123456789"))
     if _NO_POSE.search(words):
         return None
     for kind, pattern in _PARTS:
         if match := re.search(pattern, words):
             kind = "degrees" if kind == "euler" and unit.startswith("deg") else kind
-            return _number(column, index, name, kind, match[1], words[: match.start()], unit)
+            return _Number(column, index, name, kind, match[1], words[: match.start()], unit)
     return None
-
-
-def _number(column: str, index: int, name: str, kind: Kind, axis: str, rest: str, unit: str = "") -> _Number:
-    tokens = [token for token in f"{_words(column)}_{rest}".split("_") if token and not _NEUTRAL.fullmatch(token)]
-    is_commanded = any(map(_COMMANDED.fullmatch, tokens))
-    return _Number(column, index, name, kind, axis, "_".join(dict.fromkeys(tokens)), is_commanded, unit)
 
 
 def _by_width(column: str, width: int, samples: Sequence[Numbers]) -> Iterator[_Number]:
@@ -205,7 +216,7 @@ def _by_width(column: str, width: int, samples: Sequence[Numbers]) -> Iterator[_
         kinds += [("quaternion", axis) for axis in "0123"] if has_quaternion else [("rotation", axis) for axis in "012"]
         kinds += [("gripper", "")] * (width > len(kinds))
     for index, (kind, axis) in enumerate(kinds):
-        yield replace(_number(column, index, f"{column}[{index}]", kind, axis, ""), is_named=False)
+        yield _Number(column, index, f"{column}[{index}]", kind, axis, is_named=False)
 
 
 def _names_disagree(one: Column, samples: Sequence[Numbers]) -> bool:
