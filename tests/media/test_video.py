@@ -16,7 +16,7 @@ from recordings import write_mp4
 from synthetic import draw_frame, synthetic_states
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media import video as video_reader
-from vjepa2_ac.media.video import Clock, count_frames, frame_times, read_frames, write_video
+from vjepa2_ac.media.video import Clock, count_frames, frame_times, read_frames, read_header, write_video
 from vjepa2_ac.reports import imagined
 
 STEPS = 40
@@ -93,6 +93,141 @@ def test_an_episode_that_starts_within_a_file_is_found_by_time(tmp_path: Path) -
     np.testing.assert_array_equal(read, every_frame(path)[[17, 20]])
 
 
+SHOWN_AT = {  # in 1/15360 s, for steps at 10 Hz
+    "30 frames a second": [512 * frame for frame in range(STEPS)],
+    "50 frames a second": [307 * frame for frame in range(STEPS)],
+    "25 frames a second, half of the steps between two frames": [614 * frame for frame in range(STEPS)],
+    "uneven": np.cumsum(np.random.default_rng(3).integers(50, 700, STEPS)).tolist(),
+}
+
+
+@pytest.mark.parametrize(("gop", "b_frames"), [(1, 0), (2, 0), (12, 0), (12, 3), (250, 3)])
+@pytest.mark.parametrize("times", SHOWN_AT.values(), ids=SHOWN_AT)
+def test_a_step_has_the_frame_nearest_in_time_whatever_else_is_read(
+    times: list[int], gop: int, b_frames: int, tmp_path: Path
+) -> None:
+    path = write_mp4(tmp_path / "a.mp4", FRAMES, gop=gop, b_frames=b_frames, times=times)
+    frames, shown = every_frame(path), frame_times(path, where="a")
+    assert np.diff(shown).tolist() == np.diff(times).tolist()
+    clock = Clock(0.105, 10.0)
+    targets = [round(15360 * (0.105 + step / 10)) for step in range(int(shown[-1] / 1536))]
+    nearest = [min(range(STEPS), key=lambda frame: (abs(shown[frame] - target), frame)) for target in targets]
+    steps = [step for step, frame in enumerate(nearest) if abs(shown[frame] - targets[step]) < 0.49 * 1536]
+    expected = frames[[nearest[step] for step in steps]]
+    np.testing.assert_array_equal(read_frames(path, steps, where="a", clock=clock), expected)
+    for first, second in zip(range(len(steps)), (3, 0, *range(len(steps))), strict=False):
+        pair = read_frames(path, [steps[first], steps[second]], where="a", clock=clock)
+        np.testing.assert_array_equal(pair, expected[[first, second]])
+        np.testing.assert_array_equal(read_frames(path, [steps[first]], where="a", clock=clock), expected[[first]])
+
+
+def test_of_two_frames_equally_near_the_earlier_one_is_read(tmp_path: Path) -> None:
+    path = write_mp4(tmp_path / "a.mp4", FRAMES, gop=4)
+    frames = every_frame(path)
+    for steps in ([0, 1, 2], [1], [2]):
+        read = read_frames(path, steps, where="a", clock=Clock(3.5 / 15, 7.5))
+        np.testing.assert_array_equal(read, frames[[3 + 2 * step for step in steps]])
+
+
+def test_of_a_dense_video_only_the_nearest_frames_become_rgb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_mp4(tmp_path / "a.mp4", FRAMES, rate=30, gop=40)
+    converted: list[int] = []
+
+    def noted(image: np.ndarray, frame: Any, where: str) -> np.ndarray:
+        converted.append(frame.pts * 30 * frame.time_base)
+        return image
+
+    monkeypatch.setattr(video_reader, "_upright", noted)
+    read_frames(path, range(5), where="a", clock=Clock(0.01, 10.0))
+    assert converted == [0, 3, 6, 9, 12]
+
+
+def test_a_frame_half_a_step_away_is_not_the_steps_frame(tmp_path: Path) -> None:
+    times = [1024 * frame + 500 * (frame == 20) for frame in range(STEPS)]  # steps of 1024
+    path = write_mp4(tmp_path / "a.mp4", FRAMES, times=times)
+    assert len(read_frames(path, [19, 20, 21], where="a", clock=Clock(0.0, 15.0))) == 3
+    times[20] += 10
+    path = write_mp4(tmp_path / "a.mp4", FRAMES, times=times)
+    assert len(read_frames(path, [19, 21], where="a", clock=Clock(0.0, 15.0))) == 2
+    with pytest.raises(InputError, match=r"a: no frame at 1\.333 s\. needed: one for each of 3 times from 1\.267 s on"):
+        read_frames(path, [19, 20, 21], where="a", clock=Clock(0.0, 15.0))
+
+
+def test_a_missing_frame_is_found_without_decoding_the_rest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    times = [1024 * frame + 5120 * (frame > 5) for frame in range(STEPS)]
+    path = write_mp4(tmp_path / "a.mp4", FRAMES, times=times, gop=40)
+    decoded: list[int] = []
+    keep = video_reader._Targets.keep
+    monkeypatch.setattr(
+        video_reader._Targets, "keep", lambda self, frames: (decoded.extend(frames), keep(self, frames))[1]
+    )
+    with pytest.raises(InputError, match=r"no frame at 0\.400 s"):
+        read_frames(path, [6], where="a", clock=Clock(0.0, 15.0))
+    assert len(decoded) <= 8
+
+
+def test_a_video_slower_than_its_clock_is_named_with_both_rates(tmp_path: Path) -> None:
+    path = write_mp4(tmp_path / "a.mp4", FRAMES, rate=10)
+    message = r"a: no frame at 0\.033 s: the video has 10 frames a second, and meta/info\.json says 30\. needed: a frame"
+    with pytest.raises(InputError, match=message):
+        read_frames(path, [0, 1], where="a", clock=Clock(0.0, 30.0, "meta/info.json"))
+
+
+def test_the_header_gives_number_and_rate_of_the_frames_without_counting_gaps(tmp_path: Path) -> None:
+    for b_frames in (0, 3):
+        header = read_header(write_mp4(tmp_path / "a.mp4", FRAMES, rate=30, b_frames=b_frames), where="a")
+        assert header.num_frames == STEPS
+        assert header.span_s == pytest.approx(39 / 30)
+        assert header.has_rate(30.0)
+        assert not header.has_rate(25.0)
+    times = [1024 * frame + 15360 * (frame > 20) for frame in range(STEPS)]
+    for options in ({}, {"movflags": "empty_moov+default_base_moof+frag_keyframe"}):
+        header = read_header(write_mp4(tmp_path / "a.mp4", FRAMES, times=times, container=options), where="a")
+        assert header.rate_hz == pytest.approx(15)
+        assert header.span_s == pytest.approx(39 / 15 + 1)
+    assert read_header(write_mp4(tmp_path / "a.mp4", FRAMES[:1]), where="a").rate_hz == 0
+
+
+MATRICES = {  # a, b, c, d of the header's matrix, and what is displayed
+    "rotated by 90 degrees": ((0, 1, -1, 0), lambda image: np.rot90(image, -1)),
+    "rotated by 180 degrees": ((-1, 0, 0, -1), lambda image: np.rot90(image, 2)),
+    "rotated by 270 degrees": ((0, -1, 1, 0), np.rot90),
+    "mirrored": ((-1, 0, 0, 1), lambda image: image[:, ::-1]),
+    "mirrored and rotated": ((0, 1, 1, 0), lambda image: image.swapaxes(0, 1)),
+}
+
+
+def with_matrix(path: Path, *matrix: int) -> Path:
+    """Replace the display matrix in the header of an MP4, in place: a b 0, c d 0, 0 0 1."""
+
+    def packed(a: int, b: int, c: int, d: int) -> bytes:
+        return b"".join(int(one * 65536).to_bytes(4, "big", signed=True) for one in (a, b, 0, c, d, 0, 0, 0, 16384))
+
+    data = path.read_bytes()
+    start = data.index(b"tkhd")
+    place = data.index(packed(1, 0, 0, 1), start)
+    path.write_bytes(data[:place] + packed(*matrix) + data[place + 36 :])
+    return path
+
+
+@pytest.mark.parametrize("clock", [None, Clock(0.0, 15.0)])
+@pytest.mark.parametrize(("matrix", "displayed"), MATRICES.values(), ids=MATRICES)
+def test_frames_are_displayed_upright(
+    matrix: tuple[int, ...], displayed: Callable[[np.ndarray], np.ndarray], clock: Clock | None, tmp_path: Path
+) -> None:
+    path = write_mp4(tmp_path / "a.mp4", FRAMES, b_frames=2)
+    stored = read_frames(path, [0, 7], where="a", clock=clock)
+    upright = read_frames(with_matrix(path, *matrix), [0, 7], where="a", clock=clock)
+    np.testing.assert_array_equal(upright, [displayed(image) for image in stored])
+
+
+@pytest.mark.parametrize("matrix", [(0, 0, 0, 0), (1, 1, -1, 1), (1, 0, 0, 0)])
+def test_a_display_matrix_other_than_a_quarter_turn_is_refused(matrix: tuple[int, ...], tmp_path: Path) -> None:
+    path = with_matrix(write_mp4(tmp_path / "a.mp4", FRAMES), *matrix)
+    with pytest.raises(InputError, match="a: a display matrix that is no rotation by 90, 180 or 270 degrees"):
+        read_frames(path, [0], where="a")
+
+
 @pytest.mark.parametrize("flags", ["empty_moov+default_base_moof+frag_keyframe", "faststart"])
 def test_any_order_of_the_files_parts_is_read(tmp_path: Path, flags: str) -> None:
     path = write_mp4(tmp_path / "a.mp4", FRAMES, container={"movflags": flags}, b_frames=2)
@@ -103,13 +238,13 @@ def test_any_order_of_the_files_parts_is_read(tmp_path: Path, flags: str) -> Non
 def test_only_what_the_asked_frames_need_is_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_mp4(tmp_path / "a.mp4", FRAMES, gop=12)
     decoded: list[int] = []
-    keep = video_reader._Video._keep
+    keep = video_reader._Targets.keep
 
-    def counted(self: video_reader._Video, frames: Sequence[Any], *others: Any) -> None:
+    def counted(self: video_reader._Targets, frames: Sequence[Any]) -> None:
         decoded.extend(frame.pts for frame in frames)
-        keep(self, frames, *others)
+        keep(self, frames)
 
-    monkeypatch.setattr(video_reader._Video, "_keep", counted)
+    monkeypatch.setattr(video_reader._Targets, "keep", counted)
     read_frames(path, [14, 38], where="a")
     assert [time // 1024 for time in decoded] == [12, 13, 14, 36, 37, 38]
 

@@ -1,8 +1,8 @@
-"""Video: frames of an MP4 at given positions, decoded only where needed; and films that every player and page shows.
+"""Read frames of an MP4 at given positions or times, decoding only what they need; write videos and GIFs.
 
 A frame is identified by its presentation time, never by counting at the rate in the header: that rate is often wrong
-(DROID's), and frames are stored in another order than they are shown (B-frames). A film is written completely or not at
-all.
+(DROID's), and frames are stored in another order than they are shown (B-frames). Frames are rotated and mirrored as the
+file's display matrix says. A video is written completely or not at all.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import re
 from bisect import bisect_left
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -34,6 +34,7 @@ _STRICT = {
     "max_pixels": str(MOST_PIXELS),
 }
 _START = -(1 << 40)  # before every frame
+_SAME_RATE = 0.02  # relative difference of equal rates: times in milliseconds round 30 Hz to 30.3 Hz
 _FIX = "Copy the file again, or leave the episode out"
 _QUALITY = "20"  # x264's constant rate factor: text stays sharp
 _COLOURS = 255  # of a GIF
@@ -44,10 +45,24 @@ Frame = UInt8[np.ndarray, "height width 3"]
 
 @dataclass(frozen=True)
 class Clock:
-    """Where an episode's frames are in a file of many episodes: step k is shown at start_s + k / rate_hz."""
+    """The times of an episode's steps in a video file of many episodes: step k is at start_s + k / rate_hz."""
 
     start_s: float
     rate_hz: float
+    source: str = "the clock"  # where the rate is stated, for messages
+
+
+@dataclass(frozen=True)
+class VideoHeader:
+    """The number and the times of a video's frames, known without decoding."""
+
+    num_frames: int
+    span_s: float  # from the first frame to the last
+    rate_hz: float  # frames per second, by the median interval; 0 for a single frame
+
+    def has_rate(self, rate_hz: float) -> bool:
+        """Return whether the video has this many frames per second, within 2 %."""
+        return abs(self.rate_hz - rate_hz) <= _SAME_RATE * rate_hz
 
 
 def read_frames(
@@ -60,7 +75,9 @@ def read_frames(
 ) -> UInt8[np.ndarray, "time height width 3"]:
     """Return the RGB frames at these positions of a video, in this order; positions may repeat.
 
-    Decoding starts at the key frame before a requested frame; only requested frames become RGB.
+    Decoding starts at the key frame before a requested frame; only requested frames become RGB. With a clock, a step
+    has the frame nearest to its time, at most 0.49 of a step away; of two frames equally near, the earlier one. The
+    frame of a step does not depend on the other requested steps.
 
     Args:
         file: Local path, URL, or a file open for reading, which stays open.
@@ -81,7 +98,7 @@ def read_frames(
             targets, tolerance = _shown_at(steps, video.times() if times is None else times, where), 0
         else:
             targets, tolerance = _shown_by(clock, steps, video.unit_s, where)
-        frames = video.decode(sorted(set(targets)), tolerance)
+        frames = video.decode(sorted(set(targets)), tolerance, clock)
         if len(sizes := {frame.shape for frame in frames.values()}) > 1:
             found = f"frames of {' and '.join(f'{height}x{width}' for height, width, _ in sorted(sizes))}"
             raise _unusable(where, found, "frames of one size")
@@ -105,19 +122,24 @@ def _shown_by(clock: Clock, steps: Sequence[int], unit_s: float, where: str) -> 
     return targets, max(0, int(0.49 / clock.rate_hz / unit_s))
 
 
-def count_frames(file: str | Path | ByteReader, *, where: str) -> int:
-    """Return how many frames a video shows: from its index, or by counting packets if it has none.
+def read_header(file: str | Path | ByteReader, *, where: str) -> VideoHeader:
+    """Return number and rate of a video's frames: from its index, or from its packets if it has none.
 
     Raises:
         InputError: Not a video, or damaged.
         OSError: A file behind a URL cannot be read.
     """
     with _opened(file, where) as video:
-        return len(video.stored_times() if video.is_indexed else video.times())
+        return video.header()
+
+
+def count_frames(file: str | Path | ByteReader, *, where: str) -> int:
+    """Return the number of frames of a video; errors as `read_header`."""
+    return read_header(file, where=where).num_frames
 
 
 def frame_times(file: str | Path | ByteReader, *, where: str) -> list[int]:
-    """Return when each frame of a video is shown, in order, in the video's units of time; errors as `count_frames`."""
+    """Return when each frame of a video is shown, in order, in the video's units of time; errors as `read_header`."""
     with _opened(file, where) as video:
         return video.times()
 
@@ -225,33 +247,74 @@ class _Video:
         self.container.seek(seek_to, stream=self.stream, backward=True)
         yield from (packet for packet in self.container.demux(self.stream) if packet.dts is not None)
 
-    def decode(self, targets: list[int], tolerance: int) -> dict[int, Frame]:
-        """Return the frames shown at these ascending times, or the first within the tolerance of each."""
-        require_bounded(self.stream.height or 1, self.stream.width or 1, self.where, count=len(targets))
-        found: dict[int, Frame] = {}
-        while missing := [target for target in targets if target not in found]:
-            self._decode_run(_Targets(missing, tolerance), found)
-            if missing[0] not in found:
-                needed = f"one for each of {len(targets)} times from {targets[0] * self.unit_s:.3f} s on"
-                raise _unusable(self.where, f"no frame at {missing[0] * self.unit_s:.3f} s", needed)
-        return found
+    def header(self) -> VideoHeader:
+        """Return number and rate of the frames; the intervals of decoding times are those of presentation times."""
+        times = self.stored_times() if self.is_indexed else self.times()
+        intervals = np.diff(times) * self.unit_s
+        interval_s = float(np.median(intervals)) if len(intervals) else 0.0
+        return VideoHeader(len(times), float(intervals.sum()), 1 / interval_s if interval_s > 0 else 0.0)
 
-    def _decode_run(self, targets: _Targets, found: dict[int, Frame]) -> None:
-        """Decode from the key frame before the first target for as long as that costs less than the next seek."""
+    def decode(self, targets: list[int], tolerance: int, clock: Clock | None) -> dict[int, Frame]:
+        """Return the frame nearest to each of these ascending times, at most the tolerance away."""
+        require_bounded(self.stream.height or 1, self.stream.width or 1, self.where, count=len(targets))
+        frames: dict[int, Frame] = {}
+        while missing := [target for target in targets if target not in frames]:
+            decoded = self._decode_run(_Targets(missing, tolerance))
+            if missing[0] not in decoded:
+                raise self._no_frame(missing[0], targets, clock)
+            frames |= decoded
+        return frames
+
+    def _no_frame(self, target: int, targets: list[int], clock: Clock | None) -> InputError:
+        found = f"no frame at {target * self.unit_s:.3f} s"
+        rate = 0.0 if clock is None else self.header().rate_hz
+        if clock is not None and 0 < rate < (1 - _SAME_RATE) * clock.rate_hz:
+            found = f"{found}: the video has {rate:.4g} frames a second, and {clock.source} says {clock.rate_hz:g}"
+            fix = "Change the rate of the video or that of the steps, or leave the episode out"
+            return InputError(where=self.where, found=found, needed="a frame for each step", fix=fix)
+        needed = f"one for each of {len(targets)} times from {targets[0] * self.unit_s:.3f} s on"
+        return _unusable(self.where, found, needed)
+
+    def _decode_run(self, targets: _Targets) -> dict[int, Frame]:
+        """Decode from the key frame before the first target for as long as that costs less than the next seek.
+
+        Returned are the frames of the first target and of those behind it whose nearest frame is among the decoded.
+        """
         decoder = self.stream.codec_context
-        sent: set[int | None] = set()
+        frames: dict[int, Frame] = {}
         delay: int | None = None
+        first = end = 0  # targets before `first` are final: a frame that follows is shown at `end` or later
         for packet in self._packets_before(targets.times[0]):
             decoded = int(packet.dts or 0)
             shown = decoded if packet.pts is None else int(packet.pts)
             delay = shown - decoded if delay is None else delay  # of the key frame; all of the file have the same
-            sent.add(targets.nearest(shown))
-            self._keep(decoder.decode(packet), targets, found)
-            if targets.times[0] in sent:
-                following = next((time for time in targets.times if time not in sent), None)
-                if following is None or self._key_frame_before(following - delay) > decoded + int(packet.duration or 0):
-                    break
-        self._keep(decoder.decode(None), targets, found)
+            end = decoded + int(packet.duration or 0)
+            if not packet.is_discard:
+                targets.expect(shown)
+            targets.keep(decoder.decode(packet))
+            frames |= self._converted(targets, end)
+            while first < len(targets.times) and targets.is_final(targets.times[first], end):
+                first += 1
+            if first == len(targets.times) or (first and self._key_frame_before(targets.times[first] - delay) > end):
+                break
+        else:
+            end = -_START
+        targets.keep(decoder.decode(None))
+        return frames | self._converted(targets, end)
+
+    def _converted(self, targets: _Targets, end: int) -> dict[int, Frame]:
+        """Return the decoded frames that are final, as RGB."""
+        frames: dict[int, Frame] = {}
+        for target in [target for target in targets.decoded if targets.is_final(target, end)]:
+            frame = targets.decoded.pop(target)
+            if frame.pts != targets.nearest[target]:  # the nearest one is not decoded yet
+                continue
+            if frame.is_corrupt:
+                raise _unusable(self.where, f"a damaged frame at {target * self.unit_s:.3f} s", "a whole MP4")
+            require_bounded(frame.height, frame.width, self.where, count=len(targets.times))
+            image = np.asarray(self.converter.reformat(frame, format="rgb24", threads=1).to_ndarray())
+            frames[target] = _upright(image, frame, self.where)
+        return frames
 
     def _packets_before(self, target: int) -> Iterator[Packet[VideoStream]]:
         """Yield packets from the last key frame that is shown no later than the target."""
@@ -271,29 +334,55 @@ class _Video:
         place = self.stream.index_entries.search_timestamp(time, backward=True, any_frame=False)
         return int(self.stream.index_entries[place].timestamp) if place >= 0 else _START
 
-    def _keep(self, frames: Sequence[VideoFrame], targets: _Targets, found: dict[int, Frame]) -> None:
-        for frame in frames:
-            target = None if frame.pts is None else targets.nearest(int(frame.pts))
-            if target is None or target in found:
-                continue
-            if frame.is_corrupt:
-                raise _unusable(self.where, f"a damaged frame at {target * self.unit_s:.3f} s", "a whole MP4")
-            require_bounded(frame.height, frame.width, self.where, count=len(targets.times))
-            found[target] = np.asarray(self.converter.reformat(frame, format="rgb24", threads=1).to_ndarray())
-
 
 @dataclass(frozen=True)
 class _Targets:
-    """Ascending times whose frames are wanted."""
+    """Ascending times, and for each the nearest frame: packets announce frames before the decoder returns them."""
 
     times: list[int]
-    tolerance: int  # how far from a target a frame's time may lie
+    tolerance: int  # the largest distance of a frame from its target
+    nearest: dict[int, int] = field(default_factory=dict)  # time of the nearest frame announced so far
+    decoded: dict[int, VideoFrame] = field(default_factory=dict)  # not converted yet
 
-    def nearest(self, time: int) -> int | None:
+    def expect(self, time: int) -> None:
+        """Note that a frame is shown at this time."""
+        target = self._target_of(time)
+        if target is not None:
+            known = self.nearest.get(target, time)
+            self.nearest[target] = min(known, time, key=lambda one: (abs(one - target), one))
+
+    def keep(self, frames: Sequence[VideoFrame]) -> None:
+        """Keep the decoded frames that are the nearest ones so far."""
+        for frame in frames:
+            target = None if frame.pts is None else self._target_of(int(frame.pts))
+            if target is not None and frame.pts == self.nearest.get(target):
+                self.decoded[target] = frame
+
+    def is_final(self, target: int, end: int) -> bool:
+        """Return whether no frame shown at `end` or later is nearer to a target, or within the tolerance of it."""
+        distance = abs(self.nearest[target] - target) if target in self.nearest else self.tolerance + 1
+        return distance == 0 or end >= target + distance
+
+    def _target_of(self, time: int) -> int | None:
         """Return the first target within the tolerance of a time, or None."""
-        place = bisect_left(self.times, time - self.tolerance)
-        matches = place < len(self.times) and self.times[place] <= time + self.tolerance
-        return self.times[place] if matches else None
+        index = bisect_left(self.times, time - self.tolerance)
+        matches = index < len(self.times) and self.times[index] <= time + self.tolerance
+        return self.times[index] if matches else None
+
+
+def _upright(
+    image: Frame, frame: VideoFrame, where: str
+) -> UInt8[np.ndarray, "displayed_height displayed_width 3"]:
+    """Return an image as it is displayed: phones store videos on their side, with a matrix that says how."""
+    if not frame.rotation:
+        return image
+    matrix = np.frombuffer(bytes(frame.side_data["DISPLAYMATRIX"]), np.int32).reshape(3, 3)[:2, :2]
+    if matrix[0, 0] == matrix[1, 1] == 0:
+        image, matrix = image.swapaxes(0, 1), matrix[::-1]  # x becomes y
+    if np.count_nonzero(matrix) != 2 or not matrix.diagonal().all():
+        found, needed = "a display matrix that is no rotation by 90, 180 or 270 degrees", "one that is, or none"
+        raise InputError(where=where, found=found, needed=needed, fix="Convert the video")
+    return image[:: int(np.sign(matrix[1, 1])), :: int(np.sign(matrix[0, 0]))]
 
 
 def _unusable(where: str, found: str, needed: str) -> InputError:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field
+from pathlib import PurePosixPath
 from typing import Any
 
 from vjepa2_ac import storage
@@ -13,6 +15,7 @@ from vjepa2_ac.data.index import UNKNOWN, EpisodeTable, hash_of_bytes
 from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, filled
 from vjepa2_ac.data.sources.lerobot.parquet import read_table
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.media.video import VideoHeader
 from vjepa2_ac.spaces import zero_steps
 from vjepa2_ac.storage.block_file import BlockCachedFile
 from vjepa2_ac.storage.structured import json_object
@@ -25,7 +28,9 @@ TABLES = {  # templates of the files that list the episodes
 _MOST_BYTES = 1 << 28  # of meta/episodes.jsonl
 _FIX_TABLES = "Get the files in meta again"
 _FIX = "Copy the data set again, or leave the episode out"
+_FIX_RANGES = "Correct file_index, from_timestamp and to_timestamp in meta/episodes, or leave both episodes out"
 _STATISTICS = ("min", "max", "mean", "std")
+_ROUNDING_STEPS = 0.25  # by which the ranges of two episodes in a video may overlap
 
 
 @dataclass(frozen=True)
@@ -185,6 +190,61 @@ def require_files(info: DatasetInfo, row: EpisodeRow, files: Set[str], keys: Seq
             found = f"{row.lengths_s[key]:.3f} s of video, says the data set, {of_rows}"
             needed = f"{row.length / info.fps:.3f} s"
             raise InputError(where=where, found=found, needed=needed, fix="Leave the episode out")
+
+
+def require_long_videos(
+    info: DatasetInfo, row: EpisodeRow, keys: Sequence[str], header_of: Callable[[str], VideoHeader]
+) -> None:
+    """Refuse an episode whose video ends before its last step, as far as the header of the video shows.
+
+    Args:
+        info: Of the data set.
+        row: The episode.
+        keys: Features of the cameras that are used.
+        header_of: Returns the header of a video, given by its path.
+
+    Raises:
+        InputError: A video is too short, or cannot be read.
+    """
+    for key in keys:
+        if f"{key}.file" not in row.place:
+            continue
+        path = storage.join(info.root, row.video_file(info, key))
+        header, last_s = header_of(path), row.place[f"{key}.start_s"] + (row.length - 1) / info.fps
+        if header.num_frames < row.length or header.span_s < last_s - 0.5 / info.fps:
+            found = f"{header.num_frames} frames at {header.rate_hz:.4g} a second, the last one at {header.span_s:.3f} s"
+            needed = f"one for each of {row.length} rows at {info.fps:g} a second, the last one at {last_s:.3f} s"
+            raise InputError(where=f"{path}: {row.id}", found=found, needed=needed, fix=_FIX)
+
+
+def find_overlaps(info: DatasetInfo, rows: Sequence[EpisodeRow], keys: Sequence[str]) -> dict[str, InputError]:
+    """Return an error for each episode that claims seconds of a video that another episode claims, by identity.
+
+    Args:
+        info: Of the data set.
+        rows: All episodes.
+        keys: Features of the cameras that are used.
+    """
+    claims = defaultdict[str, list[tuple[float, float, str]]](list)  # of each video: start, end, identity
+    for key in keys:
+        for row in rows:
+            if f"{key}.file" in row.place:
+                start_s = row.place[f"{key}.start_s"]
+                end_s = start_s + row.lengths_s.get(key, row.length / info.fps)
+                claims[row.video_file(info, key)].append((start_s, end_s, row.id))
+    errors: dict[str, InputError] = {}
+    for path, claims_of_video in claims.items():
+        latest, *later = sorted(claims_of_video)
+        for claim in later:
+            start_s, end_s = claim[0], min(claim[1], latest[1])
+            if end_s - start_s > _ROUNDING_STEPS / info.fps:
+                seconds = f"{start_s:.10g} to {end_s:.10g} s of {PurePosixPath(path).name}"
+                found = f"{latest[2]} and {claim[2]} claim {seconds}"
+                for _, _, identity in (latest, claim):
+                    where, needed = f"{storage.join(info.root, path)}: {identity}", "seconds of one episode only"
+                    errors.setdefault(identity, InputError(where=where, found=found, needed=needed, fix=_FIX_RANGES))
+            latest = max(latest, claim, key=lambda one: one[1])
+    return errors
 
 
 def row_of(table: EpisodeTable, index: int) -> EpisodeRow:

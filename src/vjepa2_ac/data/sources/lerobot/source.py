@@ -18,17 +18,27 @@ from vjepa2_ac.data.index import EpisodeTable, get_or_build, hash_of_states, ind
 from vjepa2_ac.data.poses import poses_from
 from vjepa2_ac.data.selection import as_problem
 from vjepa2_ac.data.sources.indexed_source import Found, FramesByStep, IndexedSource, Scanned, table_of
-from vjepa2_ac.data.sources.lerobot.episodes import TABLES, EpisodeRow, read_episodes, require_files, row_of
+from vjepa2_ac.data.sources.lerobot.episodes import (
+    TABLES,
+    EpisodeRow,
+    find_overlaps,
+    read_episodes,
+    require_files,
+    require_long_videos,
+    row_of,
+)
 from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, list_by_template, missing, read_info
 from vjepa2_ac.data.sources.lerobot.parquet import EPISODE, Columns, ParquetRows
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import decode_image, require_bounded
-from vjepa2_ac.media.video import Clock, read_frames, video_library
+from vjepa2_ac.media.video import Clock, VideoHeader, read_frames, read_header, video_library
 from vjepa2_ac.spaces import require_finite
 from vjepa2_ac.storage.block_file import BlockCachedFile
 
 FRAME, TIME = "frame_index", "timestamp"
+
+_CHECKS = 2  # of episodes while a data set is indexed, and of how frames are chosen: a new number rebuilds all indexes
 
 _FIX = "Copy the file again, or leave the episode out"
 _FIX_STATES = "Check data.lerobot: state, select, rotation, position_unit, gripper_open and gripper_closed"
@@ -41,9 +51,10 @@ Content = dict[str, Any]
 class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
     """The episodes of a LeRobot data set, v3.0 or v2.1, in the order of their numbers.
 
-    Of a local data set `infos` checks the states of every episode; of a remote one it reads the files in meta, and
-    states are checked when an episode is read (all of them at once if `data.outcome` needs a value that only the rows
-    have). `read` fetches the row groups with the episode's rows; frames are fetched and decoded on request.
+    Of a local data set `infos` checks the states of every episode and the headers of the videos; of a remote one it
+    reads the files in meta, and states are checked when an episode is read (all of them at once if `data.outcome` needs
+    a value that only the rows have). `read` fetches the row groups with the episode's rows; frames are fetched and
+    decoded on request.
     """
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:  # noqa: ARG002 - frames are fetched one by one
@@ -103,6 +114,7 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
         parts = {
             **({"vector": wanted_columns(config)} if config.states == "vector" else {}),
             "source": "lerobot",
+            "checks": _CHECKS,
             "fields": fields,
             "keys": keys,
             "outcome": storage.is_url(config.path) and config.outcome != "all",
@@ -124,15 +136,21 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
             raise InputError(where=info.where, found="no episodes", needed="a data set with episodes")
         outcome_unknown = any(row.success is None for row in rows) and fields.success in info.features
         reads_rows = not is_far or (config.outcome != "all" and outcome_unknown)
+        overlaps = find_overlaps(info, rows, keys)
+        header_of = cache(lambda path: read_header(path, where=path))
 
         def look(row: EpisodeRow) -> Found:
             success, state_hash = row.success, row.state_hash
             try:
                 require_files(info, row, files, keys)
+                if row.id in overlaps:
+                    raise overlaps[row.id]
                 if reads_rows:
                     content, outcome = self._content(row)
                     success = success if outcome is None else outcome
                     state_hash = hash_of_states(content["states"])
+                if not is_far:
+                    require_long_videos(info, row, keys, header_of)
             except InputError as error:
                 return as_problem(error, row.id)
             facts, labels = EpisodeInfo(row.id, row.length, success), {"task": row.task}
@@ -158,8 +176,8 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
             path, where = storage.join(info.root, row.data_file(info)), f"{self._where(row)}: {key}"
             read = cache(partial(self._parquet.images, path, key, row.index))
             return FramesByStep(row.length, where, partial(_stored_images, read, row.length, where))
-        path = storage.join(info.root, row.video_file(info, key))
-        clock, where = Clock(start_s=row.place[f"{key}.start_s"], rate_hz=info.fps), f"{path}: {row.id}"
+        path, start_s = storage.join(info.root, row.video_file(info, key)), row.place[f"{key}.start_s"]
+        clock, where = Clock(start_s=start_s, rate_hz=info.fps, source=info.where), f"{path}: {row.id}"
         return FramesByStep(row.length, where, partial(self._video_frames, path, clock, where))
 
     def _video_frames(
