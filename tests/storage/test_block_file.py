@@ -1,11 +1,14 @@
 """The block file: reads like a file, fetches little more than is read, and that once per machine, up to a limit."""
 
 import errno
+import fcntl
 import io
 import logging
 import os
 import pickle
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -156,14 +159,16 @@ def test_the_entry_used_longest_ago_goes_first(tmp_path: Path) -> None:
 
 
 @settings(max_examples=30)
-@example(writes=[(0, 1), (0, 172), (0, 796), (0, 16)])  # full to less than what is written between two looks
-@given(writes=st.lists(st.tuples(st.integers(0, 9), st.integers(1, 1000)), max_size=30))
-def test_the_limit_holds_and_what_was_just_written_is_there(
-    tmp_path_factory: pytest.TempPathFactory, writes: list[tuple[int, int]]
+@example(writes=[(0, 1), (0, 172), (0, 796), (0, 16)], is_shared=True)
+@example(writes=[(0, 10 + size) for size in range(80)], is_shared=False)
+@given(writes=st.lists(st.tuples(st.integers(0, 9), st.integers(1, 1000)), max_size=30), is_shared=st.booleans())
+def test_the_limit_holds_and_the_newest_entry_is_present_whoever_writes_it(
+    tmp_path_factory: pytest.TempPathFactory, writes: list[tuple[int, int]], *, is_shared: bool
 ) -> None:
     folder = tmp_path_factory.mktemp("cache")
     cache = DiskCache(folder, 1000)
     for key, size in writes:
+        cache = cache if is_shared else DiskCache(folder, 1000)  # as in as many processes
         cache.write(f"{key} {size}", bytes(size))
         assert (cache.read(f"{key} {size}") == bytes(size)) == (size + 4 <= 800)
         assert size_of(folder) <= 1000
@@ -191,18 +196,92 @@ def test_a_disk_that_cannot_be_written_costs_one_warning_and_not_the_run(
     assert entries(tmp_path) == [tmp_path / "file"]
 
 
-def test_what_an_interrupted_writer_left_behind_goes_when_room_is_made(tmp_path: Path) -> None:
+def fill(folder: Path, entries: int) -> None:
+    """Write entries of 100 bytes under the keys 0, 1, ..., the first of them used longest ago."""
+    for key in range(entries):
+        before = set(folder.rglob("*"))
+        DiskCache(folder, 10_000).write(str(key), bytes(96))
+        [new] = [path for path in set(folder.rglob("*")) - before if path.is_file() and path.name != "lock"]
+        os.utime(new, (key, key))
+
+
+@pytest.mark.parametrize("is_unknown", [False, True], ids=["known total", "total of an earlier version"])
+@pytest.mark.parametrize("action", ["read", "write"])
+def test_a_folder_over_the_limit_is_reduced_at_the_first_use(tmp_path: Path, action: str, *, is_unknown: bool) -> None:
+    fill(tmp_path, 20)
+    if is_unknown:
+        (tmp_path / "lock").write_bytes(b"")
     cache = DiskCache(tmp_path, 1000)
-    cache.write("a", b"first")
+    assert size_of(tmp_path) == 2000
+    if action == "read":
+        assert cache.read("19") is not None
+        assert size_of(tmp_path) == 800
+    else:
+        cache.write("new", bytes(96))
+        assert size_of(tmp_path) == 800
+        assert cache.read("new") is not None
+    assert cache.read("0") is None
+    assert cache.read("18") is not None
+
+
+def test_a_limit_of_zero_and_no_limit_evict_nothing(tmp_path: Path) -> None:
+    fill(tmp_path, 20)
+    for limit in (0, None):
+        cache = DiskCache(tmp_path, limit)
+        cache.write("new", bytes(96))
+        assert cache.read("0") == bytes(96)
+        assert (cache.read("new") is None) == (limit == 0)
+    assert size_of(tmp_path) == 2100
+
+
+def test_partial_files_of_killed_writers_count_and_are_evicted_like_entries(tmp_path: Path) -> None:
+    cache = DiskCache(tmp_path, 1000)
+    cache.write("a", bytes(96))
     inner = entries(tmp_path)[0].parent
     old, fresh = inner / ".x.1234abcd.partial", inner / ".y.1234abcd.partial"
     for path in (old, fresh):
-        path.write_bytes(bytes(500))
+        cache._reserve(300)  # as the killed writer did
+        path.write_bytes(bytes(300))
     os.utime(old, (0, 0))
-    cache.write("b", bytes(500))
+    cache.write("b", bytes(296))  # 1000 would fit
+    assert old.exists()
+    cache.write("c", bytes(96))
     assert not old.exists()
     assert fresh.exists()
-    assert cache.read("a") == b"first"
+    assert size_of(tmp_path) == 800
+
+
+def test_an_entry_that_is_evicted_while_it_is_stored_causes_no_warning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    cache, write_bytes = DiskCache(tmp_path, 1000), Path.write_bytes
+
+    def write_and_evict(path: Path, data: bytes) -> int:
+        size = write_bytes(path, data)
+        monkeypatch.setattr(Path, "write_bytes", write_bytes)
+        cache.write("b", bytes(796))  # of another process
+        return size
+
+    monkeypatch.setattr(Path, "write_bytes", write_and_evict)
+    cache.write("a", bytes(796))
+    assert cache.read("a") is None
+    assert cache.read("b") is not None
+    assert not caplog.records
+
+
+def test_a_writer_waits_until_another_process_has_evicted(tmp_path: Path) -> None:
+    cache = DiskCache(tmp_path, 1000)
+    cache.write("a", bytes(96))
+    with (tmp_path / "lock").open("rb") as lock, ThreadPoolExecutor(1) as pool:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        stored = pool.submit(cache.write, "b", bytes(96))
+        time.sleep(0.2)
+        assert not stored.done()
+        assert cache.read("a") is not None, "readers do not wait"
+        assert cache.read("b") is None
+        fcntl.flock(lock, fcntl.LOCK_UN)
+        stored.result(timeout=60)
+    assert cache.read("b") is not None
 
 
 WRITE_MANY = """
@@ -210,23 +289,26 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from vjepa2_ac.storage.block_file import DiskCache
 
-cache = DiskCache(sys.argv[1], 5000)
+cache = DiskCache(sys.argv[1], int(sys.argv[2]))
+first = int(sys.argv[3])
 
 def once(number):
-    key = number % 37
-    cache.write(str(key), bytes([key]) * (1 + key * 20))
-    other = number * 7 % 37
-    assert cache.read(str(other)) in (None, bytes([other]) * (1 + other * 20))
+    key = (first + number) % 250
+    cache.write(str(key), bytes([key]) * (1 + key))
+    other = number * 7 % 250
+    assert cache.read(str(other)) in (None, bytes([other]) * (1 + other))
 
-with ThreadPoolExecutor(4) as pool:
-    list(pool.map(once, range(150)))
+with ThreadPoolExecutor(2) as pool:
+    list(pool.map(once, range(300)))
 """
 
 
-def test_several_processes_and_threads_share_a_folder(popen: Popen, tmp_path: Path) -> None:
-    writers = [popen([sys.executable, "-c", WRITE_MANY, str(tmp_path)]) for _ in range(2)]
-    assert [writer.wait(timeout=120) for writer in writers] == [0, 0]
-    assert size_of(tmp_path) > 0
-    DiskCache(tmp_path, 5000).write("last", b"1" * 101)  # nobody else makes room now: it is made before this returns
-    assert size_of(tmp_path) <= 5000
+def test_the_limit_holds_while_several_processes_and_threads_write(popen: Popen, tmp_path: Path) -> None:
+    limit, most_in_progress = 20_000, 4 * 2 * 255  # of 33,000 bytes
+    writers = [
+        popen([sys.executable, "-c", WRITE_MANY, str(tmp_path), str(limit), str(60 * first)]) for first in range(4)
+    ]
+    assert [writer.wait(timeout=120) for writer in writers] == [0] * 4
+    assert size_of(tmp_path) <= limit + most_in_progress
+    assert size_of(tmp_path) > limit / 2
     assert not list(tmp_path.rglob("*.partial"))

@@ -106,7 +106,8 @@ class DiskCacheConfig(Section):
     dir: Local | None = None
     """Folder; null: $VJEPA2_AC_CACHE, or vjepa2-ac in the user's cache folder."""
     limit_gb: NonNegative = 50.0
-    """Frames beyond this size are removed, least recently used first; 0: none are cached. Indexes do not count."""
+    """Most that fetched data take, in GB, of all processes together; the least recently used are removed first. 0: none
+    are cached, and none are removed. Indexes do not count."""
 
 
 def source_of(values: Any) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -24,9 +25,12 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
+open_cache = functools.cache(DiskCache)  # one instance per process and folder: its warning is logged once
+
+
 def fetched_data(config: DiskCacheConfig) -> DiskCache:
     """Return the cache of fetched data: one for all sources and runs, with one limit."""
-    return DiskCache(cache_folder(config) / "fetched", int(config.limit_gb * 1e9))
+    return open_cache(cache_folder(config) / "fetched", int(config.limit_gb * 1e9))
 
 
 class EpisodeFiles:

@@ -11,7 +11,6 @@ import io
 import logging
 import os
 import secrets
-import time
 import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
@@ -26,11 +25,9 @@ BLOCK_BYTES = 128 << 10
 _READ_AHEAD_BLOCKS = 32  # at most, for sequential reads
 _CACHED_BLOCKS = 128
 
-_CHECK_SHARE = 0.02  # of the limit: after so many bytes of its own a process looks whether the limit is reached
-_KEPT_SHARE = 0.8  # of the limit, when it was: ten processes together do not come above it until the next look
+_KEPT_SHARE = 0.8  # of the limit, after an eviction: so that a scan of the folder is rare
 _CRC_BYTES = 4  # behind the data of an entry
-_PARTIAL = ".partial"
-_ABANDONED_S = 3600.0
+_TOTAL_BYTES = 8  # length of the number in the file `lock`
 
 
 class RangedFile(io.RawIOBase):
@@ -116,22 +113,29 @@ class RangedFile(io.RawIOBase):
 class DiskCache:
     """Entries of bytes under keys in a local folder; the least recently used are evicted at the limit.
 
-    Any number of threads and processes may use one folder, with one limit. A process looks at the sizes of all entries
-    when it has written 2 % of the limit itself, and makes room down to 80 %: up to ten processes stay below the limit,
-    but for what they write while one of them makes room.
+    Any number of threads and processes may use one folder. The file `lock` holds the total size of its entries. A
+    writer adds the size of its entry to the total before it stores the entry. If the total would exceed the limit, the
+    writer first scans the folder and evicts entries down to 80 % of the limit, while other writers wait. So the folder
+    exceeds the limit by at most one entry for each thread that was storing an entry during the last scan. A folder
+    that is over the limit when a process starts is reduced at the first read or write of that process.
+
     If the folder cannot be used, all entries count as absent: that causes a warning, never an error.
 
     Args:
         folder: Created with the first entry.
-        limit_bytes: Total size of all entries; a larger entry is not stored, so with 0 none is.
+        limit_bytes: Total size of all entries, in bytes. An entry of more than 80 % of it is not stored, so with 0 none
+            is; with 0 none is evicted either. None: no limit.
     """
 
-    def __init__(self, folder: str | Path, limit_bytes: int) -> None:
+    def __init__(self, folder: str | Path, limit_bytes: int | None) -> None:
         self._folder, self._limit = Path(folder), limit_bytes
-        self._written, self._warned = 0, False
+        self._is_used, self._warned = False, False
 
     def read(self, key: str) -> bytes | None:
         """Return the entry of a key, or None; it counts as used now. A damaged one, as a power cut leaves, is none."""
+        if not self._is_used:
+            with suppress(OSError):  # usually: no such folder yet
+                self._reserve(0)
         path = self._path(key)
         try:
             content = path.read_bytes()
@@ -145,56 +149,62 @@ class DiskCache:
     def write(self, key: str, data: bytes) -> None:
         """Store bytes under a key, replacing an old entry; a warning is logged if that is not possible."""
         path, content = self._path(key), data + _crc(data)
-        if len(content) > self._limit * _KEPT_SHARE:
+        if self._limit is not None and len(content) > self._limit * _KEPT_SHARE:
             return
-        partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}{_PARTIAL}")
+        partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
+            self._reserve(len(content))
             try:
                 partial.write_bytes(content)
-                partial.replace(path)
+                with suppress(FileNotFoundError):  # evicted meanwhile
+                    partial.replace(path)
             finally:
                 partial.unlink(missing_ok=True)
-            self._written += len(content)
-            if self._written > self._limit * _CHECK_SHARE:
-                self._evict()
         except OSError as error:
             if not self._warned:
-                logger.warning("%s: %s; the run goes on and fetches again", self._folder, error.strerror)
+                logger.warning("%s: cannot be used (%s); its data are fetched again", self._folder, error.strerror)
             self._warned = True
 
     def _path(self, key: str) -> Path:
         name = hashlib.sha256(key.encode()).hexdigest()[:40]
         return self._folder / name[:2] / name[2:]
 
-    def _evict(self) -> None:
-        """Delete the least recently used entries if the limit is reached; one process at a time."""
-        with (self._folder / "lock").open("wb") as lock:
+    def _reserve(self, size: int) -> None:
+        """Add the size of an entry to the total of the folder, after an eviction if it does not fit."""
+        self._is_used = True
+        if not self._limit:
+            return
+        with os.fdopen(os.open(self._folder / "lock", os.O_RDWR | os.O_CREAT, 0o666), "r+b", buffering=0) as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
             try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:  # another one does it
-                return
-            self._written = 0
-            entries = sorted(self._entries())
-            total = sum(size for _, size, _ in entries)
-            if total <= self._limit * (1 - _CHECK_SHARE):  # what it writes until its next look fits, too
-                return
-            for _, size, path in entries:
-                if total <= self._limit * _KEPT_SHARE:
-                    break
-                Path(path).unlink(missing_ok=True)
-                total -= size
+                total = int.from_bytes(lock.read(_TOTAL_BYTES), "big")
+                if total == 0 or total + size > self._limit:  # 0: a new file, or a power cut emptied it
+                    total = self._evict(size, self._limit)
+                os.pwrite(lock.fileno(), (total + size).to_bytes(_TOTAL_BYTES, "big"), 0)
+            finally:
+                fcntl.flock(lock, fcntl.LOCK_UN)  # closing is not enough: a process forked meanwhile has the file open
+
+    def _evict(self, size: int, limit: int) -> int:
+        """Evict the least recently used entries if one of this size does not fit; return the total size of the rest."""
+        entries = sorted(self._entries())
+        total = sum(entry_size for _, entry_size, _ in entries)
+        if total + size <= limit:
+            return total
+        for _, entry_size, path in entries:
+            if total + size <= limit * _KEPT_SHARE:
+                break
+            Path(path).unlink(missing_ok=True)
+            total -= entry_size
+        return total
 
     def _entries(self) -> Iterator[tuple[int, int, str]]:
-        """Yield last use, size and path of every entry; partial files of killed writers are removed."""
+        """Yield last use, size and path of every entry, and of what killed writers left of one."""
         for inner in [entry.path for entry in os.scandir(self._folder) if entry.is_dir()]:
             for entry in os.scandir(inner):
                 with suppress(FileNotFoundError):  # renamed meanwhile
                     stat = entry.stat()
-                    if not entry.name.endswith(_PARTIAL):
-                        yield stat.st_mtime_ns, stat.st_size, entry.path
-                    elif time.time() - stat.st_mtime > _ABANDONED_S:
-                        Path(entry.path).unlink()
+                    yield stat.st_mtime_ns, stat.st_size, entry.path
 
 
 def _crc(data: bytes) -> bytes:

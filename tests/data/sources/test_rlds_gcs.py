@@ -2,6 +2,7 @@
 
 import pickle
 import re
+import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -13,9 +14,11 @@ import pytest
 
 from benches import imported
 from gcs import Gcs
+from run_fixtures import Popen
 from synthetic import write_synthetic_droid
 from tfrecords import in_any_order
 from vjepa2_ac.config import DataConfig, RldsFields
+from vjepa2_ac.data.files import fetched_data
 from vjepa2_ac.data.sources.rlds.source import RldsSource
 from vjepa2_ac.episode import Episode
 from vjepa2_ac.errors import InputError
@@ -114,6 +117,51 @@ def test_only_the_images_of_needed_steps_are_kept(
 
 def size_of(folder: Path) -> int:
     return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+
+
+READ_ALL = """
+import sys
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.files import fetched_data
+from vjepa2_ac.data.sources.rlds.source import RldsSource
+
+config = DataConfig(path=sys.argv[1], disk_cache={"dir": sys.argv[2], "limit_gb": float(sys.argv[3])})
+for episode in map(int, sys.argv[4]):
+    for camera in config.known_cameras:
+        RldsSource(config).read(episode, camera).read_frames([0])
+"""
+
+
+def entry_sizes(cache: Path) -> list[int]:
+    return [file.stat().st_size for file in (cache / "fetched").rglob("*") if file.is_file()]
+
+
+def test_the_disk_cache_stays_within_its_limit_with_several_processes(
+    long: Path, far: Callable[..., RldsSource], popen: Popen, tmp_path: Path
+) -> None:
+    unlimited = far(long)
+    for episode in range(4):
+        for camera in RldsFields().cameras:
+            unlimited.read(episode, camera).read_frames([0])
+    sizes, processes = entry_sizes(tmp_path / "cache"), 3
+    limit = sum(sizes) // 2
+    assert max(sizes) < limit / 10
+    orders = ["0123", "2031", "1320"]
+    readers = [
+        popen([sys.executable, "-c", READ_ALL, URL, str(tmp_path / "limited"), str(limit / 1e9), order])
+        for order in orders[:processes]
+    ]
+    assert [reader.wait(timeout=120) for reader in readers] == [0] * processes
+    assert 0.5 * limit < sum(entry_sizes(tmp_path / "limited")) <= limit + processes * max(sizes)
+    far(long, limit_gb=limit / 1e9).read(0)  # the folder of the first source holds everything
+    assert sum(entry_sizes(tmp_path / "cache")) <= limit
+
+
+def test_a_process_has_one_cache_for_a_folder(tmp_path: Path) -> None:
+    one, same, other = ({"disk_cache": {"dir": str(tmp_path / name)}} for name in ("a", "a", "b"))
+    caches = [fetched_data(DataConfig(path=URL, **knobs).disk_cache) for knobs in (one, same, other)]
+    assert caches[0] is caches[1]
+    assert caches[0] is not caches[2]
 
 
 @pytest.mark.parametrize("failure", [503, 429, "reset", "cut", "short"])

@@ -22,7 +22,7 @@ from jaxtyping import UInt8
 from vjepa2_ac import storage
 from vjepa2_ac.config import DiskCacheConfig, RldsData
 from vjepa2_ac.config.section import Affects, knobs_that_affect
-from vjepa2_ac.data.files import fetched_data
+from vjepa2_ac.data.files import fetched_data, open_cache
 from vjepa2_ac.data.index import EpisodeTable, cache_folder, get_or_build, index_key
 from vjepa2_ac.data.sources.indexed_source import FramesByStep, IndexedSource
 from vjepa2_ac.data.sources.rlds.episode import STEP_FLAG, Record, build_index, episode_of, position_of, step_features
@@ -31,13 +31,11 @@ from vjepa2_ac.data.sources.rlds.tfrecord import NotAnExampleError, Place, Read,
 from vjepa2_ac.episode import Episode, Progress, StepRanges
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import decode_images
-from vjepa2_ac.storage.block_file import DiskCache
 
 _CHECKED = b"\xc3"  # not all bits equal, so that a damaged file seldom contains false marks
 _GROUP_STEPS = 32  # images of so many steps are one entry of the cache
 _GAP_BYTES = 1 << 15  # images at most this far apart are fetched by one read
 _CHUNK_BYTES = 1 << 20  # all of a camera's images are fetched in parallel chunks of this size
-_NO_LIMIT = 1 << 62
 
 
 class RldsSource(IndexedSource[RldsData, tuple[Shard, ...]]):
@@ -152,7 +150,7 @@ class RemoteEpisode:
 
     def __init__(self, shard: Shard, span: RecordSpan, config: DiskCacheConfig) -> None:
         self._shard, self._span = shard, span
-        self._places, self._contents = DiskCache(cache_folder(config) / "places", _NO_LIMIT), fetched_data(config)
+        self._places, self._contents = open_cache(cache_folder(config) / "places", None), fetched_data(config)
         self._key = f"{shard.path} {shard.version} {shard.size} {span.offset}"
 
     def record(self, names: Sequence[str]) -> Record:
