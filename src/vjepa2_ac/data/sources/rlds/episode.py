@@ -47,7 +47,6 @@ _MOST_BYTES = 1 << 28  # of a feature that is read whole: numbers and texts
 FEWEST_IN_FLIGHT = 128  # reads behind a URL: they are small, and sequential within a shard
 _SAMPLES = 4
 _NUMBERS: tuple[Kind, ...] = ("float_list", "int64_list")  # booleans are stored as integers
-_FIX_STATES = "Check data.fields: state, select, rotation, position_unit, gripper_open and gripper_closed"
 _PLACE = ("shard", "record", "offset", "length")  # columns of the table
 _LENGTH_BYTES = 5  # lengths that grow with a name: of text, list, feature, entry of the map, and all of them
 
@@ -207,7 +206,7 @@ def states_of(record: Record, config: RldsData, steps: int, where: str) -> Float
     if config.states == "vector":
         require_finite(numbers, where, fix="Check data.fields.state, or leave the episode out")
         return numbers
-    return poses_from(numbers, fields, where, fix=_FIX_STATES)
+    return poses_from(numbers, fields, where, section="data.fields")
 
 
 def commands_of(
