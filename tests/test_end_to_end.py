@@ -105,7 +105,7 @@ def test_an_exported_adapter_predicts_as_the_run_does(workshop: Path, tmp_path: 
 
 WRONG = {
     "no such config": (["train", "nowhere.yaml"], "nowhere.yaml"),
-    "a folder without --resume": (["train", "{here}"], "--resume"),
+    "a folder without --resume": (["train", "{here}/lora"], "--resume"),
     "resume of no run": (["train", "{here}", "--resume"], "no config.yaml"),
     "resume with overrides": (["train", "{here}/lora", "--resume", "seed=3"], "unchanged"),
     "evaluate no run": (["evaluate", "{here}"], "no config.yaml"),

@@ -61,9 +61,38 @@ def test_what_no_robot_measures_is_named_with_its_step_and_what_it_looks_like(
     spoiled[1, place] = value
     with pytest.raises(InputError, match=rf"a\.h5: step 1: .*{complaint}"):
         POSE.require_plausible(spoiled, "a.h5")
-    with pytest.raises(InputError, match="Check the fields"):
+    with pytest.raises(InputError, match=f"{complaint}.*Check the fields"):
         POSE.require_plausible(spoiled, "a.h5", fix="Check the fields")
     POSE.require_plausible(STATES, "a.h5")
+
+
+@pytest.mark.parametrize(
+    ("scale", "hints"),
+    [
+        ([1000, 1000, 1000, 57.3, 57.3, 57.3, 1], ["positions look like millimetres", "angles look like degrees"]),
+        ([100, 100, 100, 1, 1, 1, 1], ["positions look like centimetres"]),
+        ([1, 1, 1, 57.3, 57.3, 57.3, 1], ["angles look like degrees"]),
+        ([1e6, 1e6, 1e6, 1, 1, 1, 1], []),
+        ([1, 1, 1, 1e3, 1e3, 1e3, 1], []),
+    ],
+    ids=["millimetres and degrees", "centimetres", "degrees", "no length", "no angles"],
+)
+def test_a_whole_episode_in_other_units_is_said_to_look_like_them(scale: list[float], hints: list[str]) -> None:
+    states = np.tile(STATES, (10, 1)) * scale
+    with pytest.raises(InputError) as raised:
+        POSE.require_plausible(states, "a.h5", fix="Check the fields")
+    assert [sentence.split(":")[0] for sentence in raised.value.fix.split(". ")] == [
+        *(f"The {hint}" for hint in hints), "Check the fields",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("place", [0, 4])
+def test_a_single_outlier_is_not_said_to_be_another_unit(place: int) -> None:
+    states = np.tile(STATES, (10, 1))
+    states[7, place] = 300.0
+    with pytest.raises(InputError, match=r"step 7") as raised:
+        POSE.require_plausible(states, "a.h5", fix="Check the fields")
+    assert raised.value.fix == "Check the fields"
 
 
 def test_any_finite_numbers_may_be_a_vector_and_an_episode_has_steps() -> None:

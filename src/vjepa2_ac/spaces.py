@@ -7,6 +7,7 @@ robot's joints, two arms, a mobile base. Whoever needs a part asks for it: `spac
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -20,6 +21,12 @@ from vjepa2_ac.errors import InputError
 REACH_M = 5.0  # larger positions are not in metres
 ANGLE_RAD = 2 * math.pi + 0.1  # larger angles are not in radians
 GRIPPER_SLACK = 0.1  # a measured closedness may exceed 0 .. 1 by this
+CONVERSIONS = {  # how to bring numbers in other units to metres and radians
+    "millimetres": "divide them by 1000",
+    "centimetres": "divide them by 100",
+    "degrees": "multiply them by pi / 180",
+}
+_MOST_CM, _MOST_MM, _MOST_DEGREES = 100.0, 5000.0, 360.5  # of positions and angles that look like these units
 
 Follows = Literal["change", "target", "unknown"]
 
@@ -159,25 +166,39 @@ class StateSpace(Space):
             changes[:, self.rotation] = rotation_differences(states[:, self.rotation])
         return changes
 
-    def require_plausible(self, states: Float[np.ndarray, "steps dim"], where: str, *, fix: str = "") -> None:
+    def require_plausible(
+        self,
+        states: Float[np.ndarray, "steps dim"],
+        where: str,
+        *,
+        fix: str = "",
+        conversions: Mapping[str, str] = CONVERSIONS,
+    ) -> None:
         """Refuse states that no robot has: not finite; of poses, no metres, radians or closedness.
 
         Args:
             states: One for each control step.
             where: File and episode, for messages.
-            fix: Which settings to check; empty: what the numbers look like.
+            fix: Which settings to check.
+            conversions: By the name of a unit that the numbers may look like, how to convert from it.
 
         Raises:
-            InputError: There are none; or names the first implausible one, and its numbers.
+            InputError: There are none; or names the first implausible one, its numbers, and the units that the states
+                look like.
         """
         if len(states) == 0:
             raise zero_steps(where)
-        for wrong, needed, looks in self._checks(states):
+        for wrong, needed in self._checks(states):
             if wrong.any():
                 step = int(wrong.argmax())
                 place = f"{where}: step {step}" if len(states) > 1 else where
                 found = f"the numbers {np.array2string(states[step], precision=4, max_line_width=200)}"
-                raise InputError(where=place, found=found, needed=needed, fix=fix or looks)
+                looks = [
+                    f"The {part} look like {unit}: {conversions[unit]}"
+                    for part, unit in self._likely_units(states)
+                    if unit in conversions
+                ]
+                raise InputError(where=place, found=found, needed=needed, fix=". ".join(filter(None, [*looks, fix])))
 
     def require_state(self, numbers: np.ndarray, where: str) -> None:
         """Refuse an array that is no state, or one that no robot has.
@@ -191,21 +212,35 @@ class StateSpace(Space):
             raise InputError(where=where, found=found, needed=f"{len(self)}: {', '.join(names)}")
         self.require_plausible(numbers[None], where)
 
-    def _checks(self, states: Float[np.ndarray, "steps dim"]) -> list[tuple[np.ndarray, str, str]]:
-        """Return, for each rule: where it is broken, what is needed, and what the numbers look like."""
-        checks = [(~np.isfinite(states).all(axis=1), "finite numbers", "")]
+    def _checks(self, states: Float[np.ndarray, "steps dim"]) -> list[tuple[np.ndarray, str]]:
+        """Return, for each rule: the steps at which it is broken, and what is needed."""
+        checks = [(~np.isfinite(states).all(axis=1), "finite numbers")]
         if self.position is not None:
             far = abs(states[:, self.position]).max(axis=1) > REACH_M
-            needed = f"a position within {REACH_M:g} m of the base, in metres"
-            checks.append((far, needed, "These look like millimetres: divide the position by 1000"))
+            checks.append((far, f"a position within {REACH_M:g} m of the base, in metres"))
         if self.rotation is not None:
-            wild = abs(states[:, self.rotation]).max(axis=1) > ANGLE_RAD
-            checks.append((wild, "Euler angles in radians", "These look like degrees: multiply the angles by pi / 180"))
+            checks.append((abs(states[:, self.rotation]).max(axis=1) > ANGLE_RAD, "angles in radians"))
         if self.gripper is not None:
             closed = states[:, self.gripper]
             beyond = (closed < -GRIPPER_SLACK) | (closed > 1 + GRIPPER_SLACK)
-            checks.append((beyond, "a gripper between 0 and 1", "Give 0 for open and 1 for closed"))
+            checks.append((beyond, "a gripper between 0 and 1: 0 for open, 1 for closed"))
         return checks
+
+    def _likely_units(self, states: Float[np.ndarray, "steps dim"]) -> list[tuple[str, str]]:
+        """Return the part of a pose and its unit where most steps are beyond metres and radians, as of a whole set.
+
+        A single wrong step is an outlier and no other unit.
+        """
+        found = []
+        if self.position is not None:
+            usual = float(np.median(abs(states[:, self.position]).max(axis=1)))
+            if REACH_M < usual <= _MOST_MM:
+                found.append(("positions", "centimetres" if usual < _MOST_CM else "millimetres"))
+        if self.rotation is not None:
+            angles = abs(states[:, self.rotation]).max(axis=1)
+            if np.median(angles) > ANGLE_RAD and angles.max() <= _MOST_DEGREES:
+                found.append(("angles", "degrees"))
+        return found
 
 
 @dataclass(frozen=True)

@@ -44,6 +44,25 @@ def test_check_prints_a_line_for_everything_and_ends_with_0(config: str, capsys:
     }
 
 
+COMMANDS = ["data check", "data index", "data inspect", "data calibrate", "train", "encode", "decoder", "doctor"]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_folder_in_place_of_a_config_is_answered_with_init(command: str, droid: Path, capsys: Printed) -> None:
+    assert main([*command.split(), str(droid)]) == 2
+    assert f"`vjepa2-ac init {droid}`" in capsys.readouterr().err
+
+
+def test_a_url_or_a_run_in_place_of_a_config_is_answered_with_what_to_name(
+    config: str, tmp_path: Path, capsys: Printed
+) -> None:
+    with pytest.raises(SystemExit):
+        main(["data", "check", "gs://robots/set"])
+    assert "`vjepa2-ac init gs://robots/set`" in capsys.readouterr().err
+    assert main(["data", "check", str(tmp_path)]) == 2
+    assert f"The config of the run in it is {config}" in capsys.readouterr().err
+
+
 def test_check_ends_with_1_where_training_could_not_begin(config: str, capsys: Printed) -> None:
     assert main(["data", "check", config, "data.validation_share=0", "--limit", "2"]) == 1
     assert "error    validation" in capsys.readouterr().out

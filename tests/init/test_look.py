@@ -69,6 +69,39 @@ def test_a_description_is_found_some_folders_down(tmp_path: Path) -> None:
     assert look_at(str(tmp_path / "set"), "rlds").path == str(tmp_path / "set/name/1.0.0")
 
 
+@pytest.mark.parametrize("form", [None, "rlds"])
+def test_the_newest_version_is_taken_and_the_others_are_named(form: str | None, tmp_path: Path) -> None:
+    for version in ("1.9.0", "1.10.0", "1.2.0"):
+        WRITERS["rlds"](tmp_path / "my_robot" / version, range(3))
+    for path in (tmp_path, tmp_path / "my_robot"):
+        found = look_at(str(path), form)
+        assert found.path == str(tmp_path / "my_robot/1.10.0")
+        assert found.about[-1] == "version 1.10.0, the newest of 1.2.0, 1.9.0, 1.10.0"
+    chosen = look_at(str(tmp_path / "my_robot/1.9.0"))
+    assert (chosen.path, len(chosen.about)) == (str(tmp_path / "my_robot/1.9.0"), 1)
+
+
+@pytest.mark.parametrize(
+    ("pick", "place", "form"),
+    [("lerobot", "lerobot", None), ("rlds", "rlds", "rlds"), ("rlds", "lerobot", None)],
+)
+def test_several_sets_in_a_folder_are_listed_and_none_is_chosen(
+    pick: str, place: str, form: str | None, tmp_path: Path
+) -> None:
+    WRITERS[pick](tmp_path / "pick" / "1.0.0", range(2))
+    WRITERS[place](tmp_path / "place", range(2))
+    with pytest.raises(InputError, match=f"2 data sets: {tmp_path}/pick, {tmp_path}/place.*vjepa2-ac init {tmp_path}"):
+        look_at(str(tmp_path), form)
+    if pick != place:
+        assert look_at(str(tmp_path), place).path == str(tmp_path / "place")
+
+
+def test_a_link_to_a_set_beside_it_is_no_second_set(tmp_path: Path) -> None:
+    WRITERS["lerobot"](tmp_path / "set", range(2))
+    (tmp_path / "the_same").symlink_to(tmp_path / "set")
+    assert look_at(str(tmp_path)).path == str(tmp_path / "set")
+
+
 def test_numbers_that_are_no_pose_become_a_vector(tmp_path: Path) -> None:
     folder = write_lerobot(tmp_path / "set", range(3))
     info = json.loads((folder / "meta/info.json").read_text())

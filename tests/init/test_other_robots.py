@@ -43,7 +43,7 @@ def degrees_off(pose: Pose, numbers: Numbers, states: Numbers) -> float:
     """Return the largest angle between the rotations that a proposal reads and the true ones."""
     fields = LeRobotFields(rotation=pose.rotation, select=pose.select, position_unit=pose.position_unit)
     chosen = numbers if pose.select is None else numbers[:, list(pose.select)]
-    read = poses_from(chosen, fields, "episode", fix="")
+    read = poses_from(chosen, fields, "episode", section="data.lerobot")
     assert np.allclose(read[:, :3], states[:, :3])
     away = Rotation.from_euler("xyz", read[:, 3:6]) * Rotation.from_euler("xyz", states[:, 3:6]).inv()
     return float(np.rad2deg(away.magnitude()).max())

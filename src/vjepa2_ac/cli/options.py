@@ -146,7 +146,7 @@ def add(
 
 def add_config(parser: argparse.ArgumentParser, *, such_as: str, what: str = "a YAML config", **how: Any) -> None:
     """Add the config that a command reads, and `key=value` words behind it."""
-    add(parser, "config CONFIG", what, as_local, **how)
+    add(parser, "config CONFIG", what, as_config, **how)
     add(parser, "overrides key=value", f"such as {such_as} (all keys: `vjepa2-ac config schema`)", nargs="*")
 
 
@@ -380,6 +380,13 @@ def _reader(read: Callable[[str], _Read]) -> Callable[[str], _Read]:
     return value
 
 
+def _config_path(text: str) -> str:
+    if places.is_url(text):
+        raise ValueError(f"is a URL. If it holds data, run `vjepa2-ac init {text}`, which writes a config")
+    return places.on_this_machine(text)
+
+
+as_config = _reader(_config_path)  # a config of this machine, or one that comes with the package
 as_local = _reader(places.on_this_machine)  # a path of this machine, in its spelling; `~` is the user's home
 as_path = _reader(lambda text: Path(places.on_this_machine(text)))
 as_place = _reader(places.anywhere)  # a path of this machine, or a URL

@@ -52,15 +52,15 @@ def _train(options: argparse.Namespace) -> None:
     SIGTERM, SIGINT, SIGUSR1, SIGHUP: finish the step, write a checkpoint, end with status 75; the same command goes
     on from there. A second signal: end at once.
     """
-    from vjepa2_ac.runs.folder import read_run_config
+    from vjepa2_ac.runs.folder import is_run, read_run_config
 
     path = Path(options.config)
     if options.resume and options.overrides:
         needed = "the run's own config, unchanged"
         raise InputError(where="command line", found="--resume with overrides", needed=needed)
-    if path.is_dir() and not options.resume:
-        fix = "To go on with a run, add --resume"
-        raise InputError(where=options.config, found="a folder", needed="a config file", fix=fix)
+    if is_run(options.config) and not options.resume:
+        fix = "To resume the run, add --resume"
+        raise InputError(where=options.config, found="the folder of a run", needed="a config file", fix=fix)
     if options.resume:
         cli.say_places_elsewhere(options.config)
     config = read_run_config(path) if options.resume else cli.read_config(path, options.overrides, base=True)

@@ -7,6 +7,7 @@ import importlib.resources
 import json
 import os
 import re
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -152,6 +153,11 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     except FileNotFoundError:
         fix = "`vjepa2-ac init` writes one for your data; `vjepa2-ac config list` shows those of the package"
         raise InputError(where=str(path), found="no such file", needed="a config", fix=fix) from None
+    except IsADirectoryError:
+        fix = f"If it holds data, run `vjepa2-ac init {shlex.quote(str(path))}`, which writes a config"
+        if (path / "config.yaml").is_file():
+            fix = f"The config of the run in it is {path / 'config.yaml'}"
+        raise InputError(where=str(path), found="a folder", needed="a config, which is a YAML file", fix=fix) from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(where=str(path), found=f"cannot be read ({error})", needed="a YAML file") from None
     values = parse_yaml(text, where=str(path))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float
@@ -37,7 +38,7 @@ def rotations_from(numbers: Float[np.ndarray, "steps _"], written_as: RotationFo
 
 
 def poses_from(
-    numbers: Float[np.ndarray, "steps _"], fields: PoseFields, where: str, *, fix: str
+    numbers: Float[np.ndarray, "steps _"], fields: PoseFields, where: str, *, section: str
 ) -> Float[np.ndarray, "steps 7"]:
     """Return states from the numbers of an episode: position, rotation and gripper of each step.
 
@@ -45,23 +46,35 @@ def poses_from(
         numbers: The selected numbers, in the order position, rotation, gripper.
         fields: Their format.
         where: File and episode, for messages.
-        fix: What to check if the states are implausible.
+        section: The config section of the fields, such as data.lerobot.
 
     Raises:
         InputError: They are implausible under these settings: not a unit quaternion, out of reach.
     """
+    fix = f"Check {section}: state, select, rotation, position_unit, gripper_open and gripper_closed"
+    require_plausible = partial(POSE.require_plausible, where=where, fix=fix, conversions=_conversions(fields, section))
     positions, rotation = numbers[:, :3] * _METRES[fields.position_unit], numbers[:, 3:-1]
     gripper = (numbers[:, -1:] - fields.gripper_open) / (fields.gripper_closed - fields.gripper_open)
     if num_rotation_numbers(fields.rotation) == 4:
         _require_unit_quaternions(rotation, where, fix)
     else:
         unit = np.pi / 180 if fields.rotation == "euler_xyz_degrees" else 1.0
-        POSE.require_plausible(np.concatenate([positions, unit * rotation, gripper], axis=1), where, fix=fix)
+        require_plausible(np.concatenate([positions, unit * rotation, gripper], axis=1))
     if fields.rotation != "euler_xyz":
         rotation = rotations_from(rotation, fields.rotation).as_euler("xyz")
     states = np.concatenate([positions, rotation, gripper], axis=1)
-    POSE.require_plausible(states, where, fix=fix)
+    require_plausible(states)
     return states
+
+
+def _conversions(fields: PoseFields, section: str) -> dict[str, str]:
+    """Return, by the name of a unit that implausible numbers may look like, the config key to set."""
+    found = {}
+    if fields.position_unit == "m":
+        found = {unit: f"set {section}.position_unit: {unit[0]}m" for unit in ("millimetres", "centimetres")}
+    if fields.rotation == "euler_xyz":
+        found["degrees"] = f"set {section}.rotation: euler_xyz_degrees"
+    return found
 
 
 def require_selection(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +12,7 @@ import numpy as np
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.loading import admit_forms_of_data, parse_config
-from vjepa2_ac.data.files import walk, within
+from vjepa2_ac.data.files import in_parallel, walk, within
 from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.data.sources.droid_raw.source import find_episodes
 from vjepa2_ac.data.sources.indexed_source import open_source
@@ -90,7 +90,7 @@ LOOKS: dict[str, Callable[[str], FoundData]] = {
     "npz": look_at_npz,
     "raw": look_at_raw,
 }
-_MARKS = {"lerobot": INFO, "rlds": "dataset_info.json"}  # descriptions of forms
+_MARKS = {"lerobot": INFO, "rlds": "dataset_info.json"}  # the file that describes a data set, by form
 _BY_HAND = "write one .npz for each episode (docs/data.md)"
 _WAYS = {  # to what is read, by the end of a file's name
     ".mcap": f"a ROS 2 bag. {way_by('ros2_bag')} makes .npz of it",
@@ -103,7 +103,9 @@ _WAYS = {  # to what is read, by the end of a file's name
     ".zarr": f"Zarr: {_BY_HAND}",
 }
 _HUB_NAME = re.compile(r"[\w.-]+/[\w.-]+")
+_VERSION = re.compile(r"\d+(\.\d+)*")  # a folder of TFDS
 _DEEPEST = 2  # folders down, where a description may be
+_MOST_FOLDERS = 50  # looked into, of each folder
 
 
 def look_at(path: str, form: str | None = None) -> FoundData:
@@ -125,11 +127,13 @@ def look_at(path: str, form: str | None = None) -> FoundData:
     with storage.user_can_read(path):
         if form is None and (found := _of_plugins(path)):
             return found
-        if form is None:
-            form, path = _recognized(path)
-        elif form in _MARKS:
-            path = next(_with_file(path, _MARKS[form], _DEEPEST), path)
-        return LOOKS[form](path)
+        described = [] if form in {"npz", "raw"} else _described(path, [form] if form in _MARKS else [*_MARKS])
+        if not described:
+            return LOOKS[form or _recognized(path)](path)
+        form, newest, versions = _only_set(described, path)
+        found = LOOKS[form](newest)
+        others = f"version {_name_of(newest)}, the newest of {', '.join(versions)}"
+        return replace(found, about=(*found.about, *[others] * (len(versions) > 1)))
 
 
 def _of_plugins(path: str) -> FoundData | None:
@@ -157,25 +161,60 @@ def simulated(path: str) -> FoundData:
     )
 
 
-def _with_file(folder: str, name: str, deepest: int) -> Iterator[str]:
-    """Yield the folders, at a path and below it, that have a file."""
-    if storage.exists(storage.join(folder, name)):
-        yield folder
-    elif deepest:
-        for inner in sorted(storage.list_names(folder), reverse=True)[:20]:  # the newest version first
-            if "." not in inner or re.fullmatch(r"[\d.]+", inner):
-                yield from _with_file(storage.join(folder, inner), name, deepest - 1)
+def _described(path: str, forms: Sequence[str]) -> list[tuple[str, str]]:
+    """Return form and folder of each data set with a description, at a path and up to two folders below it."""
+    found: dict[str, tuple[str, str]] = {}  # by the absolute path: links lead to one set by several names
+    folders = [path]
+    for _ in range(_DEEPEST + 1):
+        listed = zip(folders, in_parallel(storage.list_folder, folders, _CONNECTIONS), strict=True)
+        folders = []
+        for folder, entries in listed:
+            names = {entry.name for entry in entries}
+            form = next((one for one in forms if _has_mark(folder, _MARKS[one], names)), None)
+            if form is not None:
+                found.setdefault(storage.absolute(folder), (form, folder))
+                continue
+            inner = [entry.name for entry in entries if not entry.is_file and not entry.name.startswith(".")]
+            folders += [storage.join(folder, name) for name in sorted(inner, key=_as_version)[-_MOST_FOLDERS:]]
+    return list(found.values())
 
 
-def _recognized(path: str) -> tuple[str, str]:
-    for form, mark in _MARKS.items():
-        if found := next(_with_file(path, mark, _DEEPEST), None):
-            return form, found
+def _has_mark(folder: str, mark: str, names: Container[str]) -> bool:
+    return mark.split("/")[0] in names and storage.exists(storage.join(folder, mark))
+
+
+def _only_set(described: Sequence[tuple[str, str]], path: str) -> tuple[str, str, list[str]]:
+    """Return form and folder of the only data set, in its newest version, and the names of all its versions.
+
+    Raises:
+        InputError: There are several data sets: lists their folders.
+    """
+    sets: dict[str, list[tuple[str, str]]] = {}
+    for form, folder in described:
+        is_version = folder != path and _VERSION.fullmatch(_name_of(folder))
+        sets.setdefault(folder.rpartition("/")[0] if is_version else folder, []).append((form, folder))
+    if len(sets) > 1:
+        found, fix = f"{len(sets)} data sets: {', '.join(sorted(sets))}", f"Name one: `vjepa2-ac init {min(sets)}`"
+        raise InputError(where=path, found=found, needed="one data set", fix=fix)
+    versions = sorted(*sets.values(), key=lambda one: _as_version(_name_of(one[1])))
+    return *versions[-1], [_name_of(folder) for _, folder in versions]
+
+
+def _name_of(folder: str) -> str:
+    return folder.rpartition("/")[2]
+
+
+def _as_version(name: str) -> list[tuple[int, str]]:
+    """Return what sorts names with numbers in them, so that 1.10.0 comes after 1.9.0."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name) if part]
+
+
+def _recognized(path: str) -> str:
     names = _names_below(path)
     if any(name.endswith(".npz") for name in names):
-        return "npz", path
+        return "npz"
     if any(name == "trajectory.h5" or name.startswith("metadata_") for name in names):
-        return "raw", path
+        return "raw"
     way = next((text for end, text in _WAYS.items() for name in names if name.lower().endswith(end)), "")
     shown = ", ".join(names[:5]) + (", …" if len(names) > 5 else "") or "an empty folder"
     needed = "LeRobot (meta/info.json), RLDS (dataset_info.json), .npz files, or raw DROID (trajectory.h5)"

@@ -19,6 +19,7 @@ from vjepa2_ac.storage.files import (
     read_bytes,
     read_range,
     read_ranges,
+    require_content,
     require_new_folder,
     sha256_of_file,
     sync,

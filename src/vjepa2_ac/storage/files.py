@@ -38,6 +38,7 @@ _UNWRITABLE = _FULL | _ABSENT | {errno.EACCES, errno.EPERM, errno.EROFS, errno.E
 _PARTIAL = re.compile(r"\..+\.[0-9a-f]{8}\.partial")
 _NAME_BYTES = 200  # of the 255 that a name may have
 _OLD_S = 86_400.0
+_POINTER_BYTES = 1024  # git-lfs pointers are smaller
 
 
 ByteReader = RangedFile | io.BufferedIOBase
@@ -116,14 +117,37 @@ def list_names(folder: str | Path) -> list[str]:
     return [entry.name for entry in list_folder(folder)]
 
 
+def require_content(path: str | Path, size: int | None = None) -> None:
+    """Refuse a git-lfs pointer in place of a file; only the beginning of a small file is read.
+
+    Args:
+        path: The file, which may be missing.
+        size: Its size, as a listing gives it; None: it is looked up on this machine. A pointer behind a URL is refused
+            anyway as soon as its beginning is read.
+
+    Raises:
+        InputError: The file is a pointer.
+        UnreachableError: The file is at a URL and cannot be read.
+    """
+    with suppress(OSError):  # the caller reports what cannot be read
+        if size is None:
+            if is_url(path) or not Path(path).is_file():
+                return
+            size = Path(path).stat().st_size
+        if size < _POINTER_BYTES:
+            remote.refuse_pointer(str(path), read_range(path, 0, size))
+
+
 def open_to_read(path: str | Path) -> ByteReader:
     """Open a file for reading and seeking; the caller closes it.
 
     Of a URL only the blocks that are read are fetched, so it can be given to a reader of videos or tables.
 
     Raises:
+        InputError: It is a git-lfs pointer.
         OSError: There is no such file, or it cannot be read.
     """
+    require_content(path)
     return open_remote(str(path)) if is_url(path) else Path(path).open("rb")
 
 
@@ -150,12 +174,13 @@ def unreadable(where: str, error: OSError, *, needed: str = "", fix: str = "") -
 
 @contextmanager
 def user_can_read(path: str | Path, *, needed: str = "", fix: str = "") -> Iterator[None]:
-    """Raise an error for the user if a file cannot be read.
+    """Raise an error for the user if a file cannot be read, or is a git-lfs pointer on this machine.
 
     Raises:
-        UserError: Instead of any OSError; see `unreadable`.
+        UserError: Instead of any OSError; see `unreadable` and `require_content`.
     """
     try:
+        require_content(path)
         yield
     except OSError as error:
         raise unreadable(str(path), error, needed=needed, fix=fix) from None
@@ -176,9 +201,10 @@ def read_bounded(path: str | Path, most_bytes: int) -> bytes:
     """Return the content of a stranger's small file: at most `most_bytes` are ever read.
 
     Raises:
-        InputError: It is larger, or may never end, such as a pipe.
+        InputError: It is larger, a git-lfs pointer, or may never end, such as a pipe.
         OSError: There is no such file, or it cannot be read.
     """
+    require_content(path)
     if not is_url(path) and not (stat.S_ISREG(mode := Path(path).stat().st_mode) or stat.S_ISDIR(mode)):
         raise InputError(where=str(path), found="a pipe or a device", needed="a file")
     length = min(file_size(path), most_bytes + 1) if is_url(path) else most_bytes + 1

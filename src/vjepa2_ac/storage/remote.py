@@ -36,6 +36,9 @@ _EMULATOR = "STORAGE_EMULATOR_HOST"
 _MACHINE = Path("/sys/class/dmi/id/product_name")
 
 
+_POINTER = b"version https://git-lfs.github.com/spec/v1"  # the beginning of what git-lfs commits in place of a file
+
+
 class ShortReadError(OSError):
     """A file ends before the requested bytes."""
 
@@ -47,6 +50,21 @@ class FileInfo(NamedTuple):
     size: int
     version: str  # changes with the content, as far as is known without reading it
     is_file: bool = True
+
+
+def refuse_pointer(path: str, beginning: bytes) -> None:
+    """Refuse a git-lfs pointer in place of a file.
+
+    Args:
+        path: The file.
+        beginning: The first bytes of the file.
+
+    Raises:
+        InputError: The file is a pointer.
+    """
+    if beginning.startswith(_POINTER):
+        fix = "Run `git lfs pull` in the cloned repository, which downloads the files"
+        raise InputError(where=path, found="a git-lfs pointer", needed="the file that it stands for", fix=fix)
 
 
 # ---- requests, with retries ----
@@ -137,12 +155,16 @@ def read_range(url: str, start: int, length: int) -> bytes:
 
     Raises:
         FileNotFoundError: There is no such file.
+        InputError: It is a git-lfs pointer.
         UnreachableError: It cannot be reached.
     """
     if length > _PIECE_BYTES:
         cuts = range(start, start + length, _PIECE_BYTES)
         return b"".join(_concurrently(url, [(cut, min(_PIECE_BYTES, start + length - cut)) for cut in cuts]))
-    return _persist(url, lambda timeout_s: _read_once(url, start, length, timeout_s)) if length > 0 else b""
+    data = _persist(url, lambda timeout_s: _read_once(url, start, length, timeout_s)) if length > 0 else b""
+    if start == 0:
+        refuse_pointer(url, data)
+    return data
 
 
 def read_ranges(url: str, ranges: Sequence[tuple[int, int]]) -> list[bytes]:

@@ -294,8 +294,22 @@ def test_bytes_behind_the_last_promised_record_are_a_problem(droid: Path, tmp_pa
 def test_missing_shards_are_named(droid: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(droid, tmp_path / "set")
     (folder / "r2d2_faceblur-train.tfrecord-00001-of-00002").unlink()
-    with pytest.raises(InputError, match=r"1 of 2 shards are missing: r2d2_faceblur-train\.tfrecord-00001-of-00002"):
+    with pytest.raises(
+        InputError, match=r"1 of 2 shards are missing: r2d2_faceblur-train\.tfrecord-00001-of-00002\. .*Download them"
+    ):
         open_droid(folder).infos()
+
+
+@pytest.mark.parametrize(("old", "new"), [("r2d2_faceblur", "my_robot"), ("-of-00002", "-of-00003")])
+def test_renamed_shards_are_listed_beside_those_that_are_missing(
+    droid: Path, tmp_path: Path, old: str, new: str
+) -> None:
+    folder = shutil.copytree(droid, tmp_path / "set")
+    for shard in folder.glob("*.tfrecord-*"):
+        shard.rename(folder / shard.name.replace(old, new))
+    with pytest.raises(InputError, match=f"2 of 2 shards are missing.*The folder has .*{new}") as raised:
+        open_droid(folder).infos()
+    assert raised.value.fix.startswith("If these are the shards, rename them as dataset_info.json lists them")
 
 
 def test_a_folder_without_a_data_set_says_where_one_is(droid: Path, tmp_path: Path) -> None:
@@ -303,8 +317,10 @@ def test_a_folder_without_a_data_set_says_where_one_is(droid: Path, tmp_path: Pa
         open_droid(tmp_path / "none").infos()
     with pytest.raises(InputError, match="is empty"):
         open_droid(tmp_path).infos()
-    with pytest.raises(InputError, match=r"did you mean .*1\.0\.0\?"):
-        open_droid(droid.parent).infos()
+    for version in ("1.9.0", "1.10.0"):
+        shutil.copytree(droid, tmp_path / version)
+    with pytest.raises(InputError, match=r"did you mean .*1\.10\.0, .*1\.9\.0\?"):
+        open_droid(tmp_path).infos()
 
 
 @pytest.mark.parametrize(

@@ -241,7 +241,7 @@ def in_the_new_format(value: object) -> bytes:
     ("content", "said"),
     [
         (b"", "beginning with b''"),
-        (b"version https://git-lfs.github.com/spec/v1\noid", "beginning with b'version https://git-lfs"),
+        (b"version https://git-lfs.github.com/spec/v1\noid", "a git-lfs pointer"),
         (b"<!DOCTYPE html><html>not found</html>", "beginning with b'<!DOCTYPE html>"),
         (pickle.dumps({"encoder": Hostile()}), "that torch cannot read"),
         (in_the_new_format({"encoder": Hostile()}), r"would call posix\.mkdir: it was refused"),

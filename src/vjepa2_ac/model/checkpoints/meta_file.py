@@ -11,6 +11,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
+from vjepa2_ac import storage
 from vjepa2_ac.config.model import Family
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.pretrained_folder import check_tensors, require_finite
@@ -60,10 +61,11 @@ class MetaFile:
         """Map a file; reads no values, and executes nothing.
 
         Raises:
-            InputError: There is no such file, or it is of another kind, or truncated.
+            InputError: There is no such file, or it is of another kind, truncated, or a git-lfs pointer.
         """
         if not path.is_file():
             raise InputError(where=str(path), found="no such file", needed=_NEEDED, fix=FIX)
+        storage.require_content(path)
         try:
             whole = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
         except Exception as error:  # a damaged pickle ends in any of them
@@ -148,7 +150,7 @@ def depth_of(names: Mapping[str, object], blocks: str) -> int:
 
 
 def _unreadable(path: Path, error: Exception) -> str:
-    """Return what a file is that torch did not load: how it begins tells a web page or a pointer of Git LFS."""
+    """Return what a file is that torch did not load: its beginning shows a web page, for example."""
     refused = re.search(r"GLOBAL ([\w.]+)", str(error))
     if refused:
         return f"a pickle that would call {refused[1]}: it was refused, since loading it could run foreign code"

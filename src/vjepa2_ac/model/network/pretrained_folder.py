@@ -113,9 +113,11 @@ def open_safetensors(path: Path, *, needed: str) -> Iterator[Any]:
     """Open a safetensors file, whose header is checked against its size; its tensors are mapped.
 
     Raises:
-        InputError: It is missing, truncated or of another format; also of a tensor that is read within the block.
+        InputError: It is missing, truncated, a git-lfs pointer or of another format; also of a tensor that is read
+            within the block.
     """
     again = "Copy or write the folder again"
+    storage.require_content(path)
     try:
         with safe_open(path, framework="pt") as file:
             yield file

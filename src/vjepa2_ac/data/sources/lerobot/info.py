@@ -206,6 +206,7 @@ def list_by_template(root: str, template: str, key: str = "", *, connections: in
     """Return the files whose paths fit a template, sorted by path within the data set.
 
     Raises:
+        InputError: One of them is a git-lfs pointer.
         OSError: A folder cannot be listed.
     """
     pattern = _PLACE.sub(lambda place: glob.escape(key) if place[1] else "[0-9]*", template)
@@ -216,4 +217,7 @@ def list_by_template(root: str, template: str, key: str = "", *, connections: in
         found = [f"{folder}{one}/" for folder in found for one in names[folder] if fnmatchcase(one, part)]
     listings = in_parallel(lambda folder: storage.list_files(storage.join(root, folder)), found, connections)
     files = [(folder, file) for folder, inside in zip(found, listings, strict=True) for file in inside]
-    return dict(sorted((f"{folder}{file.name}", file) for folder, file in files if fnmatchcase(file.name, name)))
+    fitting = dict(sorted((f"{folder}{file.name}", file) for folder, file in files if fnmatchcase(file.name, name)))
+    for path, file in fitting.items():
+        storage.require_content(storage.join(root, path), file.size)
+    return fitting

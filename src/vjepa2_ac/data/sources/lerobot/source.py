@@ -41,7 +41,6 @@ FRAME, TIME = "frame_index", "timestamp"
 _CHECKS = 2  # of episodes while a data set is indexed, and of how frames are chosen: a new number rebuilds all indexes
 
 _FIX = "Copy the file again, or leave the episode out"
-_FIX_STATES = "Check data.lerobot: state, select, rotation, position_unit, gripper_open and gripper_closed"
 _FIX_VECTORS = "Leave the episode out, check data.lerobot: state, action, or set data.lerobot.joint_velocity: null"
 
 Content = dict[str, Any]
@@ -249,7 +248,7 @@ def content_of(
     if fields.select is not None:
         states = states[:, list(fields.select)]
     content = {
-        "states": poses_from(states, fields, where, fix=_FIX_STATES) if config.states == "pose" else states,
+        "states": poses_from(states, fields, where, section="data.lerobot") if config.states == "pose" else states,
         "commands": joined(fields.action) if config.actions == "recorded" else None,
         "joint_velocities": joined([str(fields.joint_velocity)]) if has(fields.joint_velocity) else None,
     }

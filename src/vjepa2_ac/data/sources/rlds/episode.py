@@ -49,7 +49,6 @@ FEWEST_IN_FLIGHT = 128  # reads behind a URL: they are small, and sequential wit
 _SAMPLES = 4
 _NUMBERS: tuple[Kind, ...] = ("float_list", "int64_list")  # booleans are stored as integers
 _FIX_IDENTITY = "Name text or integer features in data.fields.identity, or set data.fields.identity: record"
-_FIX_STATES = "Check data.fields: state, select, rotation, position_unit, gripper_open and gripper_closed"
 _PLACE = ("shard", "record", "offset", "length")  # columns of the table
 _LENGTH_BYTES = 5  # lengths that grow with a name: of text, list, feature, entry of the map, and all of them
 
@@ -222,7 +221,7 @@ def states_of(record: Record, config: RldsData, steps: int, where: str) -> Float
     if config.states == "vector":
         require_finite(numbers, where, fix="Check data.fields.state, or leave the episode out")
         return numbers
-    return poses_from(numbers, fields, where, fix=_FIX_STATES)
+    return poses_from(numbers, fields, where, section="data.fields")
 
 
 def commands_of(

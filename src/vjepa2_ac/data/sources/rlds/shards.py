@@ -32,6 +32,7 @@ class Shard:
     episodes: int
     size: int  # bytes
     version: str  # as from `storage.list_files`: changes with the content
+    split: str  # the name of its split in the data set
 
     @property
     def name(self) -> str:
@@ -50,21 +51,27 @@ def find_shards(folder: str) -> list[Shard]:
     if (form := info.get("fileFormat", "tfrecord")) != "tfrecord":
         raise InputError(where=where, found=f"fileFormat {form}", needed="tfrecord", fix="Convert it with TFDS")
     try:
-        listed = [pair for split in info["splits"] for pair in _listed(split, str(info["name"]))]
+        listed = [shard for split in info["splits"] for shard in _listed(split, str(info["name"]))]
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         found = f"not a description of a data set ({error!r})"
         raise InputError(where=where, found=found, needed="TFDS's own") from None
     if not listed:
         raise InputError(where=where, found="no episodes in any split", needed="a data set with episodes")
-    if len(dict(listed)) < len(listed):
+    names = [name for name, *_ in listed]
+    if len(set(names)) < len(names):
         needed = "a filepathTemplate that numbers them"
         raise InputError(where=where, found="shards of one name", needed=needed)
     present = {file.name: file for file in storage.list_files(folder)}
-    if missing := [name for name, _ in listed if name not in present]:
-        found = f"{len(missing)} of {len(listed)} shards are missing: {_shorten(missing)}"
-        raise InputError(where=folder, found=found, needed=f"every shard that {_INFO} lists", fix="Download them")
+    if missing := [name for name in names if name not in present]:
+        found = f"{len(missing)} of {len(names)} shards are missing: {_shorten(missing)}"
+        fix = "Download them"
+        if others := [name for name in present if "tfrecord" in name and name not in names]:
+            found += f". The folder has {_shorten(others)}, which {_INFO} does not list"
+            fix = f"If these are the shards, rename them as {_INFO} lists them, or correct its name and shardLengths"
+        raise InputError(where=folder, found=found, needed=f"every shard that {_INFO} lists", fix=fix)
     return [
-        Shard(storage.join(folder, name), count, present[name].size, present[name].version) for name, count in listed
+        Shard(storage.join(folder, name), count, present[name].size, present[name].version, split)
+        for name, count, split in listed
     ]
 
 
@@ -92,12 +99,12 @@ def _nothing_in(folder: str) -> str:
         return f"{folder} {'is empty' if storage.exists(folder) else 'does not exist'}"
     inner = [name for name in names if storage.exists(storage.join(storage.join(folder, name), _INFO))]
     if inner:
-        return f"no {_INFO} in {folder}; did you mean {storage.join(folder, inner[0])}?"
+        return f"no {_INFO} in {folder}; did you mean {_shorten([storage.join(folder, name) for name in inner])}?"
     return f"no {_INFO} in {folder}, only {_shorten(names)}"
 
 
-def _listed(split: dict[str, Any], dataset: str) -> Iterator[tuple[str, int]]:
-    """Yield name and number of episodes of each shard of a split; TFDS writes a number as one, or as a string."""
+def _listed(split: dict[str, Any], dataset: str) -> Iterator[tuple[str, int, str]]:
+    """Yield name, number of episodes and split of each shard; TFDS writes a number as one, or as a string."""
     counts = [int(str(count)) for count in split.get("shardLengths", [])]
     for number, count in enumerate(counts):
         if not 0 <= count <= _MOST_EPISODES:
@@ -113,7 +120,8 @@ def _listed(split: dict[str, Any], dataset: str) -> Iterator[tuple[str, int]]:
         }
         template = split.get("filepathTemplate") or _DEFAULT_TEMPLATE
         if count:
-            yield re.sub(r"\{(\w+)\}", lambda found, of=values: of.get(found[1], found[0]), template), count
+            name = re.sub(r"\{(\w+)\}", lambda found, of=values: of.get(found[1], found[0]), template)
+            yield name, count, values["SPLIT"]
 
 
 def _shorten(names: list[str]) -> str:

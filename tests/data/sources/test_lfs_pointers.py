@@ -1,0 +1,85 @@
+"""A git-lfs pointer in place of a file is named as such, in every format, on this machine and behind a URL."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from copied_sets import STEPS, WRITERS
+from gcs import Gcs
+from lerobot_sets import recorded, write_v21
+from vjepa2_ac import storage
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.network.pretrained_folder import open_safetensors
+
+POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:" + b"0" * 64 + b"\nsize 12345678\n"
+FORMS = WRITERS | {
+    "lerobot v2.1": lambda folder, numbers: write_v21(folder, [recorded(number, STEPS) for number in numbers])
+}
+
+
+def replaced_by_pointers(folder: Path, pattern: str) -> Path:
+    """Write pointers in place of the files that fit a pattern."""
+    files = [*folder.rglob(pattern)]
+    assert files
+    for file in files:
+        file.write_bytes(POINTER)
+    return folder
+
+
+def config_of(form: str, path: str | Path, tmp_path: Path) -> DataConfig:
+    source = form.split()[0]
+    values = {"source": source, "path": str(path), "frames": 3, "stride": 2, "disk_cache": {"dir": str(tmp_path)}}
+    return DataConfig.model_validate(values)
+
+
+@pytest.mark.parametrize(
+    ("form", "pattern"),
+    [
+        ("rlds", "*.tfrecord-*"),
+        ("rlds", "*.tfrecord-00001-*"),
+        ("rlds", "dataset_info.json"),
+        ("lerobot", "info.json"),
+        ("lerobot", "data/**/*.parquet"),
+        ("lerobot", "meta/**/*.parquet"),
+        ("lerobot", "*file-001.mp4"),
+        ("lerobot v2.1", "episodes.jsonl"),
+        ("npz", "*.npz"),
+        ("droid_raw", "*.h5"),
+        ("droid_raw", "*.mp4"),
+        ("droid_raw", "metadata_*.json"),
+    ],
+)
+def test_a_pointer_is_named_when_the_set_is_opened(form: str, pattern: str, tmp_path: Path) -> None:
+    folder = replaced_by_pointers(FORMS[form](tmp_path / "set", range(3)), pattern)
+    with pytest.raises(InputError, match="a git-lfs pointer.*`git lfs pull`") as raised:
+        open_dataset(config_of(form, folder, tmp_path / "cache"))
+    where = raised.value.where.split(": ")[0]
+    assert Path(where).read_bytes() == POINTER
+
+
+@pytest.mark.parametrize(("form", "pattern"), [("rlds", "*.tfrecord-*"), ("lerobot", "*.mp4"), ("npz", "*.npz")])
+def test_a_pointer_behind_a_url_is_named(form: str, pattern: str, gcs: Gcs, tmp_path: Path) -> None:
+    gcs.upload(replaced_by_pointers(FORMS[form](tmp_path / "set", range(3)), pattern), "robots/set")
+    with pytest.raises(InputError, match="gs://robots/set/.*a git-lfs pointer"):
+        open_dataset(config_of(form, "gs://robots/set", tmp_path / "cache"))
+
+
+def test_a_pointer_in_place_of_any_other_file_is_named(tmp_path: Path) -> None:
+    (path := tmp_path / "model.safetensors").write_bytes(POINTER)
+    with pytest.raises(InputError, match=r"model\.safetensors: a git-lfs pointer"), open_safetensors(path, needed=""):
+        pass
+    with pytest.raises(InputError, match="a git-lfs pointer"):
+        storage.open_to_read(path)
+    with pytest.raises(InputError, match="a git-lfs pointer"):
+        storage.read_bounded(path, 10_000)
+
+
+def test_other_small_files_missing_ones_and_pipes_pass(tmp_path: Path) -> None:
+    (small := tmp_path / "small").write_bytes(b"{}")
+    os.mkfifo(pipe := tmp_path / "pipe")
+    for path in (small, pipe, tmp_path, tmp_path / "none"):
+        storage.require_content(path)
+    assert storage.read_bounded(small, 9) == b"{}"

@@ -1,0 +1,55 @@
+"""Positions and angles in other units: the error names the config key, and with that key they are read."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lerobot_sets import STATE, Recorded, recorded, write_v30
+from synthetic import synthetic_states
+from vjepa2_ac.config import LeRobotData, RldsData
+from vjepa2_ac.data.sources.lerobot.source import LeRobotSource
+from vjepa2_ac.data.sources.rlds.source import RldsSource
+from vjepa2_ac.errors import InputError
+
+IN_OTHER_UNITS = {"position_unit": "mm", "rotation": "euler_xyz_degrees"}
+SCALE = np.array([1000.0] * 3 + [180 / np.pi] * 3)
+
+
+def write_lerobot(folder: Path) -> Path:
+    episode = recorded(0, 12)
+    pose = (episode.columns[STATE[0]] * SCALE).astype(np.float32)
+    return write_v30(folder, [Recorded({**episode.columns, STATE[0]: pose}, episode.frames)])
+
+
+def test_lerobot_names_the_keys_and_reads_with_them(tmp_path: Path) -> None:
+    def opened(**fields: Any) -> LeRobotSource:
+        return LeRobotSource(LeRobotData(path=str(folder), lerobot=fields, disk_cache={"dir": str(tmp_path / "cache")}))
+
+    folder = write_lerobot(tmp_path / "set")
+    with pytest.raises(InputError) as raised:
+        opened().infos()
+    assert raised.value.fix.startswith(
+        "The positions look like millimetres: set data.lerobot.position_unit: mm."
+        " The angles look like degrees: set data.lerobot.rotation: euler_xyz_degrees. Check data.lerobot: state, "
+    )
+    with pytest.raises(InputError, match="look like degrees") as raised:
+        opened(position_unit="mm").infos()
+    assert "millimetres" not in raised.value.fix
+    np.testing.assert_allclose(opened(**IN_OTHER_UNITS).read(0).states, synthetic_states(12, seed=0), atol=1e-5)
+
+
+def test_rlds_names_the_keys_and_reads_with_them(
+    spoiled: Callable[[Callable[[dict[str, tuple[Any, Any]]], None]], Path],
+) -> None:
+    def in_other_units(features: dict[str, tuple[Any, Any]]) -> None:
+        pose = features["steps/observation/cartesian_position"][1]
+        pose[:] = (np.reshape(pose, (-1, 6)) * SCALE).ravel().tolist()
+
+    folder = spoiled(in_other_units)
+    problem = RldsSource(RldsData(path=str(folder))).infos().problems[0]
+    assert problem.fix.startswith("The positions look like millimetres: set data.fields.position_unit: mm. The angles")
+    source = RldsSource(RldsData(path=str(folder), fields=IN_OTHER_UNITS))
+    np.testing.assert_allclose(source.read(0).states, synthetic_states(13, seed=0)[:-1], atol=1e-5)
