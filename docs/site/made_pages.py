@@ -36,6 +36,7 @@ _PROJECT = {
     "made/results": "tables that commands of the repository write",
     "published_figures": "commands that repeat figures of others",
     "IMPLEMENTATION_NOTES": "how it works, and how exactness is checked",
+    "decisions": "what was decided, and why",
     "made/changelog": "what changed for users",
     "made/contributing": "how to take part",
     "releasing": "the steps of a release",

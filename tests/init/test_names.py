@@ -64,6 +64,7 @@ def test_widths_are_a_guess(columns: dict[str, int], rotation: str, found: int) 
     pose = find_pose({name: Column(width) for name, width in columns.items()})
     assert pose is not None
     assert (pose.rotation, len(pose.columns), pose.is_guess) == (rotation, found, True)
+    assert "states: vector" in pose.why
 
 
 @pytest.mark.parametrize(

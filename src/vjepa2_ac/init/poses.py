@@ -28,6 +28,7 @@ _GRIPPER = re.compile(r"grip|finger", re.I)
 _JOINT = re.compile(r"joint|motor|shoulder|elbow|wrist|waist|\.pos$", re.I)
 _NO_POSE = re.compile(r"joint|motor|vel|speed|force|torque|effort|accel|wrench|current", re.I)
 
+_WHY_BY_WIDTH = "by the width of the column, whose numbers have no names; if they are joints, set states: vector"
 _MAX_RAD_S = 10.0  # no hand turns faster
 _METRES, _UNIT = 0.15, 1.05  # largest values of a gripper's opening in metres, and of a share
 
@@ -251,7 +252,7 @@ def _candidates(numbers: Sequence[_Number], columns: Mapping[str, Column]) -> It
             if rotations and near:
                 used = (*position, *rotations[0], near[0])
                 is_named = all(one.is_named for one in used)
-                why = f"by the names {', '.join(one.name for one in used)}" if is_named else "by widths, not by names"
+                why = f"by the names {', '.join(one.name for one in used)}" if is_named else _WHY_BY_WIDTH
                 if any(columns[one.column].names and not one.is_named for one in used):
                     why = "the names promise a quaternion, and the numbers are not of length 1; read by width"
                 is_stray = near[0].group not in {group, ""}

@@ -370,9 +370,7 @@ class _Targets:
         return self.times[index] if matches else None
 
 
-def _upright(
-    image: Frame, frame: VideoFrame, where: str
-) -> UInt8[np.ndarray, "displayed_height displayed_width 3"]:
+def _upright(image: Frame, frame: VideoFrame, where: str) -> UInt8[np.ndarray, "displayed_height displayed_width 3"]:
     """Return an image as it is displayed: phones store videos on their side, with a matrix that says how."""
     if not frame.rotation:
         return image

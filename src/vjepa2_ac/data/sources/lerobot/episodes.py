@@ -212,7 +212,9 @@ def require_long_videos(
         path = storage.join(info.root, row.video_file(info, key))
         header, last_s = header_of(path), row.place[f"{key}.start_s"] + (row.length - 1) / info.fps
         if header.num_frames < row.length or header.span_s < last_s - 0.5 / info.fps:
-            found = f"{header.num_frames} frames at {header.rate_hz:.4g} a second, the last one at {header.span_s:.3f} s"
+            found = (
+                f"{header.num_frames} frames at {header.rate_hz:.4g} a second, the last one at {header.span_s:.3f} s"
+            )
             needed = f"one for each of {row.length} rows at {info.fps:g} a second, the last one at {last_s:.3f} s"
             raise InputError(where=f"{path}: {row.id}", found=found, needed=needed, fix=_FIX)
 
