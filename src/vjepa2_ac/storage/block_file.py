@@ -11,11 +11,13 @@ import io
 import logging
 import os
 import secrets
+import struct
 import time
 import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from itertools import accumulate
 from pathlib import Path
 
 from vjepa2_ac.storage import remote
@@ -29,6 +31,7 @@ _CACHED_BLOCKS = 128
 _CHECK_SHARE = 0.02  # of the limit: after so many bytes of its own a process looks whether the limit is reached
 _KEPT_SHARE = 0.8  # of the limit, when it was: ten processes together do not come above it until the next look
 _CRC_BYTES = 4  # behind the data of an entry
+_PART = struct.Struct(">QQI")  # start, size and CRC of a part of an entry
 _PARTIAL = ".partial"
 _ABANDONED_S = 3600.0
 
@@ -162,6 +165,25 @@ class DiskCache:
             if not self._warned:
                 logger.warning("%s: %s; the run goes on and fetches again", self._folder, error.strerror)
             self._warned = True
+
+    def write_parts(self, key: str, parts: Sequence[bytes]) -> None:
+        """Store a list of parts under a key, as `write` does; `read_parts` returns some of them."""
+        starts = accumulate(map(len, parts), initial=len(parts) * _PART.size)
+        table = [_PART.pack(start, len(part), zlib.crc32(part)) for start, part in zip(starts, parts, strict=False)]
+        self.write(key, b"".join([*table, *parts]))
+
+    def read_parts(self, key: str, count: int, numbers: Sequence[int]) -> list[bytes] | None:
+        """Return some of the `count` parts of an entry without reading the others; None if absent or damaged."""
+        path = self._path(key)
+        try:
+            with path.open("rb", buffering=0) as file:
+                table = [*_PART.iter_unpack(file.read(count * _PART.size))]
+                parts = [os.pread(file.fileno(), table[number][1], table[number][0]) for number in numbers]
+        except (OSError, OverflowError, MemoryError, IndexError, struct.error):  # usually: absent
+            return None
+        with suppress(OSError):
+            os.utime(path)
+        return parts if [zlib.crc32(part) for part in parts] == [table[number][2] for number in numbers] else None
 
     def _path(self, key: str) -> Path:
         name = hashlib.sha256(key.encode()).hexdigest()[:40]
