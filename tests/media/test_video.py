@@ -121,8 +121,9 @@ def test_a_step_has_the_frame_nearest_in_time_whatever_else_is_read(
         np.testing.assert_array_equal(read_frames(path, [steps[first]], where="a", clock=clock), expected[[first]])
 
 
-def test_of_two_frames_equally_near_the_earlier_one_is_read(tmp_path: Path) -> None:
-    path = write_mp4(tmp_path / "a.mp4", FRAMES, gop=4)
+@pytest.mark.parametrize("b_frames", [0, 3])
+def test_of_two_frames_equally_near_the_earlier_one_is_read(b_frames: int, tmp_path: Path) -> None:
+    path = write_mp4(tmp_path / "a.mp4", FRAMES, gop=12, b_frames=b_frames)
     frames = every_frame(path)
     for steps in ([0, 1, 2], [1], [2]):
         read = read_frames(path, steps, where="a", clock=Clock(3.5 / 15, 7.5))

@@ -274,7 +274,7 @@ class _Video:
         for target in targets:
             if self._key_frame_before(target) > end > _START:
                 packets, times, end = self._packets_before(target), [], _START
-            while (distance := abs(_nearest(times, target) - target)) and end < target + min(distance, tolerance + 1):
+            while (distance := abs(_nearest(times, target) - target)) and end < target + distance:
                 if (packet := next(packets, None)) is None:
                     break
                 end = int(packet.dts or 0) + int(packet.duration or 0)  # all frames that follow are shown later

@@ -213,6 +213,8 @@ def test_a_later_clip_reads_only_the_images_of_its_frames(
         assert num_bytes == [sizes[step] for step in (3, 7, 11)]
         num_bytes.clear()
     assert from_tables == [LENGTHS[1]], "the table is not read again"
+    for number in (0, 2):
+        assert numbers_of(source.read(number).read_frames([3])[0]) == (number, 3, 0)
 
 
 def test_images_are_read_from_the_table_where_the_disk_cache_is_too_small_for_the_data_set(
@@ -609,9 +611,10 @@ def test_an_overlap_by_rounding_is_no_problem(v30: Path, tmp_path: Path) -> None
     assert numbers_of(source_of(tmp_path / "0.2").read(1).read_frames([0])[0]) == (1, 0, 0)
 
 
-def shorten(path: Path, num_frames: int) -> None:
-    frames = [frame.to_ndarray(format="rgb24") for frame in av.open(str(path)).decode(video=0)]
-    write_mp4(path, frames[:num_frames], rate=FPS)
+def shorten(path: Path, num_frames: int, rate: int = FPS) -> None:
+    with av.open(str(path)) as file:
+        frames = [frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)]
+    write_mp4(path, frames[:num_frames], rate=rate)
 
 
 def test_a_video_that_is_shorter_than_its_rows_is_found_while_a_local_set_is_indexed(
@@ -624,6 +627,8 @@ def test_a_video_that_is_shorter_than_its_rows_is_found_while_a_local_set_is_ind
     )
     assert re.search(message + r"rows at 15 a second, up to 0\.733 s\. Copy the data set again", only_problem(root))
     assert not source_of(root, camera="wrist_left").infos().problems
+    shorten(first_video(root), 9, rate=10)
+    assert "9 frames at 10 a second, up to 0.800 s" in only_problem(root)
     root = Path(shutil.copytree(v30, tmp_path / "v30"))
     shorten(first_video(root), 30)
     problems = source_of(root).infos().problems
