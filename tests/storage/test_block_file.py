@@ -146,6 +146,25 @@ def test_what_is_written_is_read_by_every_cache_on_the_folder(tmp_path: Path) ->
         assert cache.read("gs://a/b 0-10") is None, "as after a power cut"
 
 
+def test_parts_of_an_entry_are_read_by_number_and_a_damaged_entry_is_absent(tmp_path: Path) -> None:
+    cache, parts = DiskCache(tmp_path, 10_000), [b"first", b"second", b"third" * 100, b"last"]
+    assert cache.read_parts("a", 4, [0]) is None
+    cache.write_parts("a", parts)
+    assert cache.read_parts("a", 4, [3, 1, 2, 2, 0]) == [parts[number] for number in (3, 1, 2, 2, 0)]
+    assert cache.read_parts("a", 4, []) == []
+    assert cache.read_parts("a", 4, [4]) is None
+    path = cache._path("a")
+    data = path.read_bytes()
+    for place in (*range(0, 80, 3), data.index(b"thirdthird") + 7):  # the table of the parts, and a part
+        path.write_bytes(data[:place] + bytes([data[place] ^ 255]) + data[place + 1 :])
+        assert cache.read_parts("a", 4, [0, 1, 2, 3]) is None
+        assert cache.read_parts("a", 4, [3]) in (None, [b"last"])
+    path.write_bytes(data[:-20])
+    assert cache.read_parts("a", 4, [2, 3]) is None
+    path.write_bytes(b"")
+    assert cache.read_parts("a", 4, [0]) is None
+
+
 def test_the_entry_used_longest_ago_goes_first(tmp_path: Path) -> None:
     cache = DiskCache(tmp_path, 410)
     for second, key in enumerate("abcd"):

@@ -76,6 +76,14 @@ class EpisodeFiles:
         """Keep what was parsed of an episode."""
         self._cache.write(key, arrays_as_bytes(arrays))
 
+    def parts(self, key: str, count: int, numbers: Sequence[int]) -> list[bytes] | None:
+        """Return some of the `count` parts that were kept under a key, reading no others; None if there are none."""
+        return self._cache.read_parts(key, count, numbers)
+
+    def keep_parts(self, key: str, parts: Sequence[bytes]) -> None:
+        """Keep a list of parts, such as the images of an episode."""
+        self._cache.write_parts(key, parts)
+
     def _cached(self, key: str, fetch: Callable[[], bytes]) -> bytes:
         data = self._cache.read(key)
         if data is None:

@@ -8,10 +8,10 @@ file's display matrix says. A video is written completely or not at all.
 from __future__ import annotations
 
 import re
-from bisect import bisect_left
+from bisect import bisect_left, insort
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -34,7 +34,6 @@ _STRICT = {
     "max_pixels": str(MOST_PIXELS),
 }
 _START = -(1 << 40)  # before every frame
-_SAME_RATE = 0.02  # relative difference of equal rates: times in milliseconds round 30 Hz to 30.3 Hz
 _FIX = "Copy the file again, or leave the episode out"
 _QUALITY = "20"  # x264's constant rate factor: text stays sharp
 _COLOURS = 255  # of a GIF
@@ -59,10 +58,6 @@ class VideoHeader:
     num_frames: int
     span_s: float  # from the first frame to the last
     rate_hz: float  # frames per second, by the median interval; 0 for a single frame
-
-    def has_rate(self, rate_hz: float) -> bool:
-        """Return whether the video has this many frames per second, within 2 %."""
-        return abs(self.rate_hz - rate_hz) <= _SAME_RATE * rate_hz
 
 
 def read_frames(
@@ -94,15 +89,15 @@ def read_frames(
     if not steps or min(steps) < 0:
         raise ValueError(f"{where}: steps {list(steps)}")
     with _opened(file, where) as video:
-        if clock is None:
-            targets, tolerance = _shown_at(steps, video.times() if times is None else times, where), 0
+        if clock is not None:
+            shown = _shown_by(video, clock, steps)
         else:
-            targets, tolerance = _shown_by(clock, steps, video.unit_s, where)
-        frames = video.decode(sorted(set(targets)), tolerance, clock)
+            shown = _shown_at(steps, video.times() if times is None else times, where)
+        frames = video.decode(sorted(set(shown)))
         if len(sizes := {frame.shape for frame in frames.values()}) > 1:
             found = f"frames of {' and '.join(f'{height}x{width}' for height, width, _ in sorted(sizes))}"
             raise _unusable(where, found, "frames of one size")
-        return np.stack([frames[target] for target in targets])
+        return np.stack([frames[time] for time in shown])
 
 
 def _shown_at(steps: Sequence[int], times: Sequence[int], where: str) -> list[int]:
@@ -113,13 +108,22 @@ def _shown_at(steps: Sequence[int], times: Sequence[int], where: str) -> list[in
     return [times[step] for step in steps]
 
 
-def _shown_by(clock: Clock, steps: Sequence[int], unit_s: float, where: str) -> tuple[list[int], int]:
-    """Return the times that a clock gives to these steps, and how far from each a frame may be shown."""
-    targets = [round((clock.start_s + step / clock.rate_hz) / unit_s) for step in steps]
+def _shown_by(video: _Video, clock: Clock, steps: Sequence[int]) -> list[int]:
+    """Return when the frames nearest to the times of these steps are shown."""
+    targets = [round((clock.start_s + step / clock.rate_hz) / video.unit_s) for step in steps]
     if len(set(targets)) < len(set(steps)):
-        found = f"times in units of {unit_s:g} s for {clock.rate_hz:g} frames a second"
-        raise _unusable(where, found, "a time for each")
-    return targets, max(0, int(0.49 / clock.rate_hz / unit_s))
+        found = f"times in units of {video.unit_s:g} s for {clock.rate_hz:g} frames a second"
+        raise _unusable(video.where, found, "a time for each")
+    nearest = video.nearest_times(sorted(set(targets)), max(0, int(0.49 / clock.rate_hz / video.unit_s)))
+    if not (missing := set(targets) - nearest.keys()):
+        return [nearest[target] for target in targets]
+    found, rate_hz = f"no frame at {min(missing) * video.unit_s:.3f} s", video.header().rate_hz
+    if 0 < rate_hz < clock.rate_hz and not is_same_rate(rate_hz, clock.rate_hz):
+        found += f": the video has {rate_hz:.4g} frames a second, and {clock.source} says {clock.rate_hz:g}"
+        fix = "Change the rate of the video or that of the steps, or leave the episode out"
+        raise InputError(where=video.where, found=found, needed="a frame for each step", fix=fix)
+    needed = f"one for each of {len(targets)} times from {min(targets) * video.unit_s:.3f} s on"
+    raise _unusable(video.where, found, needed)
 
 
 def read_header(file: str | Path | ByteReader, *, where: str) -> VideoHeader:
@@ -131,6 +135,11 @@ def read_header(file: str | Path | ByteReader, *, where: str) -> VideoHeader:
     """
     with _opened(file, where) as video:
         return video.header()
+
+
+def is_same_rate(video_hz: float, steps_hz: float) -> bool:
+    """Return whether a video has the rate of its steps, within 2 %: times in milliseconds round 30 Hz to 30.3 Hz."""
+    return abs(video_hz - steps_hz) <= 0.02 * steps_hz
 
 
 def count_frames(file: str | Path | ByteReader, *, where: str) -> int:
@@ -254,67 +263,53 @@ class _Video:
         interval_s = float(np.median(intervals)) if len(intervals) else 0.0
         return VideoHeader(len(times), float(intervals.sum()), 1 / interval_s if interval_s > 0 else 0.0)
 
-    def decode(self, targets: list[int], tolerance: int, clock: Clock | None) -> dict[int, Frame]:
-        """Return the frame nearest to each of these ascending times, at most the tolerance away."""
-        require_bounded(self.stream.height or 1, self.stream.width or 1, self.where, count=len(targets))
+    def nearest_times(self, targets: Sequence[int], tolerance: int) -> dict[int, int]:
+        """Return when the frame nearest to each of these ascending times is shown, by its packet; nothing is decoded.
+
+        Of two frames equally near it is the earlier one. Times without a frame within the tolerance are left out.
+        """
+        nearest: dict[int, int] = {}
+        times: list[int] = []  # of the frames whose packets were read, ascending
+        packets, end = self._packets_before(targets[0]), _START
+        for target in targets:
+            if self._key_frame_before(target) > end > _START:
+                packets, times, end = self._packets_before(target), [], _START
+            while (distance := abs(_nearest(times, target) - target)) and end < target + distance:
+                if (packet := next(packets, None)) is None:
+                    break
+                end = int(packet.dts or 0) + int(packet.duration or 0)  # all frames that follow are shown later
+                if packet.pts is not None and not packet.is_discard:
+                    insort(times, int(packet.pts))
+            if distance <= tolerance:
+                nearest[target] = _nearest(times, target)
+        return nearest
+
+    def decode(self, times: list[int]) -> dict[int, Frame]:
+        """Return the frames that are shown at these ascending times."""
+        require_bounded(self.stream.height or 1, self.stream.width or 1, self.where, count=len(times))
         frames: dict[int, Frame] = {}
-        while missing := [target for target in targets if target not in frames]:
-            decoded = self._decode_run(_Targets(missing, tolerance))
-            if missing[0] not in decoded:
-                raise self._no_frame(missing[0], targets, clock)
-            frames |= decoded
+        while missing := [time for time in times if time not in frames]:
+            self._decode_run(missing, frames)
+            if missing[0] not in frames:
+                raise _unusable(self.where, f"no frame at {missing[0] * self.unit_s:.3f} s", "a whole MP4")
         return frames
 
-    def _no_frame(self, target: int, targets: list[int], clock: Clock | None) -> InputError:
-        found = f"no frame at {target * self.unit_s:.3f} s"
-        rate = 0.0 if clock is None else self.header().rate_hz
-        if clock is not None and 0 < rate < (1 - _SAME_RATE) * clock.rate_hz:
-            found = f"{found}: the video has {rate:.4g} frames a second, and {clock.source} says {clock.rate_hz:g}"
-            fix = "Change the rate of the video or that of the steps, or leave the episode out"
-            return InputError(where=self.where, found=found, needed="a frame for each step", fix=fix)
-        needed = f"one for each of {len(targets)} times from {targets[0] * self.unit_s:.3f} s on"
-        return _unusable(self.where, found, needed)
-
-    def _decode_run(self, targets: _Targets) -> dict[int, Frame]:
-        """Decode from the key frame before the first target for as long as that costs less than the next seek.
-
-        Returned are the frames of the first target and of those behind it whose nearest frame is among the decoded.
-        """
+    def _decode_run(self, times: list[int], frames: dict[int, Frame]) -> None:
+        """Decode from the key frame before the first time for as long as that costs less than the next seek."""
         decoder = self.stream.codec_context
-        frames: dict[int, Frame] = {}
+        sent: set[int] = set()
         delay: int | None = None
-        first = end = 0  # targets before `first` are final: a frame that follows is shown at `end` or later
-        for packet in self._packets_before(targets.times[0]):
+        for packet in self._packets_before(times[0]):
             decoded = int(packet.dts or 0)
             shown = decoded if packet.pts is None else int(packet.pts)
             delay = shown - decoded if delay is None else delay  # of the key frame; all of the file have the same
-            end = decoded + int(packet.duration or 0)
-            if not packet.is_discard:
-                targets.expect(shown)
-            targets.keep(decoder.decode(packet))
-            frames |= self._converted(targets, end)
-            while first < len(targets.times) and targets.is_final(targets.times[first], end):
-                first += 1
-            if first == len(targets.times) or (first and self._key_frame_before(targets.times[first] - delay) > end):
-                break
-        else:
-            end = -_START
-        targets.keep(decoder.decode(None))
-        return frames | self._converted(targets, end)
-
-    def _converted(self, targets: _Targets, end: int) -> dict[int, Frame]:
-        """Return the decoded frames that are final, as RGB."""
-        frames: dict[int, Frame] = {}
-        for target in [target for target in targets.decoded if targets.is_final(target, end)]:
-            frame = targets.decoded.pop(target)
-            if frame.pts != targets.nearest[target]:  # the nearest one is not decoded yet
-                continue
-            if frame.is_corrupt:
-                raise _unusable(self.where, f"a damaged frame at {target * self.unit_s:.3f} s", "a whole MP4")
-            require_bounded(frame.height, frame.width, self.where, count=len(targets.times))
-            image = np.asarray(self.converter.reformat(frame, format="rgb24", threads=1).to_ndarray())
-            frames[target] = _upright(image, frame, self.where)
-        return frames
+            sent.add(shown)
+            self._keep(decoder.decode(packet), times, frames)
+            if times[0] in sent:
+                following = next((time for time in times if time not in sent), None)
+                if following is None or self._key_frame_before(following - delay) > decoded + int(packet.duration or 0):
+                    break
+        self._keep(decoder.decode(None), times, frames)
 
     def _packets_before(self, target: int) -> Iterator[Packet[VideoStream]]:
         """Yield packets from the last key frame that is shown no later than the target."""
@@ -334,47 +329,30 @@ class _Video:
         place = self.stream.index_entries.search_timestamp(time, backward=True, any_frame=False)
         return int(self.stream.index_entries[place].timestamp) if place >= 0 else _START
 
+    def _keep(self, decoded: Sequence[VideoFrame], times: list[int], frames: dict[int, Frame]) -> None:
+        for frame in decoded:
+            time = frame.pts
+            if time is None or time in frames or time not in times:
+                continue
+            if frame.is_corrupt:
+                raise _unusable(self.where, f"a damaged frame at {time * self.unit_s:.3f} s", "a whole MP4")
+            require_bounded(frame.height, frame.width, self.where, count=len(times))
+            image = np.asarray(self.converter.reformat(frame, format="rgb24", threads=1).to_ndarray())
+            frames[time] = _upright(image, frame, self.where)
 
-@dataclass(frozen=True)
-class _Targets:
-    """Ascending times, and for each the nearest frame: packets announce frames before the decoder returns them."""
 
-    times: list[int]
-    tolerance: int  # the largest distance of a frame from its target
-    nearest: dict[int, int] = field(default_factory=dict)  # time of the nearest frame announced so far
-    decoded: dict[int, VideoFrame] = field(default_factory=dict)  # not converted yet
-
-    def expect(self, time: int) -> None:
-        """Note that a frame is shown at this time."""
-        target = self._target_of(time)
-        if target is not None:
-            known = self.nearest.get(target, time)
-            self.nearest[target] = min(known, time, key=lambda one: (abs(one - target), one))
-
-    def keep(self, frames: Sequence[VideoFrame]) -> None:
-        """Keep the decoded frames that are the nearest ones so far."""
-        for frame in frames:
-            target = None if frame.pts is None else self._target_of(int(frame.pts))
-            if target is not None and frame.pts == self.nearest.get(target):
-                self.decoded[target] = frame
-
-    def is_final(self, target: int, end: int) -> bool:
-        """Return whether no frame shown at `end` or later is nearer to a target, or within the tolerance of it."""
-        distance = abs(self.nearest[target] - target) if target in self.nearest else self.tolerance + 1
-        return distance == 0 or end >= target + distance
-
-    def _target_of(self, time: int) -> int | None:
-        """Return the first target within the tolerance of a time, or None."""
-        index = bisect_left(self.times, time - self.tolerance)
-        matches = index < len(self.times) and self.times[index] <= time + self.tolerance
-        return self.times[index] if matches else None
+def _nearest(times: Sequence[int], target: int) -> int:
+    """Return the nearest of some ascending times, the earlier of two equally near; a far one if there is none."""
+    index = bisect_left(times, target)
+    return min(times[max(0, index - 1) : index + 1], key=lambda time: abs(time - target), default=_START)
 
 
 def _upright(image: Frame, frame: VideoFrame, where: str) -> UInt8[np.ndarray, "displayed_height displayed_width 3"]:
     """Return an image as it is displayed: phones store videos on their side, with a matrix that says how."""
     if not frame.rotation:
         return image
-    matrix = np.frombuffer(bytes(frame.side_data["DISPLAYMATRIX"]), np.int32).reshape(3, 3)[:2, :2]
+    stored = cast("Any", frame.side_data)["DISPLAYMATRIX"]
+    matrix = np.frombuffer(bytes(stored), np.int32).reshape(3, 3)[:2, :2]
     if matrix[0, 0] == matrix[1, 1] == 0:
         image, matrix = image.swapaxes(0, 1), matrix[::-1]  # x becomes y
     if np.count_nonzero(matrix) != 2 or not matrix.diagonal().all():

@@ -11,10 +11,12 @@ import io
 import logging
 import os
 import secrets
+import struct
 import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from itertools import accumulate
 from pathlib import Path
 
 from vjepa2_ac.storage import remote
@@ -28,6 +30,7 @@ _CACHED_BLOCKS = 128
 _KEPT_SHARE = 0.8  # of the limit, after an eviction: so that a scan of the folder is rare
 _CRC_BYTES = 4  # behind the data of an entry
 _TOTAL_BYTES = 8  # length of the number in the file `lock`
+_PART = struct.Struct(">QQI")  # start, size and CRC of a part of an entry
 
 
 class RangedFile(io.RawIOBase):
@@ -165,6 +168,25 @@ class DiskCache:
             if not self._warned:
                 logger.warning("%s: cannot be used (%s); its data are fetched again", self._folder, error.strerror)
             self._warned = True
+
+    def write_parts(self, key: str, parts: Sequence[bytes]) -> None:
+        """Store a list of parts under a key, as `write` does; `read_parts` returns some of them."""
+        starts = accumulate(map(len, parts), initial=len(parts) * _PART.size)
+        table = [_PART.pack(start, len(part), zlib.crc32(part)) for start, part in zip(starts, parts, strict=False)]
+        self.write(key, b"".join([*table, *parts]))
+
+    def read_parts(self, key: str, count: int, numbers: Sequence[int]) -> list[bytes] | None:
+        """Return some of the `count` parts of an entry without reading the others; None if absent or damaged."""
+        path = self._path(key)
+        try:
+            with path.open("rb", buffering=0) as file:
+                table = [*_PART.iter_unpack(file.read(count * _PART.size))]
+                parts = [os.pread(file.fileno(), table[number][1], table[number][0]) for number in numbers]
+        except (OSError, OverflowError, MemoryError, IndexError, struct.error):  # usually: absent
+            return None
+        with suppress(OSError):
+            os.utime(path)
+        return parts if [zlib.crc32(part) for part in parts] == [table[number][2] for number in numbers] else None
 
     def _path(self, key: str) -> Path:
         name = hashlib.sha256(key.encode()).hexdigest()[:40]

@@ -1,14 +1,17 @@
 """LeRobot data sets: the same states and the right frames from v3.0 and v2.1, conventions, and what can be wrong."""
 
 import json
+import os
 import pickle
 import re
 import shutil
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -28,8 +31,12 @@ from lerobot_sets import (
     write_v21,
     write_v30,
 )
+from recordings import write_mp4
 from synthetic import synthetic_states
 from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.data.inspection.check import _video_rates
+from vjepa2_ac.data.sources.lerobot.parquet import ParquetRows
 from vjepa2_ac.data.sources.lerobot.source import LeRobotSource
 from vjepa2_ac.episode import Episode, EpisodeSource
 from vjepa2_ac.errors import InputError
@@ -170,6 +177,81 @@ def test_frames_may_be_in_the_table(
     assert [numbers_of(frame) for frame in frames] == [(1, 7, 0), (1, 2, 0)]
     if pictures == "png":
         np.testing.assert_array_equal(frames[0], episodes[1].frames[KEY][7])
+
+
+def count_images(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Return a list that gets the number of images of each read of a table."""
+    counts, images = list[int](), ParquetRows.images
+
+    def counted(self: ParquetRows, *place: Any) -> list[bytes]:
+        counts.append(len(found := images(self, *place)))
+        return found
+
+    monkeypatch.setattr(ParquetRows, "images", counted)
+    return counts
+
+
+@pytest.mark.parametrize("write", [write_v30, write_v21])
+def test_a_later_clip_reads_only_the_images_of_its_frames(
+    write: Callable[..., Path], episodes: list[Recorded], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, cache = write(tmp_path / "set", episodes[:3], pictures="png"), {"dir": str(tmp_path / "cache")}
+    from_tables, num_bytes, pread = count_images(monkeypatch), list[int](), os.pread
+
+    def counted(*place: int) -> bytes:
+        num_bytes.append(len(data := pread(*place)))
+        return data
+
+    monkeypatch.setattr(os, "pread", counted)
+    source = source_of(root, disk_cache=cache)
+    expected = source.read(1).read_frames([3, 7, 11])
+    assert (from_tables, num_bytes) == ([LENGTHS[1]], [])
+    for reader in (source, pickle.loads(pickle.dumps(source)), source_of(root, disk_cache=cache)):  # noqa: S301 - our own bytes
+        np.testing.assert_array_equal(reader.read(1).read_frames([3, 7, 11]), expected)
+        stored = pq.read_table(sorted(root.glob("data/*/*.parquet"))[0 if write is write_v30 else 1]).to_pylist()
+        sizes = [len(row[KEY]["bytes"]) for row in stored if row["episode_index"] == 1]
+        assert num_bytes == [sizes[step] for step in (3, 7, 11)]
+        num_bytes.clear()
+    assert from_tables == [LENGTHS[1]], "the table is not read again"
+    for number in (0, 2):
+        assert numbers_of(source.read(number).read_frames([3])[0]) == (number, 3, 0)
+
+
+def test_images_are_read_from_the_table_where_the_disk_cache_is_too_small_for_the_data_set(
+    episodes: list[Recorded], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, from_tables = write_v30(tmp_path / "set", episodes[:3], pictures="png"), count_images(monkeypatch)
+    num_bytes = sum(path.stat().st_size for path in root.glob("data/*/*.parquet"))
+    for limit_gb, count in ((0, 2), ((num_bytes - 1) / 1e9, 2), (2 * num_bytes / 1e9, 1)):
+        source = source_of(root, disk_cache={"dir": str(tmp_path / f"cache {limit_gb}"), "limit_gb": limit_gb})
+        for _ in range(2):
+            assert numbers_of(source.read(1).read_frames([7])[0]) == (1, 7, 0)
+        assert from_tables == [LENGTHS[1]] * count
+        from_tables.clear()
+
+
+def test_a_video_three_times_as_dense_as_the_steps_gives_the_frame_of_each_step(
+    episodes: list[Recorded], tmp_path: Path
+) -> None:
+    every_third = [
+        replace(one, columns={name: values[::3] for name, values in one.columns.items()})
+        for one in (recorded(number, 36) for number in range(3))
+    ]
+    for gop in (2, 40):
+        root = write_v30(tmp_path / f"set {gop}", every_third, gop=gop)
+        change_info(root, fps=FPS / 3)
+        for path in root.glob("data/*/*.parquet"):
+            change_table(path, timestamp=None)
+        episode = source_of(root).read(1)
+        expected = [(1, 3 * step, 0) for step in range(12)]
+        assert [numbers_of(frame) for frame in episode.read_frames(range(12))] == expected
+        assert [numbers_of(episode.read_frames([step])[0]) for step in range(12)] == expected
+        config = config_of(root, validation_share=0.3, test_share=0.3, frames=2, stride=1)
+        findings = [f"{one.level} {one.about}: {one.text}" for one in _video_rates(open_dataset(config))]
+        rates = "exterior_1_left: videos have 15 frames a second, steps 5"
+        assert findings == [f"ok video rate: {rates}; a step has the frame nearest in time"]
+    root = write_v30(tmp_path / "same rate", episodes)
+    assert not [*_video_rates(open_dataset(config_of(root, validation_share=0.3, frames=2)))]
 
 
 def test_a_frame_in_the_table_that_is_none_is_named(episodes: list[Recorded], tmp_path: Path) -> None:
@@ -438,3 +520,127 @@ def test_a_video_that_says_it_is_shorter_than_its_rows_is_a_problem(v30: Path, t
     ends = pq.read_table(path).column(name).to_pylist()
     change_table(path, **{name: pa.array([11 / FPS, *ends[1:]])})
     assert "0.733 s of video, says the data set, for 12 rows" in only_problem(root)
+
+
+TABLE = "meta/episodes/chunk-000/file-000.parquet"
+
+
+def change_ranges(root: Path, camera: str = KEY, **changes: dict[int, float]) -> None:
+    """Replace values in columns of a camera in the table of episodes, given by the numbers of the episodes."""
+    table = pq.read_table(root / TABLE)
+    for column, values in changes.items():
+        name = f"videos/{camera}/{column}"
+        old = table.column(name).to_pylist()
+        change_table(root / TABLE, **{name: pa.array([values.get(n, one) for n, one in enumerate(old)])})
+
+
+OVERLAPS: dict[str, tuple[dict[str, dict[int, float]], dict[str, str]]] = {
+    "all start at 0": (
+        {"from_timestamp": dict.fromkeys(range(5), 0.0), "to_timestamp": {n: LENGTHS[n] / FPS for n in range(5)}},
+        {
+            "episode_000000": "episode_000000 and episode_000001 claim 0 to 0.8 s of file-000.mp4",
+            "episode_000001": "episode_000000 and episode_000001 claim 0 to 0.8 s of file-000.mp4",
+            "episode_000002": "episode_000001 and episode_000002 claim 0 to 0.866667 s of file-000.mp4",
+            "episode_000003": "episode_000003 and episode_000004 claim 0 to 1 s of file-001.mp4",
+            "episode_000004": "episode_000003 and episode_000004 claim 0 to 1 s of file-001.mp4",
+        },
+    ),
+    "two share a range": (
+        {"from_timestamp": {2: 12 / FPS}, "to_timestamp": {2: 26 / FPS}},
+        dict.fromkeys(
+            ("episode_000001", "episode_000002"),
+            "episode_000001 and episode_000002 claim 0.8 to 1.66667 s of file-000.mp4",
+        ),
+    ),
+    "half an episode": (
+        {"from_timestamp": {1: 6 / FPS}, "to_timestamp": {1: 19 / FPS}},
+        dict.fromkeys(
+            ("episode_000000", "episode_000001"), "episode_000000 and episode_000001 claim 0.4 to 0.8 s of file-000.mp4"
+        ),
+    ),
+    "one within another": (
+        {"to_timestamp": {0: 39 / FPS}},
+        {
+            "episode_000000": "episode_000000 and episode_000001 claim 0.8 to 1.66667 s of file-000.mp4",
+            "episode_000001": "episode_000000 and episode_000001 claim 0.8 to 1.66667 s of file-000.mp4",
+            "episode_000002": "episode_000000 and episode_000002 claim 1.66667 to 2.6 s of file-000.mp4",
+        },
+    ),
+    "file of another episode": (
+        {"file_index": {3: 0}},
+        {
+            "episode_000000": "episode_000000 and episode_000003 claim 0 to 0.8 s of file-000.mp4",
+            "episode_000001": "episode_000003 and episode_000001 claim 0.8 to 1 s of file-000.mp4",
+            "episode_000003": "episode_000000 and episode_000003 claim 0 to 0.8 s of file-000.mp4",
+        },
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("how", OVERLAPS)
+def test_episodes_that_claim_the_same_seconds_of_a_video_are_refused_by_name(
+    how: str, v30: Path, tmp_path: Path
+) -> None:
+    changes, expected = OVERLAPS[how]
+    root = Path(shutil.copytree(v30, tmp_path / "set"))
+    change_ranges(root, **changes)
+    if len(expected) == len(LENGTHS):
+        with pytest.raises(InputError, match=expected["episode_000000"]):
+            source_of(root).infos()
+        return
+    table = source_of(root).infos()
+    assert {problem.name: problem.found for problem in table.problems} == expected
+    assert {info.id for info in table} == {f"episode_{number:06d}" for number in range(5)} - expected.keys()
+    with pytest.raises(InputError, match=r"set/videos/.*\.mp4: .*claim.*add to data\.exclude: \["):
+        open_dataset(config_of(root))
+
+
+def test_an_overlap_of_a_camera_that_is_not_used_is_no_problem(v30: Path, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(v30, tmp_path / "set"))
+    change_ranges(root, **OVERLAPS["two share a range"][0])
+    assert not source_of(root, camera="wrist_left").infos().problems
+    assert len(source_of(root, camera=["exterior_1_left", "wrist_left"]).infos().problems) == 2
+
+
+def test_an_overlap_by_rounding_is_no_problem(v30: Path, tmp_path: Path) -> None:
+    for steps, problems in ((0.2, 0), (0.3, 2)):
+        root = Path(shutil.copytree(v30, tmp_path / f"{steps}"))
+        change_ranges(root, from_timestamp={1: (12 - steps) / FPS})
+        source = source_of(root)
+        assert len(source.infos().problems) == problems
+    assert numbers_of(source_of(tmp_path / "0.2").read(1).read_frames([0])[0]) == (1, 0, 0)
+
+
+def shorten(path: Path, num_frames: int, rate: int = FPS) -> None:
+    with av.open(str(path)) as file:
+        frames = [frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)]
+    write_mp4(path, frames[:num_frames], rate=rate)
+
+
+def test_a_video_that_is_shorter_than_its_rows_is_found_while_a_local_set_is_indexed(
+    v21: Path, v30: Path, tmp_path: Path
+) -> None:
+    root = Path(shutil.copytree(v21, tmp_path / "v21"))
+    shorten(first_video(root), 11)
+    message = (
+        r"episode_000000\.mp4: episode_000000: 11 frames at 15 a second, up to 0\.667 s\. needed: one for each of 12 "
+    )
+    assert re.search(message + r"rows at 15 a second, up to 0\.733 s\. Copy the data set again", only_problem(root))
+    assert not source_of(root, camera="wrist_left").infos().problems
+    shorten(first_video(root), 9, rate=10)
+    assert "9 frames at 10 a second, up to 0.800 s" in only_problem(root)
+    root = Path(shutil.copytree(v30, tmp_path / "v30"))
+    shorten(first_video(root), 30)
+    problems = source_of(root).infos().problems
+    assert [problem.name for problem in problems] == ["episode_000002"]
+    assert "30 frames at 15 a second, up to 1.933 s" in problems[0].found
+
+
+def test_a_video_slower_than_the_steps_is_named_with_both_rates(copy: Path) -> None:
+    change_info(copy, fps=2 * FPS)
+    for path in copy.glob("data/*/*.parquet"):
+        change_table(path, timestamp=None)
+    episode = source_of(copy).read(0)
+    message = r"episode_000000: no frame at 0\.033 s: the video has 15 frames a second, and .*meta/info\.json says 30"
+    with pytest.raises(InputError, match=message):
+        episode.read_frames([0, 1])

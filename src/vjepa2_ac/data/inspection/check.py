@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
 from textwrap import shorten
@@ -20,9 +21,11 @@ from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.inspection.excerpts import Finding, Level, excerpt_findings
 from vjepa2_ac.data.inspection.statistics import PERCENTILES, at_some_stride
 from vjepa2_ac.data.loader import training_loader
+from vjepa2_ac.data.sources.indexed_source import FramesByStep
 from vjepa2_ac.episode import Batch, Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.intervals import ENOUGH_EPISODES
+from vjepa2_ac.media.video import is_same_rate
 from vjepa2_ac.spaces import POSE, POSES, Spaces
 
 _MOVED_M, _MOVED_SHARE = 0.01, 0.05  # of the flange, or of the range of a number: it should be visible
@@ -63,6 +66,7 @@ def check_data(
         yield Finding("ok", "stride", f"auto; looked at here at the smallest candidate, {dataset.config.stride}")
     yield from _what_takes_part(dataset)
     yield from _read(dataset, seed=seed, batch_size=batch_size, clips=clips)
+    yield from _video_rates(dataset)
     if coverage := coverage_in(dataset):
         yield from (Finding("ok", name, text) for name, text in coverage.lines.items())
         yield Finding("warning" if coverage.narrow else "ok", "coverage", coverage.verdict)
@@ -113,6 +117,18 @@ def _split_that_can_answer(dataset: Dataset) -> Iterator[Finding]:
             return
     whole = int((dataset.taking_part & among).sum())
     yield Finding("warning", "test", f"{words}: no share of {whole} leaves enough to train on. Record more")
+
+
+def _video_rates(dataset: Dataset) -> Iterator[Finding]:
+    """Yield a finding for each camera whose videos have another rate than the steps, by the first episode's header."""
+    first = int(dataset.taking_part.argmax())
+    for camera in dataset.config.cameras:
+        with suppress(InputError):  # a damaged video is reported where a clip needs it
+            frames = dataset.source.read(first, camera).read_frames
+            rates_hz = frames.rates_hz() if isinstance(frames, FramesByStep) and frames.rates_hz else (0.0, 0.0)
+            if not is_same_rate(*rates_hz):
+                text = f"{camera}: videos have {rates_hz[0]:.4g} frames a second, steps {rates_hz[1]:g}"
+                yield Finding("ok", "video rate", f"{text}; a step has the frame nearest in time")
 
 
 def _read(dataset: Dataset, *, seed: int, batch_size: int, clips: int) -> Iterator[Finding]:

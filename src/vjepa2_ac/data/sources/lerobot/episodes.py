@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from pathlib import PurePosixPath
@@ -28,7 +27,10 @@ TABLES = {  # templates of the files that list the episodes
 _MOST_BYTES = 1 << 28  # of meta/episodes.jsonl
 _FIX_TABLES = "Get the files in meta again"
 _FIX = "Copy the data set again, or leave the episode out"
-_FIX_RANGES = "Correct file_index, from_timestamp and to_timestamp in meta/episodes, or leave both episodes out"
+_FIX_RANGES = (
+    "Correct file_index, from_timestamp and to_timestamp in meta/episodes (they may be wrong for other episodes of the "
+    "file, too), or leave both episodes out"
+)
 _STATISTICS = ("min", "max", "mean", "std")
 _ROUNDING_STEPS = 0.25  # by which the ranges of two episodes in a video may overlap
 
@@ -207,16 +209,13 @@ def require_long_videos(
         InputError: A video is too short, or cannot be read.
     """
     for key in keys:
-        if f"{key}.file" not in row.place:
-            continue
-        path = storage.join(info.root, row.video_file(info, key))
-        header, last_s = header_of(path), row.place[f"{key}.start_s"] + (row.length - 1) / info.fps
-        if header.num_frames < row.length or header.span_s < last_s - 0.5 / info.fps:
-            found = (
-                f"{header.num_frames} frames at {header.rate_hz:.4g} a second, the last one at {header.span_s:.3f} s"
-            )
-            needed = f"one for each of {row.length} rows at {info.fps:g} a second, the last one at {last_s:.3f} s"
-            raise InputError(where=f"{path}: {row.id}", found=found, needed=needed, fix=_FIX)
+        if f"{key}.file" in row.place:
+            path = storage.join(info.root, row.video_file(info, key))
+            header, last_s = header_of(path), row.place[f"{key}.start_s"] + (row.length - 1) / info.fps
+            if header.num_frames < row.length or header.span_s < last_s - 0.5 / info.fps:
+                found = f"{header.num_frames} frames at {header.rate_hz:.4g} a second, up to {header.span_s:.3f} s"
+                needed = f"one for each of {row.length} rows at {info.fps:g} a second, up to {last_s:.3f} s"
+                raise InputError(where=f"{path}: {row.id}", found=found, needed=needed, fix=_FIX)
 
 
 def find_overlaps(info: DatasetInfo, rows: Sequence[EpisodeRow], keys: Sequence[str]) -> dict[str, InputError]:
@@ -227,25 +226,25 @@ def find_overlaps(info: DatasetInfo, rows: Sequence[EpisodeRow], keys: Sequence[
         rows: All episodes.
         keys: Features of the cameras that are used.
     """
-    claims = defaultdict[str, list[tuple[float, float, str]]](list)  # of each video: start, end, identity
+    errors: dict[str, InputError] = {}
     for key in keys:
+        claims = []
         for row in rows:
             if f"{key}.file" in row.place:
                 start_s = row.place[f"{key}.start_s"]
                 end_s = start_s + row.lengths_s.get(key, row.length / info.fps)
-                claims[row.video_file(info, key)].append((start_s, end_s, row.id))
-    errors: dict[str, InputError] = {}
-    for path, claims_of_video in claims.items():
-        latest, *later = sorted(claims_of_video)
-        for claim in later:
-            start_s, end_s = claim[0], min(claim[1], latest[1])
-            if end_s - start_s > _ROUNDING_STEPS / info.fps:
-                seconds = f"{start_s:.10g} to {end_s:.10g} s of {PurePosixPath(path).name}"
-                found = f"{latest[2]} and {claim[2]} claim {seconds}"
-                for _, _, identity in (latest, claim):
-                    where, needed = f"{storage.join(info.root, path)}: {identity}", "seconds of one episode only"
-                    errors.setdefault(identity, InputError(where=where, found=found, needed=needed, fix=_FIX_RANGES))
-            latest = max(latest, claim, key=lambda one: one[1])
+                claims.append((row.video_file(info, key), start_s, end_s, row.id))
+        latest = ("", 0.0, 0.0, "")
+        for claim in sorted(claims):
+            path, start_s, end_s, identity = claim
+            end_s = min(end_s, latest[2])
+            if path == latest[0] and end_s - start_s > _ROUNDING_STEPS / info.fps:
+                seconds = f"{start_s:.6g} to {end_s:.6g} s of {PurePosixPath(path).name}"
+                found, needed = f"{latest[3]} and {identity} claim {seconds}", "seconds of one episode only"
+                error = InputError(where=storage.join(info.root, path), found=found, needed=needed, fix=_FIX_RANGES)
+                errors.setdefault(latest[3], error)
+                errors.setdefault(identity, error)
+            latest = max(latest, claim, key=lambda one: (one[0], one[2]))
     return errors
 
 

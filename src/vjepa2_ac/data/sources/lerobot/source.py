@@ -32,12 +32,13 @@ from vjepa2_ac.data.sources.lerobot.parquet import EPISODE, Columns, ParquetRows
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import decode_image, require_bounded
-from vjepa2_ac.media.video import Clock, VideoHeader, read_frames, read_header, video_library
+from vjepa2_ac.media.video import Clock, read_frames, read_header, video_library
 from vjepa2_ac.spaces import require_finite
 from vjepa2_ac.storage.block_file import BlockCachedFile
 
 FRAME, TIME = "frame_index", "timestamp"
 
+_DATA_BYTES = "data_bytes"  # total size of the Parquet files with rows
 _CHECKS = 2  # of episodes while a data set is indexed, and of how frames are chosen: a new number rebuilds all indexes
 
 _FIX = "Copy the file again, or leave the episode out"
@@ -105,6 +106,7 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
             video_library(info.where)
         listed = partial(list_by_template, info.root, connections=connections_to(config))
         tables, files = listed(TABLES[info.version]), listed(info.data_path)
+        num_bytes = sum(file.size for file in files.values())
         for key in keys:
             if info.features[key].dtype == "video":
                 files |= listed(info.video_path or "", key)
@@ -122,7 +124,8 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
         }
         self._version = index_key(parts, config.path)
         build = partial(self._built, list(tables), files.keys(), keys, progress)
-        return get_or_build(config.disk_cache, self._version, config.path, build), info
+        table = get_or_build(config.disk_cache, self._version, config.path, build)
+        return replace(table, texts={**table.texts, _DATA_BYTES: str(num_bytes)}), info
 
     def _built(self, tables: list[str], files: Set[str], keys: list[str], progress: Progress) -> EpisodeTable:
         info, config, fields = self._info, self._config, self._config.lerobot
@@ -172,12 +175,14 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
     def _frames(self, row: EpisodeRow, key: str) -> FramesByStep:
         info = self._info
         if info.features[key].dtype == "image":
-            path, where = storage.join(info.root, row.data_file(info)), f"{self._where(row)}: {key}"
-            read = cache(partial(self._parquet.images, path, key, row.index))
-            return FramesByStep(row.length, where, partial(_stored_images, read, row.length, where))
+            path = storage.join(info.root, row.data_file(info))
+            read_all = cache(partial(self._parquet.images, path, key, row.index))
+            read = partial(self._stored_frames, row, key, read_all)
+            return FramesByStep(row.length, f"{self._where(row)}: {key}", read)
         path, start_s = storage.join(info.root, row.video_file(info, key)), row.place[f"{key}.start_s"]
         clock, where = Clock(start_s=start_s, rate_hz=info.fps, source=info.where), f"{path}: {row.id}"
-        return FramesByStep(row.length, where, partial(self._video_frames, path, clock, where))
+        rates_hz = partial(self._rates_hz, path, clock, where)
+        return FramesByStep(row.length, where, partial(self._video_frames, path, clock, where), rates_hz)
 
     def _video_frames(
         self, path: str, clock: Clock, where: str, steps: Sequence[int]
@@ -185,21 +190,40 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
         """Return frames of an episode's part of a video: step k is shown at the part's start + k / fps."""
         return read_frames(self._open_file(path), steps, where=where, clock=clock)
 
+    def _rates_hz(self, path: str, clock: Clock, where: str) -> tuple[float, float]:
+        """Return the frames of a video and its steps per second."""
+        return read_header(self._open_file(path), where=where).rate_hz, clock.rate_hz
+
+    def _stored_frames(
+        self, row: EpisodeRow, key: str, read_all: Callable[[], list[bytes]], steps: Sequence[int]
+    ) -> UInt8[np.ndarray, "time height width 3"]:
+        """Return frames from an episode's PNG or JPEG images in the table.
+
+        A table can only give all images of an episode, so they are kept in the disk cache, which gives single ones. A
+        data set larger than the disk cache is not kept: each clip would write an episode and evict another.
+        """
+        where, entry = f"{self._where(row)}: {key}", f"images {self._data_version} {key} {row.id}"
+        images = self._files.parts(entry, row.length, steps)
+        if images is None:
+            all_images = read_all()
+            if len(all_images) != row.length:
+                found, needed = f"{len(all_images)} images", f"one for each of {row.length} steps"
+                raise InputError(where=where, found=found, needed=needed)
+            if int(self.infos().texts[_DATA_BYTES]) <= self._config.disk_cache.limit_gb * 1e9:
+                self._files.keep_parts(entry, all_images)
+            images = [all_images[step] for step in steps]
+        return _decoded(images, steps, where)
+
     def _where(self, row: EpisodeRow) -> str:
         return f"{storage.join(self._info.root, row.data_file(self._info))}: {row.id}"
 
 
-def _stored_images(
-    read: Callable[[], list[bytes]], num_steps: int, where: str, steps: Sequence[int]
-) -> UInt8[np.ndarray, "time height width 3"]:
-    """Return frames from an episode's PNG or JPEG images in the table, all of which are read."""
-    images = read()
-    if len(images) != num_steps:
-        raise InputError(where=where, found=f"{len(images)} images", needed=f"one for each of {num_steps} steps")
+def _decoded(images: Sequence[bytes], steps: Sequence[int], where: str) -> UInt8[np.ndarray, "time height width 3"]:
+    """Return the images of some steps as frames of one size."""
     frames: list[UInt8[np.ndarray, "height width 3"]] = []
-    for step in steps:
+    for image, step in zip(images, steps, strict=True):
         at = f"{where}: step {step}"
-        frame = decode_image(images[step], at)
+        frame = decode_image(image, at)
         require_bounded(frame.shape[0], frame.shape[1], at, count=len(steps))
         if frames and frame.shape != frames[0].shape:
             found, needed = (f"an image of {one.shape[0]}x{one.shape[1]}" for one in (frame, frames[0]))
