@@ -138,7 +138,7 @@ def test_episodes_of_one_identity_are_named_once_and_not_where_nothing_would_be_
     problem = EpisodeProblem("same", "record 1", "the same identity as record 0: same")
     for names in (["same", "other"], ["same"]):
         source = MemorySource([20] * len(names), names=names, problems=[problem] * 4)
-        with pytest.raises(InputError, match="record 1: the same identity.*3 more cannot be used either") as caught:
+        with pytest.raises(InputError, match=r"record 1: the same identity.*3 more cannot be used either") as caught:
             open_in_memory(source)
         fixes = fixes_of(caught.value)
         assert fixes.get("exclude") == ({"exclude": ("same",)} if "other" in names else None)

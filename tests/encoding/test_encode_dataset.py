@@ -305,7 +305,7 @@ def test_a_run_mends_the_cache_that_it_finds_damaged(
     sound, (cut, gone, *_) = contents(folder), latents_in(folder)
     cut.write_bytes(cut.read_bytes()[:-10])
     gone.unlink()
-    with pytest.raises(InputError, match=r"no whole latents of 2 of 8 episodes.*Run `vjepa2-ac encode`"):
+    with pytest.raises(InputError, match=r"no latents of 1 of 8 episodes.*Run `vjepa2-ac encode`"):
         train(make_config(run_dir=str(tmp_path / "x"), **knobs | {"data__cache": "require"}), reporter)
     again = make_config(run_dir=str(tmp_path / "again"), **knobs)
     reporter.notes.clear()
