@@ -4,9 +4,8 @@ import pickle
 import re
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pytest
@@ -22,6 +21,8 @@ from vjepa2_ac.data.sources.npz import NpzSource
 from vjepa2_ac.data.sources.rlds.source import RldsSource
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError
+
+T = TypeVar("T")
 
 
 def write_npz(folder: Path, episodes: int) -> NpzData:
@@ -50,30 +51,32 @@ class EveryOther(IndexedSource[DataConfig, NpzSource]):
         return self._open()[1].read(2 * index, camera, needed)
 
 
-def finish(task: Callable[[], Any]) -> Any:
-    """Return the result of a task; fail where it has none within 20 s."""
-    results: list[Any] = []
-    thread = threading.Thread(target=lambda: results.append(task()), daemon=True)
-    thread.start()
-    thread.join(20)
-    assert not thread.is_alive(), "it waits for a lock"
-    return results[0]
+def run_together(*tasks: Callable[[], T]) -> list[T]:
+    """Return the results of tasks, each run by a thread of its own; fail where one is missing after 20 s."""
+    results: list[T] = []
+    threads = [threading.Thread(target=lambda one=task: results.append(one()), daemon=True) for task in tasks]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(20)
+    assert len(results) == len(tasks), "some wait for a lock"
+    return results
 
 
 def test_a_source_that_contains_another_opens_and_is_pickled_with_its_index(tmp_path: Path) -> None:
     source = EveryOther(write_npz(tmp_path / "set", 5))
-    table = finish(source.infos)
+    [table] = run_together(source.infos)
     assert [info.id for info in table] == ["0", "2", "4"]
     assert source.read(1).read_frames([3]).max() == 2
     EveryOther.looks = 0
     copy = pickle.loads(pickle.dumps(source))  # noqa: S301 - our own bytes
-    assert [info.id for info in finish(copy.infos)] == ["0", "2", "4"]
+    assert [info.id for info in run_together(copy.infos)[0]] == ["0", "2", "4"]
     assert copy.read(2).read_frames([0]).max() == 4
     assert EveryOther.looks == 0, "the index is pickled"
 
 
 def test_many_threads_open_a_source_once_and_two_sources_at_the_same_time(tmp_path: Path) -> None:
-    config, both = write_npz(tmp_path / "set", 3), threading.Barrier(2, timeout=20)
+    config, both = write_npz(tmp_path / "set", 3), threading.Barrier(2, timeout=10)
 
     class Meets(EveryOther):
         looks = 0
@@ -83,8 +86,7 @@ def test_many_threads_open_a_source_once_and_two_sources_at_the_same_time(tmp_pa
             return super()._look(progress)
 
     sources = [Meets(config), Meets(config)]
-    with ThreadPoolExecutor(8) as pool:
-        tables = list(pool.map(lambda number: sources[number % 2].infos(), range(8)))
+    tables = run_together(*(source.infos for source in sources * 4))
     assert Meets.looks == 2
     assert len({id(table) for table in tables}) == 2
 
