@@ -1,10 +1,11 @@
-"""How far has each frame of the demonstrations come? A column for a LeRobot set, and whether to trust it.
+"""Measure the progress of each frame of the demonstrations: a column for a LeRobot set, and whether to trust it.
 
     python examples/judge/progress.py RUN progress.parquet [EVERY]
 
-1 - distance now over distance at the start, in latents, to what is seen at the end: 0 at its start, 1 at its end. A row
-for every EVERY-th frame (1) and the last, by episode_index and frame_index as LeRobot has them. Spearman's correlation
-with time on held-out episodes says how far it grows.
+Progress is 1 - distance now over distance at the start, in latents, to the last frame: 0 at the start of an episode and
+1 at its end. The table has a row for every EVERY-th frame (default 1) and the last. episode_index and frame_index are
+LeRobot's; for other forms of data, episode_index is the position in the index of the set. Spearman's correlation with
+time on held-out episodes measures how steadily progress grows.
 """
 
 import sys
@@ -29,6 +30,7 @@ def main(run: str, out: str, every: str = "1") -> None:
     model, config = trained.world_model, trained.config
     dataset = open_dataset(config.data)
     held_out = dataset.members("validation") | dataset.members("test")
+    episode_index = dataset.table.locators.get("index", np.arange(len(dataset.table)))  # LeRobot's, if it has one
     rows: list[dict[str, object]] = []
     monotony: dict[str, float] = {}
     for index in np.flatnonzero(dataset.taking_part).tolist():
@@ -42,7 +44,7 @@ def main(run: str, out: str, every: str = "1") -> None:
             far += distance(encode_frames(model, frames, config.data.crop), goal, config.planning.energy).tolist()
         progress = 1.0 - np.array(far) / max(far[0], 1e-12)
         rows += [
-            {"episode_index": index, "frame_index": step, "episode": name, "progress": one}
+            {"episode_index": int(episode_index[index]), "frame_index": step, "episode": name, "progress": one}
             for step, one in zip(steps, progress.tolist(), strict=True)
         ]
         if held_out[index] and np.ptp(progress):

@@ -292,7 +292,7 @@ def test_poses_in_the_cameras_frame_lead_to_actions_in_it() -> None:
 
 
 def test_a_camera_without_a_pose_cannot_be_the_frame() -> None:
-    dataset = open_in_memory(MemorySource([30]))
+    dataset = open_in_memory(MemorySource([30, 30]))
     dataset = replace(dataset, config=dataset.config.model_copy(update={"pose_frame": "camera"}))
     with pytest.raises(InputError, match=r"episode 0: no pose of the camera.*pose_frame: base.*data\.exclude"):
         next(loader.batches_of(dataset, [(0, 0)], batch_size=1))
@@ -349,13 +349,10 @@ def test_a_validation_of_nothing_but_broken_clips_is_refused() -> None:
         list(validation_batches(nothing, "validation", clips=1, batch_size=1))
 
 
-def test_with_every_knob_on_neither_workers_nor_resuming_change_a_bit(
-    spoiled: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_with_every_knob_on_neither_workers_nor_resuming_change_a_bit(spoiled: Callable[..., Path]) -> None:
     def spoil(features: dict[str, tuple[Any, Any]]) -> None:
         features["steps/observation/exterior_image_1_left"][1][3] = b"GIF89a"
 
-    monkeypatch.setattr("vjepa2_ac.data.selection.MOST_BROKEN", 0.2)
     config = config_of(
         spoiled(spoil), validation_share=0.0, broken_episodes="skip", camera=CAMERAS, crop="letterbox",
         idle={"rule": "motion", "shortest_kept_steps": 2, "cut_last_steps": 6},

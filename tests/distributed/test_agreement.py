@@ -61,7 +61,7 @@ def test_a_command_of_several_processes_prints_an_error_once(make_config, tmp_pa
 def test_the_share_of_broken_episodes_is_that_of_all_ranks_together(make_config, tmp_path: Path) -> None:
     config = make_config(data__broken_episodes="skip")
     for said in start_both(config, tmp_path, "each_meets_another_broken_episode", status=3):
-        assert "2 of 8 episodes are broken" in said
+        assert "4 of 8 episodes are broken" in said
 
 
 def test_a_rank_that_indexes_for_long_is_waited_for(make_config, tmp_path: Path) -> None:

@@ -251,7 +251,7 @@ def test_a_deleted_file_is_missed_when_the_cache_is_opened(bucket: Gcs, far: Cal
     name = next(name for name in storage.file_sizes(folder) if name.endswith(".safetensors"))
     storage.remove(storage.join(folder, name))
     bucket.forget()
-    with pytest.raises(InputError, match="no whole latents of 1 of 8 episodes"):
+    with pytest.raises(InputError, match="no latents of 1 of 8 episodes"):
         alone(far(), folder)
 
 
@@ -299,7 +299,7 @@ def test_a_killed_upload_leaves_nothing_that_looks_finished(
     assert child.kill() == KILLED
     bucket.forget()
     folder = f"gs://bucket/{os.path.commonpath([name for name in bucket.names('bucket') if 'caches/' in name])}"
-    with pytest.raises(InputError, match="no whole latents of 5 of 8 episodes"):
+    with pytest.raises(InputError, match="no latents of 5 of 8 episodes"):
         alone(far("three"), folder)
     found = encode_config(far("three"))
     assert sum(encoded_frames) == 5 * 24

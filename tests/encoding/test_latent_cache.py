@@ -1,5 +1,7 @@
 """The latent cache: same clips in the same order; a wrong or damaged cache is refused."""
 
+import builtins
+import io
 import os
 import shutil
 from collections.abc import Callable, Sequence
@@ -16,9 +18,9 @@ from pydantic import ValidationError
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from latent_sets import NUMBERS, as_numbers, write_cache
+from latent_sets import NUMBERS, as_numbers, latents_in, write_cache
 from memory_source import MemorySource
-from synthetic import synthetic_episode, synthetic_states
+from synthetic import synthetic_episode, synthetic_states, write_synthetic_droid
 from vector_sets import write_vectors
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
@@ -403,9 +405,60 @@ def test_damage_to_a_cache_is_handled_as_damage_to_the_data(with_a_broken_one: D
     through = LatentCache.of(opened("skip"), NUMBERS).opened()
     assert len(list(batches_of(through, [(6, 0), (7, 0)], batch_size=1))) == 1
     assert list(through.broken.reasons) == ["episode 7"]
-    path.write_bytes(path.read_bytes()[:-10])  # found when the cache is opened
-    with pytest.raises(InputError, match=r"no whole latents of 1 of 100 episodes, such as episode 7"):
+    path.unlink()  # found when the cache is opened
+    with pytest.raises(InputError, match=r"no latents of 1 of 100 episodes, such as episode 7"):
         LatentCache.of(opened("skip"), NUMBERS).opened()
+
+
+@pytest.mark.parametrize("damage", [lambda data: data[:-10], lambda data: data[:20], lambda data: bytes(len(data))])
+def test_a_damaged_file_is_named_when_it_is_first_read(
+    with_a_broken_one: Dataset, damage: Callable[[bytes], bytes]
+) -> None:
+    write_cache(with_a_broken_one)
+    cache = LatentCache.of(with_a_broken_one, NUMBERS)
+    path = Path(cache.files.path(7, "exterior_1_left"))
+    path.write_bytes(damage(path.read_bytes()))
+    through = cache.opened()
+    through.source.read(6)
+    with pytest.raises(InputError, match=r"000007-exterior_1_left\.safetensors: not a whole file of latents"):
+        through.source.read(7)
+    assert [one.episode for one in cache.missing()] == [7], "it is encoded again"
+
+
+def test_an_empty_file_is_missed_when_the_cache_is_opened(with_a_broken_one: Dataset) -> None:
+    write_cache(with_a_broken_one)
+    cache = LatentCache.of(with_a_broken_one, NUMBERS)
+    Path(cache.files.path(7, "exterior_1_left")).write_bytes(b"")
+    with pytest.raises(InputError, match=r"no latents of 1 of 100 episodes, such as episode 7"):
+        cache.opened()
+
+
+def test_opening_a_cache_opens_the_same_number_of_files_whatever_its_size(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def opened_files(episodes: int) -> list[str]:
+        folder = tmp_path / str(episodes)
+        data = write_synthetic_droid(folder / "data", episodes=episodes, steps=12, size=(16, 32), shards=1)
+        original = open_dataset(config_of(data, folder, camera=("exterior_1_left", "wrist_left"), idle=IDLE))
+        write_cache(original)
+        assert len(latents_in(folder)) == 2 * episodes
+        names, io_open = list[str](), io.open
+        counting = lambda file, *more, **named: (names.append(str(file)), io_open(file, *more, **named))[1]  # noqa: E731
+        with monkeypatch.context() as patch:
+            patch.setattr(io, "open", counting)
+            patch.setattr(builtins, "open", counting)
+            through = LatentCache.of(original, NUMBERS).opened()
+            by_itself = alone(through)
+        assert len(by_itself.episodes) == len(through.episodes) == episodes
+        latents_in(folder)[1].unlink()
+        with pytest.raises(InputError, match=rf"no latents of 1 of {episodes} episodes"):
+            alone(through)
+        assert len(alone(through, camera="exterior_1_left").episodes) == episodes, "the other camera is complete"
+        return [name for name in names if str(folder) in name]
+
+    few, many = opened_files(4), opened_files(20)
+    assert len(few) == len(many) <= 8
+    assert not [name for name in many if name.endswith(".safetensors")]
 
 
 # ---- what is refused ---------------------------------------------------------------------------------------------
@@ -429,7 +482,7 @@ def a_cache(droid_with_rests: Path, tmp_path_factory: pytest.TempPathFactory) ->
         ({"idle": IDLE | {"translation_m": 0.5}}, r"data\.idle\.translation_m: 0\.001, not 0\.5"),
         ({"idle": {}}, r"data\.idle\.rule: motion, not none"),
         ({"camera": "wrist_left"}, r"data\.camera: .*exterior_1_left.*, not .*wrist_left"),
-        ({"outcome": "all"}, r"no whole latents of \d+ of \d+ episodes.*data\.outcome"),
+        ({"outcome": "all"}, r"no latents of \d+ of \d+ episodes.*data\.outcome"),
     ],
     ids=lambda value: str(value)[:20],
 )
@@ -493,7 +546,7 @@ def test_an_unfinished_or_damaged_cache_is_refused(droid_with_rests: Path, tmp_p
     (folder / "other").rename(folder / KEPT)
     next(folder.rglob("*.safetensors")).unlink()
     for read in (lambda: alone(through), lambda: LatentCache.of(original, NUMBERS).opened()):
-        with pytest.raises(InputError, match=r"no whole latents of 1 of \d+ episodes.*vjepa2-ac encode"):
+        with pytest.raises(InputError, match=r"no latents of 1 of \d+ episodes.*vjepa2-ac encode"):
             read()
     with pytest.raises(InputError, match="no latent cache"):
         alone(through, path=str(tmp_path))

@@ -13,7 +13,6 @@ import torch
 from memory_source import MemorySource
 from vjepa2_ac.config import DataConfig, ModelSizes
 from vjepa2_ac.data import dataset
-from vjepa2_ac.data import selection as broken_episodes
 from vjepa2_ac.data.sources.latents.cache_files import CacheType, LatentFiles, unpack_latents
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.encoding.pipeline import FRAMES_AT_ONCE, EncoderOnDevice, FramesToEncode, encode_files
@@ -34,7 +33,6 @@ def colours(inputs: torch.Tensor, chunk: int) -> torch.Tensor:
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
     """Encode every step of a source."""
-    monkeypatch.setattr(broken_episodes, "MOST_BROKEN", 1.0)
 
     def encode(source: MemorySource, kind: CacheType = "fp32", workers: int = 2) -> LatentFiles:
         monkeypatch.setattr(dataset, "open_source", lambda _: source)

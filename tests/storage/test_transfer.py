@@ -195,3 +195,20 @@ def test_reading_asks_for_no_right_to_write(tmp_path: Path, monkeypatch: pytest.
     assert [system.credentials.access for system in remote._filesystems.values()] == ["read_only"]
     storage.upload(source_of(tmp_path, SMALL), PLACE)
     assert [system.credentials.access for system in remote._filesystems.values()] == ["read_only", "read_write"]
+
+
+def test_a_file_that_vanishes_while_a_folder_is_listed_is_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("kept", "temporary"):
+        (tmp_path / name).write_bytes(b"1")
+    is_file = Path.is_file
+
+    def vanishes(path: Path) -> bool:
+        was_there = is_file(path)
+        if path.name == "temporary":
+            path.unlink()
+        return was_there
+
+    monkeypatch.setattr(Path, "is_file", vanishes)
+    assert storage.file_sizes(str(tmp_path)) == {"kept": 1}

@@ -7,7 +7,7 @@ import sys
 from unittest import mock
 
 from vjepa2_ac.cli import main
-from vjepa2_ac.data import loader, selection
+from vjepa2_ac.data import loader
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation import evaluate_run
 from vjepa2_ac.training import validation
@@ -30,6 +30,5 @@ if __name__ == "__main__":
         mock.patch.object(evaluate_run, "validation_windows", chosen),
         mock.patch.object(validation, "validation_windows", chosen),
         mock.patch.object(loader, "read_clip", some_read),
-        mock.patch.object(selection, "MOST_BROKEN", 0.9),
     ):
         sys.exit(main(sys.argv[1:]))

@@ -112,7 +112,6 @@ def test_a_checkpoint_knows_nothing_of_the_clips_of_the_next_step(make_config, r
             raise InputError(where="here", found="damaged")
         return read(dataset, wish)
 
-    monkeypatch.setattr("vjepa2_ac.data.selection.MOST_BROKEN", 0.2)
     monkeypatch.setattr(loader, "read_clip", read_some)
     request.getfixturevalue("on_device")
     train(config, reporter)

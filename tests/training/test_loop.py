@@ -246,7 +246,6 @@ def test_a_resumed_run_still_counts_the_broken_episodes_that_it_met(make_config,
             raise InputError(where="here", found="damaged")
         return read(dataset, wish)
 
-    monkeypatch.setattr("vjepa2_ac.data.selection.MOST_BROKEN", 0.2)
     monkeypatch.setattr(loader, "read_clip", read_some)
     train(config, reporter)
     monkeypatch.setattr(loader, "read_clip", read)

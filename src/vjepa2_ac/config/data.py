@@ -172,8 +172,9 @@ class DataConfig(Section):
     short_episodes: Annotated[Literal["skip", "error"], Affects.RUN] = "skip"
     """What to do with episodes shorter than a clip: skip them and report how many, or stop."""
     broken_episodes: Annotated[Literal["error", "skip"], Affects.NOTHING] = "error"
-    """What to do with an episode that cannot be read: stop and name it, or leave its clips out, name and count it, and
-    stop when more than 1 % of the episodes are broken."""
+    """What to do with an episode that cannot be read. error: stop and name it. skip: leave its clips out, name and
+    count it. The run stops where more are broken than 3 episodes or 1 %, whichever is larger; or, of fewer than 6
+    episodes, more than half."""
     exclude: Annotated[tuple[str, ...], Affects.NOTHING] = ()
     """Identities of episodes to leave out, as errors name them."""
     pose_frame: Annotated[Literal["base", "camera"], Affects.INDEX | Affects.CLIPS] = "base"

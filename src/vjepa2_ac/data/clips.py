@@ -12,7 +12,7 @@ from torch import Tensor
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import Dataset, require_widths
-from vjepa2_ac.data.selection import with_way_out
+from vjepa2_ac.data.selection import with_exclusion
 from vjepa2_ac.data.sources.indexed_source import measured_space
 from vjepa2_ac.data.transforms import view
 from vjepa2_ac.episode import Augmentation, Batch, Clip, StoredLatents, Widths
@@ -122,7 +122,7 @@ def collate(clips: Sequence[Clip]) -> Batch:
         (size, first), (another, name) = sizes[0], other
         found = f"frames of {another} after the crop; those of episode {first} are {size}"
         fix = "Train on episodes of one size, or set training.batch_size: 1"
-        raise with_way_out(InputError(where=f"episode {name}", found=found, fix=fix), [name], skippable=False)
+        raise with_exclusion(InputError(where=f"episode {name}", found=found, fix=fix), [name])
     latents = [clip.latents for clip in clips if clip.latents is not None]
     extrinsics = [clip.extrinsics for clip in clips if clip.extrinsics is not None]
     return Batch(

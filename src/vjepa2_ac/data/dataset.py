@@ -22,7 +22,6 @@ from vjepa2_ac.data.selection import (
     included,
     of_outcome,
     require_distinct,
-    with_way_out,
 )
 from vjepa2_ac.data.sources.indexed_source import open_source, spaces_of
 from vjepa2_ac.data.windows import Windows, clip_starts, in_split, windows_of
@@ -190,7 +189,7 @@ class Dataset:
         """
         name = self.table.identity(episode)
         if self.config.broken_episodes == "error":
-            raise with_way_out(error, [name]) from None
+            raise self.broken.refusal(error, [name]) from None
         self.broken.met(name, str(error))
 
     def needed_steps(self, episode: int) -> StepRanges | None:
@@ -211,11 +210,11 @@ def open_dataset(config: DataConfig, *, progress: Progress | None = None) -> Dat
     """
     source: Any = open_source(config)
     table = EpisodeTable.of(source.infos(progress))
-    broken = BrokenEpisodes(config, len(table) + len(table.problems))
     chosen = included(table, config)
     require_distinct(table, chosen, config)
-    broken.found([problem for problem in table.problems if problem.name not in config.exclude])
     chosen &= of_outcome(table, config)
+    broken = BrokenEpisodes(config, len(table) + len(table.problems), table.id_hash[chosen])
+    broken.found([problem for problem in table.problems if problem.name not in config.exclude])
     kept = StepSelection.whole(table, chosen)
     if config.idle.rule != "none":
         found = source.kept_ranges() if config.is_cache else find_ranges(source, table, config, progress)

@@ -110,9 +110,16 @@ class EpisodeTable(Sequence[EpisodeInfo]):
         state_hashes: Sequence[int] | None = None,
         labels: Mapping[str, Labels] | None = None,
     ) -> EpisodeTable:
-        """Make a table; a given table is returned unchanged."""
+        """Make a table; a given table is returned unchanged.
+
+        Raises:
+            InputError: An identity contains a NUL character.
+        """
         if isinstance(infos, EpisodeTable):
             return infos
+        for info in infos:
+            if "\0" in info.id:
+                raise nul_error(info.id, f"episode {info.id!r}")
         ids = np.array([info.id.encode() for info in infos] or [b""])[: len(infos)]
         return cls(
             num_steps=np.array([info.num_steps for info in infos], np.int32),
@@ -188,6 +195,12 @@ class EpisodeTable(Sequence[EpisodeInfo]):
         if len({len(column) for column in (*columns.values(), *locators.values())}) != 1:
             raise NotATableError("columns of several lengths")
         return table
+
+
+def nul_error(identity: str, where: str) -> InputError:
+    """Return the error of an identity with a NUL character; arrays of type S lose it at the end of a text."""
+    found, fix = f"a NUL character in the identity {identity!r}", "Remove it where the data set stores the identity"
+    return InputError(where=where, found=found, needed="text without NUL characters", fix=fix)
 
 
 def identity_hash(identity: str) -> int:

@@ -28,7 +28,7 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.clips import ClipRequest, collate, no_clips, read_clip
 from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.data.selection import BrokenEpisodes, named, with_way_out
+from vjepa2_ac.data.selection import BrokenEpisodes, named
 from vjepa2_ac.data.streams import ToDevice
 from vjepa2_ac.data.transforms import draw
 from vjepa2_ac.data.windows import ClipOrder, drawn, far_neighbours, spread
@@ -210,7 +210,7 @@ class _Clips(TorchDataset[Batch]):
         except InputError as error:
             name = self.dataset.table.identity(request.episode)
             if self.dataset.config.broken_episodes == "error":
-                raise with_way_out(error, [name]) from None
+                raise self.dataset.broken.refusal(error, [name]) from None
             return Skipped(name, str(error))
 
 

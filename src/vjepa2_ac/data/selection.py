@@ -20,7 +20,8 @@ from vjepa2_ac.storage.npz_reader import arrays_as_bytes, read_arrays
 logger = logging.getLogger(__name__)
 
 NAMED = 10  # episodes in one message, at most
-MOST_BROKEN = 0.01  # share of the episodes
+_FEW = 3  # broken episodes that are allowed in a set of any size
+_SHARE = 0.01  # of the episodes
 
 # For DROID, whose identities contain .../LAB/success|failure/DATE/..., and for any data in folders.
 IN_IDENTITY = {
@@ -137,8 +138,17 @@ def require_distinct(table: EpisodeTable, taking_part: Bool[np.ndarray, " episod
         if name in places:
             found, fix = f"episodes {places[name]} and {place} have the same identity: {name}", config.same_identity_fix
             error = InputError(where=f"data.path: {config.path}", found=found, fix=fix)
-            raise with_way_out(error, [name], skippable=False)
+            raise with_exclusion(error, [name]) if hashes.size > 1 else error
         places[name] = place
+
+
+def most_broken(episodes: int) -> int:
+    """Return how many broken episodes of a data set `data.broken_episodes: skip` leaves out before it stops.
+
+    3 or 1 %, whichever is larger, but of fewer than 6 episodes at most half: where most episodes cannot be read, a
+    setting is wrong rather than the recordings.
+    """
+    return max(min(_FEW, episodes // 2), int(_SHARE * episodes))
 
 
 class BrokenEpisodes:
@@ -146,10 +156,15 @@ class BrokenEpisodes:
 
     It is in the process that opened the data set; loader workers report to it. `data.broken_episodes` is the policy:
     stop at the first, or skip and count them, and stop where too many are broken.
+
+    Args:
+        config: The data.
+        episodes: How many there are, broken ones included.
+        usable: The hashes of the identities of the episodes that clips may come from; None: not known.
     """
 
-    def __init__(self, config: DataConfig, episodes: int) -> None:
-        self._config, self._episodes = config, episodes
+    def __init__(self, config: DataConfig, episodes: int, usable: UInt64[np.ndarray, " usable"] | None = None) -> None:
+        self._config, self._episodes, self._usable = config, episodes, usable
         self._reasons: dict[str, str] = {}
 
     def __len__(self) -> int:
@@ -170,7 +185,9 @@ class BrokenEpisodes:
             return
         names = [problem.name for problem in problems]
         if self._config.broken_episodes == "error":
-            raise with_way_out(as_error(problems[0]), names)
+            first, more = problems[0], len(problems) - 1
+            others = f"{more} more cannot be used either. " if more else ""
+            raise self.refusal(as_error(replace(first, fix=others + first.fix)), names)
         logger.warning(
             "%s: %d of %d episodes are broken and left out: %s; the first: %s",
             self._config.path, len(problems), self._episodes, named(names), as_error(problems[0]),
@@ -196,16 +213,29 @@ class BrokenEpisodes:
         """
         self._add({name: why for name, why in reasons.items() if name not in self._config.exclude})
 
+    def refusal(self, error: InputError, names: Sequence[str]) -> InputError:
+        """Return an error of broken episodes with those ways to leave them out that would work.
+
+        Args:
+            error: The error of one of them, or of all.
+            names: The identities of all that are known to be broken.
+        """
+        names = list(dict.fromkeys(names))
+        hashes = np.array([identity_hash(name) for name in names], np.uint64)
+        if self._usable is not None and np.isin(self._usable, hashes).all():  # nothing would be left
+            return error
+        is_few = len(names) <= most_broken(self._episodes)
+        return with_exclusion(error, names, is_skippable=is_few and self._config.broken_episodes == "error")
+
     def _add(self, reasons: Mapping[str, str]) -> None:
         self._reasons |= {name: why for name, why in reasons.items() if name not in self._reasons}
-        if len(self) <= MOST_BROKEN * self._episodes:
+        if len(self) <= (most := most_broken(self._episodes)):
             return
         name, reason = next(iter(self._reasons.items()))
-        found = f"{len(self)} of {self._episodes} episodes are broken: {named(tuple(self._reasons))}."
-        found += f" The first, {name}: {reason.rstrip('.')}"
-        needed = f"{MOST_BROKEN:.0%} at most: data.broken_episodes is skip"
-        fix = "Repair or fetch them again, or add them to data.exclude"
-        raise InputError(where=f"data.path: {self._config.path}", found=found, needed=needed, fix=fix)
+        found = f"{len(self)} of {self._episodes} episodes are broken. The first, {name}: {reason.rstrip('.')}"
+        needed, fix = f"{most} at most: data.broken_episodes is skip", "Repair or fetch them again"
+        error = InputError(where=f"data.path: {self._config.path}", found=found, needed=needed, fix=fix)
+        raise self.refusal(error, tuple(self._reasons))
 
 
 def as_error(problem: EpisodeProblem) -> InputError:
@@ -218,20 +248,19 @@ def as_problem(error: InputError, name: str) -> EpisodeProblem:
     return EpisodeProblem(name=name, where=error.where, found=error.found, needed=error.needed, fix=error.fix)
 
 
-def with_way_out(error: InputError, names: Sequence[str], *, skippable: bool = True) -> InputError:
-    """Return an error of one or more episodes with the way to exclude them: ten of them, and the number of the rest.
+def with_exclusion(error: InputError, names: Sequence[str], *, is_skippable: bool = False) -> InputError:
+    """Return an error of one or more episodes whose fix says how to leave them out.
 
     Args:
-        error: What is wrong with the first of them.
-        names: Their identities.
-        skippable: Whether `data.broken_episodes: skip` would skip them.
+        error: What is wrong with them.
+        names: Their identities, all different; the fix lists ten at most, and the number of all.
+        is_skippable: Whether `data.broken_episodes: skip` would leave them out.
     """
-    others = f"{len(names) - 1} more cannot be used either. " if len(names) > 1 else ""
     fix = f"{error.fix.rstrip('.')}. " if error.fix else ""
-    listed = json.dumps(list(names[:NAMED]), ensure_ascii=False)
+    listed = json.dumps(names[:NAMED], ensure_ascii=False)
     of_all = f" (the first {NAMED} of {len(names)})" if len(names) > NAMED else ""
-    skip = "set data.broken_episodes: skip, or " if skippable else ""
-    fix = f"{others}{fix}To go on without, {skip}add{of_all} to data.exclude: {listed}"
+    skip = "set data.broken_episodes: skip, or " if is_skippable else ""
+    fix = f"{fix}To leave {'it' if len(names) == 1 else 'them'} out, {skip}add{of_all} to data.exclude: {listed}"
     return InputError(where=error.where, found=error.found, needed=error.needed, fix=fix)
 
 

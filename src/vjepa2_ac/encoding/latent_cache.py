@@ -81,12 +81,15 @@ class LatentCache:
         return tuple(needed_frames(self.dataset))
 
     def missing(self, *, retry: bool = False) -> list[FramesToEncode]:
-        """Return what is not there; with `retry`, also what could not be read, or is damaged behind a URL."""
+        """Return what is not there; with `retry`, also what could not be read, or is damaged behind a URL.
+
+        The header of each local file is read, so that a damaged one counts as missing and is encoded again.
+        """
         if not self.is_begun:
             return list(self.wanted)
         files = self.files
         is_there = files.has if retry else files.is_done
-        connections = self.dataset.config.connections if storage.is_url(self.folder) else 1
+        connections = self.dataset.config.connections
         there = in_parallel(lambda one: is_there(one.episode, one.camera), self.wanted, connections)
         return [one for one, is_whole in zip(self.wanted, there, strict=True) if not is_whole]
 

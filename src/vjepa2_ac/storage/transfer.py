@@ -117,8 +117,12 @@ def file_sizes(folder: str) -> dict[str, int]:
     """
     if not is_url(folder):
         with _explained(folder):
-            files = [path for path in Path(folder).rglob("*") if path.is_file()]
-            return {path.relative_to(folder).as_posix(): path.stat().st_size for path in files}
+            sizes = dict[str, int]()
+            for path in Path(folder).rglob("*"):
+                with suppress(FileNotFoundError):  # a temporary file that was renamed meanwhile
+                    if path.is_file():
+                        sizes[path.relative_to(folder).as_posix()] = path.stat().st_size
+            return sizes
     return {name: file.size for name, file in files_below(folder).items()}
 
 

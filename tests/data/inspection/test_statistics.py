@@ -87,8 +87,8 @@ def test_an_episode_of_the_sample_that_cannot_be_read_is_counted_and_named(caplo
     assert len(inspect_dataset(dataset).sample) == 99
     assert list(dataset.broken.reasons) == ["episode 7"]
     assert "memory: episode 7: damaged" in caplog.text
-    with pytest.raises(InputError, match="2 of 100 episodes are broken"):
-        inspect_dataset(hundred(frozenset({7, 8}), "skip"))
+    with pytest.raises(InputError, match="4 of 100 episodes are broken"):
+        inspect_dataset(hundred(frozenset({7, 8, 9, 10}), "skip"))
     with pytest.raises(InputError, match=r"memory: episode 7: damaged\..*add to data\.exclude: \[\"episode 7\"\]"):
         inspect_dataset(hundred(frozenset({7}), "error"))
 

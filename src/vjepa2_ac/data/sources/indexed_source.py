@@ -16,7 +16,7 @@ from jaxtyping import UInt8
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.files import EpisodeFiles, connections_to, in_parallel
-from vjepa2_ac.data.index import UNKNOWN, EpisodeProblem, EpisodeTable, labels_of
+from vjepa2_ac.data.index import UNKNOWN, EpisodeProblem, EpisodeTable, labels_of, nul_error
 from vjepa2_ac.data.selection import as_error, as_problem
 from vjepa2_ac.episode import EpisodeInfo, EpisodeSource, Progress, Widths, no_progress
 from vjepa2_ac.errors import InputError
@@ -78,6 +78,8 @@ def table_of(found: Iterable[Found], config: DataConfig, total: int, progress: P
     for done, one in enumerate(found, start=1):
         if isinstance(one, EpisodeProblem):
             problems.append(one)
+        elif "\0" in one.info.id:
+            problems.append(as_problem(nul_error(one.info.id, one.where), one.info.id))
         elif (first := usable.setdefault(one.info.id, one)) is one:
             kinds[one.kind] = kinds.get(one.kind, 0) + 1
         else:
@@ -116,10 +118,9 @@ class IndexedSource(ABC, Generic[Config, More]):
     to read an episode.
     """
 
-    _opening = threading.Lock()  # one source after the other
-
     def __init__(self, config: Config) -> None:
         self._config = config
+        self._opening = threading.Lock()  # of this source only: `_look` may open another source
         self._known: tuple[EpisodeTable, More] | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -166,6 +166,21 @@ class LatentFiles:
         found = self._found(_name(number, camera))
         return 0 if found is None else found.size
 
+    def lacking(self, numbers: Sequence[int], cameras: Sequence[str]) -> list[int]:
+        """Return those episodes of which a camera has neither a file nor a note why it cannot have one.
+
+        That is known from one listing, and no file is opened: a damaged file is named when it is first read.
+
+        Raises:
+            UnreachableError: The folder cannot be listed now.
+        """
+        sizes = self._sizes()
+
+        def is_done(number: int, camera: str) -> bool:
+            return sizes.get(_name(number, camera), 0) > 0 or _name(number, camera, _BROKEN) in sizes
+
+        return [number for number in numbers if not all(is_done(number, camera) for camera in cameras)]
+
     def is_done(self, number: int, camera: str) -> bool:
         """Return whether a file is there, or in its place the reason why it cannot be; of a URL as it is listed."""
         is_there = self.size(number, camera) > 0 if storage.is_url(self.folder) else self.has(number, camera)
@@ -220,13 +235,16 @@ class LatentFiles:
     @property
     def broken(self) -> dict[int, str]:
         """The episodes that could not be read, by their index, and why."""
-        if storage.is_url(self.folder):
-            notes = sorted(name for name in self._listed if name.endswith(_BROKEN))
-        else:
-            found = Path(self.folder).glob(f"episodes/*/*{_BROKEN}")
-            notes = sorted(str(one.relative_to(self.folder)) for one in found)
-        broken = [note for note in notes if self._found(note.removesuffix(_BROKEN) + _WHOLE) is None]  # else mended
+        sizes = self._sizes()
+        notes = sorted(name for name in sizes if name.endswith(_BROKEN))
+        broken = [note for note in notes if note.removesuffix(_BROKEN) + _WHOLE not in sizes]  # else mended
         return {int(note.rpartition("/")[2].partition("-")[0]): self._reason(note) for note in broken}
+
+    def _sizes(self) -> Mapping[str, int]:
+        """Return the size in bytes of every file, by its name in the folder; of a local folder as they are now."""
+        if storage.is_url(self.folder):
+            return {name: file.size for name, file in self._listed.items()}
+        return storage.file_sizes(str(self.folder))
 
     @cached_property
     def _listed(self) -> Mapping[str, storage.FileInfo]:

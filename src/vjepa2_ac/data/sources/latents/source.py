@@ -78,17 +78,16 @@ class LatentSource(IndexedSource[DataConfig, _Cache]):
         """Return the config with the names of the cameras.
 
         Raises:
-            InputError: Some of these episodes have no files, or here no whole ones: the cache is unfinished, damaged,
-                or was made of others.
+            InputError: Some of these episodes have no files: the cache is unfinished, or was made of others.
+            UnreachableError: The folder cannot be listed now.
         """
         table, opened = self._open()
         wanted = np.unique(episodes).tolist()
-        lacking = [one for one in wanted if not all(opened.files.is_done(one, camera) for camera in self.cameras)]
-        if lacking:
+        if lacking := opened.files.lacking(wanted, self.cameras):
             such = f"{len(lacking)} of {len(wanted)} episodes, such as {table.identity(lacking[0])}"
             fix = "Run `vjepa2-ac encode` again, as the cache was made: it encodes what is missing; or leave these"
             fix += " episodes out (data.outcome, data.exclude)"
-            raise InputError(where=self._config.path, found=f"no whole latents of {such}", fix=fix)
+            raise InputError(where=self._config.path, found=f"no latents of {such}", fix=fix)
         return self._config.model_copy(update={"camera": self.cameras})
 
     def _look(self, progress: Progress) -> tuple[EpisodeTable, _Cache]:  # noqa: ARG002 - at once

@@ -1,0 +1,129 @@
+"""What all sources have in common: they are opened once, may contain one another, and refuse unusable identities."""
+
+import pickle
+import re
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import pytest
+
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config.loading import parse_config
+from vjepa2_ac.config.sources import NpzData
+from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.data.index import EpisodeTable
+from vjepa2_ac.data.selection import as_error
+from vjepa2_ac.data.sources.indexed_source import IndexedSource, Scanned, table_of
+from vjepa2_ac.data.sources.npz import NpzSource
+from vjepa2_ac.data.sources.rlds.source import RldsSource
+from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
+from vjepa2_ac.errors import InputError
+
+T = TypeVar("T")
+
+
+def write_npz(folder: Path, episodes: int) -> NpzData:
+    folder.mkdir()
+    for number in range(episodes):
+        states = np.tile(np.arange(30)[:, None] * 0.01 + number * 0.001, 7)
+        frames = np.full((30, 8, 8, 3), number, np.uint8)
+        np.savez(folder / f"{number}.npz", states=states, frames=frames, fps_hz=4.0)
+    return NpzData(path=str(folder), disk_cache={"dir": str(folder / "cache")})
+
+
+# ---- opening ----
+
+
+class EveryOther(IndexedSource[DataConfig, NpzSource]):
+    """Every other episode of another source."""
+
+    looks = 0
+
+    def _look(self, progress: Progress) -> tuple[EpisodeTable, NpzSource]:
+        type(self).looks += 1
+        inner = NpzSource(self._config)
+        return EpisodeTable.of(list(inner.infos(progress))[::2]), inner
+
+    def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:
+        return self._open()[1].read(2 * index, camera, needed)
+
+
+def run_together(*tasks: Callable[[], T]) -> list[T]:
+    """Return the results of tasks, each run by a thread of its own; fail where one is missing after 20 s."""
+    results: list[T] = []
+    threads = [threading.Thread(target=lambda one=task: results.append(one()), daemon=True) for task in tasks]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(20)
+    assert len(results) == len(tasks), "some wait for a lock"
+    return results
+
+
+def test_a_source_that_contains_another_opens_and_is_pickled_with_its_index(tmp_path: Path) -> None:
+    source = EveryOther(write_npz(tmp_path / "set", 5))
+    [table] = run_together(source.infos)
+    assert [info.id for info in table] == ["0", "2", "4"]
+    assert source.read(1).read_frames([3]).max() == 2
+    EveryOther.looks = 0
+    copy = pickle.loads(pickle.dumps(source))  # noqa: S301 - our own bytes
+    assert [info.id for info in run_together(copy.infos)[0]] == ["0", "2", "4"]
+    assert copy.read(2).read_frames([0]).max() == 4
+    assert EveryOther.looks == 0, "the index is pickled"
+
+
+def test_many_threads_open_a_source_once_and_two_sources_at_the_same_time(tmp_path: Path) -> None:
+    config, both = write_npz(tmp_path / "set", 3), threading.Barrier(2, timeout=10)
+
+    class Meets(EveryOther):
+        looks = 0
+
+        def _look(self, progress: Progress) -> tuple[EpisodeTable, NpzSource]:
+            both.wait()  # for the other source
+            return super()._look(progress)
+
+    sources = [Meets(config), Meets(config)]
+    tables = run_together(*(source.infos for source in sources * 4))
+    assert Meets.looks == 2
+    assert len({id(table) for table in tables}) == 2
+
+
+# ---- identities ----
+
+
+def error_of_problem(table: EpisodeTable) -> str:
+    [problem] = table.problems
+    return str(as_error(problem))
+
+
+@pytest.mark.parametrize("identity", ["a\0", "\0", "a\0b"])
+def test_an_identity_with_a_nul_is_a_problem_of_that_episode(identity: str, tmp_path: Path) -> None:
+    found = [Scanned(EpisodeInfo(name, 30), f"file {name!r}") for name in ("a", identity, "é")]
+    table = table_of(found, DataConfig(path=str(tmp_path)), 3)
+    assert [info.id for info in table] == ["a", "é"]
+    [problem] = table.problems
+    assert problem.name == identity
+    assert re.search(r"^file .*: a NUL character in the identity '.*\\x00", str(as_error(problem)))
+    assert EpisodeTable.from_bytes(table.to_bytes()).problems == table.problems
+    with pytest.raises(InputError, match=r"episode .*: a NUL character in the identity"):
+        EpisodeTable.of([EpisodeInfo("a", 30), EpisodeInfo(identity, 30)])
+
+
+def test_a_record_with_a_nul_in_its_identity_is_refused_and_can_be_left_out(spoiled: Callable[..., Path]) -> None:
+    def spoil(features: dict[str, Any]) -> None:
+        features["episode_metadata/file_path"][1][0] += b"\0"
+
+    path = str(spoiled(spoil))
+    table = RldsSource(DataConfig(path=path)).infos()
+    assert len(table) == 5
+    assert "record 0" in error_of_problem(table)
+    with pytest.raises(InputError, match=r"a NUL character in the identity .*data\.exclude: (\[.*\])") as caught:
+        open_dataset(DataConfig(path=path))
+    exclude = re.search(r"data\.exclude: (\[.*\])", caught.value.fix)
+    assert exclude is not None
+    values = {"run_dir": "none", "data": {"path": path}, "model": {"base": "builtin:sim-tiny"}}
+    config = parse_config(values, [f"data.exclude={exclude[1]}"], where="the config")
+    assert len(open_dataset(config.data).table) == 5

@@ -1,0 +1,147 @@
+"""The policy for broken episodes: how many may be skipped, and every fix that an error names works."""
+
+import json
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from clips import open_in_memory
+from memory_source import MemorySource
+from vjepa2_ac.config.sources import NpzData
+from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.index import EpisodeProblem
+from vjepa2_ac.data.loader import batches_of
+from vjepa2_ac.data.selection import most_broken
+from vjepa2_ac.errors import InputError
+
+Use = Callable[..., Dataset]  # opens a data set with some config values, and reads it
+
+
+@pytest.mark.parametrize(
+    ("episodes", "allowed"),
+    [(0, 0), (1, 0), (2, 1), (3, 1), (4, 2), (5, 2), (6, 3), (20, 3), (100, 3), (399, 3), (400, 4), (95_658, 956)],
+)
+def test_three_episodes_or_one_percent_may_be_broken_but_never_most_of_a_small_set(episodes: int, allowed: int) -> None:
+    assert most_broken(episodes) == allowed
+
+
+# ---- every fix that an error names works ----
+
+
+def broken_in_the_index(episodes: int, broken: int, _folder: Path) -> Use:
+    problems = [EpisodeProblem(f"bad {number}", f"record {number}", "all zeros") for number in range(broken)]
+    return lambda **values: open_in_memory(MemorySource([20] * (episodes - broken), problems=problems), **values)
+
+
+def broken_in_the_idle_pass(episodes: int, broken: int, folder: Path) -> Use:
+    knobs = {"idle": {"rule": "motion"}, "disk_cache": {"dir": str(folder)}}
+    source = MemorySource([60] * episodes, unreadable=frozenset(range(episodes - broken, episodes)))
+    return lambda **values: open_in_memory(source, **knobs, **values)
+
+
+def broken_in_a_clip(episodes: int, broken: int, _folder: Path) -> Use:
+    source = MemorySource([6] * episodes, pictureless=frozenset(range(broken)))
+
+    def use(**values: Any) -> Dataset:
+        dataset = open_in_memory(source, **values)
+        windows = dataset.windows("train")
+        list(batches_of(dataset, [windows[index] for index in range(len(windows))], batch_size=2))
+        return dataset
+
+    return use
+
+
+def of_one_identity(episodes: int, broken: int, _folder: Path) -> Use:
+    names = ["same"] * (broken + 1) + [f"episode {number}" for number in range(episodes - broken - 1)]
+    return lambda **values: open_in_memory(MemorySource([20] * episodes, names=names), **values)
+
+
+def broken_files(episodes: int, broken: int, folder: Path) -> Use:
+    steps = np.arange(30)[:, None]
+    for number in range(episodes):
+        states = np.tile((steps * 0.01 + number * 0.001) % 1, 7)
+        states[5] = np.nan if number < broken else states[5]
+        frames = np.zeros((30, 8, 8, 3), np.uint8)
+        np.savez(folder / f"{number:03d}.npz", states=states, frames=frames, fps_hz=4.0)
+    shares = {"validation_share": 0.0, "test_share": 0.0, "disk_cache": {"dir": str(folder / "cache")}}
+    return lambda **values: open_dataset(NpzData(path=str(folder), **shares, **values))
+
+
+def fixes_of(error: InputError) -> dict[str, Mapping[str, Any]]:
+    """Return the config values that a fix names, by the name of the option."""
+    fixes: dict[str, Mapping[str, Any]] = {}
+    if "data.broken_episodes: skip" in error.fix:
+        fixes["skip"] = {"broken_episodes": "skip"}
+    if listed := re.search(r"to data\.exclude: (\[.*\])", error.fix):
+        fixes["exclude"] = {"exclude": tuple(json.loads(listed[1]))}
+    return fixes
+
+
+def follow_exclusions(use: Use, **values: Any) -> None:
+    """Exclude what each error names until there is none; fail where one names no new episode."""
+    excluded: tuple[str, ...] = ()
+    while True:
+        try:
+            use(exclude=excluded, **values)
+        except InputError as error:
+            more = fixes_of(error)["exclude"]["exclude"]
+            assert not set(more) & set(excluded)
+            excluded += more
+        else:
+            return
+
+
+SIZES = [(1, 1), (2, 1), (2, 2), (3, 1), (3, 2), (4, 2), (4, 3), (6, 3), (6, 4), (20, 1), (20, 12), (100, 4), (400, 4)]
+CASES = [
+    (make, episodes, broken)
+    for make in (broken_in_the_index, broken_in_the_idle_pass, broken_in_a_clip, of_one_identity, broken_files)
+    for episodes, broken in (SIZES if make is not broken_files else SIZES[:-2])
+    if make is not of_one_identity or broken < episodes
+]
+
+
+@pytest.mark.parametrize(("make", "episodes", "broken"), CASES)
+def test_every_fix_that_an_error_of_broken_episodes_names_works(
+    make: Callable[..., Use], episodes: int, broken: int, tmp_path: Path
+) -> None:
+    use = make(episodes, broken, tmp_path)
+    with pytest.raises(InputError) as caught:
+        use()
+    fixes = fixes_of(caught.value)
+    known = 1 if make is broken_in_a_clip else broken  # when the error is raised
+    is_few = known <= most_broken(episodes) and make is not of_one_identity
+    is_rest = known < (episodes - 1 if make is of_one_identity else episodes)
+    assert list(fixes) == ["skip"] * is_few + ["exclude"] * is_rest
+    if "exclude" in fixes and broken < episodes:
+        follow_exclusions(use)
+    if broken <= most_broken(episodes) and "skip" in fixes:
+        assert len(use(**fixes["skip"]).broken) == broken
+    elif make is not of_one_identity and broken < episodes:
+        with pytest.raises(InputError, match=rf"of {episodes} episodes are broken.* at most") as caught:
+            use(broken_episodes="skip")
+        assert list(fixes_of(caught.value)) == ["exclude"]
+        follow_exclusions(use, broken_episodes="skip")
+
+
+def test_a_set_without_broken_episodes_is_the_same_with_either_policy(tmp_path: Path) -> None:
+    use = broken_files(3, 0, tmp_path)
+    for policy in ("error", "skip"):
+        dataset = use(broken_episodes=policy)
+        assert (len(dataset.episodes), len(dataset.broken)) == (3, 0)
+
+
+def test_episodes_of_one_identity_are_named_once_and_not_where_nothing_would_be_left() -> None:
+    problem = EpisodeProblem("same", "record 1", "the same identity as record 0: same")
+    for names in (["same", "other"], ["same"]):
+        source = MemorySource([20] * len(names), names=names, problems=[problem] * 4)
+        with pytest.raises(InputError, match=r"record 1: the same identity.*3 more cannot be used either") as caught:
+            open_in_memory(source)
+        fixes = fixes_of(caught.value)
+        assert fixes.get("exclude") == ({"exclude": ("same",)} if "other" in names else None)
+        assert ("skip" in fixes) == ("other" in names)
+        for values in fixes.values():
+            open_in_memory(source, **values)
