@@ -191,12 +191,18 @@ def _set(values: dict[str, Any], keys: list[str], value: Any, override: str) -> 
     values[keys[-1]] = value
 
 
+_KEYS_OF_A_RUN = {"split_by", "check_crc", "prefetch", "start_every"}
 _OLDER_GRIPPERS = {"closedness": {}, "openness": {"gripper_open": 1.0, "gripper_closed": 0.0}}
 
 
 def _replace_older_keys(values: dict[str, Any]) -> None:
-    """Replace `data.fields.gripper`, which configs of older runs have, by `gripper_open` and `gripper_closed`."""
+    """Replace `data.fields.gripper`, which configs of older runs have, by `gripper_open` and `gripper_closed`.
+
+    The config of a run has every key. One without `data.splits` is of an older run, whose splits were all drawn.
+    """
     for section, inner in values.items():
+        if section == "data" and isinstance(inner, dict) and inner.keys() >= _KEYS_OF_A_RUN:
+            inner.setdefault("splits", "hash")
         if section == "fields" and isinstance(inner, dict) and inner.get("gripper") in _OLDER_GRIPPERS:
             inner.update(_OLDER_GRIPPERS[inner.pop("gripper")])
         elif isinstance(inner, dict):
