@@ -33,7 +33,7 @@ ORDERS: dict[str, list[str]] = {
     "data": [
         "poses streams",
         "index",
-        "selection files transforms",
+        "selection files splits transforms",
         "idle windows",
         "sources",
         "dataset",
