@@ -89,6 +89,7 @@ def parse_config(values: Mapping[str, Any], overrides: Iterable[str] = (), *, wh
         if not separator or not key:
             raise InputError(where="overrides", found=f"{override!r}", needed="key=value, such as training.steps=100")
         _set(given, key.split("."), parse_yaml(text, where=f"override {key}"), override)
+    _keep_drawn_splits(given)
     _replace_older_keys(given)
     try:
         return Config.model_validate_json(_as_json(with_plugins(given, where=where, here=here), where))
@@ -175,6 +176,17 @@ def _as_json(values: Mapping[str, Any], where: str) -> str:
         raise InputError(where=where, found=f"a value that a config cannot hold ({error})") from None
 
 
+_KEYS_OF_A_RUN = {"split_by", "check_crc", "prefetch", "start_every"}  # some of all
+
+
+def _keep_drawn_splits(values: Mapping[str, Any]) -> None:
+    """Let an older run keep its splits: its config has every key of the time, and no `data.splits`."""
+    replay = values.get("replay")
+    for data in (values.get("data"), replay.get("data") if isinstance(replay, dict) else None):
+        if isinstance(data, dict) and data.keys() >= _KEYS_OF_A_RUN:
+            data.setdefault("splits", "hash")
+
+
 def _set(values: dict[str, Any], keys: list[str], value: Any, override: str) -> None:
     for depth, key in enumerate(keys[:-1]):
         if values.get(key) is None:
@@ -191,18 +203,12 @@ def _set(values: dict[str, Any], keys: list[str], value: Any, override: str) -> 
     values[keys[-1]] = value
 
 
-_KEYS_OF_A_RUN = {"split_by", "check_crc", "prefetch", "start_every"}
 _OLDER_GRIPPERS = {"closedness": {}, "openness": {"gripper_open": 1.0, "gripper_closed": 0.0}}
 
 
 def _replace_older_keys(values: dict[str, Any]) -> None:
-    """Replace `data.fields.gripper`, which configs of older runs have, by `gripper_open` and `gripper_closed`.
-
-    The config of a run has every key. One without `data.splits` is of an older run, whose splits were all drawn.
-    """
+    """Replace `data.fields.gripper`, which configs of older runs have, by `gripper_open` and `gripper_closed`."""
     for section, inner in values.items():
-        if section == "data" and isinstance(inner, dict) and inner.keys() >= _KEYS_OF_A_RUN:
-            inner.setdefault("splits", "hash")
         if section == "fields" and isinstance(inner, dict) and inner.get("gripper") in _OLDER_GRIPPERS:
             inner.update(_OLDER_GRIPPERS[inner.pop("gripper")])
         elif isinstance(inner, dict):
