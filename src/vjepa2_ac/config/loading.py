@@ -176,7 +176,7 @@ def _as_json(values: Mapping[str, Any], where: str) -> str:
         raise InputError(where=where, found=f"a value that a config cannot hold ({error})") from None
 
 
-_KEYS_OF_A_RUN = {"split_by", "check_crc", "prefetch", "start_every"}  # some of all
+_KEYS_OF_A_RUN = {"check_crc", "connections", "prefetch", "short_episodes"}  # seldom written by hand
 
 
 def _keep_drawn_splits(values: Mapping[str, Any]) -> None:
