@@ -34,7 +34,7 @@ ORDERS: dict[str, list[str]] = {
         "poses streams",
         "rotation_formats",
         "index",
-        "selection files transforms",
+        "selection files splits transforms",
         "idle windows",
         "sources",
         "dataset",

@@ -84,7 +84,8 @@ def read_clips(dataset: Dataset, split: Split = "train", *, clips: int = 16, bat
 
     Args:
         dataset: The data set.
-        split: train, validation or test: whole episodes, by a hash of their names and `validation_share`, `test_share`.
+        split: train, validation or test: whole episodes, by the data set's own splits, or by a hash of their names
+            and `validation_share`, `test_share` (`data.splits`).
         clips: How many, at most.
         batch_size: Clips of a batch; the last one may have fewer.
 

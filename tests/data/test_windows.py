@@ -16,7 +16,8 @@ from vjepa2_ac.config.data import DataConfig, Split
 from vjepa2_ac.config.loading import load_config
 from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.data.selection import StepSelection, included
-from vjepa2_ac.data.windows import ClipOrder, Windows, clip_starts, far_neighbours, in_split, permuted, spread
+from vjepa2_ac.data.splits import in_split
+from vjepa2_ac.data.windows import ClipOrder, Windows, clip_starts, far_neighbours, permuted, spread
 from vjepa2_ac.data.windows import windows_of as windows_of_starts
 from vjepa2_ac.episode import EpisodeInfo
 from vjepa2_ac.errors import InputError

@@ -9,7 +9,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.runs.checkpoint import RunState
-from vjepa2_ac.runs.folder import RunLock
+from vjepa2_ac.runs.folder import RunLock, read_run_config
 from vjepa2_ac.runs.open_run import open_run
 
 OPEN_REMOTE = "vjepa2_ac.runs.open_run.open_remote"
@@ -64,3 +64,31 @@ def test_the_stride_that_a_run_has_chosen_is_the_one_of_its_next_start(make_conf
         opened.begin(config.with_stride(3), RunState(step=0))
     with open_run(config, reporter) as opened:
         assert opened.config.data.stride == 3
+
+
+def test_an_older_run_keeps_its_drawn_splits_unless_the_config_says_otherwise(make_config, reporter) -> None:
+    with open_run(make_config(), reporter) as opened:
+        opened.begin(opened.config, RunState(step=0))
+    with open_run(make_config(), reporter) as opened:
+        assert opened.config.data.splits == "dataset"
+    file = Path(make_config().run_dir) / "config.yaml"
+    file.write_text(file.read_text().replace("  splits: dataset\n", ""))  # as a version without the key wrote it
+    assert read_run_config(file.parent).data.splits == "hash"
+    with open_run(make_config(), reporter) as opened:
+        assert opened.config.data.splits == "hash"
+    with (
+        pytest.raises(InputError, match=r"differs in data\.splits"),
+        open_run(make_config(data__splits="dataset"), reporter),
+    ):
+        pass
+
+
+def test_a_replayed_set_of_an_older_run_keeps_its_drawn_splits(make_config, reporter) -> None:
+    data = {"path": make_config().data.path, "frames": 4, "stride": 2}
+    config = make_config(replay={"data": data})
+    with open_run(config, reporter) as opened:
+        opened.begin(opened.config, RunState(step=0))
+    file = Path(config.run_dir) / "config.yaml"
+    file.write_text(file.read_text().replace("    splits: dataset\n", ""))
+    with open_run(config, reporter) as opened:
+        assert [one.splits for one in opened.config.data_sets] == ["dataset", "hash"]

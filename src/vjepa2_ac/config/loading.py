@@ -89,6 +89,7 @@ def parse_config(values: Mapping[str, Any], overrides: Iterable[str] = (), *, wh
         if not separator or not key:
             raise InputError(where="overrides", found=f"{override!r}", needed="key=value, such as training.steps=100")
         _set(given, key.split("."), parse_yaml(text, where=f"override {key}"), override)
+    _keep_drawn_splits(given)
     _replace_older_keys(given)
     try:
         return Config.model_validate_json(_as_json(with_plugins(given, where=where, here=here), where))
@@ -173,6 +174,17 @@ def _as_json(values: Mapping[str, Any], where: str) -> str:
         return json.dumps(dict(values), default=os.fspath)
     except (TypeError, ValueError) as error:
         raise InputError(where=where, found=f"a value that a config cannot hold ({error})") from None
+
+
+_KEYS_OF_A_RUN = {"check_crc", "connections", "prefetch", "short_episodes"}  # seldom written by hand
+
+
+def _keep_drawn_splits(values: Mapping[str, Any]) -> None:
+    """Let an older run keep its splits: its config has every key of the time, and no `data.splits`."""
+    replay = values.get("replay")
+    for data in (values.get("data"), replay.get("data") if isinstance(replay, dict) else None):
+        if isinstance(data, dict) and data.keys() >= _KEYS_OF_A_RUN:
+            data.setdefault("splits", "hash")
 
 
 def _set(values: dict[str, Any], keys: list[str], value: Any, override: str) -> None:

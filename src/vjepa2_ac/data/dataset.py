@@ -24,7 +24,8 @@ from vjepa2_ac.data.selection import (
     require_distinct,
 )
 from vjepa2_ac.data.sources.indexed_source import open_source, spaces_of
-from vjepa2_ac.data.windows import Windows, clip_starts, in_split, windows_of
+from vjepa2_ac.data.splits import held_out_by, members_of
+from vjepa2_ac.data.windows import Windows, clip_starts, windows_of
 from vjepa2_ac.episode import POSE_WIDTHS, Episode, EpisodeSource, Progress, StepRanges, Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.spaces import Spaces
@@ -74,7 +75,7 @@ class Dataset:
     def members(self, split: Split) -> Bool[np.ndarray, " episodes"]:
         """Return which episodes are used and belong to a split."""
         among = of_outcome(self.table, self.config)
-        return np.asarray(self.taking_part & in_split(self.split_hash, self.config, split, among))
+        return np.asarray(self.taking_part & members_of(self.table, self.split_hash, self.config, split, among))
 
     def windows(self, split: Split) -> Windows:
         """Return the clips of a split.
@@ -96,6 +97,8 @@ class Dataset:
         fix = f"Raise data.{split}_share: above 0, {three} always have one, unless it is broken or in data.exclude"
         if split == "train":
             fix = "Lower data.validation_share or data.test_share"
+        if split in held_out_by(self.table, config):
+            fix = "Set data.splits: hash, to draw the splits from all episodes"
         found = f"no {split} episodes among {taking_part.sum()}{together} ({shares})"
         return InputError(where=f"data.path: {config.path}", found=found, fix=fix)
 
@@ -240,7 +243,8 @@ def through_latents(dataset: Dataset, folder: Path | str) -> Dataset:
     """
     config = dataset.config.as_kind("latents", path=str(folder), cache="off", camera=dataset.config.cameras)
     source = open_source(config)
-    return _settled(replace(dataset, source=source, table=EpisodeTable.of(source.infos()), config=config))
+    table = replace(EpisodeTable.of(source.infos()), labels=dataset.table.labels)  # older caches lack those of splits
+    return _settled(replace(dataset, source=source, table=table, config=config))
 
 
 def _settled(dataset: Dataset) -> Dataset:

@@ -1,4 +1,4 @@
-"""Clip windows: which clips exist, the split they belong to, and their order.
+"""Clip windows: which clips exist, and their order.
 
 Everything here is a pure function of the episodes' identities and remaining steps, the seed and a position: nothing
 depends on the number of shards, workers or ranks, and resuming a run needs no saved state.
@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Int32, Int64, UInt64
+from jaxtyping import Bool, Int, Int32, Int64
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
@@ -23,49 +23,9 @@ from vjepa2_ac.errors import InputError
 
 logger = logging.getLogger(__name__)
 
-_FEWEST_GROUPS = 3  # one for each split
 _ROUNDS = 8  # of the permutation
 _HALF_BITS = 3  # minimum: narrower halves favour some orders of few windows
 _MASK64 = (1 << 64) - 1
-
-
-def in_split(
-    split_hash: UInt64[np.ndarray, " episodes"],
-    config: DataConfig,
-    split: Split,
-    among: Bool[np.ndarray, " episodes"] | None = None,
-) -> Bool[np.ndarray, " episodes"]:
-    """Return which episodes belong to a split.
-
-    The hash, as a number in [0, 1), is compared with the shares. Where that leaves validation or test without any,
-    as may happen to few episodes, though its share is above 0, the one whose number comes next moves there.
-
-    Args:
-        split_hash: Of each episode's identity; with `data.split_by`, of the name of its group.
-        config: The shares.
-        split: Which split.
-        among: Which of them are split, None: all. The split of one depends on the others where these are few: so they
-            are the same throughout a run, with those that are broken or left out by `data.exclude`.
-    """
-    number = split_hash.astype(np.float64) / 2**64
-    among = np.ones(len(number), bool) if among is None else among
-    test, held_out = _bounds(np.unique(number[among]), config)
-    low, high = {"test": (0.0, test), "validation": (test, held_out), "train": (held_out, 2.0)}[split]
-    return np.asarray(among & (number >= low) & (number < high))
-
-
-def _bounds(groups: Float[np.ndarray, " groups"], config: DataConfig) -> tuple[float, float]:
-    """Return the numbers below which a group is of test, and of test or validation; `groups` has all, sorted."""
-    test, held_out = config.test_share, config.test_share + config.validation_share
-    if len(groups) < _FEWEST_GROUPS:
-        return test, held_out
-    if config.test_share > 0 and not (groups < test).any():
-        test = float(np.nextafter(groups[0], 2.0))
-    held_out = max(test, held_out)
-    left = groups[groups >= test]
-    if config.validation_share > 0 and len(left) > 1 and not (left < held_out).any():
-        held_out = float(np.nextafter(left[0], 2.0))
-    return test, held_out
 
 
 @dataclass(frozen=True, eq=False)

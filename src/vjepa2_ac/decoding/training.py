@@ -23,6 +23,7 @@ from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.sources.latents.cache_files import LatentFiles, bytes_per_frame
 from vjepa2_ac.data.sources.latents.cache_key import CacheKey, Encoding, require_own_folder
+from vjepa2_ac.data.splits import SPLIT
 from vjepa2_ac.data.windows import permuted, require_frames, require_stride
 from vjepa2_ac.decoding.decoder_folder import CARD, DecoderCard, read_card, save_decoder
 from vjepa2_ac.decoding.frame_pairs import FramePairs, Pairs, fit_linear, mean_image, measure_decoders, wanted_frames
@@ -175,6 +176,7 @@ def _setup(config: Config, reporter: Reporter) -> Setup:
         "seed": config.seed,
         "latents": dict(LatentCache.of(dataset, encoding).key.parts),
         "data": config.data.model_dump(mode="json", include={"validation_share", "test_share", "split_by"}),
+        **({"data.splits": config.data.splits} if SPLIT in dataset.table.labels else {}),
     })  # fmt: skip
     require_own_folder(folder, KEY, key, where=f"decoder.folder {folder}")
     shape = DecoderShape(decoder.size, model.latent_dim, size // patch, patch)

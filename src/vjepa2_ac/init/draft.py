@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Literal
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import Config, EncoderConfig, ModelConfig
+from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.config.model import ModelSizes
 from vjepa2_ac.init.found import FoundData, Knob, Knobs, as_yaml, guesses, plain
@@ -168,8 +170,10 @@ class Draft:
         return None if self.step_hours is None else duration(self.encoding_hours + steps * self.step_hours)
 
 
-def make_draft(found: FoundData, machine: Machine, model: ModelChoice, *, run_dir: str) -> Draft:
-    """Return the config for a data set on a machine.
+def make_draft(
+    found: FoundData, machine: Machine, model: ModelChoice, *, run_dir: str, own_splits: Collection[Split] = ()
+) -> Draft:
+    """Return the config for a data set on a machine; without shares for splits that the data set has itself.
 
     Raises:
         InputError: The values found do not make a config.
@@ -179,7 +183,7 @@ def make_draft(found: FoundData, machine: Machine, model: ModelChoice, *, run_di
     knobs: Knobs = {
         "run_dir": Knob(run_dir),
         "seed": Knob(0),
-        "data": _data(found, machine, model),
+        "data": _data(found, machine, model, own_splits),
         "model": _model(model, machine),
         "adapter": _adapter(model, found),
         "training": training,
@@ -248,11 +252,11 @@ def _fit(config: Config, machine: Machine) -> tuple[int, bool, int]:
     return batch, True, needed(batch, True)
 
 
-def _data(found: FoundData, machine: Machine, model: ModelChoice) -> Knobs:
+def _data(found: FoundData, machine: Machine, model: ModelChoice, own_splits: Collection[Split]) -> Knobs:
     """Return the section of the data."""
     stride = max(1, round(found.rate_hz.value * _MODEL_STEP_S))
     frames, why_frames = _frames(found, model, stride)
-    share, test_share, why_share = _shares(found)
+    shares = {split: knob for split, knob in _shares(found).items() if split not in own_splits}
     size = (found.steps or math.inf) * model.bytes_a_frame
     is_cached = size <= machine.free_bytes * _CACHE_SHARE
     why_cached = f"each frame is encoded once: {_gigabytes(size)} GB at most; training then needs no encoder"
@@ -265,8 +269,7 @@ def _data(found: FoundData, machine: Machine, model: ModelChoice) -> Knobs:
         **found.knobs,
         "frames": Knob(frames, why_frames),
         "stride": Knob(stride, _why_stride(found, model, stride), found.rate_hz.is_guess),
-        "validation_share": Knob(share, why_share),
-        "test_share": Knob(test_share, "for `evaluate`; never seen in training"),
+        **{f"{split}_share": knob for split, knob in shares.items()},
         **({"idle": found.idle} if found.idle and (found.usual_steps or _SHORT) >= _SHORT else {}),
         **({"cache": Knob("auto", why_cached)} if is_cached else {}),
         "workers": Knob(workers, f"of {machine.cores} cores"),
@@ -352,14 +355,15 @@ def _frames(found: FoundData, model: ModelChoice, stride: int) -> tuple[int, str
     return frames, f"a clip spans {(frames - 1) * stride + 1} steps; {lengths}"
 
 
-def _shares(found: FoundData) -> tuple[float, float, str]:
+def _shares(found: FoundData) -> dict[Split, Knob]:
     """Return the shares of validation and test; of few episodes test gets enough for an interval, if it can."""
-    if found.episodes is None:
-        return 0.05, 0.05, "of the episodes, drawn by a hash, at least one"
-    share = next(share for least, share in _SHARES if found.episodes > least or least == 0)
-    count = max(1, round(share * found.episodes))
-    enough = min(_MOST_TESTED, math.ceil(100 * (ENOUGH_EPISODES + 1) / found.episodes) / 100)
-    return share, max(share, enough), f"about {count:,} of {found.episodes:,} episodes, drawn by a hash"
+    share, test_share, why = 0.05, 0.05, "of the episodes, drawn by a hash, at least one"
+    if found.episodes is not None:
+        share = next(share for least, share in _SHARES if found.episodes > least or least == 0)
+        count = max(1, round(share * found.episodes))
+        enough = min(_MOST_TESTED, math.ceil(100 * (ENOUGH_EPISODES + 1) / found.episodes) / 100)
+        test_share, why = max(share, enough), f"about {count:,} of {found.episodes:,} episodes, drawn by a hash"
+    return {"validation": Knob(share, why), "test": Knob(test_share, "for `evaluate`; never seen in training")}
 
 
 def _steps(found: FoundData, clips_a_step: int) -> tuple[int, str]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import numpy as np
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.loading import admit_forms_of_data, parse_config
 from vjepa2_ac.data.files import in_parallel, walk, within
 from vjepa2_ac.data.index import EpisodeTable
@@ -18,6 +20,7 @@ from vjepa2_ac.data.sources.droid_raw.source import find_episodes
 from vjepa2_ac.data.sources.indexed_source import open_source
 from vjepa2_ac.data.sources.lerobot.info import INFO
 from vjepa2_ac.data.sources.npz import FORMAT_HELP, opened_npz
+from vjepa2_ac.data.splits import describe_splits, held_out_by
 from vjepa2_ac.episode import STATE_DIM, Progress
 from vjepa2_ac.errors import InputError, UserError
 from vjepa2_ac.init.converters import way_by
@@ -170,17 +173,13 @@ def _described(path: str, forms: Sequence[str]) -> list[tuple[str, str]]:
         folders = []
         for folder, entries in listed:
             names = {entry.name for entry in entries}
-            form = next((one for one in forms if _has_mark(folder, _MARKS[one], names)), None)
-            if form is not None:
-                found.setdefault(storage.absolute(folder), (form, folder))
+            marks = {_MARKS[form]: form for form in forms if _MARKS[form].partition("/")[0] in names}
+            if mark := next((mark for mark in marks if storage.exists(storage.join(folder, mark))), None):
+                found.setdefault(storage.absolute(folder), (marks[mark], folder))
                 continue
             inner = [entry.name for entry in entries if not entry.is_file and not entry.name.startswith(".")]
             folders += [storage.join(folder, name) for name in sorted(inner, key=_as_version)[-_MOST_FOLDERS:]]
     return list(found.values())
-
-
-def _has_mark(folder: str, mark: str, names: Container[str]) -> bool:
-    return mark.split("/")[0] in names and storage.exists(storage.join(folder, mark))
 
 
 def _only_set(described: Sequence[tuple[str, str]], path: str) -> tuple[str, str, list[str]]:
@@ -240,21 +239,32 @@ def measured(found: FoundData, progress: Progress | None = None) -> FoundData:
 
     Why it cannot, the check of the data says.
     """
-    if storage.is_url(found.path):
+    if (indexed := _indexed(found, progress)) is None:
         return found
-    data = {"source": found.source, "path": found.path, "states": found.states, **plain(found.knobs)}
-    values = {"run_dir": "none", "data": data, "model": {"base": f"{BUILTIN}sim-tiny"}}
-    try:
-        source = open_source(parse_config(values, where="vjepa2-ac init").data)
-        lengths = EpisodeTable.of(source.infos(progress)).num_steps
-    except UserError:
-        return found
-    if not len(lengths):
-        return found
+    lengths, splits = indexed[0].num_steps, describe_splits(*indexed)
     return replace(
         found,
         episodes=len(lengths),
         steps=int(lengths.sum()),
         usual_steps=int(np.median(lengths)),
         short_steps=int(np.quantile(lengths, 0.1)),
+        about=(*found.about, *[f"splits: {splits}"] * bool(splits)),
     )
+
+
+def own_splits(found: FoundData) -> tuple[Split, ...]:
+    """Return which of validation and test the data set has itself, as far as `measured` reads it."""
+    indexed = _indexed(found, None)
+    return () if indexed is None else tuple(held_out_by(*indexed))
+
+
+def _indexed(found: FoundData, progress: Progress | None) -> tuple[EpisodeTable, DataConfig] | None:
+    """Return the episodes of what was found, and the config that reads them; None: behind a URL, or unreadable."""
+    data = {"source": found.source, "path": found.path, "states": found.states, **plain(found.knobs)}
+    values = {"run_dir": "none", "data": data, "model": {"base": f"{BUILTIN}sim-tiny"}}
+    with contextlib.suppress(UserError):
+        if not storage.is_url(found.path):
+            config = parse_config(values, where="vjepa2-ac init").data
+            table = EpisodeTable.of(open_source(config).infos(progress))
+            return (table, config) if len(table) else None
+    return None

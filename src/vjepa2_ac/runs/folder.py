@@ -225,13 +225,23 @@ def _earlier_starts(path: str | Path) -> list[dict[str, Any]]:
     return [start for start in starts if isinstance(start, dict)]
 
 
-def with_settled_stride(config: Config) -> Config:
-    """Return a config whose stride is a number where the run in its folder has chosen one: it is chosen once."""
+def with_settled_values(config: Config) -> Config:
+    """Return a config with what the run in its folder has chosen: the stride, where the config says auto.
+
+    Also `data.splits`, where the config does not say it: a run keeps its splits although the default has changed.
+    """
     folder = Path(config.run_dir)
-    if config.data.stride != "auto" or not (folder / CONFIG).is_file():
+    if not (folder / CONFIG).is_file():
         return config
-    stride = read_run_config(folder).data.stride
-    return config if stride == "auto" else config.with_stride(stride)
+    run = read_run_config(folder)
+    if config.data.stride == "auto" and run.data.stride != "auto":
+        config = config.with_stride(run.data.stride)
+    data, *others = [
+        one if "splits" in one.model_fields_set else one.model_copy(update={"splits": before.splits})
+        for one, before in zip(config.data_sets, [*run.data_sets, run.data], strict=False)
+    ]
+    replay = config.replay and config.replay.model_copy(update={"data": others[0]})
+    return config.model_copy(update={"data": data, "replay": replay})
 
 
 class RunLock:

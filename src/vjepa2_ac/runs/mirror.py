@@ -48,7 +48,7 @@ from vjepa2_ac.runs.folder import (
     RunLock,
     check_run_folder,
     last_start,
-    with_settled_stride,
+    with_settled_values,
 )
 from vjepa2_ac.storage.retries import quietly
 from vjepa2_ac.storage.structured import MOST_BYTES, read_json_object
@@ -270,7 +270,7 @@ def _require_this_config(config: Config, place: str, *, allow_config_change: boo
         with suppress(FileNotFoundError):
             storage.download(storage.join(place, CONFIG), Path(folder, CONFIG))
         try:
-            there = with_settled_stride(config.model_copy(update={"run_dir": folder}))
+            there = with_settled_values(config.model_copy(update={"run_dir": folder}))
             check_run_folder(there, allow_config_change=allow_config_change)
         except InputError as error:
             fix = "Set another checkpoint.remote for a new run; where the change is meant, add --allow-config-change"

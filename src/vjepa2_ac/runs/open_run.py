@@ -12,7 +12,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.checkpoint import CHECKPOINTS, RunState, find_damage, listed, step_of
-from vjepa2_ac.runs.folder import RunLock, check_run_folder, open_run_folder, with_settled_stride
+from vjepa2_ac.runs.folder import RunLock, check_run_folder, open_run_folder, with_settled_values
 from vjepa2_ac.runs.mirror import Mirror, open_remote
 
 
@@ -66,7 +66,7 @@ def open_run(
     Raises:
         InputError: The folder is not this run's, is in use or cannot be written; or as `open_remote`.
     """
-    config, trial = with_settled_stride(config), None
+    config, trial = with_settled_values(config), None
     check_run_folder(config, allow_config_change=allow_config_change)
     with contextlib.ExitStack() as until_the_end:
         lock = until_the_end.enter_context(RunLock(Path(config.run_dir)))
@@ -77,4 +77,4 @@ def open_run(
         # Locked before anything is downloaded into the run's folder: another process could still be writing there.
         first = None if check_only else lock
         config = open_remote(config, reporter, lock=first, allow_config_change=allow_config_change, into=trial)
-        yield OpenRun(with_settled_stride(config), lock, allow_config_change)
+        yield OpenRun(with_settled_values(config), lock, allow_config_change)

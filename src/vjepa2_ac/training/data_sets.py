@@ -14,6 +14,7 @@ from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.index import fingerprint_of
 from vjepa2_ac.data.loader import validation_batches
 from vjepa2_ac.data.selection import named
+from vjepa2_ac.data.splits import describe_splits
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.reporter import INDEXING, Reporter
@@ -31,6 +32,8 @@ def open_data_sets(config: Config, reporter: Reporter) -> list[Dataset]:
         InputError: One cannot be opened; or the second one's spaces or the time of its steps are others.
     """
     dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
+    if splits := describe_splits(dataset.table, config.data):
+        reporter.note(f"Splits: {splits}.")
     return [dataset] if config.replay is None else [dataset, _open_replay(config.replay, dataset, reporter)]
 
 

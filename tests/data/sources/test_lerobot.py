@@ -316,7 +316,9 @@ def test_the_gripper_is_closedness_whatever_its_range_and_sign(opened: float, cl
     source = source_of(root, lerobot=OWN | {"gripper_open": opened, "gripper_closed": closed})
     np.testing.assert_allclose(source.read(0).states, states, atol=1e-12)
     if abs(closed - opened) > 1.1:
-        with pytest.raises(InputError, match=r"needed: a gripper between 0 and 1: 0 for open, 1 for closed\. Check data\.lerobot"):
+        with pytest.raises(
+            InputError, match=r"needed: a gripper between 0 and 1: 0 for open, 1 for closed\. Check data\.lerobot"
+        ):
             source_of(root, lerobot=OWN).infos()
 
 

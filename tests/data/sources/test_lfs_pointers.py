@@ -30,7 +30,7 @@ def replaced_by_pointers(folder: Path, pattern: str) -> Path:
 
 
 def config_of(form: str, path: str | Path, tmp_path: Path) -> DataConfig:
-    source = form.split()[0]
+    source = form.split(maxsplit=1)[0]
     values = {"source": source, "path": str(path), "frames": 3, "stride": 2, "disk_cache": {"dir": str(tmp_path)}}
     return DataConfig.model_validate(values)
 
@@ -54,7 +54,7 @@ def config_of(form: str, path: str | Path, tmp_path: Path) -> DataConfig:
 )
 def test_a_pointer_is_named_when_the_set_is_opened(form: str, pattern: str, tmp_path: Path) -> None:
     folder = replaced_by_pointers(FORMS[form](tmp_path / "set", range(3)), pattern)
-    with pytest.raises(InputError, match="a git-lfs pointer.*`git lfs pull`") as raised:
+    with pytest.raises(InputError, match=r"a git-lfs pointer.*`git lfs pull`") as raised:
         open_dataset(config_of(form, folder, tmp_path / "cache"))
     where = raised.value.where.split(": ")[0]
     assert Path(where).read_bytes() == POINTER
@@ -63,7 +63,7 @@ def test_a_pointer_is_named_when_the_set_is_opened(form: str, pattern: str, tmp_
 @pytest.mark.parametrize(("form", "pattern"), [("rlds", "*.tfrecord-*"), ("lerobot", "*.mp4"), ("npz", "*.npz")])
 def test_a_pointer_behind_a_url_is_named(form: str, pattern: str, gcs: Gcs, tmp_path: Path) -> None:
     gcs.upload(replaced_by_pointers(FORMS[form](tmp_path / "set", range(3)), pattern), "robots/set")
-    with pytest.raises(InputError, match="gs://robots/set/.*a git-lfs pointer"):
+    with pytest.raises(InputError, match=r"gs://robots/set/.*a git-lfs pointer"):
         open_dataset(config_of(form, "gs://robots/set", tmp_path / "cache"))
 
 

@@ -22,6 +22,7 @@ from vjepa2_ac.data.inspection.excerpts import Finding, Level, excerpt_findings
 from vjepa2_ac.data.inspection.statistics import PERCENTILES, at_some_stride
 from vjepa2_ac.data.loader import training_loader
 from vjepa2_ac.data.sources.indexed_source import FramesByStep
+from vjepa2_ac.data.splits import describe_splits, held_out_by
 from vjepa2_ac.episode import Batch, Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.intervals import ENOUGH_EPISODES
@@ -80,6 +81,8 @@ def _what_takes_part(dataset: Dataset) -> Iterator[Finding]:
             yield Finding("warning" if one.name == "broken" else "ok", f"filter {one.name}", f"left out: {one}")
     for problem in dataset.table.problems[:3]:
         yield Finding("warning", "broken episode", f"{problem.where}: {problem.found}")
+    if splits_used := describe_splits(dataset.table, config):
+        yield Finding("ok", "splits", splits_used)
     splits: dict[Split, float] = {"train": 1.0, "validation": 1.0, "test": config.test_share}
     for split, share in splits.items():
         try:
@@ -97,7 +100,8 @@ def _what_takes_part(dataset: Dataset) -> Iterator[Finding]:
     yield from _split_that_can_answer(dataset)
     if config.split_by is not None:
         groups = len(np.unique(dataset.split_hash[dataset.taking_part]))
-        yield Finding("ok", "groups", f"{groups:,} by {config.split_by}, each in one split")
+        own = ", but for the data set's own" if held_out_by(dataset.table, config) else ""
+        yield Finding("ok", "groups", f"{groups:,} by {config.split_by}, each in one split{own}")
     duplicates = find_duplicates(dataset)
     yield Finding("warning" if duplicates.episodes else "ok", "duplicates", str(duplicates))
 
@@ -109,6 +113,9 @@ def _split_that_can_answer(dataset: Dataset) -> Iterator[Finding]:
     if not 0 < count < ENOUGH_EPISODES:
         return
     words = f"{count} episode{'s' * (count != 1)} cannot tell whether training helped, {ENOUGH_EPISODES} would"
+    if "test" in held_out_by(dataset.table, config):
+        yield Finding("warning", "test", f"{words}. data.splits=hash draws the test split from all episodes")
+        return
     for percent in range(5, 55, 5):
         other = replace(dataset, config=config.model_copy(update={"test_share": percent / 100}))
         test, train = (int((other.members(split) & among).sum()) for split in ("test", "train"))

@@ -70,11 +70,16 @@ class DatasetInfo:
     data_path: str
     video_path: str | None
     features: Mapping[str, Feature]
+    splits: Mapping[str, range] = field(default_factory=dict, repr=False)  # not in the key of stored indexes
 
     @property
     def where(self) -> str:
         """The file."""
         return storage.join(self.root, INFO)
+
+    def split_of(self, episode: int) -> str | None:
+        """Return the name of the split of an episode, given by its number; None: not said."""
+        return next((name for name, episodes in self.splits.items() if episode in episodes), None)
 
     def require_mapping(self, config: LeRobotData) -> None:
         """Check that the data set has what `data.lerobot` and `data.camera` name, before anything large is read.
@@ -168,7 +173,15 @@ def _parsed(root: str, content: Mapping[str, Any]) -> DatasetInfo:
         data_path=_template(content["data_path"]),
         video_path=None if video_path is None else _template(video_path),
         features={name: _feature(feature) for name, feature in content["features"].items()},
+        splits=_splits(content.get("splits")),
     )
+
+
+def _splits(content: object) -> dict[str, range]:
+    """Return the episodes of each split, written as {"train": "0:50"}; what is written otherwise is left out."""
+    texts = content if isinstance(content, Mapping) else {}
+    found = {str(name): re.fullmatch(r"(\d{1,9}):(\d{1,9})", str(text)) for name, text in texts.items()}
+    return {name: range(int(part[1]), int(part[2])) for name, part in found.items() if part}
 
 
 def _feature(content: Mapping[str, Any]) -> Feature:

@@ -29,6 +29,7 @@ from vjepa2_ac.data.sources.lerobot.episodes import (
 )
 from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, list_by_template, missing, read_info
 from vjepa2_ac.data.sources.lerobot.parquet import EPISODE, Columns, ParquetRows
+from vjepa2_ac.data.splits import with_own_splits
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import decode_image, require_bounded
@@ -125,7 +126,8 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
         self._version = index_key(parts, config.path)
         build = partial(self._built, list(tables), files.keys(), keys, progress)
         table = get_or_build(config.disk_cache, self._version, config.path, build)
-        return replace(table, texts={**table.texts, _DATA_BYTES: str(num_bytes)}), info
+        table = replace(table, texts={**table.texts, _DATA_BYTES: str(num_bytes)})
+        return with_own_splits(table, [info.split_of(number) for number in table.locators["index"].tolist()]), info
 
     def _built(self, tables: list[str], files: Set[str], keys: list[str], progress: Progress) -> EpisodeTable:
         info, config, fields = self._info, self._config, self._config.lerobot

@@ -28,6 +28,7 @@ from vjepa2_ac.data.sources.indexed_source import FramesByStep, IndexedSource
 from vjepa2_ac.data.sources.rlds.episode import STEP_FLAG, Record, build_index, episode_of, position_of, step_features
 from vjepa2_ac.data.sources.rlds.shards import NEEDED, Shard, find_shards, open_shard
 from vjepa2_ac.data.sources.rlds.tfrecord import NotAnExampleError, Place, Read, RecordSpan, item_places, require_intact
+from vjepa2_ac.data.splits import with_own_splits
 from vjepa2_ac.episode import Episode, Progress, StepRanges
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import decode_images
@@ -94,6 +95,7 @@ class RldsSource(IndexedSource[RldsData, tuple[Shard, ...]]):
         key = index_key(parts, config.path)
         build = partial(build_index, shards, config, cameras, progress)
         table = get_or_build(config.disk_cache, key, config.path, build)
+        table = with_own_splits(table, [shards[number].split for number in table.locators["shard"].tolist()])
         return replace(table, texts={**table.texts, "control_rate_hz": str(fields.control_rate_hz)}), shards
 
 

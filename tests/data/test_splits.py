@@ -1,0 +1,206 @@
+"""The splits that a data set has itself are used as such; what is missing is drawn, and what is pooled is said."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from clips import split_of
+from copied_sets import write_rlds
+from latent_sets import write_cache
+from run_fixtures import SilentReporter
+from split_sets import EPISODES, write_lerobot_splits, write_rlds_splits
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config.data import Split
+from vjepa2_ac.config.loading import config_as_dict, parse_config
+from vjepa2_ac.data.dataset import Dataset, open_dataset, through_latents
+from vjepa2_ac.data.inspection.check import check_data
+from vjepa2_ac.data.splits import describe_splits
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.init.draft import Machine, choose_model, make_draft
+from vjepa2_ac.init.found import plain
+from vjepa2_ac.init.look import look_at, measured, own_splits
+from vjepa2_ac.training.data_sets import open_data_sets
+
+SPLITS: tuple[Split, ...] = ("train", "validation", "test")
+Opened = Callable[..., Dataset]
+
+
+@pytest.fixture
+def opened(tmp_path: Path) -> Opened:
+    """Open a data set with shares that draw some of 8 episodes."""
+
+    def open_with(folder: Path, **changes: Any) -> Dataset:
+        values = {
+            "path": str(folder), "frames": 3, "stride": 2, "workers": 0, "validation_share": 0.3, "test_share": 0.3,
+            "disk_cache": {"dir": str(tmp_path / "cache")},
+        }  # fmt: skip
+        return open_dataset(DataConfig.model_validate(values | changes))
+
+    return open_with
+
+
+def members(dataset: Dataset) -> dict[str, str]:
+    """Return the split of each episode, by the number at the end of its identity."""
+    found = {}
+    for split in SPLITS:
+        for place in dataset.members(split).nonzero()[0].tolist():
+            identity = dataset.table.identity(place)
+            assert identity not in found
+            found[identity] = split
+    return found
+
+
+def numbers_in(dataset: Dataset, split: Split) -> set[int]:
+    """Return the numbers of the drawn episodes in a split."""
+    return {int(name.split("episode_")[1][:4]) for name, one in members(dataset).items() if one == split}
+
+
+@pytest.mark.parametrize("val", ["val", "valid", "validation", "Val"])
+def test_splits_of_rlds_are_read_as_the_set_has_them(val: str, opened: Opened, tmp_path: Path) -> None:
+    dataset = opened(write_rlds_splits(tmp_path / "set", "test", "train", val))
+    assert [numbers_in(dataset, split) for split in ("test", "train", "validation")] == [
+        set(range(start, 3 * EPISODES, 3)) for start in range(3)
+    ]
+    assert {int(place) for place in dataset.windows("test").episodes} == set(
+        dataset.members("test").nonzero()[0].tolist()
+    )
+    role = "validation" if val == "validation" else f"{val} (4 episodes) as validation"
+    text = describe_splits(dataset.table, dataset.config)
+    assert text.startswith("the data set's own: ")
+    assert role in text
+    assert "drawn" not in text
+
+
+def test_a_missing_split_is_drawn_from_train_alone(opened: Opened, tmp_path: Path) -> None:
+    dataset = opened(write_rlds_splits(tmp_path / "set", "train", "train_2", "val"), test_share=0.4)
+    assert numbers_in(dataset, "validation") == set(range(2, 3 * EPISODES, 3))
+    by_hash = dataset.config.model_copy(update={"validation_share": 0.0})
+    drawn = {name: split_of(name, by_hash) for name, split in members(dataset).items() if split != "validation"}
+    assert drawn == {name: split for name, split in members(dataset).items() if split != "validation"}
+    assert set(drawn.values()) == {"train", "test"}
+    text = describe_splits(dataset.table, dataset.config)
+    assert text == (
+        "the data set's own: train (4 episodes), train_2 (4 episodes) as train, val (4 episodes) as validation;"
+        " test is drawn from train by hash"
+    )
+
+
+@pytest.mark.parametrize(
+    ("names", "changes", "why"),
+    [
+        (("train", "val"), {"splits": "hash"}, "data.splits is hash"),
+        (("part_1", "part_2"), {}, "no train beside val, validation or test"),
+        (("val", "test"), {}, "no train beside val, validation or test"),
+    ],
+)
+def test_other_splits_are_pooled_and_drawn_by_hash_as_is_said(
+    names: tuple[str, ...], changes: dict[str, str], why: str, opened: Opened, tmp_path: Path
+) -> None:
+    dataset = opened(write_rlds_splits(tmp_path / "set", *names), **changes)
+    assert members(dataset) == {one.id: split_of(one.id, dataset.config) for one in dataset.table}
+    text = describe_splits(dataset.table, dataset.config)
+    assert text.endswith(why)
+    assert all(f"{name} (4 episodes)" in text for name in names)
+
+
+def test_a_set_with_one_split_is_drawn_by_hash_and_keeps_its_index(opened: Opened, tmp_path: Path) -> None:
+    folder = write_rlds(tmp_path / "set", range(8))
+    one, pooled = opened(folder), opened(folder, splits="hash")
+    assert one.table.to_bytes() == pooled.table.to_bytes()
+    assert "split" not in one.table.labels
+    assert members(one) == {info.id: split_of(info.id, one.config) for info in one.table}
+    assert describe_splits(one.table, one.config) == ""
+
+
+def test_the_index_does_not_depend_on_how_splits_are_used(opened: Opened, tmp_path: Path) -> None:
+    folder = write_rlds_splits(tmp_path / "set", "train", "val")
+    tables = [opened(folder, splits=splits).table for splits in ("dataset", "hash")]
+    assert tables[0].to_bytes() == tables[1].to_bytes()
+
+
+def test_splits_of_lerobot_are_ranges_of_episode_numbers(opened: Opened, tmp_path: Path) -> None:
+    folder = write_lerobot_splits(tmp_path / "set", 6, {"train": "0:3", "val": "3:5", "test": "5:6"})
+    found = members(opened(folder, source="lerobot"))
+    assert [found[f"episode_{number:06d}"] for number in range(6)] == [
+        "train", "train", "train", "validation", "validation", "test",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("splits", [{"train": "0:6"}, {}, {"train": "all", "val": "none"}, {"train": 6}])
+def test_splits_of_lerobot_that_are_one_or_written_otherwise_change_nothing(
+    splits: dict[str, str], opened: Opened, tmp_path: Path
+) -> None:
+    folder = write_lerobot_splits(tmp_path / "set", 6, splits)
+    dataset = opened(folder, source="lerobot")
+    assert members(dataset) == members(opened(folder, source="lerobot", splits="hash"))
+    assert describe_splits(dataset.table, dataset.config) == ""
+
+
+def test_a_latent_cache_of_an_older_version_keeps_the_splits(opened: Opened, tmp_path: Path) -> None:
+    dataset = opened(write_rlds_splits(tmp_path / "set", "train", "val"), cache_dir=str(tmp_path / "latents"))
+    folder = write_cache(replace(dataset, table=replace(dataset.table, labels={})))
+    assert members(through_latents(dataset, folder)) == members(dataset)
+
+
+def test_a_split_of_the_set_that_is_left_out_is_an_error_with_the_key(opened: Opened, tmp_path: Path) -> None:
+    folder = write_rlds_splits(tmp_path / "set", "train", "val")
+    held_out = [name for name, split in members(opened(folder)).items() if split == "validation"]
+    with pytest.raises(InputError, match=r"no validation episodes among 4 .*Set data\.splits: hash"):
+        opened(folder, exclude=tuple(held_out)).windows("validation")
+
+
+def test_check_says_which_splits_are_used(opened: Opened, tmp_path: Path) -> None:
+    config = opened(write_rlds_splits(tmp_path / "set", "train", "test")).config
+    findings = list(check_data(config, clips=2))
+    assert [one.text for one in findings if one.about == "splits"] == [
+        "the data set's own: test (4 episodes), train (4 episodes); validation is drawn from train by hash"
+    ]
+    (advice,) = [one.text for one in findings if "cannot tell whether" in one.text]
+    assert advice.endswith("data.splits=hash draws the test split from all episodes")
+    single = config.model_copy(update={"path": str(write_rlds_splits(tmp_path / "one", "train")), "test_share": 0.1})
+    assert "splits" not in {one.about for one in check_data(single, clips=2)}
+
+
+def test_training_says_which_splits_are_used(opened: Opened, reporter: SilentReporter, tmp_path: Path) -> None:
+    data = opened(write_rlds_splits(tmp_path / "set", "train", "val")).config.model_dump(mode="json")
+    values = {"run_dir": "run", "data": data, "model": {"base": "builtin:sim-tiny"}}
+    for splits, said in (("dataset", "the data set's own: train (4"), ("hash", "drawn by hash from all")):
+        open_data_sets(parse_config(values, [f"data.splits={splits}"], where="here"), reporter)
+        assert reporter.notes.pop().startswith(f"Splits: {said}")
+    one = write_rlds_splits(tmp_path / "one", "train")
+    open_data_sets(parse_config(values, [f"data.path={one}"], where="here"), reporter)
+    assert reporter.notes == []
+
+
+@pytest.mark.parametrize(
+    ("names", "shares"),
+    [
+        (("train", "val"), {"test_share"}),
+        (("train", "val", "test"), set()),
+        (("train", "more"), {"validation_share", "test_share"}),
+    ],
+)
+def test_init_writes_shares_only_for_splits_that_are_drawn(
+    names: tuple[str, ...], shares: set[str], tmp_path: Path
+) -> None:
+    found = measured(look_at(str(write_rlds_splits(tmp_path / "set", *names))))
+    assert found.about[-1].startswith("splits: ")
+    laptop = Machine(None, 24 * 10**9, has_bf16=False, cores=2, free_bytes=10**11)
+    model = choose_model("released", "builtin:sim-tiny")
+    draft = make_draft(found, laptop, model, run_dir="run", own_splits=own_splits(found))
+    assert {key for key in plain(draft.knobs)["data"] if key.endswith("_share")} == shares
+
+
+def test_the_config_of_an_older_run_draws_its_splits() -> None:
+    values = {"run_dir": "run", "data": {"path": "set"}, "model": {"base": "builtin:sim-tiny"}}
+    new = parse_config(values, where="here")
+    assert new.data.splits == "dataset"
+    resolved = config_as_dict(new)
+    assert parse_config(resolved, where="here") == new
+    del resolved["data"]["splits"]
+    resolved["replay"] = {"share": 0.1, "data": dict(resolved["data"])}
+    older = parse_config(resolved, where="here")
+    assert [data.splits for data in older.data_sets] == ["hash", "hash"]
