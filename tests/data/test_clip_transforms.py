@@ -50,7 +50,10 @@ def test_training_clips_are_changed_by_seed_and_position_and_others_never() -> N
     assert torch.equal(frames(dataset, 20), frames(dataset, 20))
     other = (frames(dataset, 20, seed=2) - frames(plain, 20, seed=2))[:, 0, 0, 0]
     assert not torch.equal(other, offsets)
-    both = ([batch.frames for batch in validation_batches(one, "validation", clips=4, batch_size=2)] for one in (dataset, plain))
+    both = (
+        [batch.frames for batch in validation_batches(one, "validation", clips=4, batch_size=2)]
+        for one in (dataset, plain)
+    )
     assert all(torch.equal(one, other) for one, other in zip(*both, strict=True))
     np.testing.assert_array_equal(dataset.clips()[3].frames, plain.clips()[3].frames)
 
@@ -107,11 +110,17 @@ def test_a_second_data_set_has_its_own_transforms() -> None:
     ("change", "words"),
     [
         (lambda clip: clip.frames, "frames of object"),
-        (lambda clip: None, "frames of object"),
-        (lambda clip: replace(clip, frames=clip.frames / 255), "found|frames of float64, 3 x height x width x 3.*uint8"),
+        (lambda _: None, "frames of object"),
+        (
+            lambda clip: replace(clip, frames=clip.frames / 255),
+            "found|frames of float64, 3 x height x width x 3.*uint8",
+        ),
         (lambda clip: replace(clip, frames=clip.frames[:2]), "frames of uint8, 2 x height"),
         (lambda clip: replace(clip, frames=clip.frames[..., :1]), r"width x 1\."),
-        (lambda clip: replace(clip, states=clip.states[:, :6]), "states of float32, 3 x 6. needed: states of float32, 3 x 7"),
+        (
+            lambda clip: replace(clip, states=clip.states[:, :6]),
+            "states of float32, 3 x 6. needed: states of float32, 3 x 7",
+        ),
         (lambda clip: replace(clip, actions=clip.actions.astype(float)), "actions of float64"),
     ],
 )

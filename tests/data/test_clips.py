@@ -109,7 +109,7 @@ def test_shuffled_parts_have_every_clip_once() -> None:
 
 def test_a_pickled_data_set_reads_the_same_clips(droid: Path) -> None:
     clips = opened(droid).clips()
-    copy = pickle.loads(pickle.dumps(clips))
+    copy = pickle.loads(pickle.dumps(clips))  # noqa: S301 - our own
     assert len(copy) == len(clips)
     np.testing.assert_array_equal(copy[7].frames, clips[7].frames)
 
@@ -155,7 +155,7 @@ def test_clips_behind_a_url_are_read_concurrently() -> None:
 
 def test_what_has_no_clips_is_refused() -> None:
     dataset = open_in_memory(MemorySource([9, 9]))
-    with pytest.raises(InputError, match="'tset'.*train, validation, test"):
+    with pytest.raises(InputError, match=r"'tset'.*train, validation, test"):
         dataset.clips("tset")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="no validation episodes"):
         dataset.clips("validation")

@@ -15,6 +15,8 @@ class Offset:
     """Add one random number to all pixels of a clip."""
 
     class Config(BaseModel, extra="forbid"):
+        """The options."""
+
         most: int = 100
 
     def __init__(self, options: Config) -> None:
