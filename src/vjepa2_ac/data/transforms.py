@@ -176,10 +176,10 @@ class ClipChanges:
     seed: int
 
     @classmethod
-    def of(cls, config: DataConfig, seed: int) -> ClipChanges:
+    def of(cls, data: DataConfig, seed: int) -> ClipChanges:
         """Return the changes that a config describes; transforms are made once, in the process that starts workers."""
-        made = ((one.name, TRANSFORMS.function(one.name, one.options)) for one in config.transforms)
-        return cls(tuple(made), config.augment, seed)
+        made = ((config.name, TRANSFORMS.function(config.name, config.options)) for config in data.transforms)
+        return cls(tuple(made), data.augment, seed)
 
     def apply(self, clip: Clip, position: int) -> Clip:
         """Return the changed clip: a pure function of the clip, the seed and its position in the run.
