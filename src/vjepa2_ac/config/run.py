@@ -57,7 +57,7 @@ class Config(Section):
     """Decides the order of clips, fresh weights and dropout."""
     plugins: Annotated[tuple[str, ...], Affects.NOTHING] = ()
     """Modules of your own, imported before this config is checked: they register forms of data, transforms, losses,
-    planners, metrics, energies and trackers (docs/extending.md). Installed packages register theirs without being named."""
+    planners, metrics, energies and trackers (docs/extending.md). Installed packages need not be named."""
     data: DataConfig
     """The data set, and the clips made of it."""
     replay: ReplayConfig | None = None
