@@ -29,8 +29,8 @@ import video
 from synthetic_droid import draw_episodes
 
 from vjepa2_ac.config import DataConfig, DiskCacheConfig, RldsData
-from vjepa2_ac.data.clips import ClipRequest, read_clip
-from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.data.clips import ClipRequest
+from vjepa2_ac.data.dataset import open_dataset, read_clip
 from vjepa2_ac.data.index import EpisodeTable, get_or_build
 from vjepa2_ac.data.loader import training_loader
 from vjepa2_ac.data.selection import StepSelection

@@ -16,7 +16,7 @@ from paths import ROOT
 from run_fixtures import as_yaml
 from vjepa2_ac.registry import ENERGIES, LOSSES, METRICS, PLANNERS
 
-RECIPES = ("A loss", "A planner", "An energy", "A metric", "A tracker", "A form of data")
+RECIPES = ("A loss", "A planner", "An energy", "A metric", "A tracker", "A transform", "A form of data")
 STATE = "0.4,0,0.4,3.1,0,0,0"
 PAGE = (ROOT / "docs/extending.md").read_text()
 
@@ -39,6 +39,31 @@ def at_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def command(*words: str) -> subprocess.CompletedProcess[str]:
     """Run a command in a process of its own, without the working directory on the path."""
     return nursery().run("-m", "vjepa2_ac.cli", *words, folder=Path.cwd().parent)
+
+
+def test_the_transform_adds_its_noise_and_the_run_goes_on_with_it_only(at_home: Path, make_config) -> None:
+    values = yaml.safe_load(as_yaml(make_config(training__steps=1, run_dir=at_home / "run", data__workers=0)))
+    values |= {"plugins": ["my_module"]}
+    values["data"]["transforms"] = [{"name": "sensor_noise", "options": {"std": 5.0}}]
+    (at_home / "own.yaml").write_text(yaml.safe_dump(values))
+    code = """
+import itertools
+from vjepa2_ac import load_config, open_dataset
+from vjepa2_ac.data.loader import training_loader
+read = [next(training_loader(open_dataset(load_config("own.yaml", keys)), seed=0, batch_size=8)).frames.float()
+        for keys in ([], ["data.transforms=[]"])]
+print((read[0] - read[1])[read[1] > 50].std().item())
+"""
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, check=True)
+    assert 4 < float(done.stdout) < 6
+    assert command("train", "own.yaml").returncode == 0
+    for other in ("[]", "[{name: sensor_noise, options: {std: 6.0}}]"):
+        refused = command("train", "own.yaml", f"data.transforms={other}")
+        assert (refused.returncode, "differs in" in refused.stderr, "data.transforms" in refused.stderr) == (
+            2,
+            True,
+            True,
+        )
 
 
 def test_every_recipe_is_short() -> None:
@@ -78,6 +103,7 @@ def test_a_loss_trains_and_a_planner_and_an_energy_plan_by_yaml(at_home: Path, m
     values = yaml.safe_load(as_yaml(make_config(training__steps=1, run_dir=at_home / "run")))
     values["plugins"] = ["my_module"]
     values["training"] |= {"loss": "log_cosh", "loss_options": {"scale": 2.0}}
+    values["data"] |= {"workers": 1, "transforms": [{"name": "sensor_noise", "options": {"std": 5.0}}]}
     values["planning"] |= {"planner": "random", "samples": 16, "iterations": 2}
     values["planning"]["energy"] |= {"distance": "largest"}
     values["tracking"] = {"tensorboard": False, "others": {"lines": {"file": "curves.txt"}}}

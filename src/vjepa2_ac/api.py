@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args, overload
+from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
 import torch
@@ -22,7 +22,6 @@ from vjepa2_ac.data import dataset as datasets
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.loader import validation_batches
 from vjepa2_ac.data.transforms import Crop
-from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.distributed import has_bf16, no_cuda, require_type_of_weights
 from vjepa2_ac.encoding.batch import encode_batch, encode_frames
 from vjepa2_ac.episode import Batch, LatentBatch
@@ -59,8 +58,9 @@ def open_dataset(data: str | Path | Config, **knobs: Any) -> Dataset:
         knobs: Knobs of `data:` in a config, such as `frames` and `stride`; `vjepa2-ac config schema` lists them.
 
     Returns:
-        The data set. `len(dataset.table)` episodes, `dataset.control_rate_hz` control steps a second,
-        `len(dataset.windows("train"))` clips; `dataset.source.read(0)` is an episode with its states, steps x 7.
+        The data set. `len(dataset.table)` episodes, `dataset.control_rate_hz` control steps a second;
+        `dataset.clips("train")` is a `torch.utils.data.Dataset` of clips; `dataset.source.read(0)` is an episode with
+        its states, steps x 7.
 
     Raises:
         InputError: There is no such data set, it is damaged, a knob is wrong, or no episode is left.
@@ -102,9 +102,6 @@ def read_clips(dataset: Dataset, split: Split = "train", *, clips: int = 16, bat
         >>> tuple(batch.frames.shape)
         (8, 4, 180, 243, 3)
     """
-    if split not in get_args(Split):
-        raise InputError(where="read_clips", found=f"split {split!r}", needed=", ".join(get_args(Split)))
-    require_stride(dataset.config, to="read clips", fix="Give one: open_dataset(config, stride=4)")
     return validation_batches(dataset, split, clips=clips, batch_size=batch_size)
 
 

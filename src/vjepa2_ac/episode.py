@@ -32,6 +32,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, Num, UInt8
 
 if TYPE_CHECKING:
+    import torch
     from torch import Tensor
 
 Progress = Callable[[int, int], None]  # done, total
@@ -177,6 +178,10 @@ class Batch:
             extrinsics=None if self.extrinsics is None else change(self.extrinsics),
             latents=None if self.latents is None else self.latents.mapped(change),
         )
+
+    def to(self, device: torch.device | str, *, non_blocking: bool = False) -> Batch:
+        """Return the batch with its tensors on a device."""
+        return self.mapped(lambda tensor: tensor.to(device, non_blocking=non_blocking))
 
     def pin_memory(self) -> Batch:
         """Return the batch in pinned memory, from which copies to the device do not block the host.

@@ -107,7 +107,7 @@ class Registry:
     @property
     def name_in_schema(self) -> Any:
         """The names, as a JSON schema has them: for a knob that names one of these things."""
-        return Field(json_schema_extra=lambda schema: schema.update(enum=list[Any](self.names())))
+        return Field(json_schema_extra=lambda schema: schema.update({"enum": [*self.names()]} if self.names() else {}))
 
     @property
     def things_in_schema(self) -> Any:
@@ -167,7 +167,8 @@ ENERGIES = Registry(
 )
 METRICS = Registry("metric", "vjepa2_ac.metrics", {"l1": "evaluation.result:L1", "l2": "evaluation.result:L2"})
 TRACKERS = Registry("tracker", "vjepa2_ac.trackers", {})
-REGISTRIES = (SOURCES, LOSSES, PLANNERS, ENERGIES, METRICS, TRACKERS)
+TRANSFORMS = Registry("transform", "vjepa2_ac.transforms", {})
+REGISTRIES = (SOURCES, LOSSES, PLANNERS, ENERGIES, METRICS, TRACKERS, TRANSFORMS)
 
 
 def import_plugins(modules: Iterable[str], *, where: str, here: bool = True) -> None:

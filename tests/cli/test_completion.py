@@ -24,7 +24,7 @@ echo "${{COMPREPLY[*]}}"
     ("line", "offered"),
     [
         ("tr", "train"),
-        ("data c", "check calibrate converter"),
+        ("data c", "check calibrate convert converter"),
         ("evaluate run --cl", "--clips"),
         ("evaluate run --split ", "test validation"),
         ("train mi", "mine.yaml"),

@@ -97,6 +97,20 @@ def test_inspect_prints_and_writes_statistics_and_a_figure(config: str, tmp_path
     assert (out / "contact_sheet.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_convert_writes_a_data_set_that_can_be_checked(config: str, tmp_path: Path, capsys: Printed) -> None:
+    out = tmp_path / "as_lerobot"
+    assert main(["data", "convert", config, str(out), "data.camera=wrist_left", 'data.idle={"rule": "motion"}']) == 0
+    printed = capsys.readouterr().out
+    assert "writing episodes 8/8" in printed
+    assert f"8 episodes, 320 steps. Next: vjepa2-ac init {out}" in printed.replace("\n", "")
+    keys = ["data.source=lerobot", f"data.path={out}", "data.lerobot.state=[observation.state]"]
+    keys += ["data.lerobot.cameras={wrist_left: observation.images.wrist_left}", "data.camera=wrist_left"]
+    assert main(["data", "check", config, *keys, "--limit", "4"]) == 0
+    for folder in (out, tmp_path):
+        assert main(["data", "convert", config, str(folder)]) == 2
+        assert "already there and not empty" in capsys.readouterr().err
+
+
 def test_calibrate_prints_a_table_and_writes_its_metrics(config: str, tmp_path: Path, capsys: Printed) -> None:
     out = tmp_path / "out"
     arguments = ["data", "calibrate", config, "data.stride=auto", "--out", str(out), "--limit", "4"]

@@ -30,6 +30,9 @@ data check {demo}
 data check {demo} data.path=. --model nope
 data inspect nope.yaml
 data index nope.yaml
+data convert nope.yaml out
+data convert {demo} out
+data convert {demo} data.path=. /proc/nope/out
 data calibrate nope.yaml
 data calibrate {demo} data.path=. --model nope
 data calibrate {demo} data.path=. --axes nope

@@ -12,6 +12,7 @@ from pydantic import BaseModel
 from copied_sets import WRITERS
 from run_fixtures import TINY
 from vjepa2_ac.config import Config, DataConfig, EncoderConfig, ModelSizes
+from vjepa2_ac.config.data import TransformConfig
 from vjepa2_ac.config.loading import changed_keys, config_as_yaml, parse_config
 from vjepa2_ac.config.section import Affects, Section, knobs_that_affect, mark_of, marks_of
 from vjepa2_ac.data import idle as idle_ranges
@@ -31,6 +32,7 @@ OTHERS = {
     "data.camera": {"npz": "pixels", "rlds": "wrist_left", "lerobot": "wrist_left", "droid_raw": "right"},
     "data.path": "elsewhere",
     "data.augment.crop_scale": (0.5, 1.0),
+    "data.transforms": (TransformConfig.model_construct(name="noise"),),
     "data.stride_candidates": (2, 3),
     "planning.budget_s": 1.0,
     "tracking.others": {"a tracker": {}},
@@ -89,10 +91,10 @@ def with_other(section: BaseModel, key: str, whole: str, source: str) -> BaseMod
     """Return a section in which one knob has another value; what does not fit to it stays."""
     name, _, rest = key.partition(".")
     value, field = getattr(section, name), type(section).model_fields[name]
-    if rest:
+    if rest and not isinstance(value, tuple):
         inner = value if value is not None else SECTIONS.get(whole.rpartition(".")[0]) or absent(field.annotation)
         return section.model_copy(update={name: with_other(inner, rest, whole, source)})
-    given = OTHERS.get(whole, another(value, field.annotation))
+    given = OTHERS.get(whole.removesuffix(f".{rest}"), another(value, field.annotation))
     return section.model_copy(update={name: given[source] if whole == "data.camera" else given})
 
 

@@ -25,8 +25,7 @@ from vector_sets import write_vectors
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.clips import frames_of
-from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.dataset import Dataset, frames_of, open_dataset
 from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.data.inspection.check import check_data
 from vjepa2_ac.data.inspection.statistics import inspect_dataset

@@ -133,7 +133,6 @@ def test_a_clip_that_cannot_be_read_stops_the_run_at_its_own_step(
     del on_device
     run = set_up(config, reporter)
     monkeypatch.setattr(loader, "read_clip", read_some)
-    monkeypatch.setattr("vjepa2_ac.data.clips.read_clip", read_some)
     batches = batches_from(run)
     for step in (1, 2):
         training_step(run, batches, step)

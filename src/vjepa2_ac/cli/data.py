@@ -1,4 +1,4 @@
-"""The data commands: check, index, inspect and calibrate."""
+"""The data commands: check, index, inspect, calibrate, convert and converter."""
 
 from __future__ import annotations
 
@@ -52,8 +52,29 @@ def _add_commands(commands: cli.Commands) -> None:
     cli.add(parser, "--frames N", "frames of a clip (the config's, 8 at most)", cli.whole_number(2, 256))
     cli.add(parser, "--out DIR", "where files go (inspection)", cli.as_path, default=out)
 
+    parser = cli.command(commands, "convert", _convert, "my_robot.yaml data/as_lerobot")
+    cli.add(parser, "config CONFIG", "a YAML config", cli.as_local)
+    cli.add(parser, "out OUT", "a new or empty folder", cli.as_path)
+    cli.add(parser, "overrides key=value", f"such as {such_as}", nargs="*")
+
     parser = cli.command(commands, "converter", _converter, "mp4_and_csv > mp4_and_csv.py")
     cli.add(parser, "name NAME", "which script", nargs="?")
+
+
+def _convert(options: argparse.Namespace) -> None:
+    """Write a data set as LeRobot v3.0: Parquet tables and MP4 videos.
+
+    Episodes are written whole: states, actions, task, success, and all cameras of data.camera. The videos are H.264,
+    which is lossy; all other values are exact. OUT appears when it is complete.
+    """
+    config = cli.read_config(options.config, options.overrides)
+    cli.require_new_place(options.out)
+
+    from vjepa2_ac.data.convert import convert_to_lerobot
+
+    with cli.reporter() as reporter:
+        episodes, steps = convert_to_lerobot(config.data, options.out, reporter)
+    cli.show(f"{episodes:,} episodes, {steps:,} steps. Next: vjepa2-ac init {options.out}", files=[options.out])
 
 
 def _converter(options: argparse.Namespace) -> None:

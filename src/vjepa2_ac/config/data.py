@@ -20,6 +20,7 @@ from vjepa2_ac.config.section import (
     Section,
     Share,
 )
+from vjepa2_ac.registry import TRANSFORMS
 
 # A serial number is a name, also where YAML takes it for a number.
 _CameraName = Annotated[str, BeforeValidator(lambda name: str(name) if type(name) is int else name)]
@@ -98,6 +99,20 @@ class AugmentConfig(Section):
             (least > most, f"crop_scale: {least} is more than {most}"),
             (self.crop_aspect[0] > self.crop_aspect[1], "crop_aspect: {} is more than {}".format(*self.crop_aspect)),
         )
+
+
+class TransformConfig(Section):
+    """A change of training clips by code of your own (docs/extending.md)."""
+
+    name: Annotated[str, AfterValidator(TRANSFORMS.known), TRANSFORMS.name_in_schema]
+    """The name under which the transform is registered."""
+    options: Annotated[dict[str, Any], TRANSFORMS.options_in_schema] = {}
+    """Options of the transform, if its class has some."""
+
+    @model_validator(mode="after")
+    def _options_fit(self) -> TransformConfig:
+        TRANSFORMS.options(self.name, self.options)
+        return self
 
 
 class DiskCacheConfig(Section):
@@ -188,6 +203,9 @@ class DataConfig(Section):
     square: its central square (upstream's evaluation). letterbox: all of it, with black bars."""
     augment: Annotated[AugmentConfig, Affects.RUN] = AugmentConfig()
     """Random changes of training clips."""
+    transforms: Annotated[tuple[TransformConfig, ...], Affects.RUN] = ()
+    """Changes of training clips by code of your own, in this order, before `augment` (docs/extending.md). Each is given
+    a random generator that depends on the seed and the position of the clip in the run."""
     cache: Annotated[Literal["off", "auto", "require"], OFF, Affects.RUN] = "off"
     """Whether the frozen encoder's latents are cached on disk, so that each frame is encoded once. off: no. auto: those
     that are not there yet are encoded before the first step. require: refuse to start where they are not there."""
@@ -236,8 +254,8 @@ class DataConfig(Section):
             (self.is_cache and self.stride == "auto", "stride auto: a latent cache has one stride; give its number"),
             (self.is_cache and self.cache != "off", f"source {self.source} is itself a cache: set cache: off"),
             (
-                self.augment.is_on and self.takes_latents,
-                "augment changes frames, and latents in a cache stay: choose one",
+                self.changes_clips and self.takes_latents,
+                f"{self.changes_clips} changes frames, and latents in a cache stay: choose one",
             ),
             (splits >= 1.0, "validation_share and test_share leave nothing to train on"),
             (
@@ -308,6 +326,11 @@ class DataConfig(Section):
         """Return the sections that this form of data has and others have not."""
         own = [(name, one.annotation) for name, one in cls.model_fields.items() if name not in DataConfig.model_fields]
         return {name: kind for name, kind in own if isinstance(kind, type) and issubclass(kind, Section)}
+
+    @property
+    def changes_clips(self) -> str:
+        """The key that changes training clips, augment or transforms; empty if none does."""
+        return "augment" if self.augment.is_on else "transforms" if self.transforms else ""
 
     @property
     def takes_latents(self) -> bool:

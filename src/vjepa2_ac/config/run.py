@@ -56,8 +56,8 @@ class Config(Section):
     seed: Annotated[int, Field(ge=0, lt=2**31), Affects.RUN | Affects.PLAN] = 0
     """Decides the order of clips, fresh weights and dropout."""
     plugins: Annotated[tuple[str, ...], Affects.NOTHING] = ()
-    """Modules of your own, imported before this config is checked: they register forms of data, losses, planners,
-    metrics, energies and trackers (docs/extending.md). Installed packages register theirs without being named."""
+    """Modules of your own, imported before this config is checked: they register forms of data, transforms, losses,
+    planners, metrics, energies and trackers (docs/extending.md). Installed packages need not be named."""
     data: DataConfig
     """The data set, and the clips made of it."""
     replay: ReplayConfig | None = None

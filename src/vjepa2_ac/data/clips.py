@@ -1,25 +1,27 @@
-"""Clips from the steps and frames of an episode, and batches from clips."""
+"""Clips from the steps and frames of an episode, batches from clips, and the data set of clips for any DataLoader."""
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any, SupportsIndex
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
+from torch.utils.data import Dataset as TorchDataset
+from torch.utils.data._utils.collate import default_collate_fn_map
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.dataset import Dataset, require_widths
+from vjepa2_ac.data.files import in_parallel
 from vjepa2_ac.data.selection import with_exclusion
 from vjepa2_ac.data.sources.indexed_source import measured_space
 from vjepa2_ac.data.transforms import view
-from vjepa2_ac.episode import Augmentation, Batch, Clip, StoredLatents, Widths
+from vjepa2_ac.episode import Batch, Clip, Episode, StoredLatents, Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.spaces import states_in_camera_frame
-
-Augment = Callable[[int, int], Augmentation | None]  # from the height and width of a clip's frames
 
 
 @dataclass(frozen=True)
@@ -29,26 +31,48 @@ class ClipRequest:
     episode: int  # index into the data set's table
     start: int  # first control step
     camera: str | None = None  # whose frames; None: the config's (first) camera
-    augmentation: Augment | None = None  # draws the augmentation
 
 
-def read_clip(dataset: Dataset, request: ClipRequest) -> Clip:
-    """Return a clip; decodes its frames only.
+@dataclass(frozen=True)
+class Clips(TorchDataset[Clip]):
+    """The clips of a split by index, for any `torch.utils.data.DataLoader`; see `dataset.Dataset.clips`."""
+
+    read: Callable[[int], Clip]
+    count: int
+    connections: int  # clips that are read at once
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, index: SupportsIndex) -> Clip:
+        """Return a clip; a negative index counts from the end.
+
+        Raises:
+            IndexError: There is no such clip.
+            InputError: The clip cannot be read.
+        """
+        number = operator.index(index)
+        if not -self.count <= number < self.count:
+            raise IndexError(f"clip {number} of {self.count}")
+        return self.read(number % self.count)
+
+    def __getitems__(self, indices: Sequence[SupportsIndex]) -> list[Clip]:
+        """Return several clips, as a DataLoader requests them; clips behind a URL are read concurrently."""
+        return list(in_parallel(self.__getitem__, indices, self.connections))
+
+
+def clip_of(recording: Episode, request: ClipRequest, config: DataConfig) -> Clip:
+    """Return a clip of an episode; decodes its frames only.
 
     Raises:
-        InputError: The episode or one of the frames cannot be read; does not say how to leave the episode out.
+        InputError: One of the frames cannot be read, or the camera has no pose and needs one.
     """
-    config = dataset.config
     steps = range(request.start, request.start + config.clip_steps, config.model_stride)
-    recording = dataset.source.read(request.episode, request.camera, dataset.needed_steps(request.episode))
-    require_widths(recording, dataset.widths)
-    frames = latents = augmentation = None
+    frames = latents = None
     if recording.read_latents is not None:
         latents = recording.read_latents(steps)
     else:
         frames = view(recording.read_frames(steps), config.crop)
-        if request.augmentation is not None:
-            augmentation = request.augmentation(frames.shape[1], frames.shape[2])
     states = recording.states[list(steps)]
     extrinsics = None if recording.extrinsics is None else recording.extrinsics[list(steps)]
     if config.pose_frame == "camera":
@@ -64,7 +88,6 @@ def read_clip(dataset: Dataset, request: ClipRequest) -> Clip:
         episode_id=recording.info.id,
         start=request.start,
         stride=config.model_stride,
-        augmentation=augmentation,
         latents=latents,
         camera=request.camera,
     )
@@ -138,6 +161,13 @@ def collate(clips: Sequence[Clip]) -> Batch:
     )
 
 
+def _collate_by_default(clips: Sequence[Clip], **_: Any) -> Batch:
+    return collate(clips)
+
+
+default_collate_fn_map[Clip] = _collate_by_default  # PyTorch documents this as the way to extend `default_collate`
+
+
 def joined_latents(latents: Sequence[StoredLatents], join: Callable[[list[Tensor]], Tensor]) -> StoredLatents:
     """Return latents joined by `torch.stack` or `torch.cat`, and their scales likewise."""
     scales = [one.scales for one in latents if one.scales is not None]
@@ -154,19 +184,3 @@ def no_clips(frames: int, widths: Widths) -> Batch:
         episode_ids=(),
         starts=(),
     )
-
-
-def frames_of(dataset: Dataset, batch: Batch, row: int) -> UInt8[np.ndarray, "time height width 3"]:
-    """Return the frames of a clip of a batch, cropped, for people to look at; small frames for cached latents.
-
-    Raises:
-        InputError: The frames of a cache cannot be read.
-        ValueError: The clip belongs to another data set.
-    """
-    if batch.frames is not None:
-        return batch.frames[row].numpy()
-    episode, start = dataset.table.find(batch.episode_ids[row]), batch.starts[row]
-    if episode is None:
-        raise ValueError(f"no episode {batch.episode_ids[row]}")
-    steps = range(start, start + dataset.config.clip_steps, dataset.config.model_stride)
-    return view(dataset.source.read(episode, batch.cameras[row]).read_frames(steps), dataset.config.crop)

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
-from jaxtyping import Bool, Int, UInt64
+from jaxtyping import Bool, Int, UInt8, UInt64
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
+from vjepa2_ac.data.files import connections_to
 from vjepa2_ac.data.idle import find_ranges
 from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.data.selection import (
@@ -22,13 +23,17 @@ from vjepa2_ac.data.selection import (
     included,
     of_outcome,
     require_distinct,
+    with_exclusion,
 )
 from vjepa2_ac.data.sources.indexed_source import open_source, spaces_of
 from vjepa2_ac.data.splits import held_out_by, members_of
-from vjepa2_ac.data.windows import Windows, clip_starts, windows_of
-from vjepa2_ac.episode import POSE_WIDTHS, Episode, EpisodeSource, Progress, StepRanges, Widths
+from vjepa2_ac.data.windows import Windows, clip_starts, drawn, require_stride, windows_of
+from vjepa2_ac.episode import POSE_WIDTHS, Batch, Clip, Episode, EpisodeSource, Progress, StepRanges, Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.spaces import Spaces
+
+if TYPE_CHECKING:  # PyTorch is imported when clips are read
+    from vjepa2_ac.data.clips import ClipRequest, Clips
 
 logger = logging.getLogger(__name__)
 
@@ -77,12 +82,49 @@ class Dataset:
         among = of_outcome(self.table, self.config)
         return np.asarray(self.taking_part & members_of(self.table, self.split_hash, self.config, split, among))
 
-    def windows(self, split: Split) -> Windows:
-        """Return the clips of a split.
+    def clips(self, split: Split = "train") -> Clips:
+        """Return the clips of a split as a `torch.utils.data.Dataset`.
+
+        Clip i is always the same one: clips are sorted by the identity of their episode and then by their first control
+        step, whatever the seed; of several cameras one is drawn by a hash of the clip. Clips are as recorded:
+        `data.augment` and `data.transforms` belong to the order of a training run.
+
+        Returns:
+            `len(clips)` clips; `clips[i]` is an `episode.Clip` of `frames` (time x height x width x 3, uint8, RGB,
+            cropped; None of a latent cache, which has `latents`), `states` (time x 7: metres, radians, closedness) and
+            `actions` (time-1 x 7), float32. A DataLoader collates clips to an `episode.Batch` of tensors. It may
+            shuffle and use any number of workers; for data behind a URL, workers that are not forked.
 
         Raises:
-            InputError: There are none; see `windows_of`.
+            InputError: No such split, no clips, or `data.stride` is auto. `clips[i]` raises it where the clip cannot be
+                read, whatever `data.broken_episodes` is; from a worker, DataLoader makes a RuntimeError of it.
+
+        Example:
+            >>> loader = torch.utils.data.DataLoader(dataset.clips("train"), batch_size=8, shuffle=True, num_workers=4)
+            >>> latents = encode(model, next(iter(loader))).latents
         """
+        from vjepa2_ac.data.clips import Clips
+
+        windows = self.windows(split)
+        return Clips(partial(_read_window, self, windows), len(windows), connections_to(self.config))
+
+    def request(self, window: tuple[int, int]) -> ClipRequest:
+        """Return the request for the clip of a window: (episode, first control step); its camera is drawn by a hash."""
+        from vjepa2_ac.data.clips import ClipRequest
+
+        episode, start = window
+        number = drawn(int(~self.table.id_hash[episode]), start)
+        return ClipRequest(episode, start, self.config.cameras[int(number * len(self.config.cameras))])
+
+    def windows(self, split: Split) -> Windows:
+        """Return where the clips of a split begin, in the fixed order of `clips`.
+
+        Raises:
+            InputError: No such split, or no clips; see `windows_of`. Or `data.stride` is auto.
+        """
+        if split not in get_args(Split):
+            raise InputError(where="split", found=repr(split), needed=", ".join(get_args(Split)))
+        require_stride(self.config, to="read clips", fix="Give one: open_dataset(config, stride=4)")
         members = self.members(split)
         if not members.any():
             raise self._empty_split(split)
@@ -195,6 +237,16 @@ class Dataset:
             raise self.broken.refusal(error, [name]) from None
         self.broken.met(name, str(error))
 
+    def read(self, episode: int, camera: str | None = None) -> Episode:
+        """Return an episode; no frame is read before `Episode.read_frames` requests it.
+
+        Raises:
+            InputError: The episode cannot be read, or its states or actions have other widths than those of the others.
+        """
+        recording = self.source.read(episode, camera, self.needed_steps(episode))
+        require_widths(recording, self.widths)
+        return recording
+
     def needed_steps(self, episode: int) -> StepRanges | None:
         """Return the steps of an episode that clips may come from; None: all of them."""
         return None if self.config.idle.rule == "none" else self.kept.of(episode)
@@ -251,6 +303,43 @@ def _settled(dataset: Dataset) -> Dataset:
     """Check that a latent cache has what the clips need, and set its cameras in the config."""
     source: Any = dataset.source
     return replace(dataset, config=source.settle(dataset.starts.episode)) if dataset.config.is_cache else dataset
+
+
+def read_clip(dataset: Dataset, request: ClipRequest) -> Clip:
+    """Return a clip; decodes its frames only.
+
+    Raises:
+        InputError: The episode or one of the frames cannot be read; does not say how to leave the episode out.
+    """
+    from vjepa2_ac.data.clips import clip_of
+
+    return clip_of(dataset.read(request.episode, request.camera), request, dataset.config)
+
+
+def _read_window(dataset: Dataset, windows: Windows, index: int) -> Clip:
+    request = dataset.request(windows[index])
+    try:
+        return read_clip(dataset, request)
+    except InputError as error:
+        raise with_exclusion(error, [dataset.table.identity(request.episode)]) from None
+
+
+def frames_of(dataset: Dataset, batch: Batch, row: int) -> UInt8[np.ndarray, "time height width 3"]:
+    """Return the frames of a clip of a batch, cropped, for people to look at; small frames for cached latents.
+
+    Raises:
+        InputError: The frames of a cache cannot be read.
+        ValueError: The clip belongs to another data set.
+    """
+    from vjepa2_ac.data.transforms import view
+
+    if batch.frames is not None:
+        return batch.frames[row].numpy()
+    episode, start = dataset.table.find(batch.episode_ids[row]), batch.starts[row]
+    if episode is None:
+        raise ValueError(f"no episode {batch.episode_ids[row]}")
+    steps = range(start, start + dataset.config.clip_steps, dataset.config.model_stride)
+    return view(dataset.source.read(episode, batch.cameras[row]).read_frames(steps), dataset.config.crop)
 
 
 def widths_of(episode: Episode) -> Widths:

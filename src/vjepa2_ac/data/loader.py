@@ -12,7 +12,6 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import partial
@@ -26,12 +25,13 @@ from torch.utils.data import Dataset as TorchDataset
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.clips import ClipRequest, collate, no_clips, read_clip
-from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.clips import ClipRequest, collate, no_clips
+from vjepa2_ac.data.dataset import Dataset, read_clip
+from vjepa2_ac.data.files import connections_to, in_parallel
 from vjepa2_ac.data.selection import BrokenEpisodes, named
 from vjepa2_ac.data.streams import ToDevice
-from vjepa2_ac.data.transforms import draw
-from vjepa2_ac.data.windows import ClipOrder, drawn, far_neighbours, spread
+from vjepa2_ac.data.transforms import ClipChanges
+from vjepa2_ac.data.windows import ClipOrder, far_neighbours, spread
 from vjepa2_ac.episode import Batch, Clip, Skipped
 from vjepa2_ac.errors import InputError, UserError
 
@@ -104,15 +104,15 @@ def first_clips(share: ProcessShare, batch_size: int, *, start: int) -> Iterator
         yield from (start + (before + number) * batch_size for number in share.own)
 
 
-def _training_clips(dataset: Dataset, seed: int) -> _Clips:
-    return _Clips(dataset, partial(_training_clip, dataset.config, ClipOrder(dataset.windows("train"), seed)))
+def _training_clips(dataset: Dataset, seed: int) -> _MicroBatches:
+    order = ClipOrder(dataset.windows("train"), seed)
+    return _MicroBatches(dataset, partial(_training_clip, dataset.config, order), ClipChanges.of(dataset.config, seed))
 
 
 def _training_clip(config: DataConfig, order: ClipOrder, position: int) -> ClipRequest:
-    """Return a clip of the endless sequence of a run: camera and augmentation are drawn per clip."""
+    """Return the request for a clip of the endless sequence of a run: the camera is drawn per clip."""
     camera = config.cameras[order.choice(position, len(config.cameras))]
-    augmentation = partial(draw, config.augment, seed=order.seed, position=position)
-    return ClipRequest(*order.window(position), camera, augmentation)
+    return ClipRequest(*order.window(position), camera)
 
 
 def validation_batches(dataset: Dataset, split: Split, *, clips: int, batch_size: int) -> Iterator[Batch]:
@@ -150,7 +150,7 @@ def batches_of(
     count, empty = len(windows), not may_be_none
     rows = [list(range(first, min(first + batch_size, count))) for first in range(0, count, batch_size)]
     workers = dataset.config.workers if count >= CLIPS_WORTH_WORKERS else 0
-    clips = _Clips(dataset, partial(_chosen_clip, dataset, windows))
+    clips = _MicroBatches(dataset, partial(_chosen_clip, dataset, windows))
     for batch in Batches(_micro_batches(clips, iter(rows), workers), dataset.broken):
         if batch.starts:
             empty = False
@@ -162,20 +162,17 @@ def batches_of(
 
 
 def _chosen_clip(dataset: Dataset, windows: Sequence[tuple[int, int]], position: int) -> ClipRequest:
-    """Return a clip of a list of windows; the camera is drawn per window."""
-    episode, start = windows[position]
-    cameras = dataset.config.cameras
-    number = drawn(int(~dataset.table.id_hash[episode]), start)
-    return ClipRequest(episode, start, cameras[int(number * len(cameras))])
+    return dataset.request(windows[position])
 
 
 @dataclass(frozen=True)
-class _Clips(TorchDataset[Batch]):
-    """Clips by position, read a micro-batch at a time."""
+class _MicroBatches(TorchDataset[Batch]):
+    """Micro-batches of the clips at given positions."""
 
     dataset: Dataset
     request_at: Callable[[int], ClipRequest]  # a pure function of the position, the same in every worker
-    replayed: _Clips | None = None  # of the second data set
+    changes: ClipChanges | None = None  # of training clips; likewise
+    replayed: _MicroBatches | None = None  # of the second data set
     share: Fraction = Fraction(0)  # of these
 
     def __getitems__(self, positions: list[int]) -> Batch | UserError:
@@ -191,11 +188,8 @@ class _Clips(TorchDataset[Batch]):
             return error
 
     def _read(self, positions: list[int]) -> list[Clip | Skipped]:
-        configs = [one.dataset.config for one in (self, self.replayed) if one is not None]
-        if not any(storage.is_url(config.path) for config in configs):
-            return [self._clip(position) for position in positions]
-        with ThreadPoolExecutor(min(len(positions), *(config.connections for config in configs))) as pool:
-            return list(pool.map(self._clip, positions))
+        data_sets = [one.dataset for one in (self, self.replayed) if one is not None]
+        return list(in_parallel(self._clip, positions, max(connections_to(one.config) for one in data_sets)))
 
     def _clip(self, position: int) -> Clip | Skipped:
         if self.replayed is not None:
@@ -206,12 +200,13 @@ class _Clips(TorchDataset[Batch]):
             position -= before
         request = self.request_at(position)
         try:
-            return read_clip(self.dataset, request)
+            clip = read_clip(self.dataset, request)
         except InputError as error:
             name = self.dataset.table.identity(request.episode)
             if self.dataset.config.broken_episodes == "error":
                 raise self.dataset.broken.refusal(error, [name]) from None
             return Skipped(name, str(error))
+        return clip if self.changes is None else self.changes.apply(clip, position)
 
 
 class Batches(Iterator[Batch]):
@@ -281,7 +276,7 @@ def prefetch_next(batches: Iterator[Batch]) -> None:
 
 
 def _micro_batches(
-    clips: _Clips, positions: Iterator[list[int]], workers: int, *, pinned: bool = False
+    clips: _MicroBatches, positions: Iterator[list[int]], workers: int, *, pinned: bool = False
 ) -> Generator[Batch | UserError, None, None]:
     # A fork server has no threads: a plain fork may hang in OpenMP or CUDA, and Python warns of it.
     context = multiprocessing.get_context("forkserver") if workers else None

@@ -1,7 +1,8 @@
-"""Camera frames to encoder input: crop, augmentation, scaling, normalisation.
+"""Camera frames to encoder input: crop, transforms, augmentation, scaling, normalisation.
 
-The crop is taken in the loader, on uint8; everything else runs on the device, on a whole batch. Augmentation of
-training clips, a random crop and colour jitter, is drawn once per clip in the loader and applied on the device.
+The crop is taken in the loader, on uint8, and the user's transforms are applied there; everything else runs on the
+device, on a whole batch. Augmentation of training clips, a random crop and colour jitter, is drawn once per clip in the
+loader and applied on the device.
 
 Source: facebookresearch/vjepa2 @ c2963a4, app/vjepa_droid/transforms.py and src/datasets/utils/video/transforms.py. The
 recipe's random crop never fits a 16:9 frame, so its fallback, a central crop, is always taken: nothing is random.
@@ -10,8 +11,8 @@ recipe's random crop never fits a 16:9 frame, so its fallback, a central crop, i
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Literal
 
@@ -20,11 +21,13 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from vjepa2_ac.config import AugmentConfig
-from vjepa2_ac.episode import Augmentation
+from vjepa2_ac.config import AugmentConfig, DataConfig
+from vjepa2_ac.episode import Augmentation, Clip
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.registry import TRANSFORMS
 
 Crop = Literal["released", "square", "letterbox"]
+Transform = Callable[[Clip, np.random.Generator], Clip]
 
 NARROWEST, WIDEST = 0.75, 1.35  # width over height that the recipe leaves uncropped
 
@@ -32,6 +35,7 @@ _MEAN = (0.485 * 255, 0.456 * 255, 0.406 * 255)  # of ImageNet, as the encoder w
 _STD = (0.229 * 255, 0.224 * 255, 0.225 * 255)
 _BRIGHTNESS = (0.299, 0.587, 0.114)  # weights of red, green and blue, ITU-R BT.601
 _STREAM = 0xA6  # separates the random numbers of augmentation from others of the same seed and position
+_TRANSFORMS_STREAM = 0x7F  # likewise those of transforms
 
 
 @dataclass(frozen=True)
@@ -161,6 +165,52 @@ def _resized(frames: UInt8[Tensor, "count height width 3"], size: int) -> Float[
     return torch.nn.functional.interpolate(
         pixels, size=(size, size), mode="bilinear", align_corners=False, antialias=False
     )
+
+
+@dataclass(frozen=True)
+class ClipChanges:
+    """Changes of the training clips of a run: the user's transforms, then augmentation."""
+
+    transforms: tuple[tuple[str, Transform], ...]  # by name, in the config's order
+    augment: AugmentConfig
+    seed: int
+
+    @classmethod
+    def of(cls, data: DataConfig, seed: int) -> ClipChanges:
+        """Return the changes that a config describes; transforms are made once, in the process that starts workers."""
+        made = ((config.name, TRANSFORMS.function(config.name, config.options)) for config in data.transforms)
+        return cls(tuple(made), data.augment, seed)
+
+    def apply(self, clip: Clip, position: int) -> Clip:
+        """Return the changed clip: a pure function of the clip, the seed and its position in the run.
+
+        Raises:
+            InputError: A transform returned something that training cannot use.
+        """
+        for number, (name, transform) in enumerate(self.transforms):
+            before, generator = clip, np.random.default_rng([_TRANSFORMS_STREAM, number, self.seed, position])
+            clip = transform(before, generator)
+            _require_same_form(clip, before, name)
+        if clip.frames is None:
+            return clip
+        height, width = clip.frames.shape[1:3]
+        return replace(clip, augmentation=draw(self.augment, height, width, seed=self.seed, position=position))
+
+
+def _require_same_form(result: object, before: Clip, name: str) -> None:
+    """Refuse the result of a transform unless shapes and types are as before; frames may have another size."""
+    found, needed = ([_form(one, part) for part in ("frames", "states", "actions")] for one in (result, before))
+    for one, other in zip(found, needed, strict=True):
+        if one != other:
+            raise InputError(where=f"data.transforms: {name}", found=one, needed=other)
+
+
+def _form(clip: object, part: str) -> str:
+    array = np.asarray(getattr(clip, part, None))
+    shape = [str(size) for size in array.shape]
+    if part == "frames":
+        shape[1:3] = ["height", "width"]
+    return f"{part} of {array.dtype}, {' x '.join(shape)}"
 
 
 def draw(config: AugmentConfig, height: int, width: int, *, seed: int, position: int) -> Augmentation | None:

@@ -40,7 +40,7 @@ def encode_batch(world_model: WorldModel, batch: Batch, *, device: torch.device,
         InputError: The model needs camera poses and a clip has none.
     """
     arrived = batch.on_device() if batch.on_device else None  # None, too, if it was used before
-    batch = (arrived or batch).mapped(lambda tensor: tensor.to(device, non_blocking=True))
+    batch = (arrived or batch).to(device, non_blocking=True)
     if batch.latents is not None:
         latents = unpack_latents(batch.latents)
     elif batch.frames is not None:

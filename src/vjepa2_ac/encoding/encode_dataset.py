@@ -100,16 +100,16 @@ def require_encodable(config: Config) -> None:
     """Refuse a config that cannot have a cache, before anything is opened.
 
     Raises:
-        InputError: The data are a cache, the stride is not known, or clips are augmented.
+        InputError: The data are a cache, the stride is not known, or training clips are changed.
     """
     data = config.data
     if data.is_cache:
         raise InputError(where="data.source", found="latents: they are encoded already", needed="a data set of frames")
     fix = "`vjepa2-ac data calibrate CONFIG` finds one; or let the run encode by itself, with data.cache: auto"
     require_stride(data, to="know which frames are needed", fix=fix)
-    if data.augment.is_on:
+    if key := data.changes_clips:
         found = "clips that look different every time, and a cache holds one latent of each frame"
-        raise InputError(where="data.augment", found=found, fix="Leave data.augment out")
+        raise InputError(where=f"data.{key}", found=found, fix=f"Leave data.{key} out")
 
 
 def begin_encoding(cache: LatentCache, left: Sequence[FramesToEncode], reporter: Reporter) -> None:

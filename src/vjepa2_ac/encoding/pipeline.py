@@ -21,7 +21,7 @@ from torch import Tensor
 from vjepa2_ac import storage
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.clips import joined_latents
-from vjepa2_ac.data.dataset import Dataset, require_widths
+from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.sources.latents.cache_files import CacheType, EncodedEpisode, LatentFiles, pack_latents
 from vjepa2_ac.data.transforms import input_to_pixels, pixels_to_input, view
 from vjepa2_ac.distributed import autocast
@@ -141,7 +141,7 @@ def _parts(
     frames = encoder.chunk * max(1, FRAMES_AT_ONCE // encoder.chunk)  # whole chunks, but for the last of an episode
     waiting = deque[tuple[FramesToEncode, Future[tuple[Episode, _Frames]]]]()
     for one in wanted:
-        recording = pool.submit(_open, dataset, one)
+        recording = pool.submit(dataset.read, one.episode, one.camera)
         for first in range(0, len(one.steps), frames):
             steps = one.steps[first : first + frames].tolist()
             pinned = encoder.device.type == "cuda"
@@ -150,12 +150,6 @@ def _parts(
                 yield waiting.popleft()
     while waiting:
         yield waiting.popleft()
-
-
-def _open(dataset: Dataset, one: FramesToEncode) -> Episode:
-    recording = dataset.source.read(one.episode, one.camera, dataset.needed_steps(one.episode))
-    require_widths(recording, dataset.widths)
-    return recording
 
 
 def _read(dataset: Dataset, opened: Future[Episode], steps: Sequence[int], *, pinned: bool) -> tuple[Episode, _Frames]:

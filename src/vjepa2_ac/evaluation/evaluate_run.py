@@ -15,8 +15,7 @@ from jaxtyping import UInt8
 
 from vjepa2_ac import __version__
 from vjepa2_ac.config import Config
-from vjepa2_ac.data.clips import frames_of
-from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.dataset import Dataset, frames_of, open_dataset
 from vjepa2_ac.data.loader import batches_of, validation_windows
 from vjepa2_ac.data.transforms import frames_as_seen
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder

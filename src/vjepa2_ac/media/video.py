@@ -35,7 +35,7 @@ _STRICT = {
 }
 _START = -(1 << 40)  # before every frame
 _FIX = "Copy the file again, or leave the episode out"
-_QUALITY = "20"  # x264's constant rate factor: text stays sharp
+_CRF = 20  # x264's constant rate factor: text stays sharp
 _COLOURS = 255  # of a GIF
 _SAMPLED = 4  # every so many-th pixel decides about the palette
 
@@ -374,13 +374,17 @@ def video_library(where: str = "video") -> Any:
     return require_library("av", where=where, called="PyAV, which decodes and writes video", extra="video")
 
 
-def write_video(path: str | Path, frames: Iterable[Frame], *, rate_hz: float) -> Path:
+def write_video(
+    path: str | Path, frames: Iterable[Frame], *, rate_hz: float, crf: int = _CRF, key_frame_every: int | None = None
+) -> Path:
     """Write RGB frames as a video and return its path; an odd last row or column of pixels is dropped.
 
     Args:
         path: A local file; missing folders are created.
         frames: Of one size, at least one.
         rate_hz: Frames per second.
+        crf: x264's constant rate factor; a lower one loses less.
+        key_frame_every: Frames from a key frame to the next; few make single frames quick to read. None: x264 decides.
 
     Raises:
         UnreachableError: PyAV is not installed.
@@ -389,9 +393,8 @@ def write_video(path: str | Path, frames: Iterable[Frame], *, rate_hz: float) ->
     av = video_library()
     size: tuple[int, int] | None = None
     with atomic_writer(path) as file, av.open(file, "w", format="mp4", options={"movflags": "faststart"}) as container:
-        stream = container.add_stream(
-            "libx264", rate=Fraction(rate_hz).limit_denominator(1000), options={"crf": _QUALITY, "preset": "medium"}
-        )
+        options = {"crf": str(crf), "preset": "medium"} | ({"g": str(key_frame_every)} if key_frame_every else {})
+        stream = container.add_stream("libx264", rate=Fraction(rate_hz).limit_denominator(1000), options=options)
         stream.pix_fmt = "yuv420p"  # supported by browsers
         for frame in frames:
             even = frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]

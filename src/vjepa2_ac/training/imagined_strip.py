@@ -15,8 +15,7 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from vjepa2_ac.data.clips import frames_of
-from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.dataset import Dataset, frames_of
 from vjepa2_ac.data.transforms import frames_as_seen
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
 from vjepa2_ac.decoding.imagine import AS_RECORDED, Imagination, Imagined, Start, rolled_out, shown, strip_of

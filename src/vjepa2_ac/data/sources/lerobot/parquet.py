@@ -164,7 +164,7 @@ def _no_numbers(where: str, kind: str, gaps: int) -> InputError:
 @contextmanager
 def _opened(opened: str | BlockCachedFile, path: str) -> Iterator[parquet.ParquetFile]:
     """Open a Parquet file with verified page checksums; its errors become errors for the user."""
-    pa = _library(path)
+    pa = parquet_library(path)
     try:
         with pa.parquet.ParquetFile(
             opened, page_checksum_verification=True, pre_buffer=not isinstance(opened, str), memory_map=False
@@ -213,7 +213,7 @@ def _require_consistent(file: parquet.ParquetFile, opened: str | BlockCachedFile
     does not expect. A reader of one row makes the same checks, and raises. Of a remote file it reads none, and
     finds less: the blocks of every row group would be fetched.
     """
-    parquet = _library(str(opened)).parquet
+    parquet = parquet_library(str(opened)).parquet
     rows = 1 if isinstance(opened, str) else 0
     with parquet.ParquetFile(opened, metadata=file.metadata, buffer_size=_BUFFER_BYTES, pre_buffer=False) as light:
         for group in range(file.num_row_groups):
@@ -246,8 +246,8 @@ def _bytes_in(value: Any) -> int:
     return sum(map(_bytes_in, value)) if isinstance(value, list) else 8
 
 
-def _library(where: str) -> Any:
+def parquet_library(where: str) -> Any:
     """Return pyarrow, with its module `parquet`."""
-    called = "pyarrow, which reads LeRobot data sets"
+    called = "pyarrow, which reads and writes LeRobot data sets"
     require_library("pyarrow.parquet", where=where, called=called, extra="lerobot")
     return require_library("pyarrow", where=where, called=called, extra="lerobot")

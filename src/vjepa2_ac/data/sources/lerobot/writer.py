@@ -1,0 +1,193 @@
+"""Writes LeRobot data sets v3.0, with pyarrow and PyAV: the files, columns and keys that LeRobot itself writes.
+
+Frames become H.264 (yuv420p, constant rate factor 18, a key frame every 2 frames), which is lossy: values of BridgeData
+V2 (64 x 64 pixels) differ by 3 of 255 levels on average. There is an MP4 for each episode and camera, and one table
+with a row group for each episode. All numbers and texts are exact. Layout, names and types are those of a data set that
+LeRobot 0.4.4 wrote.
+"""
+
+from __future__ import annotations
+
+import importlib.resources
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Shaped, UInt8
+
+from vjepa2_ac import storage
+from vjepa2_ac.data.sources.lerobot.episodes import TABLES
+from vjepa2_ac.data.sources.lerobot.info import INFO, filled
+from vjepa2_ac.data.sources.lerobot.parquet import parquet_library
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.media.video import write_video
+
+Columns = Mapping[str, Shaped[np.ndarray, "steps numbers"]]
+Frames = Iterable[UInt8[np.ndarray, "height width 3"]]
+Statistics = dict[str, np.ndarray]
+"""min, max, mean, std, count and quantiles of a feature, by LeRobot's names."""
+
+_FORM = Path(str(importlib.resources.files("vjepa2_ac"))) / "assets" / "lerobot" / "v30.json"
+_TASK = "__index_level_0__"  # the text of a task is the index of pandas' table: LeRobot looks tasks up by it
+_QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
+_CRF, _KEY_FRAME_EVERY = 18, 2
+_SAMPLED_FRAMES, _SAMPLED_SIDE = 32, 100  # of an episode, and pixels: enough for the statistics of a camera
+_EPISODES_AT_ONCE = 100  # rows of the table of episodes that are written together
+
+
+class LeRobotWriter:
+    """Writes episodes one after another into an empty folder; after `finish` the data set is complete.
+
+    Args:
+        folder: The folder.
+        rate_hz: Control steps per second.
+        names: What the numbers of a column are called, by feature.
+    """
+
+    def __init__(self, folder: Path, rate_hz: float, names: Mapping[str, Sequence[str]]) -> None:
+        self._folder, self._names, self._form = folder, names, json.loads(_FORM.read_text())
+        self._rate_hz = int(rate_hz) if float(rate_hz).is_integer() else rate_hz  # LeRobot's own sets have integers
+        self._features: dict[str, Any] = {}
+        self._statistics: dict[str, Statistics] = {}
+        self._tasks: dict[str, int] = {}
+        self._rows: list[dict[str, Any]] = []  # of the table of episodes, not yet written
+        self._tables: dict[str, Any] = {}  # open Parquet files
+        self.num_episodes = self.num_steps = 0
+
+    def add(self, columns: Columns, frames: Mapping[str, Frames], task: str) -> None:
+        """Write an episode; nothing of it remains if one of its frames cannot be used.
+
+        Args:
+            columns: Its numbers, by feature.
+            frames: A frame for each step, by feature; an odd last row or column of pixels is dropped.
+            task: What the robot was to do; may be empty.
+
+        Raises:
+            InputError: A frame has another size than those of the first episode; or is raised by `frames`.
+            OSError: A file cannot be written.
+        """
+        number, start, steps = self.num_episodes, self.num_steps, len(next(iter(columns.values())))
+        order = np.arange(steps)[:, None]
+        columns = {
+            **columns,
+            "timestamp": (order / self._rate_hz).astype(np.float32),
+            "frame_index": order,
+            "episode_index": np.full_like(order, number),
+            "index": start + order,
+            "task_index": np.full_like(order, self._tasks.get(task, len(self._tasks))),
+        }
+        for name, values in columns.items():
+            about = {"dtype": str(values.dtype), "shape": [values.shape[1]], "names": self._names.get(name)}
+            self._features.setdefault(name, about)
+        statistics = {name: statistics_of(values) for name, values in columns.items()}
+        row = {"episode_index": number, "tasks": [task], "length": steps, **_place("data", 0, 0)}
+        row |= {"dataset_from_index": start, "dataset_to_index": start + steps}
+        chunk, file = divmod(number, self._form["info"]["chunks_size"])
+        videos = {key: self._folder / filled(self._form["info"]["video_path"], chunk, file, key) for key in frames}
+        try:
+            for key, path in videos.items():
+                statistics[key] = self._write_video(path, key, frames[key], steps)
+                times = {f"videos/{key}/from_timestamp": 0.0, f"videos/{key}/to_timestamp": steps / self._rate_hz}
+                row |= {**_place(f"videos/{key}", chunk, file), **times}
+        except BaseException:
+            for path in videos.values():
+                path.unlink(missing_ok=True)
+            raise
+        rows = {name: _column(values) for name, values in columns.items()}
+        self._append(filled(self._form["info"]["data_path"], 0, 0), rows)
+        for name, new in statistics.items():
+            row |= {f"stats/{name}/{kind}": value.tolist() for kind, value in new.items()}
+            self._statistics[name] = joined(self._statistics[name], new) if name in self._statistics else new
+        self._rows.append(row | _place("meta/episodes", 0, 0))
+        self._tasks.setdefault(task, len(self._tasks))
+        self.num_episodes, self.num_steps = number + 1, start + steps
+        if len(self._rows) == _EPISODES_AT_ONCE:
+            self._write_rows()
+
+    def finish(self) -> None:
+        """Write what describes the data set; meta/info.json comes last."""
+        self._write_rows()
+        pandas = {"pandas": json.dumps(self._form["pandas_of_tasks"])}
+        self._append("meta/tasks.parquet", {"task_index": [*self._tasks.values()], _TASK: [*self._tasks]}, pandas)
+        self.close()
+        counts = {"episodes": self.num_episodes, "frames": self.num_steps, "tasks": len(self._tasks)}
+        info = self._form["info"] | {f"total_{name}": count for name, count in counts.items()}
+        info |= {"fps": self._rate_hz, "splits": {"train": f"0:{self.num_episodes}"}, "features": self._features}
+        for name, content in (("meta/stats.json", self._statistics), (INFO, info)):
+            storage.write_atomically(self._folder / name, json.dumps(content, indent=4, default=np.ndarray.tolist))
+
+    def close(self) -> None:
+        """Close the tables."""
+        for table in self._tables.values():
+            table.close()
+
+    def _write_video(self, path: Path, key: str, frames: Frames, steps: int) -> Statistics:
+        """Write the frames of a camera, and return statistics of a sample of their pixels, from 0 to 1."""
+        sample: list[UInt8[np.ndarray, "height width 3"]] = []
+
+        def sampled() -> Iterator[UInt8[np.ndarray, "height width 3"]]:
+            for step, frame in enumerate(frames):
+                height, width = (size // 2 * 2 for size in frame.shape[:2])
+                of_first = self._features.setdefault(key, self._camera(height, width))["shape"]
+                if of_first[:2] != [height, width]:
+                    needed = f"{of_first[0]}x{of_first[1]}, as in the first episode"
+                    fix = "Convert recordings of different cameras to different data sets"
+                    raise InputError(where=key, found=f"frames of {height}x{width}", needed=needed, fix=fix)
+                if step % (steps // _SAMPLED_FRAMES + 1) == 0:
+                    every = min(height, width) // _SAMPLED_SIDE + 1
+                    sample.append(frame[:height:every, :width:every])
+                yield frame
+
+        write_video(path, sampled(), rate_hz=float(self._rate_hz), crf=_CRF, key_frame_every=_KEY_FRAME_EVERY)
+        of_pixels = statistics_of(np.stack(sample).reshape(-1, 3) / 255) | {"count": np.array([len(sample)])}
+        return {name: value if name == "count" else value.reshape(3, 1, 1) for name, value in of_pixels.items()}
+
+    def _camera(self, height: int, width: int) -> dict[str, Any]:
+        sizes = {"video.height": height, "video.width": width, "video.fps": self._rate_hz}
+        shape, names = [height, width, 3], ["height", "width", "channels"]
+        return {"dtype": "video", "shape": shape, "names": names, "info": self._form["camera"] | sizes}
+
+    def _write_rows(self) -> None:
+        if rows := self._rows:
+            self._append(filled(TABLES["v3.0"], 0, 0), {name: [row[name] for row in rows] for name in rows[0]})
+            rows.clear()
+
+    def _append(self, name: str, columns: Mapping[str, Any], about: Mapping[str, str] | None = None) -> None:
+        """Write a row group to a Parquet file, which is created with its first one."""
+        pa = parquet_library("data convert")
+        table = pa.table(dict(columns), metadata=about)
+        if name not in self._tables:
+            path = self._folder / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._tables[name] = pa.parquet.ParquetWriter(path, table.schema, write_page_checksum=True)
+        self._tables[name].write_table(table)
+
+
+def statistics_of(values: Shaped[np.ndarray, "steps numbers"]) -> Statistics:
+    """Return the statistics of each number of a column."""
+    numbers = values.astype(np.float64)
+    moments = {"mean": numbers.mean(axis=0), "std": numbers.std(axis=0), "count": np.array([len(values)])}
+    quantiles = dict(zip(_QUANTILES, np.quantile(numbers, [*_QUANTILES.values()], axis=0), strict=True))
+    return {"min": values.min(axis=0), "max": values.max(axis=0), **moments, **quantiles}
+
+
+def joined(known: Statistics, new: Statistics) -> Statistics:
+    """Return the statistics of two sets of steps together; quantiles are averaged, as LeRobot does."""
+    share = new["count"] / (known["count"] + new["count"])
+    averages = {name: known[name] + (new[name] - known[name]) * share for name in ("mean", *_QUANTILES)}
+    variances = [one["std"] ** 2 + (one["mean"] - averages["mean"]) ** 2 for one in (known, new)]
+    std, count = np.sqrt(variances[0] * (1 - share) + variances[1] * share), known["count"] + new["count"]
+    extremes = {"min": np.minimum(known["min"], new["min"]), "max": np.maximum(known["max"], new["max"])}
+    return {**extremes, "std": std, "count": count, **averages}
+
+
+def _column(values: Shaped[np.ndarray, "steps numbers"]) -> Any:
+    pa = parquet_library("data convert")
+    flat, width = pa.array(values.ravel()), values.shape[1]
+    return flat if width == 1 else pa.FixedSizeListArray.from_arrays(flat, width)
+
+
+def _place(kind: str, chunk: int, file: int) -> dict[str, Any]:
+    return {f"{kind}/chunk_index": chunk, f"{kind}/file_index": file}

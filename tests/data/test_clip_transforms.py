@@ -1,0 +1,158 @@
+"""Transforms of training clips: registered, a pure function of the seed and the position, checked, never cached."""
+
+import itertools
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from clip_transforms import TRANSFORMS as THINGS
+from clips import open_in_memory
+from memory_source import MemorySource
+from vjepa2_ac.config.loading import config_schema, parse_config
+from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.loader import Mixed, training_loader, validation_batches
+from vjepa2_ac.encoding.encode_dataset import require_encodable
+from vjepa2_ac.episode import Clip
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.registry import TRANSFORMS
+
+
+@pytest.fixture(autouse=True)
+def registered(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    things = dict(THINGS)
+    monkeypatch.setattr(TRANSFORMS, "_things", things)
+    return things
+
+
+def opened(*transforms: dict[str, Any], **keys: Any) -> Dataset:
+    return open_in_memory(MemorySource([30] * 10), transforms=transforms, **keys)
+
+
+def frames(dataset: Dataset, count: int, seed: int = 1, **keys: Any) -> torch.Tensor:
+    batches = training_loader(dataset, seed=seed, batch_size=2, **keys)
+    return torch.cat([batch.frames for batch in itertools.islice(batches, count)])
+
+
+OFFSET = {"name": "offset"}
+
+
+def test_training_clips_are_changed_by_seed_and_position_and_others_never() -> None:
+    dataset = opened(OFFSET, validation_share=0.5)
+    plain = opened(validation_share=0.5)
+    offsets = (frames(dataset, 20) - frames(plain, 20))[:, 0, 0, 0]
+    assert torch.equal(offsets[:, 0], offsets[:, 1])  # one number for a clip
+    assert 10 < len(set(offsets[:, 0].tolist())) <= 40
+    assert torch.equal(frames(dataset, 20), frames(dataset, 20))
+    other = (frames(dataset, 20, seed=2) - frames(plain, 20, seed=2))[:, 0, 0, 0]
+    assert not torch.equal(other, offsets)
+    both = (
+        [batch.frames for batch in validation_batches(one, "validation", clips=4, batch_size=2)]
+        for one in (dataset, plain)
+    )
+    assert all(torch.equal(one, other) for one, other in zip(*both, strict=True))
+    np.testing.assert_array_equal(dataset.clips()[3].frames, plain.clips()[3].frames)
+
+
+def test_a_resumed_run_and_workers_see_the_same_changes(droid: Path) -> None:
+    data = {"path": droid, "frames": 3, "stride": 2, "transforms": [OFFSET, {"name": "halve"}]}
+
+    def read(count: int, start: int = 0, workers: int = 0) -> torch.Tensor:
+        config = parse_config(values(**data, workers=workers), where="").data
+        return frames(open_dataset(config), count, start_position=start)
+
+    whole = read(12)
+    assert torch.equal(read(4, 16), whole[16:])
+    assert torch.equal(read(12, workers=2), whole)
+    assert torch.equal(read(4, 16, workers=1), whole[16:])
+
+
+def test_transforms_are_applied_in_their_order_each_with_numbers_of_its_own() -> None:
+    plain, offset = frames(opened(), 8), frames(opened(OFFSET), 8)
+    assert torch.equal(frames(opened(OFFSET, {"name": "halve"}), 8), offset // 2)
+    assert not torch.equal(frames(opened({"name": "halve"}, OFFSET), 8), offset // 2)
+    assert not torch.equal(frames(opened(OFFSET, OFFSET), 8) - offset, offset - plain)
+
+
+def test_options_reach_a_class_and_are_checked() -> None:
+    least = opened({"name": "offset", "options": {"most": 2}})
+    assert torch.equal(frames(least, 4), frames(opened(), 4) + 1)
+    for transform, words in (
+        ({"name": "offset", "options": {"mots": 2}}, "mots"),
+        ({"name": "halve", "options": {"most": 2}}, "no options of its own"),
+        ({"name": "ofset"}, "Did you mean offset"),
+        ({"options": {}}, r"transforms.0.name: missing"),
+    ):
+        with pytest.raises(InputError, match=words):
+            parse_config(values(transforms=[transform]), where="")
+
+
+def test_frames_may_get_another_size_and_are_augmented_afterwards() -> None:
+    dataset = opened({"name": "cut"}, augment={"crop_scale": (0.9, 1.0)})
+    batch = next(training_loader(dataset, seed=0, batch_size=8))
+    assert batch.frames.shape[2:4] == (2, 5)
+    assert all(one.box[0] + one.box[2] <= 2 for one in batch.augmentations)
+
+
+def test_a_second_data_set_has_its_own_transforms() -> None:
+    mixed = Mixed(opened(), opened({"name": "halve"}), 0.5)
+    plain, halved = frames(opened(), 2), frames(opened({"name": "halve"}), 2)
+    found = frames(mixed, 4)
+    assert torch.equal(found[::2], plain)
+    assert torch.equal(found[1::2], halved)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda clip: clip.frames, "frames of object"),
+        (lambda _: None, "frames of object"),
+        (
+            lambda clip: replace(clip, frames=clip.frames / 255),
+            "found|frames of float64, 3 x height x width x 3.*uint8",
+        ),
+        (lambda clip: replace(clip, frames=clip.frames[:2]), "frames of uint8, 2 x height"),
+        (lambda clip: replace(clip, frames=clip.frames[..., :1]), r"width x 1\."),
+        (
+            lambda clip: replace(clip, states=clip.states[:, :6]),
+            "states of float32, 3 x 6. needed: states of float32, 3 x 7",
+        ),
+        (lambda clip: replace(clip, actions=clip.actions.astype(float)), "actions of float64"),
+    ],
+)
+@pytest.mark.parametrize("policy", ["error", "skip"])
+def test_a_result_that_training_cannot_use_stops_the_run_and_no_episode_is_blamed(
+    registered: dict[str, Any], change: Callable[[Clip], Any], words: str, policy: str
+) -> None:
+    registered["wrong"] = lambda clip, _: change(clip)
+    dataset = opened({"name": "wrong"}, broken_episodes=policy)
+    with pytest.raises(InputError, match=f"data.transforms: wrong: .*({words})") as caught:
+        frames(dataset, 1)
+    assert "exclude" not in str(caught.value)
+    assert not len(dataset.broken)
+
+
+def values(**data: Any) -> dict[str, Any]:
+    return {"run_dir": "run", "data": {"path": "data", **data}, "model": {"base": "builtin:sim-tiny"}}
+
+
+@pytest.mark.parametrize("data", [{"cache": "auto"}, {"cache": "require"}, {"source": "latents"}])
+def test_cached_latents_cannot_be_transformed(data: dict[str, str]) -> None:
+    with pytest.raises(InputError, match="transforms changes frames, and latents in a cache stay"):
+        parse_config(values(transforms=[{"name": "halve"}], **data), where="")
+    parse_config(values(transforms=[], **data), where="")
+    with pytest.raises(InputError, match=r"data\.transforms: .*Leave data\.transforms out"):
+        require_encodable(parse_config(values(transforms=[{"name": "halve"}]), where=""))
+
+
+def test_the_schema_names_the_transforms(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    del tmp_path
+    described = config_schema()["$defs"]["TransformConfig"]["properties"]
+    assert described["name"]["enum"] == list(THINGS)
+    assert "most" in described["options"]["anyOf"][0]["properties"]
+    monkeypatch.setattr(TRANSFORMS, "_things", {})
+    assert "enum" not in config_schema()["$defs"]["TransformConfig"]["properties"]["name"]

@@ -1,0 +1,163 @@
+"""The clips of a split are a PyTorch data set that works in any DataLoader."""
+
+import multiprocessing
+import pickle
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import DataLoader, Subset, random_split
+from torch.utils.data import Dataset as TorchDataset
+
+from clips import clip_at, open_in_memory
+from memory_source import MemorySource
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.clips import collate
+from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.episode import Batch, Clip, Episode
+from vjepa2_ac.errors import InputError
+
+
+def opened(folder: Path, **keys: Any) -> Dataset:
+    chosen = {"frames": 3, "stride": 2, "validation_share": 0.3, "test_share": 0.0} | keys
+    return open_dataset(DataConfig(path=str(folder), **chosen))
+
+
+def names(clips: list[Clip]) -> list[tuple[str, int]]:
+    return [(clip.episode_id, clip.start) for clip in clips]
+
+
+def test_clip_i_is_the_ith_window_sorted_by_identity_and_start(droid: Path) -> None:
+    dataset = opened(droid)
+    clips, windows = dataset.clips("train"), dataset.windows("train")
+    assert isinstance(clips, TorchDataset)
+    assert len(clips) == len(windows) > 10
+    for index in (0, 5, len(clips) - 1):
+        clip, expected = clips[index], clip_at(dataset, *windows[index])
+        assert (clip.episode_id, clip.start, clip.stride) == (expected.episode_id, expected.start, 2)
+        for part in ("frames", "states", "actions"):
+            np.testing.assert_array_equal(getattr(clip, part), getattr(expected, part))
+    assert (clips[0].frames.dtype, clips[0].states.dtype, clips[0].actions.dtype) == (np.uint8, np.float32, np.float32)
+    assert (clips[0].frames.ndim, clips[0].states.shape, clips[0].actions.shape) == (4, (3, 7), (2, 7))
+    every = names(list(clips))
+    assert all(one < other for one, other in pairwise(every))
+
+
+def test_splits_are_disjoint_and_training_is_the_default(droid: Path) -> None:
+    dataset = opened(droid)
+    training, validation = ({clip.episode_id for clip in dataset.clips(split)} for split in ("train", "validation"))
+    assert training
+    assert validation
+    assert not training & validation
+    assert names(list(dataset.clips())) == names(list(dataset.clips("train")))
+
+
+def test_indices_count_from_the_end_and_iteration_ends() -> None:
+    clips = open_in_memory(MemorySource([9, 9])).clips()
+    assert len(list(clips)) == len(clips) == 10
+    assert names([clips[-1], clips[-10]]) == names([clips[9], clips[0]])
+    assert names([clips[np.int64(3)], clips[torch.tensor(3)]]) == names([clips[3]] * 2)
+    for beyond in (10, -11):
+        with pytest.raises(IndexError, match=f"clip {beyond} of 10"):
+            clips[beyond]
+    with pytest.raises(TypeError):
+        clips[1.0]
+
+
+def test_default_collation_gives_a_batch() -> None:
+    clips = open_in_memory(MemorySource([9, 9])).clips()
+    batches = list(DataLoader(clips, batch_size=4))
+    assert [type(batch) for batch in batches] == [Batch] * 3
+    assert [tuple(batch.frames.shape) for batch in batches] == [(4, 3, 4, 5, 3)] * 2 + [(2, 3, 4, 5, 3)]
+    explicit = next(iter(DataLoader(clips, batch_size=4, collate_fn=collate)))
+    assert torch.equal(explicit.frames, batches[0].frames)
+    assert (explicit.episode_ids, explicit.starts) == (batches[0].episode_ids, batches[0].starts)
+    assert isinstance(next(iter(DataLoader(clips, batch_size=None))), Clip)
+
+
+@pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")  # Python 3.12 warns of fork beside threads
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_workers_read_the_same_clips(droid: Path, method: str) -> None:
+    clips = opened(droid, camera=("exterior_1_left", "wrist_left")).clips("train")
+    alone = collate([clips[index] for index in range(len(clips))])
+    context = multiprocessing.get_context(method)
+    batches = list(DataLoader(clips, batch_size=4, num_workers=2, multiprocessing_context=context))
+    assert torch.equal(torch.cat([batch.frames for batch in batches]), alone.frames)
+    assert torch.equal(torch.cat([batch.actions for batch in batches]), alone.actions)
+    assert sum((batch.cameras for batch in batches), ()) == alone.cameras
+    assert len(set(alone.cameras)) == 2
+
+
+def test_shuffled_parts_have_every_clip_once() -> None:
+    clips = open_in_memory(MemorySource([9, 9])).clips()
+    generator = torch.Generator().manual_seed(3)
+    parts = random_split(clips, [0.7, 0.3], generator=generator)
+    loaders = [DataLoader(part, batch_size=3, shuffle=True, generator=generator) for part in parts]
+    found = [
+        name for loader in loaders for batch in loader for name in zip(batch.episode_ids, batch.starts, strict=True)
+    ]
+    assert found != names(list(clips))
+    assert sorted(found) == names(list(clips))
+    assert names([Subset(clips, [4, 2])[1]]) == names([clips[2]])
+
+
+def test_a_pickled_data_set_reads_the_same_clips(droid: Path) -> None:
+    clips = opened(droid).clips()
+    copy = pickle.loads(pickle.dumps(clips))  # noqa: S301 - our own
+    assert len(copy) == len(clips)
+    np.testing.assert_array_equal(copy[7].frames, clips[7].frames)
+
+
+def test_the_seed_and_changes_of_training_clips_do_not_matter(droid: Path) -> None:
+    plain, changed = (opened(droid, **keys).clips() for keys in ({}, {"augment": {"brightness": 0.5}}))
+    assert changed[3].augmentation is None
+    np.testing.assert_array_equal(changed[3].frames, plain[3].frames)
+
+
+@pytest.mark.parametrize("policy", ["error", "skip"])
+def test_a_broken_episode_is_named_with_a_fix_that_works(
+    spoiled: Callable[[Callable[[Any], None]], Path], policy: str
+) -> None:
+    def spoil(features: dict[str, tuple[Any, Any]]) -> None:
+        features["steps/observation/exterior_image_1_left"][1][:] = [b"GIF89a"] * 12
+
+    clips = opened(spoiled(spoil), broken_episodes=policy, validation_share=0.0).clips()
+    reasons = []
+    for index in range(len(clips)):
+        try:
+            clips[index]
+        except InputError as error:
+            reasons.append(str(error))
+    assert 0 < len(reasons) < len(clips)
+    assert all("not a JPEG" in reason for reason in reasons)
+    assert all("add to data.exclude" in reason and "skip" not in reason for reason in reasons)
+
+
+def test_clips_behind_a_url_are_read_concurrently() -> None:
+    meeting = threading.Barrier(4, timeout=120)
+
+    class Slow(MemorySource):
+        def read(self, *arguments: Any) -> Episode:
+            meeting.wait()  # nobody continues before four are here
+            return super().read(*arguments)
+
+    dataset = open_in_memory(Slow([30] * 10))
+    remote = replace(dataset, config=dataset.config.model_copy(update={"path": "gs://bucket/set"}))
+    batch = next(iter(DataLoader(remote.clips(), batch_size=4)))
+    assert batch.starts == (0, 1, 2, 3)
+
+
+def test_what_has_no_clips_is_refused() -> None:
+    dataset = open_in_memory(MemorySource([9, 9]))
+    with pytest.raises(InputError, match=r"'tset'.*train, validation, test"):
+        dataset.clips("tset")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="no validation episodes"):
+        dataset.clips("validation")
+    with pytest.raises(InputError, match="stride=4"):
+        open_in_memory(MemorySource([30]), stride="auto").clips()

@@ -1,0 +1,366 @@
+"""Any data set becomes a LeRobot data set v3.0, whole or not at all, that reads back with the same values."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+from pyarrow import parquet
+
+from lerobot_sets import Recorded, numbered, numbers_of, write_v30
+from memory_source import MemorySource
+from synthetic import draw_frame, synthetic_states
+from vector_sets import draw_vector, vectors, write_vectors
+from vjepa2_ac import storage
+from vjepa2_ac.config import DataConfig, IdleConfig
+from vjepa2_ac.config.loading import parse_config
+from vjepa2_ac.data import dataset as opening
+from vjepa2_ac.data.convert import convert_to_lerobot
+from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.sources.lerobot import writer
+from vjepa2_ac.episode import Episode
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.init.look import look_at
+from vjepa2_ac.reporter import SILENT, Reporter
+from vjepa2_ac.spaces import actions_from_states
+
+CAMERAS = ("exterior_1_left", "wrist_left")
+LENGTHS = [12, 14, 16, 13, 15, 17]  # of the episodes of two shards
+
+
+def config_of(path: object, **data: Any) -> DataConfig:
+    values = {"path": path, "frames": 3, "stride": 2, "workers": 0} | data
+    return parse_config({"run_dir": "r", "data": values, "model": {"base": "builtin:sim-tiny"}}, where="").data
+
+
+def read_back(folder: Path, *cameras: str, **data: Any) -> Dataset:
+    lerobot = {"state": ["observation.state"], "cameras": {name: f"observation.images.{name}" for name in cameras}}
+    return open_dataset(config_of(folder, source="lerobot", camera=list(cameras), lerobot=lerobot, **data))
+
+
+def info_of(folder: Path) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads((folder / "meta/info.json").read_text())
+    return content
+
+
+def mean_difference(one: np.ndarray, other: np.ndarray) -> float:
+    return float(abs(one.astype(int) - other.astype(int)).mean())
+
+
+def files_in(folder: Path) -> list[str]:
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+
+
+def test_poses_read_back_with_the_same_values(droid: Path, tmp_path: Path) -> None:
+    config = config_of(droid, camera=list(CAMERAS))
+    assert convert_to_lerobot(config, tmp_path / "out", SILENT) == (6, 87)
+    before, after = open_dataset(config), read_back(tmp_path / "out", *CAMERAS)
+    assert after.table.num_steps.tolist() == before.table.num_steps.tolist()
+    assert after.table.success.tolist() == before.table.success.tolist() == [1, 0, 1, 1, 1, 0]
+    assert after.control_rate_hz == before.control_rate_hz == 15
+    for index in range(6):
+        one, other = before.source.read(index), after.source.read(index)
+        np.testing.assert_array_equal(other.states, one.states.astype(np.float32))
+        np.testing.assert_allclose(actions_from_states(other.states), actions_from_states(one.states), atol=2e-6)
+        assert other.metadata == one.metadata == {"language": f"move to place {LENGTHS[index] - 12}"}
+        for camera in CAMERAS:
+            steps = range(len(one.states))
+            frames = [dataset.source.read(index, camera).read_frames(steps) for dataset in (before, after)]
+            assert mean_difference(*frames) < 3
+    table = parquet.read_table(tmp_path / "out/data/chunk-000/file-000.parquet")
+    actions = np.array(table["action"].to_pylist())
+    ends = np.cumsum(before.table.num_steps) - 1
+    assert not actions[ends].any(), "nothing follows the last step of an episode"
+    np.testing.assert_allclose(actions[: ends[0]], actions_from_states(before.source.read(0).states), atol=1e-6)
+
+
+def test_vectors_and_recorded_commands_read_back_with_the_same_values(tmp_path: Path) -> None:
+    source = write_vectors(tmp_path / "in", width=14, action_width=5, episodes=3, success=True, language="stack")
+    keys = {"states": "vector", "actions": "recorded", "join_actions": "mean"}
+    assert convert_to_lerobot(config_of(source, source="npz", **keys), tmp_path / "out", SILENT) == (3, 72)
+    after = read_back(tmp_path / "out", "frames", **keys)
+    assert after.control_rate_hz == 10
+    for index in range(3):
+        episode = after.source.read(index)
+        np.testing.assert_array_equal(episode.states, vectors(24, 14, seed=index).astype(np.float32))
+        np.testing.assert_array_equal(episode.commands, vectors(24, 5, seed=1000 + index).astype(np.float32))
+        assert (episode.info.success, episode.metadata) == (True, {"language": "stack"})
+        drawn = np.stack([draw_vector(state) for state in vectors(24, 14, seed=index)])
+        assert mean_difference(episode.read_frames(range(24)), drawn) < 7  # hard edges of bright colours
+    names = {name: feature["names"] for name, feature in info_of(tmp_path / "out")["features"].items()}
+    assert names["observation.state"] == [f"state {number}" for number in range(14)]
+    assert names["action"] == [f"action {number}" for number in range(5)]
+
+
+def test_each_step_has_its_own_frame(tmp_path: Path) -> None:
+    def recording(number: int, steps: int) -> Recorded:
+        states = synthetic_states(steps, seed=number).astype(np.float32)
+        drawn = [numbered(draw_frame(state, size=(48, 64)), number, step) for step, state in enumerate(states)]
+        return Recorded({"observation.state": states}, {"observation.images.front": drawn})
+
+    source = write_v30(tmp_path / "in", [recording(number, 70) for number in range(3)])
+    fields = {"state": ["observation.state"], "cameras": {"front": "observation.images.front"}}
+    convert_to_lerobot(config_of(source, source="lerobot", lerobot=fields), tmp_path / "out", SILENT)
+    after = read_back(tmp_path / "out", "front")
+    for index in range(3):
+        frames = after.source.read(index).read_frames(range(70))
+        assert [numbers_of(frame, 2) for frame in frames] == [(index, step) for step in range(70)]
+
+
+def test_the_form_is_that_of_lerobot(droid: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    convert_to_lerobot(config_of(droid), out, SILENT)
+    key = "observation.images.exterior_1_left"
+    assert files_in(out) == [
+        "data/chunk-000/file-000.parquet",
+        "meta/episodes/chunk-000/file-000.parquet",
+        "meta/info.json",
+        "meta/stats.json",
+        "meta/tasks.parquet",
+        *(f"videos/{key}/chunk-000/file-{number:03d}.mp4" for number in range(6)),
+    ]
+    info = info_of(out)
+    features = info.pop("features")
+    assert info == {
+        "codebase_version": "v3.0",
+        "robot_type": None,
+        "total_episodes": 6,
+        "total_frames": 87,
+        "total_tasks": 6,
+        "chunks_size": 1000,
+        "data_files_size_in_mb": 100,
+        "video_files_size_in_mb": 200,
+        "fps": 15,
+        "splits": {"train": "0:6"},
+        "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+        "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
+    }
+    assert type(info["fps"]) is int
+    assert features["observation.state"] == {
+        "dtype": "float32", "shape": [7], "names": ["x", "y", "z", "roll", "pitch", "yaw", "gripper"]
+    }  # fmt: skip
+    assert features["action"]["names"] == ["dx", "dy", "dz", "droll", "dpitch", "dyaw", "dgripper"]
+    assert features["is_episode_successful"] == {"dtype": "bool", "shape": [1], "names": None}
+    about = features[key].pop("info")
+    assert features[key] == {"dtype": "video", "shape": [48, 96, 3], "names": ["height", "width", "channels"]}
+    assert about == {
+        "video.height": 48, "video.width": 96, "video.codec": "h264", "video.pix_fmt": "yuv420p",
+        "video.is_depth_map": False, "video.fps": 15, "video.channels": 3, "has_audio": False,
+    }  # fmt: skip
+    with av.open(str(out / f"videos/{key}/chunk-000/file-002.mp4")) as video:
+        stream = video.streams.video[0]
+        assert (stream.codec_context.name, stream.pix_fmt) == ("h264", "yuv420p")
+        assert (stream.average_rate, stream.frames) == (15, 16)
+        assert [entry.is_keyframe for entry in stream.index_entries] == [True, False] * 8
+
+    schema = parquet.read_schema(out / "data/chunk-000/file-000.parquet")
+    assert {field.name: str(field.type) for field in schema} == {
+        "observation.state": "fixed_size_list<element: float>[7]",
+        "action": "fixed_size_list<element: float>[7]",
+        "is_episode_successful": "bool",
+        "timestamp": "float",
+        "frame_index": "int64",
+        "episode_index": "int64",
+        "index": "int64",
+        "task_index": "int64",
+    }
+    assert parquet.ParquetFile(out / "data/chunk-000/file-000.parquet").num_row_groups == 6
+    tasks = parquet.read_table(out / "meta/tasks.parquet")
+    assert tasks.column_names == ["task_index", "__index_level_0__"]
+    assert json.loads(tasks.schema.metadata[b"pandas"])["index_columns"] == ["__index_level_0__"]
+
+
+def test_the_table_of_episodes_says_where_each_is(droid: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(writer, "_EPISODES_AT_ONCE", 4)  # written in two parts
+    convert_to_lerobot(config_of(droid), tmp_path / "out", SILENT)
+    rows = parquet.read_table(tmp_path / "out/meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    key = "observation.images.exterior_1_left"
+    assert [row["episode_index"] for row in rows] == list(range(6))
+    assert [row["length"] for row in rows] == LENGTHS
+    assert [(row["dataset_from_index"], row["dataset_to_index"]) for row in rows[:3]] == [(0, 12), (12, 26), (26, 42)]
+    assert rows[4]["tasks"] == ["move to place 3"]
+    assert (rows[4]["data/chunk_index"], rows[4]["data/file_index"]) == (0, 0)
+    assert (rows[4]["meta/episodes/chunk_index"], rows[4]["meta/episodes/file_index"]) == (0, 0)
+    assert [rows[4][f"videos/{key}/{part}"] for part in ("chunk_index", "file_index")] == [0, 4]
+    times = [rows[4][f"videos/{key}/{part}_timestamp"] for part in ("from", "to")]
+    assert times == [0.0, 1.0]
+    kinds = {"min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q99"}
+    features = info_of(tmp_path / "out")["features"]
+    found = {name for name in rows[0] if name.startswith("stats/")}
+    assert found == {f"stats/{name}/{kind}" for name in features for kind in kinds}
+    assert np.shape(rows[0][f"stats/{key}/q50"]) == (3, 1, 1)
+
+
+def test_statistics_are_those_of_the_numbers_and_pixels(droid: Path, tmp_path: Path) -> None:
+    convert_to_lerobot(config_of(droid), tmp_path / "out", SILENT)
+    dataset = open_dataset(config_of(droid))
+    states = [dataset.source.read(index).states.astype(np.float32) for index in range(6)]
+    found = json.loads((tmp_path / "out/meta/stats.json").read_text())
+    whole, of_state = np.concatenate(states), found["observation.state"]
+    for kind in ("min", "max", "mean", "std"):
+        np.testing.assert_allclose(of_state[kind], getattr(np, kind)(whole.astype(float), axis=0), atol=1e-6)
+    assert of_state["count"] == [87]
+    weights = [len(one) / 87 for one in states]
+    medians = sum(weight * np.median(one, axis=0) for weight, one in zip(weights, states, strict=True))
+    np.testing.assert_allclose(of_state["q50"], medians, atol=1e-6)
+    of_success, of_pixels = found["is_episode_successful"], found["observation.images.exterior_1_left"]
+    assert (of_success["min"], of_success["max"]) == ([False], [True])
+    frames = (
+        np.concatenate([dataset.source.read(i).read_frames(range(LENGTHS[i])) for i in range(6)]).reshape(-1, 3) / 255
+    )
+    for kind in ("min", "max", "mean", "std"):
+        np.testing.assert_allclose(np.ravel(of_pixels[kind]), getattr(np, kind)(frames, axis=0), atol=1e-9)
+    assert (np.shape(of_pixels["mean"]), of_pixels["count"]) == ((3, 1, 1), [87])
+
+
+def test_init_finds_what_was_written(droid: Path, tmp_path: Path) -> None:
+    convert_to_lerobot(config_of(droid, camera=list(CAMERAS)), tmp_path / "out", SILENT)
+    found = look_at(str(tmp_path / "out"))
+    assert (found.source, found.episodes) == ("lerobot", 6)
+
+
+def test_episodes_are_whole_whatever_is_idle_or_held_out_and_excluded_ones_are_left_out(
+    droid: Path, tmp_path: Path
+) -> None:
+    idle = {"rule": "motion", "shortest_kept_steps": 2, "cut_last_steps": 6}
+    config = config_of(droid, idle=idle, validation_share=0.5, stride="auto")
+    assert convert_to_lerobot(config, tmp_path / "out", SILENT) == (6, 87)
+    first = open_dataset(config_of(droid)).table.identity(0)
+    left = config_of(droid, idle=idle, exclude=[first], outcome="success")
+    assert convert_to_lerobot(left, tmp_path / "less", SILENT) == (3, 13 + 15 + 16)
+    assert read_back(tmp_path / "less", "exterior_1_left").table.num_steps.tolist() == [16, 13, 15]
+
+
+# What cannot be written.
+
+
+def damaged(spoiled: Callable[..., Path]) -> Path:
+    def spoil(features: dict[str, tuple[Any, Any]]) -> None:
+        features["steps/observation/wrist_image_left"][1][9] = b"GIF89a"  # after frames that were written already
+
+    return spoiled(spoil)
+
+
+def test_a_broken_episode_stops_the_conversion_and_nothing_is_left(
+    spoiled: Callable[..., Path], tmp_path: Path
+) -> None:
+    config = config_of(damaged(spoiled), camera=list(CAMERAS))
+    for folder in (tmp_path / "new/out", tmp_path / "empty"):
+        if folder.name == "empty":
+            folder.mkdir()
+        with pytest.raises(InputError, match=r"not a JPEG.*add to data\.exclude"):
+            convert_to_lerobot(config, folder, SILENT)
+        assert not folder.exists() or not list(folder.iterdir())
+    assert not list((tmp_path / "new").iterdir())
+
+
+def test_a_broken_episode_is_left_out_where_the_policy_says_so(
+    spoiled: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vjepa2_ac.data.selection.MOST_BROKEN", 0.2)
+    config = config_of(damaged(spoiled), camera=list(CAMERAS), broken_episodes="skip")
+    assert convert_to_lerobot(config, tmp_path / "out", SILENT) == (5, 75)
+    after = read_back(tmp_path / "out", *CAMERAS)
+    assert after.table.num_steps.tolist() == LENGTHS[1:]
+    videos = [name for name in files_in(tmp_path / "out") if name.endswith(".mp4")]
+    assert len(videos) == 10
+    assert (
+        mean_difference(
+            after.source.read(0, CAMERAS[1]).read_frames([5]),
+            open_dataset(config).source.read(1, CAMERAS[1]).read_frames([5]),
+        )
+        < 3
+    )
+
+
+def test_a_last_episode_that_is_broken_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vjepa2_ac.data.selection.MOST_BROKEN", 0.5)
+    source = MemorySource([9, 9, 9], pictureless=frozenset({2}))
+    monkeypatch.setattr(opening, "open_source", lambda _: source)
+    assert convert_to_lerobot(config_of("x", broken_episodes="skip"), tmp_path / "out", SILENT) == (2, 18)
+    videos = [name for name in files_in(tmp_path / "out") if "videos/" in name]
+    assert [name[-7:-4] for name in videos] == ["000", "001"]
+
+
+def test_frames_of_two_sizes_cannot_be_one_feature(tmp_path: Path) -> None:
+    for number, size in enumerate(((36, 48), (36, 64))):
+        frames = np.zeros((6, *size, 3), np.uint8)
+        (tmp_path / "in").mkdir(exist_ok=True)
+        np.savez(tmp_path / f"in/{number}.npz", states=synthetic_states(6), frames=frames, fps_hz=10.0)
+    with pytest.raises(InputError, match=r"images\.frames: frames of 36x64\. needed: 36x48, as in the first episode"):
+        convert_to_lerobot(config_of(tmp_path / "in", source="npz"), tmp_path / "out", SILENT)
+    assert not (tmp_path / "out").exists()
+
+
+def test_odd_sizes_lose_a_row_and_a_column_and_short_episodes_and_odd_rates_are_written(tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    for number, steps in enumerate((1, 5)):
+        frames = np.stack([np.full((37, 49, 3), 40 * step, np.uint8) for step in range(steps)])
+        arrays = {"states": synthetic_states(steps), "frames": frames, "fps_hz": 12.5}
+        np.savez(tmp_path / f"in/{number}.npz", **arrays)
+    assert convert_to_lerobot(config_of(tmp_path / "in", source="npz"), tmp_path / "out", SILENT) == (2, 6)
+    after = read_back(tmp_path / "out", "frames")
+    frames = after.source.read(1).read_frames(range(5))
+    assert frames.shape == (5, 36, 48, 3)
+    np.testing.assert_allclose(frames.mean(axis=(1, 2, 3)), 40 * np.arange(5), atol=2)
+    assert (after.control_rate_hz, info_of(tmp_path / "out")["fps"]) == (12.5, 12.5)
+
+
+def test_success_that_is_not_known_of_all_is_left_out_with_a_note(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    notes: list[str] = []
+
+    class Noting(Reporter):
+        def note(self, text: str) -> None:
+            notes.append(text)
+
+    for success, expected in (([True, None, False], 1), ([None] * 3, 0)):
+        source = MemorySource([9, 9, 9], success=success)
+        monkeypatch.setattr(opening, "open_source", lambda _, source=source: source)
+        convert_to_lerobot(config_of("x"), tmp_path / f"out{expected}", Noting())
+        assert "is_episode_successful" not in info_of(tmp_path / f"out{expected}")["features"]
+        assert len(notes) == 1
+    assert notes == ["Success is left out: it is not known for 1 of 3 episodes."]
+
+
+def test_latents_and_names_with_a_slash_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"latents, without frames.*to write its frames"):
+        convert_to_lerobot(config_of("x", source="latents"), tmp_path / "out", SILENT)
+    with pytest.raises(InputError, match=r"'a/b'.*without /"):
+        convert_to_lerobot(config_of("x", source="npz", camera="a/b"), tmp_path / "out", SILENT)
+
+
+def test_a_full_disk_leaves_nothing(droid: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: Any, **__: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(storage, "write_atomically", full)
+    dataset = config_of(droid, disk_cache={"dir": str(tmp_path / "cache")})
+    with pytest.raises(InputError, match="No space left"):
+        convert_to_lerobot(dataset, tmp_path / "out", SILENT)
+    assert not (tmp_path / "out").exists()
+
+
+def test_frames_are_read_a_few_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    most = 0
+
+    class Watched(MemorySource):
+        def read(self, *arguments: Any) -> Episode:
+            episode = super().read(*arguments)
+
+            def read_frames(steps: Any) -> np.ndarray:
+                nonlocal most
+                most = max(most, len(steps))
+                return episode.read_frames(steps)
+
+            return replace(episode, read_frames=read_frames)
+
+    monkeypatch.setattr(opening, "open_source", lambda _: Watched([100]))
+    convert_to_lerobot(config_of("x"), tmp_path / "out", SILENT)
+    assert 0 < most <= 32
+    assert IdleConfig().rule == "none"
