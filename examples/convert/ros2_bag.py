@@ -11,12 +11,12 @@ BAGS is a bag, or a folder of bags: each becomes an episode. TOPIC:FIELD names a
 The pose is that of the flange in the frame of the robot's base: any message with a position and an orientation, alone
 or inside (PoseStamped, Odometry, TransformStamped), or 16 numbers, a 4x4 matrix by columns (FrankaState).
 
-The gripper is a number. TOPIC:FIELD[NAME] or TOPIC:FIELD[NUMBER] selects a joint of several; [NAME,NAME] selects joints
-to add. Without brackets all numbers are added, and refused if more than two move, or two that do not move together.
+The gripper is a number. TOPIC:FIELD[NAME] or TOPIC:FIELD[NUMBER] selects a joint of several; [NAME,NAME] adds two.
+Without brackets all numbers are added. This is refused if more than two move, or two that do not move together.
 
-Every 1/RATE seconds a step is made of each topic's newest message. Messages without a measurement (an orientation of
-zeros, NaN, other joints than the selected ones) are left out and counted. A topic that is silent for longer than
-MOST_SILENT steps ends the conversion.
+Every 1/RATE seconds a step is made of each topic's newest message. Messages without a measurement (an orientation or a
+pose of zeros, NaN, other joints than the selected ones) are left out and counted. A topic that is silent for longer
+than MOST_SILENT steps ends the conversion.
 """
 
 import argparse
@@ -24,6 +24,7 @@ import io
 import itertools
 import re
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -48,9 +49,14 @@ def bags_in(path: Path) -> list[Path]:
     return [bag for entry in entries if entry.is_dir() or entry.suffix in ENDINGS for bag in bags_in(entry)]
 
 
-def open_bag(bag: Path) -> AnyReader:
-    """Return a reader; a bag without message definitions is read with those of ROS 2 Humble."""
-    return AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+@contextmanager
+def open_bag(bag: Path) -> Iterator[AnyReader]:
+    """Open a bag; one without message definitions is read with those of ROS 2 Humble."""
+    try:
+        with AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+            yield reader
+    except AnyReaderError as error:
+        raise SystemExit(f"{bag}: not a readable bag ({error})") from None
 
 
 def image_of(message: Any, height: int, where: str) -> np.ndarray:
@@ -86,7 +92,8 @@ def pose_of(value: Any, names: list[str], where: str) -> np.ndarray:  # noqa: AR
     if abs(size - 1) > 0.01:
         raise SystemExit(f"{where}: the rotation {numbers.tolist()}. Expected a unit quaternion or a rotation matrix.")
     rotation = Rotation.from_quat(numbers) if numbers.ndim == 1 else Rotation.from_matrix(numbers)
-    return np.concatenate([position, rotation.as_euler("xyz")])
+    pose = np.concatenate([position, rotation.as_euler("xyz")])
+    return pose if pose.any() else np.full(6, np.nan)
 
 
 def gripper_of(value: Any, names: list[str], where: str, selected: list[str]) -> np.ndarray:
@@ -142,10 +149,8 @@ def measurements_of(
         rows.append(convert(value, names, f"{bag}: {topic} at {second:.2f} s"))
     is_measured = np.array([len(row) > 0 and bool(np.isfinite(row).all()) for row in rows])
     if not is_measured.all():
-        found = (
-            f"{topic}: {(~is_measured).sum()} of {len(rows)} messages have no measurement (zeros, NaN or other joints)"
-        )
-        print(f"warning: {bag}: {found} and are left out, the first at {seconds[~is_measured][0]:.2f} s")
+        found = f"{(~is_measured).sum()} of {len(rows)} messages have no measurement (zeros, NaN or other joints)"
+        print(f"warning: {bag}: {topic}: {found} and are left out, the first at {seconds[~is_measured][0]:.2f} s")
     measured = [row for row, is_one in zip(rows, is_measured, strict=True) if is_one]
     if len({len(row) for row in measured}) != 1:
         found = "messages have different joints" if measured else "no message has a measurement"
@@ -153,16 +158,23 @@ def measurements_of(
     return times[is_measured], np.stack(measured), names
 
 
-def require_fingers(numbers: np.ndarray, names: list[str], where: str, options: argparse.Namespace) -> None:
-    """Refuse to add joints if more than two of them move, or two that do not move together as fingers do."""
-    is_moving = np.ptp(numbers, axis=0) > 0.05 * abs(options.gripper_closed - options.gripper_open)
-    moving = numbers[:, is_moving].T
-    if len(moving) > 2 or (len(moving) == 2 and np.corrcoef(moving)[0, 1] < 0.9):
+def closedness_of(numbers: np.ndarray, names: list[str], where: str, options: argparse.Namespace) -> np.ndarray:
+    """Return 0 (open) to 1 (closed) for the numbers of a gripper, [steps, joints], which are added."""
+    total, span = numbers.sum(axis=1), options.gripper_closed - options.gripper_open
+    closedness = (total - options.gripper_open) / span
+    is_in_range = closedness.min() >= -0.1 and closedness.max() <= 1.1
+    moving = numbers[:, np.ptp(numbers, axis=0) > 0.05 * abs(span)].T
+    is_gripper = len(moving) < 2 or (len(moving) == 2 and np.corrcoef(moving)[0, 1] > 0.9)  # two fingers move together
+    if "[" not in options.gripper and not (is_gripper and (is_in_range or numbers.shape[1] <= 2)):
         last = numbers.shape[1] - 1
         names = names or [str(index) for index in range(last + 1)]
         found = f"{last + 1} joints, numbered from 0 to {last}: {', '.join(names)}"
         fix = f"Append its name or number to the topic, such as [{names[-1]}]"
         raise SystemExit(f"{where}: {found}. Expected the gripper's joint. {fix}.")
+    if not is_in_range:
+        ends = f"{total.min():.4g} to {total.max():.4g}"
+        raise SystemExit(f"{where} goes from {ends}: set --gripper-open and --gripper-closed")
+    return np.asarray(closedness.clip(0, 1))
 
 
 def newest(times: np.ndarray, steps: np.ndarray, where: str) -> np.ndarray:
@@ -195,14 +207,8 @@ def episode_of(bag: Path, cameras: dict[str, str], options: argparse.Namespace) 
         for (name, topic), at_steps in zip(cameras.items(), indices, strict=False):
             images = values_of(reader, topic, bag, at_steps.tolist())
             arrays[name] = np.stack([image_of(image, options.height, f"{bag}: {topic}") for image, _ in images])
-    if not selected:
-        require_fingers(fingers, names, f"{bag}: {options.gripper}", options)
-    gripper = fingers[indices[-1]].sum(axis=1)
-    closedness = (gripper - options.gripper_open) / (options.gripper_closed - options.gripper_open)
-    if closedness.min() < -0.1 or closedness.max() > 1.1:
-        ends = f"{gripper.min():.4g} to {gripper.max():.4g}"
-        raise SystemExit(f"{bag}: {options.gripper} goes from {ends}: set --gripper-open and --gripper-closed")
-    arrays["states"] = np.concatenate([poses[indices[-2]], closedness.clip(0, 1)[:, None]], axis=1)
+    closedness = closedness_of(fingers[indices[-1]], names, f"{bag}: {options.gripper}", options)
+    arrays["states"] = np.concatenate([poses[indices[-2]], closedness[:, None]], axis=1)
     return arrays | ({"language": options.language} if options.language else {})
 
 
@@ -248,7 +254,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except AnyReaderError as error:
-        raise SystemExit(f"not a readable bag: {error}") from None
+    main()

@@ -6,7 +6,7 @@ import io
 import runpy
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -324,7 +324,7 @@ PLAIN = table_of(EULER_HEADER)
         PLAIN.replace("x,y,z", " X, Y ,Z"),
         PLAIN.replace("\n", ",\n"),
         PLAIN + "\n,,,,,,\n",
-        table_of(f"note,{EULER_HEADER},note").replace("\n", "\nwhat; 1.5,", STEPS).replace("note,x", "note,x"),
+        table_of(f"note,{EULER_HEADER},note").replace("\n", "\nopen; 1.5,", STEPS),
     ],
     ids=["plain", "BOM", "CRLF", "decimal commas", "semicolons", "tabs", "names", "empty column", "empty rows", "text"],
 )
@@ -414,17 +414,51 @@ def test_millimetres_and_an_inverted_gripper_are_converted(tmp_path: Path) -> No
 # ROS bags.
 
 
-def messages(*, encoding: str, skip: range = range(0)) -> Iterator[tuple[str, str, float, Any]]:
-    """Yield topic, type, time in seconds, and message; the camera's are 20 ms late, so that the newest is its own."""
+ARM = np.sin(np.arange(STEPS)[:, None] / 5 + np.arange(7))
+FINGER = 0.04 * (1 - STATES[:, 6])
+JOINTS = [*(f"arm/joint{number}" for number in range(7)), "left.finger", "right.finger"]
+NO_ORIENTATION = (0.0, 0.0, 0.0, 0.0)
+
+
+def messages(
+    *,
+    encoding: str = "jpeg",
+    skip: range = range(0),
+    orientations: Mapping[int, tuple[float, ...]] | None = None,
+    joints: Sequence[str] = (),
+    arm: np.ndarray | None = None,
+    is_alternating: bool = False,
+) -> Iterator[tuple[str, str, float, Any]]:
+    """Yield topic, type, time in seconds and message; the camera is 20 ms late, so that the newest frame is its own.
+
+    Args:
+        encoding: Of the frames.
+        skip: Steps without a frame.
+        orientations: Quaternions of the pose that replace the true ones, by step.
+        joints: Names of the joints in /fingers.
+        arm: Joints that precede the fingers in /fingers.
+        is_alternating: Arm and fingers are in messages of their own, the fingers first.
+    """
     kinds = TYPES.types
     header = kinds["std_msgs/msg/Header"](stamp=kinds["builtin_interfaces/msg/Time"](sec=0, nanosec=0), frame_id="")
     for step, (state, frame) in enumerate(zip(STATES, FRAMES, strict=True)):
-        time, grip = step / RATE_HZ, 0.04 * (1 - state[6])
-        turned = kinds["geometry_msgs/msg/Quaternion"](*Rotation.from_euler("xyz", state[3:6]).as_quat())
+        time, fingers = step / RATE_HZ, np.repeat(FINGER[step], 2)
+        quaternion = (orientations or {}).get(step, tuple(Rotation.from_euler("xyz", state[3:6]).as_quat()))
+        turned = kinds["geometry_msgs/msg/Quaternion"](*quaternion)
         pose = kinds["geometry_msgs/msg/Pose"](kinds["geometry_msgs/msg/Point"](*state[:3]), turned)
         yield "/pose", "geometry_msgs/msg/PoseStamped", time, kinds["geometry_msgs/msg/PoseStamped"](header, pose)
-        fingers = kinds["sensor_msgs/msg/JointState"](header, [], np.array([grip, grip]), np.zeros(0), np.zeros(0))
-        yield "/fingers", "sensor_msgs/msg/JointState", time, fingers
+        parts = [(list(joints), fingers if arm is None else np.r_[arm[step], fingers])]
+        if is_alternating and arm is not None:
+            parts = [(list(joints[-2:]), fingers), (list(joints[:-2]), arm[step])]
+        for delay, (names, numbers) in enumerate(parts):
+            positions = kinds["sensor_msgs/msg/JointState"](header, names, numbers, np.zeros(0), np.zeros(0))
+            yield "/fingers", "sensor_msgs/msg/JointState", time + 0.01 * delay, positions
+        matrix = np.eye(4)
+        has_rotation = np.linalg.norm(quaternion) > 0
+        matrix[:3, :3], matrix[:3, 3] = Rotation.from_quat(quaternion).as_matrix() if has_rotation else 0, state[:3]
+        layout = kinds["std_msgs/msg/MultiArrayLayout"]([], 0)
+        numbers = kinds["std_msgs/msg/Float64MultiArray"](layout, matrix.ravel(order="F"))
+        yield "/matrix", "std_msgs/msg/Float64MultiArray", time, numbers
         if step in skip:
             continue
         if encoding == "jpeg":
@@ -444,7 +478,7 @@ def messages(*, encoding: str, skip: range = range(0)) -> Iterator[tuple[str, st
 def write_bag(path: Path, storage: StoragePlugin, **changes: Any) -> Path:
     with Writer(path, version=9, storage_plugin=storage) as writer:
         topics: dict[str, Any] = {}
-        for topic, kind, time, message in messages(**({"encoding": "jpeg"} | changes)):
+        for topic, kind, time, message in messages(**changes):
             if topic not in topics:
                 topics[topic] = writer.add_connection(topic, kind, typestore=TYPES)
             writer.write(topics[topic], int(time * 1e9), TYPES.serialize_cdr(message, kind))
@@ -473,15 +507,42 @@ def test_a_bag_becomes_an_episode(storage: StoragePlugin, encoding: str, tmp_pat
     [
         ({"encoding": "16UC1"}, CHOSEN, r"images of 16UC1; read are rgb8.*depth is not"),
         ({"skip": range(5, 15)}, CHOSEN, r"/camera: silent for 1\.\d+ s"),
-        ({}, ("--pose", "/tf", *CHOSEN[2:]), "no topic /tf; it has /camera, /fingers, /pose"),
+        ({}, ("--pose", "/tf", *CHOSEN[2:]), "no topic /tf; it has /camera, /fingers, /matrix, /pose"),
         ({}, ("--pose", "/pose", "--gripper", "/fingers:width"), "has no width; it has header, name, position"),
         (
             {},
             (*CHOSEN[:4], "--gripper-open", 0.001, "--gripper-closed", 0),
             r"goes from 0\.02957 to 0\.07884: set --gripper-open",
         ),
+        (
+            {"joints": JOINTS, "arm": ARM},
+            CHOSEN,
+            r"/fingers:position: 9 joints, numbered from 0 to 8: arm/joint0, .*right.finger. Expected the gripper",
+        ),
+        ({"joints": JOINTS, "arm": np.ones_like(ARM)}, CHOSEN, "9 joints, numbered from 0 to 8: arm/joint0"),
+        (
+            {"joints": JOINTS[:1] + JOINTS[-1:], "arm": ARM[:, :0]},
+            ("--pose", "/pose", "--gripper", "/fingers:position[gripper]"),
+            r"no message has a measurement\. The joints of the last one: arm/joint0, right\.finger\.",
+        ),
+        (
+            {"joints": JOINTS, "arm": ARM, "is_alternating": True},
+            CHOSEN,
+            "/fingers:position: messages have different joints",
+        ),
+        (
+            {"orientations": dict.fromkeys(range(STEPS), NO_ORIENTATION)},
+            CHOSEN,
+            "/pose: no message has a measurement",
+        ),
+        ({"orientations": dict.fromkeys(range(5, 15), NO_ORIENTATION)}, CHOSEN, r"/pose: silent for 1\.\d+ s"),
+        (
+            {"orientations": {7: (0.0, 0.0, 0.0, 0.5)}},
+            CHOSEN,
+            r"/pose at 0\.70 s: the rotation \[0\.0, 0\.0, 0\.0, 0\.5\]\. Expected a unit quaternion",
+        ),
     ],
-    ids=["depth", "silent", "topic", "no field", "gripper"],
+    ids=lambda value: "" if not isinstance(value, str) else value[:20],
 )
 def test_a_bag_that_does_not_fit_says_why(
     changes: dict[str, Any], words: tuple[object, ...], found: str, tmp_path: Path
@@ -490,6 +551,74 @@ def test_a_bag_that_does_not_fit_says_why(
     with pytest.raises(SystemExit, match=found):
         run("ros2_bag", bag, "--out", tmp_path / "npz", "--camera", "frames=/camera", *words)
     assert not (tmp_path / "npz").exists()
+
+
+def test_messages_without_a_measurement_are_left_out_and_counted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    empty = dict.fromkeys(range(3), NO_ORIENTATION) | {7: (np.nan,) * 4}
+    bag = write_bag(tmp_path / "bag", StoragePlugin.SQLITE3, orientations=empty)
+    out = tmp_path / "npz"
+    run("ros2_bag", bag, "--out", out, "--rate", RATE_HZ, "--camera", "frames=/camera", *CHOSEN)
+    expected = STATES[3:-1].copy()
+    expected[7 - 3, :6] = STATES[6, :6]  # the newest pose that was measured
+    assert np.abs(states_in(out) - expected).max() < 1e-6
+    found = (
+        "/pose: 4 of 20 messages have no measurement (zeros, NaN or other joints) and are left out, the first at 0.00 s"
+    )
+    assert found in capsys.readouterr().out
+
+
+def test_a_pose_of_default_values_is_no_measurement() -> None:
+    """ROS 2 fills a new pose with zeros and w = 1."""
+    kinds = TYPES.types
+    turned = kinds["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+    pose_of = runpy.run_path(str(ROOT / "examples/convert/ros2_bag.py"))["pose_of"]
+    point = kinds["geometry_msgs/msg/Point"]
+    assert np.isnan(pose_of(kinds["geometry_msgs/msg/Pose"](point(0.0, 0.0, 0.0), turned), [], "")).all()
+    made = pose_of(kinds["geometry_msgs/msg/Pose"](point(0.001, 0.0, 0.0), turned), [], "")
+    assert made.tolist() == [0.001, 0, 0, 0, 0, 0]
+
+
+def test_files_that_are_no_bags_are_ignored_or_named(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "bags/first", StoragePlugin.MCAP)
+    (bag.parent / "._first.mcap").write_bytes(b"\0\5\x16\7" + bytes(99))
+    words = ("--out", tmp_path / "npz", "--camera", "frames=/camera", *CHOSEN)
+    run("ros2_bag", bag.parent, *words)
+    assert [path.name for path in (tmp_path / "npz").iterdir()] == ["first.npz"]
+    (bag.parent / "other.mcap").write_bytes(b"no bag" * 100)
+    with pytest.raises(SystemExit, match=r"other\.mcap: not a readable bag"):
+        run("ros2_bag", bag.parent, *words)
+
+
+def test_a_matrix_of_zeros_is_no_measurement(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "bag", StoragePlugin.SQLITE3, orientations=dict.fromkeys(range(2), NO_ORIENTATION))
+    chosen = ("--pose", "/matrix:data", *CHOSEN[2:])
+    run("ros2_bag", bag, "--out", tmp_path / "npz", "--rate", RATE_HZ, "--camera", "frames=/camera", *chosen)
+    assert np.abs(states_in(tmp_path / "npz") - STATES[2:-1]).max() < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("gripper", "changes"),
+    [
+        ("/fingers:position[left.finger]", {}),
+        ("/fingers:position[7]", {}),
+        ("/fingers:position[left.finger]", {"is_alternating": True}),
+        ("/fingers:position[left.finger, right.finger]", {}),
+        ("/fingers:position", {"arm": np.ones_like(ARM) / 1000}),
+    ],
+    ids=["name", "number", "messages of arm and fingers", "two fingers", "an arm at rest"],
+)
+def test_the_joints_of_the_gripper_are_selected(gripper: str, changes: dict[str, Any], tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "bag", StoragePlugin.SQLITE3, **({"joints": JOINTS, "arm": ARM} | changes))
+    is_sum, offset = "right" in gripper or "[" not in gripper, 0.007 if "[" not in gripper else 0.0
+    ends = ("--gripper-open", 0.04 * (1 + is_sum) + offset, "--gripper-closed", offset)
+    out = tmp_path / "npz"
+    run(
+        "ros2_bag", bag, "--out", out, "--rate", RATE_HZ, "--camera", "frames=/camera",
+        "--pose", "/pose", "--gripper", gripper, *ends,
+    )  # fmt: skip
+    assert np.abs(states_in(out)[:, 6] - STATES[:-1, 6]).max() < 1e-6
 
 
 # Lance tables. In processes of their own: Lance warns of every fork in the process that has imported it.
