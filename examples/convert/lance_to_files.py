@@ -79,7 +79,7 @@ def write_videos(source: Path, out: Path, info: dict[str, Any]) -> None:
 def main(source: str, out: str) -> None:
     """Write meta, rows and videos."""
     if Path(out).exists():
-        raise SystemExit(f"{out}: is there already")
+        raise SystemExit(f"{out}: exists. Expected a new folder.")
     info = write_meta(Path(source), Path(out))
     write_rows(Path(source), Path(out), info)
     write_videos(Path(source), Path(out), info)
@@ -87,4 +87,6 @@ def main(source: str, out: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:3])
+    if len(sys.argv) != 3:
+        raise SystemExit(__doc__)
+    main(*sys.argv[1:])

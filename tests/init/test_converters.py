@@ -1,14 +1,17 @@
 """Each converter makes of its form what was recorded, and says what is wrong; `data converter` prints it."""
 
+import argparse
 import csv
 import io
 import runpy
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import pytest
 from PIL import Image
@@ -56,8 +59,12 @@ def test_the_command_prints_it_whole_and_lists_it(name: str, capsys: pytest.Capt
 
 # Videos and tables.
 
+MP4_AND_CSV = runpy.run_path(str(ROOT / "examples/convert/mp4_and_csv.py"))
+EULER_HEADER = "x,y,z,roll,pitch,yaw,gripper"
+ROTATIONS = Rotation.from_euler("xyz", STATES[:, 3:6])
 
-def write_recording(folder: Path, *, header: str = "x,y,z,roll,pitch,yaw,gripper", rows: np.ndarray = STATES) -> Path:
+
+def write_recording(folder: Path, *, header: str = EULER_HEADER, rows: np.ndarray = STATES) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     write_video(folder / "first.mp4", FRAMES, rate_hz=RATE_HZ)
     with (folder / "first.csv").open("w", newline="") as file:
@@ -66,28 +73,55 @@ def write_recording(folder: Path, *, header: str = "x,y,z,roll,pitch,yaw,gripper
     return folder
 
 
+def write_video_at(path: Path, times: np.ndarray) -> None:
+    """Write FRAMES as a video whose frames have these times in seconds."""
+    with av.open(str(path), "w") as file:
+        stream = file.add_stream("libx264", rate=10, options={"crf": "1", "bf": "0"})
+        stream.height, stream.width, stream.pix_fmt = 64, 96, "yuv420p"
+        stream.time_base = stream.codec_context.time_base = Fraction(1, 10000)
+        for time, pixels in zip(times, FRAMES, strict=True):
+            frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
+            frame.pts, frame.time_base = round(10000 * time), Fraction(1, 10000)
+            file.mux(stream.encode(frame))
+        file.mux(stream.encode(None))
+
+
 def states_in(folder: Path) -> np.ndarray:
     dataset = open_dataset(folder, source="npz", frames=3, stride=2, validation_share=0.0, test_share=0.0)
     assert dataset.control_rate_hz == RATE_HZ
     return np.asarray(dataset.source.read(0).states)
 
 
-def with_quaternions() -> np.ndarray:
-    return np.concatenate([STATES[:, :3], Rotation.from_euler("xyz", STATES[:, 3:6]).as_quat(), STATES[:, 6:]], axis=1)
+def read_table(path: Path, text: str | bytes, **options: Any) -> Any:
+    """Return the states of a table with this text, as the converter reads them."""
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    defaults: dict[str, Any] = {"rotation": None, "position_unit": "m", "gripper_open": 0.0, "gripper_closed": 1.0}
+    return MP4_AND_CSV["read_table"](path, argparse.Namespace(**defaults | options))[0]
+
+
+def table_of(header: str, numbers: np.ndarray = STATES) -> str:
+    return "\n".join([header, *(",".join(map(repr, row)) for row in numbers.tolist())]) + "\n"
+
+
+def with_rotation(rotation: np.ndarray) -> np.ndarray:
+    return np.concatenate([STATES[:, :3], rotation, STATES[:, 6:]], axis=1)
 
 
 @pytest.mark.parametrize(
     ("header", "rows"),
     [
-        ("x,y,z,roll,pitch,yaw,gripper", STATES),
-        ("x,y,z,qx,qy,qz,qw,gripper", with_quaternions()),
-        ("time,x,y,z,roll,pitch,yaw,gripper", np.insert(STATES, 0, np.arange(STEPS) / RATE_HZ + 0.02, axis=1)[::-1]),
+        (EULER_HEADER, STATES),
+        ("x,y,z,qx,qy,qz,qw,gripper", with_rotation(ROTATIONS.as_quat())),
+        (f"time,{EULER_HEADER}", np.insert(STATES, 0, np.arange(STEPS) / RATE_HZ + 0.02, axis=1)[::-1]),
     ],
     ids=["angles", "quaternions", "times, in any order"],
 )
-def test_videos_and_tables_become_episodes(header: str, rows: np.ndarray, tmp_path: Path) -> None:
+def test_videos_and_tables_become_episodes(
+    header: str, rows: np.ndarray, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     run("mp4_and_csv", write_recording(tmp_path / "own", header=header, rows=rows), tmp_path / "npz", "--height", 32)
     assert np.abs(states_in(tmp_path / "npz") - STATES).max() < 1e-6
+    assert "warning" not in capsys.readouterr().out
     with np.load(tmp_path / "npz/first.npz") as file:
         assert file["frames"].shape == (STEPS, 32, 48, 3)
         smaller = [np.asarray(Image.fromarray(frame).resize((48, 32))) for frame in FRAMES]
@@ -98,19 +132,37 @@ def drop_table(folder: Path) -> None:
     (folder / "first.csv").unlink()
 
 
+def damage_video(folder: Path) -> None:
+    (folder / "first.mp4").write_bytes(b"no video" * 100)
+
+
 @pytest.mark.parametrize(
     ("changes", "spoil", "found"),
     [
         ({"rows": STATES[:-2]}, None, "18 rows for 20 frames"),
-        ({"header": "x,y,z,roll,pitch,yaw,grip"}, None, "no column gripper; it has grip, pitch"),
-        ({}, drop_table, "no table of poses beside it, first.csv"),
+        ({"header": "x,y,z,roll,pitch,yaw,grip"}, None, "no column gripper; it has x, y, z, roll, pitch, yaw, grip"),
+        ({}, drop_table, r"first.mp4: no table of poses. Expected first.csv"),
+        ({}, damage_video, r"first.mp4: not a readable video"),
         (
-            {"header": "time,x,y,z,roll,pitch,yaw,gripper", "rows": np.insert(STATES, 0, 1.7e9, axis=1)},
+            {"header": f"time,{EULER_HEADER}", "rows": np.insert(STATES, 0, 1.7e9, axis=1)},
             None,
             "is `time` 0 at the first frame",
         ),
+        (
+            {"header": f"time,{EULER_HEADER}", "rows": np.insert(STATES[::3], 0, np.arange(0, STEPS, 3) / 30, axis=1)},
+            None,
+            "a frame is 1.30 s from the nearest row",
+        ),
+        (
+            {
+                "header": f"time,{EULER_HEADER}",
+                "rows": np.insert(STATES[::2], 0, np.arange(0.5, STEPS, 2) / 10, axis=1),
+            },
+            None,
+            r"first.csv: 10 of 20 steps repeat the row of the step before. Expected 20% at most. Pass a lower --fps",
+        ),
     ],
-    ids=["lengths", "column", "no table", "another clock"],
+    ids=["lengths", "column", "no table", "damaged video", "another clock", "short table", "half as many rows"],
 )
 def test_a_recording_that_does_not_fit_says_why(
     changes: dict[str, Any], spoil: Callable[[Path], None] | None, found: str, tmp_path: Path
@@ -123,20 +175,290 @@ def test_a_recording_that_does_not_fit_says_why(
     assert not list(tmp_path.rglob("*.npz"))
 
 
+def test_files_of_cameras_and_macs_are_read_or_ignored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_recording(tmp_path / "own")
+    (folder / "first.mp4").rename(folder / "first.MP4")
+    (folder / "first.csv").rename(folder / "first.CSV")
+    for name in ("._first.mp4", "._first.csv"):
+        (folder / name).write_bytes(b"\0\5\x16\7" + bytes(99))
+    (folder / "second.csv").write_text("x\n")
+    run("mp4_and_csv", folder, tmp_path / "npz")
+    assert [path.name for path in (tmp_path / "npz").rglob("*.npz")] == ["first.npz"]
+    assert "second.csv is not used: there is no second.mp4" in capsys.readouterr().out
+
+
+# Steps at even times.
+
+
+def converted(folder: Path, times: np.ndarray, *words: object, row_times: np.ndarray | None = None) -> Any:
+    """Convert a recording whose frames have these times; `row_times`: a column `time`."""
+    write_recording(folder)
+    write_video_at(folder / "first.mp4", times)
+    if row_times is not None:
+        table = np.insert(STATES, 0, row_times, axis=1)
+        (folder / "first.csv").write_text(table_of(f"time,{EULER_HEADER}", table))
+    run("mp4_and_csv", folder, folder / "npz", "--height", 64, *words)
+    return np.load(folder / "npz/first.npz")
+
+
+def require_steps(made: Any, expected: np.ndarray) -> None:
+    """Require these rows as the states, and the frames that were taken with them."""
+    assert np.abs(made["states"] - STATES[expected]).max() < 1e-9
+    away = np.abs(made["frames"][:, None].astype(int) - FRAMES).mean(axis=(2, 3, 4))
+    assert np.array_equal(away.argmin(axis=1), expected)
+
+
+UNEVEN = np.r_[0, np.cumsum(np.random.default_rng(0).choice([0.03, 0.1, 0.2, 0.6], STEPS - 1))]
+
+
+def test_uneven_frame_times_are_refused_with_the_option_that_resamples(tmp_path: Path) -> None:
+    with pytest.raises(
+        SystemExit, match=r"first.mp4: frames are 0\.030 to 0\.600 s apart.*up to 1\.65 no step repeats"
+    ):
+        converted(tmp_path, UNEVEN)
+
+
+def test_small_jitter_is_no_reason_to_resample(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    jitter = np.random.default_rng(1).uniform(-0.006, 0.006, STEPS)
+    made = converted(tmp_path, np.arange(STEPS) / RATE_HZ + jitter - jitter[0])
+    require_steps(made, np.arange(STEPS))
+    assert made["fps_hz"] == pytest.approx(RATE_HZ, rel=0.01)
+    assert "warning" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("has_times", [False, True], ids=["rows by number", "rows by time"])
+def test_fps_takes_the_nearest_frame_with_its_own_pose(has_times: bool, tmp_path: Path) -> None:
+    made = converted(tmp_path, UNEVEN, "--fps", 1.65, row_times=UNEVEN if has_times else None)
+    grid = np.arange(0, UNEVEN[-1], 1 / 1.65)
+    expected = np.abs(UNEVEN - grid[:, None]).argmin(axis=1)
+    assert made["fps_hz"] == 1.65
+    require_steps(made, expected)
+
+
+def test_fps_below_the_rate_leaves_frames_out_and_near_the_rate_keeps_all(tmp_path: Path) -> None:
+    even = np.arange(STEPS) / RATE_HZ
+    require_steps(converted(tmp_path / "half", even, "--fps", 5), np.arange(0, STEPS, 2))
+    nearly = converted(tmp_path / "nearly", even, "--fps", 10.1)
+    require_steps(nearly, np.arange(STEPS))
+    assert nearly["fps_hz"] == 10.1
+
+
+def test_steps_that_repeat_a_frame_are_counted_and_many_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    hole = np.arange(STEPS) / RATE_HZ + 0.3 * (np.arange(STEPS) > 9)  # 0.4 s without a frame
+    require_steps(converted(tmp_path / "hole", hole, "--fps", 10), np.r_[:10, 9, 10, 10, 10:20])
+    assert "warning: " in (out := capsys.readouterr().out)
+    assert "3 of 23 steps repeat the frame of the step before" in out
+    with pytest.raises(SystemExit, match=r"19 of 39 steps repeat the frame.*Expected 20% at most. Pass a lower --fps"):
+        converted(tmp_path / "double", np.arange(STEPS) / RATE_HZ, "--fps", 20)
+
+
+def test_the_times_of_the_table_are_used_if_the_video_has_other_ones(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """OpenCV writes a nominal rate: here 10 per second for frames that were taken at 8 per second."""
+    made = converted(tmp_path, np.arange(STEPS) / RATE_HZ, row_times=np.arange(STEPS) / 8 + 3)
+    require_steps(made, np.arange(STEPS))
+    assert made["fps_hz"] == 8
+    assert "`time` covers 2.38 s and the video 1.90 s" in capsys.readouterr().out
+
+
+# Orientation of a phone.
+
+TURNS = {  # matrix of the header: (right, down) of a stored row and a stored column; how the displayed frames differ
+    "upright": ((1, 0, 0, 1), lambda frames: frames),
+    "90 clockwise": ((0, 1, -1, 0), lambda frames: np.rot90(frames, -1, (1, 2))),
+    "180": ((-1, 0, 0, -1), lambda frames: np.rot90(frames, 2, (1, 2))),
+    "90 counterclockwise": ((0, -1, 1, 0), lambda frames: np.rot90(frames, 1, (1, 2))),
+    "mirrored": ((-1, 0, 0, 1), lambda frames: frames[:, :, ::-1]),
+    "upside down": ((1, 0, 0, -1), lambda frames: frames[:, ::-1]),
+    "mirrored and turned": ((0, 1, 1, 0), lambda frames: frames.swapaxes(1, 2)),
+}
+
+
+def set_display_matrix(path: Path, entries: Sequence[float]) -> None:
+    data, unity = bytearray(path.read_bytes()), display_matrix((1, 0, 0, 1))
+    start = bytes(data).index(unity, bytes(data).index(b"tkhd"))
+    data[start : start + len(unity)] = display_matrix(entries)
+    path.write_bytes(data)
+
+
+def display_matrix(entries: Sequence[float]) -> bytes:
+    a, b, c, d = (round(65536 * entry) for entry in entries)
+    return np.array([a, b, 0, c, d, 0, 0, 0, 1 << 30], ">i4").tobytes()
+
+
+@pytest.mark.parametrize("turn", TURNS)
+def test_frames_are_turned_as_players_show_them(turn: str, tmp_path: Path) -> None:
+    entries, displayed = TURNS[turn]
+    folder = write_recording(tmp_path / "own")
+    run("mp4_and_csv", folder, tmp_path / "stored", "--height", 64)
+    set_display_matrix(folder / "first.mp4", entries)
+    run("mp4_and_csv", folder, tmp_path / "npz", "--height", 96 if entries[0] == 0 else 64)
+    with np.load(tmp_path / "stored/first.npz") as stored, np.load(tmp_path / "npz/first.npz") as made:
+        assert np.array_equal(made["frames"], displayed(stored["frames"]))
+
+
+def test_an_oblique_orientation_is_refused(tmp_path: Path) -> None:
+    folder = write_recording(tmp_path / "own")
+    set_display_matrix(folder / "first.mp4", (0.7071, 0.7071, -0.7071, 0.7071))
+    with pytest.raises(SystemExit, match=r"displayed at -4[45] degrees. Expected 0, 90, 180 or 270"):
+        run("mp4_and_csv", folder, tmp_path / "npz")
+
+
+# Cells of a table.
+
+PLAIN = table_of(EULER_HEADER)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        PLAIN,
+        b"\xef\xbb\xbf" + PLAIN.encode(),
+        PLAIN.replace("\n", "\r\n"),
+        PLAIN.replace(",", ";").replace(".", ","),
+        PLAIN.replace(",", ";"),
+        PLAIN.replace(",", "\t"),
+        PLAIN.replace("x,y,z", " X, Y ,Z"),
+        PLAIN.replace("\n", ",\n"),
+        PLAIN + "\n,,,,,,\n",
+        table_of(f"note,{EULER_HEADER},note").replace("\n", "\nopen; 1.5,", STEPS),
+    ],
+    ids=["plain", "BOM", "CRLF", "decimal commas", "semicolons", "tabs", "names", "empty column", "empty rows", "text"],
+)
+def test_tables_are_read_as_people_have_them(text: str | bytes, tmp_path: Path) -> None:
+    assert np.abs(read_table(tmp_path / "a.csv", text) - STATES).max() < 1e-12
+
+
+ONE = "0.1,0.2,0.3,0.4,0.5,0.6,0.7"
+
+
+@pytest.mark.parametrize(
+    ("rows", "found"),
+    [
+        (f"{EULER_HEADER}\n{ONE}\n,0.2,0.3,0.4,0.5,0.6,0.7", "line 3, column x: an empty cell. Expected a number"),
+        (f"{EULER_HEADER}\n{ONE}\n0.1,0.2,0.3,0.4", "line 3, column pitch: an empty cell"),
+        (f"{EULER_HEADER}\n\n{ONE.replace('0.7', 'open')}", "line 3, column gripper: 'open'. Expected a number"),
+        (f"{EULER_HEADER}\n{ONE.replace('0.2', 'nan')}", "line 2, column y: 'nan'. Expected a number"),
+        (f"{EULER_HEADER}\n0,1,0,2,0,3,0,4,0,5,0,6,0,7", "line 2: 14 cells. Expected 7, as in the first line"),
+        (f"{EULER_HEADER},X\n{ONE},1", "2 columns are called x. Rename all but one"),
+        (f"{EULER_HEADER}", "no rows. Expected a line with the names"),
+        ("", "no rows. Expected a line with the names"),
+        (PLAIN.encode("utf-16"), r"not a text table .*Save the table as CSV \(UTF-8\)"),
+        (
+            f"x,y,z,gripper\n{ONE}",
+            "no columns for the rotation; it has x, y, z, gripper. Expected roll, pitch, yaw, or",
+        ),
+        (f"x,y,z,rx,ry,rz,gripper\n{ONE}", "rx, ry, rz can be rotation_vector, euler_xyz or euler_xyz_degrees. Pass"),
+        ("x,y,z,q0,q1,q2,q3,gripper\n0,0,0,0,0,0,1,0", "q0, q1, q2, q3 can be quaternion_xyzw or quaternion_wxyz"),
+        ("x,y,z,qx,qy,qz,qw,gripper\n0,0,0,0,0,0,1,0\n0,0,0,0,0,0,0,0", "line 3: 0, 0, 0, 0. Expected quaternion_xyzw"),
+        ("x,y,z,rx,ry,rz,rw,gripper\n0,0,0,0.1,0.2,0.3,0.4,0", "line 2: 0.1, 0.2, 0.3, 0.4. Expected quaternion_xyzw"),
+        (
+            f"{EULER_HEADER}\n{ONE.replace('0.4', '178')}",
+            "line 2: 178, 0.5, 0.6. Expected euler_xyz .*Check --rotation",
+        ),
+        (f"{EULER_HEADER}\n{ONE.replace('0.1', '412')}", "line 2: 412, 0.2, 0.3. Expected .*5 m.*--position-unit"),
+        (f"{EULER_HEADER}\n{ONE.replace('0.7', '85')}", "line 2: 85. Expected .*0 to 1. Set --gripper-open"),
+    ],
+)
+def test_a_table_that_cannot_be_read_is_refused_in_one_sentence(rows: str | bytes, found: str, tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match=rf"a\.csv: {found}"):
+        read_table(tmp_path / "a.csv", rows)
+
+
+XYZW, WXYZ, VECTOR = ROTATIONS.as_quat(), ROTATIONS.as_quat(scalar_first=True), ROTATIONS.as_rotvec()
+
+
+@pytest.mark.parametrize(
+    ("columns", "rotation", "numbers"),
+    [
+        ("rx,ry,rz,rw", None, XYZW),
+        ("rw,rx,ry,rz", None, WXYZ),
+        ("qw,qx,qy,qz", "quaternion_wxyz", WXYZ),
+        ("quat_x,quat_y,quat_z,quat_w", None, XYZW),
+        ("rot.w,rot.x,rot.y,rot.z", "quaternion_xyzw", WXYZ),
+        ("q0,q1,q2,q3", "quaternion_wxyz", WXYZ),
+        ("quat_1,quat_2,quat_3,quat_4", "quaternion_xyzw", XYZW),
+        ("rotvec_x,rotvec_y,rotvec_z", None, VECTOR),
+        ("axis_angle1,axis_angle2,axis_angle3", None, VECTOR),
+        ("wx,wy,wz", None, VECTOR),
+        ("rx,ry,rz", "rotation_vector", VECTOR),
+        ("rx,ry,rz", "euler_xyz", STATES[:, 3:6]),
+        ("roll,pitch,yaw", "euler_xyz_degrees", np.degrees(STATES[:, 3:6])),
+    ],
+)
+def test_rotations_are_read_by_name_or_as_requested(
+    columns: str, rotation: str | None, numbers: np.ndarray, tmp_path: Path
+) -> None:
+    table = table_of(f"x,y,z,{columns},gripper", with_rotation(numbers))
+    states = read_table(tmp_path / "a.csv", table, rotation=rotation)
+    assert np.abs(states - STATES).max() < 1e-9
+
+
+def test_the_requested_rotation_is_chosen_from_several(tmp_path: Path) -> None:
+    table = table_of(f"{EULER_HEADER},rx,ry,rz", np.concatenate([STATES[::-1], VECTOR], axis=1))
+    assert np.array_equal(read_table(tmp_path / "a.csv", table), STATES[::-1])
+    states = read_table(tmp_path / "a.csv", table, rotation="rotation_vector")
+    assert np.abs(states[:, 3:6] - STATES[:, 3:6]).max() < 1e-9
+
+
+def test_millimetres_and_an_inverted_gripper_are_converted(tmp_path: Path) -> None:
+    own = STATES * ([1000] * 3 + [1] * 4)
+    own[:, 6] = 85 * (1 - STATES[:, 6])
+    options = {"position_unit": "mm", "gripper_open": 85.0, "gripper_closed": 0.0}
+    assert np.abs(read_table(tmp_path / "a.csv", table_of(EULER_HEADER, own), **options) - STATES).max() < 1e-12
+
+
 # ROS bags.
 
 
-def messages(*, encoding: str, skip: range = range(0)) -> Iterator[tuple[str, str, float, Any]]:
-    """Yield topic, type, time in seconds, and message; the camera's are 20 ms late, so that the newest is its own."""
+ARM = np.sin(np.arange(STEPS)[:, None] / 5 + np.arange(7))
+FINGER = 0.04 * (1 - STATES[:, 6])
+JOINTS = [*(f"arm/joint{number}" for number in range(7)), "left.finger", "right.finger"]
+NO_ORIENTATION = (0.0, 0.0, 0.0, 0.0)
+
+
+def messages(
+    *,
+    encoding: str = "jpeg",
+    skip: range = range(0),
+    orientations: Mapping[int, tuple[float, ...]] | None = None,
+    joints: Sequence[str] = (),
+    arm: np.ndarray | None = None,
+    is_alternating: bool = False,
+) -> Iterator[tuple[str, str, float, Any]]:
+    """Yield topic, type, time in seconds and message; the camera is 20 ms late, so that the newest frame is its own.
+
+    Args:
+        encoding: Of the frames.
+        skip: Steps without a frame.
+        orientations: Quaternions of the pose that replace the true ones, by step.
+        joints: Names of the joints in /fingers.
+        arm: Joints that precede the fingers in /fingers.
+        is_alternating: Arm and fingers are in messages of their own, the fingers first.
+    """
     kinds = TYPES.types
     header = kinds["std_msgs/msg/Header"](stamp=kinds["builtin_interfaces/msg/Time"](sec=0, nanosec=0), frame_id="")
     for step, (state, frame) in enumerate(zip(STATES, FRAMES, strict=True)):
-        time, grip = step / RATE_HZ, 0.04 * (1 - state[6])
-        turned = kinds["geometry_msgs/msg/Quaternion"](*Rotation.from_euler("xyz", state[3:6]).as_quat())
+        time, fingers = step / RATE_HZ, np.repeat(FINGER[step], 2)
+        quaternion = (orientations or {}).get(step, tuple(Rotation.from_euler("xyz", state[3:6]).as_quat()))
+        turned = kinds["geometry_msgs/msg/Quaternion"](*quaternion)
         pose = kinds["geometry_msgs/msg/Pose"](kinds["geometry_msgs/msg/Point"](*state[:3]), turned)
         yield "/pose", "geometry_msgs/msg/PoseStamped", time, kinds["geometry_msgs/msg/PoseStamped"](header, pose)
-        fingers = kinds["sensor_msgs/msg/JointState"](header, [], np.array([grip, grip]), np.zeros(0), np.zeros(0))
-        yield "/fingers", "sensor_msgs/msg/JointState", time, fingers
+        parts = [(list(joints), fingers if arm is None else np.r_[arm[step], fingers])]
+        if is_alternating and arm is not None:
+            parts = [(list(joints[-2:]), fingers), (list(joints[:-2]), arm[step])]
+        for delay, (names, numbers) in enumerate(parts):
+            positions = kinds["sensor_msgs/msg/JointState"](header, names, numbers, np.zeros(0), np.zeros(0))
+            yield "/fingers", "sensor_msgs/msg/JointState", time + 0.01 * delay, positions
+        matrix = np.eye(4)
+        has_rotation = np.linalg.norm(quaternion) > 0
+        matrix[:3, :3], matrix[:3, 3] = Rotation.from_quat(quaternion).as_matrix() if has_rotation else 0, state[:3]
+        layout = kinds["std_msgs/msg/MultiArrayLayout"]([], 0)
+        numbers = kinds["std_msgs/msg/Float64MultiArray"](layout, matrix.ravel(order="F"))
+        yield "/matrix", "std_msgs/msg/Float64MultiArray", time, numbers
         if step in skip:
             continue
         if encoding == "jpeg":
@@ -156,7 +478,7 @@ def messages(*, encoding: str, skip: range = range(0)) -> Iterator[tuple[str, st
 def write_bag(path: Path, storage: StoragePlugin, **changes: Any) -> Path:
     with Writer(path, version=9, storage_plugin=storage) as writer:
         topics: dict[str, Any] = {}
-        for topic, kind, time, message in messages(**({"encoding": "jpeg"} | changes)):
+        for topic, kind, time, message in messages(**changes):
             if topic not in topics:
                 topics[topic] = writer.add_connection(topic, kind, typestore=TYPES)
             writer.write(topics[topic], int(time * 1e9), TYPES.serialize_cdr(message, kind))
@@ -185,15 +507,42 @@ def test_a_bag_becomes_an_episode(storage: StoragePlugin, encoding: str, tmp_pat
     [
         ({"encoding": "16UC1"}, CHOSEN, r"images of 16UC1; read are rgb8.*depth is not"),
         ({"skip": range(5, 15)}, CHOSEN, r"/camera: silent for 1\.\d+ s"),
-        ({}, ("--pose", "/tf", *CHOSEN[2:]), "no topic /tf; it has /camera, /fingers, /pose"),
+        ({}, ("--pose", "/tf", *CHOSEN[2:]), "no topic /tf; it has /camera, /fingers, /matrix, /pose"),
         ({}, ("--pose", "/pose", "--gripper", "/fingers:width"), "has no width; it has header, name, position"),
         (
             {},
             (*CHOSEN[:4], "--gripper-open", 0.001, "--gripper-closed", 0),
             r"goes from 0\.02957 to 0\.07884: set --gripper-open",
         ),
+        (
+            {"joints": JOINTS, "arm": ARM},
+            CHOSEN,
+            r"/fingers:position: 9 joints, numbered from 0 to 8: arm/joint0, .*right.finger. Expected the gripper",
+        ),
+        ({"joints": JOINTS, "arm": np.ones_like(ARM)}, CHOSEN, "9 joints, numbered from 0 to 8: arm/joint0"),
+        (
+            {"joints": JOINTS[:1] + JOINTS[-1:], "arm": ARM[:, :0]},
+            ("--pose", "/pose", "--gripper", "/fingers:position[gripper]"),
+            r"no message has a measurement\. The joints of the last one: arm/joint0, right\.finger\.",
+        ),
+        (
+            {"joints": JOINTS, "arm": ARM, "is_alternating": True},
+            CHOSEN,
+            "/fingers:position: messages have different joints",
+        ),
+        (
+            {"orientations": dict.fromkeys(range(STEPS), NO_ORIENTATION)},
+            CHOSEN,
+            "/pose: no message has a measurement",
+        ),
+        ({"orientations": dict.fromkeys(range(5, 15), NO_ORIENTATION)}, CHOSEN, r"/pose: silent for 1\.\d+ s"),
+        (
+            {"orientations": {7: (0.0, 0.0, 0.0, 0.5)}},
+            CHOSEN,
+            r"/pose at 0\.70 s: the rotation \[0\.0, 0\.0, 0\.0, 0\.5\]\. Expected a unit quaternion",
+        ),
     ],
-    ids=["depth", "silent", "topic", "no field", "gripper"],
+    ids=lambda value: "" if not isinstance(value, str) else value[:20],
 )
 def test_a_bag_that_does_not_fit_says_why(
     changes: dict[str, Any], words: tuple[object, ...], found: str, tmp_path: Path
@@ -202,6 +551,74 @@ def test_a_bag_that_does_not_fit_says_why(
     with pytest.raises(SystemExit, match=found):
         run("ros2_bag", bag, "--out", tmp_path / "npz", "--camera", "frames=/camera", *words)
     assert not (tmp_path / "npz").exists()
+
+
+def test_messages_without_a_measurement_are_left_out_and_counted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    empty = dict.fromkeys(range(3), NO_ORIENTATION) | {7: (np.nan,) * 4}
+    bag = write_bag(tmp_path / "bag", StoragePlugin.SQLITE3, orientations=empty)
+    out = tmp_path / "npz"
+    run("ros2_bag", bag, "--out", out, "--rate", RATE_HZ, "--camera", "frames=/camera", *CHOSEN)
+    expected = STATES[3:-1].copy()
+    expected[7 - 3, :6] = STATES[6, :6]  # the newest pose that was measured
+    assert np.abs(states_in(out) - expected).max() < 1e-6
+    found = (
+        "/pose: 4 of 20 messages have no measurement (zeros, NaN or other joints) and are left out, the first at 0.00 s"
+    )
+    assert found in capsys.readouterr().out
+
+
+def test_a_pose_of_default_values_is_no_measurement() -> None:
+    """ROS 2 fills a new pose with zeros and w = 1."""
+    kinds = TYPES.types
+    turned = kinds["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+    pose_of = runpy.run_path(str(ROOT / "examples/convert/ros2_bag.py"))["pose_of"]
+    point = kinds["geometry_msgs/msg/Point"]
+    assert np.isnan(pose_of(kinds["geometry_msgs/msg/Pose"](point(0.0, 0.0, 0.0), turned), [], "")).all()
+    made = pose_of(kinds["geometry_msgs/msg/Pose"](point(0.001, 0.0, 0.0), turned), [], "")
+    assert made.tolist() == [0.001, 0, 0, 0, 0, 0]
+
+
+def test_files_that_are_no_bags_are_ignored_or_named(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "bags/first", StoragePlugin.MCAP)
+    (bag.parent / "._first.mcap").write_bytes(b"\0\5\x16\7" + bytes(99))
+    words = ("--out", tmp_path / "npz", "--camera", "frames=/camera", *CHOSEN)
+    run("ros2_bag", bag.parent, *words)
+    assert [path.name for path in (tmp_path / "npz").iterdir()] == ["first.npz"]
+    (bag.parent / "other.mcap").write_bytes(b"no bag" * 100)
+    with pytest.raises(SystemExit, match=r"other\.mcap: not a readable bag"):
+        run("ros2_bag", bag.parent, *words)
+
+
+def test_a_matrix_of_zeros_is_no_measurement(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "bag", StoragePlugin.SQLITE3, orientations=dict.fromkeys(range(2), NO_ORIENTATION))
+    chosen = ("--pose", "/matrix:data", *CHOSEN[2:])
+    run("ros2_bag", bag, "--out", tmp_path / "npz", "--rate", RATE_HZ, "--camera", "frames=/camera", *chosen)
+    assert np.abs(states_in(tmp_path / "npz") - STATES[2:-1]).max() < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("gripper", "changes"),
+    [
+        ("/fingers:position[left.finger]", {}),
+        ("/fingers:position[7]", {}),
+        ("/fingers:position[left.finger]", {"is_alternating": True}),
+        ("/fingers:position[left.finger, right.finger]", {}),
+        ("/fingers:position", {"arm": np.ones_like(ARM) / 1000}),
+    ],
+    ids=["name", "number", "messages of arm and fingers", "two fingers", "an arm at rest"],
+)
+def test_the_joints_of_the_gripper_are_selected(gripper: str, changes: dict[str, Any], tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "bag", StoragePlugin.SQLITE3, **({"joints": JOINTS, "arm": ARM} | changes))
+    is_sum, offset = "right" in gripper or "[" not in gripper, 0.007 if "[" not in gripper else 0.0
+    ends = ("--gripper-open", 0.04 * (1 + is_sum) + offset, "--gripper-closed", offset)
+    out = tmp_path / "npz"
+    run(
+        "ros2_bag", bag, "--out", out, "--rate", RATE_HZ, "--camera", "frames=/camera",
+        "--pose", "/pose", "--gripper", gripper, *ends,
+    )  # fmt: skip
+    assert np.abs(states_in(out)[:, 6] - STATES[:-1, 6]).max() < 1e-6
 
 
 # Lance tables. In processes of their own: Lance warns of every fork in the process that has imported it.
