@@ -211,3 +211,11 @@ def test_open_and_closed_follow_from_range_and_name(
     knobs = gripper_knobs(name, ranges)
     assert tuple(plain(knobs).values()) == expected
     assert bool(guesses(knobs)) == is_guess
+
+
+def test_single_wrong_values_do_not_change_the_proposal() -> None:
+    numbers = [one.copy() for one in EPISODES]
+    numbers[0][3] = np.nan
+    numbers[1][5, :6] = 4000.0
+    pose = proposed("x y z roll pitch yaw gripper", numbers)
+    assert (pose.rotation, pose.position_unit, pose.is_rotation_guess) == ("euler_xyz", "m", False)

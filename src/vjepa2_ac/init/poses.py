@@ -345,11 +345,17 @@ def _judged(
 
 
 def _values(numbers: Sequence[_Number], samples: Samples) -> list[Numbers]:
-    """Return the sampled values of some numbers for each episode; empty if a column was not read."""
+    """Return the finite sampled values of some numbers for each episode; empty if a column was not read."""
     if any(number.column not in samples for number in numbers):
         return []
     series = [[episode[:, number.index] for episode in samples[number.column]] for number in numbers]
-    return [np.stack(episode, axis=1) for episode in zip(*series, strict=True)]
+    episodes = [np.stack(episode, axis=1) for episode in zip(*series, strict=True)]
+    return [finite for one in episodes if len(finite := one[np.isfinite(one).all(axis=1)])]
+
+
+def _usual_size(values: Sequence[Numbers]) -> float:
+    """Return the size that 95 % of the steps do not exceed, so that single wrong values do not count."""
+    return float(np.quantile(np.concatenate([abs(one).max(axis=1) for one in values]), 0.95)) if values else 0.0
 
 
 def _format(chosen: _Candidate, samples: Samples, control_rate_hz: float) -> tuple[RotationFormat, str, bool]:
@@ -368,9 +374,10 @@ def _format(chosen: _Candidate, samples: Samples, control_rate_hz: float) -> tup
         why = f"or {other}: the names fit both"
     if not values:
         return proposed, f"{why}; the numbers were not read" if is_guess else why, is_guess
-    largest = max(float(abs(one).max()) for one in values)
+    largest = _usual_size(values)
     if proposed != "euler_xyz_degrees" and largest > ANGLE_RAD:
         return "euler_xyz_degrees", f"the numbers reach {largest:.0f}, which is too much for radians", is_guess
+    values = [one[abs(one).max(axis=1) <= max(largest, ANGLE_RAD)] for one in values]
     smoother = smoother_format(rotation_speeds(values, control_rate_hz), proposed, _MAX_RAD_S)
     if smoother is not None and smoother != proposed:
         name = f"{smoother} moves much more smoothly than {proposed}"
@@ -383,8 +390,7 @@ def _position_unit(chosen: _Candidate, samples: Samples) -> tuple[Literal["m", "
     named: dict[str, Literal["m", "cm", "mm"]] = {"m": "m", "cm": "cm", "mm": "mm"}
     if (unit := chosen.position[0].unit) in named:
         return named[unit], ""
-    values = _values(chosen.position, samples)
-    largest = max((float(np.nanmax(abs(one), initial=0.0)) for one in values), default=0.0)
+    largest = _usual_size(_values(chosen.position, samples))
     if largest <= REACH_M:
         return "m", ""
     return ("mm" if largest > 100 * REACH_M / 2 else "cm"), f"the numbers reach {largest:.0f}, too much for metres"
@@ -424,4 +430,4 @@ def gripper_knobs(name: str, ranges: tuple[float, float] | None) -> Knobs:
 def range_in(samples: Samples, column: str, number: int) -> tuple[float, float] | None:
     """Return the least and the greatest sampled value of a number; None: the column was not read."""
     values = [one[:, number] for one in samples.get(column, ())]
-    return (float(min(map(np.min, values))), float(max(map(np.max, values)))) if values else None
+    return (float(min(map(np.nanmin, values))), float(max(map(np.nanmax, values)))) if values else None
