@@ -81,7 +81,7 @@ def test_a_rank_decides_and_the_error_between_equal_ones() -> None:
         ({"data__frames": 5}, {"data.frames", "its clips"}),
         ({"data__stride": 3}, {"data.stride", "its clips"}),
         ({"data__crop": "square"}, {"data.crop"}),
-        ({"data__fields": {"gripper_open": 0.5}}, {"data.fields.gripper_open"}),
+        ({"data__fields": {"gripper_open": -1.0}}, {"data.fields.gripper_open"}),
         ({"validation__clips": 2}, {"its clips"}),
         ({"validation__ranking_samples": 5}, {"validation.ranking_samples"}),
         ({"checkpoint__keep_best": "off"}, {"checkpoint.keep_best"}),
