@@ -228,8 +228,8 @@ def _earlier_starts(path: str | Path) -> list[dict[str, Any]]:
 def with_settled_values(config: Config) -> Config:
     """Return the config with the values that the run in its folder has settled.
 
-    The stride, if the config says auto; and `data.splits`, if the config does not set it, so that an older run keeps its
-    drawn splits.
+    These are the stride, if the config says auto, and `data.splits`, if the config does not set it: an older run keeps
+    its drawn splits.
     """
     folder = Path(config.run_dir)
     if not (folder / CONFIG).is_file():
