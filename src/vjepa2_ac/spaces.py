@@ -227,9 +227,9 @@ class StateSpace(Space):
         return checks
 
     def _likely_units(self, states: Float[np.ndarray, "steps dim"]) -> list[tuple[str, str]]:
-        """Return the part of a pose and its unit where most steps are beyond metres and radians, as of a whole set.
+        """Return the parts of a pose that look like another unit than metres and radians, each with that unit.
 
-        A single wrong step is an outlier and no other unit.
+        Most steps must be too large: a few wrong steps are outliers, and say nothing about the unit.
         """
         found = []
         if self.position is not None:

@@ -9,7 +9,8 @@ import pytest
 
 from lerobot_sets import STATE, Recorded, recorded, write_v30
 from synthetic import synthetic_states
-from vjepa2_ac.config import LeRobotData, RldsData
+from vjepa2_ac.config import LeRobotData, LeRobotFields, RldsData
+from vjepa2_ac.data.poses import poses_from
 from vjepa2_ac.data.sources.lerobot.source import LeRobotSource
 from vjepa2_ac.data.sources.rlds.source import RldsSource
 from vjepa2_ac.errors import InputError
@@ -53,3 +54,11 @@ def test_rlds_names_the_keys_and_reads_with_them(
     assert problem.fix.startswith("The positions look like millimetres: set data.fields.position_unit: mm. The angles")
     source = RldsSource(RldsData(path=str(folder), fields=IN_OTHER_UNITS))
     np.testing.assert_allclose(source.read(0).states, synthetic_states(13, seed=0)[:-1], atol=1e-5)
+
+
+def test_a_unit_that_the_config_names_is_not_doubted() -> None:
+    numbers = synthetic_states(12, seed=0) * ([1e6] * 3 + [180 / np.pi] * 3 + [1])
+    fields = LeRobotFields(position_unit="mm", rotation="rotation_vector")
+    with pytest.raises(InputError, match="within 5 m") as raised:
+        poses_from(numbers, fields, "here", section="data.lerobot")
+    assert raised.value.fix.startswith("Check data.lerobot: ")

@@ -177,9 +177,9 @@ class DataConfig(Section):
     test_share: Annotated[Share, Affects.RUN] = 0.05
     """Share of the episodes held out for `evaluate`, likewise; never seen in training nor in validation."""
     splits: Annotated[Literal["dataset", "hash"], Affects.RUN] = "dataset"
-    """What is done where the data set has several splits itself (RLDS, LeRobot). dataset: train, val (or valid,
+    """How the data set's own splits are used, if it has several (RLDS, LeRobot). dataset: train, val (or valid,
     validation) and test are used as such; a missing one is drawn from train by its share, and other names count as
-    train. hash: all episodes are pooled, and the splits are drawn from them."""
+    train. hash: all episodes are pooled, and the splits are drawn from them by the shares."""
     split_by: Annotated[Annotated[str, Field(max_length=500), AfterValidator(_split_by)] | None, Affects.RUN] = None
     """What keeps related episodes in one split, so that training reveals nothing about held-out ones: a field (lab, day
     or folder, as the identity says; task, scene, building, operator or day where the data set does), or a regular

@@ -176,11 +176,14 @@ def _as_json(values: Mapping[str, Any], where: str) -> str:
         raise InputError(where=where, found=f"a value that a config cannot hold ({error})") from None
 
 
-_KEYS_OF_A_RUN = {"check_crc", "connections", "prefetch", "short_episodes"}  # seldom written by hand
+_KEYS_OF_A_RUN = {"check_crc", "connections", "prefetch", "short_episodes"}
 
 
 def _keep_drawn_splits(values: Mapping[str, Any]) -> None:
-    """Let an older run keep its splits: its config has every key of the time, and no `data.splits`."""
+    """Set `data.splits` to hash in the config of a run that is older than this key, when all splits were drawn.
+
+    The config of a run is recognised by keys that are seldom written by hand: it has every key of its version.
+    """
     replay = values.get("replay")
     for data in (values.get("data"), replay.get("data") if isinstance(replay, dict) else None):
         if isinstance(data, dict) and data.keys() >= _KEYS_OF_A_RUN:

@@ -22,16 +22,17 @@ Members = Bool[np.ndarray, " episodes"]
 
 
 def roles_of(names: Iterable[str]) -> dict[str, Split]:
-    """Return which split each split of a data set is used as, by its name.
+    """Return as which of our splits each split of a data set is used, by its name.
 
-    A name that is not known counts as train. Empty: there is not both a split to train on and one that is held out.
+    An unknown name counts as train. The result is empty unless the data set has both a split to train on and a split
+    that is held out.
     """
     roles = {name: _ROLES.get(name.lower(), "train") for name in names}
     return roles if "train" in roles.values() and len(set(roles.values())) > 1 else {}
 
 
 def with_own_splits(table: EpisodeTable, names: Sequence[str | None]) -> EpisodeTable:
-    """Return a table with the name of each episode's split in the data set, if the data set has several splits."""
+    """Return the table with the name of each episode's split as a label, if the data set has several splits."""
     labels = Labels.of(names)
     return table if len(labels.names) < 2 else replace(table, labels={**table.labels, SPLIT: labels})
 
@@ -47,7 +48,7 @@ def held_out_by(table: EpisodeTable, config: DataConfig) -> dict[Split, Members]
 
 
 def describe_splits(table: EpisodeTable, config: DataConfig) -> str:
-    """Return how the data set's own splits are used; empty: it has only one."""
+    """Return how the data set's own splits are used, as text; empty if the data set has only one split."""
     labels = table.labels.get(SPLIT)
     if labels is None:
         return ""

@@ -226,9 +226,10 @@ def _earlier_starts(path: str | Path) -> list[dict[str, Any]]:
 
 
 def with_settled_values(config: Config) -> Config:
-    """Return a config with what the run in its folder has chosen: the stride, where the config says auto.
+    """Return the config with the values that the run in its folder has settled.
 
-    Also `data.splits`, where the config does not say it: a run keeps its splits although the default has changed.
+    These are the stride, if the config says auto, and `data.splits`, if the config does not set it: an older run keeps
+    its drawn splits.
     """
     folder = Path(config.run_dir)
     if not (folder / CONFIG).is_file():

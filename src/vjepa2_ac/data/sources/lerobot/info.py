@@ -78,7 +78,7 @@ class DatasetInfo:
         return storage.join(self.root, INFO)
 
     def split_of(self, episode: int) -> str | None:
-        """Return the name of the split of an episode, given by its number; None: not said."""
+        """Return the name of the split of an episode, given by its number; None: no split has it."""
         return next((name for name, episodes in self.splits.items() if episode in episodes), None)
 
     def require_mapping(self, config: LeRobotData) -> None:
@@ -178,7 +178,7 @@ def _parsed(root: str, content: Mapping[str, Any]) -> DatasetInfo:
 
 
 def _splits(content: object) -> dict[str, range]:
-    """Return the episodes of each split, written as {"train": "0:50"}; what is written otherwise is left out."""
+    """Return the episodes of each split, from {"train": "0:50"}; other notations are ignored."""
     texts = content if isinstance(content, Mapping) else {}
     found = {str(name): re.fullmatch(r"(\d{1,9}):(\d{1,9})", str(text)) for name, text in texts.items()}
     return {name: range(int(part[1]), int(part[2])) for name, part in found.items() if part}
