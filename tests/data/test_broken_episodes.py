@@ -15,7 +15,7 @@ from vjepa2_ac.config.sources import NpzData
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.index import EpisodeProblem
 from vjepa2_ac.data.loader import batches_of
-from vjepa2_ac.data.selection import most_broken
+from vjepa2_ac.data.selection import max_broken
 from vjepa2_ac.errors import InputError
 
 Use = Callable[..., Dataset]  # opens a data set with some config values, and reads it
@@ -26,7 +26,7 @@ Use = Callable[..., Dataset]  # opens a data set with some config values, and re
     [(0, 0), (1, 0), (2, 1), (3, 1), (4, 2), (5, 2), (6, 3), (20, 3), (100, 3), (399, 3), (400, 4), (95_658, 956)],
 )
 def test_three_episodes_or_one_percent_may_be_broken_but_never_most_of_a_small_set(episodes: int, allowed: int) -> None:
-    assert most_broken(episodes) == allowed
+    assert max_broken(episodes) == allowed
 
 
 # ---- every fix that an error names works ----
@@ -113,12 +113,12 @@ def test_every_fix_that_an_error_of_broken_episodes_names_works(
         use()
     fixes = fixes_of(caught.value)
     known = 1 if make is broken_in_a_clip else broken  # when the error is raised
-    is_few = known <= most_broken(episodes) and make is not of_one_identity
+    is_few = known <= max_broken(episodes) and make is not of_one_identity
     is_rest = known < (episodes - 1 if make is of_one_identity else episodes)
     assert list(fixes) == ["skip"] * is_few + ["exclude"] * is_rest
     if "exclude" in fixes and broken < episodes:
         follow_exclusions(use)
-    if broken <= most_broken(episodes) and "skip" in fixes:
+    if broken <= max_broken(episodes) and "skip" in fixes:
         assert len(use(**fixes["skip"]).broken) == broken
     elif make is not of_one_identity and broken < episodes:
         with pytest.raises(InputError, match=rf"of {episodes} episodes are broken.* at most") as caught:

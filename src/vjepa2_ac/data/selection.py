@@ -20,8 +20,8 @@ from vjepa2_ac.storage.npz_reader import arrays_as_bytes, read_arrays
 logger = logging.getLogger(__name__)
 
 NAMED = 10  # episodes in one message, at most
-_FEW = 3  # broken episodes that are allowed in a set of any size
-_SHARE = 0.01  # of the episodes
+_ALLOWED_BROKEN = 3  # episodes, in all but the smallest data sets
+_ALLOWED_SHARE = 0.01  # of the episodes, in large data sets
 
 # For DROID, whose identities contain .../LAB/success|failure/DATE/..., and for any data in folders.
 IN_IDENTITY = {
@@ -142,13 +142,13 @@ def require_distinct(table: EpisodeTable, taking_part: Bool[np.ndarray, " episod
         places[name] = place
 
 
-def most_broken(episodes: int) -> int:
+def max_broken(episodes: int) -> int:
     """Return how many broken episodes of a data set `data.broken_episodes: skip` leaves out before it stops.
 
     3 or 1 %, whichever is larger, but of fewer than 6 episodes at most half: where most episodes cannot be read, a
     setting is wrong rather than the recordings.
     """
-    return max(min(_FEW, episodes // 2), int(_SHARE * episodes))
+    return max(min(_ALLOWED_BROKEN, episodes // 2), int(_ALLOWED_SHARE * episodes))
 
 
 class BrokenEpisodes:
@@ -214,7 +214,9 @@ class BrokenEpisodes:
         self._add({name: why for name, why in reasons.items() if name not in self._config.exclude})
 
     def refusal(self, error: InputError, names: Sequence[str]) -> InputError:
-        """Return an error of broken episodes with those ways to leave them out that would work.
+        """Return an error of broken episodes, with the fixes that would leave them out: skip, exclusion, or none.
+
+        Skip is a fix if the episodes are few enough; exclusion is one if other episodes remain.
 
         Args:
             error: The error of one of them, or of all.
@@ -224,16 +226,16 @@ class BrokenEpisodes:
         hashes = np.array([identity_hash(name) for name in names], np.uint64)
         if self._usable is not None and np.isin(self._usable, hashes).all():  # nothing would be left
             return error
-        is_few = len(names) <= most_broken(self._episodes)
+        is_few = len(names) <= max_broken(self._episodes)
         return with_exclusion(error, names, is_skippable=is_few and self._config.broken_episodes == "error")
 
     def _add(self, reasons: Mapping[str, str]) -> None:
         self._reasons |= {name: why for name, why in reasons.items() if name not in self._reasons}
-        if len(self) <= (most := most_broken(self._episodes)):
+        if len(self) <= (allowed := max_broken(self._episodes)):
             return
         name, reason = next(iter(self._reasons.items()))
         found = f"{len(self)} of {self._episodes} episodes are broken. The first, {name}: {reason.rstrip('.')}"
-        needed, fix = f"{most} at most: data.broken_episodes is skip", "Repair or fetch them again"
+        needed, fix = f"at most {allowed} with data.broken_episodes: skip", "Repair or fetch them again"
         error = InputError(where=f"data.path: {self._config.path}", found=found, needed=needed, fix=fix)
         raise self.refusal(error, tuple(self._reasons))
 

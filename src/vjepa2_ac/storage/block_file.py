@@ -135,7 +135,7 @@ class DiskCache:
         self._is_used, self._warned = False, False
 
     def read(self, key: str) -> bytes | None:
-        """Return the entry of a key, or None; it counts as used now. A damaged one, as a power cut leaves, is none."""
+        """Return the entry of a key, or None if there is none or it is damaged; the entry counts as used now."""
         if not self._is_used:
             with suppress(OSError):  # usually: no such folder yet
                 self._reserve(0)

@@ -137,7 +137,7 @@ def test_clips_are_shortened_to_eight_frames_by_default() -> None:
 
 
 def test_clips_that_cannot_be_read_are_left_out_and_all_of_them_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vjepa2_ac.data.selection.most_broken", lambda episodes: episodes)
+    monkeypatch.setattr("vjepa2_ac.data.selection.max_broken", lambda episodes: episodes)
     monkeypatch.setattr(Dataset, "control_rate_hz", 15.0)
     source = tracks([80] * 20)
     dataset = dataset_of(source, broken_episodes="skip")

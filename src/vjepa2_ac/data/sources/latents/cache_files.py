@@ -166,10 +166,10 @@ class LatentFiles:
         found = self._found(_name(number, camera))
         return 0 if found is None else found.size
 
-    def lacking(self, numbers: Sequence[int], cameras: Sequence[str]) -> list[int]:
-        """Return those episodes of which a camera has neither a file nor a note why it cannot have one.
+    def episodes_without_file(self, numbers: Sequence[int], cameras: Sequence[str]) -> list[int]:
+        """Return the episodes that lack the file of a camera, and the note why it could not be written.
 
-        That is known from one listing, and no file is opened: a damaged file is named when it is first read.
+        The folder is listed once and no file is opened: a damaged file is named when it is first read.
 
         Raises:
             UnreachableError: The folder cannot be listed now.

@@ -82,9 +82,9 @@ class LatentSource(IndexedSource[DataConfig, _Cache]):
             UnreachableError: The folder cannot be listed now.
         """
         table, opened = self._open()
-        wanted = np.unique(episodes).tolist()
-        if lacking := opened.files.lacking(wanted, self.cameras):
-            such = f"{len(lacking)} of {len(wanted)} episodes, such as {table.identity(lacking[0])}"
+        numbers = np.unique(episodes).tolist()
+        if missing := opened.files.episodes_without_file(numbers, self.cameras):
+            such = f"{len(missing)} of {len(numbers)} episodes, such as {table.identity(missing[0])}"
             fix = "Run `vjepa2-ac encode` again, as the cache was made: it encodes what is missing; or leave these"
             fix += " episodes out (data.outcome, data.exclude)"
             raise InputError(where=self._config.path, found=f"no latents of {such}", fix=fix)
