@@ -32,6 +32,7 @@ ORDERS: dict[str, list[str]] = {
     ],
     "data": [
         "poses streams",
+        "rotation_formats",
         "index",
         "selection files transforms",
         "idle windows",

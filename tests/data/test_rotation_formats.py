@@ -102,7 +102,7 @@ def test_numbers_without_jumps_do_not_tell_the_format() -> None:
 
 def test_speeds_are_those_of_the_rotation_in_each_format() -> None:
     angles = np.linspace(3.0, 3.5, 11)[:, None] * [1.0, 0, 0]
-    wrapped = np.where(angles > np.pi, angles - 2 * np.pi, angles) + [0.0, 0.3, 0.0]
+    wrapped = np.where(angles > np.pi, angles - 2 * np.pi, angles) + np.array([0.0, 0.3, 0.0])
     speeds = rotation_speeds([wrapped], 10.0)
     assert speeds["euler_xyz"].median_rad_s == pytest.approx(0.5)
     assert speeds["euler_xyz_degrees"].median_rad_s == pytest.approx(0.5 * np.pi / 180)

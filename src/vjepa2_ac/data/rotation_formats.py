@@ -44,6 +44,10 @@ class RotationSpeeds:
         """The number of jumps at which the hand turns about as fast as around them, as in the right format."""
         return int((self.at_jumps <= _SMOOTH).sum())
 
+    def num_smoother_than(self, other: RotationSpeeds) -> int:
+        """Return the number of jumps at which the hand turns smoothly in this format and abruptly in the other."""
+        return int(((self.at_jumps <= _SMOOTH) & (other.at_jumps >= _ABRUPT)).sum())
+
 
 def rotation_speeds(
     episodes: Iterable[Float[np.ndarray, "steps 3"]], control_rate_hz: float
@@ -96,11 +100,11 @@ def smoother_format(
     own = speeds.get(written_as)
     if own is None or own.median_rad_s > max_rad_s:
         return "euler_xyz_degrees" if written_as != "euler_xyz_degrees" else None
-    gains = {other: _num_only_smooth(one, own) for other, one in speeds.items()}
+    gains = {other: one.num_smoother_than(own) for other, one in speeds.items()}
     clear = [
         other
         for other, gain in gains.items()
-        if gain >= MIN_JUMPS and gain > _CLEAR_MAJORITY * _num_only_smooth(own, speeds[other])
+        if gain >= MIN_JUMPS and gain > _CLEAR_MAJORITY * own.num_smoother_than(speeds[other])
     ]
     return max(clear, key=lambda other: gains[other], default=None)
 
@@ -124,14 +128,9 @@ def _step_angles(numbers: Float[np.ndarray, "steps 3"], written_as: RotationForm
 def _relative_to_neighbours(
     angles: Float[np.ndarray, " changes"], is_jump: Bool[np.ndarray, " changes"]
 ) -> Float[np.ndarray, " jumps"]:
-    """Return the angle at each jump, over the mean angle of the steps around it without jumps (NaN if there are none)."""
+    """Return the angle at each jump, relative to the mean of the steps around it without jumps; NaN: there are none."""
     calm = np.stack([np.where(is_jump, 0.0, angles), ~is_jump])
     sums = np.cumsum(np.pad(calm, ((0, 0), (_STEPS_AROUND + 1, _STEPS_AROUND))), axis=1)
     total, count = (sums[:, 2 * _STEPS_AROUND + 1 :] - sums[:, : -2 * _STEPS_AROUND - 1])[:, is_jump]
     mean = np.where(count > 0, total / np.maximum(count, 1), np.nan)
     return np.asarray(angles[is_jump] / np.maximum(mean, _MIN_ANGLE_RAD))
-
-
-def _num_only_smooth(one: RotationSpeeds, other: RotationSpeeds) -> int:
-    """Return the number of jumps at which the hand turns smoothly in one format and abruptly in the other."""
-    return int(((one.at_jumps <= _SMOOTH) & (other.at_jumps >= _ABRUPT)).sum())
