@@ -46,6 +46,7 @@ OTHERS = {
         "exterior_1_left": "observation.images.exterior_1_left", "wrist": "observation.images.exterior_1_left"
     },
     "data.lerobot.select": (6, 5, 4, 3, 2, 1, 0),
+    "data.fields.select": (6, 5, 4, 3, 2, 1, 0),
     "data.lerobot.fps": 7.0,
 }  # fmt: skip
 ONLY_REMOTE = {"data.outcome"}  # where reading the episodes costs something

@@ -141,7 +141,7 @@ def test_every_knob_is_read_somewhere() -> None:
     read = {(owner.removeprefix("_"), name) for owner, name in re.findall(r"(\w+)(?=\.(\w+))", source)}
     for key in set(all_keys()) - {"plugins"}:  # these are read before the config is checked
         *sections, name = key.split(".")
-        owners = ["config", "sizes", "knobs", "self", *sections[-1:]]
+        owners = ["config", "sizes", "knobs", "self", "fields", *sections[-1:]]
         assert any((owner, name) in read for owner in owners), f"nobody reads {key}"
 
 

@@ -15,7 +15,6 @@ from vjepa2_ac.simulation.world.domains import named_domain
 from vjepa2_ac.simulation.world.motion import MotionRecipe, random_reaching
 from vjepa2_ac.spaces import POSE, matrices_from_euler, rotation_differences, states_in_camera_frame, vector_states
 
-
 DIVERSE = "motions are diverse enough to plan with"
 
 

@@ -66,13 +66,15 @@ def check_motion(dataset: Dataset) -> Iterator[Finding]:
         yield _check_ends(dataset)
 
 
-def speed_finding(stretches: Sequence[Stretch], control_rate_hz: float, limits: MotionLimits, checked: str) -> Finding:
+def speed_finding(
+    stretches: Sequence[Stretch], control_rate_hz: float, motion_limits: MotionLimits, checked: str
+) -> Finding:
     """Return whether poses change faster between consecutive control steps than an arm can move.
 
     Args:
         stretches: Steps of some episodes.
         control_rate_hz: Control steps per second.
-        limits: The highest plausible speeds.
+        motion_limits: The highest plausible speeds.
         checked: The number of episodes, for the text.
     """
     if not stretches:
@@ -80,7 +82,7 @@ def speed_finding(stretches: Sequence[Stretch], control_rate_hz: float, limits: 
     changes = np.concatenate([POSE.differences(one.states) for one in stretches])
     speeds = control_rate_hz * np.linalg.norm(changes[:, POSE.position], axis=1)
     turns = control_rate_hz * Rotation.from_euler("xyz", changes[:, POSE.rotation]).magnitude()
-    excess = np.maximum(speeds / limits.speed_m_s, turns / limits.rotation_rad_s)
+    excess = np.maximum(speeds / motion_limits.speed_m_s, turns / motion_limits.rotation_rad_s)
     if excess.max() <= 1:
         text = f"at most {speeds.max():.2f} m/s and {turns.max():.2f} rad/s between control steps ({checked})"
         return Finding("ok", "speed", text)
@@ -88,7 +90,7 @@ def speed_finding(stretches: Sequence[Stretch], control_rate_hz: float, limits: 
     fast, worst = np.flatnonzero(excess > 1).tolist(), int(excess.argmax())
     name, step = steps[worst]
     episodes = counted(len({steps[one][0] for one in fast}), "episode")
-    limit = f"{limits.speed_m_s:g} m/s or {limits.rotation_rad_s:g} rad/s, which no arm reaches"
+    limit = f"{motion_limits.speed_m_s:g} m/s or {motion_limits.rotation_rad_s:g} rad/s, which no arm reaches"
     text = f"{len(fast):,} of {len(steps):,} control steps, in {episodes}, are faster than {limit} ({checked})"
     example = f"{name}, step {step} to {step + 1}: {speeds[worst]:.1f} m/s, {turns[worst]:.1f} rad/s"
     fix = "Look for padding, lost measurements and joined recordings; data.motion_limits sets the limits"
