@@ -25,7 +25,7 @@ from vjepa2_ac.config.loading import load_config, parse_config
 from vjepa2_ac.data.coverage import sample_of
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.inspection.check import check_data
-from vjepa2_ac.data.inspection.excerpts import Finding
+from vjepa2_ac.data.inspection.findings import Finding
 from vjepa2_ac.data.inspection.statistics import at_some_stride
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.calibration.data import VariantProbe, probe_config
@@ -127,8 +127,9 @@ def _asked(
 
 
 def _alarms(outcome: Outcome) -> set[tuple[str, str]]:
-    """Return the alarms; narrow data are none: nothing is wrong with them."""
-    return {(one.about, one.level) for one in outcome.findings if one.level != "ok" and one.about != "coverage"}
+    """Return the errors and warnings, except those about coverage: data of low diversity have no fault."""
+    alarms = [one for one in outcome.findings if one.level in {"error", "warning"}]
+    return {(one.about, one.level) for one in alarms if one.about not in {"directions", "coverage"}}
 
 
 def _print(fault: Fault, outcome: Outcome, usual: set[tuple[str, str]]) -> None:

@@ -103,7 +103,7 @@ def test_a_table_says_what_was_refused_warned_and_missed(
         "as it is": ("quiet", "quiet"), "y negated": ("missed", "named"), "frames reversed": ("refused", "misled"),
         "stale poses, every 5th": ("warned", "missed"), "BGR": ("missed", "missed"),
     }  # fmt: skip
-    assert "error agreement: frames and states run against each other" in printed
+    assert "error agreement: frames and states have opposite orders in time" in printed
     assert "0.500 with y negated" in printed
 
 

@@ -32,16 +32,49 @@ def config(droid: Path, tmp_path: Path) -> str:
 
 
 Printed = pytest.CaptureFixture[str]
+LEVELS = ("ok", "warning", "error", "skipped")
 
 
 def test_check_prints_a_line_for_everything_and_ends_with_0(config: str, capsys: Printed) -> None:
     assert main(["data", "check", config, "--limit", "4"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    about = [line.split()[1] for line in lines if line.startswith(("ok", "warning", "error"))]
-    assert about[:2] == ["source", "index"]
+    *lines, summary = capsys.readouterr().out.splitlines()
+    findings = [line.split()[:2] for line in lines if line.startswith(LEVELS)]
+    assert [about for _, about in findings[:2]] == ["source", "index"]
     assert {"train", "validation", "batch", "pixels", "position", "rotation", "gripper", "actions", "timing"} <= {
-        *about
+        about for _, about in findings
     }
+    counts = {level: sum(one == level for one, _ in findings) for level in LEVELS}
+    assert (
+        summary == f"0 errors, {counts['warning']} warning{'s' * (counts['warning'] != 1)}, {counts['skipped']} skipped"
+    )
+
+
+@pytest.mark.parametrize("words", [[], ["--model", "builtin:sim-tiny"]], ids=["data", "with a model"])
+def test_check_with_json_prints_one_object_with_the_same_findings(
+    config: str, capsys: Printed, words: list[str]
+) -> None:
+    assert main(["data", "check", config, "--limit", "4", *words]) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith(LEVELS)]
+    assert main(["data", "check", config, "--limit", "4", "--json", *words]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    shown = [f"{one['level']:<7}  {one['name']:<16}{one['text']}" for one in printed["findings"]]
+    assert len(shown) == len(lines)
+    assert {*lines} ^ {*shown} <= {line for line in [*lines, *shown] if " s" in line}, "only times differ"
+    levels = [one["level"] for one in printed["findings"]]
+    assert [printed[name] for name in ("errors", "warnings", "skipped")] == [
+        levels.count(level) for level in ("error", "warning", "skipped")
+    ]
+    assert ("variants" in printed) == bool(words)
+    if words:
+        assert printed["variants"][0]["name"] == "as they are"
+        assert {"value", "low", "high"} == printed["variants"][1]["difference"].keys()
+
+
+def test_check_with_json_keeps_stdout_empty_where_the_data_cannot_be_read(config: str, capsys: Printed) -> None:
+    assert main(["data", "check", config, "--json", "data.camera=elsewhere"]) == 2
+    assert capsys.readouterr().out == ""
+    assert main(["data", "check", config, "--json", "--limit", "2", "data.validation_share=0"]) == 1
+    assert json.loads(capsys.readouterr().out)["errors"] == 1
 
 
 COMMANDS = ["data check", "data index", "data inspect", "data calibrate", "train", "encode", "decoder", "doctor"]

@@ -9,11 +9,13 @@ from scipy.spatial.transform import Rotation
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.coverage import PLAY, Coverage, ReadEpisode, coverage_by, coverage_in, coverage_of
 from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.data.inspection.check import check_data
+from vjepa2_ac.data.inspection.check import check_data, coverage_findings
 from vjepa2_ac.data.inspection.statistics import inspect_dataset
 from vjepa2_ac.simulation.world.domains import named_domain
 from vjepa2_ac.simulation.world.motion import MotionRecipe, random_reaching
 from vjepa2_ac.spaces import POSE, matrices_from_euler, rotation_differences, states_in_camera_frame, vector_states
+
+DIVERSE = "motions are diverse enough to plan with"
 
 
 def moving(*scales: float, lift: tuple[float, ...] = (0, 0, 0), steps: int = 400, seed: int = 0) -> np.ndarray:
@@ -43,16 +45,16 @@ FIT = {
 NARROW = {
     "one way": (moving(0.2, 0.2, 0.2, lift=(3, 0, 0)), "nearly all go one way, (x +1.0, y +0.0, z +0.0)"),
     "one axis": (moving(0, 3, 0), "nearly all go back and forth along"),
-    "one plane": (moving(3, 3, 0), "nearly all lie in one plane, across"),
-    "thick plane": (moving(3, 3, 0.6), "nearly all lie in one plane, across"),
+    "one plane": (moving(3, 3, 0), "nearly all are in one plane, normal to"),
+    "thick plane": (moving(3, 3, 0.6), "nearly all are in one plane, normal to"),
     "one half": (upwards(), "few go towards (x +0.0, y +0.0, z -1.0)"),
-    "tiny": (moving(0.3, 0.3, 0.3), "90% of the steps are shorter than"),
+    "tiny": (moving(0.3, 0.3, 0.3), "90 % of the steps are at most"),
 }
 
 
 @pytest.mark.parametrize("changes", FIT.values(), ids=FIT)
 def test_varied_motion_is_fit_to_plan_with(changes: np.ndarray) -> None:
-    assert (poses(changes).narrow, poses(changes).verdict) == ("", "fit to plan with")
+    assert (poses(changes).narrow, poses(changes).verdict) == ("", DIVERSE)
 
 
 @pytest.mark.parametrize(("changes", "reason"), NARROW.values(), ids=NARROW)
@@ -61,7 +63,7 @@ def test_motion_of_few_directions_or_tiny_is_narrow_with_the_reason_and_what_to_
 ) -> None:
     found = poses(changes)
     assert reason in found.narrow
-    assert found.verdict == f"narrow: {found.narrow}. {PLAY}"
+    assert found.verdict == f"motions are not diverse enough to plan with: {found.narrow}. {PLAY}"
 
 
 @pytest.mark.parametrize("changes", [*FIT.values(), *(one for one, _ in NARROW.values())], ids=[*FIT, *NARROW])
@@ -94,7 +96,10 @@ def test_the_unit_of_coverage_is_an_equal_share() -> None:
 def test_too_few_steps_decide_nothing() -> None:
     for found in (poses(moving(3, 0, 0, steps=99)), poses(moving(3, 0, 0, steps=399), 4)):
         assert found.narrow == ""
-        assert found.verdict.startswith("not known of fewer than 100 model steps")
+        assert found.verdict == f"needs at least 100 consecutive moving steps, found {found.moving_steps}"
+        assert {one.about: one.level for one in coverage_findings(found)} == {
+            "directions": "skipped", "axes": "ok", "coverage": "skipped"
+        }  # fmt: skip
     still = poses(np.zeros((5, 7)))
     assert (still.metrics["directions"], still.metrics["mean_direction"], still.narrow) == (0, 0, "")
 
@@ -107,9 +112,9 @@ def test_random_reaching_of_the_simulator_is_fit_and_one_way_reaching_is_narrow(
         states = [np.concatenate([one.poses, one.gripper[:, None]], axis=1) for one in motions]
         return coverage_by([ReadEpisode(0, one, ((0, 61),)) for one in states], POSE, 4)
 
-    assert recorded(MotionRecipe()).verdict == "fit to plan with"
+    assert recorded(MotionRecipe()).verdict == DIVERSE
     one_way = recorded(MotionRecipe(drift_m=(0.01, 0.0, 0.0)))
-    assert "steps go to 7% of all directions; nearly all go one way" in one_way.narrow
+    assert "they cover 7 % of all directions; nearly all go one way" in one_way.narrow
 
 
 def test_changes_are_those_over_a_stride_within_kept_ranges_in_the_frame_of_the_model() -> None:
@@ -136,14 +141,14 @@ def test_vectors_are_narrow_where_most_numbers_hardly_move_or_go_one_way() -> No
         return coverage_of(changes, vector_states(6), stride)
 
     free = np.random.default_rng(0).normal(size=(300, 6)) * 0.1
-    assert vectors(free).verdict == "fit to plan with"
+    assert vectors(free).verdict == DIVERSE
     held = free * [1, 1, 0, 0, 0.001, 0.001]
     found = vectors(held)
     assert (found.metrics["both_ways"], found.metrics["still"]) == ([0, 1], [2, 3, 4, 5])
-    assert found.narrow == "4 of 6 numbers hardly move, 0 only one way"
-    assert vectors(np.abs(free)).narrow == "0 of 6 numbers hardly move, 6 only one way"
+    assert found.narrow == "4 of 6 numbers hardly move, 0 move only one way"
+    assert vectors(np.abs(free)).narrow == "0 of 6 numbers hardly move, 6 move only one way"
     assert vectors(held, 4).narrow == "", "75 steps"
-    assert found.lines["numbers"] == "2 of 6 go up and down, 4 hardly move"
+    assert found.lines["numbers"] == "2 of 6 numbers go up and down, 4 hardly move"
 
 
 def written(folder: Path, *, one_way: bool) -> DataConfig:
@@ -162,10 +167,10 @@ def written(folder: Path, *, one_way: bool) -> DataConfig:
 def test_data_check_and_inspect_say_whether_data_are_fit_to_plan_with(tmp_path: Path, *, one_way: bool) -> None:
     config = written(tmp_path, one_way=one_way)
     found = {one.about: one for one in check_data(config, clips=4)}
-    assert found["coverage"].level == ("warning" if one_way else "ok")
+    assert found["coverage"].level == found["directions"].level == ("warning" if one_way else "ok")
     assert ("nearly all go one way, (x +1.0, y +0.0, z +0.0)" in found["coverage"].text) == one_way
     written_down = inspect_dataset(open_dataset(config)).values["coverage"]
-    assert written_down["narrow"].startswith("steps go to 7%" if one_way else "")
+    assert written_down["narrow"].startswith("they cover 7 %" if one_way else "")
     assert bool(written_down["narrow"]) == one_way
     assert coverage_in(open_dataset(config)).metrics == written_down, "of the same episodes"
 

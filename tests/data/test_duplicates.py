@@ -88,7 +88,7 @@ def test_a_far_set_of_which_nothing_tells_the_states_is_said_to_be_not_known(gcs
     gcs.upload(write_lerobot(tmp_path / "set", RECORDINGS), "bucket/set")
     found = find_duplicates(open_dataset(config_of("lerobot", "gs://bucket/set", tmp_path)))
     assert found == Duplicates(is_known=False)
-    assert "not known" in str(found)
+    assert str(found) == "need the states of the episodes; the index of this data set has none"
 
 
 def test_those_across_splits_are_counted_and_two_of_them_are_named() -> None:

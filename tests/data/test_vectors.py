@@ -17,7 +17,7 @@ from vector_sets import vectors, write_vectors
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.data.inspection.check import findings_in
+from vjepa2_ac.data.inspection.check import batch_findings
 from vjepa2_ac.data.inspection.statistics import CHANGED, inspect_dataset
 from vjepa2_ac.data.sources.indexed_source import open_source
 from vjepa2_ac.episode import Batch, Widths
@@ -203,13 +203,13 @@ def batch(states: np.ndarray, actions: np.ndarray | None = None) -> Batch:
     ("states", "about", "level", "words"),
     [
         (vectors(9, 5, seed=0) * [1, 0, 1, 1, 0], "states", "warning", "1, 4 (from 0) never change"),
-        (vectors(9, 5, seed=0) * [1, 1, 4096, 1, 1], "states", "warning", "large are 2 (from 0)"),
-        (vectors(9, 5, seed=0) * 0, "states", "error", "none of them ever changes"),
+        (vectors(9, 5, seed=0) * [1, 1, 4096, 1, 1], "states", "warning", "numbers 2 (from 0) are large"),
+        (vectors(9, 5, seed=0) * 0, "states", "error", "none of the numbers ever changes"),
         (vectors(9, 5, seed=0) * 0, "actions", "error", "nothing to learn from"),
     ],
 )
 def test_the_check_tells_numbers_that_teach_nothing(states: np.ndarray, about: str, level: str, words: str) -> None:
-    found = {one.about: one for one in findings_in([batch(states)], FIVE)}
+    found = {one.about: one for one in batch_findings([batch(states)], FIVE)}
     assert found[about].level == level
     assert words in found[about].text
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import time
 from pathlib import Path
@@ -13,6 +14,8 @@ from vjepa2_ac.errors import InputError
 
 if TYPE_CHECKING:
     from vjepa2_ac.config import Config
+    from vjepa2_ac.episode import Progress
+    from vjepa2_ac.evaluation.calibration.data import VariantProbe
 
 _CLIPS, _PAIRS = 64, 200  # to calibrate by: strides, axes (as the paper)
 
@@ -29,9 +32,10 @@ def _add_commands(commands: cli.Commands) -> None:
 
     parser = cli.command(commands, "check", _check, "my_robot.yaml")
     cli.add_config(parser, such_as=such_as)
-    cli.add(parser, "--limit N", "clips to load (32); to probe, twice as many", cli.count, default=32)
-    text = "ask a model that knows robots, too: are frames shifted, mirrored, reversed, BGR, or the gripper inverted?"
+    cli.add(parser, "--limit N", "number of clips to load (32); --model uses twice as many", cli.count, default=32)
+    text = "also measure with a model whether frames are shifted, mirrored, reversed or BGR, or the gripper is inverted"
     cli.add(parser, "--model RUN_OR_MODEL", text, cli.as_model)
+    cli.add(parser, "--json", "print one JSON object: the findings and their counts", action="store_true")
 
     parser = cli.command(commands, "index", _index, "my_robot.yaml")
     cli.add_config(parser, such_as=such_as)
@@ -92,48 +96,65 @@ def _converter(options: argparse.Namespace) -> None:
 
 
 def _check(options: argparse.Namespace) -> int:
-    """Read some clips as training would, and check every number.
+    """Check a data set: read some clips as training would, and judge every number.
 
-    Exit status 0: all is well or only warnings, 1: training would learn nothing or not begin, 2: something cannot
-    be used.
+    Each line begins with ok, warning, error or skipped (the check did not run; the line says what it needs).
+
+    Exit status 0: no errors. 1: training would not start, or learn nothing. 2: an input cannot be used.
     """
     config = cli.read_config(options.config, options.overrides)
     if options.model is not None:
         cli.require_subject(options.model)
-    status = check_and_print(config, clips=options.limit)
-    if options.model is not None:
-        _probe(config, options.model, clips=2 * options.limit)
-    return status
+    return check_and_print(config, clips=options.limit, model=options.model, as_json=options.json)
 
 
-def check_and_print(config: Config, *, clips: int = 32) -> int:
-    """Look at the data of a config and print what is found; return 1 where training would learn nothing."""
-    from vjepa2_ac.cli.console.tables import print_finding
+def check_and_print(config: Config, *, clips: int = 32, model: str | None = None, as_json: bool = False) -> int:
+    """Check the data of a config and print the findings; return 1 if one of them is an error.
+
+    Args:
+        config: The data, and the order and size of batches.
+        clips: The approximate number of clips to read; a model is measured on twice as many.
+        model: A run or a model that measures the data, too.
+        as_json: Print one JSON object and nothing else, when all checks are done.
+    """
+    from vjepa2_ac.cli.console.tables import print_finding, variants_table
     from vjepa2_ac.data.inspection.check import check_data
-    from vjepa2_ac.reporter import INDEXING
+    from vjepa2_ac.data.inspection.findings import Finding, findings_as_dict, summary_of
+    from vjepa2_ac.reporter import INDEXING, SILENT
+    from vjepa2_ac.storage.structured import json_text
 
-    status, batch_size = 0, config.training.batch_size
-    with cli.reporter() as reporter:
+    findings: list[Finding] = []
+
+    def add(finding: Finding) -> None:
+        findings.append(finding)
+        if not as_json:
+            print_finding(finding)
+
+    batch_size, probe = config.training.batch_size, None
+    with contextlib.nullcontext(SILENT) if as_json else cli.reporter() as reporter:
         progress = reporter.task(INDEXING)
         for one in check_data(config.data, seed=config.seed, batch_size=batch_size, clips=clips, progress=progress):
-            print_finding(one)
-            status = 1 if one.level == "error" else status
-    return status
+            add(one)
+        if model is not None:
+            probe = _probe(config, model, clips=2 * clips, progress=reporter.task("probing"))
+    if probe is not None:
+        if not as_json:
+            title = "One-step error / persistence of the data in variants"
+            cli.show(variants_table(title, [probe.plain, *probe.results], ["difference"]))
+        add(Finding("warning" if probe.better else "ok" if probe.is_decided else "skipped", "probe", probe.verdict()))
+    if as_json:
+        print(json_text(findings_as_dict(findings) | (probe.as_dict() if probe else {})), end="")
+    else:
+        cli.show(summary_of(findings))
+    return int(any(one.level == "error" for one in findings))
 
 
-def _probe(config: Config, model: str, *, clips: int) -> None:
-    from vjepa2_ac.cli.console.tables import print_finding, variants_table
+def _probe(config: Config, model: str, *, clips: int, progress: Progress) -> VariantProbe:
     from vjepa2_ac.data.dataset import open_dataset
-    from vjepa2_ac.data.inspection.excerpts import Finding
     from vjepa2_ac.data.inspection.statistics import at_some_stride
     from vjepa2_ac.evaluation.calibration.data import probe_config
 
-    dataset = at_some_stride(open_dataset(config.data))
-    with cli.reporter() as reporter:
-        probe = probe_config(config, dataset, model=model, clips=clips, progress=reporter.task("probing"))
-    title = "One-step error / persistence of the data, read otherwise"
-    cli.show(variants_table(title, [probe.plain, *probe.results], ["difference"]))
-    print_finding(Finding("warning" if probe.better else "ok", "probe", probe.verdict()))
+    return probe_config(config, at_some_stride(open_dataset(config.data)), model=model, clips=clips, progress=progress)
 
 
 def _index(options: argparse.Namespace) -> None:

@@ -1,19 +1,19 @@
-"""What a data set teaches: coverage of actions (does its motion teach enough of them to plan with?), and duplicates.
+"""Measure action coverage (has the motion enough directions and sizes to plan with?), and find duplicates.
 
-A planner searches all directions up to its limits, and takes the action with the lowest energy: where the data have no
-such actions, the model guesses, and the search finds the guesses that flatter. So the data are narrow if they move in
-few directions, or hardly at all; it does not matter which way the axes point.
+A planner searches all directions up to its limits and takes the action with the lowest energy. Where the data have no
+such actions, the model extrapolates, and the optimiser exploits its errors. Data have low diversity ("narrow" in the
+code) if they move in few directions, or hardly at all; the orientation of the axes does not matter.
 
-Sources of the advice: GPC (arXiv 2502.00622: a world model needs random exploration beside demonstrations), DreamZero
-(a new robot from 30 minutes of play), lassesofus/thesis @ 4a2f29f (V-JEPA 2-AC fine-tuned on one-direction reaches
-plans worse than its base).
+Sources of the advice: GPC (arXiv 2502.00622: a world model needs random exploration in addition to demonstrations),
+DreamZero (a new robot from 30 minutes of play), lassesofus/thesis @ 4a2f29f (V-JEPA 2-AC fine-tuned on one-direction
+reaches plans worse than its base).
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -30,23 +30,23 @@ from vjepa2_ac.spaces import POSE, StateSpace, states_in_camera_frame
 
 T = TypeVar("T")
 
-PERCENTILE = 99  # of each number's change: what was taught
+PERCENTILE = 99  # of each number's change
 PLAY = (
-    "Record half an hour of random motion, in all directions, as far in a step as you will plan: it helps a planner"
+    "Record half an hour of random motion in all directions, with steps as long as the planner's: this helps planning"
     " more than further demonstrations"
 )
 
 _SPLITS: tuple[Split, ...] = ("train", "validation", "test")
-WAY_OUT = "Leave copies out with data.exclude, or keep in one split what belongs together with data.split_by"
+DUPLICATES_FIX = "List copies in data.exclude, or keep related episodes in one split with data.split_by"
 
-ENOUGH_NEAR = 0.5  # a direction is taught if so many steps go near it, over all directions being equally frequent
+ENOUGH_NEAR = 0.5  # a direction is covered by this share of the steps that go near it if all are equally frequent
 _SHORT_CM = 0.5  # a shorter step has no direction, and along an axis no sign (as evaluation.action_score.metrics)
 _NEAR_DEG = 30.0
 # Measured: random reaching of the simulated arm 0.99 or more, of 100 random steps 0.90; half of all directions 0.61,
 # a plane 0.50 (0.58 if a fifth as thick as wide), an axis 0.14 (0.43), one way 0.07; starts of BridgeData 0.41.
-_ENOUGH = 0.7
+ENOUGH_DIRECTIONS = 0.7
 _SMALL_CM = 1.0  # an image hardly shows a shorter step
-_FEWEST = 100  # steps that do not overlap
+_FEWEST_STEPS = 100  # that do not overlap
 _ROWS, _COLUMNS, _MOST = 24, 48, 5000
 _ONE_WAY, _ONE_AXIS, _ONE_PLANE, _LEANING = 0.8, 0.8, 0.1, 0.3
 _GRIPPER = 0.1  # of its way: a change of the gripper
@@ -118,24 +118,27 @@ def read_sample(dataset: Dataset, count: int, progress: Progress = no_progress) 
 class Coverage:
     """Coverage of actions by the changes of the state, from each control step to the one `stride` later."""
 
-    narrow: str  # why the data are not fit to plan with; empty: they are, or there are too few steps to tell
-    is_known: bool  # whether there are enough steps to tell
+    narrow: str  # why the data are not diverse enough to plan with; empty: they are, or there are too few steps to tell
+    moving_steps: int  # consecutive model steps that move
     usual: Float[np.ndarray, " dim"]  # the 99th percentile of the size of each number's change
-    lines: Mapping[str, str]  # what was found, by its name
+    lines: Mapping[str, str]  # the results as text, by name
     metrics: Mapping[str, Any]  # the same as plain values
     density: Float[np.ndarray, "rows columns"] | None = None  # of the directions of poses; see `density_of`
 
     @property
+    def is_known(self) -> bool:
+        """Whether there are enough steps to tell."""
+        return self.moving_steps >= _FEWEST_STEPS
+
+    @property
     def verdict(self) -> str:
-        """Whether the data are fit to plan with, and if not, why, and what to record."""
+        """Whether the motion is diverse enough to plan with, and if not, why, and what to record."""
         if self.narrow:
-            return f"narrow: {self.narrow}. {PLAY}"
-        if not self.is_known:
-            return f"not known of fewer than {_FEWEST} model steps, one after the other, that move"
-        return "fit to plan with"
+            return f"motions are not diverse enough to plan with: {self.narrow}. {PLAY}"
+        return "motions are diverse enough to plan with" if self.is_known else _needed(self.moving_steps)
 
     def noted(self) -> dict[str, Any]:
-        """Return what a run notes of its data, as plain values."""
+        """Return what a run stores about its data, as plain values."""
         return {"percentile": PERCENTILE, "changes": self.usual.tolist(), "narrow": self.narrow}
 
 
@@ -157,38 +160,45 @@ def coverage_by(sample: Iterable[ReadEpisode], space: StateSpace, stride: int) -
 def coverage_of(changes: Float[np.ndarray, "pairs dim"], space: StateSpace, stride: int) -> Coverage:
     """Return the coverage of actions by one or more changes of states, of which neighbouring ones overlap."""
     usual = np.asarray(np.percentile(np.abs(changes), PERCENTILE, axis=0))
-    is_enough = len(changes) >= _FEWEST * stride
-    found = _of_poses(changes, usual, stride) if space.is_pose else _of_vectors(changes, usual, is_known=is_enough)
-    metrics = {"stride": stride, "steps": len(changes), **found.metrics, "percentile_99": usual.tolist()}
-    narrow = found.narrow if is_enough else ""
-    return Coverage(narrow, found.is_known, usual, found.lines, metrics | {"narrow": narrow}, found.density)
+    coverage = _of_poses(changes, usual, stride) if space.is_pose else _of_vectors(changes, usual, stride)
+    metrics = {"stride": stride, "steps": len(changes), **coverage.metrics, "percentile_99": usual.tolist()}
+    narrow = coverage.narrow if len(changes) >= _FEWEST_STEPS * stride else ""
+    return replace(coverage, narrow=narrow, metrics=metrics | {"narrow": narrow})
+
+
+def _needed(moving_steps: int) -> str:
+    return f"needs at least {_FEWEST_STEPS} consecutive moving steps, found {moving_steps}"
 
 
 def _of_poses(changes: Float[np.ndarray, "pairs 7"], usual: Float[np.ndarray, " 7"], stride: int) -> Coverage:
     ways_cm, lengths_cm = 100 * changes[:, POSE.position], POSE.shown_size(changes)
     directions = (ways_cm / np.maximum(lengths_cm, 1e-12)[:, None])[lengths_cm >= _SHORT_CM]
-    is_known = len(directions) >= _FEWEST * stride
+    moving_steps = len(directions) // stride
+    is_known = moving_steps >= _FEWEST_STEPS
     density = density_of(directions)
     covered = float((density >= ENOUGH_NEAR).mean())
     mean = directions.mean(axis=0) if len(directions) else np.zeros(3)
     one_way = float(np.linalg.norm(mean))  # 0 if the directions balance, 1 if they are one
     shares, axes = np.linalg.eigh(directions.T @ directions / max(1, len(directions)))  # the least share first
     usual_cm = [float(one) for one in np.percentile(lengths_cm, [10, 50, 90, 99])]
+    share = f"{100 * covered:.0f} % of all directions"
     narrow = ""
     if usual_cm[2] < _SMALL_CM:
-        narrow = f"90% of the steps are shorter than {usual_cm[2]:.1f} cm, which images hardly show: widen data.stride"
-    elif is_known and covered < _ENOUGH:
-        narrow = f"steps go to {covered:.0%} of all directions; {_where(mean, one_way, shares, axes.T)}"
+        narrow = f"90 % of the steps are at most {usual_cm[2]:.1f} cm long, which images hardly show: raise data.stride"
+    elif is_known and covered < ENOUGH_DIRECTIONS:
+        narrow = f"they cover {share}; {_where(mean, one_way, shares, axes.T)}"
     back, forth = ((sign * ways_cm >= _SHORT_CM).mean(axis=0) for sign in (-1, 1))
     gripper = float((np.abs(changes[:, POSE.gripper]) >= _GRIPPER).mean())
     along = (
-        f"{name} {100 * far:.1f} cm ({one:.0%} back, {other:.0%} forth)"
-        for name, far, one, other in zip(POSE.change_names[:3], usual[:3], back, forth, strict=True)
+        f"{name} {100 * far:.1f} cm ({100 * one:.0f} % of them towards -{name}, {100 * other:.0f} % towards +{name})"
+        for name, far, one, other in zip("xyz", usual[:3], back, forth, strict=True)
     )
     lines = {
-        "directions": f"{covered:.0%} are taught (at least half of an equal share of the steps goes within"
-        f" {_NEAR_DEG:g} degrees); mean direction {one_way:.2f} (0 balanced, 1 one way)",
-        "axes": f"{PERCENTILE} % of the steps within {', '.join(along)}; the gripper changes in {gripper:.0%}",
+        "directions": f"{'motions' if is_known else f'{_needed(moving_steps)}; these'} cover {share}"
+        f" (below {100 * ENOUGH_DIRECTIONS:.0f} % planning is unreliable);"
+        f" the mean direction has length {one_way:.2f} (0 balanced, 1 one way)",
+        "axes": f"{PERCENTILE} % of the steps move at most {', '.join(along)};"
+        f" the gripper moves in {100 * gripper:.0f} % of the steps",
     }
     metrics = {
         "directions": covered,
@@ -199,11 +209,11 @@ def _of_poses(changes: Float[np.ndarray, "pairs 7"], usual: Float[np.ndarray, " 
         "forth_share_xyz": forth.tolist(),
         "gripper_share": gripper,
     }
-    return Coverage(narrow, is_known, usual, lines, metrics, density)
+    return Coverage(narrow, moving_steps, usual, lines, metrics, density)
 
 
 def density_of(directions: Float[np.ndarray, "steps 3"]) -> Float[np.ndarray, "rows columns"]:
-    """Return how many steps go within 30 degrees of a direction, over how many would if all were equally frequent.
+    """Return the number of steps within 30 degrees of each direction, relative to equally frequent directions.
 
     The cells have equal areas: rows are equally spaced in z (-1 to 1), columns in azimuth (-180 to 180 degrees).
     """
@@ -227,7 +237,7 @@ def _where(
     if shares[2] >= _ONE_AXIS:
         return f"nearly all go back and forth along {_shown(axes[2])}"
     if shares[0] <= _ONE_PLANE:
-        return f"nearly all lie in one plane, across {_shown(axes[0])}"
+        return f"nearly all are in one plane, normal to {_shown(axes[0])}"
     return f"few go towards {_shown(-mean / one_way)}" if one_way >= _LEANING else f"few go along {_shown(axes[0])}"
 
 
@@ -236,24 +246,24 @@ def _shown(direction: Float[np.ndarray, " 3"]) -> str:
     return f"({', '.join(f'{name} {one:+.1f}' for name, one in zip('xyz', numbers, strict=True))})"
 
 
-def _of_vectors(
-    changes: Float[np.ndarray, "pairs dim"], usual: Float[np.ndarray, " dim"], *, is_known: bool
-) -> Coverage:
-    """Return the coverage of each number by itself: how they move together is not known."""
+def _of_vectors(changes: Float[np.ndarray, "pairs dim"], usual: Float[np.ndarray, " dim"], stride: int) -> Coverage:
+    """Return the coverage of each number by itself: how numbers depend on each other is not known."""
     back, forth = ((sign * changes > _STEP * usual).mean(axis=0) for sign in (-1, 1))
     both = np.flatnonzero((np.minimum(back, forth) >= _OFTEN) & (usual >= _HARDLY)).tolist()
     still = np.flatnonzero(usual < _HARDLY).tolist()
     width = len(usual)
     is_narrow = len(both) <= _HALF * width
     lines = {
-        "numbers": f"{len(both)} of {width} go up and down, {len(still)} hardly move",
-        "changes": f"{PERCENTILE} % of the steps within {', '.join(f'{one:.2g}' for one in usual)}",
+        "numbers": f"{len(both)} of {width} numbers go up and down, {len(still)} hardly move",
+        "changes": f"{PERCENTILE} % of the steps change the numbers by at most"
+        f" {', '.join(f'{one:.2g}' for one in usual)}",
     }
-    narrow = f"{len(still)} of {width} numbers hardly move, {width - len(both) - len(still)} only one way"
-    return Coverage(narrow if is_narrow else "", is_known, usual, lines, {"both_ways": both, "still": still})
+    narrow = f"{len(still)} of {width} numbers hardly move, {width - len(both) - len(still)} move only one way"
+    metrics = {"both_ways": both, "still": still}
+    return Coverage(narrow if is_narrow else "", len(changes) // stride, usual, lines, metrics)
 
 
-# ---- duplicates: an episode under several names, which could be in both the training and the validation split ----
+# ---- duplicates: an episode under several names could be in both the training and the validation split ----
 
 
 @dataclass(frozen=True)
@@ -269,14 +279,14 @@ class Duplicates:
 
     def __str__(self) -> str:
         if not self.is_known:
-            return "not known: this data was indexed without its states"
+            return "need the states of the episodes; the index of this data set has none"
         if not self.episodes:
             return "no two episodes have the same states"
         (one, its_split), (other, others_split) = self.example
         return (
-            f"{self.episodes:,} episodes have the states of another one: they are {self.different:,} different ones."
+            f"{self.episodes:,} episodes have the states of another episode ({self.different:,} different recordings)."
             f" {self.across:,} of them have a copy in another split, such as"
-            f" {one} ({its_split}) and {other} ({others_split}). {WAY_OUT}"
+            f" {one} ({its_split}) and {other} ({others_split}). {DUPLICATES_FIX}"
         )
 
     def as_dict(self) -> dict[str, Any]:

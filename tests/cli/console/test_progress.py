@@ -17,7 +17,7 @@ from vjepa2_ac.cli.console import progress as console_module
 from vjepa2_ac.cli.console import tables, training
 from vjepa2_ac.cli.console.progress import ConsoleReporter, ProgressBar
 from vjepa2_ac.cli.console.training import TrainingConsole
-from vjepa2_ac.data.inspection.excerpts import Finding
+from vjepa2_ac.data.inspection.findings import Finding
 from vjepa2_ac.evaluation.measure import VALIDATED
 from vjepa2_ac.evaluation.result import PredictionErrors, Validation
 

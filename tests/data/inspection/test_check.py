@@ -9,8 +9,8 @@ import torch
 from vector_sets import write_vectors
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.data.inspection.check import check_data, findings_in
-from vjepa2_ac.data.inspection.excerpts import Finding
+from vjepa2_ac.data.inspection.check import batch_findings, check_data
+from vjepa2_ac.data.inspection.findings import Finding
 from vjepa2_ac.data.inspection.statistics import at_some_stride
 from vjepa2_ac.episode import Batch
 
@@ -34,7 +34,7 @@ def found_in(**changes: torch.Tensor) -> dict[str, Finding]:
     values = good() | changes
     ids = tuple(f"episode {number}" for number in range(len(values["states"])))
     batch = Batch(**values, extrinsics=None, episode_ids=ids, starts=(0,) * len(ids))
-    return {finding.about: finding for finding in findings_in([batch])}
+    return {finding.about: finding for finding in batch_findings([batch])}
 
 
 def with_column(column: int, value: float) -> torch.Tensor:
@@ -50,19 +50,19 @@ def test_good_numbers_are_all_well() -> None:
 @pytest.mark.parametrize(
     ("about", "level", "words", "changes"),
     [
-        ("pixels", "error", "all are 0", {"frames": torch.zeros_like(good()["frames"])}),
+        ("pixels", "error", "all pixels are 0", {"frames": torch.zeros_like(good()["frames"])}),
         ("pixels", "warning", "nearly black", {"frames": good()["frames"] // 100}),
-        ("pictures", "error", "although the robot moved", {"frames": good()["frames"][:, :1].repeat(1, 5, 1, 1, 1)}),
+        ("frames", "error", "although the robot moved", {"frames": good()["frames"][:, :1].repeat(1, 5, 1, 1, 1)}),
         ("position", "error", "never changes", {"states": torch.zeros_like(good()["states"])}),
-        ("position", "warning", "metres", {"states": good()["states"] * 8}),
+        ("position", "warning", "in metres, from the base", {"states": good()["states"] * 8}),
         ("position", "warning", "within 1 cm", {"states": good()["states"] * 0.01}),
         ("rotation", "warning", "never changes", {"actions": good()["actions"] * ONLY_MOVES}),
-        ("rotation", "warning", "wild", {"actions": good()["actions"] + TURNS_BY_2_5}),
+        ("rotation", "warning", "the rotation jumps", {"actions": good()["actions"] + TURNS_BY_2_5}),
         ("gripper", "warning", "never moves in 4 clips", {"states": with_column(6, 1.0)}),
         ("gripper", "warning", "width in metres", {"states": good()["states"] * IN_METRES}),
-        ("actions", "error", "all are zero", {"actions": torch.zeros_like(good()["actions"])}),
+        ("actions", "error", "all actions are zero", {"actions": torch.zeros_like(good()["actions"])}),
         ("actions", "warning", "nearly still", {"actions": good()["actions"] * 1e-3}),
-        ("actions", "warning", "very far", {"actions": good()["actions"] * 10}),
+        ("actions", "warning", "the steps are long", {"actions": good()["actions"] * 10}),
     ],
 )  # fmt: skip
 def test_wrong_numbers_are_named(about: str, level: str, words: str, changes: dict[str, torch.Tensor]) -> None:
@@ -80,7 +80,7 @@ def test_a_whole_set_is_looked_at_as_training_would(droid: Path) -> None:
     about = {finding.about: finding for finding in findings}
     assert "6 episodes, 87 steps" in about["index"].text
     assert "frames (2, 3, 48, 65, 3) uint8" in about["batch"].text
-    assert about["timing"].text.startswith("first batch of 2 after ")
+    assert about["timing"].text.startswith("the first batch of 2 clips took ")
     assert "network" not in about
     assert not [finding for finding in findings if finding.level == "error"]
 
@@ -104,8 +104,8 @@ def test_a_test_split_that_cannot_answer_is_told_the_share_that_can(tmp_path: Pa
     for episodes in (30, 6):
         folder = write_vectors(tmp_path / str(episodes), width=3, episodes=episodes)
         config = knobs(folder, source="npz", states="vector", validation_share=0.1, test_share=0.05)
-        texts[episodes] = [one.text for one in check_data(config, clips=2) if "cannot tell whether" in one.text]
-    assert "no share of 6 leaves enough to train on" in texts[6][0]
+        texts[episodes] = [one.text for one in check_data(config, clips=2) if "cannot show whether" in one.text]
+    assert "No data.test_share of 6 episodes leaves enough for training" in texts[6][0]
     share = float(re.search(r"data.test_share=([\d.]+)", texts[30][0])[1])
     config = knobs(tmp_path / "30", source="npz", states="vector", test_share=share)
     assert open_dataset(config).members("test").sum() >= 5

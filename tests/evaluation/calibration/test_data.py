@@ -138,7 +138,7 @@ def test_each_fault_is_named_and_mending_it_makes_the_model_fit(name: str) -> No
     assert probe.better is not None
     assert probe.better.name == name
     assert probe.better.ratio.value < 0.02 < 0.1 < probe.plain.ratio.value
-    assert probe.verdict().endswith(f"less with {name}: {probe.better.repair}")
+    assert probe.verdict().endswith(f" with {name}: {probe.better.repair}")
 
 
 @pytest.mark.parametrize("name", ["red and blue exchanged", "frames mirrored"])
@@ -155,7 +155,8 @@ def test_of_good_data_no_variant_fits_better_and_only_changed_frames_are_encoded
     assert probe.better is None
     assert probe.plain.ratio.value < 0.02
     assert min(one.difference.value for one in probe.results) > 0.1
-    assert probe.verdict().endswith("on 16 clips of 8 episodes; no variant certainly fits better")
+    assert probe.verdict().endswith("on 16 clips of 8 episodes; no variant fits better with certainty")
+    assert probe.is_decided
     assert knowing.encoded == 2 * 3  # two batches; again with red and blue exchanged, and mirrored
     assert {one.name for one in probe.results} >= {*FAULTS, "red and blue exchanged"}
 
@@ -164,7 +165,8 @@ def test_of_few_episodes_nothing_is_claimed() -> None:
     probe = probed(dataset_of(FAULTS["the states backwards"], episodes=4))
     assert min(one.difference.value for one in probe.results) < -0.1
     assert probe.better is None
-    assert "too few episodes to compare, 5 are needed" in probe.verdict()
+    assert probe.verdict().startswith("needs at least 5 episodes, found 4 (")
+    assert not probe.is_decided
 
 
 def test_what_is_worse_than_persistence_is_no_better_reading() -> None:
@@ -182,7 +184,8 @@ def test_what_is_worse_than_persistence_is_no_better_reading() -> None:
 def test_a_model_that_predicts_nothing_gives_no_result() -> None:
     probe = probed(dataset_of(FAULTS["y negated"]), Copier())
     assert probe.better is None
-    assert "the result is unknown" in probe.verdict()
+    assert probe.verdict().startswith("needs a model that predicts these data better than persistence (")
+    assert not probe.is_decided
 
 
 @pytest.mark.parametrize(("steps", "widest"), [(STEPS, 8), (22, 4), (14, 2), (11, 1), (9, 0)])

@@ -18,7 +18,7 @@ from vjepa2_ac.spaces import POSE
 
 if TYPE_CHECKING:
     from vjepa2_ac.data.index import EpisodeTable, Usage
-    from vjepa2_ac.data.inspection.excerpts import Finding
+    from vjepa2_ac.data.inspection.findings import Finding
     from vjepa2_ac.data.inspection.statistics import StepSizes
     from vjepa2_ac.decoding.decoder_folder import DecoderCard
     from vjepa2_ac.evaluation.calibration.variants import VariantResult
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from vjepa2_ac.planning.demonstrations.make_goals import MadeGoals
     from vjepa2_ac.simulation.closed_loop.benchmark import ClosedLoopBenchmark
 
-_COLOURS = {"ok": "green", "warning": "yellow", "error": "red"}
+_COLOURS = {"ok": "green", "warning": "yellow", "error": "red", "skipped": "cyan"}
 _USUAL = {"planned", "nothing", "random", "scripted"}  # reasons of actions that are not mentioned
 _DECODERS = {"decoder": "decoder", "linear": "linear decoder", "mean_image": "mean image"}
 

@@ -1,4 +1,4 @@
-"""Excerpts of episodes, in grey: whether frames and states belong together, and signs of wrong ones, without a model.
+"""Check excerpts of episodes without a model: do frames and states belong together, and are both plausible?
 
 The limits follow from measurements (docs/log.md: simulated arms, BridgeData and DROID excerpts, unchanged and spoiled):
 each limit is well away from all clean sets, so slight errors pass.
@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
@@ -25,9 +24,10 @@ from scipy.stats import rankdata
 from vjepa2_ac import storage
 from vjepa2_ac.data.coverage import read_each, sample_of
 from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.inspection.findings import Finding, Level
 from vjepa2_ac.spaces import POSE, StateSpace
 
-EPISODES, _EPISODES_FAR = 24, 12  # far away, of some 5 MB each, for DROID
+EPISODES, _EPISODES_AT_URL = 24, 12  # an episode of DROID is about 5 MB
 STEPS = 64
 _ROWS, _COLUMNS = 24, 32  # of a small frame: an arm is still some pixels wide, and a camera's noise is averaged out
 _STILL_FRAME = 0.1  # of an episode's median change: the codec noise of a repeated frame
@@ -44,17 +44,6 @@ _FEWEST_EPISODES = 8  # with fewer, chance level is not known well enough
 _SURE = 3.0  # standard errors, or deviations of chance
 _GAIN = 0.25  # of the value above chance, that another shift must add
 _ABOVE = 0.15  # minimum above chance for matching frames: 0.3 and more was measured
-
-Level = Literal["ok", "warning", "error"]
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One line of `data check`."""
-
-    level: Level
-    about: str
-    text: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,24 +93,31 @@ def small_grey(frames: UInt8[np.ndarray, "steps height width 3"]) -> Float32[np.
     return np.asarray(grey)
 
 
-def excerpt_findings(dataset: Dataset) -> Iterator[Finding]:
-    """Read some episodes and yield what is unusual in them.
+def num_excerpts(dataset: Dataset) -> int:
+    """Return the number of episodes whose frames are read: fewer behind a URL."""
+    return _EPISODES_AT_URL if storage.is_url(dataset.config.path) else EPISODES
+
+
+def check_excerpts(dataset: Dataset) -> Iterator[Finding]:
+    """Read excerpts of some episodes and yield what is unusual in them.
 
     Raises:
         InputError: An episode cannot be read, and `data.broken_episodes` does not skip it.
     """
     if dataset.config.is_cache:
-        yield Finding("ok", "agreement", "not looked at in a latent cache: check the data set that it was made from")
+        yield Finding("skipped", "agreement", "needs frames; check the data set that this latent cache was made from")
         return
-    episodes = _EPISODES_FAR if storage.is_url(dataset.config.path) else EPISODES
-    space, stride = dataset.spaces.state, dataset.config.model_stride
-    yield from signs_in(list(excerpts_of(dataset, episodes=episodes)), space, stride, dataset.control_rate_hz)
+    excerpts = list(excerpts_of(dataset, episodes=num_excerpts(dataset)))
+    yield from excerpt_findings(excerpts, dataset.spaces.state, dataset.config.model_stride, dataset.control_rate_hz)
 
 
-def signs_in(excerpts: Sequence[Excerpt], space: StateSpace, stride: int, control_rate_hz: float) -> Iterator[Finding]:
+def excerpt_findings(
+    excerpts: Sequence[Excerpt], space: StateSpace, stride: int, control_rate_hz: float
+) -> Iterator[Finding]:
     """Yield what is unusual in excerpts, and whether frames and states belong together; reads nothing."""
     excerpts = [one for one in excerpts if len(one.states) > 1]
     if not excerpts:
+        yield _agreement([], stride, control_rate_hz, is_sound=True)
         return
     moved = _motion_in(excerpts, space)
     wrong = [*_noise_as_frames(excerpts), *_repetitions(excerpts, moved)]
@@ -150,29 +146,32 @@ def _noise_as_frames(excerpts: Sequence[Excerpt]) -> Iterator[Finding]:
         half = len(grey) // 2
         far += float(np.abs(grey[half:] - grey[: len(grey) - half]).mean()) * (len(grey) - 1)
     if far > 0 and near >= _FAR_LIKE_NEAR * far:
-        text = f"neighbouring frames differ as much as far ones ({near / far:.0%}): noise, or frames in no order"
-        yield Finding("error", "pictures", text)
+        text = f"consecutive frames differ by {100 * near / far:.0f} % of the difference of distant frames"
+        yield Finding("error", "frames", f"{text}: they are noise, or out of order")
 
 
 def _repetitions(excerpts: Sequence[Excerpt], moved: Sequence[Float[np.ndarray, " _"]]) -> Iterator[Finding]:
     """Report repetitions: of poses while frames change, of frames while poses change, or of single steps of both."""
     each_held = [(np.diff(one.states, axis=0) == 0).all(axis=1) for one in excerpts]
-    each_still = [_is_still(one.frame_change) for one in excerpts]
+    each_still = [is_still(one.frame_change) for one in excerpts]
     singly = np.concatenate([_alone(one & other) for one, other in zip(each_held, each_still, strict=True)])
     held, still = np.concatenate(each_held), np.concatenate(each_still)
     fast = np.concatenate([one > np.median(one) for one in moved])
     if (stale := _share(held, ~still)) > _STALE:
-        text = f"{stale:.0%} repeat the one before while the frame changes: measured more seldom, or stale"
-        yield Finding("error" if stale > _MOSTLY_STALE else "warning", "stale poses", text)
+        text = f"{100 * stale:.0f} % of the poses repeat the previous pose while the frame changes"
+        level: Level = "error" if stale > _MOSTLY_STALE else "warning"
+        yield Finding(level, "stale poses", f"{text}: they are measured at a lower rate than the frames, or are stale")
     if (shown_again := _share(still, fast & ~held)) > _COPIED:
-        text = f"{shown_again:.0%} of the frames repeat the one before while the robot moves"
-        yield Finding("warning", "repeated", f"{text}: filmed at a lower rate. Check the control rate")
+        text = f"{100 * shown_again:.0f} % of the frames repeat the previous frame while the robot moves"
+        yield Finding("warning", "repeated", f"{text}: the camera has a lower rate. Check the control rate")
     if (copied := float(singly.mean())) > _COPIED:
-        text = f"{copied:.0%} of the steps repeat the one before, singly: recorded at a lower rate than stated"
-        yield Finding("warning", "repeated", f"{text}. Check the control rate, or double data.stride")
+        text = f"{100 * copied:.0f} % of the steps are single repetitions of the previous step"
+        fix = "Check the control rate, or double data.stride"
+        yield Finding("warning", "repeated", f"{text}: the data are recorded at a lower rate than stated. {fix}")
 
 
-def _is_still(change: Float[np.ndarray, " changes"]) -> Bool[np.ndarray, " changes"]:
+def is_still(change: Float[np.ndarray, " changes"]) -> Bool[np.ndarray, " changes"]:
+    """Return which changes of frames are no more than the codec noise of a repeated frame."""
     changing = change[change > 0]
     return np.asarray(change <= (_STILL_FRAME * np.median(changing) if len(changing) else 0.0))
 
@@ -195,12 +194,12 @@ def _deltas_for_poses(excerpts: Sequence[Excerpt]) -> Iterator[Finding]:
         return
     steps = np.concatenate([np.diff(one, axis=0) for one in positions])
     jumps = float(np.sqrt((steps**2).mean()) / np.sqrt((np.concatenate(positions) ** 2).mean()))
-    text = f"half of the positions lie within {median_m * 100:.1f} cm of the robot's base"
+    text = f"half of the positions are within {median_m * 100:.1f} cm of the robot's base"
     if jumps > _DELTA_JUMPS:
-        text += f", and change by {jumps:.0%} of that from step to step: differences, not poses"
-        yield Finding("error", "position", f"{text}. Sum them up, or choose the field with the measured pose")
+        text += f" and change by {100 * jumps:.0f} % of their size at each step: they are differences, not poses"
+        yield Finding("error", "position", f"{text}. Sum them, or choose the field with the measured pose")
     else:
-        yield Finding("warning", "position", f"{text}: poses are needed in the frame of the base, in metres")
+        yield Finding("warning", "position", f"{text}. Check that they are in metres, in the frame of the base")
 
 
 def _agreement(
@@ -227,8 +226,8 @@ def _agreement(
     usual = float(np.median([len(one) for one, _ in pairs])) if pairs else 0.0
     pairs = [pair for pair in pairs if len(pair[0]) >= usual / 2]  # shorter ones would allow few shifts only
     if len(pairs) < _FEWEST_EPISODES or usual < _FEWEST_STEPS:
-        needed = f"{_FEWEST_EPISODES} are needed to tell whether frames and states belong together"
-        return Finding("ok", "agreement", f"not known of {len(pairs)} moving episodes of enough steps: {needed}")
+        needed = f"needs at least {_FEWEST_EPISODES} moving episodes of {_FEWEST_STEPS} or more steps"
+        return Finding("skipped", "agreement", f"{needed}, found {len(pairs)} of {usual:.0f} steps (median)")
     most = min(_MOST_LAG, int(usual) // _LAG_SHARE)
     lags = range(-most, most + 1)  # control steps by which frames lag behind states
     ways, seen = (_ranks([pair[which] for pair in pairs]) for which in (0, 1))
@@ -239,28 +238,29 @@ def _agreement(
     fitting, reverse = own[:, best], turned[:, int(turned.mean(axis=0).argmax())]
     unshifted = own[:, lags.index(0)]
     limit, lag = chance + _SURE * foreign.std(ddof=1), lags[best]
-    measure = f"rank correlation of their changes over {len(pairs)} episodes"
-    text = f"{measure} {mean[best]:.2f}, {chance:.2f} with another episode's frames"
+    measure = f"rank correlation of frame change and motion over {len(pairs)} episodes:"
+    text = f"{measure} {mean[best]:.2f}, with another episode's frames {chance:.2f}"
     if reverse.mean() > limit and _surely_above(reverse, fitting):
-        text = f"{measure} {reverse.mean():.2f} with the frames backwards, {mean[best]:.2f} forwards"
-        return Finding("error", "agreement", f"frames and states run against each other in time: {text}")
+        text = f"{measure} {reverse.mean():.2f} with the frames reversed, {mean[best]:.2f} as recorded"
+        return Finding("error", "agreement", f"frames and states have opposite orders in time ({text})")
     if mean[best] <= limit:
         highest = mean[best] + 2 * fitting.std(ddof=1) / np.sqrt(len(pairs))
         if highest < chance + _ABOVE and is_sound:
-            fix = "Are they of these episodes, and of this robot?"
-            return Finding("warning", "agreement", f"frames do not change when the robot moves: {text}. {fix}")
-        return Finding("ok", "agreement", f"not known whether frames and states belong together: {text}")
+            fix = "Check that frames and states are of the same episodes and of this robot"
+            return Finding("warning", "agreement", f"frames do not change when the robot moves ({text}). {fix}")
+        needed = "needs more episodes or more motion to decide whether frames and states belong together"
+        return Finding("skipped", "agreement", f"{needed} ({text})")
     steps = "1 step" if abs(lag) == 1 else f"{abs(lag)} steps"
     shift = f"{steps} {'late' if lag > 0 else 'early'}"
     is_more = mean[best] - unshifted.mean() > _GAIN * (mean[best] - chance)
     if abs(lag) >= min(2, stride) and is_more and _surely_above(fitting, unshifted):
-        text = f"{measure} {mean[best]:.2f} so, {unshifted.mean():.2f} as they are"
+        text = f"{measure} {mean[best]:.2f} with shifted frames, {unshifted.mean():.2f} as recorded"
         fix = f"Give each frame the state of {steps} {'before' if lag > 0 else 'after'}"
         by = f"frames are {'at least ' * (abs(lag) == most)}{shift} ({abs(lag) / control_rate_hz:.2f} s)"
-        level: Level = "error" if abs(lag) >= stride else "warning"  # each action has another one's frames
-        return Finding(level, "agreement", f"{by}: {text}. {fix}")
-    text += f", best where frames are {shift}" if lag else ""
-    return Finding("ok", "agreement", f"frames change when the robot moves: {text}")
+        level: Level = "error" if abs(lag) >= stride else "warning"  # an error: each action has the frames of another
+        return Finding(level, "agreement", f"{by}; {text}. {fix}")
+    text += f"; it is highest for frames that are {shift}" if lag else ""
+    return Finding("ok", "agreement", f"frames change when the robot moves ({text})")
 
 
 def _ranks(rows: Sequence[Float[np.ndarray, " _"]]) -> Float[np.ndarray, "rows longest"]:

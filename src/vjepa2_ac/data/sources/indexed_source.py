@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
 from jaxtyping import UInt8
@@ -135,6 +135,12 @@ class IndexedSource(ABC, Generic[Config, More]):
             OSError: Data behind a URL cannot be read.
         """
         return self._open(progress or no_progress)[0]
+
+    def with_raw_states(self) -> Self:
+        """Return the source of the same episodes whose states are the numbers of the data set; the index is shared."""
+        other = type(self)(self._config.model_copy(update={"states": "vector"}))
+        other._known = self._known
+        return other
 
     @cached_property
     def _files(self) -> EpisodeFiles:

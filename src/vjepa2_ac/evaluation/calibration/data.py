@@ -7,8 +7,9 @@ variant that is certainly better is most likely the true reading of the data.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,6 +18,7 @@ from jaxtyping import Float
 from vjepa2_ac.config import Config, DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.inspection.findings import counted
 from vjepa2_ac.data.loader import validation_windows
 from vjepa2_ac.data.windows import spread
 from vjepa2_ac.distributed import make_accelerator
@@ -36,6 +38,7 @@ from vjepa2_ac.evaluation.calibration.variants import (
 from vjepa2_ac.evaluation.measure import ClipSample, Predictor
 from vjepa2_ac.intervals import ENOUGH_EPISODES
 from vjepa2_ac.spaces import POSE, euler_from_matrices, matrices_from_euler
+from vjepa2_ac.storage.structured import plain
 
 SHIFTS = (1, 2, 4, 8)  # control steps
 AS_THEY_ARE = "as they are"
@@ -57,18 +60,28 @@ class VariantProbe:
         better = [one for one in certain if one.gain > _GAIN and one.ratio.high < 1]  # else it only fails less
         return max(better, key=lambda one: one.gain, default=None)
 
+    @property
+    def is_decided(self) -> bool:
+        """Whether the model can tell variants apart: on enough episodes it predicts better than persistence."""
+        return self.better is not None or (self.plain.episodes >= ENOUGH_EPISODES and self.plain.ratio.value < 1)
+
     def verdict(self) -> str:
         """Return as text whether the unchanged data fit the model best."""
         plain, better = self.plain, self.better
-        text = f"error / persistence {plain.ratio} on {plain.clips} clips of {plain.episodes} episodes"
+        text = f"one-step error / persistence {plain.ratio} on {counted(plain.clips, 'clip')}"
+        text += f" of {counted(plain.episodes, 'episode')}"
         if better is not None and (found := better.difference) is not None:
             less = f"{-found.value:.3f} [{-found.high:.3f}, {-found.low:.3f}]"
-            return f"{text}, and {less} less with {better.name}: {better.repair}"
+            return f"{text}, lower by {less} with {better.name}: {better.repair}"
         if plain.episodes < ENOUGH_EPISODES:
-            return f"{text}: too few episodes to compare, {ENOUGH_EPISODES} are needed"
+            return f"needs at least {ENOUGH_EPISODES} episodes, found {plain.episodes} ({text})"
         if plain.ratio.value >= 1:
-            return f"{text}: the model predicts none of this better than persistence, so the result is unknown"
-        return f"{text}; no variant certainly fits better"
+            return f"needs a model that predicts these data better than persistence ({text})"
+        return f"{text}; no variant fits better with certainty"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the results of all variants as plain values, the unchanged data first."""
+        return {"variants": plain([asdict(one) for one in (self.plain, *self.results)])}
 
 
 def probe_config(

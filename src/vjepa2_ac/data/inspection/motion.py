@@ -1,0 +1,208 @@
+"""Check motion and the ends of episodes: speeds that no arm reaches, padding, lost measurements, rotation formats."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+from scipy.spatial.transform import Rotation
+
+from vjepa2_ac import storage
+from vjepa2_ac.config.data import MotionLimits
+from vjepa2_ac.config.sources import PoseFields, RotationFormat
+from vjepa2_ac.data.coverage import PERCENTILE, ReadEpisode, read_each, read_sample, sample_of
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.inspection.excerpts import is_still, num_excerpts, small_grey
+from vjepa2_ac.data.inspection.findings import Finding, counted
+from vjepa2_ac.data.poses import num_rotation_numbers
+from vjepa2_ac.data.rotation_formats import MIN_JUMPS, rotation_speeds, smoother_format
+from vjepa2_ac.data.sources.indexed_source import IndexedSource
+from vjepa2_ac.spaces import POSE
+
+_EPISODES, _EPISODES_AT_URL = 200, 12
+_END_STEPS = 16  # steps at each end of an episode whose frames are read
+_BLACK = 8.0  # of 255: no part of a black frame is brighter
+_MIN_FROZEN = 3  # single repeated frames come from a camera with a lower rate
+_MOVED_M = 0.01  # an image shows such a motion
+_FARTHER = 1.5  # a step from or to zeros, relative to the 99th percentile of other steps: not a motion
+_EXCLUDE = "Remove these steps from the data set, or list the episodes in data.exclude"
+
+
+class Stretch(NamedTuple):
+    """Consecutive control steps of an episode that training uses."""
+
+    name: str  # the episode's identity
+    start: int  # the first step
+    states: Float[np.ndarray, "steps 7"]
+
+
+def check_motion(dataset: Dataset) -> Iterator[Finding]:
+    """Read the states of some episodes, and the frames at the ends of fewer, and yield what no robot does.
+
+    Raises:
+        InputError: An episode cannot be read, and `data.broken_episodes` does not skip it.
+    """
+    if dataset.spaces.state.position is None:
+        for name in ("speed", "padding", "rotation format"):
+            yield Finding("skipped", name, "needs poses (data.states: pose), found vectors")
+    else:
+        count = _EPISODES_AT_URL if storage.is_url(dataset.config.path) else _EPISODES
+        sample = list(read_sample(dataset, count))
+        checked = f"{len(sample):,} of {counted(len(dataset.episodes), 'episode')} checked"
+        stretches = [
+            Stretch(dataset.table.identity(one.index), start, one.states[start:end])
+            for one in sample
+            for start, end in one.kept
+            if end - start > 1
+        ]
+        yield speed_finding(stretches, dataset.control_rate_hz, dataset.config.motion_limits, checked)
+        yield padding_finding(stretches, checked)
+        yield from _check_rotation_format(dataset, sample)
+    if dataset.config.is_cache:
+        yield Finding("skipped", "episode ends", "needs frames; check the data set that this cache was made from")
+    else:
+        yield _check_ends(dataset)
+
+
+def speed_finding(
+    stretches: Sequence[Stretch], control_rate_hz: float, motion_limits: MotionLimits, checked: str
+) -> Finding:
+    """Return whether poses change faster between consecutive control steps than an arm can move.
+
+    Args:
+        stretches: Steps of some episodes.
+        control_rate_hz: Control steps per second.
+        motion_limits: The highest plausible speeds.
+        checked: The number of episodes, for the text.
+    """
+    if not stretches:
+        return Finding("skipped", "speed", "needs episodes of two or more steps, found none")
+    changes = np.concatenate([POSE.differences(one.states) for one in stretches])
+    speeds = control_rate_hz * np.linalg.norm(changes[:, POSE.position], axis=1)
+    turns = control_rate_hz * Rotation.from_euler("xyz", changes[:, POSE.rotation]).magnitude()
+    excess = np.maximum(speeds / motion_limits.speed_m_s, turns / motion_limits.rotation_rad_s)
+    if excess.max() <= 1:
+        text = f"at most {speeds.max():.2f} m/s and {turns.max():.2f} rad/s between control steps ({checked})"
+        return Finding("ok", "speed", text)
+    steps = [(one.name, one.start + step) for one in stretches for step in range(len(one.states) - 1)]
+    fast, worst = np.flatnonzero(excess > 1).tolist(), int(excess.argmax())
+    name, step = steps[worst]
+    episodes = counted(len({steps[one][0] for one in fast}), "episode")
+    limit = f"{motion_limits.speed_m_s:g} m/s or {motion_limits.rotation_rad_s:g} rad/s, which no arm reaches"
+    text = f"{len(fast):,} of {len(steps):,} control steps, in {episodes}, are faster than {limit} ({checked})"
+    example = f"{name}, step {step} to {step + 1}: {speeds[worst]:.1f} m/s, {turns[worst]:.1f} rad/s"
+    fix = "Look for padding, lost measurements and joined recordings; data.motion_limits sets the limits"
+    return Finding("warning", "speed", f"{text}. Example: {example}. {fix}")
+
+
+def padding_finding(stretches: Sequence[Stretch], checked: str) -> Finding:
+    """Return whether the numbers of poses are exactly zero although the robot is elsewhere before or after them.
+
+    Poses relative to the first state of an episode begin with zeros, too; but from there the robot moves slowly.
+    """
+    runs: list[tuple[float, str, int, int]] = []  # farthest step from or to the zeros, identity, first step, end
+    moves_m = [np.zeros(1)]
+    for name, start, states in stretches:
+        is_zero = np.all(states[:, : POSE.gripper] == 0, axis=1)
+        steps_m = np.linalg.norm(np.diff(states[:, POSE.position], axis=0), axis=1)
+        moves_m.append(steps_m[~(is_zero[1:] | is_zero[:-1])])
+        for first, end in np.flatnonzero(np.diff(np.pad(is_zero.astype(int), 1))).reshape(-1, 2).tolist():
+            farthest_m = np.inf if end - first == len(states) else float(steps_m[max(0, first - 1) : end].max())
+            runs.append((farthest_m, name, start + first, start + end))
+    least_m = _FARTHER * float(np.percentile(np.concatenate(moves_m), PERCENTILE))
+    padding = [run for run in runs if run[0] > least_m]
+    if not padding:
+        return Finding("ok", "padding", f"no padding with zeros ({checked})")
+    zeros = counted(sum(end - first for *_, first, end in padding), "state")
+    episodes = counted(len({name for _, name, *_ in padding}), "episode")
+    _, name, first, end = max(padding, key=lambda run: run[3] - run[2])
+    example = f"step {first}" if end - first == 1 else f"steps {first} to {end - 1}"
+    text = f"{zeros} in {episodes} with a position and a rotation of exactly zero: padding or lost measurements"
+    return Finding("warning", "padding", f"{text} ({checked}). Example: {name}, {example}. {_EXCLUDE}")
+
+
+def _check_rotation_format(dataset: Dataset, sample: Sequence[ReadEpisode]) -> Iterator[Finding]:
+    """Yield whether the hand turns more smoothly if the rotation numbers are read in another format."""
+    config, source, about = dataset.config, dataset.source, "rotation format"
+    if config.is_cache:
+        yield Finding("skipped", about, "needs rotation numbers; check the data set that this cache was made from")
+        return
+    sections = [(name, getattr(config, name)) for name in config.own_sections()]
+    section, fields = next(((name, one) for name, one in sections if isinstance(one, PoseFields)), ("", None))
+    configured: RotationFormat = "euler_xyz" if fields is None else fields.rotation
+    if num_rotation_numbers(configured) == 4:  # a quaternion has the same speed in both orders
+        return
+    states = {one.index: one.states for one in sample}
+    if configured != "euler_xyz" and isinstance(source, IndexedSource):
+        raw = source.with_raw_states()
+        states = {index: np.asarray(one.states) for index, one in read_each(dataset, [*states], raw.read)}
+    numbers = [one[start:end, POSE.rotation] for index, one in states.items() for start, end in dataset.kept.of(index)]
+    speeds = rotation_speeds(numbers, dataset.control_rate_hz)
+    if smoother := smoother_format(speeds, configured, config.motion_limits.rotation_rad_s):
+        readings = "; ".join(
+            f"read as {name}, the hand turns by {one.median_rad_s:.2f} rad/s (median) and smoothly at"
+            f" {one.num_smooth_jumps} of {one.num_jumps} jumps of the numbers"
+            for name, one in speeds.items()
+            if name in {configured, smoother}
+        )
+        fix = f"Set data.{section}.rotation: {smoother}" if section else "Write extrinsic xyz Euler angles in radians"
+        yield Finding("warning", about, f"{readings}. {fix}")
+        return
+    own, others = speeds[configured], [one for name, one in speeds.items() if name != configured]
+    decisive = min(map(own.num_smoother_than, others), default=MIN_JUMPS)
+    if decisive < MIN_JUMPS:
+        needed = f"needs at least {MIN_JUMPS} jumps of the rotation numbers, as where an angle passes pi"
+        yield Finding("skipped", about, f"{needed}, to tell formats apart; found {decisive}")
+    else:
+        text = f"the hand turns smoothly at {own.num_smooth_jumps} of {own.num_jumps} jumps of the rotation numbers"
+        yield Finding("ok", about, f"{text} if they are read as {configured}, and in no other format")
+
+
+def _check_ends(dataset: Dataset) -> Finding:
+    """Count the black and the frozen frames at the ends of some episodes."""
+    is_pose = dataset.spaces.state.position is not None
+
+    def read(index: int) -> list[tuple[int, int, str]]:
+        ranges = dataset.kept.of(index) or [(0, int(dataset.table.num_steps[index]))]
+        start, end = ranges[0][0], ranges[-1][1]
+        count = min(_END_STEPS, (end - start + 1) // 2)
+        episode = dataset.source.read(index, None, dataset.needed_steps(index))
+        counts = []
+        for which, first, order in (("first", start, 1), ("last", end - count, -1)):
+            grey = small_grey(episode.read_frames(range(first, first + count)))[::order]
+            states = episode.states[first : first + count][::order]
+            counts.append((*count_at_end(grey, states, is_pose=is_pose), f"{episode.info.id}, the {which}"))
+        return counts
+
+    chosen = sample_of(dataset, num_excerpts(dataset))
+    ends = [end for _, pair in read_each(dataset, chosen, read) for end in pair]
+    checked = f"up to {_END_STEPS} frames at both ends of {counted(len(ends) // 2, 'episode')} checked"
+    black, frozen, example = max(ends, key=lambda end: max(end[:2]))
+    if not black + frozen:
+        return Finding("ok", "episode ends", f"no black or frozen frames ({checked})")
+    kind = f"{black} frames are black" if black > frozen else f"{frozen} frames are one image while the robot moves"
+    text = f"{sum(end[0] for end in ends):,} black and {sum(end[1] for end in ends):,} frozen frames ({checked})"
+    return Finding("warning", "episode ends", f"{text}. Example: {example} {kind}. {_EXCLUDE}")
+
+
+def count_at_end(
+    grey: Float32[np.ndarray, "steps rows columns"], states: Float[np.ndarray, "steps dim"], *, is_pose: bool
+) -> tuple[int, int]:
+    """Return the number of black frames at an end of an episode, and of frames with one image while the robot moves.
+
+    Args:
+        grey: Frames from 0 to 255, the outermost one first.
+        states: Their states.
+        is_pose: Whether the states are poses; else frozen frames are not counted.
+    """
+    black = _num_leading(grey.max(axis=(1, 2)) < _BLACK)
+    same = _num_leading(is_still(np.abs(np.diff(grey, axis=0)).mean(axis=(1, 2), dtype=np.float64))) + 1
+    has_moved = is_pose and np.ptp(states[:same, POSE.position], axis=0).max() > _MOVED_M
+    return black, same if has_moved and same >= _MIN_FROZEN and same > black else 0
+
+
+def _num_leading(mask: Bool[np.ndarray, " steps"]) -> int:
+    """Return the number of true values before the first false one."""
+    return int(np.cumprod(mask).sum())

@@ -1,0 +1,237 @@
+"""Speeds that no arm reaches, padding, rotation formats and episode ends: faults are named, clean data stay silent."""
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from lerobot_sets import STATE, recorded, write_v30
+from vector_sets import write_vectors
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config.data import MotionLimits
+from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.data.inspection.findings import Finding
+from vjepa2_ac.data.inspection.motion import Stretch, check_motion, count_at_end, padding_finding, speed_finding
+
+STEPS, RATE_HZ = 40, 10.0
+LIMITS = MotionLimits()
+Pair = tuple[np.ndarray, np.ndarray]
+
+
+def states_of(number: int, steps: int = STEPS) -> np.ndarray:
+    """Return a hand that points down and moves smoothly; roll and yaw pass pi."""
+    rng, time_s = np.random.default_rng(number), np.arange(steps)[:, None] / RATE_HZ
+    waves = np.sin(rng.uniform(0.5, 2.0, 7) * time_s + rng.uniform(0, 6, 7))
+    states = np.array([0.5, 0.0, 0.3, np.pi, 0.1, np.pi, 0.5]) + waves * [0.1, 0.2, 0.1, 0.2, 0.2, 0.6, 0.5]
+    states[:, 3:6] = (states[:, 3:6] + np.pi) % (2 * np.pi) - np.pi
+    return states
+
+
+def frames_of(states: np.ndarray) -> np.ndarray:
+    """Return a bright disc where the pose is."""
+    rows, columns = np.mgrid[:36, :48]
+    distance = (rows - 18 + 40 * (states[:, 2] - 0.3)[:, None, None]) ** 2
+    distance = distance + (columns - 24 - 40 * states[:, 1, None, None]) ** 2
+    grey = 60 + 150 * np.exp(-distance / 40)
+    return np.repeat(grey[..., None], 3, axis=3).astype(np.uint8)
+
+
+def clean(number: int) -> Pair:
+    states = states_of(number)
+    return states, frames_of(states)
+
+
+def padded(number: int) -> Pair:
+    states, frames = clean(number)
+    end = STEPS - 5 * (1 + number % 2)
+    states[end:], frames[end:] = 0, 0
+    return states, frames
+
+
+def joined(number: int) -> Pair:
+    (first, one), (second, other) = clean(number), clean(100 + number)
+    second[:, 0] += 0.4
+    return np.concatenate([first, second]), np.concatenate([one, other])
+
+
+def with_dropout(number: int) -> Pair:
+    states, frames = clean(number)
+    states[9 + number] = 0
+    return states, frames
+
+
+def with_frozen_camera(number: int) -> Pair:
+    states, frames = clean(number)
+    frames[:8] = frames[8]
+    return states, frames
+
+
+def near_the_base(number: int) -> Pair:
+    """Return poses relative to the first state of the episode, which is exactly zero."""
+    states, frames = clean(number)
+    states[:, :3] -= states[0, :3]
+    first = Rotation.from_euler("xyz", states[0, 3:6])
+    states[:, 3:6] = (Rotation.from_euler("xyz", states[:, 3:6]) * first.inv()).as_euler("xyz")
+    states[0, 3:6] = 0
+    return states, frames
+
+
+def standing_at_the_ends(number: int) -> Pair:
+    states, frames = clean(number)
+    order = np.clip(np.arange(STEPS), 8, 30)
+    return states[order], frames[order]
+
+
+def config_of(folder: Path, make: Callable[[int], Pair], *, rate_hz: float = RATE_HZ, **changes: object) -> DataConfig:
+    folder.mkdir(exist_ok=True)
+    for number in range(6):
+        states, frames = make(number)
+        np.savez(folder / f"{number:03d}.npz", states=states, frames=frames, fps_hz=rate_hz)
+    values = {"source": "npz", "path": str(folder), "frames": 3, "stride": 2, "test_share": 0.0, "workers": 0}
+    return DataConfig.model_validate(values | changes)
+
+
+def findings_of(config: DataConfig) -> dict[str, Finding]:
+    return {one.about: one for one in check_motion(open_dataset(config))}
+
+
+def warnings_of(config: DataConfig) -> dict[str, str]:
+    return {name: one.text for name, one in findings_of(config).items() if one.level in {"warning", "error"}}
+
+
+@pytest.mark.parametrize("rate_hz", [1.0, 10.0])
+@pytest.mark.parametrize("make", [clean, near_the_base, standing_at_the_ends])
+def test_clean_motion_has_no_warning_at_any_rate(tmp_path: Path, make: Callable[[int], Pair], rate_hz: float) -> None:
+    findings = findings_of(config_of(tmp_path / "set", make, rate_hz=rate_hz))
+    assert {one.level for one in findings.values()} <= {"ok", "skipped"}
+    assert findings["speed"].text.endswith("between control steps (6 of 6 episodes checked)")
+    assert [name for name, one in findings.items() if one.level == "skipped"] == (
+        ["rotation format"] if make is near_the_base else []
+    )
+
+
+def test_padding_is_named_with_its_steps_and_black_frames_are_counted(tmp_path: Path) -> None:
+    warnings = warnings_of(config_of(tmp_path / "set", padded))
+    assert set(warnings) == {"speed", "padding", "episode ends"}
+    assert warnings["padding"].startswith("45 states in 6 episodes with a position and a rotation of exactly zero")
+    assert re.search(r"Example: 00[135], steps 30 to 39\.", warnings["padding"])
+    assert "6 of 234 control steps, in 6 episodes, are faster than 2.5 m/s or 10 rad/s" in warnings["speed"]
+    assert warnings["episode ends"].startswith("45 black and 0 frozen frames")
+    assert re.search(r"Example: 00[135], the last 10 frames are black\.", warnings["episode ends"])
+
+
+def test_speed_example_is_the_step_between_joined_recordings(tmp_path: Path) -> None:
+    warnings = warnings_of(config_of(tmp_path / "set", joined))
+    assert set(warnings) == {"speed"}
+    assert f"step {STEPS - 1} to {STEPS}: " in warnings["speed"]
+    states = joined(0)[0]
+    stretch = Stretch("e", 7, np.concatenate([states[:40], states[40:]]))
+    text = speed_finding([stretch], RATE_HZ, LIMITS, "1 of 1 episode checked").text
+    jump_m = np.linalg.norm(states[40, :3] - states[39, :3])
+    assert f"Example: e, step 46 to 47: {RATE_HZ * jump_m:.1f} m/s" in text
+
+
+def test_single_zero_states_are_lost_measurements(tmp_path: Path) -> None:
+    warnings = warnings_of(config_of(tmp_path / "set", with_dropout))
+    assert set(warnings) == {"speed", "padding"}
+    assert warnings["padding"].startswith("6 states in 6 episodes")
+    assert re.search(r"Example: 00\d, step \d+\. ", warnings["padding"])
+    slow = warnings_of(config_of(tmp_path / "slow", with_dropout, rate_hz=1.0))
+    assert set(slow) == {"padding"}, "zeros are named where the rate is too low for an impossible speed"
+
+
+def test_frozen_camera_is_counted_where_the_robot_moves(tmp_path: Path) -> None:
+    warnings = warnings_of(config_of(tmp_path / "set", with_frozen_camera))
+    assert warnings.keys() == {"episode ends"}
+    assert warnings["episode ends"].startswith("0 black and 54 frozen frames")
+    assert "the first 9 frames are one image while the robot moves" in warnings["episode ends"]
+
+
+def test_wraps_are_no_rotation_and_limits_are_those_of_the_config(tmp_path: Path) -> None:
+    turning = np.tile([0.5, 0.0, 0.3, 0.0, 0.0, 0.0, 0.0], (STEPS, 1))
+    turning[:, 5] = (0.3 * np.arange(STEPS) + np.pi) % (2 * np.pi) - np.pi
+    finding = speed_finding([Stretch("e", 0, turning)], RATE_HZ, LIMITS, "checked")
+    assert (finding.level, "at most 0.00 m/s and 3.00 rad/s" in finding.text) == ("ok", True)
+    config = config_of(tmp_path / "set", clean, motion_limits={"speed_m_s": 0.1, "rotation_rad_s": 0.1})
+    assert "faster than 0.1 m/s or 0.1 rad/s" in warnings_of(config)["speed"]
+
+
+def test_steps_outside_the_kept_ranges_do_not_count(tmp_path: Path) -> None:
+    idle = {"rule": "motion", "shortest_idle_steps": 3, "shortest_kept_steps": 5, "cut_last_steps": 1}
+    assert "padding" not in warnings_of(config_of(tmp_path / "set", padded, idle=idle))
+
+
+def test_short_sequences_are_skipped_and_an_episode_of_zeros_is_padding() -> None:
+    assert speed_finding([], RATE_HZ, LIMITS, "checked").level == "skipped"
+    assert padding_finding([], "checked").level == "ok"
+    zeros = [Stretch("zeros", 0, np.zeros((5, 7))), Stretch("moves", 0, states_of(0))]
+    assert "Example: zeros, steps 0 to 4." in padding_finding(zeros, "checked").text
+
+
+def test_end_of_one_frame_and_vectors_have_no_frozen_frames() -> None:
+    grey, states = np.full((5, 3, 4), 90, np.float32), np.arange(35.0).reshape(5, 7)
+    assert count_at_end(grey, states, is_pose=True) == (0, 5)
+    assert count_at_end(grey, states, is_pose=False) == (0, 0)
+    assert count_at_end(grey[:1], states[:1], is_pose=True) == (0, 0)
+    assert count_at_end(0 * grey, states, is_pose=True) == (5, 0)
+
+
+def test_vectors_and_latent_caches_skip_what_needs_poses_and_frames(tmp_path: Path) -> None:
+    values = {"source": "npz", "path": str(write_vectors(tmp_path / "set", width=7)), "states": "vector"}
+    config = DataConfig.model_validate(values | {"frames": 3, "stride": 2, "workers": 0})
+    findings = findings_of(config)
+    assert [one.level for one in findings.values()] == ["skipped", "skipped", "skipped", "ok"]
+    assert findings["speed"].text == "needs poses (data.states: pose), found vectors"
+
+
+# Rotation formats, read from a data set.
+
+
+def written_as(folder: Path, numbers_of: Callable[[Rotation], np.ndarray], rotation: str) -> DataConfig:
+    """Write LeRobot episodes of the same motion whose rotation numbers have another format than configured."""
+    episodes = []
+    for number in range(4):
+        episode, states = recorded(number, STEPS), states_of(number)
+        pose = np.concatenate([states[:, :3], numbers_of(Rotation.from_euler("xyz", states[:, 3:6]))], axis=1)
+        episodes.append(replace(episode, columns={**episode.columns, STATE[0]: pose.astype(np.float32)}))
+    values = {"source": "lerobot", "path": str(write_v30(folder, episodes)), "frames": 3, "stride": 2, "workers": 0}
+    return DataConfig.model_validate(values | {"test_share": 0.0, "lerobot": {"rotation": rotation}})
+
+
+FORMATS: dict[str, Callable[[Rotation], np.ndarray]] = {
+    "euler_xyz": lambda rotation: rotation.as_euler("xyz"),
+    "rotation_vector": lambda rotation: rotation.as_rotvec(),
+    "euler_xyz_degrees": lambda rotation: rotation.as_euler("xyz", degrees=True),
+}
+
+
+@pytest.mark.parametrize("true", ["euler_xyz", "rotation_vector"])
+@pytest.mark.parametrize("configured", FORMATS)
+def test_rotation_format_of_the_numbers_is_named(tmp_path: Path, true: str, configured: str) -> None:
+    config = written_as(tmp_path / "set", FORMATS[true], configured)
+    finding = findings_of(config)["rotation format"]
+    assert finding.level == ("ok" if true == configured else "warning"), finding
+    if true == configured:
+        assert f"if they are read as {true}, and in no other format" in finding.text
+    else:
+        assert finding.text.endswith(f"Set data.lerobot.rotation: {true}")
+
+
+def test_degrees_too_large_for_radians_need_no_jumps(tmp_path: Path) -> None:
+    config = written_as(tmp_path / "set", FORMATS["euler_xyz_degrees"], "euler_xyz_degrees")
+    assert findings_of(config)["rotation format"].level == "ok"
+
+
+def test_npz_with_rotation_vectors_is_told_what_to_write(tmp_path: Path) -> None:
+    def make(number: int) -> Pair:
+        states, frames = clean(number)
+        states[:, 3:6] = Rotation.from_euler("xyz", states[:, 3:6]).as_rotvec()
+        return states, frames
+
+    text = findings_of(config_of(tmp_path / "set", make))["rotation format"].text
+    assert text.startswith("read as euler_xyz, the hand turns by ")
+    assert text.endswith("Write extrinsic xyz Euler angles in radians")
