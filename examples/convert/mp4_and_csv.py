@@ -100,7 +100,7 @@ def read_table(path: Path, options: argparse.Namespace) -> tuple[np.ndarray, np.
             if not math.isfinite(numbers[row, column]):
                 found = repr(cell) if cell else "an empty cell"
                 raise SystemExit(f"{place}, column {header[names.index(name)]}: {found}. Expected a number.")
-    states = states_from([place for place, _ in rows], numbers[:, : 4 + len(rotation_columns)], rotation, options)
+    states = make_states([place for place, _ in rows], numbers[:, : 4 + len(rotation_columns)], rotation, options)
     return states, numbers[:, -1] if "time" in names else None, f"{rotation} from {', '.join(rotation_columns)}"
 
 
@@ -121,7 +121,7 @@ def choose_rotation(path: Path, names: list[str], requested: str | None) -> tupl
     return rotation, group
 
 
-def states_from(places: list[str], numbers: np.ndarray, rotation: str, options: argparse.Namespace) -> np.ndarray:
+def make_states(places: list[str], numbers: np.ndarray, rotation: str, options: argparse.Namespace) -> np.ndarray:
     """Return the states, [rows, 7], from x, y, z, the rotation and the gripper as the table has them."""
     positions, rotations = numbers[:, :3] * METRES[options.position_unit], numbers[:, 3:-1]
     gripper = (numbers[:, -1:] - options.gripper_open) / (options.gripper_closed - options.gripper_open)
@@ -155,7 +155,7 @@ def read_video(path: Path, height: int) -> tuple[list[np.ndarray], np.ndarray]:
     try:
         with av.open(str(path)) as video:
             for frame in video.decode(video=0) if video.streams.video else ():
-                frames.append(upright_pixels(path, frame, height))
+                frames.append(decode_upright(path, frame, height))
                 times.append(frame.time)
     except av.FFmpegError as error:
         raise SystemExit(f"{path}: not a readable video ({error})") from None
@@ -164,7 +164,7 @@ def read_video(path: Path, height: int) -> tuple[list[np.ndarray], np.ndarray]:
     return frames, np.array(times) - times[0]
 
 
-def upright_pixels(path: Path, frame: av.VideoFrame, height: int) -> np.ndarray:
+def decode_upright(path: Path, frame: av.VideoFrame, height: int) -> np.ndarray:
     """Return RGB pixels of this height, turned and mirrored by the display matrix that phones write."""
     matrix: Any = frame.side_data.get("DISPLAYMATRIX")
     axes = np.eye(2)  # the directions (right, down) in which a stored row and a stored column are displayed
@@ -188,7 +188,7 @@ def match_rows(path: Path, row_times: np.ndarray, times: np.ndarray) -> tuple[np
         found = f"a row for each frame, but `time` covers {duration:.2f} s and the video {times[-1]:.2f} s"
         print(f"warning: {path}: {found}; row n is used for frame n, and `time` as the time of both")
         return np.arange(len(times)), row_times - row_times[0]
-    rows = nearest(row_times, times)
+    rows = find_nearest(row_times, times)
     if (farthest := abs(row_times[rows] - times).max()) > FARTHEST_S:
         raise SystemExit(f"{path}: a frame is {farthest:.2f} s from the nearest row; is `time` 0 at the first frame?")
     return rows, times
@@ -204,10 +204,10 @@ def choose_steps(path: Path, times: np.ndarray, fps: float | None) -> tuple[np.n
         found = f"{path}: frames are {gaps.min():.3f} to {gaps.max():.3f} s apart"
         fix = f"Pass --fps N to resample; up to {0.99 / gaps.max():.3g} no step repeats a frame"
         raise SystemExit(f"{found}. Expected even times (within {LARGEST_JITTER:.0%}). {fix}.")
-    return nearest(times, np.arange(int(times[-1] * fps + 1e-6) + 1) / fps), fps
+    return find_nearest(times, np.arange(int(times[-1] * fps + 1e-6) + 1) / fps), fps
 
 
-def nearest(times: np.ndarray, targets: np.ndarray) -> np.ndarray:
+def find_nearest(times: np.ndarray, targets: np.ndarray) -> np.ndarray:
     """Return the index of the time nearest to each target; the earlier one of two at the same distance."""
     rising, indices = np.unique(times, return_index=True)
     after = np.searchsorted(rising, targets).clip(max=len(rising) - 1)

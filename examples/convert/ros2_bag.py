@@ -40,13 +40,13 @@ CHANNELS = {"rgb8": [0, 1, 2], "bgr8": [2, 1, 0], "rgba8": [0, 1, 2], "bgra8": [
 ENDINGS = {".db3", ".mcap", ".bag"}
 
 
-def bags_in(path: Path) -> list[Path]:
+def find_bags(path: Path) -> list[Path]:
     """Return the bags at a path: files, or folders with a metadata.yaml. The ._NAME files of macOS are ignored."""
     if path.suffix in ENDINGS or (path / "metadata.yaml").exists():
         return [path]
     entries = sorted(path.iterdir()) if path.is_dir() else []
     entries = [entry for entry in entries if not entry.name.startswith("._")]
-    return [bag for entry in entries if entry.is_dir() or entry.suffix in ENDINGS for bag in bags_in(entry)]
+    return [bag for entry in entries if entry.is_dir() or entry.suffix in ENDINGS for bag in find_bags(entry)]
 
 
 @contextmanager
@@ -59,7 +59,7 @@ def open_bag(bag: Path) -> Iterator[AnyReader]:
         raise SystemExit(f"{bag}: not a readable bag ({error})") from None
 
 
-def image_of(message: Any, height: int, where: str) -> np.ndarray:
+def decode_image(message: Any, height: int, where: str) -> np.ndarray:
     """Return the RGB image of an Image or CompressedImage, [height, width, 3] of uint8."""
     if hasattr(message, "encoding"):
         if message.encoding not in CHANNELS:
@@ -73,7 +73,7 @@ def image_of(message: Any, height: int, where: str) -> np.ndarray:
     return np.asarray(image.resize((round(height * image.width / image.height), height), Image.Resampling.LANCZOS))
 
 
-def pose_of(value: Any, names: list[str], where: str) -> np.ndarray:  # noqa: ARG001 - as `gripper_of`
+def read_pose(value: Any, names: list[str], where: str) -> np.ndarray:  # noqa: ARG001 - as `read_gripper`
     """Return x, y, z (metres), roll, pitch, yaw (radians) of a message with a pose, or of 16 numbers; NaN if empty."""
     while (inner := getattr(value, "pose", getattr(value, "transform", None))) is not None:
         value = inner
@@ -96,7 +96,7 @@ def pose_of(value: Any, names: list[str], where: str) -> np.ndarray:  # noqa: AR
     return pose if pose.any() else np.full(6, np.nan)
 
 
-def gripper_of(value: Any, names: list[str], where: str, selected: list[str]) -> np.ndarray:
+def read_gripper(value: Any, names: list[str], where: str, selected: list[str]) -> np.ndarray:
     """Return the numbers of a gripper, or of the selected joints; NaN if the message does not have these."""
     try:
         numbers = np.ravel(np.asarray(getattr(value, "data", value), float))
@@ -108,7 +108,7 @@ def gripper_of(value: Any, names: list[str], where: str, selected: list[str]) ->
     return np.array([numbers[indices[joint]] if joint in indices else np.nan for joint in selected])
 
 
-def connections_of(reader: AnyReader, topic: str, bag: Path) -> list[Any]:
+def find_connections(reader: AnyReader, topic: str, bag: Path) -> list[Any]:
     """Return the connections of a bag that have a TOPIC, TOPIC:FIELD or TOPIC:FIELD[JOINT]."""
     name = re.split(r"[:\[]", topic)[0]
     connections = [connection for connection in reader.connections if connection.topic == name]
@@ -117,16 +117,16 @@ def connections_of(reader: AnyReader, topic: str, bag: Path) -> list[Any]:
     return connections
 
 
-def times_of(reader: AnyReader, topic: str, bag: Path) -> np.ndarray:
+def read_times(reader: AnyReader, topic: str, bag: Path) -> np.ndarray:
     """Return the times of a topic's messages in seconds."""
-    return np.array([time_ns / 1e9 for _, time_ns, _ in reader.messages(connections_of(reader, topic, bag))])
+    return np.array([time_ns / 1e9 for _, time_ns, _ in reader.messages(find_connections(reader, topic, bag))])
 
 
-def values_of(reader: AnyReader, topic: str, bag: Path, indices: Iterable[int]) -> Iterator[tuple[Any, list[str]]]:
+def read_values(reader: AnyReader, topic: str, bag: Path, indices: Iterable[int]) -> Iterator[tuple[Any, list[str]]]:
     """Yield the field of a topic's messages at these indices, which rise or repeat, and the names of its joints."""
     field, remaining = topic.partition("[")[0].partition(":")[2], iter(indices)
     following = next(remaining, None)
-    for index, (connection, _, data) in enumerate(reader.messages(connections_of(reader, topic, bag))):
+    for index, (connection, _, data) in enumerate(reader.messages(find_connections(reader, topic, bag))):
         if index != following:
             continue
         names, value = [], reader.deserialize(data, connection.msgtype)
@@ -139,13 +139,13 @@ def values_of(reader: AnyReader, topic: str, bag: Path, indices: Iterable[int]) 
             following = next(remaining, None)
 
 
-def measurements_of(
+def read_measurements(
     reader: AnyReader, topic: str, bag: Path, convert: Callable[[Any, list[str], str], np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """Return times and numbers, [messages, numbers], of the messages that have a measurement, and names of joints."""
-    times, rows, names = times_of(reader, topic, bag), list[np.ndarray](), list[str]()
+    times, rows, names = read_times(reader, topic, bag), list[np.ndarray](), list[str]()
     seconds = times - reader.start_time / 1e9
-    for second, (value, names) in zip(seconds, values_of(reader, topic, bag, itertools.count()), strict=False):
+    for second, (value, names) in zip(seconds, read_values(reader, topic, bag, itertools.count()), strict=False):
         rows.append(convert(value, names, f"{bag}: {topic} at {second:.2f} s"))
     is_measured = np.array([len(row) > 0 and bool(np.isfinite(row).all()) for row in rows])
     if not is_measured.all():
@@ -158,7 +158,7 @@ def measurements_of(
     return times[is_measured], np.stack(measured), names
 
 
-def closedness_of(numbers: np.ndarray, names: list[str], where: str, options: argparse.Namespace) -> np.ndarray:
+def compute_closedness(numbers: np.ndarray, names: list[str], where: str, options: argparse.Namespace) -> np.ndarray:
     """Return 0 (open) to 1 (closed) for the numbers of a gripper, [steps, joints], which are added."""
     total, span = numbers.sum(axis=1), options.gripper_closed - options.gripper_open
     closedness = (total - options.gripper_open) / span
@@ -177,7 +177,7 @@ def closedness_of(numbers: np.ndarray, names: list[str], where: str, options: ar
     return np.asarray(closedness.clip(0, 1))
 
 
-def newest(times: np.ndarray, steps: np.ndarray, where: str) -> np.ndarray:
+def find_newest(times: np.ndarray, steps: np.ndarray, where: str) -> np.ndarray:
     """Return the index of the newest message at each step."""
     indices = np.searchsorted(times, steps, side="right") - 1
     silent_s = float((steps - times[indices]).max())
@@ -186,15 +186,15 @@ def newest(times: np.ndarray, steps: np.ndarray, where: str) -> np.ndarray:
     return indices
 
 
-def episode_of(bag: Path, cameras: dict[str, str], options: argparse.Namespace) -> dict[str, Any]:
+def make_episode(bag: Path, cameras: dict[str, str], options: argparse.Namespace) -> dict[str, Any]:
     """Return the arrays of one episode."""
     topics = [*cameras.values(), options.pose, options.gripper]
     selected = [joint.strip() for joint in options.gripper.partition("[")[2].rstrip("]").split(",") if joint]
     with open_bag(bag) as reader:
-        times = [times_of(reader, topic, bag) for topic in cameras.values()]
-        pose_times, poses, _ = measurements_of(reader, options.pose, bag, pose_of)
-        read_gripper = partial(gripper_of, selected=selected)
-        gripper_times, fingers, names = measurements_of(reader, options.gripper, bag, read_gripper)
+        times = [read_times(reader, topic, bag) for topic in cameras.values()]
+        pose_times, poses, _ = read_measurements(reader, options.pose, bag, read_pose)
+        convert = partial(read_gripper, selected=selected)
+        gripper_times, fingers, names = read_measurements(reader, options.gripper, bag, convert)
         times += [pose_times, gripper_times]
         if short := [topic for topic, of_topic in zip(topics, times, strict=True) if len(of_topic) < 2]:
             raise SystemExit(f"{bag}: fewer than two messages of {', '.join(short)}")
@@ -202,12 +202,14 @@ def episode_of(bag: Path, cameras: dict[str, str], options: argparse.Namespace) 
         steps = np.arange(start_s, end_s, 1 / options.rate)
         if len(steps) < 2:
             raise SystemExit(f"{bag}: the topics are together for less than two steps")
-        indices = [newest(of_topic, steps, f"{bag}: {topic}") for topic, of_topic in zip(topics, times, strict=True)]
+        indices = [
+            find_newest(of_topic, steps, f"{bag}: {topic}") for topic, of_topic in zip(topics, times, strict=True)
+        ]
         arrays: dict[str, Any] = {"fps_hz": options.rate}
         for (name, topic), at_steps in zip(cameras.items(), indices, strict=False):
-            images = values_of(reader, topic, bag, at_steps.tolist())
-            arrays[name] = np.stack([image_of(image, options.height, f"{bag}: {topic}") for image, _ in images])
-    closedness = closedness_of(fingers[indices[-1]], names, f"{bag}: {options.gripper}", options)
+            images = read_values(reader, topic, bag, at_steps.tolist())
+            arrays[name] = np.stack([decode_image(image, options.height, f"{bag}: {topic}") for image, _ in images])
+    closedness = compute_closedness(fingers[indices[-1]], names, f"{bag}: {options.gripper}", options)
     arrays["states"] = np.concatenate([poses[indices[-2]], closedness[:, None]], axis=1)
     return arrays | ({"language": options.language} if options.language else {})
 
@@ -234,7 +236,7 @@ def main() -> None:
     parser.add_argument("--height", type=int, default=256, help="height of the stored frames (256, as the model reads)")
     parser.add_argument("--language", help="the task as text")
     args = parser.parse_args()
-    bags = bags_in(args.bags)
+    bags = find_bags(args.bags)
     if not bags:
         raise SystemExit(f"{args.bags}: no bags ({', '.join(sorted(ENDINGS))}, or folders with a metadata.yaml)")
     if args.out is None:
@@ -245,7 +247,7 @@ def main() -> None:
     if args.gripper_open == args.gripper_closed or args.rate <= 0:
         parser.error("--gripper-open and --gripper-closed must differ, and --rate must be positive")
     for number, bag in enumerate(bags):
-        arrays = episode_of(bag, dict(camera.split("=", 1) for camera in args.camera), args)
+        arrays = make_episode(bag, dict(camera.split("=", 1) for camera in args.camera), args)
         out = args.out / f"{bag.stem if bag.suffix in ENDINGS else bag.name}.npz"
         out.parent.mkdir(parents=True, exist_ok=True)
         np.savez(out, **arrays)
