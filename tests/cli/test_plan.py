@@ -112,7 +112,7 @@ WRONG = {
     "goal of another size": (["--goal", "{here}/other.png"], "48 x 60 pixels (width x height)"),
     "an image that is not there": (["--goal", "{here}/nowhere.png"], "nowhere.png: cannot be read: No such file"),
     "a black mask": (["--mask", "{here}/black.png"], "nothing of what the model sees counts"),
-    "degrees": (["--state", "0.4,0,0.3,180,0,5,0"], "multiply the angles by pi / 180"),
+    "degrees": (["--state", "0.4,0,0.3,180,0,5,0"], "multiply them by pi / 180"),
     "too few numbers": (["--state", "0.4,0,0.3"], "3 numbers in the shape (3,)"),
     "limits below zero": (["planning.limits.xyz=[-0.05,0.05,0.05]"], "planning.limits.xyz.0"),
     "a knob of training": (["training.steps=2"], "a setting that planning does not use"),
