@@ -68,8 +68,8 @@ def _add_commands(commands: cli.Commands) -> None:
 def _convert(options: argparse.Namespace) -> None:
     """Write a data set as LeRobot v3.0.
 
-    The tables are Parquet, the videos MP4. Episodes are written whole: states, actions, task, success, and all cameras of data.camera. The videos are H.264,
-    which is lossy; all other values are exact. OUT appears when it is complete.
+    The tables are Parquet, the videos MP4. Episodes are written whole: states, actions, task, success, and all cameras
+    of data.camera. The videos are H.264, which is lossy; all other values are exact. OUT appears when it is complete.
     """
     config = cli.read_config(options.config, options.overrides)
     cli.require_new_place(options.out)
