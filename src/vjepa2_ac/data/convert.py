@@ -70,7 +70,7 @@ def _add(writer: LeRobotWriter, dataset: Dataset, index: int, *, has_success: bo
     recording = next(iter(by_camera.values()))
     columns = {STATE: recording.states.astype(np.float32), ACTION: _actions(recording, dataset)}
     if has_success:
-        columns[SUCCESS] = np.full((len(recording.states), 1), recording.info.success)
+        columns[SUCCESS] = np.full((len(recording.states), 1), dataset.table[index].success)
     frames = {CAMERA + camera: _frames(one) for camera, one in by_camera.items()}
     writer.add(columns, frames, recording.metadata.get("language", ""))
 
