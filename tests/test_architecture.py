@@ -38,7 +38,7 @@ ORDERS: dict[str, list[str]] = {
         "sources",
         "clips",
         "dataset",
-        "loader convert",
+        "loader conversion",
         "coverage",
         "inspection",
     ],

@@ -20,9 +20,9 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.data import dataset as opening
-from vjepa2_ac.data.convert import convert_to_lerobot
+from vjepa2_ac.data.conversion import lerobot_writer
+from vjepa2_ac.data.conversion.convert import convert_to_lerobot
 from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.data.sources.lerobot import writer
 from vjepa2_ac.episode import Episode
 from vjepa2_ac.errors import InputError, UnreachableError
 from vjepa2_ac.init.look import look_at
@@ -176,7 +176,7 @@ def test_the_form_is_that_of_lerobot(droid: Path, tmp_path: Path) -> None:
 
 
 def test_the_table_of_episodes_says_where_each_is(droid: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(writer, "_EPISODES_AT_ONCE", 4)  # written in two parts
+    monkeypatch.setattr(lerobot_writer, "_EPISODES_AT_ONCE", 4)  # written in two parts
     convert_to_lerobot(config_of(droid), tmp_path / "out", SILENT)
     rows = parquet.read_table(tmp_path / "out/meta/episodes/chunk-000/file-000.parquet").to_pylist()
     key = "observation.images.exterior_1_left"
@@ -264,7 +264,7 @@ def test_a_broken_episode_stops_the_conversion_and_nothing_is_left(
 def test_a_broken_episode_is_left_out_where_the_policy_says_so(
     spoiled: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("vjepa2_ac.data.selection.MOST_BROKEN", 0.2)
+    monkeypatch.setattr("vjepa2_ac.data.selection.MOST_BROKEN", 0.2, raising=False)
     config = config_of(damaged(spoiled), camera=list(CAMERAS), broken_episodes="skip")
     assert convert_to_lerobot(config, tmp_path / "out", SILENT) == (5, 75)
     after = read_back(tmp_path / "out", *CAMERAS)
@@ -288,7 +288,7 @@ def test_a_last_episode_whose_second_camera_is_broken_leaves_no_file(
             pictureless = frozenset({2} if camera == "wrist_left" else ())
             return MemorySource.read(replace(self, pictureless=pictureless), index, camera, needed)
 
-    monkeypatch.setattr("vjepa2_ac.data.selection.MOST_BROKEN", 0.5)
+    monkeypatch.setattr("vjepa2_ac.data.selection.MOST_BROKEN", 0.5, raising=False)
     monkeypatch.setattr(opening, "open_source", lambda _: BrokenAtLast([9, 9, 9]))
     config = config_of("x", broken_episodes="skip", camera=list(CAMERAS))
     assert convert_to_lerobot(config, tmp_path / "out", SILENT) == (2, 18)

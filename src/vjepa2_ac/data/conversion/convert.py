@@ -11,9 +11,9 @@ from jaxtyping import Float32, UInt8
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig, IdleConfig
+from vjepa2_ac.data.conversion.lerobot_writer import LeRobotWriter
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.sources.lerobot.info import INFO
-from vjepa2_ac.data.sources.lerobot.writer import LeRobotWriter
 from vjepa2_ac.data.windows import require_frames
 from vjepa2_ac.episode import Episode
 from vjepa2_ac.errors import InputError
