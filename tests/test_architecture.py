@@ -39,7 +39,7 @@ ORDERS: dict[str, list[str]] = {
         "sources",
         "clips",
         "dataset",
-        "loader convert",
+        "loader conversion",
         "coverage",
         "inspection",
     ],

@@ -84,7 +84,7 @@ def test_options_reach_a_class_and_are_checked() -> None:
     for transform, words in (
         ({"name": "offset", "options": {"mots": 2}}, "mots"),
         ({"name": "halve", "options": {"most": 2}}, "no options of its own"),
-        ({"name": "ofset"}, "Did you mean offset"),
+        ({"name": "halved"}, "Did you mean halve"),
         ({"options": {}}, r"transforms.0.name: missing"),
     ):
         with pytest.raises(InputError, match=words):

@@ -79,6 +79,9 @@ def test_default_collation_gives_a_batch() -> None:
     assert torch.equal(explicit.frames, batches[0].frames)
     assert (explicit.episode_ids, explicit.starts) == (batches[0].episode_ids, batches[0].starts)
     assert isinstance(next(iter(DataLoader(clips, batch_size=None))), Clip)
+    moved = explicit.to("meta")
+    assert {one.device.type for one in (moved.frames, moved.states, moved.actions)} == {"meta"}
+    assert moved.starts == explicit.starts
 
 
 @pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")  # Python 3.12 warns of fork beside threads

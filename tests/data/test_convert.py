@@ -1,6 +1,7 @@
 """Any data set becomes a LeRobot data set v3.0, whole or not at all, that reads back with the same values."""
 
 import json
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -16,14 +17,14 @@ from memory_source import MemorySource
 from synthetic import draw_frame, synthetic_states
 from vector_sets import draw_vector, vectors, write_vectors
 from vjepa2_ac import storage
-from vjepa2_ac.config import DataConfig, IdleConfig
+from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.data import dataset as opening
-from vjepa2_ac.data.convert import convert_to_lerobot
+from vjepa2_ac.data.conversion import lerobot_writer
+from vjepa2_ac.data.conversion.convert import convert_to_lerobot
 from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.data.sources.lerobot import writer
 from vjepa2_ac.episode import Episode
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, UnreachableError
 from vjepa2_ac.init.look import look_at
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.spaces import actions_from_states
@@ -175,7 +176,7 @@ def test_the_form_is_that_of_lerobot(droid: Path, tmp_path: Path) -> None:
 
 
 def test_the_table_of_episodes_says_where_each_is(droid: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(writer, "_EPISODES_AT_ONCE", 4)  # written in two parts
+    monkeypatch.setattr(lerobot_writer, "_EPISODES_AT_ONCE", 4)  # written in two parts
     convert_to_lerobot(config_of(droid), tmp_path / "out", SILENT)
     rows = parquet.read_table(tmp_path / "out/meta/episodes/chunk-000/file-000.parquet").to_pylist()
     key = "observation.images.exterior_1_left"
@@ -229,6 +230,8 @@ def test_episodes_are_whole_whatever_is_idle_or_held_out_and_excluded_ones_are_l
     idle = {"rule": "motion", "shortest_kept_steps": 2, "cut_last_steps": 6}
     config = config_of(droid, idle=idle, validation_share=0.5, stride="auto")
     assert convert_to_lerobot(config, tmp_path / "out", SILENT) == (6, 87)
+    never_read = config_of(droid, idle={"rule": "published", "ranges": str(tmp_path / "missing.json")})
+    assert convert_to_lerobot(never_read, tmp_path / "again", SILENT) == (6, 87)
     first = open_dataset(config_of(droid)).table.identity(0)
     left = config_of(droid, idle=idle, exclude=[first], outcome="success")
     assert convert_to_lerobot(left, tmp_path / "less", SILENT) == (3, 13 + 15 + 16)
@@ -261,7 +264,7 @@ def test_a_broken_episode_stops_the_conversion_and_nothing_is_left(
 def test_a_broken_episode_is_left_out_where_the_policy_says_so(
     spoiled: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("vjepa2_ac.data.selection.MOST_BROKEN", 0.2)
+    monkeypatch.setattr("vjepa2_ac.data.selection.MOST_BROKEN", 0.2, raising=False)
     config = config_of(damaged(spoiled), camera=list(CAMERAS), broken_episodes="skip")
     assert convert_to_lerobot(config, tmp_path / "out", SILENT) == (5, 75)
     after = read_back(tmp_path / "out", *CAMERAS)
@@ -277,13 +280,20 @@ def test_a_broken_episode_is_left_out_where_the_policy_says_so(
     )
 
 
-def test_a_last_episode_that_is_broken_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vjepa2_ac.data.selection.MOST_BROKEN", 0.5)
-    source = MemorySource([9, 9, 9], pictureless=frozenset({2}))
-    monkeypatch.setattr(opening, "open_source", lambda _: source)
-    assert convert_to_lerobot(config_of("x", broken_episodes="skip"), tmp_path / "out", SILENT) == (2, 18)
+def test_a_last_episode_whose_second_camera_is_broken_leaves_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class BrokenAtLast(MemorySource):
+        def read(self, index: int, camera: str | None = None, needed: Any = None) -> Episode:
+            pictureless = frozenset({2} if camera == "wrist_left" else ())
+            return MemorySource.read(replace(self, pictureless=pictureless), index, camera, needed)
+
+    monkeypatch.setattr("vjepa2_ac.data.selection.MOST_BROKEN", 0.5, raising=False)
+    monkeypatch.setattr(opening, "open_source", lambda _: BrokenAtLast([9, 9, 9]))
+    config = config_of("x", broken_episodes="skip", camera=list(CAMERAS))
+    assert convert_to_lerobot(config, tmp_path / "out", SILENT) == (2, 18)
     videos = [name for name in files_in(tmp_path / "out") if "videos/" in name]
-    assert [name[-7:-4] for name in videos] == ["000", "001"]
+    assert [name[-7:-4] for name in videos] == ["000", "001"] * 2
 
 
 def test_frames_of_two_sizes_cannot_be_one_feature(tmp_path: Path) -> None:
@@ -363,4 +373,13 @@ def test_frames_are_read_a_few_at_a_time(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(opening, "open_source", lambda _: Watched([100]))
     convert_to_lerobot(config_of("x"), tmp_path / "out", SILENT)
     assert 0 < most <= 32
-    assert IdleConfig().rule == "none"
+
+
+@pytest.mark.parametrize("library", ["pyarrow", "av"])
+def test_without_a_library_nothing_is_written_and_no_episode_is_called_broken(
+    droid: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, library: str
+) -> None:
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(UnreachableError, match=r"is not installed\. .*pip install"):
+        convert_to_lerobot(config_of(droid, broken_episodes="skip"), tmp_path / "out", SILENT)
+    assert not (tmp_path / "out").exists()

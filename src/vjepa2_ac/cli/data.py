@@ -74,7 +74,7 @@ def _convert(options: argparse.Namespace) -> None:
     config = cli.read_config(options.config, options.overrides)
     cli.require_new_place(options.out)
 
-    from vjepa2_ac.data.convert import convert_to_lerobot
+    from vjepa2_ac.data.conversion.convert import convert_to_lerobot
 
     with cli.reporter() as reporter:
         episodes, steps = convert_to_lerobot(config.data, options.out, reporter)

@@ -34,7 +34,7 @@ class ClipRequest:
 
 
 @dataclass(frozen=True)
-class Clips(TorchDataset[Clip]):
+class ClipDataset(TorchDataset[Clip]):
     """The clips of a split by index, for any `torch.utils.data.DataLoader`; see `dataset.Dataset.clips`."""
 
     read: Callable[[int], Clip]

@@ -33,7 +33,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.spaces import Spaces
 
 if TYPE_CHECKING:  # PyTorch is imported when clips are read
-    from vjepa2_ac.data.clips import ClipRequest, Clips
+    from vjepa2_ac.data.clips import ClipDataset, ClipRequest
 
 logger = logging.getLogger(__name__)
 
@@ -82,7 +82,7 @@ class Dataset:
         among = of_outcome(self.table, self.config)
         return np.asarray(self.taking_part & members_of(self.table, self.split_hash, self.config, split, among))
 
-    def clips(self, split: Split = "train") -> Clips:
+    def clips(self, split: Split = "train") -> ClipDataset:
         """Return the clips of a split as a `torch.utils.data.Dataset`.
 
         Clip i is always the same one: clips are sorted by the identity of their episode and then by their first control
@@ -103,10 +103,10 @@ class Dataset:
             >>> loader = torch.utils.data.DataLoader(dataset.clips("train"), batch_size=8, shuffle=True, num_workers=4)
             >>> latents = encode(model, next(iter(loader))).latents
         """
-        from vjepa2_ac.data.clips import Clips
+        from vjepa2_ac.data.clips import ClipDataset
 
         windows = self.windows(split)
-        return Clips(partial(_read_window, self, windows), len(windows), connections_to(self.config))
+        return ClipDataset(partial(_read_window, self, windows), len(windows), connections_to(self.config))
 
     def request(self, window: tuple[int, int]) -> ClipRequest:
         """Return the request for the clip of a window: (episode, first control step); its camera is drawn by a hash."""

@@ -11,9 +11,9 @@ from jaxtyping import Float32, UInt8
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig, IdleConfig
+from vjepa2_ac.data.conversion.lerobot_writer import LeRobotWriter
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.sources.lerobot.info import INFO
-from vjepa2_ac.data.sources.lerobot.writer import LeRobotWriter
 from vjepa2_ac.data.windows import require_frames
 from vjepa2_ac.episode import Episode
 from vjepa2_ac.errors import InputError
@@ -70,7 +70,7 @@ def _add(writer: LeRobotWriter, dataset: Dataset, index: int, *, has_success: bo
     recording = next(iter(by_camera.values()))
     columns = {STATE: recording.states.astype(np.float32), ACTION: _actions(recording, dataset)}
     if has_success:
-        columns[SUCCESS] = np.full((len(recording.states), 1), recording.info.success)
+        columns[SUCCESS] = np.full((len(recording.states), 1), dataset.table[index].success)
     frames = {CAMERA + camera: _frames(one) for camera, one in by_camera.items()}
     writer.add(columns, frames, recording.metadata.get("language", ""))
 

@@ -48,6 +48,7 @@ class LeRobotWriter:
 
     def __init__(self, folder: Path, rate_hz: float, names: Mapping[str, Sequence[str]]) -> None:
         self._folder, self._names, self._form = folder, names, json.loads(_FORM.read_text())
+        self._pa = parquet_library("data convert")
         self._rate_hz = int(rate_hz) if float(rate_hz).is_integer() else rate_hz  # LeRobot's own sets have integers
         self._features: dict[str, Any] = {}
         self._statistics: dict[str, Statistics] = {}
@@ -95,7 +96,7 @@ class LeRobotWriter:
             for path in videos.values():
                 path.unlink(missing_ok=True)
             raise
-        rows = {name: _column(values) for name, values in columns.items()}
+        rows = {name: self._column(values) for name, values in columns.items()}
         self._append(filled(self._form["info"]["data_path"], 0, 0), rows)
         for name, new in statistics.items():
             row |= {f"stats/{name}/{kind}": value.tolist() for kind, value in new.items()}
@@ -149,6 +150,10 @@ class LeRobotWriter:
         shape, names = [height, width, 3], ["height", "width", "channels"]
         return {"dtype": "video", "shape": shape, "names": names, "info": self._form["camera"] | sizes}
 
+    def _column(self, values: Shaped[np.ndarray, "steps numbers"]) -> Any:
+        flat, width = self._pa.array(values.ravel()), values.shape[1]
+        return flat if width == 1 else self._pa.FixedSizeListArray.from_arrays(flat, width)
+
     def _write_rows(self) -> None:
         if rows := self._rows:
             self._append(filled(TABLES["v3.0"], 0, 0), {name: [row[name] for row in rows] for name in rows[0]})
@@ -156,12 +161,11 @@ class LeRobotWriter:
 
     def _append(self, name: str, columns: Mapping[str, Any], about: Mapping[str, str] | None = None) -> None:
         """Write a row group to a Parquet file, which is created with its first one."""
-        pa = parquet_library("data convert")
-        table = pa.table(dict(columns), metadata=about)
+        table = self._pa.table(dict(columns), metadata=about)
         if name not in self._tables:
             path = self._folder / name
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._tables[name] = pa.parquet.ParquetWriter(path, table.schema, write_page_checksum=True)
+            self._tables[name] = self._pa.parquet.ParquetWriter(path, table.schema, write_page_checksum=True)
         self._tables[name].write_table(table)
 
 
@@ -181,12 +185,6 @@ def joined(known: Statistics, new: Statistics) -> Statistics:
     std, count = np.sqrt(variances[0] * (1 - share) + variances[1] * share), known["count"] + new["count"]
     extremes = {"min": np.minimum(known["min"], new["min"]), "max": np.maximum(known["max"], new["max"])}
     return {**extremes, "std": std, "count": count, **averages}
-
-
-def _column(values: Shaped[np.ndarray, "steps numbers"]) -> Any:
-    pa = parquet_library("data convert")
-    flat, width = pa.array(values.ravel()), values.shape[1]
-    return flat if width == 1 else pa.FixedSizeListArray.from_arrays(flat, width)
 
 
 def _place(kind: str, chunk: int, file: int) -> dict[str, Any]:
