@@ -86,8 +86,10 @@ def with_statistics(folder: Path) -> None:
 
 def test_a_far_set_of_which_nothing_tells_the_states_is_said_to_be_not_known(gcs: Gcs, tmp_path: Path) -> None:
     gcs.upload(write_lerobot(tmp_path / "set", RECORDINGS), "bucket/set")
-    found = find_duplicates(open_dataset(config_of("lerobot", "gs://bucket/set", tmp_path)))
+    config = config_of("lerobot", "gs://bucket/set", tmp_path)
+    found = find_duplicates(open_dataset(config))
     assert found == Duplicates(is_known=False)
+    assert {one.about: one.level for one in check_data(config, clips=2)}["duplicates"] == "skipped"
     assert str(found) == "need the states of the episodes; the index of this data set has none"
 
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from vjepa2_ac.config.data import MotionLimits
 from vjepa2_ac.config.sources import RotationFormat
-from vjepa2_ac.data.rotation_formats import FORMATS, rotation_speeds, smoother_format
+from vjepa2_ac.data.rotation_formats import FORMATS, RotationSpeeds, rotation_speeds, smoother_format
 
 MAX_RAD_S = MotionLimits().rotation_rad_s
 RATES_HZ = (1.0, 5.0, 15.0, 30.0)
@@ -110,6 +110,17 @@ def test_speeds_are_those_of_the_rotation_in_each_format() -> None:
     assert at_the_wrap == pytest.approx(1.0)
     assert speeds["rotation_vector"].at_jumps[0] > 5
     assert [one.num_smooth_jumps for one in speeds.values()] == [1, 0, 0]
+
+
+def test_jumps_that_contradict_each_other_decide_nothing() -> None:
+    speeds = {
+        "euler_xyz": RotationSpeeds(1.0, np.array([20.0, 20, 20, 20, 1])),
+        "rotation_vector": RotationSpeeds(1.0, np.array([1.0, 1, 1, 1, 20])),
+    }
+    assert smoother_format(speeds, "euler_xyz", MAX_RAD_S) is None
+    agreeing = {name: RotationSpeeds(1.0, one.at_jumps[:4]) for name, one in speeds.items()}
+    assert smoother_format(agreeing, "euler_xyz", MAX_RAD_S) == "rotation_vector"
+    assert smoother_format(agreeing, "rotation_vector", MAX_RAD_S) is None
 
 
 def test_numbers_too_large_or_too_fast_for_radians_are_degrees() -> None:

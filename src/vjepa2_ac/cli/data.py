@@ -96,7 +96,7 @@ def _converter(options: argparse.Namespace) -> None:
 
 
 def _check(options: argparse.Namespace) -> int:
-    """Check a data set: read some clips as training would, and judge every number.
+    """Check a data set: read clips as training would, judge every number.
 
     Each line begins with ok, warning, error or skipped (the check did not run; the line says what it needs).
 

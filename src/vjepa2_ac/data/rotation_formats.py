@@ -63,7 +63,7 @@ def rotation_speeds(
     Returns:
         By format; those in radians only if no number is too large for radians.
     """
-    numbers = [_without_gaps(one) for one in episodes]
+    numbers = [_without_repetitions(one) for one in episodes]
     numbers = [one for one in numbers if len(one) > 1]
     largest = max((float(abs(one).max()) for one in numbers), default=0.0)
     jumps = [_jumps_in(one) for one in numbers]
@@ -109,9 +109,8 @@ def smoother_format(
     return max(clear, key=lambda other: gains[other], default=None)
 
 
-def _without_gaps(numbers: Float[np.ndarray, "steps 3"]) -> Float[np.ndarray, "changing 3"]:
-    """Return the steps without zeros (padding, dropouts) and repetitions, which hide the speed."""
-    numbers = numbers[numbers.any(axis=1)]
+def _without_repetitions(numbers: Float[np.ndarray, "steps 3"]) -> Float[np.ndarray, "changing 3"]:
+    """Return the steps without those that repeat the previous one, which hide the speed."""
     return numbers[np.append(np.diff(numbers, axis=0).any(axis=1), True)] if len(numbers) else numbers
 
 
