@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from vjepa2_ac.config.loading import yaml_line
+from vjepa2_ac.errors import InputError
 
 GUESSED = "GUESSED: "
 _COLUMN = 34  # of the comments
@@ -100,6 +101,22 @@ def pick_camera(cameras: Sequence[str]) -> str:
     """Return the camera that most resembles what the released weights saw: one that looks on from outside."""
     outside = [name for name in cameras if not _AT_THE_HAND.search(name)]
     return next((name for name in outside if _FROM_OUTSIDE.search(name)), (outside or list(cameras))[0])
+
+
+def camera_knobs(features: Sequence[str], no_cameras: Sequence[str], where: str) -> tuple[Knob, Knob]:
+    """Return the keys `camera` and `cameras` of a config: the camera that is used, and the feature of each camera.
+
+    Raises:
+        InputError: There is no feature with images of a camera.
+    """
+    if not features:
+        found = f"no camera, only depth maps ({', '.join(no_cameras)})" if no_cameras else "no camera"
+        raise InputError(where=where, found=found, needed="videos or images of the robot at each step")
+    names = camera_names(features)
+    why = f"of {', '.join(names.values())}; the released weights were trained on DROID's exterior_1_left"
+    is_guess = len(names) > 1
+    camera = Knob(names[pick_camera(features)], why if is_guess else "", is_guess)
+    return camera, Knob({name: feature for feature, name in names.items()})
 
 
 def camera_names(features: Sequence[str]) -> dict[str, str]:

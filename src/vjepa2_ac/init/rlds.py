@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import prod
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -16,8 +15,8 @@ from vjepa2_ac.data.sources.rlds.episode import Record
 from vjepa2_ac.data.sources.rlds.shards import Shard, dataset_name, find_shards, open_shard
 from vjepa2_ac.data.sources.rlds.tfrecord import HEADER_BYTES, Kind, span_at
 from vjepa2_ac.errors import InputError, MissingFileError, UserError
-from vjepa2_ac.init.found import FoundData, Knob, Knobs, camera_names, idle_rule, is_no_camera, pick_camera
-from vjepa2_ac.init.poses import Column, Samples, find_pose, gripper_knobs, measured_columns, range_in
+from vjepa2_ac.init.found import FoundData, Knob, camera_knobs, idle_rule, is_no_camera
+from vjepa2_ac.init.poses import Column, Samples, find_state, measured_columns
 from vjepa2_ac.storage.structured import read_json_object
 
 DROID = "gs://gresearch/robotics/droid/1.0.1"
@@ -35,7 +34,6 @@ _VELOCITIES = "steps/action_dict/joint_velocity"
 _SAMPLED = 24  # records whose values are looked at
 _ALL_KINDS: tuple[Kind, ...] = ("bytes_list", "float_list", "int64_list")
 _PATHS = frozenset({"file_path", "episode_id", "recording_folderpath"})
-_FLAG = re.compile(r"/(is_|discount|reward)")
 
 
 @dataclass(frozen=True)
@@ -71,27 +69,28 @@ def look_at_rlds(path: str) -> FoundData:
         is_simulated = storage.exists(storage.join(path, _SIMULATION))
         return like_droid(path, episodes, is_simulated=is_simulated)
     images, depth = _cameras(features)
-    if not images:
-        where = storage.join(path, "features.json")
-        found = f"no camera, only depth maps ({', '.join(depth)})" if depth else "no images among its features"
-        raise InputError(where=where, found=found, needed="images of the robot at each step")
+    where = storage.join(path, "features.json")
+    camera, all_cameras = camera_knobs(images, depth, where)
     is_bridge = name in _BRIDGE_NAMES and _BRIDGE_FEATURE in features
     rate = _rate(features, is_bridge=is_bridge)
     has_velocities = _VELOCITIES in features
-    names, texts = camera_names(images), [name for name, one in features.items() if one.kind == "text"]
+    texts = [name for name, one in features.items() if one.kind == "text"]
     columns, texts_of_episode = _columns(features), _identity_features(features)
-    records = _sampled(shards, [*columns, *texts_of_episode])
-    samples = _samples(records, columns)
-    states, fields = _state(path, columns, samples, rate.value, is_bridge=is_bridge)
+    measured = measured_columns(columns)
+    records = _sampled(shards, [*measured, *texts_of_episode])
+    states, fields = find_state(columns, _samples(records, measured), where, control_rate_hz=rate.value)
+    if is_bridge:
+        state, opened = Knob([_BRIDGE_FEATURE], "x, y, z, three angles, the gripper"), Knob(1.0, "BridgeData's")
+        states, fields = "pose", {"state": state, "gripper_open": opened, "gripper_closed": Knob(0.0)}
     return FoundData(
         source="rlds",
         path=path,
         knobs={
-            "camera": Knob(names[pick_camera(images)], f"of {', '.join(names.values())}", is_guess=len(images) > 1),
+            "camera": camera,
             "fields": {
                 **fields,
                 "identity": _identity(records, texts_of_episode),
-                "cameras": Knob({name: feature for feature, name in names.items()}),
+                "cameras": all_cameras,
                 "language": Knob(next((name for name in texts if "instruction" in name), None)),
                 "joint_velocity": Knob(_VELOCITIES if has_velocities else None),
                 "control_rate_hz": rate,
@@ -184,12 +183,11 @@ def _sampled(shards: Sequence[Shard], names: Sequence[str]) -> list[dict[str, tu
 
 def _columns(features: Mapping[str, _Feature]) -> dict[str, Column]:
     """Return the features that are numbers of the robot at each step."""
-    numbers = {
+    return {
         name: Column(one.width)
         for name, one in features.items()
         if name.startswith("steps/") and one.kind == "tensor" and one.dtype.startswith(("float", "int", "bool"))
     }
-    return measured_columns({name: one for name, one in numbers.items() if not _FLAG.search(name)})
 
 
 def _samples(records: Sequence[Mapping[str, tuple[Any, ...]]], columns: Mapping[str, Column]) -> Samples:
@@ -208,24 +206,6 @@ def _identity_features(features: Mapping[str, _Feature]) -> list[str]:
         for name, one in features.items()
         if name.startswith("episode_metadata/") and (one.kind == "text" or one.dtype.startswith(("int", "uint", "str")))
     ]
-
-
-def _state(
-    path: str, columns: Mapping[str, Column], samples: Samples, control_rate_hz: float, *, is_bridge: bool
-) -> tuple[Literal["pose", "vector"], Knobs]:
-    """Return the kind of state, and the keys that read it."""
-    if is_bridge:
-        gripper = {"gripper_open": Knob(1.0, "BridgeData's"), "gripper_closed": Knob(0.0)}
-        return "pose", {"state": Knob([_BRIDGE_FEATURE], "x, y, z, three angles, the gripper"), **gripper}
-    if pose := find_pose(columns, samples, control_rate_hz=control_rate_hz):
-        column, number = pose.gripper
-        return "pose", pose.knobs(gripper_knobs(column.rsplit("/", 1)[-1], range_in(samples, column, number)))
-    if not columns:
-        needed = "numbers of the robot at each step, as float, int or bool"
-        raise InputError(where=storage.join(path, "features.json"), found="no such feature", needed=needed)
-    name = next((name for name in columns if name.endswith("/state")), next(iter(columns)))
-    why = f"{columns[name].width} numbers, of which no pose could be recognised; others: {', '.join(columns)}"
-    return "vector", {"state": Knob([name], why, is_guess=True)}
 
 
 def _identity(records: Sequence[Mapping[str, tuple[Any, ...]]], names: Sequence[str]) -> Knob:
