@@ -25,7 +25,7 @@ def dataset_of(folder: Path, progress: Progress | None = None) -> Dataset:
 def test_without_its_reader_no_episode_is_called_broken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = write_v21(tmp_path / "set", [recorded(0, 20)])
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with pytest.raises(UnreachableError, match="pyarrow, which reads LeRobot data sets, is not installed") as raised:
+    with pytest.raises(UnreachableError, match="pyarrow, which reads and writes LeRobot data sets, is not installed") as raised:
         dataset_of(folder)
     assert "broken" not in str(raised.value)
 
