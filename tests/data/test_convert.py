@@ -261,10 +261,7 @@ def test_a_broken_episode_stops_the_conversion_and_nothing_is_left(
     assert not list((tmp_path / "new").iterdir())
 
 
-def test_a_broken_episode_is_left_out_where_the_policy_says_so(
-    spoiled: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("vjepa2_ac.data.selection.MOST_BROKEN", 0.2, raising=False)
+def test_a_broken_episode_is_left_out_where_the_policy_says_so(spoiled: Callable[..., Path], tmp_path: Path) -> None:
     config = config_of(damaged(spoiled), camera=list(CAMERAS), broken_episodes="skip")
     assert convert_to_lerobot(config, tmp_path / "out", SILENT) == (5, 75)
     after = read_back(tmp_path / "out", *CAMERAS)
@@ -288,7 +285,6 @@ def test_a_last_episode_whose_second_camera_is_broken_leaves_no_file(
             pictureless = frozenset({2} if camera == "wrist_left" else ())
             return MemorySource.read(replace(self, pictureless=pictureless), index, camera, needed)
 
-    monkeypatch.setattr("vjepa2_ac.data.selection.MOST_BROKEN", 0.5, raising=False)
     monkeypatch.setattr(opening, "open_source", lambda _: BrokenAtLast([9, 9, 9]))
     config = config_of("x", broken_episodes="skip", camera=list(CAMERAS))
     assert convert_to_lerobot(config, tmp_path / "out", SILENT) == (2, 18)

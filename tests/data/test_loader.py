@@ -112,7 +112,7 @@ def test_an_error_in_a_worker_is_the_error_the_user_reads(
             take(60, config, copies=copies)
     assert type(caught.value) is InputError
     assert "tfrecord-00000-of-00002: record 0 at byte 0" in caught.value.where
-    assert caught.value.needed == "a JPEG image"
+    assert caught.value.needed == "a JPEG or PNG image"
     exclude = tuple(json.loads(caught.value.fix.split("data.exclude: ")[1]))
     assert len(exclude) == 1
     assert exclude[0] not in {name for name, _ in names(take(60, config.model_copy(update={"exclude": exclude})))}

@@ -158,7 +158,7 @@ def test_check_says_which_splits_are_used(opened: Opened, tmp_path: Path) -> Non
     assert [one.text for one in findings if one.about == "splits"] == [
         "the data set's own: test (4 episodes), train (4 episodes); validation is drawn from train by hash"
     ]
-    (advice,) = [one.text for one in findings if "cannot tell whether" in one.text]
+    (advice,) = [one.text for one in findings if "cannot show whether" in one.text]
     assert advice.endswith("data.splits=hash draws the test split from all episodes")
     single = config.model_copy(update={"path": str(write_rlds_splits(tmp_path / "one", "train")), "test_share": 0.1})
     assert "splits" not in {one.about for one in check_data(single, clips=2)}

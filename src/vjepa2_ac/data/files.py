@@ -37,7 +37,7 @@ class EpisodeFiles:
     """Reads files; what comes from URLs or was parsed is cached on this machine, within `data.disk_cache.limit_gb`."""
 
     def __init__(self, config: DataConfig) -> None:
-        self._cache = fetched_data(config.disk_cache)
+        self.cache = fetched_data(config.disk_cache)
 
     def open(self, path: str, *, version: str) -> str | BlockCachedFile:
         """Return what to open for partial reads: a local path itself, or a file of cached blocks.
@@ -51,8 +51,8 @@ class EpisodeFiles:
         """
         if not storage.is_url(path):
             return path
-        size = self._cached(f"size {path} {version}", lambda: str(storage.file_size(path)).encode())
-        return BlockCachedFile(path, version=version, size=int(size), cache=self._cache)
+        size = self.cache.read_or_make(f"size {path} {version}", lambda: str(storage.file_size(path)).encode())
+        return BlockCachedFile(path, version=version, size=int(size), cache=self.cache)
 
     def read(self, path: str, *, version: str) -> bytes:
         """Return the content of a file.
@@ -62,33 +62,19 @@ class EpisodeFiles:
         """
         with storage.user_can_read(path, fix="Copy the episode again"):
             if storage.is_url(path):
-                return self._cached(f"{path}@{version}", lambda: storage.read_bytes(path))
+                return self.cache.read_or_make(f"{path}@{version}", lambda: storage.read_bytes(path))
             return storage.read_bytes(path)
 
     def arrays(self, key: str) -> dict[str, np.ndarray] | None:
         """Return the arrays that were kept under a key; None if there are none, or they are damaged."""
-        data = self._cache.read(key)
+        data = self.cache.read(key)
         with suppress(InputError):
             return None if data is None else read_arrays(data)
         return None
 
     def keep(self, key: str, arrays: Mapping[str, np.ndarray]) -> None:
         """Keep what was parsed of an episode."""
-        self._cache.write(key, arrays_as_bytes(arrays))
-
-    def parts(self, key: str, count: int, numbers: Sequence[int]) -> list[bytes] | None:
-        """Return some of the `count` parts that were kept under a key, reading no others; None if there are none."""
-        return self._cache.read_parts(key, count, numbers)
-
-    def keep_parts(self, key: str, parts: Sequence[bytes]) -> None:
-        """Keep a list of parts, such as the images of an episode."""
-        self._cache.write_parts(key, parts)
-
-    def _cached(self, key: str, fetch: Callable[[], bytes]) -> bytes:
-        data = self._cache.read(key)
-        if data is None:
-            self._cache.write(key, data := fetch())
-        return data
+        self.cache.write(key, arrays_as_bytes(arrays))
 
 
 def connections_to(config: DataConfig) -> int:
@@ -124,7 +110,7 @@ def walk(root: str, connections: int) -> Iterator[tuple[str, FileInfo]]:
         listed = in_parallel(lambda folder: list_folder(root, folder), folders, connections)
         for folder, (files, names) in zip(folders, listed, strict=True):
             yield from ((folder, file) for file in files if not file.name.startswith("."))
-            below += [within(folder, name) for name in names]
+            below += [storage.join(folder, name) for name in names]
         places = {storage.absolute(storage.join(root, folder)): folder for folder in reversed(below)}
         folders = sorted(folder for place, folder in places.items() if place not in known)
         known |= places.keys()
@@ -137,15 +123,10 @@ def list_folder(root: str, folder: str) -> tuple[list[FileInfo], list[str]]:
         OSError: It cannot be listed.
         InputError: A name is not UTF-8.
     """
-    place = storage.join(root, folder) if folder else root
+    place = storage.join(root, folder)
     listed = storage.list_folder(place)
     for one in listed:  # the identity of an episode must be text that can be encoded
         if not one.name.isascii() and any("\ud800" <= letter <= "\udfff" for letter in one.name):
             raise InputError(where=place, found=f"the name {one.name!r}", needed="names in UTF-8", fix="Rename it")
     folders = [one.name for one in listed if not one.is_file and not one.name.startswith(".")]
     return [one for one in listed if one.is_file], folders
-
-
-def within(folder: str, name: str) -> str:
-    """Return the path of an entry of a folder, with the same base as the folder's path."""
-    return f"{folder}/{name}" if folder else name

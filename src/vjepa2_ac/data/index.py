@@ -150,6 +150,10 @@ class EpisodeTable(Sequence[EpisodeInfo]):
         """Return the identity of one episode."""
         return bytes(self.ids[index]).decode(errors="replace")
 
+    def label(self, name: str, index: int) -> str | None:
+        """Return a label of one episode, such as its task; None: it has none."""
+        return self.labels[name].of_episode(index) if name in self.labels else None
+
     def find(self, identity: str) -> int | None:
         """Return the index of an episode, or None if the identity is unknown."""
         for index in np.flatnonzero(self.id_hash == np.uint64(identity_hash(identity))):

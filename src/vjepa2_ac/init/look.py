@@ -14,7 +14,7 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.loading import admit_forms_of_data, parse_config
-from vjepa2_ac.data.files import in_parallel, walk, within
+from vjepa2_ac.data.files import in_parallel, walk
 from vjepa2_ac.data.index import EpisodeTable
 from vjepa2_ac.data.sources.droid_raw.source import find_episodes
 from vjepa2_ac.data.sources.indexed_source import open_source
@@ -38,7 +38,8 @@ def look_at_npz(path: str) -> FoundData:
     Raises:
         InputError: There are none, or the first has no states, no rate or no frames.
     """
-    files = sorted(within(folder, file.name) for folder, file in walk(path, _CONNECTIONS) if file.name.endswith(".npz"))
+    listed = [storage.join(folder, file.name) for folder, file in walk(path, _CONNECTIONS)]
+    files = sorted(name for name in listed if name.endswith(".npz"))
     if not files:
         raise InputError(where=path, found="no .npz files", needed="one for each episode", fix=FORMAT_HELP)
     where = storage.join(path, files[0])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import struct
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -115,16 +115,37 @@ def decode_images(
     """
     if not any(image.startswith(_PNG) for image in images):
         return decode_jpegs(images, steps, where)
-    frames: list[UInt8[np.ndarray, "height width 3"]] = []
-    for image, step in zip(images, steps, strict=True):
+
+    def decode(image: bytes, step: int) -> UInt8[np.ndarray, "height width 3"]:
+        if image.startswith(_PNG):
+            return decode_image(image, f"{where}: step {step}")
+        return decode_jpegs([image], [step], where)[0]
+
+    return stack_frames(map(decode, images, steps), steps, where)
+
+
+def stack_frames(
+    frames: Iterable[UInt8[np.ndarray, "height width 3"]], steps: Sequence[int], where: str
+) -> UInt8[np.ndarray, "time height width 3"]:
+    """Return frames, which are decoded one after another, as one array.
+
+    Args:
+        frames: One or more, all of one size.
+        steps: Control step of each, for messages.
+        where: File, episode and camera, for messages.
+
+    Raises:
+        InputError: A frame has another size than the first, or the frames are too large together.
+    """
+    stacked: list[UInt8[np.ndarray, "height width 3"]] = []
+    for frame, step in zip(frames, steps, strict=True):
         at = f"{where}: step {step}"
-        frame = decode_image(image, at) if image.startswith(_PNG) else decode_jpegs([image], [step], where)[0]
-        require_bounded(frame.shape[0], frame.shape[1], at, count=len(images))
-        if frames and frame.shape != frames[0].shape:
-            found, needed = (f"an image of {one.shape[0]}x{one.shape[1]}" for one in (frame, frames[0]))
+        require_bounded(frame.shape[0], frame.shape[1], at, count=len(steps))
+        if stacked and frame.shape != stacked[0].shape:
+            found, needed = (f"an image of {one.shape[0]}x{one.shape[1]}" for one in (frame, stacked[0]))
             raise InputError(where=at, found=found, needed=f"{needed}, as at step {steps[0]}")
-        frames.append(frame)
-    return np.stack(frames)
+        stacked.append(frame)
+    return np.stack(stacked)
 
 
 def _size_of(image: bytes, step: int, where: str) -> tuple[int, int]:

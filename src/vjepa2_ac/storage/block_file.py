@@ -169,6 +169,14 @@ class DiskCache:
                 logger.warning("%s: cannot be used (%s); its data are fetched again", self._folder, error.strerror)
             self._warned = True
 
+    def read_or_make(self, key: str, make: Callable[[], bytes]) -> bytes:
+        """Return the entry of a key; make and store it if there is none."""
+        data = self.read(key)
+        if data is None:
+            data = make()
+            self.write(key, data)
+        return data
+
     def write_parts(self, key: str, parts: Sequence[bytes]) -> None:
         """Store a list of parts under a key, as `write` does; `read_parts` returns some of them."""
         starts = accumulate(map(len, parts), initial=len(parts) * _PART.size)
@@ -278,17 +286,9 @@ def cached_ranges(url: str, ranges: Sequence[tuple[int, int]], *, key: str, cach
     """
     found = {one: cache.read(f"{key} {one}") or b"" for one in ranges}
     lacking = sorted(one for one, data in found.items() if len(data) != one[1])
-    runs = list[list[tuple[int, int]]]()
-    for start, length in lacking:
-        if runs and sum(runs[-1][-1]) == start:
-            runs[-1].append((start, length))
-        else:
-            runs.append([(start, length)])
-    fetched = remote.read_ranges(url, [(run[0][0], sum(run[-1]) - run[0][0]) for run in runs])
-    for run, data in zip(runs, fetched, strict=True):
-        for start, length in run:
-            found[start, length] = data[start - run[0][0] :][:length]
-            cache.write(f"{key} {(start, length)}", found[start, length])
+    for one, data in zip(lacking, remote.read_neighbours(url, lacking), strict=True):
+        found[one] = data
+        cache.write(f"{key} {one}", data)
     return [found[one] for one in ranges]
 
 

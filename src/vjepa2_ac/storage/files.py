@@ -49,7 +49,9 @@ ByteReader = RangedFile | io.BufferedIOBase
 
 
 def join(folder: str | Path, name: str) -> str:
-    """Return the path of a file in a folder."""
+    """Return the path of a file in a folder; of the folder itself if the name is empty."""
+    if not name:
+        return str(folder)
     return f"{str(folder).rstrip('/')}/{name}" if is_url(folder) else str(Path(folder) / name)
 
 

@@ -181,6 +181,25 @@ def read_ranges(url: str, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
     return pieces
 
 
+def read_neighbours(url: str, ranges: Sequence[tuple[int, int]], gap_bytes: int = 0) -> list[bytes]:
+    """Return several (start, length) pieces as `read_ranges`; those at most `gap_bytes` apart are fetched together.
+
+    Args:
+        url: The file.
+        ranges: Ascending.
+        gap_bytes: Such a gap is fetched, too.
+    """
+    runs: list[list[tuple[int, int]]] = []
+    for start, length in ranges:
+        if runs and start - sum(runs[-1][-1]) <= gap_bytes:
+            runs[-1].append((start, length))
+        else:
+            runs.append([(start, length)])
+    fetched = read_ranges(url, [(run[0][0], sum(run[-1]) - run[0][0]) for run in runs])
+    pieces = zip(runs, fetched, strict=True)
+    return [data[start - run[0][0] :][:length] for run, data in pieces for start, length in run]
+
+
 def _concurrently(url: str, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
     if len(ranges) < 2 or any(length > _PIECE_BYTES for _, length in ranges):
         return [read_range(url, start, length) for start, length in ranges]

@@ -35,7 +35,7 @@ from recordings import write_mp4
 from synthetic import synthetic_states
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.data.inspection.check import _video_rates
+from vjepa2_ac.data.inspection.check import _check_video_rates
 from vjepa2_ac.data.sources.lerobot.parquet import ParquetRows
 from vjepa2_ac.data.sources.lerobot.source import LeRobotSource
 from vjepa2_ac.episode import Episode, EpisodeSource
@@ -247,11 +247,11 @@ def test_a_video_three_times_as_dense_as_the_steps_gives_the_frame_of_each_step(
         assert [numbers_of(frame) for frame in episode.read_frames(range(12))] == expected
         assert [numbers_of(episode.read_frames([step])[0]) for step in range(12)] == expected
         config = config_of(root, validation_share=0.3, test_share=0.3, frames=2, stride=1)
-        findings = [f"{one.level} {one.about}: {one.text}" for one in _video_rates(open_dataset(config))]
+        findings = [f"{one.level} {one.about}: {one.text}" for one in _check_video_rates(open_dataset(config))]
         rates = "exterior_1_left: videos have 15 frames a second, steps 5"
         assert findings == [f"ok video rate: {rates}; a step has the frame nearest in time"]
     root = write_v30(tmp_path / "same rate", episodes)
-    assert not [*_video_rates(open_dataset(config_of(root, validation_share=0.3, frames=2)))]
+    assert not [*_check_video_rates(open_dataset(config_of(root, validation_share=0.3, frames=2)))]
 
 
 def test_a_frame_in_the_table_that_is_none_is_named(episodes: list[Recorded], tmp_path: Path) -> None:

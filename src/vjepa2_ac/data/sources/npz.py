@@ -36,7 +36,7 @@ from jaxtyping import Float64, UInt8
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.files import walk, within
+from vjepa2_ac.data.files import walk
 from vjepa2_ac.data.index import EpisodeTable, get_or_build, hash_of_states, index_key
 from vjepa2_ac.data.sources.indexed_source import (
     FramesByStep,
@@ -127,7 +127,7 @@ class NpzSource(IndexedSource[DataConfig, None]):
         """Return the cached table, or read every episode; a changed file changes the key."""
         config, root = self._config, self._config.path
         listed = sorted(
-            (within(folder, file.name), file.size, file.version)
+            (storage.join(folder, file.name), file.size, file.version)
             for folder, file in walk(root, config.connections)
             if file.name.endswith(_SUFFIX)
         )

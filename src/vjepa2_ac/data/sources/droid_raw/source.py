@@ -19,7 +19,7 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import RawDroidData
 from vjepa2_ac.config.section import Affects, knobs_that_affect
 from vjepa2_ac.config.sources import RAW_CAMERAS
-from vjepa2_ac.data.files import DEEPEST, in_parallel, list_folder, within
+from vjepa2_ac.data.files import DEEPEST, in_parallel, list_folder
 from vjepa2_ac.data.index import EpisodeTable, get_or_build, hash_of_states, index_key, key_of
 from vjepa2_ac.data.sources.indexed_source import FramesByStep, IndexedSource, Scanned, require_as_indexed
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
@@ -82,8 +82,7 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
         states = _states_of(numbers)
         require_as_indexed(len(states), info, self._path(place.folder, TRAJECTORY))
         video = self._path(place.folder, f"{VIDEOS}/{serial}.mp4")
-        tasks = table.labels.get("task")
-        task = None if tasks is None else tasks.of_episode(index)
+        task = table.label("task", index)
         frames = partial(self._frames, video, place.version, numbers["frame"].tolist())
         return Episode(
             info=info,
@@ -196,8 +195,7 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
         return numbers
 
     def _path(self, folder: str, name: str) -> str:
-        path = storage.join(self._config.path, folder) if folder else self._config.path
-        return storage.join(path, name) if name else path
+        return storage.join(storage.join(self._config.path, folder), name)
 
 
 def parse_trajectory(data: bytes, where: str, serials: Sequence[str]) -> dict[str, Float[np.ndarray, "steps _"]]:
@@ -320,7 +318,7 @@ def list_episode(root: str, folder: str) -> EpisodeFolder:
     Raises:
         OSError: A folder cannot be listed.
     """
-    path = storage.join(root, folder) if folder else root
+    path = storage.join(root, folder)
     videos = storage.list_files(storage.join(path, VIDEOS))
     return EpisodeFolder(folder, tuple(storage.list_files(path)), tuple(videos))
 
@@ -346,7 +344,7 @@ def _children(root: str, folder: str) -> list[tuple[str, bool]]:
 
     In DROID's own layout the depth shows that, without listing every episode.
     """
-    children = [within(folder, name) for name in list_folder(root, folder)[1]]
+    children = [storage.join(folder, name) for name in list_folder(root, folder)[1]]
     return [(path, success_of(identity_of(root, path)) is not None or _is_episode(root, path)) for path in children]
 
 
@@ -355,7 +353,7 @@ def _ends_as_in_droid(parts: Sequence[str]) -> bool:
 
 
 def _is_episode(root: str, folder: str) -> bool:
-    names = storage.list_names(storage.join(root, folder) if folder else root)
+    names = storage.list_names(storage.join(root, folder))
     return any(name == TRAJECTORY or _is_metadata(name) for name in names)
 
 

@@ -32,7 +32,7 @@ from vjepa2_ac.data.sources.lerobot.parquet import EPISODE, Columns, ParquetRows
 from vjepa2_ac.data.splits import with_own_splits
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.images import decode_image, require_bounded
+from vjepa2_ac.media.images import decode_image, stack_frames
 from vjepa2_ac.media.video import Clock, read_frames, read_header, video_library
 from vjepa2_ac.spaces import require_finite
 from vjepa2_ac.storage.block_file import BlockCachedFile
@@ -68,8 +68,7 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
         table = self.infos()
         info, row = table[index], row_of(table, index)
         content, _ = self._content(row)
-        tasks = table.labels.get("task")
-        task = None if tasks is None else tasks.of_episode(index)
+        task = table.label("task", index)
         key = self._info.camera_key(self._config.lerobot, camera or self._config.cameras[0])
         return Episode(
             info=info,
@@ -183,18 +182,12 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
             return FramesByStep(row.length, f"{self._where(row)}: {key}", read)
         path, start_s = storage.join(info.root, row.video_file(info, key)), row.place[f"{key}.start_s"]
         clock, where = Clock(start_s=start_s, rate_hz=info.fps, source=info.where), f"{path}: {row.id}"
-        rates_hz = partial(self._rates_hz, path, clock, where)
-        return FramesByStep(row.length, where, partial(self._video_frames, path, clock, where), rates_hz)
-
-    def _video_frames(
-        self, path: str, clock: Clock, where: str, steps: Sequence[int]
-    ) -> UInt8[np.ndarray, "time height width 3"]:
-        """Return frames of an episode's part of a video: step k is shown at the part's start + k / fps."""
-        return read_frames(self._open_file(path), steps, where=where, clock=clock)
-
-    def _rates_hz(self, path: str, clock: Clock, where: str) -> tuple[float, float]:
-        """Return the frames of a video and its steps per second."""
-        return read_header(self._open_file(path), where=where).rate_hz, clock.rate_hz
+        return FramesByStep(
+            row.length,
+            where,
+            decode=lambda steps: read_frames(self._open_file(path), steps, where=where, clock=clock),
+            rates_hz=lambda: (read_header(self._open_file(path), where=where).rate_hz, info.fps),
+        )
 
     def _stored_frames(
         self, row: EpisodeRow, key: str, read_all: Callable[[], list[bytes]], steps: Sequence[int]
@@ -205,33 +198,20 @@ class LeRobotSource(IndexedSource[LeRobotData, DatasetInfo]):
         data set larger than the disk cache is not kept: each clip would write an episode and evict another.
         """
         where, entry = f"{self._where(row)}: {key}", f"images {self._data_version} {key} {row.id}"
-        images = self._files.parts(entry, row.length, steps)
+        images = self._files.cache.read_parts(entry, row.length, steps)
         if images is None:
             all_images = read_all()
             if len(all_images) != row.length:
                 found, needed = f"{len(all_images)} images", f"one for each of {row.length} steps"
                 raise InputError(where=where, found=found, needed=needed)
             if int(self.infos().texts[_DATA_BYTES]) <= self._config.disk_cache.limit_gb * 1e9:
-                self._files.keep_parts(entry, all_images)
+                self._files.cache.write_parts(entry, all_images)
             images = [all_images[step] for step in steps]
-        return _decoded(images, steps, where)
+        frames = (decode_image(image, f"{where}: step {step}") for image, step in zip(images, steps, strict=True))
+        return stack_frames(frames, steps, where)
 
     def _where(self, row: EpisodeRow) -> str:
         return f"{storage.join(self._info.root, row.data_file(self._info))}: {row.id}"
-
-
-def _decoded(images: Sequence[bytes], steps: Sequence[int], where: str) -> UInt8[np.ndarray, "time height width 3"]:
-    """Return the images of some steps as frames of one size."""
-    frames: list[UInt8[np.ndarray, "height width 3"]] = []
-    for image, step in zip(images, steps, strict=True):
-        at = f"{where}: step {step}"
-        frame = decode_image(image, at)
-        require_bounded(frame.shape[0], frame.shape[1], at, count=len(steps))
-        if frames and frame.shape != frames[0].shape:
-            found, needed = (f"an image of {one.shape[0]}x{one.shape[1]}" for one in (frame, frames[0]))
-            raise InputError(where=at, found=found, needed=f"{needed}, as at step {steps[0]}")
-        frames.append(frame)
-    return np.stack(frames)
 
 
 def wanted_columns(config: LeRobotData) -> list[str]:

@@ -32,6 +32,7 @@ from vjepa2_ac.data.splits import with_own_splits
 from vjepa2_ac.episode import Episode, Progress, StepRanges
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.images import decode_images
+from vjepa2_ac.storage.remote import read_neighbours
 
 _CHECKED = b"\xc3"  # not all bits equal, so that a damaged file seldom contains false marks
 _GROUP_STEPS = 32  # images of so many steps are one entry of the cache
@@ -166,10 +167,7 @@ class RemoteEpisode:
         places = [located[name] for name in names if name in located]
         key = f"{self._key} {' '.join(names)}"
         with storage.user_can_read(self._shard.path, needed=NEEDED):
-            data = self._contents.read(key)
-            if data is None:
-                data = b"".join(storage.read_ranges(self._shard.path, places))
-                self._contents.write(key, data)
+            data = self._contents.read_or_make(key, lambda: b"".join(storage.read_ranges(self._shard.path, places)))
         pieces, position = {}, 0
         for offset, length in places:
             pieces[offset] = _Piece(offset, data[position : position + length])
@@ -201,13 +199,12 @@ class RemoteEpisode:
         return FramesByStep(num_steps, where, decode)
 
     def _located(self) -> dict[str, Place]:
-        cached = self._places.read(self._key)
-        if cached is not None:
-            return {name: tuple(place) for name, place in json.loads(cached).items()}
-        with open_shard(self._shard) as read:
-            located = Record(read, self._span).located
-        self._places.write(self._key, json.dumps(located).encode())
-        return located
+        def locate() -> bytes:
+            with open_shard(self._shard) as read:
+                return json.dumps(Record(read, self._span).located).encode()
+
+        located = json.loads(self._places.read_or_make(self._key, locate))
+        return {name: tuple(place) for name, place in located.items()}
 
     def _fetch_all(
         self, key: str, feature: Place, num_steps: int, needed: StepRanges | None, where: str
@@ -221,7 +218,8 @@ class RemoteEpisode:
         steps = {step for first, stop in needed or [(0, num_steps)] for step in range(max(0, first), stop)}
         for group in sorted({step // _GROUP_STEPS for step in steps if step < num_steps}):
             members = places[group * _GROUP_STEPS : (group + 1) * _GROUP_STEPS]
-            self._contents.write(f"{key} {group}", piece(*_range_of(members)))
+            start = members[0][0]
+            self._contents.write(f"{key} {group}", piece(start, sum(members[-1]) - start))
         return {step: piece(*place) for step, place in enumerate(places)}
 
     def _some(self, key: str, places: list[Place], steps: Sequence[int]) -> dict[int, bytes]:
@@ -232,16 +230,9 @@ class RemoteEpisode:
             if cached is not None:
                 piece = _Piece(places[group * _GROUP_STEPS][0], cached)
                 found |= {step: piece(*places[step]) for step in steps if step // _GROUP_STEPS == group}
-        runs: list[list[int]] = []
-        for step in sorted(set(steps) - found.keys()):
-            if runs and places[step][0] - sum(places[runs[-1][-1]]) <= _GAP_BYTES:
-                runs[-1].append(step)
-            else:
-                runs.append([step])
-        ranges = [_range_of([places[step] for step in run]) for run in runs]
-        for run, (start, _), data in zip(runs, ranges, storage.read_ranges(self._shard.path, ranges), strict=True):
-            found |= {step: _Piece(start, data)(*places[step]) for step in run}
-        return found
+        lacking = sorted(set(steps) - found.keys())
+        images = read_neighbours(self._shard.path, [places[step] for step in lacking], _GAP_BYTES)
+        return found | dict(zip(lacking, images, strict=True))
 
 
 def _places_of(read: Read, feature: Place, num_steps: int, where: str) -> list[Place]:
@@ -259,8 +250,3 @@ def _places_of(read: Read, feature: Place, num_steps: int, where: str) -> list[P
         needed = f"one for each of the {num_steps} steps"
         raise InputError(where=where, found=found, needed=needed)
     return places
-
-
-def _range_of(places: Sequence[Place]) -> Place:
-    """Return the position from the start of the first place to the end of the last."""
-    return places[0][0], sum(places[-1]) - places[0][0]
