@@ -119,7 +119,8 @@ def decode_images(
     def decode(image: bytes, step: int) -> UInt8[np.ndarray, "height width 3"]:
         if image.startswith(_PNG):
             return decode_image(image, f"{where}: step {step}")
-        return decode_jpegs([image], [step], where)[0]
+        (frame,) = decode_jpegs([image], [step], where)
+        return np.asarray(frame)
 
     return stack_frames(map(decode, images, steps), steps, where)
 
