@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -170,10 +169,8 @@ class Draft:
         return None if self.step_hours is None else duration(self.encoding_hours + steps * self.step_hours)
 
 
-def make_draft(
-    found: FoundData, machine: Machine, model: ModelChoice, *, run_dir: str, own_splits: Collection[Split] = ()
-) -> Draft:
-    """Return the config for a data set on a machine; without shares for splits that the data set has itself.
+def make_draft(found: FoundData, machine: Machine, model: ModelChoice, *, run_dir: str) -> Draft:
+    """Return the config for a data set on a machine.
 
     Raises:
         InputError: The values found do not make a config.
@@ -183,7 +180,7 @@ def make_draft(
     knobs: Knobs = {
         "run_dir": Knob(run_dir),
         "seed": Knob(0),
-        "data": _data(found, machine, model, own_splits),
+        "data": _data(found, machine, model),
         "model": _model(model, machine),
         "adapter": _adapter(model, found),
         "training": training,
@@ -252,11 +249,10 @@ def _fit(config: Config, machine: Machine) -> tuple[int, bool, int]:
     return batch, True, needed(batch, True)
 
 
-def _data(found: FoundData, machine: Machine, model: ModelChoice, own_splits: Collection[Split]) -> Knobs:
+def _data(found: FoundData, machine: Machine, model: ModelChoice) -> Knobs:
     """Return the section of the data."""
     stride = max(1, round(found.rate_hz.value * _MODEL_STEP_S))
     frames, why_frames = _frames(found, model, stride)
-    shares = {split: knob for split, knob in _shares(found).items() if split not in own_splits}
     size = (found.steps or math.inf) * model.bytes_a_frame
     is_cached = size <= machine.free_bytes * _CACHE_SHARE
     why_cached = f"each frame is encoded once: {_gigabytes(size)} GB at most; training then needs no encoder"
@@ -269,7 +265,7 @@ def _data(found: FoundData, machine: Machine, model: ModelChoice, own_splits: Co
         **found.knobs,
         "frames": Knob(frames, why_frames),
         "stride": Knob(stride, _why_stride(found, model, stride), found.rate_hz.is_guess),
-        **{f"{split}_share": knob for split, knob in shares.items()},
+        **{f"{split}_share": knob for split, knob in _shares(found).items() if split not in found.own_splits},
         **({"idle": found.idle} if found.idle and (found.usual_steps or _SHORT) >= _SHORT else {}),
         **({"cache": Knob("auto", why_cached)} if is_cached else {}),
         "workers": Knob(workers, f"of {machine.cores} cores"),

@@ -16,7 +16,7 @@ from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, filled, list_by_tem
 from vjepa2_ac.data.sources.lerobot.parquet import ParquetRows
 from vjepa2_ac.errors import UserError
 from vjepa2_ac.init.found import FoundData, Knob, camera_knobs, idle_rule, is_no_camera
-from vjepa2_ac.init.poses import Column, Range, Samples, find_state, measured_columns
+from vjepa2_ac.init.poses import Column, Range, Samples, find_pose, measured_columns, vector_state
 from vjepa2_ac.storage.structured import json_object
 
 _STATISTICS = ("meta/stats.json", "meta/episodes_stats.jsonl")
@@ -43,10 +43,9 @@ def look_at_lerobot(path: str) -> FoundData:
         if one.is_numbers and name not in _OURS
     }
     samples = _sampled(info, measured_columns(columns))
-    range_of = partial(_range_of, path)
-    states, fields = find_state(columns, samples, info.where, control_rate_hz=info.fps, range_of=range_of)
-    if states == "pose" and _DROID_GRIPPER in fields["state"].value and info.features.keys() >= _OF_DROID:
-        fields |= {"gripper_open": Knob(0.0, "DROID's"), "gripper_closed": Knob(1.0)}
+    pose = find_pose(columns, samples, control_rate_hz=info.fps, range_of=partial(_range_of, path))
+    if pose and _DROID_GRIPPER in pose["state"].value and info.features.keys() >= _OF_DROID:
+        pose |= {"gripper_open": Knob(0.0, "DROID's"), "gripper_closed": Knob(1.0)}
     velocity = next((name for name in columns if "joint_vel" in name and name.startswith("action")), None)
     success = next((name for name in info.features if "success" in name), None)
     return FoundData(
@@ -55,17 +54,17 @@ def look_at_lerobot(path: str) -> FoundData:
         knobs={
             "camera": camera,
             "lerobot": {
-                **fields,
+                **(pose or vector_state(columns, info.where)),
                 "cameras": all_cameras,
                 "joint_velocity": Knob(velocity),
                 "success": Knob(success),
             },
         },
         rate_hz=Knob(info.fps, "of meta/info.json"),
-        states=states,
+        states="pose" if pose else "vector",
         episodes=info.episodes,
         steps=info.frames,
-        idle=idle_rule(has_velocities=velocity is not None) if states == "pose" else None,
+        idle=idle_rule(has_velocities=velocity is not None) if pose else None,
         about=(f"LeRobot {info.version}, {info.episodes:,} episodes at {info.fps:g} a second",)
         + ((f"depth maps are not used: {', '.join(depth)}",) if depth else ()),
     )

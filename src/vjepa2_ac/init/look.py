@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -12,7 +11,6 @@ import numpy as np
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.loading import admit_forms_of_data, parse_config
 from vjepa2_ac.data.files import in_parallel, walk, within
 from vjepa2_ac.data.index import EpisodeTable
@@ -235,36 +233,28 @@ def _names_below(path: str) -> list[str]:
 
 
 def measured(found: FoundData, progress: Progress | None = None) -> FoundData:
-    """Return what was found with the numbers of the index; unchanged behind a URL, or where it cannot be built.
+    """Return what was found with the numbers of the index; unchanged behind a URL, or if it cannot be built.
 
-    Why it cannot, the check of the data says.
+    `data check` explains why the index cannot be built.
     """
-    if (indexed := _indexed(found, progress)) is None:
+    data = {"source": found.source, "path": found.path, "states": found.states, **plain(found.knobs)}
+    values = {"run_dir": "none", "data": data, "model": {"base": f"{BUILTIN}sim-tiny"}}
+    if storage.is_url(found.path):
         return found
-    lengths, splits = indexed[0].num_steps, describe_splits(*indexed)
+    try:
+        config = parse_config(values, where="vjepa2-ac init").data
+        table = EpisodeTable.of(open_source(config).infos(progress))
+    except UserError:
+        return found
+    if not len(table):
+        return found
+    lengths, splits = table.num_steps, describe_splits(table, config)
     return replace(
         found,
         episodes=len(lengths),
         steps=int(lengths.sum()),
         usual_steps=int(np.median(lengths)),
         short_steps=int(np.quantile(lengths, 0.1)),
-        about=(*found.about, *[f"splits: {splits}"] * bool(splits)),
+        own_splits=tuple(held_out_by(table, config)),
+        about=(*found.about, f"splits: {splits}") if splits else found.about,
     )
-
-
-def own_splits(found: FoundData) -> tuple[Split, ...]:
-    """Return which of validation and test the data set has itself, as far as `measured` reads it."""
-    indexed = _indexed(found, None)
-    return () if indexed is None else tuple(held_out_by(*indexed))
-
-
-def _indexed(found: FoundData, progress: Progress | None) -> tuple[EpisodeTable, DataConfig] | None:
-    """Return the episodes of what was found, and the config that reads them; None: behind a URL, or unreadable."""
-    data = {"source": found.source, "path": found.path, "states": found.states, **plain(found.knobs)}
-    values = {"run_dir": "none", "data": data, "model": {"base": f"{BUILTIN}sim-tiny"}}
-    with contextlib.suppress(UserError):
-        if not storage.is_url(found.path):
-            config = parse_config(values, where="vjepa2-ac init").data
-            table = EpisodeTable.of(open_source(config).infos(progress))
-            return (table, config) if len(table) else None
-    return None

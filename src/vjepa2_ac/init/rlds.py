@@ -16,7 +16,7 @@ from vjepa2_ac.data.sources.rlds.shards import Shard, dataset_name, find_shards,
 from vjepa2_ac.data.sources.rlds.tfrecord import HEADER_BYTES, Kind, span_at
 from vjepa2_ac.errors import InputError, MissingFileError, UserError
 from vjepa2_ac.init.found import FoundData, Knob, camera_knobs, idle_rule, is_no_camera
-from vjepa2_ac.init.poses import Column, Samples, find_state, measured_columns
+from vjepa2_ac.init.poses import Column, Samples, find_pose, measured_columns, vector_state
 from vjepa2_ac.storage.structured import read_json_object
 
 DROID = "gs://gresearch/robotics/droid/1.0.1"
@@ -26,6 +26,11 @@ _DROID_CAMERA, _SEEN = "exterior_1_left", "what the released weights saw"
 _DROID_FEATURE, _BRIDGE_FEATURE = "steps/observation/exterior_image_1_left", "steps/observation/state"
 _DROID_NAMES = frozenset({"droid", "droid_100", "droid_101", "r2d2_faceblur"})  # as the sets call themselves
 _BRIDGE_NAMES = frozenset({"bridge", "bridge_dataset", "bridge_orig"})
+_BRIDGE_POSE = {
+    "state": Knob([_BRIDGE_FEATURE], "x, y, z, three angles, the gripper"),
+    "gripper_open": Knob(1.0, "BridgeData's"),
+    "gripper_closed": Knob(0.0),
+}
 _DROID_RATE_HZ, _BRIDGE_RATE_HZ, _UNKNOWN_RATE_HZ = 15.0, 5.0, 10.0
 _SIMULATION = "simulation.json"  # beside the shards of `vjepa2-ac simulate record`
 _VELOCITIES = "steps/action_dict/joint_velocity"
@@ -78,17 +83,14 @@ def look_at_rlds(path: str) -> FoundData:
     columns, texts_of_episode = _columns(features), _identity_features(features)
     measured = measured_columns(columns)
     records = _sampled(shards, [*measured, *texts_of_episode])
-    states, fields = find_state(columns, _samples(records, measured), where, control_rate_hz=rate.value)
-    if is_bridge:
-        state, opened = Knob([_BRIDGE_FEATURE], "x, y, z, three angles, the gripper"), Knob(1.0, "BridgeData's")
-        states, fields = "pose", {"state": state, "gripper_open": opened, "gripper_closed": Knob(0.0)}
+    pose = _BRIDGE_POSE if is_bridge else find_pose(columns, _samples(records, measured), control_rate_hz=rate.value)
     return FoundData(
         source="rlds",
         path=path,
         knobs={
             "camera": camera,
             "fields": {
-                **fields,
+                **(pose or vector_state(columns, where)),
                 "identity": _identity(records, texts_of_episode),
                 "cameras": all_cameras,
                 "language": Knob(next((name for name in texts if "instruction" in name), None)),
@@ -97,9 +99,9 @@ def look_at_rlds(path: str) -> FoundData:
             },
         },
         rate_hz=rate,
-        states=states,
+        states="pose" if pose else "vector",
         episodes=episodes,
-        idle=idle_rule(has_velocities=has_velocities) if states == "pose" else None,
+        idle=idle_rule(has_velocities=has_velocities) if pose else None,
         about=(f"RLDS {name}, {episodes:,} episodes, {rate.value:g} steps a second{' (guessed)' * rate.is_guess}",)
         + ((f"depth maps are not used: {', '.join(depth)}",) if depth else ()),
     )
