@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -19,8 +18,8 @@ from vjepa2_ac.init.found import FoundData, Knob, camera_knobs, idle_rule, is_no
 from vjepa2_ac.init.poses import Column, Range, Samples, find_pose, measured_columns, vector_state
 from vjepa2_ac.storage.structured import json_object
 
-_STATISTICS = ("meta/stats.json", "meta/episodes_stats.jsonl")
-_MOST_BYTES = 256 << 20  # of statistics
+_STATISTICS = "meta/stats.json"  # without it (v2.1) the sampled episodes give the range
+_MAX_BYTES = 16 << 20
 _OURS = frozenset({"timestamp", "frame_index", "episode_index", "index", "task_index", "subtask_index"})
 _DROID_GRIPPER = "observation.state.gripper_position"
 _OF_DROID = frozenset({"building", "collector_id"})  # columns of its ports to LeRobot
@@ -85,24 +84,10 @@ def _sampled(info: DatasetInfo, columns: Mapping[str, Column]) -> Samples:
     return {name: episodes for name, episodes in read.items() if episodes}
 
 
-def _range_of(root: str, column: str, number: int) -> Range | None:
-    """Return the least and the greatest value that the statistics of a column give, None where none do."""
-    lows, highs = [], []
-    for statistics in _statistics(root):
-        try:
-            of_column = statistics[column]
-            lows.append(float(of_column["min"][number]))
-            highs.append(float(of_column["max"][number]))
-        except (KeyError, IndexError, TypeError, ValueError):
-            continue
-    return (min(lows), max(highs)) if lows else None
-
-
-def _statistics(root: str) -> Iterator[Mapping[str, Any]]:
-    """Yield the statistics of the set (v3.0), or of each episode (v2.1); nothing, where they cannot be read."""
-    for name in _STATISTICS:
-        with contextlib.suppress(OSError, UserError):
-            data = storage.read_bounded(storage.join(root, name), _MOST_BYTES)
-            for line in [data] if name.endswith(".json") else data.splitlines():
-                found = json_object(line, where=name)
-                yield found.get("stats", found)
+def _range_of(root: str, column: str, index: int) -> Range | None:
+    """Return the least and the greatest value of a number by the statistics of the data set; None: not known."""
+    where = storage.join(root, _STATISTICS)
+    with contextlib.suppress(OSError, UserError, KeyError, IndexError, TypeError, ValueError):
+        statistics = json_object(storage.read_bounded(where, _MAX_BYTES), where=where)[column]
+        return float(statistics["min"][index]), float(statistics["max"][index])
+    return None

@@ -154,7 +154,7 @@ def _of_plugins(path: str) -> FoundData | None:
 def simulated(path: str) -> FoundData:
     """Return what `vjepa2-ac simulate record` will make."""
     return replace(
-        like_droid(path, episodes=60, is_simulated=True),
+        like_droid(path, episodes=60, title="the simulated arm"),
         steps=60 * 41,
         usual_steps=41,
         short_steps=41,

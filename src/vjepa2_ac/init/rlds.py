@@ -22,7 +22,7 @@ from vjepa2_ac.storage.structured import read_json_object
 DROID = "gs://gresearch/robotics/droid/1.0.1"
 RANGES = "gs://openpi-assets/droid/droid_sample_ranges_v1_0_1.json"
 _DROID_EPISODES, _DROID_STEPS = 95_658, 27_600_000
-_DROID_CAMERA, _SEEN = "exterior_1_left", "what the released weights saw"
+_DROID_CAMERA = "exterior_1_left"
 _DROID_FEATURE, _BRIDGE_FEATURE = "steps/observation/exterior_image_1_left", "steps/observation/state"
 _DROID_NAMES = frozenset({"droid", "droid_100", "droid_101", "r2d2_faceblur"})  # as the sets call themselves
 _BRIDGE_NAMES = frozenset({"bridge", "bridge_dataset", "bridge_orig"})
@@ -53,7 +53,7 @@ def droid() -> FoundData:
     """Return what is known of DROID 1.0.1 without a look at it."""
     published = Knob("published", "openpi's ranges; they are valid for 1.0.1 only")
     return replace(
-        like_droid(DROID, _DROID_EPISODES, is_simulated=False),
+        like_droid(DROID, _DROID_EPISODES, "DROID 1.0.1"),
         steps=_DROID_STEPS,
         idle={"rule": published, "ranges": Knob(RANGES)},
         about=(f"DROID 1.0.1, {_DROID_EPISODES:,} episodes, 1.7 TB, fetched from Google Cloud as they are needed",),
@@ -72,7 +72,7 @@ def look_at_rlds(path: str) -> FoundData:
     name = dataset_name(path)
     if name in _DROID_NAMES and _DROID_FEATURE in features:
         is_simulated = storage.exists(storage.join(path, _SIMULATION))
-        return like_droid(path, episodes, is_simulated=is_simulated)
+        return like_droid(path, episodes, "the simulated arm" if is_simulated else "DROID")
     images, depth = _cameras(features)
     where = storage.join(path, "features.json")
     camera, all_cameras = camera_knobs(images, depth, where)
@@ -107,18 +107,15 @@ def look_at_rlds(path: str) -> FoundData:
     )
 
 
-def like_droid(path: str, episodes: int, *, is_simulated: bool) -> FoundData:
-    """Return what is known of DROID, or of the simulated arm, whose data sets are called as DROID's."""
-    camera = "a view from outside, as of DROID the released weights saw it" if is_simulated else _SEEN
-    rule = "openpi's rule" + ("" if is_simulated else "; the published ranges are of DROID 1.0.1")
-    title = "the simulated arm" if is_simulated else "DROID"
+def like_droid(path: str, episodes: int, title: str) -> FoundData:
+    """Return what is known of DROID, or of the simulated arm, whose data sets have the same features."""
     return FoundData(
         source="rlds",
         path=path,
-        knobs={"camera": Knob(_DROID_CAMERA, camera)},
+        knobs={"camera": Knob(_DROID_CAMERA)},
         rate_hz=Knob(_DROID_RATE_HZ),
         episodes=episodes,
-        idle={"rule": Knob("commands", rule)},
+        idle={"rule": Knob("commands", "openpi's rule")},
         about=(f"RLDS, {title}, {episodes:,} episodes, {_DROID_RATE_HZ:g} steps a second",),
     )
 
