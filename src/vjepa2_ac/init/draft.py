@@ -246,6 +246,10 @@ def _fit(config: Config, machine: Machine) -> tuple[int, bool, int]:
 def _data(found: FoundData, machine: Machine, model: ModelChoice) -> Knobs:
     """Return the section of the data."""
     stride = max(1, round(found.rate_hz.value * _MODEL_STEP_S))
+    why_stride = (
+        f"a model step of {stride / found.rate_hz.value:.2f} s at {found.rate_hz.value:g} control steps a second; "
+        "`data calibrate` compares others: the released weights may suit 0.27, 0.53 or 1 s"
+    )
     size = (found.steps or math.inf) * model.bytes_a_frame
     is_cached = size <= machine.free_bytes * _CACHE_SHARE
     why_cached = f"each frame is encoded once: {_gigabytes(size)} GB at most; training then needs no encoder"
@@ -257,7 +261,7 @@ def _data(found: FoundData, machine: Machine, model: ModelChoice) -> Knobs:
         **({} if found.states == "pose" else {"states": vector}),
         **found.knobs,
         "frames": _frames(found, model, stride),
-        "stride": Knob(stride, _why_stride(found, model, stride), found.rate_hz.is_guess),
+        "stride": Knob(stride, why_stride, found.rate_hz.is_guess),
         **{f"{split}_share": knob for split, knob in _shares(found).items() if split not in found.own_splits},
         **({"idle": found.idle} if found.idle and (found.usual_steps or _SHORT) >= _SHORT else {}),
         **({"cache": Knob("auto", why_cached)} if is_cached else {}),
@@ -306,28 +310,18 @@ def _training(found: FoundData, machine: Machine, model: ModelChoice) -> Knobs:
     elif model.is_scratch:
         learning_rate = Knob(1.5e-4, "the released 4.25e-4 for 256 clips a step, times sqrt(32 / 256); not measured")
     weak = Knob(True, "the tiny model was never trained on real images")
-    bf16 = "no GPU here; on one from Ampere on: bf16" + ("" if model.is_tiny else ", and model.dtype: bfloat16")
-    whys = {"fp32": bf16, "fp16": "this GPU has no bf16"}
+    no_gpu = "no GPU here; on one from Ampere on: bf16" + ("" if model.is_tiny else ", and model.dtype: bfloat16")
+    why_precision = {"fp32": no_gpu, "fp16": "this GPU has no bf16", "bf16": ""}[machine.precision]
     return {
         "steps": _steps(found, batch * accumulation),
         "batch_size": Knob(batch),
         "accumulation": Knob(accumulation),
         "rollout_steps": Knob(2),
         "learning_rate": learning_rate,
-        "precision": Knob(machine.precision, whys.get(machine.precision, "")),
+        "precision": Knob(machine.precision, why_precision),
         "gradient_checkpointing": Knob(False),
         **({"allow_weak_base": weak} if model.is_tiny and not model.is_scratch else {}),
     }
-
-
-def _why_stride(found: FoundData, model: ModelChoice, stride: int) -> str:
-    seconds = stride / found.rate_hz.value
-    why = f"a model step of {seconds:.2f} s at {found.rate_hz.value:g} control steps a second"
-    if model.is_scratch or found.states == "vector":
-        return f"{why}; `data inspect` shows how far the robot moves in it"
-    if model.is_tiny:
-        return f"{why}; the tiny model was trained at {_MODEL_STEP_S:.2f} s"
-    return f"{why}; `data calibrate` shows whether 0.27, 0.53 or 1 s suits the released weights"
 
 
 def _frames(found: FoundData, model: ModelChoice, stride: int) -> Knob:
@@ -364,9 +358,6 @@ def _fresh_predictor(model: ModelChoice) -> Knobs:
     if model.is_tiny:
         return {"image_size": Knob(96), "predictor": {"width": Knob(128), "depth": Knob(4), "heads": Knob(4)}}
     width = model.sizes.encoder.width
-    sizes = {
-        "width": Knob(width, "as wide as the latents: it can begin at copying"),
-        "depth": Knob(12),
-        "heads": Knob(width // 64),
-    }
-    return {"image_size": Knob(256, "256 tokens a frame"), "predictor": sizes}
+    why = "as wide as the latents: it can begin at copying"
+    predictor = {"width": Knob(width, why), "depth": Knob(12), "heads": Knob(width // 64)}
+    return {"image_size": Knob(256, "256 tokens a frame"), "predictor": predictor}

@@ -92,16 +92,11 @@ LOOKS: dict[str, Callable[[str], FoundData]] = {
     "raw": look_at_raw,
 }
 _MARKS = {"lerobot": INFO, "rlds": "dataset_info.json"}  # the file that describes a data set, by form
-_BY_HAND = "write one .npz for each episode (docs/data.md)"
-_WAYS = {  # to what is read, by the end of a file's name
-    ".mcap": f"a ROS 2 bag. {way_by('ros2_bag')} makes .npz of it",
-    ".db3": f"a ROS 2 bag. {way_by('ros2_bag')} makes .npz of it",
-    ".bag": f"a ROS 1 bag. {way_by('ros2_bag')} makes .npz of it",
-    ".lance": f"LeRobot's tables in Lance. {way_by('lance_to_files')} makes files of them",
-    ".mp4": f"videos alone. {way_by('mp4_and_csv')} makes .npz of videos and poses",
-    ".hdf5": f"HDF5: {_BY_HAND}",
-    ".h5": f"HDF5: {_BY_HAND}",
-    ".zarr": f"Zarr: {_BY_HAND}",
+_FIXES = {  # what to do with other data, by the end of a file's name
+    (".mcap", ".db3", ".bag"): f"a ROS bag. {way_by('ros2_bag')} makes .npz files of it",
+    (".lance",): f"LeRobot's tables in Lance. {way_by('lance_to_files')} makes files of them",
+    (".mp4",): f"videos alone. {way_by('mp4_and_csv')} makes .npz files of videos and poses",
+    (".hdf5", ".h5", ".zarr"): "HDF5 or Zarr: write one .npz for each episode (docs/data.md)",
 }
 _HUB_NAME = re.compile(r"[\w.-]+/[\w.-]+")
 _VERSION = re.compile(r"\d+(\.\d+)*")  # a folder of TFDS
@@ -212,10 +207,10 @@ def _recognized(path: str) -> str:
         return "npz"
     if any(name == "trajectory.h5" or name.startswith("metadata_") for name in names):
         return "raw"
-    way = next((text for end, text in _WAYS.items() for name in names if name.lower().endswith(end)), "")
+    fixes = (text for ends, text in _FIXES.items() for name in names if name.lower().endswith(ends))
     shown = ", ".join(names[:5]) + (", …" if len(names) > 5 else "") or "an empty folder"
     needed = "LeRobot (meta/info.json), RLDS (dataset_info.json), .npz files, or raw DROID (trajectory.h5)"
-    fix = f"This looks like {way}" if way else "docs/data.md says how other data become one of these"
+    fix = f"This looks like {next(fixes, 'other data: docs/data.md shows how to convert them')}"
     raise InputError(where=path, found=f"nothing that is read ({shown})", needed=needed, fix=fix)
 
 
