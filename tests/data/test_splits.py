@@ -21,7 +21,7 @@ from vjepa2_ac.data.splits import describe_splits
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.init.draft import Machine, choose_model, make_draft
 from vjepa2_ac.init.found import plain
-from vjepa2_ac.init.look import look_at, measured, own_splits
+from vjepa2_ac.init.look import look_at, measured
 from vjepa2_ac.training.data_sets import open_data_sets
 
 SPLITS: tuple[Split, ...] = ("train", "validation", "test")
@@ -190,7 +190,7 @@ def test_init_writes_shares_only_for_splits_that_are_drawn(
     assert found.about[-1].startswith("splits: ")
     laptop = Machine(None, 24 * 10**9, has_bf16=False, cores=2, free_bytes=10**11)
     model = choose_model("released", "builtin:sim-tiny")
-    draft = make_draft(found, laptop, model, run_dir="run", own_splits=own_splits(found))
+    draft = make_draft(found, laptop, model, run_dir="run")
     assert {key for key in plain(draft.knobs)["data"] if key.endswith("_share")} == shares
 
 

@@ -169,9 +169,8 @@ def test_depth_maps_are_not_offered_as_cameras(tmp_path: Path) -> None:
     [(0.0, 1.0, (0.0, 1.0)), (0.0, 0.08, (0.08, 0.0)), (2.0, 99.5, (99.5, 2.0))],
     ids=["share", "metres", "percent"],
 )
-@pytest.mark.parametrize("name", ["meta/stats.json", "meta/episodes_stats.jsonl"])
 def test_the_grippers_range_is_read_from_the_statistics(
-    low: float, high: float, expected: tuple[float, float], name: str, tmp_path: Path
+    low: float, high: float, expected: tuple[float, float], tmp_path: Path
 ) -> None:
     folder = write_lerobot(tmp_path / "set", range(3))
     info = json.loads((folder / "meta/info.json").read_text())
@@ -180,8 +179,7 @@ def test_the_grippers_range_is_read_from_the_statistics(
         del info["features"][f"observation.state.{column}"]
     (folder / "meta/info.json").write_text(json.dumps(info))
     of_column = {"observation.state": {"min": [0.0] * 6 + [low], "max": [0.0] * 6 + [high]}}
-    lines = [of_column] if name.endswith(".json") else [{"episode_index": 0, "stats": of_column}] * 2
-    (folder / name).write_text("\n".join(map(json.dumps, lines)))
+    (folder / "meta/stats.json").write_text(json.dumps(of_column))
     knobs = plain(look_at(str(folder)).knobs)["lerobot"]
     assert (knobs["gripper_open"], knobs["gripper_closed"]) == expected
 

@@ -108,6 +108,29 @@ def test_names_of_a_quaternion_over_a_rotation_vector_and_two_fingers_are_a_gues
     assert knobs == {"gripper_open": 0.04, "gripper_closed": 0.0}
 
 
+def test_numbered_names_of_a_quaternion_over_other_numbers_are_a_guess() -> None:
+    numbers = [np.concatenate([one, -one[:, 6:]], axis=1) for one in EPISODES]
+    state = proposed("x y z quat_0 quat_1 quat_2 quat_3 gripper", numbers)["state"]
+    assert state.is_guess
+    assert "not of length 1" in state.why
+
+
+def test_a_named_pose_with_a_gripper_column_is_no_guess() -> None:
+    columns = {STATE: Column(6, tuple(ONE_ARM)), "observation.gripper_open": Column(1)}
+    pose = find_pose(columns)
+    assert pose is not None
+    assert pose["state"].value == list(columns)
+    assert not pose["state"].is_guess
+
+
+def test_a_rotation_of_a_known_format_is_preferred_to_a_quaternion_of_unknown_order() -> None:
+    widths = {"eef_pos": 3, "eef_quat": 4, "eef_axis_angle": 3, "gripper": 1}
+    pose = find_pose({f"steps/observation/{name}": Column(width) for name, width in widths.items()})
+    assert pose is not None
+    assert "steps/observation/eef_axis_angle" in pose["state"].value
+    assert (pose["rotation"].value, pose["rotation"].is_guess) == ("rotation_vector", False)
+
+
 def test_degrees_and_millimetres_are_recognised_by_their_size() -> None:
     numbers = [written(one, "euler_xyz_degrees") * [1000, 1000, 1000, 1, 1, 1, 1] for one in EPISODES]
     pose = proposed("x y z roll pitch yaw gripper", numbers)

@@ -87,7 +87,7 @@ def _init(options: argparse.Namespace) -> int:
     with user_can_write(f"--out {out}"):
         try_writing_at(out.parent)
 
-    from vjepa2_ac.init.look import look_at, measured, own_splits, simulated
+    from vjepa2_ac.init.look import look_at, measured, simulated
     from vjepa2_ac.model.base_model import find_base, find_encoder_path
 
     if options.model is not None:
@@ -105,8 +105,7 @@ def _init(options: argparse.Namespace) -> int:
     model = choose_model("scratch" if form == "scratch" else "released", model_path)
     machine = this_machine()
     cli.show(f"Data: {'; '.join(found.about)}.\nMachine: {machine.about}.")
-    splits = () if is_missing else own_splits(found)
-    draft = make_draft(found, machine, model, run_dir=f"runs/{name}", own_splits=splits)
+    draft = make_draft(found, machine, model, run_dir=f"runs/{name}")
     with user_can_write(f"--out {out}"):
         write_atomically(out, draft.text(found, machine).encode())
     guessed = [f"  GUESSED  {key} = {value_and_why}" for key, value_and_why in guesses(draft.knobs).items()]

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Collection
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Literal
 
@@ -27,11 +25,11 @@ RELEASED = "checkpoints/vjepa2-ac-vitg.pt"
 SCRATCH_ENCODER = "checkpoints/vjepa2.1-vitb-384.pt"
 TINY = f"{BUILTIN}sim-tiny"
 _UTILIZATION = 0.4  # of the speed of one large product: assumed
-_LARGEST_BATCH = 16
+_BATCHES = ((4, False), (4, True), (2, True), (1, True))  # and whether with gradient checkpointing
+_BATCHES_ON_GPU = ((16, False), (8, False), *_BATCHES)
 _CLIPS_A_STEP = 32  # of every model but the tiny one
 _MODEL_STEP_S = 4 / 15  # the shortest of those that the released weights may know: 0.27, 0.53 and 1 s
 _FEW_EPISODES = 500  # to which the advice for few demonstrations applies
-_NEAR_S = 0.005
 _MOST_TESTED = 0.35  # share of few episodes
 _SHARES = ((5_000, 0.02), (500, 0.05), (100, 0.1), (0, 0.15))  # held out, by the number of episodes
 _LEAST_FRAMES = 3  # two rollout steps and the frame before them
@@ -97,31 +95,31 @@ def this_machine() -> Machine:
 
 @dataclass(frozen=True)
 class ModelChoice:
-    """The model that is trained."""
+    """The model that is trained: a pre-trained predictor, or a fresh one on an encoder."""
 
-    kind: str  # released, tiny, scratch
     path: str
+    is_scratch: bool  # a fresh predictor; `path` is the encoder's
     sizes: ModelSizes
 
     @property
     def bytes_a_frame(self) -> int:
-        """Of its latents, in bfloat16."""
+        """The size of a frame's latents in bfloat16."""
         return 2 * self.sizes.tokens_per_frame * self.sizes.encoder.width
 
     @property
     def is_tiny(self) -> bool:
-        """Whether it is the one that comes with the package."""
+        """Whether the model comes with the package."""
         return self.path.startswith(BUILTIN)
 
     @property
     def download(self) -> tuple[str, str] | None:
-        """The command that fetches it, and what that costs; None, where it is none that is published."""
-        one = next((one for one in PUBLISHED if Path(self.path) == Path("checkpoints", one.file)), None)
-        if one is None:
-            return None
-        time = duration(one.gigabytes * GIGABYTE / _USUAL_BYTES_PER_S / 3600)
-        name = "" if one.name == OFFICIAL else f" {one.name}"
-        return f"vjepa2-ac download{name}", f"{one.gigabytes:g} GB, {time} at 100 Mbit/s"
+        """The command that downloads the model, and its size and time; None: the model is not a published one."""
+        for one in PUBLISHED:
+            if Path(self.path) == Path("checkpoints", one.file):
+                time = duration(one.gigabytes * GIGABYTE / _USUAL_BYTES_PER_S / 3600)
+                command = "vjepa2-ac download" if one.name == OFFICIAL else f"vjepa2-ac download {one.name}"
+                return command, f"{one.gigabytes:g} GB, {time} at 100 Mbit/s"
+        return None
 
 
 def choose_model(kind: str, path: str | None) -> ModelChoice:
@@ -129,17 +127,17 @@ def choose_model(kind: str, path: str | None) -> ModelChoice:
 
     Args:
         kind: released, or scratch: a fresh predictor on an encoder.
-        path: What `model.base` or `model.encoder.path` takes; None: the released one.
+        path: The value of `model.base` or `model.encoder.path`; None: the released one.
 
     Raises:
-        InputError: There is a folder, and it is no model.
+        InputError: The folder at the path is no model.
     """
-    path = path or (SCRATCH_ENCODER if kind == "scratch" else RELEASED)
-    is_tiny = path.startswith(BUILTIN)
+    is_scratch = kind == "scratch"
+    path = path or (SCRATCH_ENCODER if is_scratch else RELEASED)
     config = ModelConfig(base=path)
-    if kind == "scratch" and not is_tiny:
+    if is_scratch and not path.startswith(BUILTIN):
         config = ModelConfig(encoder=EncoderConfig(path=path, frame="tubelet"), random=ModelSizes())
-    return ModelChoice("tiny" if is_tiny and kind != "scratch" else kind, path, base_sizes(config))
+    return ModelChoice(path, is_scratch, base_sizes(config))
 
 
 @dataclass(frozen=True)
@@ -170,10 +168,8 @@ class Draft:
         return None if self.step_hours is None else duration(self.encoding_hours + steps * self.step_hours)
 
 
-def make_draft(
-    found: FoundData, machine: Machine, model: ModelChoice, *, run_dir: str, own_splits: Collection[Split] = ()
-) -> Draft:
-    """Return the config for a data set on a machine; without shares for splits that the data set has itself.
+def make_draft(found: FoundData, machine: Machine, model: ModelChoice, *, run_dir: str) -> Draft:
+    """Return the config for a data set on a machine.
 
     Raises:
         InputError: The values found do not make a config.
@@ -183,7 +179,7 @@ def make_draft(
     knobs: Knobs = {
         "run_dir": Knob(run_dir),
         "seed": Knob(0),
-        "data": _data(found, machine, model, own_splits),
+        "data": _data(found, machine, model),
         "model": _model(model, machine),
         "adapter": _adapter(model, found),
         "training": training,
@@ -195,30 +191,32 @@ def make_draft(
         },
     }
     config = _config_of(knobs)
-    steps = found.steps or 0 if config.data.takes_latents else 0  # whose frames are encoded first
-    costs = [f"Disk: at most {_gigabytes(steps * model.bytes_a_frame)} GB of cached latents."] * (steps > 0)
+    num_encoded = found.steps or 0 if config.data.takes_latents else 0  # frames that are encoded before the first step
+    costs: list[str] = []
+    if num_encoded:
+        costs.append(f"Disk: at most {_gigabytes(num_encoded * model.bytes_a_frame)} GB of cached latents.")
     if model.is_tiny:
         return Draft(knobs, config, costs)
     batch, checkpointing, needed = _fit(config, machine)
-    fits, on = needed <= machine.gpu_bytes, f"on {machine.room}"
-    found_to_fit = {
-        "batch_size": Knob(batch, f"the largest tried that fits {on}" if fits else f"does not fit {on}"),
-        "accumulation": Knob(max(1, _CLIPS_A_STEP // batch), f"{_CLIPS_A_STEP} clips a step"),
-        "gradient_checkpointing": Knob(checkpointing, f"{'does not fit' if checkpointing else 'fits'} without {on}"),
+    fits = "fits" if needed <= machine.gpu_bytes else "does NOT fit"
+    fitted = {
+        "batch_size": Knob(batch, f"{fits} on {machine.room}"),
+        "accumulation": Knob(_CLIPS_A_STEP // batch, f"{_CLIPS_A_STEP} clips a step"),
+        "gradient_checkpointing": Knob(checkpointing, "does not fit without" if checkpointing else "fits without"),
     }
-    knobs = {**knobs, "training": {**training, **found_to_fit}}
+    knobs = {**knobs, "training": {**training, **fitted}}
     config = _config_of(knobs)
-    size = f"{needed / GIGABYTE:.1f} GB; {'fits' if fits else 'does NOT fit'} {on}"
+    size = f"{needed / GIGABYTE:.1f} GB; {fits} on {machine.room}"
     costs = [f"Memory, as `vjepa2-ac doctor` counts: {size}.", *costs]
+    if machine.gpu is None:
+        costs.append("Time: not known without the GPU. `vjepa2-ac init` on its machine sets batch size and precision.")
     if machine.flops is None:
-        unknown = "not known without the GPU; run `vjepa2-ac init` on the machine that has it: batch and precision are"
-        return Draft(knobs, config, [*costs, *[f"Time: {unknown} then its own."] * (machine.gpu is None)])
-    sizes = base_sizes(config.model)
-    clip, an_hour = clip_flops(config, sizes), machine.flops * _UTILIZATION * 3600
-    encoding = steps * frame_flops(sizes) / an_hour
-    of_clip = (clip.predictor if config.data.takes_latents else clip.total) / an_hour
-    step = of_clip * config.training.batch_size * config.training.accumulation
-    draft = Draft(knobs, config, costs, step, encoding)
+        return Draft(knobs, config, costs)
+    sizes, flops_per_hour = base_sizes(config.model), machine.flops * _UTILIZATION * 3600
+    clip = clip_flops(config, sizes)
+    step_flops = _CLIPS_A_STEP * (clip.predictor if config.data.takes_latents else clip.total)
+    encoding_flops = num_encoded * frame_flops(sizes)
+    draft = Draft(knobs, config, costs, step_flops / flops_per_hour, encoding_flops / flops_per_hour)
     speed = f"{machine.flops / 1e12:.0f} TFLOP/s measured here for one product"
     time = draft.time_of(config.training.steps)
     costs.append(f"Time: {time}, if a step reaches {_UTILIZATION:.0%} (assumed) of {speed}.")
@@ -234,29 +232,24 @@ def _gigabytes(size: float) -> str:
 
 
 def _fit(config: Config, machine: Machine) -> tuple[int, bool, int]:
-    """Return batch size, whether with checkpointing, and bytes at the peak: the largest batch that fits, 4 at first."""
-    room, batch, sizes = machine.gpu_bytes, config.training.batch_size, base_sizes(config.model)
-
-    @cache
-    def needed(batch: int, checkpointing: bool) -> int:
+    """Return the first batch size that fits, whether with checkpointing, and the bytes at the peak; or the smallest."""
+    sizes = base_sizes(config.model)
+    for batch, checkpointing in _BATCHES_ON_GPU if machine.gpu else _BATCHES:
         training = config.training.model_copy(update={"batch_size": batch})
         estimate = estimate_memory(config.model_copy(update={"training": training}), sizes)
-        return int(estimate.total(checkpointing=checkpointing))
-
-    if needed(batch, False) <= room:
-        while machine.gpu and batch < _LARGEST_BATCH and needed(2 * batch, False) <= room:
-            batch *= 2
-        return batch, False, needed(batch, False)
-    while batch > 1 and needed(batch, True) > room:
-        batch //= 2
-    return batch, True, needed(batch, True)
+        needed = int(estimate.total(checkpointing=checkpointing))
+        if needed <= machine.gpu_bytes:
+            break
+    return batch, checkpointing, needed
 
 
-def _data(found: FoundData, machine: Machine, model: ModelChoice, own_splits: Collection[Split]) -> Knobs:
+def _data(found: FoundData, machine: Machine, model: ModelChoice) -> Knobs:
     """Return the section of the data."""
     stride = max(1, round(found.rate_hz.value * _MODEL_STEP_S))
-    frames, why_frames = _frames(found, model, stride)
-    shares = {split: knob for split, knob in _shares(found).items() if split not in own_splits}
+    why_stride = (
+        f"a model step of {stride / found.rate_hz.value:.2f} s at {found.rate_hz.value:g} control steps a second; "
+        "`data calibrate` compares others: the released weights may suit 0.27, 0.53 or 1 s"
+    )
     size = (found.steps or math.inf) * model.bytes_a_frame
     is_cached = size <= machine.free_bytes * _CACHE_SHARE
     why_cached = f"each frame is encoded once: {_gigabytes(size)} GB at most; training then needs no encoder"
@@ -267,9 +260,9 @@ def _data(found: FoundData, machine: Machine, model: ModelChoice, own_splits: Co
         "path": Knob(found.path),
         **({} if found.states == "pose" else {"states": vector}),
         **found.knobs,
-        "frames": Knob(frames, why_frames),
-        "stride": Knob(stride, _why_stride(found, model, stride), found.rate_hz.is_guess),
-        **{f"{split}_share": knob for split, knob in shares.items()},
+        "frames": _frames(found, model, stride),
+        "stride": Knob(stride, why_stride, found.rate_hz.is_guess),
+        **{f"{split}_share": knob for split, knob in _shares(found).items() if split not in found.own_splits},
         **({"idle": found.idle} if found.idle and (found.usual_steps or _SHORT) >= _SHORT else {}),
         **({"cache": Knob("auto", why_cached)} if is_cached else {}),
         "workers": Knob(workers, f"of {machine.cores} cores"),
@@ -279,23 +272,22 @@ def _data(found: FoundData, machine: Machine, model: ModelChoice, own_splits: Co
 def _model(model: ModelChoice, machine: Machine) -> Knobs:
     """Return the section of the model."""
     dtype = Knob("float32" if model.is_tiny or machine.precision != "bf16" else "bfloat16")
-    if model.kind == "scratch":
+    path = Knob(model.path, ": ".join(model.download or ()))
+    if model.is_scratch:
         return {
-            "encoder": {
-                "path": Knob(model.path, ": ".join(model.download or ())),
-                **({} if model.is_tiny else {"frame": Knob("tubelet")}),
-            },
+            "encoder": {"path": path} if model.is_tiny else {"path": path, "frame": Knob("tubelet")},
             "random": _fresh_predictor(model),
             "random_start": Knob("persistence", "the first steps are not spent on learning to copy"),
             "dtype": dtype,
         }
-    tiny = "has seen a simulated arm only: to try the way, not a result"
-    return {"base": Knob(model.path, tiny if model.is_tiny else ": ".join(model.download or ())), "dtype": dtype}
+    if model.is_tiny:
+        path = Knob(model.path, "trained on a simulated arm only: to try the commands, not for results")
+    return {"base": path, "dtype": dtype}
 
 
 def _adapter(model: ModelChoice, found: FoundData) -> Knobs:
     """Return the section of the adapter."""
-    if model.kind == "scratch":
+    if model.is_scratch:
         return {"kind": Knob("none", "a fresh predictor has nothing to adapt: all of it is trained")}
     whole = ["state_encoder", "action_encoder"] if found.states == "vector" else _IN_AND_OUT
     why = "fresh: other numbers than a pose" if found.states == "vector" else "whole: less error at every rank (sim)"
@@ -310,49 +302,36 @@ def _adapter(model: ModelChoice, found: FoundData) -> Knobs:
 
 
 def _training(found: FoundData, machine: Machine, model: ModelChoice) -> Knobs:
-    """Return the section of training; the batch is what `fit` changes."""
+    """Return the section of training, with a batch that is not yet fitted to the GPU."""
     batch, accumulation = (8, 1) if model.is_tiny else (4, _CLIPS_A_STEP // 4)
-    steps, why = _steps(found, batch * accumulation)
-    kind = "tiny" if model.is_tiny else model.kind
-    scratch = "the released 4.25e-4, of 256 clips a step, times the root of 32 / 256: not measured"
-    rates = {"scratch": Knob(1.5e-4, scratch), "tiny": Knob(3e-3)}
-    weak = "it is weak, knowingly: it has never seen a real image"
-    bf16 = "no GPU here; on one from Ampere on: bf16" + ("" if model.is_tiny else ", and model.dtype: bfloat16")
-    whys = {"fp32": bf16, "fp16": "this GPU has no bf16"}
+    learning_rate = Knob(1e-4, "3e-4 is the other one to try")
+    if model.is_tiny:
+        learning_rate = Knob(3e-3)
+    elif model.is_scratch:
+        learning_rate = Knob(1.5e-4, "the released 4.25e-4 for 256 clips a step, times sqrt(32 / 256); not measured")
+    weak = Knob(True, "the tiny model was never trained on real images")
+    no_gpu = "no GPU here; on one from Ampere on: bf16" + ("" if model.is_tiny else ", and model.dtype: bfloat16")
+    why_precision = {"fp32": no_gpu, "fp16": "this GPU has no bf16", "bf16": ""}[machine.precision]
     return {
-        "steps": Knob(steps, why),
+        "steps": _steps(found, batch * accumulation),
         "batch_size": Knob(batch),
         "accumulation": Knob(accumulation),
         "rollout_steps": Knob(2),
-        "learning_rate": rates.get(kind, Knob(1e-4, "3e-4 is the other one to try")),
-        "precision": Knob(machine.precision, whys.get(machine.precision, "")),
+        "learning_rate": learning_rate,
+        "precision": Knob(machine.precision, why_precision),
         "gradient_checkpointing": Knob(False),
-        **({"allow_weak_base": Knob(True, weak)} if model.kind == "tiny" else {}),
+        **({"allow_weak_base": weak} if model.is_tiny and not model.is_scratch else {}),
     }
 
 
-def _why_stride(found: FoundData, model: ModelChoice, stride: int) -> str:
-    seconds = stride / found.rate_hz.value
-    why = f"a model step of {seconds:.2f} s"
-    if abs(seconds - _MODEL_STEP_S) > _NEAR_S:
-        why += f", as near to {_MODEL_STEP_S:.2f} s as whole control steps come"
-    if found.rate_hz.is_guess:
-        why = f"if the rate is {found.rate_hz.value:g} a second, {why}"
-    if model.kind == "tiny":
-        return f"{why}; the model was trained at {_MODEL_STEP_S:.2f} s"
-    if model.kind == "released" and found.states == "pose":
-        return f"{why}; whether the released weights know 0.27, 0.53 or 1 s is unsettled: data calibrate"
-    return f"{why}; data inspect shows how far the robot goes in it, and in longer ones"
-
-
-def _frames(found: FoundData, model: ModelChoice, stride: int) -> tuple[int, str]:
-    wanted = 4 if model.is_tiny else 16 if (found.episodes or 0) > _FEW_EPISODES else 8
+def _frames(found: FoundData, model: ModelChoice, stride: int) -> Knob:
+    frames = 4 if model.is_tiny else 16 if (found.episodes or 0) > _FEW_EPISODES else 8
     if found.usual_steps is None or found.short_steps is None:
-        return wanted, "of a clip, one per model step"
-    most = 1 + (min(found.usual_steps // 2, found.short_steps) - 1) // stride
-    frames = max(_LEAST_FRAMES, min(most, wanted))
+        return Knob(frames, "of a clip, one per model step")
+    longest = 1 + (min(found.usual_steps // 2, found.short_steps) - 1) // stride
+    frames = max(_LEAST_FRAMES, min(longest, frames))
     lengths = f"half of the episodes have {found.usual_steps} or more, one of ten at most {found.short_steps}"
-    return frames, f"a clip spans {(frames - 1) * stride + 1} steps; {lengths}"
+    return Knob(frames, f"a clip spans {(frames - 1) * stride + 1} steps; {lengths}")
 
 
 def _shares(found: FoundData) -> dict[Split, Knob]:
@@ -366,22 +345,19 @@ def _shares(found: FoundData) -> dict[Split, Knob]:
     return {"validation": Knob(share, why), "test": Knob(test_share, "for `evaluate`; never seen in training")}
 
 
-def _steps(found: FoundData, clips_a_step: int) -> tuple[int, str]:
+def _steps(found: FoundData, clips_a_step: int) -> Knob:
     if found.steps is None:
-        return _LEAST_STEPS, "a first run; docs/training.md says how many"
+        return Knob(_LEAST_STEPS, "a first run; docs/training.md says how many")
     wanted = math.ceil(_PASSES * found.steps / _CLIPS_A_STEP / 100) * 100  # a clip begins at every step
     steps = max(_LEAST_STEPS, min(_MOST_STEPS, wanted))
     passes = steps * clips_a_step / found.steps
-    return steps, f"{passes:.2g} passes over the starts of clips; the error falls for longer, planning may get worse"
+    return Knob(steps, f"{passes:.2g} passes over the data; more lower the error, but planning may get worse")
 
 
 def _fresh_predictor(model: ModelChoice) -> Knobs:
     if model.is_tiny:
         return {"image_size": Knob(96), "predictor": {"width": Knob(128), "depth": Knob(4), "heads": Knob(4)}}
     width = model.sizes.encoder.width
-    sizes = {
-        "width": Knob(width, "as wide as the latents: it can begin at copying"),
-        "depth": Knob(12),
-        "heads": Knob(width // 64),
-    }
-    return {"image_size": Knob(256, "256 tokens a frame"), "predictor": sizes}
+    why = "as wide as the latents: it can begin at copying"
+    predictor = {"width": Knob(width, why), "depth": Knob(12), "heads": Knob(width // 64)}
+    return {"image_size": Knob(256, "256 tokens a frame"), "predictor": predictor}

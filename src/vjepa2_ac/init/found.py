@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.loading import yaml_line
 from vjepa2_ac.errors import InputError
 
@@ -76,6 +77,7 @@ class FoundData:
     steps: int | None = None  # control steps of all episodes
     usual_steps: int | None = None  # of an episode: the median
     short_steps: int | None = None  # nine of ten episodes have more
+    own_splits: tuple[Split, ...] = ()  # validation and test, if the data set has them itself
     idle: Knobs | None = None  # of `data.idle`; None: no rule
     about: tuple[str, ...] = ()  # what a person should know of it
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -16,11 +15,11 @@ from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, filled, list_by_tem
 from vjepa2_ac.data.sources.lerobot.parquet import ParquetRows
 from vjepa2_ac.errors import UserError
 from vjepa2_ac.init.found import FoundData, Knob, camera_knobs, idle_rule, is_no_camera
-from vjepa2_ac.init.poses import Column, Range, Samples, find_state, measured_columns
+from vjepa2_ac.init.poses import Column, Range, Samples, find_pose, measured_columns, vector_state
 from vjepa2_ac.storage.structured import json_object
 
-_STATISTICS = ("meta/stats.json", "meta/episodes_stats.jsonl")
-_MOST_BYTES = 256 << 20  # of statistics
+_STATISTICS = "meta/stats.json"  # without it (v2.1) the sampled episodes give the range
+_MAX_BYTES = 16 << 20
 _OURS = frozenset({"timestamp", "frame_index", "episode_index", "index", "task_index", "subtask_index"})
 _DROID_GRIPPER = "observation.state.gripper_position"
 _OF_DROID = frozenset({"building", "collector_id"})  # columns of its ports to LeRobot
@@ -43,10 +42,9 @@ def look_at_lerobot(path: str) -> FoundData:
         if one.is_numbers and name not in _OURS
     }
     samples = _sampled(info, measured_columns(columns))
-    range_of = partial(_range_of, path)
-    states, fields = find_state(columns, samples, info.where, control_rate_hz=info.fps, range_of=range_of)
-    if states == "pose" and _DROID_GRIPPER in fields["state"].value and info.features.keys() >= _OF_DROID:
-        fields |= {"gripper_open": Knob(0.0, "DROID's"), "gripper_closed": Knob(1.0)}
+    pose = find_pose(columns, samples, control_rate_hz=info.fps, range_of=partial(_range_of, path))
+    if pose and _DROID_GRIPPER in pose["state"].value and info.features.keys() >= _OF_DROID:
+        pose |= {"gripper_open": Knob(0.0, "DROID's"), "gripper_closed": Knob(1.0)}
     velocity = next((name for name in columns if "joint_vel" in name and name.startswith("action")), None)
     success = next((name for name in info.features if "success" in name), None)
     return FoundData(
@@ -55,17 +53,17 @@ def look_at_lerobot(path: str) -> FoundData:
         knobs={
             "camera": camera,
             "lerobot": {
-                **fields,
+                **(pose or vector_state(columns, info.where)),
                 "cameras": all_cameras,
                 "joint_velocity": Knob(velocity),
                 "success": Knob(success),
             },
         },
         rate_hz=Knob(info.fps, "of meta/info.json"),
-        states=states,
+        states="pose" if pose else "vector",
         episodes=info.episodes,
         steps=info.frames,
-        idle=idle_rule(has_velocities=velocity is not None) if states == "pose" else None,
+        idle=idle_rule(has_velocities=velocity is not None) if pose else None,
         about=(f"LeRobot {info.version}, {info.episodes:,} episodes at {info.fps:g} a second",)
         + ((f"depth maps are not used: {', '.join(depth)}",) if depth else ()),
     )
@@ -86,24 +84,10 @@ def _sampled(info: DatasetInfo, columns: Mapping[str, Column]) -> Samples:
     return {name: episodes for name, episodes in read.items() if episodes}
 
 
-def _range_of(root: str, column: str, number: int) -> Range | None:
-    """Return the least and the greatest value that the statistics of a column give, None where none do."""
-    lows, highs = [], []
-    for statistics in _statistics(root):
-        try:
-            of_column = statistics[column]
-            lows.append(float(of_column["min"][number]))
-            highs.append(float(of_column["max"][number]))
-        except (KeyError, IndexError, TypeError, ValueError):
-            continue
-    return (min(lows), max(highs)) if lows else None
-
-
-def _statistics(root: str) -> Iterator[Mapping[str, Any]]:
-    """Yield the statistics of the set (v3.0), or of each episode (v2.1); nothing, where they cannot be read."""
-    for name in _STATISTICS:
-        with contextlib.suppress(OSError, UserError):
-            data = storage.read_bounded(storage.join(root, name), _MOST_BYTES)
-            for line in [data] if name.endswith(".json") else data.splitlines():
-                found = json_object(line, where=name)
-                yield found.get("stats", found)
+def _range_of(root: str, column: str, index: int) -> Range | None:
+    """Return the least and the greatest value of a number by the statistics of the data set; None: not known."""
+    where = storage.join(root, _STATISTICS)
+    with contextlib.suppress(OSError, UserError, KeyError, IndexError, TypeError, ValueError):
+        statistics = json_object(storage.read_bounded(where, _MAX_BYTES), where=where)[column]
+        return float(statistics["min"][index]), float(statistics["max"][index])
+    return None

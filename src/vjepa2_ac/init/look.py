@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -12,7 +11,6 @@ import numpy as np
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.loading import admit_forms_of_data, parse_config
 from vjepa2_ac.data.files import in_parallel, walk
 from vjepa2_ac.data.index import EpisodeTable
@@ -95,16 +93,11 @@ LOOKS: dict[str, Callable[[str], FoundData]] = {
     "raw": look_at_raw,
 }
 _MARKS = {"lerobot": INFO, "rlds": "dataset_info.json"}  # the file that describes a data set, by form
-_BY_HAND = "write one .npz for each episode (docs/data.md)"
-_WAYS = {  # to what is read, by the end of a file's name
-    ".mcap": f"a ROS 2 bag. {way_by('ros2_bag')} makes .npz of it",
-    ".db3": f"a ROS 2 bag. {way_by('ros2_bag')} makes .npz of it",
-    ".bag": f"a ROS 1 bag. {way_by('ros2_bag')} makes .npz of it",
-    ".lance": f"LeRobot's tables in Lance. {way_by('lance_to_files')} makes files of them",
-    ".mp4": f"videos alone. {way_by('mp4_and_csv')} makes .npz of videos and poses",
-    ".hdf5": f"HDF5: {_BY_HAND}",
-    ".h5": f"HDF5: {_BY_HAND}",
-    ".zarr": f"Zarr: {_BY_HAND}",
+_FIXES = {  # what to do with other data, by the end of a file's name
+    (".mcap", ".db3", ".bag"): f"a ROS bag. {way_by('ros2_bag')} makes .npz files of it",
+    (".lance",): f"LeRobot's tables in Lance. {way_by('lance_to_files')} makes files of them",
+    (".mp4",): f"videos alone. {way_by('mp4_and_csv')} makes .npz files of videos and poses",
+    (".hdf5", ".h5", ".zarr"): "HDF5 or Zarr: write one .npz for each episode (docs/data.md)",
 }
 _HUB_NAME = re.compile(r"[\w.-]+/[\w.-]+")
 _VERSION = re.compile(r"\d+(\.\d+)*")  # a folder of TFDS
@@ -157,7 +150,7 @@ def _of_plugins(path: str) -> FoundData | None:
 def simulated(path: str) -> FoundData:
     """Return what `vjepa2-ac simulate record` will make."""
     return replace(
-        like_droid(path, episodes=60, is_simulated=True),
+        like_droid(path, episodes=60, title="the simulated arm"),
         steps=60 * 41,
         usual_steps=41,
         short_steps=41,
@@ -215,10 +208,10 @@ def _recognized(path: str) -> str:
         return "npz"
     if any(name == "trajectory.h5" or name.startswith("metadata_") for name in names):
         return "raw"
-    way = next((text for end, text in _WAYS.items() for name in names if name.lower().endswith(end)), "")
+    fixes = (text for ends, text in _FIXES.items() for name in names if name.lower().endswith(ends))
     shown = ", ".join(names[:5]) + (", …" if len(names) > 5 else "") or "an empty folder"
     needed = "LeRobot (meta/info.json), RLDS (dataset_info.json), .npz files, or raw DROID (trajectory.h5)"
-    fix = f"This looks like {way}" if way else "docs/data.md says how other data become one of these"
+    fix = f"This looks like {next(fixes, 'other data: docs/data.md shows how to convert them')}"
     raise InputError(where=path, found=f"nothing that is read ({shown})", needed=needed, fix=fix)
 
 
@@ -236,36 +229,28 @@ def _names_below(path: str) -> list[str]:
 
 
 def measured(found: FoundData, progress: Progress | None = None) -> FoundData:
-    """Return what was found with the numbers of the index; unchanged behind a URL, or where it cannot be built.
+    """Return what was found with the numbers of the index; unchanged behind a URL, or if it cannot be built.
 
-    Why it cannot, the check of the data says.
+    `data check` explains why the index cannot be built.
     """
-    if (indexed := _indexed(found, progress)) is None:
+    data = {"source": found.source, "path": found.path, "states": found.states, **plain(found.knobs)}
+    values = {"run_dir": "none", "data": data, "model": {"base": f"{BUILTIN}sim-tiny"}}
+    if storage.is_url(found.path):
         return found
-    lengths, splits = indexed[0].num_steps, describe_splits(*indexed)
+    try:
+        config = parse_config(values, where="vjepa2-ac init").data
+        table = EpisodeTable.of(open_source(config).infos(progress))
+    except UserError:
+        return found
+    if not len(table):
+        return found
+    lengths, splits = table.num_steps, describe_splits(table, config)
     return replace(
         found,
         episodes=len(lengths),
         steps=int(lengths.sum()),
         usual_steps=int(np.median(lengths)),
         short_steps=int(np.quantile(lengths, 0.1)),
-        about=(*found.about, *[f"splits: {splits}"] * bool(splits)),
+        own_splits=tuple(held_out_by(table, config)),
+        about=(*found.about, f"splits: {splits}") if splits else found.about,
     )
-
-
-def own_splits(found: FoundData) -> tuple[Split, ...]:
-    """Return which of validation and test the data set has itself, as far as `measured` reads it."""
-    indexed = _indexed(found, None)
-    return () if indexed is None else tuple(held_out_by(*indexed))
-
-
-def _indexed(found: FoundData, progress: Progress | None) -> tuple[EpisodeTable, DataConfig] | None:
-    """Return the episodes of what was found, and the config that reads them; None: behind a URL, or unreadable."""
-    data = {"source": found.source, "path": found.path, "states": found.states, **plain(found.knobs)}
-    values = {"run_dir": "none", "data": data, "model": {"base": f"{BUILTIN}sim-tiny"}}
-    with contextlib.suppress(UserError):
-        if not storage.is_url(found.path):
-            config = parse_config(values, where="vjepa2-ac init").data
-            table = EpisodeTable.of(open_source(config).infos(progress))
-            return (table, config) if len(table) else None
-    return None

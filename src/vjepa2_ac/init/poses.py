@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -73,37 +72,6 @@ class _Number:
     is_named: bool = True  # False: recognised by the width of its column
 
 
-def find_state(
-    columns: Mapping[str, Column],
-    samples: Samples,
-    where: str,
-    *,
-    control_rate_hz: float,
-    range_of: Callable[[str, int], Range | None] | None = None,
-) -> tuple[Literal["pose", "vector"], dict[str, Knob]]:
-    """Return the kind of state, and the keys of a config section that read it: a pose, or a column of any numbers.
-
-    Args:
-        columns: All columns of numbers.
-        samples: The numbers of some episodes in the columns that may hold a pose.
-        where: The file that describes the columns, for the error.
-        control_rate_hz: Control steps per second.
-        range_of: Returns the range of a number, by column and index; default: the range of the samples.
-
-    Raises:
-        InputError: No column has measured numbers of the robot.
-    """
-    if pose := find_pose(columns, samples, control_rate_hz=control_rate_hz, range_of=range_of):
-        return "pose", pose
-    measured = [name for name in columns if re.search(r"observation|\bstate", name)]
-    if not measured:
-        found = f"no measured numbers among {', '.join(columns) or 'no columns'}"
-        raise InputError(where=where, found=found, needed="observations of the robot as float, int or bool")
-    chosen = next((name for name in measured if _last_part(name) == "state"), measured[0])
-    why = f"{columns[chosen].width} numbers, no pose could be recognised; all columns: {', '.join(measured)}"
-    return "vector", {"state": Knob([chosen], why, is_guess=True)}
-
-
 def find_pose(
     columns: Mapping[str, Column],
     samples: Samples | None = None,
@@ -136,6 +104,21 @@ def find_pose(
     name = names[index] if index < len(names) else _last_part(column)
     ranges = (range_of and range_of(column, index)) or _range_in(samples.get(column, ()), index)
     return {**keys, **gripper_knobs(name, ranges)}
+
+
+def vector_state(columns: Mapping[str, Column], where: str) -> dict[str, Knob]:
+    """Return the key that reads a column of any numbers, if no pose was recognised: the one called state, if any.
+
+    Raises:
+        InputError: No column has measured numbers of the robot.
+    """
+    measured = [name for name in columns if re.search(r"observation|\bstate", name)]
+    if not measured:
+        found = f"no measured numbers among {', '.join(columns) or 'no columns'}"
+        raise InputError(where=where, found=found, needed="observations of the robot as float, int or bool")
+    chosen = next((name for name in measured if _last_part(name) == "state"), measured[0])
+    why = f"{columns[chosen].width} numbers, no pose could be recognised; all columns: {', '.join(measured)}"
+    return {"state": Knob([chosen], why, is_guess=True)}
 
 
 def measured_columns(columns: Mapping[str, Column]) -> dict[str, Column]:

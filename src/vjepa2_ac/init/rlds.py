@@ -16,21 +16,24 @@ from vjepa2_ac.data.sources.rlds.shards import Shard, dataset_name, find_shards,
 from vjepa2_ac.data.sources.rlds.tfrecord import HEADER_BYTES, Kind, span_at
 from vjepa2_ac.errors import InputError, MissingFileError, UserError
 from vjepa2_ac.init.found import FoundData, Knob, camera_knobs, idle_rule, is_no_camera
-from vjepa2_ac.init.poses import Column, Samples, find_state, measured_columns
+from vjepa2_ac.init.poses import Column, Samples, find_pose, measured_columns, vector_state
 from vjepa2_ac.storage.structured import read_json_object
 
 DROID = "gs://gresearch/robotics/droid/1.0.1"
 RANGES = "gs://openpi-assets/droid/droid_sample_ranges_v1_0_1.json"
 _DROID_EPISODES, _DROID_STEPS = 95_658, 27_600_000
-_DROID_CAMERA, _SEEN = "exterior_1_left", "what the released weights saw"
+_DROID_CAMERA = "exterior_1_left"
 _DROID_FEATURE, _BRIDGE_FEATURE = "steps/observation/exterior_image_1_left", "steps/observation/state"
 _DROID_NAMES = frozenset({"droid", "droid_100", "droid_101", "r2d2_faceblur"})  # as the sets call themselves
 _BRIDGE_NAMES = frozenset({"bridge", "bridge_dataset", "bridge_orig"})
+_BRIDGE_POSE = {
+    "state": Knob([_BRIDGE_FEATURE], "x, y, z, three angles, the gripper"),
+    "gripper_open": Knob(1.0, "BridgeData's"),
+    "gripper_closed": Knob(0.0),
+}
 _DROID_RATE_HZ, _BRIDGE_RATE_HZ, _UNKNOWN_RATE_HZ = 15.0, 5.0, 10.0
 _SIMULATION = "simulation.json"  # beside the shards of `vjepa2-ac simulate record`
 _VELOCITIES = "steps/action_dict/joint_velocity"
-
-
 _SAMPLED = 24  # records whose values are looked at
 _ALL_KINDS: tuple[Kind, ...] = ("bytes_list", "float_list", "int64_list")
 _PATHS = frozenset({"file_path", "episode_id", "recording_folderpath"})
@@ -48,7 +51,7 @@ def droid() -> FoundData:
     """Return what is known of DROID 1.0.1 without a look at it."""
     published = Knob("published", "openpi's ranges; they are valid for 1.0.1 only")
     return replace(
-        like_droid(DROID, _DROID_EPISODES, is_simulated=False),
+        like_droid(DROID, _DROID_EPISODES, "DROID 1.0.1"),
         steps=_DROID_STEPS,
         idle={"rule": published, "ranges": Knob(RANGES)},
         about=(f"DROID 1.0.1, {_DROID_EPISODES:,} episodes, 1.7 TB, fetched from Google Cloud as they are needed",),
@@ -67,7 +70,7 @@ def look_at_rlds(path: str) -> FoundData:
     name = dataset_name(path)
     if name in _DROID_NAMES and _DROID_FEATURE in features:
         is_simulated = storage.exists(storage.join(path, _SIMULATION))
-        return like_droid(path, episodes, is_simulated=is_simulated)
+        return like_droid(path, episodes, "the simulated arm" if is_simulated else "DROID")
     images, depth = _cameras(features)
     where = storage.join(path, "features.json")
     camera, all_cameras = camera_knobs(images, depth, where)
@@ -78,17 +81,14 @@ def look_at_rlds(path: str) -> FoundData:
     columns, texts_of_episode = _columns(features), _identity_features(features)
     measured = measured_columns(columns)
     records = _sampled(shards, [*measured, *texts_of_episode])
-    states, fields = find_state(columns, _samples(records, measured), where, control_rate_hz=rate.value)
-    if is_bridge:
-        state, opened = Knob([_BRIDGE_FEATURE], "x, y, z, three angles, the gripper"), Knob(1.0, "BridgeData's")
-        states, fields = "pose", {"state": state, "gripper_open": opened, "gripper_closed": Knob(0.0)}
+    pose = _BRIDGE_POSE if is_bridge else find_pose(columns, _samples(records, measured), control_rate_hz=rate.value)
     return FoundData(
         source="rlds",
         path=path,
         knobs={
             "camera": camera,
             "fields": {
-                **fields,
+                **(pose or vector_state(columns, where)),
                 "identity": _identity(records, texts_of_episode),
                 "cameras": all_cameras,
                 "language": Knob(next((name for name in texts if "instruction" in name), None)),
@@ -97,26 +97,23 @@ def look_at_rlds(path: str) -> FoundData:
             },
         },
         rate_hz=rate,
-        states=states,
+        states="pose" if pose else "vector",
         episodes=episodes,
-        idle=idle_rule(has_velocities=has_velocities) if states == "pose" else None,
+        idle=idle_rule(has_velocities=has_velocities) if pose else None,
         about=(f"RLDS {name}, {episodes:,} episodes, {rate.value:g} steps a second{' (guessed)' * rate.is_guess}",)
         + ((f"depth maps are not used: {', '.join(depth)}",) if depth else ()),
     )
 
 
-def like_droid(path: str, episodes: int, *, is_simulated: bool) -> FoundData:
-    """Return what is known of DROID, or of the simulated arm, whose data sets are called as DROID's."""
-    camera = "a view from outside, as of DROID the released weights saw it" if is_simulated else _SEEN
-    rule = "openpi's rule" + ("" if is_simulated else "; the published ranges are of DROID 1.0.1")
-    title = "the simulated arm" if is_simulated else "DROID"
+def like_droid(path: str, episodes: int, title: str) -> FoundData:
+    """Return what is known of DROID, or of the simulated arm, whose data sets have the same features."""
     return FoundData(
         source="rlds",
         path=path,
-        knobs={"camera": Knob(_DROID_CAMERA, camera)},
+        knobs={"camera": Knob(_DROID_CAMERA)},
         rate_hz=Knob(_DROID_RATE_HZ),
         episodes=episodes,
-        idle={"rule": Knob("commands", rule)},
+        idle={"rule": Knob("commands", "openpi's rule")},
         about=(f"RLDS, {title}, {episodes:,} episodes, {_DROID_RATE_HZ:g} steps a second",),
     )
 
