@@ -102,6 +102,13 @@ def test_a_link_to_a_set_beside_it_is_no_second_set(tmp_path: Path) -> None:
     assert look_at(str(tmp_path)).path == str(tmp_path / "set")
 
 
+def test_a_set_with_a_version_folder_is_found_beside_another_one(tmp_path: Path) -> None:
+    WRITERS["rlds"](tmp_path / "rlds/name/1.0.0", range(2))
+    WRITERS["lerobot"](tmp_path / "lerobot", range(2))
+    with pytest.raises(InputError, match=r"2 data sets: .*lerobot, .*rlds/name"):
+        look_at(str(tmp_path))
+
+
 def test_numbers_that_are_no_pose_become_a_vector(tmp_path: Path) -> None:
     folder = write_lerobot(tmp_path / "set", range(3))
     info = json.loads((folder / "meta/info.json").read_text())

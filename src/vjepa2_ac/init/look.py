@@ -159,10 +159,10 @@ def simulated(path: str) -> FoundData:
 
 
 def _described(path: str, forms: Sequence[str]) -> list[tuple[str, str]]:
-    """Return form and folder of each data set with a description, at a path and up to two folders below it."""
+    """Return form and folder of each described data set, at a path, up to two folders below it, or in a version there."""
     found: dict[str, tuple[str, str]] = {}  # by the absolute path: links lead to one set by several names
     folders = [path]
-    for _ in range(_DEEPEST + 1):
+    for depth in range(_DEEPEST + 2):
         listed = zip(folders, in_parallel(storage.list_folder, folders, _CONNECTIONS), strict=True)
         folders = []
         for folder, entries in listed:
@@ -172,6 +172,8 @@ def _described(path: str, forms: Sequence[str]) -> list[tuple[str, str]]:
                 found.setdefault(storage.absolute(folder), (marks[mark], folder))
                 continue
             inner = [entry.name for entry in entries if not entry.is_file and not entry.name.startswith(".")]
+            if depth == _DEEPEST:
+                inner = [name for name in inner if _VERSION.fullmatch(name)]
             folders += [storage.join(folder, name) for name in sorted(inner, key=_as_version)[-_MOST_FOLDERS:]]
     return list(found.values())
 
