@@ -159,7 +159,7 @@ def simulated(path: str) -> FoundData:
 
 
 def _described(path: str, forms: Sequence[str]) -> list[tuple[str, str]]:
-    """Return form and folder of each described data set, at a path, up to two folders below it, or in a version there."""
+    """Return form and folder of each described set, at a path and up to two folders below, or in a version there."""
     found: dict[str, tuple[str, str]] = {}  # by the absolute path: links lead to one set by several names
     folders = [path]
     for depth in range(_DEEPEST + 2):
