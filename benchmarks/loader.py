@@ -20,6 +20,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -179,8 +180,9 @@ def measure_index(config: DataConfig) -> None:
     ]
     columns = {"shard": np.int32, "record": np.int32, "offset": np.int64, "length": np.int64}
     locators = {name: np.arange(DROID_EPISODES, dtype=kind) for name, kind in columns.items()}
-    get_or_build(config.disk_cache, "synthetic", config.path, lambda: EpisodeTable.of(infos, locators=locators))
-    del infos
+    table = replace(EpisodeTable.of(infos), locators=locators)
+    get_or_build(config.disk_cache, "synthetic", config.path, lambda: table)
+    del infos, table
     with multiprocessing.get_context("spawn").Pool(1) as fresh:  # memory freed by this process would be used again
         clips, opened, taken, memory = fresh.apply(_open_index, (config,))
     size = (Path(str(config.disk_cache.dir)) / "index" / "synthetic.index").stat().st_size / 1e6

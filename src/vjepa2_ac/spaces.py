@@ -66,6 +66,11 @@ def rotation_differences(angles: Float[np.ndarray, "time 3"]) -> Float[np.ndarra
     return euler_from_matrices(rotations[1:] @ rotations[:-1].swapaxes(-1, -2))
 
 
+def rotation_angles(rotations: Float[np.ndarray, "count 3"]) -> Float[np.ndarray, " count"]:
+    """Return the angles, in radians, of rotations given by extrinsic xyz Euler angles."""
+    return np.asarray(Rotation.from_euler("xyz", rotations).magnitude())
+
+
 def apply_action(
     state: Float[np.ndarray, "*batch 7"], action: Float[np.ndarray, "*batch 7"]
 ) -> Float[np.ndarray, "*batch 7"]:

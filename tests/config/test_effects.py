@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, get_args, get_origin
@@ -149,7 +150,7 @@ def keys_of(monkeypatch: pytest.MonkeyPatch) -> Callable[[Config], dict[str, str
             index: str = found(lambda: open_source(config.data).infos())
         except InputError:
             return dict.fromkeys(("index", "idle", "latents"))
-        table = EpisodeTable.of([EpisodeInfo("one", 9, None)], texts={"index": index})
+        table = replace(EpisodeTable.of([EpisodeInfo("one", 9, None)]), texts={"index": index})
         ranges = found(lambda: idle_ranges.find_ranges(open_source(config.data), table, config.data, None))
         latents = key_of_cache(config.data, index, encoding_of(world_model(), config))
         return {"index": index, "idle": ranges, "latents": latents.digest}

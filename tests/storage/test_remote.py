@@ -103,7 +103,7 @@ def test_a_read_past_the_end_gives_what_there_is(gcs: Gcs, file: str) -> None:
     gcs.fail_next(416, match="/download/")  # what Google says there
     assert storage.read_range(file, size, 10) == b""
     assert storage.read_range(file, 0, 0) == b""
-    with pytest.raises(storage.ShortReadError, match=f"3 of 10 bytes at {size - 3}"):
+    with pytest.raises(remote.ShortReadError, match=f"3 of 10 bytes at {size - 3}"):
         storage.read_ranges(file, [(0, 4), (size - 3, 10)])
 
 

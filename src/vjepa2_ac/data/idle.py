@@ -7,7 +7,6 @@ from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial.transform import Rotation
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig, IdleConfig
@@ -17,7 +16,7 @@ from vjepa2_ac.data.index import EpisodeProblem, EpisodeTable, fingerprint_of, g
 from vjepa2_ac.data.selection import StepSelection, as_error, as_problem
 from vjepa2_ac.episode import Episode, EpisodeSource, Progress, no_progress
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.spaces import POSE
+from vjepa2_ac.spaces import POSE, rotation_angles
 from vjepa2_ac.storage.structured import read_json_object, shown
 
 logger = logging.getLogger(__name__)
@@ -142,7 +141,7 @@ def idle_by_motion(states: Float[np.ndarray, "steps 7"], config: IdleConfig) -> 
     motion = POSE.differences(states.astype(np.float64))
     still = (
         (np.linalg.norm(motion[:, POSE.position], axis=1) < config.translation_m)
-        & (Rotation.from_euler("xyz", motion[:, POSE.rotation]).magnitude() < config.rotation_rad)
+        & (rotation_angles(motion[:, POSE.rotation]) < config.rotation_rad)
         & (abs(motion[:, POSE.gripper]) < config.gripper)
     )
     return np.concatenate([[False], still])

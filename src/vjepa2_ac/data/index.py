@@ -100,17 +100,8 @@ class EpisodeTable(Sequence[EpisodeInfo]):
     labels: Mapping[str, Labels] = field(default_factory=dict)
 
     @classmethod
-    def of(
-        cls,
-        infos: Sequence[EpisodeInfo],
-        *,
-        problems: Sequence[EpisodeProblem] = (),
-        locators: Mapping[str, np.ndarray] | None = None,
-        texts: Mapping[str, str] | None = None,
-        state_hashes: Sequence[int] | None = None,
-        labels: Mapping[str, Labels] | None = None,
-    ) -> EpisodeTable:
-        """Make a table; a given table is returned unchanged.
+    def of(cls, infos: Sequence[EpisodeInfo]) -> EpisodeTable:
+        """Make a table without the optional columns; a given table is returned unchanged.
 
         Raises:
             InputError: An identity contains a NUL character.
@@ -127,11 +118,6 @@ class EpisodeTable(Sequence[EpisodeInfo]):
             ids=ids,
             id_hash=np.array([identity_hash(info.id) for info in infos], np.uint64),
             id_rank=np.argsort(np.argsort(ids, kind="stable")).astype(np.int32),
-            problems=tuple(problems),
-            locators=dict(locators or {}),
-            texts=dict(texts or {}),
-            state_hash=None if state_hashes is None else np.array(state_hashes, np.uint64),
-            labels=dict(labels or {}),
         )
 
     def __len__(self) -> int:

@@ -142,11 +142,6 @@ def is_same_rate(video_hz: float, steps_hz: float) -> bool:
     return abs(video_hz - steps_hz) <= 0.02 * steps_hz
 
 
-def count_frames(file: str | Path | ByteReader, *, where: str) -> int:
-    """Return the number of frames of a video; errors as `read_header`."""
-    return read_header(file, where=where).num_frames
-
-
 def frame_times(file: str | Path | ByteReader, *, where: str) -> list[int]:
     """Return when each frame of a video is shown, in order, in the video's units of time; errors as `read_header`."""
     with _opened(file, where) as video:

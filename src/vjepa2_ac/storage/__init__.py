@@ -30,7 +30,7 @@ from vjepa2_ac.storage.files import (
     write_atomically,
 )
 from vjepa2_ac.storage.places import folder_at, is_url
-from vjepa2_ac.storage.remote import FileInfo, ShortReadError, bytes_fetched
+from vjepa2_ac.storage.remote import FileInfo, bytes_fetched
 from vjepa2_ac.storage.transfer import (
     download,
     file_sizes,

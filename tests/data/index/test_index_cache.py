@@ -3,6 +3,7 @@
 import errno
 import logging
 import random
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +22,9 @@ from vjepa2_ac.data.index import (
 )
 from vjepa2_ac.episode import EpisodeInfo
 
-TABLE = EpisodeTable.of(
-    [EpisodeInfo(f"küche/{number}", 10 + number) for number in range(5)],
-    problems=[EpisodeProblem("bad", "here", "damaged")],
+TABLE = replace(
+    EpisodeTable.of([EpisodeInfo(f"küche/{number}", 10 + number) for number in range(5)]),
+    problems=(EpisodeProblem("bad", "here", "damaged"),),
     locators={"offset": np.arange(5)},
     labels=labels_of([{"task": task} for task in (None, "lift", "push", "", "lift")]),
 )
@@ -53,7 +54,8 @@ def test_a_table_is_built_once_and_again_when_that_is_asked_for(tmp_path: Path) 
 
 
 def test_an_index_of_a_folder_is_found_wherever_it_is_moved_and_its_problems_are_there(tmp_path: Path) -> None:
-    broken = EpisodeTable.of([EpisodeInfo("one", 3)], problems=[EpisodeProblem("bad", "/data/set/a.npz: x", "damaged")])
+    problem = EpisodeProblem("bad", "/data/set/a.npz: x", "damaged")
+    broken = replace(EpisodeTable.of([EpisodeInfo("one", 3)]), problems=(problem,))
     kept(tmp_path, table=broken)
     table = kept(tmp_path, index_key({"files": 3}, "/mnt/set"), "/mnt/set")
     assert [problem.where for problem in table.problems] == ["/mnt/set/a.npz: x"]

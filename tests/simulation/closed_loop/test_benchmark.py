@@ -22,7 +22,7 @@ from vjepa2_ac.cli.console.tables import benchmark_notes
 from vjepa2_ac.decoding.decoder_folder import load_decoder
 from vjepa2_ac.evaluation.answer import CLOSED_LOOP_FILE
 from vjepa2_ac.media.images import read_image
-from vjepa2_ac.media.video import count_frames
+from vjepa2_ac.media.video import read_header
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.session import load_to_plan
 from vjepa2_ac.serving.about import metadata_of
@@ -133,7 +133,7 @@ def test_the_command_prints_a_row_for_each_and_writes_figures_and_a_film(
     assert reported["policies"]["tiny"]["why_counts"] == {"planned": 4}
     starts = [one["by_episode"]["distance_cm"][0][0] for one in reported["policies"].values()]
     assert starts == starts[:1] * 4  # the same problems for all
-    assert count_frames(tmp_path / FILM, where="film") == 4 + 1 + 4  # the first and the last image are held
+    assert read_header(tmp_path / FILM, where="film").num_frames == 4 + 1 + 4  # the first and the last image are held
 
 
 def test_the_same_call_gives_the_same_figures_and_another_seed_others(model: str, tmp_path: Path) -> None:

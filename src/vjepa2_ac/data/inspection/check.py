@@ -11,7 +11,6 @@ from textwrap import shorten
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
@@ -29,7 +28,7 @@ from vjepa2_ac.episode import Batch, Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.intervals import ENOUGH_EPISODES
 from vjepa2_ac.media.video import is_same_rate
-from vjepa2_ac.spaces import POSE, POSES, Spaces
+from vjepa2_ac.spaces import POSE, POSES, Spaces, rotation_angles
 
 _DARK = 8  # of 255: mean of frames that are nearly black
 _MOVED_M, _MOVED_SHARE = 0.01, 0.05  # of the flange, or of the range of a number: images should show it
@@ -247,7 +246,7 @@ def _pose_findings(
         (reach > _REACH_M, "warning", "most arms do not reach as far. Check that it is in metres, from the base"),
         (extent < 0.01, "warning", "all positions are within 1 cm. Check that they are in metres"),
     )
-    turned = np.rad2deg(Rotation.from_euler("xyz", actions[:, POSE.rotation]).magnitude())
+    turned = np.rad2deg(rotation_angles(actions[:, POSE.rotation]))
     yield first_case(
         "rotation",
         f"angles {angles.min():.2f} to {angles.max():.2f} rad; degrees per model step: {_percentiles(turned, '.1f')}",

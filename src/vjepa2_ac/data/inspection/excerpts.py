@@ -70,11 +70,10 @@ def excerpts_of(dataset: Dataset, *, episodes: int = EPISODES, steps: int = STEP
     """
 
     def read(index: int) -> Excerpt:
-        ranges = dataset.kept.of(index) or [(0, int(dataset.table.num_steps[index]))]
-        start, end = max(ranges, key=lambda one: one[1] - one[0])
+        start, end = max(dataset.kept.of(index), key=lambda one: one[1] - one[0])
         first = start + max(0, end - start - steps) // 2
         chosen = range(first, min(end, first + steps))
-        episode = dataset.source.read(index, None, dataset.needed_steps(index))
+        episode = dataset.read(index)
         states = np.asarray(episode.states[chosen.start : chosen.stop], np.float64)
         return Excerpt(episode.info.id, states, small_grey(episode.read_frames(chosen)))
 

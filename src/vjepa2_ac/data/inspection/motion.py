@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
-from scipy.spatial.transform import Rotation
 
 from vjepa2_ac import storage
 from vjepa2_ac.config.data import MotionLimits
@@ -19,7 +18,7 @@ from vjepa2_ac.data.inspection.findings import Finding, counted
 from vjepa2_ac.data.poses import num_rotation_numbers
 from vjepa2_ac.data.rotation_formats import MIN_JUMPS, rotation_speeds, smoother_format
 from vjepa2_ac.data.sources.indexed_source import IndexedSource
-from vjepa2_ac.spaces import POSE
+from vjepa2_ac.spaces import POSE, rotation_angles
 
 _EPISODES, _EPISODES_AT_URL = 200, 12
 _END_STEPS = 16  # steps at each end of an episode whose frames are read
@@ -81,7 +80,7 @@ def speed_finding(
         return Finding("skipped", "speed", "needs episodes of two or more steps, found none")
     changes = np.concatenate([POSE.differences(one.states) for one in stretches])
     speeds = control_rate_hz * np.linalg.norm(changes[:, POSE.position], axis=1)
-    turns = control_rate_hz * Rotation.from_euler("xyz", changes[:, POSE.rotation]).magnitude()
+    turns = control_rate_hz * rotation_angles(changes[:, POSE.rotation])
     excess = np.maximum(speeds / motion_limits.speed_m_s, turns / motion_limits.rotation_rad_s)
     if excess.max() <= 1:
         text = f"at most {speeds.max():.2f} m/s and {turns.max():.2f} rad/s between control steps ({checked})"
@@ -165,10 +164,10 @@ def _check_ends(dataset: Dataset) -> Finding:
     is_pose = dataset.spaces.state.position is not None
 
     def read(index: int) -> list[tuple[int, int, str]]:
-        ranges = dataset.kept.of(index) or [(0, int(dataset.table.num_steps[index]))]
+        ranges = dataset.kept.of(index)
         start, end = ranges[0][0], ranges[-1][1]
         count = min(_END_STEPS, (end - start + 1) // 2)
-        episode = dataset.source.read(index, None, dataset.needed_steps(index))
+        episode = dataset.read(index)
         counts = []
         for which, first, order in (("first", start, 1), ("last", end - count, -1)):
             grey = small_grey(episode.read_frames(range(first, first + count)))[::order]

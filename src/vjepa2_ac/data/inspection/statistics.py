@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial.transform import Rotation
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
@@ -17,6 +16,7 @@ from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.idle import idle_by_motion, long_idle_runs
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.spaces import rotation_angles
 
 PERCENTILES = (10, 50, 90, 99)
 SPLITS: tuple[Split, ...] = ("train", "validation", "test")
@@ -81,8 +81,8 @@ class Inspection:
         pieces = [piece for one in self.sample for piece in one.changes(stride, space)]
         changes = np.concatenate([np.zeros((0, len(space))), *pieces])
         if self.has_poses:
-            turned = Rotation.from_euler("xyz", changes[:, space.rotation]).magnitude()
-            sizes = {MOVED: space.shown_size(changes), TURNED: np.rad2deg(turned)}
+            turned_deg = np.rad2deg(rotation_angles(changes[:, space.rotation]))
+            sizes = {MOVED: space.shown_size(changes), TURNED: turned_deg}
         else:
             sizes = {CHANGED: largest_change(changes, self.ranges)}
         return StepSizes(stride, stride / control_rate_hz, sizes)

@@ -7,7 +7,7 @@ import logging
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Generic, Self, TypeVar
 
@@ -97,12 +97,12 @@ def table_of(found: Iterable[Found], config: DataConfig, total: int, progress: P
     rows = [one for one in usable.values() if one.kind == usual]
     logger.info("%s: %d episodes, %d that cannot be used", config.path, len(rows), len(problems))
     hashes, rate = [one.state_hash for one in rows], rows[0].rate_hz
-    return EpisodeTable.of(
-        [one.info for one in rows],
-        problems=problems,
+    return replace(
+        EpisodeTable.of([one.info for one in rows]),
+        problems=tuple(problems),
         locators={name: np.array([one.place[name] for one in rows]) for name in rows[0].place},
         texts={} if rate is None else {"control_rate_hz": str(rate)},
-        state_hashes=hashes if any(hashes) else None,
+        state_hash=np.array(hashes, np.uint64) if any(hashes) else None,
         labels=labels_of([one.labels for one in rows]),
     )
 

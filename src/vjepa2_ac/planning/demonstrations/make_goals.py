@@ -25,7 +25,7 @@ from vjepa2_ac.episode import FrameReader, Progress, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.film import spread_with_ends
 from vjepa2_ac.media.images import encode_png
-from vjepa2_ac.media.video import count_frames, read_frames
+from vjepa2_ac.media.video import read_frames, read_header
 from vjepa2_ac.planning.demonstrations.key_frames import (
     KeyFrame,
     StillRule,
@@ -202,7 +202,7 @@ def recording_of_film(path: Path) -> Recording:
         InputError: PyAV is not installed, or it is no MP4 of two frames or more.
     """
     where = str(path)
-    frames = count_frames(path, where=where)
+    frames = read_header(path, where=where).num_frames
     return Recording(path.name, frames, partial(read_frames, path, where=where), None, {"film": where})
 
 

@@ -24,7 +24,7 @@ from vjepa2_ac.data.index import EpisodeTable, get_or_build, hash_of_states, ind
 from vjepa2_ac.data.sources.indexed_source import FramesByStep, IndexedSource, Scanned, require_as_indexed
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError, require_library
-from vjepa2_ac.media.video import count_frames, frame_times, read_frames
+from vjepa2_ac.media.video import frame_times, read_frames, read_header
 from vjepa2_ac.spaces import POSE, zero_steps
 from vjepa2_ac.storage import FileInfo
 from vjepa2_ac.storage.structured import json_object
@@ -166,7 +166,7 @@ class RawDroidSource(IndexedSource[RawDroidData, None]):
                 there = ", ".join(video.name for video in listed.videos) or "none"
                 needed = f"the MP4 that {listed.metadata} or data.camera names; there are {there}"
                 raise InputError(where=path, found="no such file", needed=needed, fix=_FIX)
-            counts[serial] = count_frames(path, where=path)
+            counts[serial] = read_header(path, where=path).num_frames
         return counts
 
     def _numbers(self, place: _Place, serials: tuple[str, ...]) -> Arrays:
