@@ -1,8 +1,8 @@
 """Write LeRobot data sets v3.0, with pyarrow and PyAV: the files, columns and keys that LeRobot itself writes.
 
-Frames become H.264 (yuv420p, constant rate factor 18, a key frame every 2 frames), which is lossy. There is an MP4 for each episode and camera, and one table
-with a row group for each episode. All numbers and texts are exact. Layout, names and types are those of a data set that
-LeRobot 0.4.4 wrote.
+Frames become H.264 (yuv420p, constant rate factor 18, a key frame every 2 frames), which is lossy. There is an MP4 for
+each episode and camera, and one table with a row group for each episode. All numbers and texts are exact. Layout, names
+and types are those of a data set that LeRobot 0.4.4 wrote.
 """
 
 from __future__ import annotations
