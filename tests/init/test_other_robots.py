@@ -247,3 +247,139 @@ def test_single_wrong_values_do_not_change_the_proposal() -> None:
     pose = proposed("x y z roll pitch yaw gripper", numbers)
     assert (pose["rotation"].value, pose["rotation"].is_guess) == ("euler_xyz", False)
     assert "position_unit" not in pose
+
+
+def chosen_names(names: str) -> list[str]:
+    """Return the names of the numbers that are proposed; empty: no pose."""
+    named = tuple(names.split())
+    pose = find_pose({STATE: Column(len(named), named)})
+    if pose is None:
+        return []
+    return [named[place] for place in (pose["select"].value if "select" in pose else range(len(named)))]
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        ("x y z qx qy qz qw vx vy vz wx wy wz gripper", "x y z qx qy qz qw gripper"),
+        ("x y z rx ry rz vx vy vz wx wy wz gripper", "x y z rx ry rz gripper"),
+        ("x y z wx wy wz vx vy vz gripper", ""),  # an angular velocity is no rotation
+        ("theta_1 theta_2 theta_3 x y z rx ry rz gripper", "x y z rx ry rz gripper"),
+        ("angle1 angle2 angle3 x y z gripper", ""),
+        ("x y z r1 r2 r3 r4 r5 r6 gripper", ""),  # six numbers of a rotation matrix
+        ("fx fy fz tx ty tz x y z roll pitch yaw gripper", "x y z roll pitch yaw gripper"),
+        ("x y yaw ee_x ee_y ee_z ee_roll ee_pitch ee_yaw gripper", "ee_x ee_y ee_z ee_roll ee_pitch ee_yaw gripper"),
+        ("x.pos y.pos z.pos roll.pos pitch.pos yaw.pos gripper.pos",) * 2,
+        ("j_0 j_1 cube_x cube_y cube_z cube_roll cube_pitch cube_yaw gripper", ""),
+        ("gripper_vel x y z roll pitch yaw gripper", "x y z roll pitch yaw gripper"),
+    ],
+)
+def test_numbers_of_other_quantities_are_not_taken_for_the_pose(names: str, expected: str) -> None:
+    assert chosen_names(names) == expected.split()
+
+
+@pytest.mark.parametrize(
+    ("columns", "chosen", "is_guess"),
+    [
+        (["observation.left.cartesian_position", "observation.right.cartesian_position"], 0, True),
+        (["observation.target.cartesian_position", "observation.robot_state.cartesian_position"], 1, True),
+        (["observation.target_tcp_pose", "observation.current_tcp_pose"], 1, True),
+        (["observation.demo_start_pose", "observation.ee_pose"], 1, True),
+        (["observation.leader_ee_pose", "observation.follower_ee_pose"], 1, True),
+        (["observation.object_pose", "observation.ee_pose"], 1, True),
+        (["observation.prev_tcp_pose"], 0, True),
+        (["observation.ee_pose_in_camera", "observation.ee_pose_in_base"], 1, True),
+    ],
+)
+def test_the_measured_pose_of_the_hand_is_preferred(columns: list[str], chosen: int, is_guess: bool) -> None:
+    pose = find_pose({**{name: Column(6) for name in columns}, "observation.gripper_position": Column(1)})
+    assert pose is not None
+    assert (pose["state"].value[0], pose["state"].is_guess) == (columns[chosen], is_guess)
+
+
+@pytest.mark.parametrize("name", ["object_pose", "camera_pose", "head_pose", "cube_pose"])
+def test_the_pose_of_another_thing_is_not_the_robot(name: str) -> None:
+    assert find_pose({f"observation.{name}": Column(6), "observation.gripper": Column(1)}) is None
+
+
+def test_two_arms_in_columns_called_as_droids_are_not_mixed() -> None:
+    sides = [("left", "cartesian"), ("right", "gripper"), ("right", "cartesian"), ("left", "gripper")]
+    pose = find_pose(
+        {f"observation.{side}.{kind}_position": Column(6 if kind == "cartesian" else 1) for side, kind in sides}
+    )
+    assert pose is not None
+    assert pose["state"].value == ["observation.left.cartesian_position", "observation.left.gripper_position"]
+    assert pose["state"].is_guess
+
+
+def test_rotation_vectors_in_droids_columns_are_noticed() -> None:
+    samples = {
+        "steps/observation/cartesian_position": [written(one, "rotation_vector")[:, :6] for one in EPISODES],
+        "steps/observation/gripper_position": [one[:, 6:] for one in EPISODES],
+    }
+    pose = find_pose(
+        {"steps/observation/cartesian_position": Column(6), "steps/observation/gripper_position": Column(1)}, samples
+    )
+    assert pose is not None
+    assert (pose["rotation"].value, pose["rotation"].is_guess) == ("rotation_vector", True)
+
+
+def test_columns_of_robosuite_are_read() -> None:
+    samples = {
+        "observation.robot0_eef_pos": [one[:, :3] for one in EPISODES],
+        "observation.robot0_eef_quat": [written(one, "quaternion_xyzw")[:, 3:7] for one in EPISODES],
+        "observation.robot0_gripper_qpos": [np.stack([0.04 * (1 - one[:, 6])] * 2, axis=1) for one in EPISODES],
+        "observation.robot0_joint_pos": list(EPISODES),
+        "observation.robot0_gripper_qvel": [one[:, :2] for one in EPISODES],
+    }
+    pose = find_pose({name: Column(one[0].shape[1]) for name, one in samples.items()}, samples)
+    assert pose is not None
+    assert pose["state"].value == list(samples)[:3]
+    assert pose["select"].value == [0, 1, 2, 3, 4, 5, 6, 7]
+    assert pose["gripper_closed"].value == 0.0
+
+
+def test_names_of_position_and_orientation_may_be_in_the_column() -> None:
+    columns = {
+        "observation.tcp_position": Column(3, ("x", "y", "z")),
+        "observation.tcp_orientation": Column(4, ("w", "x", "y", "z")),
+        "observation.gripper": Column(1),
+    }
+    pose = find_pose(columns)
+    assert pose is not None
+    assert (pose["select"].value, pose["rotation"].value) == ([0, 1, 2, 4, 5, 6, 3, 7], "quaternion_xyzw")
+
+
+def test_rotation_vectors_in_degrees_are_a_guess_that_says_so() -> None:
+    numbers = [one * [1, 1, 1, 57.3, 57.3, 57.3, 1] for one in (written(one, "rotation_vector") for one in EPISODES)]
+    pose = proposed("x y z rotvec_x rotvec_y rotvec_z gripper", numbers)
+    assert pose["rotation"].is_guess
+    assert "rotation vectors in degrees cannot be read" in pose["rotation"].why
+
+
+def test_quaternions_with_empty_measurements_are_still_quaternions() -> None:
+    numbers = [written(one, "quaternion_xyzw") for one in EPISODES]
+    for one in numbers:
+        one[::4, 3:7] = 0.0
+    assert proposed("x y z qx qy qz qw gripper", numbers)["rotation"].value == "quaternion_xyzw"
+
+
+@pytest.mark.parametrize(
+    ("name", "ranges", "expected"),
+    [
+        ("gripper_closed", (0.0, 255.0), (0.0, 255.0)),
+        ("gripper_open", (-1.0, 1.0), (1.0, -1.0)),
+        ("gripper_closed", (0.0, 0.1), (0.0, 0.1)),
+    ],
+)
+def test_the_name_of_the_gripper_decides_its_direction(
+    name: str, ranges: tuple[float, float], expected: tuple[float, float]
+) -> None:
+    assert tuple(plain(gripper_knobs(name, ranges)).values()) == expected
+
+
+def test_of_eight_numbers_the_gripper_is_the_one_that_moves() -> None:
+    numbers = [np.insert(one, 6, 0.0, axis=1) for one in EPISODES]
+    pose = find_pose({STATE: Column(8)}, {STATE: numbers})
+    assert pose is not None
+    assert pose["select"].value == [0, 1, 2, 3, 4, 5, 7]

@@ -91,7 +91,7 @@ def idle_rule(*, has_velocities: bool) -> Knobs:
 
 _AT_THE_HAND = re.compile(r"wrist|hand|eih|gripper", re.I)
 _FROM_OUTSIDE = re.compile(r"ext|front|side|third|agent|base|scene|top|over|left|image_0|primary", re.I)
-_NOT_SEEN = re.compile(r"depth|disparity|segment|mask", re.I)
+_NOT_SEEN = re.compile(r"depth|disparity|segment|mask|gelsight|tactile", re.I)
 
 
 def is_no_camera(feature: str) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Mapping
 from functools import partial
 
@@ -89,5 +90,7 @@ def _range_of(root: str, column: str, index: int) -> Range | None:
     where = storage.join(root, _STATISTICS)
     with contextlib.suppress(OSError, UserError, KeyError, IndexError, TypeError, ValueError):
         statistics = json_object(storage.read_bounded(where, _MAX_BYTES), where=where)[column]
-        return float(statistics["min"][index]), float(statistics["max"][index])
+        low, high = float(statistics["min"][index]), float(statistics["max"][index])
+        if math.isfinite(low) and math.isfinite(high):
+            return low, high
     return None

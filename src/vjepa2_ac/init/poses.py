@@ -18,14 +18,20 @@ Numbers = Float[np.ndarray, "steps _"]
 Samples = Mapping[str, Sequence[Numbers]]  # the numbers of some episodes, by column; without a column: not read
 Range = tuple[float, float]  # the least and the greatest value
 
-DROID_STATE = ("cartesian_position", "gripper_position")  # 6 and 1 numbers, at the end of their names
+_NAMES_OF_DROID = ["x", "y", "z", "roll", "pitch", "yaw"]
 _MAX_RAD_S = 10.0  # no hand turns faster
 _MAX_GRIPPER_M, _MAX_SHARE = 0.15, 1.05  # largest values of a gripper's opening in metres, and of a share
 
-_OTHER_QUANTITY = r"joint|motor|shoulder|elbow|qpos|vel|speed|force|torque|effort|accel|wrench|current"
-_NO_POSE = re.compile(_OTHER_QUANTITY, re.I)
-_NO_STATE = re.compile(rf"action|timestamp|index|reward|done|{_OTHER_QUANTITY}", re.I)
-_COMMANDED = re.compile(r"target|cmd|command(ed)?|goal|desired|des|setpoint|action|ref(erence)?")
+_RATE = r"vel|speed|force|torque|effort|accel|wrench|current(?!_?(?:tcp|ee|pose|cart|pos|state))"
+_NO_RATE = re.compile(_RATE, re.I)
+_NO_POSE = re.compile(rf"joint|motor|shoulder|elbow|qpos|{_RATE}", re.I)
+_NO_STATE = re.compile(r"action|timestamp|index|reward|done", re.I)
+_NOT_MEASURED = re.compile(  # a pose of these is commanded, of another time, or relative
+    r"target|cmd|command(ed)?|goal|desired|des|setpoint|action|ref(erence)?|prev(ious)?|last|next|delta|rel(ative)?|"
+    r"err(or)?|start|init(ial)?|demo|leader|master"
+)
+_NO_HAND = re.compile(r"object|obj|cube|block|camera|cam|base|mobile|head|torso|world|tag|marker|aruco")
+_HAND = re.compile(r"|left|right|l|r|(robot|arm)_?\d*")  # a group whose pose is certainly that of a hand
 _POSE = re.compile(r"cartesian|ee_?f?(_|\.|$|pose|pos)|tcp|pose|state", re.I)
 _GRIPPER = re.compile(r"grip|finger", re.I)
 
@@ -33,12 +39,13 @@ _KINDS = (  # by the end of a number's name; the group is the axis
     ("euler_xyz", r"(?:^|_)(roll|pitch|yaw)$"),
     ("rotation_vector", r"(?:axis_?angle|axang|rot_?vec|rotation_vector|rvec)_?([xyz0-3])$"),
     ("rotation_vector", r"(?:^|_)w([xyz])$"),
-    ("euler_xyz", r"(?:euler|rpy|angles?|theta)_?([xyz0-3])$"),
+    ("euler_xyz", r"(?:euler|rpy)_?([xyz0-3])$"),
+    ("euler_xyz", r"(?:angles?|theta)_?([xyz])$"),  # with digits these are joints
     ("quaternion", r"(?:(?:^|_)q|quat_?|quaternion_?)([xyzw])$"),
     ("quaternion", r"(?:quat|quaternion)_?([0-4])$"),
     ("rotation", r"(?:^|_)(?:r|rot_?|rotation_?|ori_?|orient_?|orientation_?)([xyzw0-3])$"),
     ("position", r"(?:pos|position|trans|translation|xyz)_?([xyz0-3])$"),
-    ("position", r"(?:^|_)(?:[pt]_?)?([xyz])$"),
+    ("position", r"(?:^|_)(?:p_?)?([xyz])$"),
 )
 _COUNTS = {"rotation": (3, 4), "quaternion": (4,)}  # of numbers with different axes; of other kinds 3
 _AXES = {"roll": "x", "pitch": "y", "yaw": "z"}
@@ -68,6 +75,7 @@ class _Number:
     kind: str  # position, gripper, quaternion, rotation (names that fit several formats), or a rotation format
     axis: str = ""  # x, y, z, w or a digit
     group: str = ""  # the part of its name that tells arms apart; empty: nothing does
+    prefix: str = ""  # all of its name before the kind
     unit: str = ""
     is_named: bool = True  # False: recognised by the width of its column
 
@@ -88,18 +96,12 @@ def find_pose(
         range_of: Returns the range of a number, by column and index; default: the range of the samples.
     """
     measured, samples = measured_columns(columns), samples or {}
-    by_last_part = {_last_part(name): name for name in reversed(measured)}
-    droid = [by_last_part[end] for end in DROID_STATE if end in by_last_part]
-    if [measured[name].width for name in droid] == [6, 1]:
-        keys = {"state": Knob(droid, "called as DROID's columns"), "rotation": Knob("euler_xyz")}
-        column, index = droid[1], 0
-    else:
-        numbers = [number for name, one in measured.items() for number in _numbers_of(name, one, samples.get(name, ()))]
-        chosen = min(_candidates(numbers), key=_rank, default=None)
-        if chosen is None:
-            return None
-        keys = _keys_of(chosen, _left_out(chosen, numbers), measured, samples, control_rate_hz)
-        column, index = chosen[-1].column, chosen[-1].index
+    numbers = [number for name, one in measured.items() for number in _numbers_of(name, one, samples.get(name, ()))]
+    chosen = min(_candidates(numbers), key=_rank, default=None)
+    if chosen is None:
+        return None
+    keys = _keys_of(chosen, _left_out(chosen, numbers), measured, samples, control_rate_hz)
+    column, index = chosen[-1].column, chosen[-1].index
     names = measured[column].names
     name = names[index] if index < len(names) else _last_part(column)
     ranges = (range_of and range_of(column, index)) or _range_in(samples.get(column, ()), index)
@@ -107,7 +109,7 @@ def find_pose(
 
 
 def vector_state(columns: Mapping[str, Column], where: str) -> dict[str, Knob]:
-    """Return the key that reads a column of any numbers, if no pose was recognised: the one called state, if any.
+    """Return the key that reads a column of any numbers, if no pose was recognised: called state, or the widest.
 
     Raises:
         InputError: No column has measured numbers of the robot.
@@ -116,14 +118,18 @@ def vector_state(columns: Mapping[str, Column], where: str) -> dict[str, Knob]:
     if not measured:
         found = f"no measured numbers among {', '.join(columns) or 'no columns'}"
         raise InputError(where=where, found=found, needed="observations of the robot as float, int or bool")
-    chosen = next((name for name in measured if _last_part(name) == "state"), measured[0])
+    chosen = max(measured, key=lambda name: (_last_part(name) == "state", columns[name].width))
     why = f"{columns[chosen].width} numbers, no pose could be recognised; all columns: {', '.join(measured)}"
     return {"state": Knob([chosen], why, is_guess=True)}
 
 
 def measured_columns(columns: Mapping[str, Column]) -> dict[str, Column]:
-    """Return the columns that may hold a measured pose: no commands, joints or velocities."""
-    return {name: one for name, one in columns.items() if not _NO_STATE.search(name)}
+    """Return the columns that may hold a measured pose or gripper: no actions, joints or velocities."""
+    return {
+        name: one
+        for name, one in columns.items()
+        if not _NO_STATE.search(name) and not (_NO_RATE if _GRIPPER.search(name) else _NO_POSE).search(name)
+    }
 
 
 # ---- what each number is ----
@@ -139,6 +145,7 @@ def _words(name: str) -> str:
 
 
 def _group_in(words: str) -> str:
+    words = re.sub(r"_?(?:in|to|wrt|from)_(?:base|world|robot)(?:_frame)?", "", words)
     parts = dict.fromkeys(words.split("_"))
     return "_".join(part for part in parts if part and not _NEUTRAL.fullmatch(part))
 
@@ -153,29 +160,36 @@ def _numbers_of(column: str, one: Column, samples: Sequence[Numbers]) -> list[_N
     elif any(map(_NO_POSE.search, one.names)):
         return []
     names = _usual_names(column, one.width, samples)
-    is_named = len(names) == 1  # a gripper
+    is_named = len(names) == 1 or names == _NAMES_OF_DROID  # one number is a gripper
     return [replace(number, name=f"{column}[{number.index}]", is_named=is_named) for number in _named(column, names)]
 
 
 def _named(column: str, names: Sequence[str]) -> list[_Number]:
     """Return those numbers of a column whose names are of a part of a pose."""
     numbers = []
-    for index, name in enumerate(names):
-        words = _words(name)
+    all_words = [_words(name) for name in names]
+    has_rates = any(re.search(r"(?:^|_)v[xyz]$", words) for words in all_words)
+    has_six = any(re.search(r"(?:^|_)(?:r|rot|rotation)_?[4-9]$", words) for words in all_words)
+    for index, (name, words) in enumerate(zip(names, all_words, strict=True)):
         head, _, unit = words.rpartition("_")
         words = head if unit in _UNITS else words
-        kind, axis, group = _kind_of(words)
+        words = f"{_words(_last_part(column))}_{words}" if words in {"x", "y", "z", "w"} else words
+        kind, axis, prefix = _kind_of(words)
         if kind == "euler_xyz" and unit.startswith("deg"):
             kind = "euler_xyz_degrees"
-        if kind:
-            numbers.append(_Number(column, index, name, kind, axis, _group_in(f"{_words(column)}_{group}"), unit))
+        is_rate = has_rates and re.search(r"(?:^|_)w[xyz]$", words)  # beside a velocity: an angular velocity
+        is_of_six = has_six and kind == "rotation"  # six numbers of a rotation matrix
+        if kind and not is_rate and not is_of_six:
+            group = _group_in(f"{_words(column)}_{prefix}")
+            numbers.append(_Number(column, index, name, kind, axis, group, prefix, unit))
     return numbers
 
 
 def _kind_of(words: str) -> tuple[str, str, str]:
     """Return kind and axis of a number by the words of its name, and the other words; without a kind: of no pose."""
     if _GRIPPER.search(words):
-        return "gripper", "", words.rstrip("0123456789")
+        return ("", "", "") if _NO_RATE.search(words) else ("gripper", "", words.rstrip("0123456789"))
+    words = re.sub(r"_(?:pos|position)$", "", words)
     if not _NO_POSE.search(words):
         for kind, pattern in _KINDS:
             if match := re.search(pattern, words):
@@ -190,19 +204,24 @@ def _usual_names(column: str, width: int, samples: Sequence[Numbers]) -> list[st
         return [name] if width <= 2 else []
     if width in {3, 4}:
         return [f"{name}_{index}" for index in range(width)]
-    if width not in {6, 7, 8} or not _POSE.search(column):
+    if width == 6 and name == "cartesian_position":
+        return _NAMES_OF_DROID
+    if width not in {6, 7, 8} or not _POSE.search(column) or re.search(r"rot|axis|euler|quat|angle", name, re.I):
         return []
     if samples:
         has_quaternion = width > 6 and _are_unit(samples, [3, 4, 5, 6])
     else:
         has_quaternion = width == 8 or (width == 7 and not name.lower().endswith("state"))
     rotation = ["quat_0", "quat_1", "quat_2", "quat_3"] if has_quaternion else ["rot_0", "rot_1", "rot_2"]
-    return ["pos_0", "pos_1", "pos_2", *rotation, "gripper"][:width]
+    is_padded = width == 8 and len(rotation) == 3 and not any(np.ptp(one[:, 6]) for one in samples)
+    return ["pos_0", "pos_1", "pos_2", *rotation, *["padding"] * is_padded, "gripper"][:width]
 
 
 def _are_unit(samples: Sequence[Numbers], indexes: list[int]) -> bool:
+    """Return whether some numbers have length 1 at 90 % of the steps; without empty measurements (NaN or zeros)."""
     lengths = np.linalg.norm(np.concatenate(list(samples))[:, indexes], axis=1)
-    return bool((abs(lengths - 1) < 0.01).mean() > 0.9)
+    lengths = lengths[np.isfinite(lengths) & (lengths > 0)]
+    return len(lengths) > 0 and bool((abs(lengths - 1) < 0.01).mean() > 0.9)
 
 
 # ---- which numbers belong together ----
@@ -212,10 +231,10 @@ _Numbers = tuple[_Number, ...]  # of a candidate: position (3), rotation (3 or 4
 
 def _parts(numbers: Sequence[_Number]) -> Iterator[_Numbers]:
     """Yield positions and rotations: the numbers of an arm, a column and a kind in the order of their axes, w last."""
-    parts: dict[tuple[str, str, str], dict[str, _Number]] = {}
+    parts: dict[tuple[str, str, str, str], dict[str, _Number]] = {}
     for one in numbers:
-        parts.setdefault((one.group, one.column, one.kind), {}).setdefault(one.axis, one)
-    for (_, _, kind), by_axis in parts.items():
+        parts.setdefault((one.group, one.column, one.kind, one.prefix), {}).setdefault(one.axis, one)
+    for (_, _, kind, _), by_axis in parts.items():
         if len(by_axis) in _COUNTS.get(kind, (3,)):
             yield tuple(by_axis[axis] for axis in "01234xyzw" if axis in by_axis)
 
@@ -223,25 +242,34 @@ def _parts(numbers: Sequence[_Number]) -> Iterator[_Numbers]:
 def _candidates(numbers: Sequence[_Number]) -> Iterator[_Numbers]:
     """Yield position, rotation and gripper of each arm."""
     parts, all_grippers = list(_parts(numbers)), [one for one in numbers if one.kind == "gripper"]
-    for position in (part for part in parts if part[0].kind == "position"):
+    positions = [part for part in parts if part[0].kind == "position"]
+    for position in (part for part in positions if not any(map(_NO_HAND.fullmatch, part[0].group.split("_")))):
         group, column = position[0].group, position[0].column
         rotations = [part for part in parts if part[0].kind != "position" and part[0].group == group]
         grippers = [one for one in all_grippers if one.group in {group, ""} or len(all_grippers) == 1]
         if rotations and grippers:
-            rotation = min(rotations, key=lambda part: (part[0].column != column, part[0].kind not in FORMATS))
+            rotation = min(
+                rotations,
+                key=lambda part: (part[0].column != column, _is_w(part[0]), part[0].kind not in FORMATS),
+            )
             gripper = min(grippers, key=lambda one: (one.group != group, one.column != column))
             yield (*position, *rotation, gripper)
+
+
+def _is_w(number: _Number) -> bool:
+    """Return whether a number is called wx, wy or wz, which may also be an angular velocity."""
+    return number.kind == "rotation_vector" and re.search(r"(?:^|_)w[xyz]$", _words(number.name)) is not None
 
 
 def _rank(candidate: _Numbers) -> tuple[bool, bool, bool, int]:
     """Return what decides between candidates: measured, named, without the name of an arm, few columns."""
     is_named = all(one.is_named for one in candidate)
     columns = {one.column for one in candidate}
-    return _is_commanded(candidate), not is_named, bool(candidate[0].group), len(columns)
+    return _is_not_measured(candidate), not is_named, bool(candidate[0].group), len(columns)
 
 
-def _is_commanded(candidate: _Numbers) -> bool:
-    return any(_COMMANDED.fullmatch(part) for one in candidate for part in one.group.split("_"))
+def _is_not_measured(candidate: _Numbers) -> bool:
+    return any(_NOT_MEASURED.fullmatch(part) for one in candidate for part in one.group.split("_"))
 
 
 def _left_out(chosen: _Numbers, numbers: Sequence[_Number]) -> list[str]:
@@ -249,7 +277,7 @@ def _left_out(chosen: _Numbers, numbers: Sequence[_Number]) -> list[str]:
     columns = {one.column for one in chosen}
     rest = [one for one in numbers if one not in chosen and (one.group != chosen[0].group or one.column in columns)]
     groups = {one.group for one in rest if one.kind == "position"}
-    return [one.name for one in rest if one.group in groups]
+    return [one.name if one.column in columns else f"{one.column}: {one.name}" for one in rest if one.group in groups]
 
 
 # ---- how the numbers are written ----
@@ -263,18 +291,24 @@ def _keys_of(
     concatenated = [(name, index) for name in used for index in range(columns[name].width)]
     select = [concatenated.index((one.column, one.index)) for one in chosen]
     unnamed = [columns[one.column] for one in chosen if not one.is_named]
-    is_commanded, is_stray = _is_commanded(chosen), chosen[-1].group not in {chosen[0].group, ""}
+    group, is_stray = chosen[0].group, chosen[-1].group not in {chosen[0].group, ""}
+    doubts = []
     why = f"by the names {', '.join(one.name for one in chosen)}"
     if any(len(one.names) == one.width for one in unnamed):
         why = "the names promise a quaternion, and the numbers are not of length 1; read by width"
     elif unnamed:
         why = "by the width of the column, whose numbers have no names; if they are joints, set states: vector"
+    if is_stray:
+        doubts.append(f"the gripper is called {chosen[-1].name}")
+    if _is_not_measured(chosen):
+        doubts.append(f"{group or chosen[0].name} may not be the measured pose, which was not found")
+    elif not _HAND.fullmatch(group):
+        doubts.append(f"if {group} is not the hand, set states: vector")
     if left_out:
         shown = ", ".join(left_out[:8]) + (", …" if len(left_out) > 8 else "")
-        why += f"; left out: {shown}. For all numbers of the robot: states: vector"
-    if is_commanded:
-        why += "; these are commanded values, measured ones were not found"
-    is_guess = bool(unnamed or left_out) or is_commanded or is_stray
+        doubts.append(f"left out: {shown}. For all numbers of the robot: states: vector")
+    why = "; ".join([why, *doubts])
+    is_guess = bool(unnamed or doubts)
     keys = {"state": Knob(used, why, is_guess)}
     if select != list(range(len(concatenated))):
         keys["select"] = Knob(select, why, is_guess)
@@ -310,7 +344,10 @@ def _rotation_format(rotation: _Numbers, samples: Samples, control_rate_hz: floa
         why += "; the numbers were not read"
     largest = _usual_size(values)
     if proposed != "euler_xyz_degrees" and largest > ANGLE_RAD:
-        return Knob("euler_xyz_degrees", f"the numbers reach {largest:.0f}, which is too much for radians", is_guess)
+        why = f"the numbers reach {largest:.0f}, which is too much for radians"
+        if proposed == "rotation_vector":
+            why += "; rotation vectors in degrees cannot be read"
+        return Knob("euler_xyz_degrees", why, is_guess or proposed == "rotation_vector")
     values = [one[abs(one).max(axis=1) <= max(largest, ANGLE_RAD)] for one in values]
     smoother = smoother_format(rotation_speeds(values, control_rate_hz), proposed, _MAX_RAD_S) if values else None
     if smoother in {None, proposed}:
@@ -351,10 +388,10 @@ def gripper_knobs(name: str, ranges: Range | None) -> dict[str, Knob]:
         elif low < -0.5:
             opened, closed, why = -1.0, 1.0, f"{why}: probably -1 open, 1 closed"
     words = set(re.findall("open|close", name.lower()))
-    if len(words) == 1 and (opened, closed) == (0.0, 1.0):
-        if words == {"open"}:
-            opened, closed = 1.0, 0.0
-        if ranges is not None:
+    if len(words) == 1:
+        low, high = sorted((opened, closed))
+        opened, closed = (high, low) if words == {"open"} else (low, high)
+        if ranges is not None and (low, high) == (0.0, 1.0):
             return {"gripper_open": Knob(opened, f"by the name {name}"), "gripper_closed": Knob(closed)}
     why = f"{why}; `data check CONFIG --model RUN_OR_MODEL` tests whether it is inverted"
     return {"gripper_open": Knob(opened, why, is_guess=True), "gripper_closed": Knob(closed, "likewise", is_guess=True)}
@@ -362,5 +399,6 @@ def gripper_knobs(name: str, ranges: Range | None) -> dict[str, Knob]:
 
 def _range_in(samples: Sequence[Numbers], index: int) -> Range | None:
     """Return the least and the greatest sampled value of a number; None: the column was not read."""
-    values = [one[:, index] for one in samples]
-    return (float(min(map(np.nanmin, values))), float(max(map(np.nanmax, values)))) if values else None
+    values = np.concatenate([one[:, index] for one in samples]) if samples else np.zeros(0)
+    values = values[np.isfinite(values)]
+    return (float(values.min()), float(values.max())) if len(values) else None

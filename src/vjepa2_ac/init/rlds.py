@@ -35,6 +35,7 @@ _DROID_RATE_HZ, _BRIDGE_RATE_HZ, _UNKNOWN_RATE_HZ = 15.0, 5.0, 10.0
 _SIMULATION = "simulation.json"  # beside the shards of `vjepa2-ac simulate record`
 _VELOCITIES = "steps/action_dict/joint_velocity"
 _SAMPLED = 24  # records whose values are looked at
+_NUMBERS = ("float", "int", "uint", "bool")
 _ALL_KINDS: tuple[Kind, ...] = ("bytes_list", "float_list", "int64_list")
 _PATHS = frozenset({"file_path", "episode_id", "recording_folderpath"})
 
@@ -137,7 +138,11 @@ def _features(path: str) -> Iterator[tuple[str, _Feature]]:
         fix = "Name the features in the config by hand: `vjepa2-ac config text builtin:bridge` is an example"
         needed = "the features, as TFDS writes them"
         raise InputError(where=where, found="no such file", needed=needed, fix=fix) from None
-    yield from _inside(content, "")
+    try:
+        yield from _inside(content, "")
+    except (AttributeError, TypeError, ValueError) as error:
+        found = f"not a description of features ({error})"
+        raise InputError(where=where, found=found, needed="the features, as TFDS writes them") from None
 
 
 def _inside(content: Any, name: str) -> Iterator[tuple[str, _Feature]]:
@@ -183,7 +188,7 @@ def _columns(features: Mapping[str, _Feature]) -> dict[str, Column]:
     return {
         name: Column(one.width)
         for name, one in features.items()
-        if name.startswith("steps/") and one.kind == "tensor" and one.dtype.startswith(("float", "int", "bool"))
+        if name.startswith("steps/") and one.kind == "tensor" and one.dtype.startswith(_NUMBERS) and one.width > 0
     }
 
 
@@ -210,7 +215,8 @@ def _identity(records: Sequence[Mapping[str, tuple[Any, ...]]], names: Sequence[
     paths = [name for name in names if name.rsplit("/", 1)[-1] in _PATHS]
     for some in (paths, names):
         values = [tuple(record.get(name, ()) for name in some) for record in records]
-        if some and all(map(any, values)) and len(set(values)) == len(values):
+        is_named = all(any(part != b"" for feature in value for part in feature) for value in values)
+        if some and values and is_named and len(set(values)) == len(values):
             return Knob(list(some), "what tells episodes apart", is_guess=True)
     if not records and names:
         return Knob(list(paths or names), "what tells episodes apart; no record could be read", is_guess=True)

@@ -192,7 +192,9 @@ def _feature(content: Mapping[str, Any]) -> Feature:
     dtype, shape, names = content["dtype"], tuple(content["shape"]), content.get("names")
     if not isinstance(dtype, str) or not all(type(size) is int and size > 0 for size in shape):
         raise TypeError(f"a feature of dtype {dtype!r} and shape {shape!r}")
-    if isinstance(names, dict) and len(names) == 1:  # {"motors": ["x", "y", ...]}, as in older ports
+    if isinstance(names, dict) and all(type(index) is int for index in names.values()):  # {"x": 0, "y": 1, ...}
+        names = sorted(names, key=names.__getitem__)
+    elif isinstance(names, dict) and len(names) == 1:  # {"motors": ["x", "y", ...]}, as in older ports
         names = next(iter(names.values()))
     marks = [one for one in (content.get("info"), content.get("video_info")) if isinstance(one, Mapping)]
     is_depth = any(
