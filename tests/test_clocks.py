@@ -13,7 +13,7 @@ from vjepa2_ac.storage.files import remove_abandoned
 SOURCE = ROOT / "src/vjepa2_ac"
 DAY_S = 86_400.0
 WALL = {"time", "time_ns", "now", "today", "utcnow"}
-AGES_OF_FILES = {"storage/files.py", "storage/block_file.py"}  # which only the wall clock tells
+AGES_OF_FILES = {"storage/files.py"}  # which only the wall clock tells
 
 
 def asks_for_the_wall_clock(node: ast.AST) -> bool:
