@@ -27,8 +27,8 @@ _NO_RATE = re.compile(_RATE, re.I)
 _NO_POSE = re.compile(rf"joint|motor|shoulder|elbow|qpos|{_RATE}", re.I)
 _NO_STATE = re.compile(r"action|timestamp|index|reward|done", re.I)
 _NOT_MEASURED = re.compile(  # a pose of these is commanded, of another time, or relative
-    r"target|cmd|command(ed)?|goal|desired|des|setpoint|action|ref(erence)?|prev(ious)?|last|next|delta|rel(ative)?|"
-    r"err(or)?|start|init(ial)?|demo|leader|master"
+    r"target|cmd|command(ed)?|goal|desired|des|setpoint|action|ref(erence)?|prev(ious)?|last|next|delta|rel|relative|"
+    r"err|error|start|init|initial|demo|leader|master"
 )
 _NO_HAND = re.compile(r"object|obj|cube|block|camera|cam|base|mobile|head|torso|world|tag|marker|aruco")
 _HAND = re.compile(r"|left|right|l|r|(robot|arm)_?\d*")  # a group whose pose is certainly that of a hand
