@@ -198,6 +198,9 @@ def _section(prefix: str, section: Mapping[str, Any], schema: Mapping[str, Any],
     rows, inner = [], []
     for name, one in section.get("properties", {}).items():
         found = _section_of(one, schema)
+        of_items = _section_of(one.get("items") or {}, schema)  # of a list of sections
+        if of_items is not None:
+            inner.append((f"{prefix}{name}", of_items, f"{_about(one)} A list; each item has these keys."))
         if found is None:
             rows.append(f"| `{prefix}{name}` | {_kind(one, schema)} | {_default(one)} | {_about(one)} |")
         else:
