@@ -57,7 +57,7 @@ def poses_from(
     gripper = (numbers[:, -1:] - fields.gripper_open) / (fields.gripper_closed - fields.gripper_open)
     if num_rotation_numbers(fields.rotation) == 4:
         _require_unit_quaternions(rotation, where, fix)
-    else:
+    elif fields.rotation != "euler_xyz":
         unit = np.pi / 180 if fields.rotation == "euler_xyz_degrees" else 1.0
         require_plausible(np.concatenate([positions, unit * rotation, gripper], axis=1))
     if fields.rotation != "euler_xyz":
@@ -69,12 +69,12 @@ def poses_from(
 
 def _conversions(fields: PoseFields, section: str) -> dict[str, str]:
     """Return, by the name of a unit that implausible numbers may look like, the config key to set."""
-    found = {}
+    conversions = {}
     if fields.position_unit == "m":
-        found = {unit: f"set {section}.position_unit: {unit[0]}m" for unit in ("millimetres", "centimetres")}
+        conversions = {unit: f"set {section}.position_unit: {unit[0]}m" for unit in ("millimetres", "centimetres")}
     if fields.rotation == "euler_xyz":
-        found["degrees"] = f"set {section}.rotation: euler_xyz_degrees"
-    return found
+        conversions["degrees"] = f"set {section}.rotation: euler_xyz_degrees"
+    return conversions
 
 
 def require_selection(

@@ -2,7 +2,7 @@
 
 An Euler angle jumps by 2 pi where it passes pi, and a rotation vector changes its sign, although the hand turns on
 evenly. Read in the right format, a jump of the numbers is an ordinary step; read in another format, the hand turns
-abruptly. The speed over all steps does not show the format: a wrong format changes it by a factor of 0.3 to 3.
+abruptly. The speed over all steps does not show the format: in a wrong format the hand may be faster or slower.
 """
 
 from __future__ import annotations
@@ -83,12 +83,10 @@ def smoother_format(
 ) -> RotationFormat | None:
     """Return the format in which the hand turns much more smoothly than in the configured one; None: there is none.
 
-    Measured on 5,880 sets of random smooth motions in all three formats, also with noise, rounded numbers, repeated
-    steps, dropouts and joined episodes (a part of them: tests/data/test_rotation_formats.py): no false alarm. Where the
-    numbers jump 5 times or more, a wrong format was named in 99 % of the sets. A hand that points down (roll near pi)
-    makes them jump in nearly all sets (98 % named). If the hand is tilted by more than it moves, or is near its zero
-    rotation, the numbers never jump, and a wrong format is not found: half of all sets. Numbers in degrees are always
-    found if one of them is too large for radians.
+    tests/data/test_rotation_formats.py tries random smooth motions in all three formats. A hand that points down (roll
+    near pi) usually makes the numbers jump. If the hand is tilted by more than it moves, or is near its zero rotation,
+    the numbers never jump, and a wrong format is not found. Numbers in degrees are found if one of them is too large
+    for radians.
 
     Args:
         speeds: What `rotation_speeds` returns.
@@ -97,14 +95,14 @@ def smoother_format(
     """
     if num_rotation_numbers(written_as) == 4:
         return None
-    own = speeds.get(written_as)
-    if own is None or own.median_rad_s > max_rad_s:
+    configured = speeds.get(written_as)
+    if configured is None or configured.median_rad_s > max_rad_s:
         return "euler_xyz_degrees" if written_as != "euler_xyz_degrees" else None
-    gains = {other: one.num_smoother_than(own) for other, one in speeds.items()}
+    gains = {other: one.num_smoother_than(configured) for other, one in speeds.items()}
     clear = [
         other
         for other, gain in gains.items()
-        if gain >= MIN_JUMPS and gain > _CLEAR_MAJORITY * own.num_smoother_than(speeds[other])
+        if gain >= MIN_JUMPS and gain > _CLEAR_MAJORITY * configured.num_smoother_than(speeds[other])
     ]
     return max(clear, key=lambda other: gains[other], default=None)
 

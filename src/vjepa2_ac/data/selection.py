@@ -186,8 +186,8 @@ class BrokenEpisodes:
         names = [problem.name for problem in problems]
         if self._config.broken_episodes == "error":
             first, more = problems[0], len(problems) - 1
-            others = f"{more} more cannot be used either. " if more else ""
-            raise self.refusal(as_error(replace(first, fix=others + first.fix)), names)
+            more_problems = f"{more} more cannot be used either. " if more else ""
+            raise self.refusal(as_error(replace(first, fix=more_problems + first.fix)), names)
         logger.warning(
             "%s: %d of %d episodes are broken and left out: %s; the first: %s",
             self._config.path, len(problems), self._episodes, named(names), as_error(problems[0]),

@@ -129,8 +129,8 @@ def look_at(path: str, form: str | None = None) -> FoundData:
             return LOOKS[form or _recognized(path)](path)
         form, newest, versions = _only_set(described, path)
         found = LOOKS[form](newest)
-        others = f"version {_name_of(newest)}, the newest of {', '.join(versions)}"
-        return replace(found, about=(*found.about, *[others] * (len(versions) > 1)))
+        version_note = f"version {_name_of(newest)}, the newest of {', '.join(versions)}"
+        return replace(found, about=(*found.about, *[version_note] * (len(versions) > 1)))
 
 
 def _of_plugins(path: str) -> FoundData | None:
@@ -160,7 +160,7 @@ def simulated(path: str) -> FoundData:
 
 def _described(path: str, forms: Sequence[str]) -> list[tuple[str, str]]:
     """Return form and folder of each described set, at a path and up to two folders below, or in a version there."""
-    found: dict[str, tuple[str, str]] = {}  # by the absolute path: links lead to one set by several names
+    described: dict[str, tuple[str, str]] = {}  # by the absolute path: links lead to one set by several names
     folders = [path]
     for depth in range(_DEEPEST + 2):
         listed = zip(folders, in_parallel(storage.list_folder, folders, _CONNECTIONS), strict=True)
@@ -169,13 +169,13 @@ def _described(path: str, forms: Sequence[str]) -> list[tuple[str, str]]:
             names = {entry.name for entry in entries}
             marks = {_MARKS[form]: form for form in forms if _MARKS[form].partition("/")[0] in names}
             if mark := next((mark for mark in marks if storage.exists(storage.join(folder, mark))), None):
-                found.setdefault(storage.absolute(folder), (marks[mark], folder))
+                described.setdefault(storage.absolute(folder), (marks[mark], folder))
                 continue
             inner = [entry.name for entry in entries if not entry.is_file and not entry.name.startswith(".")]
             if depth == _DEEPEST:
                 inner = [name for name in inner if _VERSION.fullmatch(name)]
             folders += [storage.join(folder, name) for name in sorted(inner, key=_as_version)[-_MOST_FOLDERS:]]
-    return list(found.values())
+    return list(described.values())
 
 
 def _only_set(described: Sequence[tuple[str, str]], path: str) -> tuple[str, str, list[str]]:

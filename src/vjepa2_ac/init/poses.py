@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from vjepa2_ac.config.data import MotionLimits
 from vjepa2_ac.data.rotation_formats import FORMATS, rotation_speeds, smoother_format
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.init.found import Knob
@@ -19,7 +20,7 @@ Samples = Mapping[str, Sequence[Numbers]]  # the numbers of some episodes, by co
 Range = tuple[float, float]  # the least and the greatest value
 
 _NAMES_OF_DROID = ["x", "y", "z", "roll", "pitch", "yaw"]
-_MAX_RAD_S = 10.0  # no hand turns faster
+_MAX_RAD_S = MotionLimits().rotation_rad_s  # as `data check` assumes
 _MAX_GRIPPER_M, _MAX_SHARE = 0.15, 1.05  # largest values of a gripper's opening in metres, and of a share
 
 _RATE = r"vel|speed|force|torque|effort|accel|wrench|current(?!_?(?:tcp|ee|pose|cart|pos|state))"
@@ -177,7 +178,7 @@ def _named(column: str, names: Sequence[str]) -> list[_Number]:
         kind, axis, prefix = _kind_of(words)
         if kind == "euler_xyz" and unit.startswith("deg"):
             kind = "euler_xyz_degrees"
-        is_rate = has_rates and re.search(r"(?:^|_)w[xyz]$", words)  # beside a velocity: an angular velocity
+        is_rate = has_rates and re.search(r"(?:^|_)w[xyz]$", words)  # next to a velocity: an angular velocity
         is_of_six = has_six and kind == "rotation"  # six numbers of a rotation matrix
         if kind and not is_rate and not is_of_six:
             group = _group_in(f"{_words(column)}_{prefix}")

@@ -99,8 +99,8 @@ def _check_selection(dataset: Dataset) -> Iterator[Finding]:
     yield from _check_test_split(dataset)
     if config.split_by is not None:
         groups = len(np.unique(dataset.split_hash[dataset.taking_part]))
-        own = ", except for the splits of the data set" if held_out_by(dataset.table, config) else ""
-        yield Finding("ok", "groups", f"{groups:,} groups by {config.split_by}; each is in one split{own}")
+        exception = ", except for the splits of the data set" if held_out_by(dataset.table, config) else ""
+        yield Finding("ok", "groups", f"{groups:,} groups by {config.split_by}; each is in one split{exception}")
     duplicates = find_duplicates(dataset)
     level = "skipped" if not duplicates.is_known else "warning" if duplicates.episodes else "ok"
     yield Finding(level, "duplicates", str(duplicates))

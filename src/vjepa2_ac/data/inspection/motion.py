@@ -149,13 +149,14 @@ def _check_rotation_format(dataset: Dataset, sample: Sequence[ReadEpisode]) -> I
         fix = f"Set data.{section}.rotation: {smoother}" if section else "Write extrinsic xyz Euler angles in radians"
         yield Finding("warning", about, f"{readings}. {fix}")
         return
-    own, others = speeds[configured], [one for name, one in speeds.items() if name != configured]
-    decisive = min(map(own.num_smoother_than, others), default=MIN_JUMPS)
+    of_configured, of_others = speeds[configured], [one for name, one in speeds.items() if name != configured]
+    decisive = min(map(of_configured.num_smoother_than, of_others), default=MIN_JUMPS)
     if decisive < MIN_JUMPS:
         needed = f"needs at least {MIN_JUMPS} jumps of the rotation numbers, as where an angle passes pi"
         yield Finding("skipped", about, f"{needed}, to tell formats apart; found {decisive}")
     else:
-        text = f"the hand turns smoothly at {own.num_smooth_jumps} of {own.num_jumps} jumps of the rotation numbers"
+        smooth, jumps = of_configured.num_smooth_jumps, of_configured.num_jumps
+        text = f"the hand turns smoothly at {smooth} of {jumps} jumps of the rotation numbers"
         yield Finding("ok", about, f"{text} if they are read as {configured}, and in no other format")
 
 

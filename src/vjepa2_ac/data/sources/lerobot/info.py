@@ -180,8 +180,8 @@ def _parsed(root: str, content: Mapping[str, Any]) -> DatasetInfo:
 def _splits(content: object) -> dict[str, range]:
     """Return the episodes of each split, from {"train": "0:50"}; other notations are ignored."""
     texts = content if isinstance(content, Mapping) else {}
-    found = {str(name): re.fullmatch(r"(\d{1,9}):(\d{1,9})", str(text)) for name, text in texts.items()}
-    return {name: range(int(part[1]), int(part[2])) for name, part in found.items() if part}
+    ranges = {str(name): re.fullmatch(r"(\d{1,9}):(\d{1,9})", str(text)) for name, text in texts.items()}
+    return {name: range(int(part[1]), int(part[2])) for name, part in ranges.items() if part}
 
 
 def _feature(content: Mapping[str, Any]) -> Feature:
