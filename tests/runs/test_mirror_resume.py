@@ -178,7 +178,9 @@ def test_a_place_without_permission_is_an_error_with_the_way_out(
     bucket: Gcs, config: Config, match: str, failure: int
 ) -> None:
     bucket.fail_next(failure, times=9, match=match)
-    with pytest.raises(InputError, match=r"^checkpoint.remote: gs://bucket/run: no permission.*Log in.*another place"):
+    with pytest.raises(
+        InputError, match=r"^checkpoint.remote: gs://bucket/run\S*: no permission.*Log in.*another place"
+    ):
         open_remote(config, SILENT)
 
 

@@ -26,6 +26,7 @@ _USUAL_ALPHA = 32.0  # of every config here, at any rank
 Family = Literal["v2", "v2.1"]
 FramePath = Literal["tubelet", "image"]
 EncoderKey = Literal["ema_encoder", "target_encoder", "encoder"]
+EncoderWeights = Literal["target_encoder", "encoder"]
 
 
 class EncoderSizes(Section):
@@ -165,6 +166,9 @@ class ModelConfig(Section):
     encoder: Annotated[EncoderConfig | None, Affects.RUN] = None
     """A pretrained encoder, for a fresh predictor (`random`) or one that comes without (a `base` that holds a predictor
     alone); null: the base's own. Its family, width, depth, heads and MLP are the file's."""
+    encoder_weights: Annotated[EncoderWeights, Affects.RUN | Affects.PLAN] = "target_encoder"
+    """The encoder of an official `.pt` that holds two different ones. Meta's code trains the predictor on
+    `target_encoder`; a file with one encoder, or with two equal ones, gives the same model with either value."""
     random: Annotated[ModelSizes | None, Affects.RUN] = None
     """Instead of `base`: a fresh predictor of these sizes, and, without `encoder`, a random encoder; with
     `adapter.kind: none` that is training from scratch."""

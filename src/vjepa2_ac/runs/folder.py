@@ -38,7 +38,7 @@ from vjepa2_ac.config.loading import changed_keys, config_as_flat_dict, config_a
 from vjepa2_ac.config.section import Affects, mark_of
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.runs.checkpoint import CHECKPOINTS, remove_leavings
-from vjepa2_ac.storage import read_bounded, try_writing_at, user_can_write, write_atomically
+from vjepa2_ac.storage import read_bounded, try_writing_at, user_can_read, user_can_write, write_atomically
 from vjepa2_ac.storage.places import BUILTIN, is_url, literal
 from vjepa2_ac.storage.structured import MOST_BYTES, json_list, shown, utc_now
 
@@ -237,8 +237,9 @@ def _is_without_config(path: Path) -> bool:
 
 def _earlier_starts(path: str | Path) -> list[dict[str, Any]]:
     try:
-        starts = json_list(read_bounded(path, MOST_BYTES), where=str(path))
-    except (OSError, InputError):
+        with user_can_read(path):
+            starts = json_list(read_bounded(path, MOST_BYTES), where=str(path))
+    except InputError:  # there is none, or it is damaged
         return []
     return [start for start in starts if isinstance(start, dict)]
 
