@@ -225,7 +225,7 @@ def _words(options: argparse.Namespace) -> tuple[str, ...]:
 
 def _of_clip(options: argparse.Namespace, out: Path, reporter: Reporter) -> Imagination:
     from vjepa2_ac.evaluation.imagined import ImagineOptions, imagine_clip
-    from vjepa2_ac.evaluation.request import EvaluationOptions
+    from vjepa2_ac.evaluation.request import EvaluationOptions, settle
     from vjepa2_ac.simulation.counterfactual import with_what_happens
 
     cli.say_places_elsewhere(options.subject)
@@ -239,9 +239,10 @@ def _of_clip(options: argparse.Namespace, out: Path, reporter: Reporter) -> Imag
         episode=options.episode,
         start=options.start,
         evaluation=EvaluationOptions(
-            checkpoint=options.checkpoint, data=data, out=out, overrides=tuple(options.overrides)
+            checkpoint=options.checkpoint, data=data, out=out, planning=tuple(options.overrides)
         ),
     )
+    cli.require_subject(options.subject, settle(options.subject, asked.evaluation), options.words)
     return with_what_happens(imagine_clip(options.subject, asked, reporter=reporter)).imagination
 
 
