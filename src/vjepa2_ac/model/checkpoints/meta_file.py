@@ -32,7 +32,7 @@ _PARTS = (
 )
 _NEEDED = "a checkpoint of V-JEPA 2, 2.1 or 2-AC as Meta publishes it"
 _SPLIT = ("q", "k", "v")
-_PREFIXES = re.compile(r"^(?:(?:module|backbone)\.)+|_orig_mod\.")  # DistributedDataParallel, Meta, torch.compile
+_PREFIXES = re.compile(r"^(?:(?:module|backbone|_orig_mod)\.)+|_orig_mod\.")  # the last: of torch.compile, anywhere
 _IGNORED = "pos_embed"  # may be in a file: a network with rotary positions does not use it
 _ENCODER = [
     (r"^vit\.embeddings\.patch_embeddings\.", "patch_embed."),
