@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -213,6 +213,7 @@ NEAR = st.builds(
 
 
 @settings(max_examples=150, deadline=None)
+@example(np.array([[0.04, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]] * 2), "delta", 0.4)  # together they leave the workspace
 @given(WILD | NEAR, st.sampled_from(["delta", "pose"]), st.floats(0.26, 0.5))
 def test_whatever_a_controller_plans_the_action_sent_is_within_the_limits(
     liar: Session, lie: np.ndarray, form: ActionForm, x: float
