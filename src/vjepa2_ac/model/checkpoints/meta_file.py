@@ -67,7 +67,7 @@ class MetaFile:
 
         Raises:
             InputError: There is no such file, or it is of another kind, truncated, a git-lfs pointer or a pipe.
-        UnreachableError: It cannot be read.
+            UnreachableError: It cannot be read.
         """
         with storage.user_can_read(path, needed=_NEEDED, fix=FIX):
             try:
