@@ -33,6 +33,7 @@ from vjepa2_ac.evaluation.result import PERSISTENCE, About, Evaluation, Measurem
 from vjepa2_ac.model.adapter.lora import base_only, unadapted_copy
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.planning.prior.action_prior import load_prior
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import select_checkpoint
 from vjepa2_ac.runs.folder import METRICS, is_run
@@ -159,6 +160,10 @@ def measure_subject(
     chosen = validation_windows(dataset, asked.split, clips=asked.clips)
     loaded = load_subject(subject, config, asked, dataset, decoder)
     run, world_model, contenders = loaded.run, loaded.world_model, loaded.contenders
+    planning, prior = config.planning, None
+    if asked.probes.planning_clips and planning.prior is not None:
+        trained = load_prior(planning.prior, where="planning.prior")
+        prior = trained.of(world_model.encoder_fingerprint(), config.data.crop).to(accelerator.device)
     through_cache = with_latents_if_there(config, dataset, world_model)
     if through_cache.config.is_cache and not asked.calibrate:
         world_model.set_encoder_aside()
@@ -176,7 +181,7 @@ def measure_subject(
             contenders,
             clips,
             _about(subject, run, config, dataset, asked),
-            probes=replace(asked.probes, planning=config.planning, axis_clips=axis_clips),
+            probes=replace(asked.probes, planning=planning, prior=prior, axis_clips=axis_clips),
             reporter=reporter,
         )
         decoded = None

@@ -14,6 +14,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.data import Split
@@ -24,6 +25,9 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.settings import require_limits, with_taught_limits
 from vjepa2_ac.runs.checkpoint import SELECTED
 from vjepa2_ac.runs.folder import is_of_moved, is_run, read_run_config
+
+if TYPE_CHECKING:
+    from vjepa2_ac.planning.prior.action_prior import ActionPrior
 
 STEPS = 3  # of a scored plan
 FRAMES = STEPS + 1  # required of a clip
@@ -62,6 +66,7 @@ class ProbeOptions:
     at_once: int = 64  # samples per batch
     planning_clips: int = 0  # number of clips whose plans are compared with the demonstration; of poses only
     planning: PlanningConfig = field(default_factory=PlanningConfig)  # settings of one-step plans
+    prior: ActionPrior | None = None  # network of `planning.prior`, on the device of the latents
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from vjepa2_ac.media.images import require_image, require_mask
 from vjepa2_ac.model.network.world_model import WorldModel, heads_to_replace, widths_as_text, widths_of_model
 from vjepa2_ac.model.state_integration import states_along
 from vjepa2_ac.planning.chunks import ChunkScores
-from vjepa2_ac.planning.energy import Goal, Scene, WorldModelCost, distance, patch_weights
+from vjepa2_ac.planning.energy import EnergyFunction, Goal, Scene, WorldModelCost, distance, patch_weights
 from vjepa2_ac.planning.goals import REACHED, GoalProgress, GripperMode, SubGoal, timed, with_shares
 from vjepa2_ac.planning.model_setup import Axes, Fingerprints, prepare_for_planning
 from vjepa2_ac.planning.planner import Cancelled, Plan, Planner, SearchCancelledError, until_cancelled
@@ -114,7 +114,7 @@ class Controller:
             raise InputError(where="planning.views", found=found, needed=needed)
         self._model, self.seed, self.crop = prepare_for_planning(world_model, self.config), seed, crop
         self._camera = None if extrinsics is None else torch.from_numpy(extrinsics.astype(np.float32))
-        self.spaces = spaces
+        self.spaces, self._energy = spaces, EnergyFunction.of(self.config.energy)
         self._load_what_is_its(world_model)
         self.space = search_space(self.config, spaces.state)  # the allowed changes of the state, of the last decision
         self.planner = Planner(self.config, self.space)
@@ -398,7 +398,7 @@ class Controller:
         """Return which goal applies to the current image."""
 
         def energy(place: int) -> float:
-            return float(distance(latents, self._goal_latents[place], self.config.energy, self._patch_weights))
+            return float(distance(latents, self._goal_latents[place], self._energy, self._patch_weights))
 
         if self._progress is None:
             return GoalProgress(0, 0, energy(0))
@@ -419,12 +419,12 @@ class Controller:
         """Return how far the current image is from the goal of each of so many steps, and which goals these are."""
         goal, done = self._goal_from(progress.place), self._done - progress.since
         wanted = goal.ahead(done, steps)
-        still = distance(latents.expand_as(wanted), wanted, self.config.energy, goal.weights)
+        still = distance(latents.expand_as(wanted), wanted, self._energy, goal.weights)
         return still, tuple(progress.place + goal.place(done + step) for step in range(steps))
 
     def _cost(self, seen: Sequence[Seen], progress: GoalProgress) -> WorldModelCost:
         goal, done = self._goal_from(progress.place), self._done - progress.since
-        return WorldModelCost(self._model, self._scene(seen), goal, self.config.energy, done=done, spaces=self.spaces)
+        return WorldModelCost(self._model, self._scene(seen), goal, self._energy, done=done, spaces=self.spaces)
 
     def _over_steps(self, distances: Float[Tensor, " steps"]) -> float:
         return float(distances[-1] if self.config.energy.steps == "last" else distances.sum())
@@ -474,7 +474,7 @@ class Controller:
         is_other = now.surprise.is_alarm or now.progress.place != before.progress.place
         if is_other or len(before.plan.actions) < 2 or before.plan.stopped == "no finite energy":
             return None
-        return replace(before.plan, actions=before.plan.actions[1:], iterations=(), evaluations=0, seconds=0.0)
+        return replace(before.plan, actions=before.plan.actions[1:], evaluations=0, seconds=0.0)
 
     def _start(self, cost: WorldModelCost, progress: GoalProgress, samples: np.ndarray | None) -> PlanStart | None:
         """Return where a search starts: what a policy or the prior says, or what is left of the last plan."""

@@ -130,8 +130,9 @@ class Plan:
 
         A decision of the next plan begins at the mean of what this plan would have done in its model steps: if an
         action is repeated, a decision begins between two of this plan's. The last decision is repeated for the steps
-        that this plan did not reach.
+        that this plan did not reach. Steps of a plan that was carried on before, whose actions are gone, count as well.
         """
+        done += len(self.mean) * self.repeat - len(self.actions)
         elites = self.iterations[-1].elites if self.iterations else self.mean[None][:0]
         return PlanStart(_later(self.mean[None], done, self.repeat)[0], _later(elites, done, self.repeat))
 
