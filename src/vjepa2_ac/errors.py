@@ -137,6 +137,11 @@ def refusal_of(error: OSError) -> tuple[str, str]:
     return f"{said} ({owned}; this process runs as uid {os.geteuid()})", fix
 
 
+def shell_command(*words: object) -> str:
+    """Return a command of this program as it is typed in a shell, with paths quoted where they need it."""
+    return shlex.join([_PACKAGE, *map(str, words)])
+
+
 def pip_install(extra: str = "") -> str:
     """Return the command that installs this package, or an extra of it, as it was installed: a checkout, or a wheel.
 

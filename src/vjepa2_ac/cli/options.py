@@ -12,7 +12,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias, TypeVar
 
-from vjepa2_ac.errors import InputError, did_you_mean, printable
+from vjepa2_ac.errors import InputError, did_you_mean, printable, shell_command
 from vjepa2_ac.process import is_first
 from vjepa2_ac.storage import places
 
@@ -384,7 +384,7 @@ def _reader(read: Callable[[str], _Read]) -> Callable[[str], _Read]:
 
 def _config_path(text: str) -> str:
     if places.is_url(text):
-        raise ValueError(f"is a URL. If it holds data, run `vjepa2-ac init {text}`, which writes a config")
+        raise ValueError(f"is a URL. If it holds data, run `{shell_command('init', text)}`, which writes a config")
     return places.on_this_machine(text)
 
 

@@ -7,7 +7,6 @@ import importlib.resources
 import json
 import os
 import re
-import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from vjepa2_ac.config import Config, DataConfig
 from vjepa2_ac.config.data import source_of
 from vjepa2_ac.config.run import ReplayConfig
 from vjepa2_ac.config.section import marks_of
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, shell_command
 from vjepa2_ac.registry import SOURCES, UNKNOWN_OPTION, import_plugins
 from vjepa2_ac.storage.places import BUILTIN
 from vjepa2_ac.storage.structured import message_of, parse_yaml
@@ -155,7 +154,7 @@ def _read_yaml(path: Path) -> dict[str, Any]:
         fix = "`vjepa2-ac init` writes one for your data; `vjepa2-ac config list` shows those of the package"
         raise InputError(where=str(path), found="no such file", needed="a config", fix=fix) from None
     except IsADirectoryError:
-        fix = f"If it holds data, run `vjepa2-ac init {shlex.quote(str(path))}`, which writes a config"
+        fix = f"If it holds data, run `{shell_command('init', path)}`, which writes a config"
         if (path / "config.yaml").is_file():
             fix = f"The config of the run in it is {path / 'config.yaml'}"
         raise InputError(where=str(path), found="a folder", needed="a config, which is a YAML file", fix=fix) from None

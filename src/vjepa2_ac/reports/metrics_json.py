@@ -14,7 +14,7 @@ from typing import Any, Literal
 from pydantic import TypeAdapter, ValidationError
 from pydantic_core import to_jsonable_python
 
-from vjepa2_ac.errors import InputError, MissingFileError
+from vjepa2_ac.errors import InputError, MissingFileError, shell_command
 from vjepa2_ac.evaluation.answer import Answer, answer
 from vjepa2_ac.evaluation.request import SCORED
 from vjepa2_ac.evaluation.result import L1, Evaluation, Row, WrittenAbout
@@ -81,7 +81,7 @@ def read_metrics(folder: Path) -> Metrics:
         InputError: There is nothing, it is damaged, or of another format.
         UnreachableError: It cannot be read.
     """
-    path, fix = folder / METRICS_FILE, f"Write it with `vjepa2-ac evaluate {folder}`"
+    path, fix = folder / METRICS_FILE, f"Write it with `{shell_command('evaluate', folder)}`"
     try:
         with user_can_read(path):
             return TypeAdapter(Metrics).validate_json(path.read_bytes())

@@ -26,10 +26,7 @@ Part = Literal["encoder", "encoder 2.1", "predictor"]
 Rename = Callable[[str], tuple[str, int | None]]
 """Our name of a tensor -> the file's, and which third of a fused one it is (None: all of it)."""
 
-_PARTS = (
-    'both parts for model.base, as torch.save({"encoder": ..., "predictor": ...}, FILE) writes them; model.encoder.path'
-    " for an encoder alone (with model.random), and in addition to model.base for a predictor alone"
-)
+_PARTS = 'both parts, as of torch.save({"encoder": ..., "predictor": ...}, FILE), or model.encoder.path for the encoder'
 _NEEDED = "a checkpoint of V-JEPA 2, 2.1 or 2-AC as Meta publishes it"
 _SPLIT = ("q", "k", "v")
 _PREFIXES = re.compile(r"^(?:(?:module|backbone|_orig_mod)\.)+|_orig_mod\.")  # the last: of torch.compile, anywhere
