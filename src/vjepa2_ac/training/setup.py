@@ -16,8 +16,8 @@ from torch import nn
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.coverage import find_duplicates
 from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.inspection.motion import warnings_from_index
 from vjepa2_ac.data.loader import Batches, Mixed, ProcessShare, training_loader
 from vjepa2_ac.data.streams import copies_for
 from vjepa2_ac.distributed import PRECISIONS, broadcast_object, first_of_machine, first_only, make_accelerator
@@ -138,8 +138,8 @@ def set_up(
         decoder = load_decoder(config.validation.decoder, where="validation.decoder:")
     # The others find the index of the first one on this machine, however long it takes.
     dataset, *others = first_of_machine(accelerator, lambda: open_data_sets(config, reporter))
-    if (duplicates := find_duplicates(dataset)).episodes:
-        reporter.note(f"Warning: {duplicates}.")
+    for warning in warnings_from_index(dataset):
+        reporter.note(f"Warning: {warning.text}.")
     _check_heads(config, dataset)
     chooser, calibration = None, None
     if is_auto:
