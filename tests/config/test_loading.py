@@ -16,6 +16,7 @@ from vjepa2_ac.config.loading import (
     config_path,
     config_schema,
     load_config,
+    load_config_of_run,
     packaged_configs,
     parse_config,
 )
@@ -201,3 +202,14 @@ def test_gripper_key_of_an_older_run_is_read(older: str, values: tuple[float, fl
     config = parse_config({"run_dir": "none", "data": data, "model": {"base": "builtin:sim-tiny"}}, where="x").data
     assert (config.fields.gripper_open, config.fields.gripper_closed) == values
     assert config.fields.control_rate_hz == 5.0
+
+
+def test_a_config_larger_than_a_megabyte_is_refused_before_it_is_parsed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vjepa2_ac.config.loading.parse_yaml", lambda *_, **__: pytest.fail("parsed"))
+    path = tmp_path / "config.yaml"
+    path.write_text("#" * 1_000_001)
+    for read in (load_config, load_config_of_run):
+        with pytest.raises(InputError, match="more than 1,000,000 bytes"):
+            read(path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -127,20 +128,21 @@ def _next(measured: Evaluated, data: str | None) -> str:
     from vjepa2_ac.simulation.world.domains import Domain
 
     about, answer = measured.evaluation.about, measured.answer
+    subject = shlex.quote(about.subject)
     if not about.checkpoint:
         return f"vjepa2-ac train {data}"
     if answer.predicts.why:
-        return f"vjepa2-ac data check {about.subject}/config.yaml"
+        return f"vjepa2-ac data check {subject}/config.yaml"
     if "no" in {answer.predicts.word, answer.uses_actions.word}:
-        return f"vjepa2-ac data check {about.subject}/config.yaml --model {about.subject}"
+        return f"vjepa2-ac data check {subject}/config.yaml --model {subject}"
     if answer.plans.says.startswith("solves"):  # the closed loop has been measured
-        return f"vjepa2-ac serve {about.subject}"
+        return f"vjepa2-ac serve {subject}"
     try:
         recorded = read_simulation(Path(about.data).resolve(strict=True))
     except (OSError, UserError):
-        return f"vjepa2-ac serve {about.subject}"
+        return f"vjepa2-ac serve {subject}"
     domain = f" --domain {recorded.worlds.name}" if isinstance(recorded.worlds, Domain) else ""
-    return f"vjepa2-ac simulate {about.subject} --task {recorded.task or 'reach'}{domain}"
+    return f"vjepa2-ac simulate {subject} --task {recorded.task or 'reach'}{domain}"
 
 
 def _asked(options: argparse.Namespace) -> list[tuple[str, EvaluationOptions]]:
@@ -156,7 +158,7 @@ def _asked(options: argparse.Namespace) -> list[tuple[str, EvaluationOptions]]:
     every = cli.record_of_options(
         EvaluationOptions,
         options,
-        data=cli.read_config(options.data, of_run=True) if options.data else None,
+        data=cli.read_config(options.data) if options.data else None,
         against=tuple(options.against) if options.against else None,
         probes=cli.record_of_options(ProbeOptions, options, planning_clips=clips),
         planning=(*(plan_settings or ()), *options.overrides),
@@ -228,7 +230,7 @@ def _of_clip(options: argparse.Namespace, out: Path, reporter: Reporter) -> Imag
     from vjepa2_ac.simulation.counterfactual import with_what_happens
 
     cli.say_places_elsewhere(options.subject)
-    data = None if options.data is None else cli.read_config(options.data, of_run=True)
+    data = None if options.data is None else cli.read_config(options.data)
     asked = ImagineOptions(
         decoder=options.decoder,
         actions=_words(options),

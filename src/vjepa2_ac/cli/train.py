@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import shlex
 from pathlib import Path
 
 from vjepa2_ac.cli import options as cli
@@ -71,7 +72,7 @@ def _train(options: argparse.Namespace) -> None:
     with TrainingConsole() as reporter:
         folder = train(config, reporter, check_only=options.check, allow_config_change=options.allow_config_change)
     if is_first() and not options.check:
-        cli.show(f"The run is in {folder}; see how good it is: vjepa2-ac evaluate {folder}")
+        cli.show(f"The run is in {folder}; see how good it is: vjepa2-ac evaluate {shlex.quote(str(folder))}")
 
 
 def _encode(options: argparse.Namespace) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -189,7 +190,8 @@ def _only_set(described: Sequence[tuple[str, str]], path: str) -> tuple[str, str
         is_version = folder != path and _VERSION.fullmatch(_name_of(folder))
         sets.setdefault(folder.rpartition("/")[0] if is_version else folder, []).append((form, folder))
     if len(sets) > 1:
-        found, fix = f"{len(sets)} data sets: {', '.join(sorted(sets))}", f"Name one: `vjepa2-ac init {min(sets)}`"
+        found = f"{len(sets)} data sets: {', '.join(sorted(sets))}"
+        fix = f"Name one: `vjepa2-ac init {shlex.quote(min(sets))}`"
         raise InputError(where=path, found=found, needed="one data set", fix=fix)
     versions = sorted(*sets.values(), key=lambda one: _as_version(_name_of(one[1])))
     return *versions[-1], [_name_of(folder) for _, folder in versions]
