@@ -93,6 +93,11 @@ def printable(text: str) -> str:
     return "".join(one if is_safe else one.encode("unicode_escape").decode() for one, is_safe in shown)
 
 
+def escaped(text: str) -> str:
+    r"""Return a text on one line, as names of third parties have to be in comments: line ends are escaped, as \n."""
+    return "".join(one if one.isprintable() else one.encode("unicode_escape").decode() for one in text)
+
+
 def _short(text: str) -> str:
     if len(text) <= _MOST_CHARACTERS:
         return text

@@ -157,7 +157,7 @@ def _asked(options: argparse.Namespace) -> list[tuple[str, EvaluationOptions]]:
     every = cli.record_of_options(
         EvaluationOptions,
         options,
-        data=cli.read_config(options.data, of_run=True) if options.data else None,
+        data=cli.read_config(options.data) if options.data else None,
         against=tuple(options.against) if options.against else None,
         probes=cli.record_of_options(ProbeOptions, options, planning_clips=clips),
         planning=(*(plan_settings or ()), *options.overrides),
@@ -229,7 +229,7 @@ def _of_clip(options: argparse.Namespace, out: Path, reporter: Reporter) -> Imag
     from vjepa2_ac.simulation.counterfactual import with_what_happens
 
     cli.say_places_elsewhere(options.subject)
-    data = None if options.data is None else cli.read_config(options.data, of_run=True)
+    data = None if options.data is None else cli.read_config(options.data)
     asked = ImagineOptions(
         decoder=options.decoder,
         actions=_words(options),

@@ -232,7 +232,7 @@ def read_config(path: str | Path, overrides: Sequence[str] = (), *, base: bool =
         path: The YAML file.
         overrides: Such as training.steps=100.
         base: Whether `model.base` and `model.encoder` have to be there, too.
-        of_run: It may be the config of a run that was made.
+        of_run: It is the config of a run, whatever else is in its folder.
 
     Raises:
         InputError: The config is wrong, or one of them is not there.

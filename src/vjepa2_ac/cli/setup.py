@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
-from vjepa2_ac.errors import InputError, UserError, shell_command
+from vjepa2_ac.errors import InputError, UnreachableError, UserError, shell_command
 from vjepa2_ac.storage import try_writing_at, user_can_write, write_atomically
 from vjepa2_ac.storage.places import BUILTIN
 
@@ -235,9 +235,10 @@ def _doctor(options: argparse.Namespace) -> int:
     import torch
 
     from vjepa2_ac.cli.console.setup import memory_lines, verdict
+    from vjepa2_ac.data.streams import require_shared_memory
     from vjepa2_ac.distributed import slow_bf16
     from vjepa2_ac.model.checkpoints.loading import base_sizes
-    from vjepa2_ac.training.cost.memory import USUAL_GPU, estimate_memory, ways_to_fit
+    from vjepa2_ac.training.cost.memory import USUAL_GPU, batch_bytes, estimate_memory, ways_to_fit
 
     sizes = base_sizes(config.model)
     gpu, available = "a GPU of 24 GB (there is none here)", USUAL_GPU
@@ -253,6 +254,10 @@ def _doctor(options: argparse.Namespace) -> int:
     )
     if unusual := config.adapter.out_of_line:
         cli.show(f"Warning: {unusual}.")
+    try:
+        require_shared_memory(config.data, batch_bytes(config, sizes))
+    except UnreachableError as error:
+        cli.show(f"Warning: {error}")
     if not torch.cuda.is_available() and config.training.precision == "bf16" and (slow := slow_bf16()):
         cli.show(f"Without a GPU set training.precision=fp32 model.dtype=float32: in bfloat16 {slow}.")
     cli.show(f"The data are looked at by: {shell_command('data', 'check', options.config)}")
@@ -280,7 +285,7 @@ def _demo(_options: argparse.Namespace) -> int:
     ]
     for words in commands[Path(_SIMULATED).exists() :]:
         print(f"$ vjepa2-ac {words}", flush=True)
-        program = [sys.executable, "-m", "vjepa2_ac.cli", *shlex.split(words)]
+        program = [sys.executable, "-P", "-m", "vjepa2_ac.cli", *shlex.split(words)]
         if status := subprocess.call(program):  # noqa: S603 - our own command
             return status
     return 0

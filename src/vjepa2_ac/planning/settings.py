@@ -12,7 +12,7 @@ from typing import Annotated
 from pydantic import Field
 
 from vjepa2_ac.config import Config, DataConfig
-from vjepa2_ac.config.loading import load_config_of_run, parse_config
+from vjepa2_ac.config.loading import load_config, parse_config
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.config.section import Affects, mark_of
 from vjepa2_ac.data.windows import require_stride
@@ -56,7 +56,7 @@ def planning_settings(
         plain = {"run_dir": "none", "data": {"path": "none"}, "model": {"base": subject, "dtype": dtype}}
         its = parse_config(plain, overrides, where="overrides")
     else:
-        its = load_config_of_run(config, [*overrides, _ANY_TYPE])
+        its = load_config(config, [*overrides, _ANY_TYPE])
         its = its.model_copy(update={"model": its.model.with_base(subject)})
     require_limits(its)
     require_axes(its)
