@@ -144,9 +144,13 @@ def matmul_speed(device: torch.device, dtype: torch.dtype) -> float:
     return 2 * size**3 / best
 
 
-def has_bf16() -> bool:
-    """Return whether the CUDA device of this process computes in bfloat16."""
-    return torch.cuda.get_device_capability(cuda_index()) >= _BF16_FROM
+def has_bf16(device: torch.device | None = None) -> bool:
+    """Return whether a CUDA device computes in bfloat16; None, or one without an index: that of this process."""
+    return torch.cuda.get_device_capability(_index_of(device)) >= _BF16_FROM
+
+
+def _index_of(device: torch.device | None) -> int:
+    return cuda_index() if device is None or device.index is None else device.index
 
 
 def cuda_index() -> int:
@@ -164,10 +168,11 @@ def _require_bf16(device: torch.device, *, where: str, found: str, fix: str) -> 
     """Refuse bfloat16 where a GPU only emulates it; on a CPU that is slow in it, say so."""
     if device.type == "cpu":
         _warn(f"{where}: {found}", fix)
-    if device.type != "cuda" or has_bf16():
+    if device.type != "cuda" or has_bf16(device):
         return
-    major, minor = torch.cuda.get_device_capability(cuda_index())
-    found += f", on {torch.cuda.get_device_name(cuda_index())} of compute capability {major}.{minor}"
+    index = _index_of(device)
+    major, minor = torch.cuda.get_device_capability(index)
+    found += f", on {torch.cuda.get_device_name(index)} of compute capability {major}.{minor}"
     needed = "8.0 or more (Ampere or later): earlier GPUs only emulate bfloat16"
     raise InputError(where=where, found=found, needed=needed, fix=fix)
 

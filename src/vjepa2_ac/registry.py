@@ -15,7 +15,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import BaseModel, Field
+from pydantic import AfterValidator, BaseModel, Field, ValidationError, ValidationInfo
+from pydantic_core import InitErrorDetails, PydanticCustomError
 
 from vjepa2_ac.errors import InputError, did_you_mean
 
@@ -81,18 +82,36 @@ class Registry:
         """
         return None if isinstance(self._things.get(name), str) else getattr(self.find(name), "Config", None)
 
-    def options(self, name: str, given: Mapping[str, Any]) -> dict[str, BaseModel]:
+    def options(self, name: str, given: Mapping[str, Any], *, at: tuple[str, ...] = ()) -> dict[str, BaseModel]:
         """Return the checked options of a thing, as the keyword argument that it takes them by; empty: it has none.
+
+        Args:
+            name: The thing.
+            given: Its options.
+            at: Location of the options below the config key that is checked, for messages.
 
         Raises:
             ValueError: They are not what its `Config` says, or it has none.
         """
         section = self.section(name)
         if section is not None:
-            return {"options": section.model_validate(dict(given))}
+            try:
+                return {"options": section.model_validate(dict(given))}
+            except ValidationError as error:
+                raise _located(error, section, at) from None
         if given:
             raise ValueError(f"{self.kind} {name!r} has no options of its own, and {', '.join(given)} is given")
         return {}
+
+    def options_of(self, name: str) -> Any:
+        """Return a check of a config key: it holds the options of the thing that the key `name` before it names."""
+
+        def checked(given: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
+            if name in info.data:  # else the name is wrong, which is reported there
+                self.options(info.data[name], given)
+            return given
+
+        return AfterValidator(checked)
 
     def function(self, name: str, given: Mapping[str, Any]) -> Callable[..., Any]:
         """Return a function of a name; of a class an object that was made with its options.
@@ -132,8 +151,24 @@ class Registry:
             if sections:
                 schema["anyOf"] = [*sections, {"type": "object", "maxProperties": 0}]
 
-        return Field(json_schema_extra=add)
+        return Field(json_schema_extra=add, validate_default=True)
 
+
+def _located(error: ValidationError, section: type[BaseModel], at: tuple[str, ...]) -> ValidationError:
+    """Return the errors of options at their location in the config; that of an unknown option names a known one."""
+    lines = []
+    for one in error.errors(include_url=False):
+        kind, text, location = one["type"], one["msg"], one["loc"]
+        if kind == "extra_forbidden":
+            known = f"known here: {', '.join(section.model_fields)}"
+            meant = did_you_mean(str(location[-1]), section.model_fields)
+            kind, text = UNKNOWN_OPTION, f"unknown key; {f'd{meant[1:-1]}' if meant else known}"
+        custom = PydanticCustomError(kind, text)
+        lines.append(InitErrorDetails(type=custom, loc=(*at, *location), input=one["input"]))
+    return ValidationError.from_exception_data(error.title, lines)
+
+
+UNKNOWN_OPTION = "unknown_option"
 
 SOURCES = Registry("form of data", "vjepa2_ac.sources", {})
 LOSSES = Registry(

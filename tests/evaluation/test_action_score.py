@@ -21,6 +21,7 @@ from vjepa2_ac.evaluation.action_score import (
 from vjepa2_ac.evaluation.request import SCORED
 from vjepa2_ac.evaluation.result import Evaluation, PlanningStudy, Plans
 from vjepa2_ac.model.state_integration import states_along
+from vjepa2_ac.planning.energy import EnergyFunction
 from vjepa2_ac.planning.planner import Plan, Planner
 from vjepa2_ac.reports.metrics_json import metrics_as_dict
 from vjepa2_ac.spaces import vector_actions
@@ -172,7 +173,7 @@ def test_three_steps_keep_to_the_protocol_whatever_the_config_says(monkeypatch: 
 
     class Noted(Planner):
         def plan(self, cost: WindowCost, *more: object) -> Plan:  # type: ignore[override]
-            asked.append((self.config, cost.config))
+            asked.append((self.config, EnergyFunction.of(cost.energy).config))
             return Planner(self.config.model_copy(update={"iterations": 1, "samples": 10})).plan(cost, *more)  # type: ignore[arg-type]
 
     monkeypatch.setattr(measure, "Planner", Noted)

@@ -12,13 +12,13 @@ from vjepa2_ac.planning.energy import Goal, Scene, WorldModelCost
 TOKENS, DIM = 9, 24
 
 
-def tiny_model(*, adapted: bool = False, extrinsics: bool = False, states: bool = True) -> WorldModel:
+def tiny_model(*, adapted: bool = False, extrinsics: bool = False, states: bool = True, depth: int = 2) -> WorldModel:
     """Return a random model that heeds its actions; perhaps with an adapter that does something."""
     sizes = ModelSizes(
         image_size=48,
         encoder=EncoderSizes(width=DIM, depth=1, heads=2, mlp_ratio=2.0),
         predictor=PredictorSizes(
-            width=36, depth=2, heads=3, mlp_ratio=2.0, use_extrinsics=extrinsics, use_states=states
+            width=36, depth=depth, heads=3, mlp_ratio=2.0, use_extrinsics=extrinsics, use_states=states
         ),
     )
     model = WorldModel.random(sizes, seed=0)

@@ -61,7 +61,7 @@ def add_compare(commands: cli.Commands) -> None:
 def add_imagine(commands: cli.Commands) -> None:
     """Add `imagine` to a parser."""
     parser = cli.command(commands, "imagine", _imagine, "demo/run --decoder demo/decoder --actions true,up,left")
-    cli.add_planner(parser, such_as="with --image: such as planning.limits.xyz=data")
+    cli.add_planner(parser, such_as="such as model.base=PATH; with --image: planning.limits.xyz=data")
     cli.add_decoder(parser, "what is imagined", required=True)
     text = (
         "with commas between them: true (as recorded), none, up, down, left, right, forward, back, open, close; or"
@@ -90,8 +90,7 @@ def _evaluate(options: argparse.Namespace) -> None:
 
     asked = _asked(options)
     for subject, how in asked:
-        settle(subject, how)
-        cli.require_subject(subject)
+        cli.require_subject(subject, settle(subject, how), options.words)
 
     from vjepa2_ac.cli.console.tables import row_tables
     from vjepa2_ac.distributed import leave_processes
@@ -146,9 +145,11 @@ def _next(measured: Evaluated, data: str | None) -> str:
 def _asked(options: argparse.Namespace) -> list[tuple[str, EvaluationOptions]]:
     """Return what is asked of each subject; refuse planning settings that would have no effect: without plans."""
     from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
+    from vjepa2_ac.runs.folder import is_of_moved
 
-    if options.overrides and options.plan_settings is None:
-        found = f"{' '.join(options.overrides)}, and no plans are asked for"
+    of_plans = [word for word in options.overrides if not is_of_moved(word)]
+    if of_plans and options.plan_settings is None:
+        found = f"{' '.join(of_plans)}, and no plans are asked for"
         needed = "--planning beside settings of planning; what else a config says is not changed by evaluate"
         raise InputError(where="command line", found=found, needed=needed, fix="Add --planning")
     several, plan_settings = len(options.subjects) > 1, options.plan_settings
@@ -224,7 +225,7 @@ def _words(options: argparse.Namespace) -> tuple[str, ...]:
 
 def _of_clip(options: argparse.Namespace, out: Path, reporter: Reporter) -> Imagination:
     from vjepa2_ac.evaluation.imagined import ImagineOptions, imagine_clip
-    from vjepa2_ac.evaluation.request import EvaluationOptions
+    from vjepa2_ac.evaluation.request import EvaluationOptions, settle
     from vjepa2_ac.simulation.counterfactual import with_what_happens
 
     cli.say_places_elsewhere(options.subject)
@@ -237,8 +238,11 @@ def _of_clip(options: argparse.Namespace, out: Path, reporter: Reporter) -> Imag
         split=options.split,
         episode=options.episode,
         start=options.start,
-        evaluation=EvaluationOptions(checkpoint=options.checkpoint, data=data, out=out),
+        evaluation=EvaluationOptions(
+            checkpoint=options.checkpoint, data=data, out=out, planning=tuple(options.overrides)
+        ),
     )
+    cli.require_subject(options.subject, settle(options.subject, asked.evaluation), options.words)
     return with_what_happens(imagine_clip(options.subject, asked, reporter=reporter)).imagination
 
 

@@ -195,7 +195,9 @@ def _monitor(options: argparse.Namespace) -> int:
     """
     from vjepa2_ac.runs.folder import is_run
 
-    cli.require_to_plan(options)
+    if (views := cli.require_to_plan(options).planning.views) > 1:
+        needed, fix = "1: a monitor is made with one camera", "Add planning.views=1"
+        raise InputError(where="planning.views", found=f"{views}", needed=needed, fix=fix)
     if options.out is None and not is_run(options.subject):
         raise InputError(where="--out", found=f"{options.subject}, a model, and no folder", needed="--out FOLDER")
     data = None if options.data is None else cli.read_config(options.data)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
+import gc
 import logging
 import os
 import sys
@@ -25,6 +27,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     130 interrupted. A reader that closes early, as `head` does, changes nothing; a full disk for the output is an
     error, in the end.
     """
+    # OpenMP reads it when PyTorch is imported: a waiting thread sleeps after about 20 microseconds, not milliseconds.
+    # Until then it holds its core: two trainings on the same cores were ten times slower (benchmarks/two_at_once.py).
+    os.environ.setdefault("GOMP_SPINCOUNT", "1000")
+    atexit.register(gc.freeze)  # PyTorch's half a million objects are not searched for garbage when the program ends
     if "_ARGCOMPLETE" in os.environ:  # a shell asks what may stand at its cursor
         from vjepa2_ac.cli.completion import complete
 
@@ -40,6 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(arguments: Sequence[str] | None) -> int:
     words = sys.argv[1:] if arguments is None else arguments
     options = parsed(_parser(words), words)
+    options.words = words
     handler: Handler = options.handler
     try:
         _require_working_directory()

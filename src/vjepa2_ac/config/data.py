@@ -106,13 +106,8 @@ class TransformConfig(Section):
 
     name: Annotated[str, AfterValidator(TRANSFORMS.known), TRANSFORMS.name_in_schema]
     """The name under which the transform is registered."""
-    options: Annotated[dict[str, Any], TRANSFORMS.options_in_schema] = {}
+    options: Annotated[dict[str, Any], TRANSFORMS.options_of("name"), TRANSFORMS.options_in_schema] = {}
     """Options of the transform, if its class has some."""
-
-    @model_validator(mode="after")
-    def _options_fit(self) -> TransformConfig:
-        TRANSFORMS.options(self.name, self.options)
-        return self
 
 
 class DiskCacheConfig(Section):

@@ -20,7 +20,7 @@ from vjepa2_ac.config.data import source_of
 from vjepa2_ac.config.run import ReplayConfig
 from vjepa2_ac.config.section import marks_of
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.registry import SOURCES, import_plugins
+from vjepa2_ac.registry import SOURCES, UNKNOWN_OPTION, import_plugins
 from vjepa2_ac.storage.places import BUILTIN
 from vjepa2_ac.storage.structured import message_of, parse_yaml
 
@@ -337,6 +337,8 @@ def _explain(key: str, detail: Any) -> str:
         return "missing; it has no default"
     if detail["type"] == "union_tag_invalid":
         return f"Input should be {' or '.join(map(repr, DataConfig.kinds))} (found {detail['ctx']['tag']!r})"
+    if detail["type"] == UNKNOWN_OPTION:
+        return str(detail["msg"])
     if detail["type"] != "extra_forbidden":
         return message_of(detail)
     section, dot, name = key.rpartition(".")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -78,17 +78,12 @@ class EnergyConfig(Section):
     distance: Annotated[str, AfterValidator(ENERGIES.known), ENERGIES.name_in_schema] = "l1"
     """Of predicted and goal latents. l1: mean absolute difference (upstream). l2: mean square. cosine: 1 - cosine of a
     token. Or an energy of your own (docs/extending.md)."""
-    options: Annotated[dict[str, Any], ENERGIES.options_in_schema] = {}
+    options: Annotated[dict[str, Any], ENERGIES.options_of("distance"), ENERGIES.options_in_schema] = {}
     """Options of an energy of your own, where its class has some."""
     steps: Literal["last", "sum"] = "last"
     """last: of the plan's last step (upstream). sum: over all its steps."""
     samples_at_once: PositiveInt = 64
     """Action sequences that go through the predictor at once: bounds its memory."""
-
-    @model_validator(mode="after")
-    def _options_fit(self) -> EnergyConfig:
-        ENERGIES.options(self.distance, self.options)
-        return self
 
 
 class GoalsConfig(Section):
@@ -164,7 +159,7 @@ class PlanningConfig(Section):
     planner: Annotated[str, AfterValidator(PLANNERS.known), PLANNERS.name_in_schema] = "cem"
     """How actions are searched: cem, icem, mppi, gradient, or a planner of your own (docs/extending.md). prior: not at
     all, the mean of `prior` is taken."""
-    planner_options: Annotated[dict[str, Any], PLANNERS.options_in_schema] = {}
+    planner_options: Annotated[dict[str, Any], PLANNERS.options_of("planner"), PLANNERS.options_in_schema] = {}
     """Options of a planner of your own, where its class has some."""
     horizon: PositiveInt = 1
     """Model steps that a plan spans."""
@@ -183,7 +178,7 @@ class PlanningConfig(Section):
     first always runs. Encoding the frame is not counted. null: all iterations run."""
     prior: Local | None = None
     """Folder of an action prior (`vjepa2-ac prior`), of which every search starts: from its mean, as wide as it is
-    unsure. Not of `evaluate --planning`."""
+    unsure."""
     prior_steps: PositiveInt = 3
     """Model steps in which the prior is to reach a goal that says no bound of its own: fewer are bolder."""
     monitor: Local | None = None
@@ -232,17 +227,51 @@ class PlanningConfig(Section):
 
     @model_validator(mode="after")
     def _numbers_fit(self) -> PlanningConfig:
-        PLANNERS.options(self.planner, self.planner_options)
         elites = {"cem": self.cem.elites, "icem": self.icem.elites}.get(self.planner, 0)
         repeat, first = self.action_repeat, self.limits.gripper_from
         return self.refused(
             (self.horizon % repeat, f"horizon {self.horizon} is not a multiple of action_repeat {repeat}"),
             (first % repeat, f"limits.gripper_from {first} is not a multiple of action_repeat {repeat}"),
-            (self.views > 1 and self.context > 1, f"views {self.views} need context 1, not {self.context}"),
-            (self.views > 1 and self.axes, f"axes are of one camera, and there are {self.views} views"),
-            (self.views > 1 and self.prior, f"a prior is of one camera, and there are {self.views} views"),
-            (self.prior and self.warm_start, "prior and warm_start are two starts of one search"),
-            (self.replan != "always" and not self.monitor, "replan on_surprise needs a monitor: `vjepa2-ac monitor`"),
-            (self.planner == "prior" and not self.prior, "planner prior needs a prior: `vjepa2-ac prior` trains one"),
             (elites > self.samples, f"{self.planner}.elites {elites} are more than {self.samples} samples"),
+            *(rule.on(self) for rule in RULES),
         )
+
+
+class Rule(NamedTuple):
+    """Two options of `planning` of which one excludes or needs the other, and what to do about it.
+
+    An option is set if its value is not the default, or if it is the value after `=`.
+    """
+
+    option: str
+    relation: Literal["excludes", "needs"]
+    other: str
+    reason: str
+    fix: str
+
+    def on(self, config: PlanningConfig) -> tuple[bool, str]:
+        """Return whether a config breaks the rule, and the message for it."""
+        (name, value, is_set), (other, other_value, is_other_set) = (
+            _option(config, one) for one in (self.option, self.other)
+        )
+        is_broken = is_set and is_other_set == (self.relation == "excludes")
+        found = f"{name}: {value} {self.relation} {other}" + f": {other_value}" * is_other_set
+        return is_broken, f"{found}, because {self.reason}. {self.fix}"
+
+
+def _option(config: PlanningConfig, option: str) -> tuple[str, Any, bool]:
+    """Return the name and the value of an option, and whether it is set."""
+    name, _, chosen = option.partition("=")
+    value = getattr(config, name)
+    return name, value, value == chosen if chosen else value != PlanningConfig.model_fields[name].default
+
+
+RULES = (
+    Rule("views", "excludes", "context", "earlier frames are kept for one camera only", "Set context: 1"),
+    Rule("views", "excludes", "axes", "axes are calibrated with one camera", "Leave axes out, or set views: 1"),
+    Rule("views", "excludes", "prior", "a prior is trained with one camera", "Leave prior out, or set views: 1"),
+    Rule("views", "excludes", "monitor", "a monitor is made with one camera", "Leave monitor out, or set views: 1"),
+    Rule("prior", "excludes", "warm_start", "each says where a search starts", "Leave one of them out"),
+    Rule("replan", "needs", "monitor", "only a monitor notices a surprise", "`vjepa2-ac monitor RUN` makes one"),
+    Rule("planner=prior", "needs", "prior", "it takes all actions from there", "`vjepa2-ac prior RUN` trains one"),
+)

@@ -44,7 +44,7 @@ class TrainingConfig(Section):
     loss: Annotated[str, AfterValidator(LOSSES.known), LOSSES.name_in_schema] = "l1"
     """Distance of predicted and true latents. l1: absolute (released). l2: squared. smooth_l1: squared only below
     smooth_l1_beta. Or a loss of your own (docs/extending.md)."""
-    loss_options: Annotated[dict[str, Any], LOSSES.options_in_schema] = {}
+    loss_options: Annotated[dict[str, Any], LOSSES.options_of("loss"), LOSSES.options_in_schema] = {}
     """Options of a loss of your own, where its class has some."""
     smooth_l1_beta: Positive = 1.0
     """Below this difference smooth_l1 is squared, above it is absolute; smooth_l1 only."""
@@ -98,7 +98,6 @@ class TrainingConfig(Section):
     def _parts_fit(self) -> TrainingConfig:
         warmup, decay, schedule = self.warmup_steps, self.decay_steps, self.schedule
         decays, constant = schedule == "warmup_stable_decay", schedule == "constant"
-        LOSSES.options(self.loss, self.loss_options)
         weights, has_beta = self.teacher_forcing_weight + self.rollout_weight, self.smooth_l1_beta != 1.0
         return self.refused(
             (warmup + decay > self.steps, f"warmup_steps {warmup} and decay_steps {decay} exceed steps {self.steps}"),
@@ -170,7 +169,7 @@ class TrackingConfig(Section):
     @model_validator(mode="after")
     def _others_are_known(self) -> TrackingConfig:
         for name, options in self.others.items():
-            TRACKERS.options(TRACKERS.known(name), options)
+            TRACKERS.options(TRACKERS.known(name), options, at=("others", name))
         return self
 
 

@@ -22,7 +22,7 @@ from jaxtyping import Float, Float32, Int8, Int32, UInt64
 from vjepa2_ac import storage
 from vjepa2_ac.config import DiskCacheConfig
 from vjepa2_ac.episode import STATE_DIM, EpisodeInfo
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, MissingFileError
 from vjepa2_ac.spaces import step_sizes
 from vjepa2_ac.storage import places
 from vjepa2_ac.storage.npz_reader import arrays_as_bytes, read_arrays
@@ -340,17 +340,22 @@ def get_or_make(
     to_bytes: Callable[[T], bytes],
     from_bytes: Callable[[bytes], T],
 ) -> T:
-    """Return the object cached under a key; make and cache it if it is missing or damaged (a NotATableError)."""
+    """Return the object cached under a key; make and cache it if it is missing or damaged (a NotATableError).
+
+    Raises:
+        UnreachableError: It is there and cannot be read.
+    """
     path = cache_folder(config) / "index" / f"{key}.index"
     usage = _usage.get()
     if usage:
         usage.files.append(path)
     try:
         if not (usage and usage.rebuild):
-            return from_bytes(path.read_bytes())
-    except FileNotFoundError:
+            with storage.user_can_read(path):
+                return from_bytes(path.read_bytes())
+    except MissingFileError:
         pass
-    except (OSError, NotATableError) as error:
+    except (InputError, NotATableError) as error:
         logger.warning("%s: cannot be used (%s); the index is built again", path, error)
     made = make()
     try:

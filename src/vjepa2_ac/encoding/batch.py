@@ -76,16 +76,20 @@ def encode_frames(
         world_model: The model whose frozen encoder is used.
         frames: RGB, uncropped, of any size.
         crop: The part of a frame that the model sees.
-        chunk: Frames per encoder call.
+        chunk: Frames per encoder call; no more are on the device as pixels at once.
         views: Cameras side by side in each frame.
 
     Raises:
         InputError: The width is not that of so many views.
     """
-    seen = view(split_views(frames, views), crop)
-    pixels = torch.from_numpy(np.ascontiguousarray(seen)).to(world_model.device)[None]
-    latents = world_model.encode(pixels_to_input(pixels, world_model.image_size), chunk=chunk)[0]
-    return latents.reshape(len(frames), -1, latents.shape[-1])
+
+    def encoded(part: UInt8[np.ndarray, "frames height all 3"]) -> Tensor:
+        seen = view(split_views(part, views), crop)
+        pixels = torch.from_numpy(np.ascontiguousarray(seen)).to(world_model.device)[None]
+        latents = world_model.encode(pixels_to_input(pixels, world_model.image_size), chunk=chunk)[0]
+        return latents.reshape(len(part), -1, latents.shape[-1])
+
+    return torch.cat([encoded(frames[first : first + chunk]) for first in range(0, len(frames), chunk)])
 
 
 def encoding_of(world_model: WorldModel, config: Config) -> Encoding:

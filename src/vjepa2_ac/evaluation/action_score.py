@@ -23,9 +23,11 @@ from vjepa2_ac.evaluation.request import FRAMES_SEEN, SCORED, STEPS
 from vjepa2_ac.evaluation.result import Evaluation, PlanningStudy, Plans
 from vjepa2_ac.intervals import Estimate, bootstrapped, mean_of, ratio
 from vjepa2_ac.model.state_integration import states_along
-from vjepa2_ac.planning.energy import distance
+from vjepa2_ac.planning.energy import EnergyFunction, distance
 from vjepa2_ac.planning.planner import Plan, Planner
+from vjepa2_ac.planning.prior.action_prior import ActionPrior
 from vjepa2_ac.planning.search_space import SearchSpace, pose_space
+from vjepa2_ac.planning.solvers import PlanStart
 from vjepa2_ac.spaces import POSE
 
 _RANDOM_PLANS = 64  # of each start: their mean error is the random plan's
@@ -53,11 +55,12 @@ class WindowCost:
     model: Predictor
     start: PlanningStart
     goal: Float[Tensor, "tokens dim"]
-    config: EnergyConfig
+    energy: EnergyConfig | EnergyFunction
 
     def __call__(self, actions: Float[Tensor, "samples steps 7"]) -> Float[Tensor, " samples"]:
         """Return energies on the device of the actions."""
-        parts = actions.to(self.start.state).split(self.config.samples_at_once)  # type: ignore[no-untyped-call]  # torch
+        at_once = EnergyFunction.of(self.energy).config.samples_at_once
+        parts = actions.to(self.start.state).split(at_once)  # type: ignore[no-untyped-call]  # torch
         return torch.cat([self._energies(part) for part in parts]).to(actions.device)
 
     def _energies(self, actions: Float[Tensor, "samples steps 7"]) -> Float[Tensor, " samples"]:
@@ -74,7 +77,7 @@ class WindowCost:
         for end in range(FRAMES_SEEN + 1, steps + 1):
             following = self.model.predict(frames, *during(end - FRAMES_SEEN, end))[:, -1:]
             frames = torch.cat([frames[:, 1:], following], dim=1)
-        return distance(frames[:, -1].float(), self.goal.float(), self.config)
+        return distance(frames[:, -1].float(), self.goal.float(), self.energy)
 
 
 def planning_start(batch: LatentBatch, row: int, seed: int) -> PlanningStart:
@@ -98,7 +101,12 @@ def one_step_settings(config: PlanningConfig) -> PlanningConfig:
 
 
 def measure_plans(
-    model: Predictor, starts: Sequence[PlanningStart], config: PlanningConfig, progress: Progress = no_progress
+    model: Predictor,
+    starts: Sequence[PlanningStart],
+    config: PlanningConfig,
+    progress: Progress = no_progress,
+    *,
+    prior: ActionPrior | None = None,
 ) -> Plans:
     """Plan from each start, one step and three.
 
@@ -107,14 +115,20 @@ def measure_plans(
         starts: One or more.
         config: Settings of one-step plans; for three steps, only the number of samples per batch.
         progress: Called with the number of finished plans.
+        prior: Network of `planning.prior`, on the device of the starts: one-step plans start from it.
     """
-    energy = SCORED.energy.model_copy(update={"samples_at_once": config.energy.samples_at_once})
-    planners = Planner(one_step_settings(config)), Planner(SCORED.model_copy(update={"energy": energy}))
+    fixed = SCORED.energy.model_copy(update={"samples_at_once": config.energy.samples_at_once})
+    planners = Planner(one_step_settings(config)), Planner(SCORED.model_copy(update={"energy": fixed}))
+    energies = [EnergyFunction.of(planner.config.energy) for planner in planners]
 
     def planned(start: PlanningStart) -> list[Plan]:
+        begun = (None if prior is None else _proposed(prior, start)), None
+        goals = start.following, start.goal
         return [
-            planner.plan(WindowCost(model, start, goal, planner.config.energy), torch.Generator().manual_seed(seed))
-            for planner, goal, seed in zip(planners, (start.following, start.goal), start.seeds[:2], strict=True)
+            planner.plan(WindowCost(model, start, goal, energy), torch.Generator().manual_seed(seed), first)
+            for planner, goal, energy, seed, first in zip(
+                planners, goals, energies, start.seeds[:2], begun, strict=True
+            )
         ]
 
     plans = list(zip(*shared(starts, planned, progress), strict=True))
@@ -123,6 +137,12 @@ def measure_plans(
     )
     empty = sum(plan.stopped == "no finite energy" for found in plans for plan in found)
     return Plans(one_step[:, :, 0], three_steps, empty)
+
+
+def _proposed(prior: ActionPrior, start: PlanningStart) -> PlanStart:
+    """Return the start of a one-step plan: what a prior proposes to reach the next frame in one step."""
+    mean, std = prior.next_action(start.frame.float(), start.state, start.following.float(), 1)
+    return PlanStart(mean[None], mean[None, None], std[None])
 
 
 def study_of(starts: Sequence[PlanningStart], config: PlanningConfig) -> PlanningStudy:

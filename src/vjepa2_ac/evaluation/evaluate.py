@@ -238,7 +238,8 @@ def _measure(
         found = replace(found, landscapes=maps)
     if seen.planned:
         planner = model if contender.to_plan is None else contender.to_plan()
-        found = replace(found, plans=measure_plans(planner, seen.planned, probes.planning, progress("planning")))
+        plans = measure_plans(planner, seen.planned, probes.planning, progress("planning"), prior=probes.prior)
+        found = replace(found, plans=plans)
     if starts and probes.axis_clips and space.is_pose:
         chosen = [starts[place] for place in spread(len(starts), probes.axis_clips)]
         found = replace(found, beside={"axes": infer_axes(model, chosen, probes.at_once, progress("axes"))})

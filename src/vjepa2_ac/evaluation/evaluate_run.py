@@ -33,6 +33,7 @@ from vjepa2_ac.evaluation.result import PERSISTENCE, About, Evaluation, Measurem
 from vjepa2_ac.model.adapter.lora import base_only, unadapted_copy
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.planning.prior.action_prior import load_prior
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import select_checkpoint
 from vjepa2_ac.runs.folder import METRICS, is_run
@@ -78,7 +79,7 @@ def load_subject(
     Raises:
         InputError: One of the models cannot be loaded; it does not fit the data, the decoder, or the others.
     """
-    run = load_run(Path(name), asked.checkpoint) if is_run(name) else None
+    run = load_run(Path(name), asked.checkpoint, config) if is_run(name) else None
     world_model = run.world_model if run else load_base(config.model.with_base(name), seed=config.seed)
     require_widths(world_model, dataset.widths, where=name)
     if decoder is not None:
@@ -87,9 +88,9 @@ def load_subject(
     found: list[Contender] = []
     notes: tuple[str, ...] = ()
     if BASE in against and config.model.base is None:
-        if run is None:
-            needed = "a base to compare with"
-            raise InputError(where="--against base", found="a config without model.base", needed=needed)
+        if asked.against is not None:
+            found, needed = "a model without a base (model.base is not set)", "a base to compare with"
+            raise InputError(where="--against base", found=found, needed=needed, fix="Leave out --against base")
     elif BASE in against and run is None:
         found.append(_contender(BASE, "base", _like(name, world_model, str(config.model.base), config, dataset.widths)))
     elif BASE in against and world_model.fresh_heads is not None:
@@ -159,6 +160,10 @@ def measure_subject(
     chosen = validation_windows(dataset, asked.split, clips=asked.clips)
     loaded = load_subject(subject, config, asked, dataset, decoder)
     run, world_model, contenders = loaded.run, loaded.world_model, loaded.contenders
+    planning, prior = config.planning, None
+    if asked.probes.planning_clips and planning.prior is not None:
+        trained = load_prior(planning.prior, where="planning.prior")
+        prior = trained.of(world_model.encoder_fingerprint(), config.data.crop).to(accelerator.device)
     through_cache = with_latents_if_there(config, dataset, world_model)
     if through_cache.config.is_cache and not asked.calibrate:
         world_model.set_encoder_aside()
@@ -176,7 +181,7 @@ def measure_subject(
             contenders,
             clips,
             _about(subject, run, config, dataset, asked),
-            probes=replace(asked.probes, planning=config.planning, axis_clips=axis_clips),
+            probes=replace(asked.probes, planning=planning, prior=prior, axis_clips=axis_clips),
             reporter=reporter,
         )
         decoded = None

@@ -16,7 +16,7 @@ from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import batches_of, validation_windows
 from vjepa2_ac.data.sources.indexed_source import measured_space
-from vjepa2_ac.data.transforms import frames_as_seen, view
+from vjepa2_ac.data.transforms import frames_as_seen, split_views, view
 from vjepa2_ac.data.windows import require_frames
 from vjepa2_ac.decoding.decoder_folder import load_decoder
 from vjepa2_ac.decoding.imagine import AS_RECORDED, Imagination, Imagined, Start, rolled_out, shown, worth_knowing
@@ -55,7 +55,7 @@ def imagine_image(
     steps: int,
     size_m: float = STEP_M,
 ) -> Imagination:
-    """Imagine what follows from an image under actions by name, or from files.
+    """Imagine what follows from an image under actions by name, or from files; `planning.views` as a planner sees them.
 
     Args:
         session: The model, and the config whose crop and limits count.
@@ -69,6 +69,7 @@ def imagine_image(
         InputError: Decoder, state or actions cannot be used.
     """
     require_one_process()
+    _require_some(actions)
     model, config = session.world_model, session.config
     decoder = load_decoder(decoder_name)
     decoder.require_fit(model, config.data.crop, subject=session.subject)
@@ -77,10 +78,17 @@ def imagine_image(
     _require_directions(space, where="--state")
     chosen = {name: _actions_by_name(name, steps, size_m, config.planning.limits) for name in actions}
     camera = None if seen.extrinsics is None else torch.as_tensor(seen.extrinsics, dtype=torch.float32).to(model.device)
-    latents = encode_frames(model, seen.image[None], config.data.crop)[0]
-    start = Start(latents, np.asarray(seen.state, dtype=np.float64), space, camera)
-    first = _as_seen(config, model.image_size, seen.image[None])[0]
-    decoded_first = shown(decoder.decoder, latents[None])[0]
+    views = config.planning.views
+    latents = encode_frames(model, seen.image[None], config.data.crop, views=views)
+    state = np.asarray(seen.state, dtype=np.float64)
+    starts = [Start(one, state, space, camera) for one in latents[0].chunk(views)]
+    first = np.concatenate(_as_seen(config, model.image_size, split_views(seen.image[None], views)), axis=1)
+    decoded_first = shown(decoder.decoder, latents, views)[0]
+
+    def imagined(taken: Float[np.ndarray, "steps 7"]) -> Frames:
+        rolled = torch.cat([rolled_out(model.rollout, start, taken) for start in starts], dim=1)
+        return shown(decoder.decoder, rolled, views)
+
     return Imagination(
         subject=session.subject,
         episode_id="",
@@ -88,15 +96,17 @@ def imagine_image(
         seconds_per_step=(config.data.model_stride if config.data.stride != "auto" else 1) / _RATE_HZ,
         first=first,
         decoded_first=decoded_first,
-        rollouts=tuple(
-            Imagined("model", word, taken, shown(decoder.decoder, rolled_out(model.rollout, start, taken)))
-            for word, taken in chosen.items()
-        ),
+        rollouts=tuple(Imagined("model", word, taken, imagined(taken)) for word, taken in chosen.items()),
         notes=(
             f"Times in the film suppose {_RATE_HZ:g} control steps in a second.",
             *worth_knowing(decoder.card, first, decoded_first),
         ),
     )
+
+
+def _require_some(actions: Sequence[str]) -> None:
+    if not actions:
+        raise InputError(where="--actions", found="no actions", needed=f"one or more of {', '.join(ACTION_NAMES)}")
 
 
 def _require_directions(space: StateSpace, *, where: str, fix: str = "") -> None:
@@ -210,9 +220,7 @@ def imagine_clip(subject: str, asked: ImagineOptions, *, reporter: Reporter = SI
 
 
 def _actions_of(asked: ImagineOptions, batch: Batch, dataset: Dataset, limits: LimitsConfig) -> dict[str, np.ndarray]:
-    if not asked.actions or not 0 < asked.size_m < np.inf:
-        found = f"{len(asked.actions)} sequences of actions, named ones of {asked.size_m:g} m a step"
-        raise InputError(where="--actions, --size", found=found, needed="one or more, of more than 0")
+    _require_some(asked.actions)
     recorded = batch.actions[0].double().numpy()
     chosen: dict[str, np.ndarray] = {}
     for word in asked.actions:

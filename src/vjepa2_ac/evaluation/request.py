@@ -14,6 +14,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.data import Split
@@ -23,7 +24,10 @@ from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.settings import require_limits, with_taught_limits
 from vjepa2_ac.runs.checkpoint import SELECTED
-from vjepa2_ac.runs.folder import is_run, read_run_config
+from vjepa2_ac.runs.folder import is_of_moved, is_run, read_run_config
+
+if TYPE_CHECKING:
+    from vjepa2_ac.planning.prior.action_prior import ActionPrior
 
 STEPS = 3  # of a scored plan
 FRAMES = STEPS + 1  # required of a clip
@@ -62,6 +66,7 @@ class ProbeOptions:
     at_once: int = 64  # samples per batch
     planning_clips: int = 0  # number of clips whose plans are compared with the demonstration; of poses only
     planning: PlanningConfig = field(default_factory=PlanningConfig)  # settings of one-step plans
+    prior: ActionPrior | None = None  # network of `planning.prior`, on the device of the latents
 
 
 @dataclass(frozen=True)
@@ -79,7 +84,8 @@ class EvaluationOptions:
     decoder: str | None = None  # folder of a decoder, or builtin:sim-tiny: rollouts are decoded and measured as images
     lpips: Path | None = None  # with a decoder: torchvision's AlexNet or VGG16, for LPIPS
     lpips_heads: Path | None = None  # its heads
-    planning: tuple[str, ...] = ()  # settings in place of the config's, such as planning.samples=200
+    # Settings in place of the config's: planning.samples=200; for a run whose base was moved model.base=PATH, too.
+    planning: tuple[str, ...] = ()
 
 
 def settle(subject: str, asked: EvaluationOptions) -> Config:
@@ -99,8 +105,8 @@ def settle(subject: str, asked: EvaluationOptions) -> Config:
         raise InputError(where="--lpips, --lpips-heads", found="one without the others", needed=needed)
     config = _config_of(subject, asked)
     for setting in asked.planning:
-        if not setting.startswith("planning."):
-            needed = "settings of planning, such as planning.samples=200"
+        if not (setting.startswith("planning.") or (is_run(subject) and is_of_moved(setting))):
+            needed = "settings of planning, such as planning.samples=200; or, for a run, model.base=PATH"
             raise InputError(where="--planning", found=setting, needed=needed)
     config = parse_config(config_as_dict(config), asked.planning, where="--planning")
     if is_run(subject):

@@ -77,8 +77,11 @@ def changes_of_chunks(
         space: What a state is.
 
     Raises:
-        InputError: A chunk has other numbers than a state, one that no robot has, or is shorter than a model step.
+        InputError: A chunk has other numbers than a state, one that no robot has, or is shorter than a model step; or
+            the state is none.
     """
+    state = np.array(state, dtype=np.float64)
+    space.require_state(state, "state")
     found = np.array(chunks, dtype=np.float64)
     if found.ndim != 3 or not len(found) or found.shape[2] != len(space) or not np.isfinite(found).all():
         needed = f"finite numbers, chunks x control steps x {len(space)}: {', '.join(space.names)}"
@@ -86,8 +89,7 @@ def changes_of_chunks(
     if found.shape[1] < control_steps:
         needed = f"{control_steps} at least, which are one model step"
         raise InputError(where="chunks", found=f"{found.shape[1]} control steps", needed=needed)
-    now = torch.from_numpy(np.array(state, dtype=np.float64))
-    given = torch.from_numpy(found)
+    now, given = torch.from_numpy(state), torch.from_numpy(found)
     if form == "deltas":
         targets = states_along(now, given, space)[:, 1:].numpy()
     else:

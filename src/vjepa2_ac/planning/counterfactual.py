@@ -47,11 +47,13 @@ def named_actions(
             `size_m` counts alone, and the gripper changes as upstream's.
 
     Raises:
-        InputError: No such name, or one that the limits hold still.
-        ValueError: No steps, or no length.
+        InputError: No such name, one that the limits hold still, or no length.
+        ValueError: No steps.
     """
-    if steps < 1 or not 0 < size_m < np.inf:
-        raise ValueError(f"{steps} steps of {size_m} m")
+    if steps < 1:
+        raise ValueError(f"{steps} steps")
+    if not 0 < size_m < np.inf:
+        raise InputError(where="--size", found=f"{100 * size_m:g} cm a step", needed="a length above 0 cm")
     actions = np.zeros((steps, ACTION_DIM))
     if name == "none":
         return actions
@@ -60,8 +62,12 @@ def named_actions(
     axis, sign = _DIRECTIONS[name]
     size = _size_along(axis, size_m, limits)
     if size == 0:
-        key = "planning.limits.gripper" if axis == GRIPPER else "planning.limits.xyz"
-        raise InputError(where=key, found=f"0, so that nothing can move {name}", needed="a limit above 0")
+        key, found, needed = "planning.limits.xyz", "0", "a limit above 0"
+        if axis == GRIPPER:
+            key = "planning.limits.gripper"
+            if limits is not None and limits.gripper_mode == "held":
+                key, found, needed = "planning.limits.gripper_mode", "held", "rounded or free"
+        raise InputError(where=key, found=f"{found}, so that nothing can move {name}", needed=needed)
     actions[:, axis] = sign * size
     return actions
 
@@ -108,5 +114,5 @@ def _size_along(axis: int, size_m: float, limits: LimitsConfig | None) -> float:
     if limits is None:
         return GRIPPER_STEP if axis == GRIPPER else size_m
     if axis == GRIPPER:
-        return limits.gripper
+        return 0.0 if limits.gripper_mode == "held" else limits.gripper
     return min(size_m, limits.xyz_m[axis], limits.radius if limits.ball != "none" else np.inf)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from math import comb
@@ -99,6 +99,21 @@ class Scene:
         return self.extrinsics if self.axes is None or self.extrinsics is None else self.axes.poses(self.extrinsics)
 
 
+@dataclass(frozen=True)
+class EnergyFunction:
+    """The distance between latents that a config names; an energy that is a class is constructed once for it."""
+
+    config: EnergyConfig
+    by_token: Callable[[Tensor, Tensor], Tensor]
+
+    @classmethod
+    def of(cls, energy: EnergyConfig | EnergyFunction) -> EnergyFunction:
+        """Return the function of a config; one that is there already is returned unchanged."""
+        if isinstance(energy, EnergyFunction):
+            return energy
+        return cls(energy, ENERGIES.function(energy.distance, energy.options))
+
+
 class WorldModelCost:
     """The energy of action sequences from a scene towards a goal.
 
@@ -111,7 +126,7 @@ class WorldModelCost:
         world_model: WorldModel,
         scene: Scene,
         goal: Goal,
-        config: EnergyConfig,
+        energy: EnergyConfig | EnergyFunction,
         *,
         done: int = 0,
         spaces: Spaces = POSES,
@@ -122,7 +137,7 @@ class WorldModelCost:
             world_model: In eval mode: dropout would make energies differ from call to call.
             scene: The start of the actions.
             goal: Their target.
-            config: The distance, and the number of samples per batch.
+            energy: The distance, and the number of samples per batch.
             done: Model steps since the goal was set: selects the goal that applies.
             spaces: What the model's states and actions are. What is evaluated are changes of the state; where actions
                 are targets, the model is given the states that they lead to.
@@ -133,7 +148,7 @@ class WorldModelCost:
         if world_model.predictor.training:
             raise ValueError("a model in training mode: dropout would change energies; call eval() first")
         device = world_model.device
-        self._model, self._config, self._spaces, self._done = world_model, config, spaces, done
+        self._model, self._energy, self._spaces, self._done = world_model, EnergyFunction.of(energy), spaces, done
         weights = None if goal.weights is None else goal.weights.to(device)
         self._goal = Goal(goal.latents.to(device), goal.durations, weights)
         self._frame, self._state = scene.latents[-1].to(device), scene.states[-1].to(device)
@@ -148,7 +163,7 @@ class WorldModelCost:
         With gradients, predictions of each part but the only one are recomputed in the backward pass, so that memory is
         bounded as well.
         """
-        parts = actions.to(self._model.device).split(self._config.samples_at_once)  # type: ignore[no-untyped-call]  # torch
+        parts = actions.to(self._model.device).split(self._energy.config.samples_at_once)  # type: ignore[no-untyped-call]  # torch
         again = torch.is_grad_enabled() and len(parts) > 1
         energies: list[Tensor] = []
         done = 0
@@ -183,9 +198,9 @@ class WorldModelCost:
     def _energies(self, actions: Float[Tensor, "samples steps action_dim"]) -> Float[Tensor, " samples"]:
         predicted, _ = self.imagine(actions)
         wanted = self._goal.ahead(self._done, actions.shape[1])
-        if self._config.steps == "last":
+        if self._energy.config.steps == "last":
             predicted, wanted = predicted[:, -1:], wanted[-1:]
-        far = distance(predicted, wanted, self._config, self._goal.weights)
+        far = distance(predicted, wanted, self._energy, self._goal.weights)
         return far.sum(dim=1)
 
     @torch.no_grad()
@@ -202,9 +217,14 @@ class WorldModelCost:
         return cache
 
 
-def distance(predicted: Latents, wanted: Wanted, energy: EnergyConfig, weights: Weights | None = None) -> OfEach:
-    """Return the distance between latents that a config names, over patches by weight (None: equal weights)."""
-    by_token: Tensor = ENERGIES.function(energy.distance, energy.options)(predicted, wanted)
+def distance(
+    predicted: Latents, wanted: Wanted, energy: EnergyConfig | EnergyFunction, weights: Weights | None = None
+) -> OfEach:
+    """Return the distance between latents that a config names, over patches by weight (None: equal weights).
+
+    For several calls give the function, so that an energy that is a class is constructed once.
+    """
+    by_token = EnergyFunction.of(energy).by_token(predicted, wanted)
     return by_token.mean(dim=-1) if weights is None else (by_token * (weights / weights.sum())).sum(dim=-1)
 
 

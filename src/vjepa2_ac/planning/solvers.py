@@ -243,9 +243,19 @@ class MppiSolver(Solver):
 
 
 class PriorSolver(Solver):
-    """No search: what the prior says, once evaluated."""
+    """No search: what the prior says, once evaluated.
+
+    Raises:
+        InputError: There is no start: a command that loads no prior has nothing to say.
+    """
 
     elites = 1
+
+    def __init__(self, space: SearchSpace, config: PlanningConfig, generator: Generator, start: Before = None) -> None:
+        super().__init__(space, config, generator, start)
+        if start is None:
+            found, needed = "prior, in a command that loads none", "a planner that searches, such as cem"
+            raise InputError(where="planning.planner", found=found, needed=needed)
 
     def sample(self) -> Samples:
         """Return the prior's mean."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import io
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,11 +14,11 @@ import numpy as np
 from jaxtyping import Shaped
 
 from vjepa2_ac.errors import InputError, UserError
-from vjepa2_ac.storage import ByteReader
+from vjepa2_ac.storage import ByteReader, is_refusal
 
 _LOCAL_HEADER_BYTES = 30
 _MOST_BYTES = 1 << 30  # of an array that is read completely
-_MOST_UNPACKED, _MOST_RATIO = 1 << 30, 100  # bytes of a compressed array that is larger than its packed bytes by this
+_MOST_UNPACKED, _MOST_RATIO = 1 << 30, 100  # a larger compressed array has at most this many times its packed bytes
 _KINDS = frozenset({zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED})  # as numpy writes; others expand without a bound
 _FIX = "Write the file again, with numpy.savez"
 
@@ -121,7 +120,7 @@ class NpzFile:
         except UserError:
             raise
         except Exception as error:  # zipfile, zlib and numpy raise whatever damage makes of a file
-            if isinstance(error, OSError) and error.errno != errno.EINVAL:  # EINVAL: a seek before the start
+            if is_refusal(error):
                 raise
             place = f"{self._where}: {name}" if name else self._where
             found = f"cannot be read ({str(error)[:200] or type(error).__name__})"

@@ -32,7 +32,13 @@ from vjepa2_ac.model.network.compilation import require_compiler
 from vjepa2_ac.model.network.world_model import WorldModel, fit_heads, heads_to_replace, require_trained
 from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import RunState
-from vjepa2_ac.training.data_sets import first_clip, open_data_sets, require_fitting_clips, require_same_data
+from vjepa2_ac.training.data_sets import (
+    first_clip,
+    open_data_sets,
+    require_fitting_clips,
+    require_same_base,
+    require_same_data,
+)
 from vjepa2_ac.training.loss import Objective
 from vjepa2_ac.training.micro_step import GraphedMicroStep, MicroStep, captured, plain_micro_step
 from vjepa2_ac.training.optim import make_optimizer, trained_parameters
@@ -147,6 +153,7 @@ def set_up(
         first_only(accelerator, lambda: require_same_data(config, (dataset, *others)))
 
     world_model = chooser or load_base(config.model, seed=config.seed)
+    first_only(accelerator, lambda: require_same_base(config, world_model))
     extrinsics_for(world_model, clip)
     if decoder is not None:
         decoder.require_fit(world_model, config.data.crop, subject=str(config.model.base or "the random model"))

@@ -21,6 +21,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.intervals import Estimate, mean_of, ratio, ratio_difference
 from vjepa2_ac.planning.chunks import ChunkForm, changes_of_chunks
 from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.planning.demonstrations.make_goals import recording_of, require_views
 from vjepa2_ac.runs.checkpoint import step_of
 from vjepa2_ac.runs.folder import METRICS, is_run
 from vjepa2_ac.runs.metrics_log import read_metrics_log
@@ -154,8 +155,11 @@ def score_policies(
         progress: Called with (done, total) in places.
 
     Raises:
-        InputError: There is no common place, an episode or a frame is not there, or chunks cannot be used.
+        InputError: There is no common place, an episode or a frame is not there, the data have fewer cameras than the
+            controller has views, or chunks cannot be used.
     """
+    views = controller.config.views
+    require_views(dataset.config, views, to="score policies at")
     places = sorted(set.intersection(*(set(one.places) for one in policies)))
     if not places:
         raise InputError(where="--policy", found="no frame that all of them have", needed="the same places in all")
@@ -178,7 +182,7 @@ def score_policies(
             )[:, : len(place.changes)]
             for one, row in zip(policies, rows, strict=True)
         ]  # fmt: skip
-        frame, goal = place.frames(dataset)
+        frame, goal = place.frames(dataset, views)
         controller.reset(goal)
         found = controller.score(frame, place.state, np.concatenate([place.changes[None], others, *chunks]))
         true, rest = found.energies[0], found.energies[1 + len(others) :]
@@ -238,9 +242,9 @@ class _Place:
         states = episode.states[step : step + ahead + 1 : dataset.config.model_stride]
         return cls(place, index, ahead, episode.states[step], controller.spaces.state.differences(states))
 
-    def frames(self, dataset: Dataset) -> np.ndarray:
-        """Return what is seen there, and the goal image."""
-        return dataset.source.read(self.index).read_frames([self.place[1], self.place[1] + self.ahead])
+    def frames(self, dataset: Dataset, views: int) -> np.ndarray:
+        """Return what so many cameras see there, side by side, and the goal image."""
+        return recording_of(dataset, self.index, views).read([self.place[1], self.place[1] + self.ahead])
 
 
 def _drawn(rng: np.random.Generator, number: int, episodes: Sequence[str]) -> Int[np.ndarray, " others"]:

@@ -93,13 +93,13 @@ def recording_of_episode(
     return recording_of(dataset, number_of_episode(dataset, wanted), views)
 
 
-def require_views(config: DataConfig, views: int) -> None:
+def require_views(config: DataConfig, views: int, *, to: str = "make goals of") -> None:
     """Refuse data without frames, or of fewer cameras than are seen side by side.
 
     Raises:
         InputError: They are.
     """
-    require_frames(config, to="make goals of")
+    require_frames(config, to=to)
     if len(config.cameras) < views:
         found, needed = ", ".join(config.cameras), f"{views} cameras, from left to right, as planning.views says"
         raise InputError(where="data.camera", found=found, needed=needed)

@@ -16,13 +16,12 @@ from typing import Annotated, Any, Literal
 import torch
 from jaxtyping import Float, Int
 from pydantic import Field
-from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.nn.functional import gelu
 
 from vjepa2_ac import __version__
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.network.pretrained_folder import read_tensors
+from vjepa2_ac.model.network.pretrained_folder import read_tensors, save_tensors
 from vjepa2_ac.planning.energy import WorldModelCost
 from vjepa2_ac.planning.search_space import SearchSpace
 from vjepa2_ac.planning.solvers import PlanStart
@@ -131,6 +130,27 @@ class ActionPrior(nn.Module):
         return torch.cat([points, values], dim=2).flatten(1)
 
     @torch.no_grad()
+    def next_action(
+        self,
+        seen: Float[Tensor, "tokens dim"],
+        state: Float[Tensor, " state_dim"],
+        wanted: Float[Tensor, "tokens dim"],
+        remaining: int,
+    ) -> tuple[Float[Tensor, " action_dim"], Float[Tensor, " action_dim"]]:
+        """Return mean and standard deviation of the next action, on the CPU.
+
+        Args:
+            seen: Latents of the current frame.
+            state: Measured.
+            wanted: Latents of the goal.
+            remaining: Model steps to it, at a guess.
+        """
+        left = torch.tensor([max(1, remaining)], device=seen.device)
+        mean, deviation = self(seen[None], wanted[None], left, state[None])
+        std = math.sqrt(2) * deviation  # of a Laplace distribution
+        return (mean * self.scale)[0].float().cpu(), (std * self.scale)[0].float().cpu()
+
+    @torch.no_grad()
     def start(
         self, cost: WorldModelCost, wanted: Float[Tensor, "tokens dim"], remaining: int, space: SearchSpace
     ) -> PlanStart:
@@ -149,10 +169,7 @@ class ActionPrior(nn.Module):
             if done:
                 predicted, states = cost.imagine(space.over_steps(space.allowed(decisions))[None])
                 seen, state = predicted[0, done - 1], states[0, done]
-            left = torch.tensor([max(1, remaining - done)], device=seen.device)
-            mean, deviation = self(seen[None], wanted[None], left, state[None])
-            decisions[number] = (mean * self.scale)[0].cpu()
-            spread[number] = (math.sqrt(2) * deviation * self.scale)[0].cpu()  # of a Laplace distribution
+            decisions[number], spread[number] = self.next_action(seen, state, wanted, remaining - done)
         return PlanStart(decisions, decisions[None], spread)
 
 
@@ -163,7 +180,7 @@ def save_prior(folder: Path, card: PriorCard, prior: ActionPrior) -> None:
         InputError: The folder cannot be written.
     """
     with folder_writer(folder, CARD) as fresh:
-        save_file({name: one.detach().cpu().contiguous() for name, one in prior.state_dict().items()}, fresh / WEIGHTS)
+        save_tensors(prior.state_dict(), fresh / WEIGHTS)
         (fresh / CARD).write_text(json.dumps(asdict(card), indent=1) + "\n", encoding="utf-8")
 
 

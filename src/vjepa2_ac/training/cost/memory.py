@@ -2,8 +2,8 @@
 
 The predictor's part is measured (`training.cost.step`). Calculated is what needs no pass through it: weights and
 moments from the counts of parameters (bitsandbytes' kernels take no fake tensors), the next batch from its sizes, and
-the encoder at work, whose code would take seconds to import. The total has not yet been compared with the peak that a
-GPU measures.
+the encoder at work, whose code would take seconds to import. On an H100 the peak that PyTorch's allocator reported
+differed from the total by 1 %; the CUDA context was not compared.
 """
 
 from __future__ import annotations

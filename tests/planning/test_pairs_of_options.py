@@ -1,0 +1,289 @@
+"""Every pair of planning options works in every command that plans, or is refused before the first decision."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from itertools import combinations
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from pydantic import BaseModel, ValidationError
+from torch import Tensor
+
+from decisions import STATE, image
+from random_decoder import write_decoder
+from tiny_models import DIM, TOKENS, tiny_model
+from vjepa2_ac.config import Config
+from vjepa2_ac.config.loading import parse_config
+from vjepa2_ac.config.planning import PlanningConfig
+from vjepa2_ac.config.section import marks_of
+from vjepa2_ac.decoding.decoder_folder import load_decoder
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation import imagined
+from vjepa2_ac.evaluation.imagined import imagine_image
+from vjepa2_ac.model.network import compilation
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.planning.decision import PlanRequest, decide
+from vjepa2_ac.planning.goals import timed
+from vjepa2_ac.planning.model_setup import Fingerprints
+from vjepa2_ac.planning.prior.action_prior import ActionPrior, PriorCard, PriorSizes, save_prior
+from vjepa2_ac.planning.session import PlanningSession
+from vjepa2_ac.planning.solvers import CemSolver
+from vjepa2_ac.planning.surprise import Monitor
+from vjepa2_ac.registry import ENERGIES, PLANNERS
+from vjepa2_ac.simulation.closed_loop.policies import Moves, Planning
+from vjepa2_ac.simulation.closed_loop.rollout import Observation, Span, run_in
+
+SIDE = 16  # pixels of a view: the model scales every image
+BASE = {"horizon": 2, "samples": 4, "iterations": 1, "cem.elites": 2, "icem.elites": 2}
+# Another value than the default's or that of BASE, for every key; with the keys that it needs.
+OTHERS: dict[str, Any] = {
+    "planner": {"planner": "icem"},
+    "planner_options": {"planner": "own planner", "planner_options": {"reach": 0.5}},
+    "horizon": 4,
+    "action_repeat": 2,
+    "samples": 6,
+    "iterations": 2,
+    "start_std": 0.5,
+    "gripper_start_std": 0.5,
+    "budget_s": 1e-6,
+    "prior": "PRIOR",
+    "prior_steps": 2,
+    "monitor": "MONITOR",
+    "replan": {"replan": "on_surprise", "monitor": "MONITOR"},
+    "warm_start": True,
+    "views": 2,
+    "context": 2,
+    "compile": "blocks",
+    "axes": "AXES",
+    "limits.xyz": [0.02, 0.0, 0.03],
+    "limits.ball": "l2",
+    "limits.radius": {"limits.ball": "l1", "limits.radius": 0.02},
+    "limits.workspace": [[0.38, -0.02, 0.28], [0.41, 0.02, 0.31]],
+    "limits.rotation": 0.1,
+    "limits.axes": [0.1],
+    "limits.gripper": 0.0,
+    "limits.gripper_mode": "held",
+    "limits.gripper_rounding": 0.1,
+    "limits.gripper_from": {"limits.gripper_mode": "close", "limits.gripper_from": 2},
+    "energy.distance": "cosine",
+    "energy.options": {"energy.distance": "own energy", "energy.options": {"power": 3.0}},
+    "energy.steps": "sum",
+    "energy.samples_at_once": 3,
+    "goals.share": 0.9,
+    "goals.stop_share": 0.9,
+    "cem.elites": 3,
+    "cem.momentum_mean": 0.5,
+    "cem.momentum_std": 0.5,
+    "cem.momentum_mean_gripper": 0.5,
+    "cem.momentum_std_gripper": 0.5,
+    "cem.try_mean": True,
+    "cem.answer": "best",
+    "icem.elites": {"planner": "icem", "icem.elites": 3},
+    "icem.momentum": {"planner": "icem", "icem.momentum": 0.5},
+    "icem.noise_exponent": {"planner": "icem", "icem.noise_exponent": 0.0},
+    "icem.shrink": {"planner": "icem", "icem.shrink": 2.0},
+    "icem.kept": {"planner": "icem", "icem.kept": 1.0},
+    "mppi.temperature": {"planner": "mppi", "mppi.temperature": 1.0},
+    "mppi.std_decay": {"planner": "mppi", "mppi.std_decay": 0.5},
+    "gradient.starts": {"planner": "gradient", "gradient.starts": 2},
+    "gradient.learning_rate": {"planner": "gradient", "gradient.learning_rate": 0.5, "gradient.starts": 2},
+}
+# What a caller gives along with a frame, and a planner that needs another option.
+MORE: dict[str, Any] = {
+    "planner=prior": {"planner": "prior", "prior": "PRIOR"},
+    "mask": {},
+    "samples of a policy": {},
+}
+# Options that change numbers of a search only: their pairs are tried many at a time, all others one by one.
+NUMBERS = {
+    *("samples", "iterations", "start_std", "gripper_start_std", "prior_steps", "energy.distance", "goals.share"),
+    *("energy.samples_at_once", "limits.xyz", "limits.ball", "limits.radius", "limits.rotation", "limits.axes"),
+    *("limits.gripper", "limits.gripper_rounding", "gradient.learning_rate"),
+    *(name for name in OTHERS if name.startswith(("cem.", "icem.", "mppi."))),
+}
+REFUSED = {
+    *(frozenset({"views", other}) for other in ("context", "axes", "prior", "planner=prior", "monitor", "replan")),
+    *(frozenset({"warm_start", other}) for other in ("prior", "planner=prior")),
+}
+
+
+class Power(BaseModel, extra="forbid"):
+    power: float = 1.0
+
+
+class OwnEnergy:
+    Config = Power
+
+    def __init__(self, options: Power) -> None:
+        self.power = options.power
+
+    def __call__(self, predicted: Tensor, wanted: Tensor) -> Tensor:
+        return (predicted - wanted).abs().pow(self.power).mean(dim=-1)
+
+
+class Reach(BaseModel, extra="forbid"):
+    reach: float = 1.0
+
+
+class OwnPlanner(CemSolver):
+    Config = Reach
+
+    def __init__(self, *given: Any, options: Reach) -> None:
+        super().__init__(*given)
+        self.std = self.std * options.reach
+
+
+@dataclass
+class Scene:
+    """The files and objects that all pairs share."""
+
+    model: WorldModel
+    files: dict[str, str]
+    imagined: set[str] = field(default_factory=set)  # of which options
+
+    def planning(self, *names: str) -> dict[str, Any]:
+        """Return the values of some options, each with what it needs."""
+        planning: dict[str, Any] = {}
+        for key, value in [*BASE.items(), *(pair for name in names for pair in entries(name).items())]:
+            section, _, inner = key.rpartition(".")
+            (planning.setdefault(section, {}) if section else planning)[inner] = self.files.get(str(value), value)
+        return planning
+
+    def config(self, *names: str) -> Config:
+        """Return the config with some options.
+
+        Raises:
+            InputError: They exclude one another.
+        """
+        planning = self.planning(*names)
+        try:  # quick
+            update = {"planning": PlanningConfig.model_validate_json(json.dumps(planning))}
+            return CONFIG.model_copy(update=update)
+        except ValidationError:
+            return parse_config(VALUES | {"planning": planning}, where="test")
+
+
+VALUES = {"run_dir": "r", "data": {"path": "d", "stride": 4}, "model": {"base": "b"}}
+CONFIG = parse_config(VALUES, where="test")
+
+
+def entries(name: str) -> dict[str, Any]:
+    value = (OTHERS | MORE)[name]
+    return value if isinstance(value, dict) else {name: value}
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
+    folder, model = tmp_path_factory.mktemp("files"), tiny_model(depth=1)
+    known = model.merged_from = Fingerprints.of(model)  # hashed once
+    monitor = Monitor("vjepa2-ac monitor 1", 1e6, 0.1, 8, (1.0,), (0.0,) * TOKENS, known.encoder, known.predictor)
+    (folder / "monitor.json").write_text(json.dumps(asdict(monitor)))
+    whose = {"subject": "tiny", "encoder": known.encoder, "predictor": known.predictor}
+    axes = {"format": 1, "yaw_degrees": {"value": 43.0}, "problem": None, "model": whose}
+    (folder / "axes.json").write_text(json.dumps(axes))
+    sizes = PriorSizes(grid=3, dim=DIM, state=7, action=7, ahead=3)
+    save_prior(
+        folder / "prior", PriorCard("vjepa2-ac prior 1", sizes, known.encoder, "released", "", 0), ActionPrior(sizes)
+    )
+    decoder = load_decoder(str(write_decoder(folder / "decoder", model)))
+    files = {"MONITOR": "monitor.json", "AXES": "axes.json", "PRIOR": "prior"}
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(compilation, "missing_for_compilation", lambda _: None)
+        patched.setattr(imagined, "load_decoder", lambda _: decoder)
+        for registry, name, kind in ((ENERGIES, "own energy", OwnEnergy), (PLANNERS, "own planner", OwnPlanner)):
+            patched.setitem(registry._things, name, kind)
+        with torch.compiler.set_stance("force_eager"):
+            yield Scene(model, {name: str(folder / file) for name, file in files.items()})
+
+
+class StillWorld:
+    """A world that shows noise, whatever is done."""
+
+    def __init__(self, views: int) -> None:
+        self.images = [image(seed, SIDE, SIDE * views) for seed in range(4)]
+
+    def begin(self, _: object) -> tuple[np.ndarray, Observation]:
+        self.left = self.images[:3]
+        return self.images[3], self.seen()
+
+    def act(self, *_: object) -> tuple[bool, Observation]:
+        return True, self.seen()
+
+    def seen(self) -> Observation:
+        return Observation(self.left.pop(), STATE, 0.1, is_done=False)
+
+
+def tried(scene: Scene, *names: str) -> None:
+    """Take options through two decisions in closed loop, `plan`, `score` and `imagine`."""
+    config = scene.config(*names)
+    planning, controller = config.planning, Controller.of_config(scene.model, config)
+    world = StillWorld(planning.views)
+    goals = timed(world.images[2:], (1,))
+    mask = np.arange(SIDE * SIDE * planning.views).reshape(SIDE, -1) % 3 > 0 if "mask" in names else None
+    if "samples of a policy" in names:
+        chunks = np.random.default_rng(0).normal(0, 0.01, (3, planning.horizon, 7))
+        acting = controller.act
+        controller.act = lambda frame, state: acting(frame, state, samples=chunks)  # type: ignore[method-assign]
+    policy = Planning(controller, goals_of=lambda _: goals)
+    if mask is not None:
+        policy.reset = lambda *_: controller.follow(goals, mask=mask)  # type: ignore[method-assign]
+    found = run_in(world, policy, SimpleNamespace(), Span(steps=2, stride=1))
+    assert policy.moves == Moves.FLANGE
+    assert np.isfinite(found.actions).all()
+    assert np.isfinite(controller.score(world.images[0], STATE, np.full((2, 3, 7), 0.01)).energies).all()
+    planned = decide(controller, PlanRequest(world.images[0], STATE, goals, mask), nodes=0)
+    assert np.isfinite(planned.actions).all()
+    if (read := f"{planning.views} {planning.limits}") in scene.imagined:  # it reads no other options
+        return
+    scene.imagined.add(read)
+    session = PlanningSession(scene.model, config, "tiny", "")
+    film = imagine_image(session, "decoder", imagined.Seen(world.images[0], STATE), ["back"], steps=1)
+    assert film.rollouts[0].frames.shape[1:] == film.first.shape == film.decoded_first.shape
+
+
+def test_every_option_has_another_value(scene: Scene) -> None:
+    keys = {key.removeprefix("planning.") for key in marks_of(Config) if key.startswith("planning.")}
+    assert set(OTHERS) == keys, "a new key needs another value here"
+    usual = scene.config()
+    for name in OTHERS:
+        assert scene.config(name) != usual
+
+
+def test_every_pair_of_options_works_or_is_refused_before_the_first_decision(scene: Scene) -> None:
+    refused, together = set(), {name: set[str]() for name in OTHERS | MORE}
+    for one, other in combinations(OTHERS | MORE, 2):
+        shared = entries(one).keys() & entries(other).keys()
+        if any(entries(one)[key] != entries(other)[key] for key in shared):
+            continue  # two values of one option
+        try:
+            scene.config(one, other)
+        except InputError:
+            refused.add(frozenset({one, other}))
+            continue
+        together[one].add(other)
+        together[other].add(one)
+    assert refused == REFUSED
+    for names in groups(together):
+        try:
+            tried(scene, *names)
+        except Exception as error:
+            raise AssertionError(f"{', '.join(names)}: {scene.planning(*names)}") from error
+
+
+def groups(together: dict[str, set[str]]) -> Iterator[list[str]]:
+    """Yield options that go together: each pair without numbers, then groups that cover all other pairs."""
+    left = [frozenset(pair) for pair in combinations(together, 2) if pair[1] in together[pair[0]]]
+    yield from (sorted(pair) for pair in left if not pair & NUMBERS)
+    left = [pair for pair in left if pair & NUMBERS]
+    while left:
+        group = sorted(left[0])
+        for name in sorted(together, key=lambda name: -sum(name in pair for pair in left)):
+            if all(name in together[one] for one in group):
+                group.append(name)
+        left = [pair for pair in left if not pair <= {*group}]
+        yield group
