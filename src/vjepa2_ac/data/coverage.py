@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt64
 from scipy.spatial import KDTree
 
 from vjepa2_ac.config.data import Split
@@ -309,7 +309,7 @@ def find_duplicates(dataset: Dataset) -> Duplicates:
         return Duplicates(is_known=False)
     members = np.flatnonzero(dataset.taking_part & (table.state_hash != UNKNOWN))
     members = members[np.argsort(table.id_rank[members])]
-    recordings = _recordings(table, members)
+    recordings = _recordings(table, members, table.state_hash[members])
     is_copied = np.bincount(recordings)[recordings] > 1
     members, recordings = members[is_copied], recordings[is_copied]
     if not len(members):
@@ -331,10 +331,12 @@ def find_duplicates(dataset: Dataset) -> Duplicates:
     )
 
 
-def _recordings(table: EpisodeTable, members: Int[np.ndarray, " members"]) -> Int[np.ndarray, " members"]:
+def _recordings(
+    table: EpisodeTable, members: Int[np.ndarray, " members"], hashes: UInt64[np.ndarray, " members"]
+) -> Int[np.ndarray, " members"]:
     """Return a number for each episode: the same for equal and for nearly equal states."""
     motion = table.motion[members]
-    numbers = np.unique(table.state_hash[members], return_inverse=True)[1]  # type: ignore[index]
+    numbers = np.unique(hashes, return_inverse=True)[1]
     moving = np.flatnonzero(motion[:, SPANS].max(axis=1, initial=0.0) > _MOVING)  # not those of unknown motion
     points = np.column_stack([motion[moving, 2:], table.num_steps[members[moving]]])
     _, nearest = KDTree(points).query(points, k=_MOST_COPIES, p=np.inf, distance_upper_bound=_NEAR)

@@ -18,7 +18,7 @@ from vjepa2_ac.storage import ByteReader, is_refusal
 
 _LOCAL_HEADER_BYTES = 30
 _MOST_BYTES = 1 << 30  # of an array that is read completely
-_MOST_UNPACKED, _MOST_RATIO = 1 << 30, 100  # bytes of a compressed array that is larger than its packed bytes by this
+_MOST_UNPACKED, _MOST_RATIO = 1 << 30, 100  # a larger compressed array has at most this many times its packed bytes
 _KINDS = frozenset({zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED})  # as numpy writes; others expand without a bound
 _FIX = "Write the file again, with numpy.savez"
 
