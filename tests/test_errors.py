@@ -4,7 +4,7 @@ import pickle
 import re
 import shlex
 import sys
-from importlib.metadata import PathDistribution
+from importlib.metadata import PathDistribution, version
 from pathlib import Path
 
 import pytest
@@ -63,6 +63,9 @@ def test_a_name_has_no_say_over_a_terminal(text: str, shown: str) -> None:
     assert printable(text) == shown
 
 
+WHEEL = f"vjepa2_ac-{version('vjepa2-ac')}-py3-none-any.whl"
+
+
 @pytest.mark.parametrize(
     ("origin", "extra", "command"),
     [
@@ -79,8 +82,10 @@ def test_a_name_has_no_say_over_a_terminal(text: str, shown: str) -> None:
             "pip install -c '/x y/constraints.txt' -e '/x y'",
         ),
         ('{"url": "file:///x.whl", "archive_info": {}}', "sim", 'pip install "vjepa2-ac[sim] @ file:///x.whl"'),
-        (None, "sim", 'pip install "vjepa2-ac[sim]"'),  # from an index
-        (None, "", "pip install vjepa2-ac"),
+        ('{"url": "file:///x", "dir_info": {}}', "sim", 'pip install "vjepa2-ac[sim] @ file:///x"'),
+        ('{"url": "https://x", "vcs_info": {}}', "sim", f'pip install "./{WHEEL}[sim]"'),
+        (None, "sim", f'pip install "./{WHEEL}[sim]"'),
+        (None, "", f'pip install "./{WHEEL}"'),
     ],
 )
 def test_the_line_that_installs_an_extra_fits_the_installation(

@@ -56,7 +56,7 @@ _OTHER_LAUNCHES = ("FSDP", "DEEPSPEED", "MEGATRON_LM", "PARALLELISM_CONFIG")
 _LAUNCHER = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
 _UNSET = "Unset RANK and WORLD_SIZE if you did not start several processes"
 _MEETING = timedelta(minutes=10)  # of all processes, before any work
-_PATIENCE_S = 10.0  # until the others that are waited for are reported
+_PATIENCE_S = 5.0  # until the others that are waited for are reported
 LARGE = 1_000_000  # numbers of a gradient that is a message of its own
 _LONGEST_STEP = timedelta(hours=2)  # until a process is given up that does not come to a sum: its disk may have stalled
 _AS_LONG_AS_IT_TAKES = timedelta(days=7)

@@ -165,9 +165,12 @@ def pip_install(extra: str = "") -> str:
         constraints = "constraints.txt" if here else shlex.quote(str(clone / "constraints.txt"))
         place = f'"{"." if here else clone}{wanted}"' if extra else "." if here else shlex.quote(str(clone))
         return f"{_pip()} install -c {constraints} -e {place}"
-    if "archive_info" in origin:  # a wheel's file
+    if "url" in origin and "vcs_info" not in origin:  # a wheel, or a folder
         return f'{_pip()} install "{_PACKAGE}{wanted} @ {origin["url"]}"'
-    return f'{_pip()} install "{_PACKAGE}{wanted}"' if extra else f"{_pip()} install {_PACKAGE}"
+    # Not by the name alone: whoever registers it on an index could run code here.
+    from vjepa2_ac import __version__
+
+    return f'{_pip()} install "./vjepa2_ac-{__version__}-py3-none-any.whl{wanted}"'
 
 
 def require_library(module: str, *, where: str, called: str, extra: str) -> Any:

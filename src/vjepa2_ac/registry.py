@@ -13,6 +13,7 @@ import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cache
 from importlib import import_module
+from importlib.machinery import ModuleSpec
 from importlib.metadata import EntryPoint, EntryPoints, entry_points
 from importlib.util import find_spec
 from pathlib import Path
@@ -242,12 +243,12 @@ _plugins: set[str] = set()  # modules that were imported and have registered som
 def installed(group: str) -> EntryPoints:
     """Return the entry points of a group. Packages in the working directory are not installed."""
     with _installed_only():
-        return _entry_points(tuple(sys.path)).select(group=group)
+        return _entry_points(group, tuple(sys.path))
 
 
 @cache
-def _entry_points(_path: tuple[str, ...]) -> EntryPoints:
-    return entry_points()
+def _entry_points(group: str, _path: tuple[str, ...]) -> EntryPoints:
+    return entry_points(group=group)
 
 
 def load_installed(entry_point: EntryPoint) -> Any:
@@ -298,35 +299,20 @@ def import_user_module(module: str, *, where: str, here: bool = True) -> ModuleT
     if module in sys.modules:
         return sys.modules[module]
     package = _package(module)
-
-    def load() -> ModuleType | None:
-        try:
-            return import_module(module)
-        except ModuleNotFoundError as error:
-            if error.name and f"{module}.".startswith(f"{error.name}."):
-                return None
-            raise
-
     with contextlib.nullcontext() if here else _installed_only():
-        if find_spec(package) is None and here:
+        if here and find_spec(package) is None:
             sys.path.append(str(Path.cwd()))
-        elif not (here or _mentions_us(package)):
+        spec = find_spec(package)
+        if spec is None:
+            fix = "Install it, or run where it is" if here else f"Install it, or name it by --plugin {module}"
+            raise InputError(where=where, found=f"plugin {module!r}: no such module", fix=fix)
+        if not (here or _mentions_us(spec)):
             _refuse(module, where)
-        imported = _imported(load, f"plugin {module!r}", where)
-    if imported is None:
-        fix = "Install it, or run where it is" if here else f"Install it, or name it by --plugin {module}"
-        raise InputError(where=where, found=f"plugin {module!r}: no such module", fix=fix)
-    return imported
+        return _imported(lambda: import_module(module), f"plugin {module!r}", where)
 
 
-def _mentions_us(package: str) -> bool:
-    """Return whether the files of a package mention this one, as all do that register something; imports nothing.
-
-    Also True if there is no such package, for the error of its import.
-    """
-    spec = find_spec(package)
-    if spec is None:
-        return True
+def _mentions_us(spec: ModuleSpec) -> bool:
+    """Return whether the files of a package mention this one, as all do that register something; imports nothing."""
     files = [Path(spec.origin)] if spec.has_location and spec.origin else []
     files += [file for folder in spec.submodule_search_locations or () for file in Path(folder).rglob("*.py")]
     return any(_US.encode() in file.read_bytes() for file in files)

@@ -245,10 +245,11 @@ class DataConfig(Section):
             TypeError: A section has the name of something else that all forms of data have.
         """
         for name, field in cls.model_fields.items():
-            common = DataConfig.model_fields[name].annotation if name in DataConfig.model_fields else Section
-            is_section = isinstance(field.annotation, type) and issubclass(field.annotation, Section)
-            is_common = isinstance(common, type) and issubclass(field.annotation, common) if is_section else True
-            if hasattr(DataConfig, name) or not is_common:
+            section, common = field.annotation, DataConfig.model_fields.get(name)
+            base = Section if common is None else common.annotation
+            if not (isinstance(section, type) and issubclass(section, Section)):
+                continue
+            if hasattr(DataConfig, name) or not (isinstance(base, type) and issubclass(section, base)):
                 raise TypeError(f"{cls.__name__}.{name}: all forms of data have a key of this name. Choose another")
         name = cls.model_fields["source"].default
         DataConfig.kinds[name] = SOURCES.register(name)(cls)
