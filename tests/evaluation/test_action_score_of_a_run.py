@@ -119,7 +119,7 @@ def test_clips_too_short_to_plan_on_are_refused_before_any_data_are_read(tmp_pat
 def test_a_prior_that_is_not_there_is_refused_before_any_data_are_read(tmp_path: Path) -> None:
     setting = f"planning.prior={tmp_path / 'nowhere'}"
     options = replace(asked(tmp_path, Path("no such data"), Path("no such model")), planning=(setting,))
-    with pytest.raises(InputError, match="nowhere/prior.json"):
+    with pytest.raises(InputError, match=r"nowhere/prior\.json"):
         evaluate_subject("no such model", options)
 
 
