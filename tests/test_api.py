@@ -30,6 +30,7 @@ from vjepa2_ac import (
     read_clips,
     train,
 )
+from vjepa2_ac.distributed import has_bf16
 from vjepa2_ac.reports.export import export_run
 
 PAGE = (ROOT / "docs/python.md").read_text()
@@ -72,7 +73,10 @@ def test_what_type_checkers_see_is_what_is_imported() -> None:
 
 def test_importing_the_package_imports_next_to_nothing_and_dir_knows_the_names() -> None:
     code = (
-        "import sys, vjepa2_ac\n"
+        "import os, sys\n"
+        "before = dict(os.environ)\n"
+        "import vjepa2_ac\n"
+        "assert os.environ == before\n"
         "assert set(vjepa2_ac.__all__) <= set(dir(vjepa2_ac))\n"
         "found = {name for name in sys.modules if name.startswith('vjepa2_ac.')}\n"
         "assert not found and not {'torch', 'numpy', 'pydantic'} & set(sys.modules), found\n"
@@ -134,6 +138,19 @@ def test_a_model_that_cannot_be_had_is_told(arguments: dict[str, Any], words: st
 def test_cuda_that_is_not_there_is_told() -> None:
     with pytest.raises(UserError, match="sees no CUDA device"):
         load_model(TINY, device="cuda:0")
+
+
+def test_a_device_is_asked_by_its_own_index(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda index: f"card {index}")
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda index: [(8, 0), (7, 5)][index])
+    with pytest.raises(UserError, match=r"device: cuda:9.* cuda:0 to cuda:1"):
+        load_model(TINY, device="cuda:9")
+    monkeypatch.setenv("LOCAL_RANK", "1")
+    assert [has_bf16(torch.device(name)) for name in ("cuda:0", "cuda:1", "cuda")] == [True, False, False]
+    with pytest.raises(UserError, match=r"card 1 of compute capability 7\.5"):
+        load_model(TINY, device="cuda:1", dtype="bfloat16")
 
 
 @torch.no_grad()

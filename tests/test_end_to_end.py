@@ -86,7 +86,7 @@ def test_evaluate_of_several_runs_tells_their_spread(workshop: Path, capsys: pyt
 def test_a_finished_run_has_nothing_left_to_do(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = sorted(path.name for path in (workshop / "lora" / "checkpoints").iterdir())
     assert main(["train", str(workshop / "lora"), "--resume"]) == 0
-    assert "3 of 3 steps are done" in capsys.readouterr().out
+    assert "all 3 steps are done" in capsys.readouterr().out
     assert sorted(path.name for path in (workshop / "lora" / "checkpoints").iterdir()) == before
 
 
@@ -107,7 +107,7 @@ WRONG = {
     "no such config": (["train", "nowhere.yaml"], "nowhere.yaml"),
     "a folder without --resume": (["train", "{here}/lora"], "--resume"),
     "resume of no run": (["train", "{here}", "--resume"], "no config.yaml"),
-    "resume with overrides": (["train", "{here}/lora", "--resume", "seed=3"], "unchanged"),
+    "resume with overrides": (["train", "{here}/lora", "--resume", "seed=3"], "differs in seed"),
     "evaluate no run": (["evaluate", "{here}"], "no config.yaml"),
     "evaluate nothing": (["evaluate", "{here}/nowhere"], "no such folder"),
     "export over something": (["export", "{here}/lora", "{here}/base"], "something is there already"),

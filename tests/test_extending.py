@@ -90,13 +90,15 @@ def test_training_loads_the_core_only() -> None:
     assert not rooms & set(beside.split())
 
 
-def test_what_is_known_is_found_without_looking_through_installed_packages(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_installed_packages_are_searched_once_for_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
     """A search asks for its energy at each part of each iteration."""
-    monkeypatch.setattr("vjepa2_ac.registry.entry_points", lambda **_: pytest.fail("looked through"))
     for registry in (LOSSES, PLANNERS, ENERGIES, METRICS):
         first = next(iter(registry._things))
+        assert registry.known(first) == first
+        monkeypatch.setattr("vjepa2_ac.registry.installed", lambda _: pytest.fail("searched again"))
         assert registry.find(registry.known(first)) is registry.find(first)
         assert registry.options(first, {}) == {}
+        monkeypatch.undo()
 
 
 def test_a_loss_trains_and_a_planner_and_an_energy_plan_by_yaml(at_home: Path, make_config) -> None:

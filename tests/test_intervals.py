@@ -63,6 +63,14 @@ def test_figures_are_those_of_each_column_by_itself() -> None:
         assert (one.low, one.high) == pytest.approx((alone.low, alone.high))
 
 
+def test_the_level_of_an_interval_is_that_of_few_episodes() -> None:
+    """Quantiles of a uniform distribution are their levels: here Phi(-sqrt(n / (n - 1)) t), with Student's t, n - 1."""
+    for episodes, student in ((2, 12.7062), (5, 2.77645), (30, 2.04523)):
+        (found,) = bootstrapped_by_weights(lambda weights: np.linspace(0, 1, len(weights))[:, None], episodes)
+        level = stats.norm.cdf(-math.sqrt(episodes / (episodes - 1)) * student)
+        assert (found.low, found.high) == pytest.approx((level, 1 - level), rel=1e-3)
+
+
 def test_an_episode_is_drawn_with_all_of_its_clips() -> None:
     """Two episodes: each alone or both are all that can be drawn, and the interval reaches from end to end."""
     found = mean_of(np.array([1.0, 1.0, 5.0]), ("a", "a", "b"))

@@ -4,7 +4,6 @@ The public names are described in docs/python.md. Each is imported when it is fi
 time and imports no PyTorch.
 """
 
-import os
 from importlib import import_module
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
@@ -22,13 +21,6 @@ __all__ = [
 ]  # fmt: skip
 
 __version__ = version("vjepa2-ac")
-
-os.environ.setdefault("GOMP_SPINCOUNT", "1000")
-"""How often a thread of PyTorch's OpenMP looks for work before it sleeps: some 20 microseconds, not milliseconds.
-
-A thread that looks for work holds its core. On cores that other programs use too, a training was ten times slower by
-that (`benchmarks/two_at_once.py`). OpenMP reads it when PyTorch is imported; a value of the user's stays.
-"""
 
 _NAMES = {  # the same as above, for the time of use
     "vjepa2_ac.api": ("encode", "evaluate", "load_model", "load_run", "open_dataset", "read_clips", "train"),

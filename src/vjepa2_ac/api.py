@@ -6,7 +6,7 @@ What trains and evaluates is imported where it is used: to load a model takes no
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, overload
 
@@ -178,7 +178,7 @@ def load_model(
         (96, 36, 128)
     """
     place = _device(device)
-    has_bfloat16 = place.type == "cuda" and has_bf16()
+    has_bfloat16 = place.type == "cuda" and has_bf16(place)
     model_values = {
         "base": str(name),
         "dtype": ("bfloat16" if has_bfloat16 else "float32") if dtype == "auto" else dtype,
@@ -193,13 +193,21 @@ def load_model(
     return model.to(place).eval()
 
 
-def load_run(folder: str | Path, checkpoint: str | int = "selected", *, device: Device = "auto") -> loading.TrainedRun:
+def load_run(
+    folder: str | Path,
+    checkpoint: str | int = "selected",
+    *,
+    device: Device = "auto",
+    overrides: Iterable[str] = (),
+) -> loading.TrainedRun:
     """Load the model of a trained run, in eval mode: its base with the adapter of a complete checkpoint.
 
     Args:
         folder: The run, as `train` returns it.
         checkpoint: selected (the best by validation, else the newest), newest, best, or a number of optimizer steps.
         device: As of `load_model`. The type of the base's weights is the run's `model.dtype`.
+        overrides: Where the base or the encoder was moved: model.base=PATH, model.encoder.path=PATH. The fingerprints
+            of the weights must be those that the run was trained on.
 
     Returns:
         `world_model`, with the adapter beside its base; `config` of the run; `checkpoint`, the folder it is from.
@@ -215,7 +223,7 @@ def load_run(folder: str | Path, checkpoint: str | int = "selected", *, device: 
     if not is_run(str(folder)) and (folder / ADAPTER_FILE).is_file():
         found, fix = "an adapter without its run", "Name its base, too: load_model(BASE, adapter=FOLDER)"
         raise InputError(where=str(folder), found=found, needed="the folder of a run", fix=fix)
-    run = loading.load_run(folder, str(checkpoint))
+    run = loading.load_run(folder, str(checkpoint), loading.run_config_of(folder, overrides))
     run.world_model.to(place).eval()
     return run
 
@@ -335,4 +343,7 @@ def _device(device: Device) -> torch.device:
         raise InputError(where="device", found=repr(device), needed="auto, cpu, cuda, or one such as cuda:1") from None
     if found.type == "cuda" and not has_cuda:
         raise no_cuda(where="device", asked=str(device), instead="Take device='cpu'")
+    if found.type == "cuda" and (found.index or 0) >= (count := torch.cuda.device_count()):
+        needed = f"one of the {count} CUDA devices of this machine, cuda:0 to cuda:{count - 1}"
+        raise InputError(where="device", found=str(device), needed=needed)
     return found

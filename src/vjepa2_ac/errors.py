@@ -4,10 +4,12 @@ import difflib
 import errno
 import importlib
 import json
+import os
 import re
 import resource
 import shlex
 import shutil
+import stat
 import sys
 import unicodedata
 from collections.abc import Iterable
@@ -23,6 +25,8 @@ _LESS_MEMORY = (
     "Set training.gradient_checkpointing=true, or lower training.batch_size (and raise training.accumulation),"
     " model.encode_chunk, validation.batch_size, planning.energy.samples_at_once or decoder.batch_size"
 )
+_CLOSED = frozenset({errno.EACCES, errno.EPERM})
+_NO_MORE_FILES = frozenset({errno.EMFILE, errno.ENFILE})
 _MOST_CHARACTERS = 8_000  # of a part of a message: quoted input may have any length
 _CONTROL = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})  # some control terminals; lone surrogates cannot be encoded
 
@@ -89,6 +93,11 @@ def printable(text: str) -> str:
     return "".join(one if is_safe else one.encode("unicode_escape").decode() for one, is_safe in shown)
 
 
+def escaped(text: str) -> str:
+    r"""Return a text on one line, as names of third parties have to be in comments: line ends are escaped, as \n."""
+    return "".join(one if one.isprintable() else one.encode("unicode_escape").decode() for one in text)
+
+
 def _short(text: str) -> str:
     if len(text) <= _MOST_CHARACTERS:
         return text
@@ -103,11 +112,9 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 
 
 def in_words(error: BaseException) -> str:
-    """Return the message of an error; for a lack of files or memory, with a fix."""
-    if isinstance(error, OSError) and error.errno in {errno.EMFILE, errno.ENFILE}:
-        limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
-        found = f"too many open files: this process may have {limit} of them at once (ulimit -n)"
-        fix = "Raise that where it is started, as with `ulimit -n 4096`, or lower data.workers and data.connections"
+    """Return the message of an error; for a lack of permission, files or memory, with a fix."""
+    if isinstance(error, OSError) and (error.errno in _NO_MORE_FILES or (error.filename and error.errno in _CLOSED)):
+        found, fix = refusal_of(error)
         return str(InputError(where=str(error.filename or "ulimit -n"), found=found, fix=fix))
     if not is_out_of_memory(error):
         return str(error)
@@ -115,6 +122,29 @@ def in_words(error: BaseException) -> str:
     if type(error).__name__ == _GPU_IS_FULL:
         return f"the GPU's memory is not enough ({said}). {_LESS_MEMORY}"
     return f"this machine's memory is not enough ({said})"
+
+
+def refusal_of(error: OSError) -> tuple[str, str]:
+    """Return what the operating system refused, with mode and owner for a lack of permission, and how to fix it."""
+    said = error.strerror or str(error)
+    if error.errno in _NO_MORE_FILES:
+        limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+        fix = "Raise the limit where the program is started, as with `ulimit -n 4096`, or lower data.workers and"
+        return f"too many open files: this process may have {limit} at once (ulimit -n)", f"{fix} data.connections"
+    if error.errno not in _CLOSED or error.filename is None:
+        return said, "Check its permissions, and the disk"
+    path = Path(str(error.filename)).absolute()
+    # A closed folder above the file hides it, and is named instead; Path.exists would raise.
+    place = next(one for one in (path, *path.parents) if os.path.exists(one))  # noqa: PTH110
+    status, name = place.stat(), "" if place == path else f"{place}: "
+    owned = f"{name}mode {stat.S_IMODE(status.st_mode):04o}, owner uid {status.st_uid}"
+    fix = "As the owner, change the permissions with chmod; or run this command as a user who has access"
+    return f"{said} ({owned}; this process runs as uid {os.geteuid()})", fix
+
+
+def shell_command(*words: object) -> str:
+    """Return a command of this program as it is typed in a shell, with paths quoted where they need it."""
+    return shlex.join([_PACKAGE, *map(str, words)])
 
 
 def pip_install(extra: str = "") -> str:

@@ -100,7 +100,8 @@ sys.exit(main(["download", "--list"]) or len({"torch", "transformers", "matplotl
 
 
 def test_threads_of_pytorch_sleep_soon_where_they_have_nothing_to_do_unless_the_user_says_otherwise() -> None:
-    program = "import vjepa2_ac, torch; torch.ones(64, 64) @ torch.ones(64, 64)"
+    command_line = "from vjepa2_ac.cli import main; main(['config', 'list']); "
+    program = command_line + "import torch; torch.ones(64, 64) @ torch.ones(64, 64)"
     for given, expected in (({}, "1000"), ({"GOMP_SPINCOUNT": "7"}, "7")):
         environment = {name: value for name, value in os.environ.items() if name != "GOMP_SPINCOUNT"}
         environment |= {"OMP_DISPLAY_ENV": "verbose", **given}  # libgomp says what it has read

@@ -1,5 +1,6 @@
 """Each knob says what it affects; when it changes, that becomes another one, and nothing else does."""
 
+import json
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -8,13 +9,14 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, get_args, get_origin
 
 import pytest
+import yaml
 from pydantic import BaseModel
 
 from copied_sets import WRITERS
 from run_fixtures import TINY
 from vjepa2_ac.config import Config, DataConfig, EncoderConfig, ModelSizes
 from vjepa2_ac.config.data import TransformConfig
-from vjepa2_ac.config.loading import changed_keys, config_as_yaml, parse_config
+from vjepa2_ac.config.loading import changed_keys, config_as_dict, config_as_yaml, parse_config
 from vjepa2_ac.config.section import Affects, Section, knobs_that_affect, mark_of, marks_of
 from vjepa2_ac.data import idle as idle_ranges
 from vjepa2_ac.data.index import EpisodeInfo, EpisodeTable
@@ -24,7 +26,7 @@ from vjepa2_ac.encoding.batch import encoding_of
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.settings import USED, planning_settings
-from vjepa2_ac.runs.folder import check_run_folder
+from vjepa2_ac.runs.folder import check_run_folder, open_run_folder
 
 # What cannot be guessed from a knob's type, or must exist in the data set.
 SECTIONS = {"model.encoder": EncoderConfig(path="encoder.pt")}  # of knobs that are null: those without a default
@@ -242,8 +244,32 @@ def test_a_data_set_that_was_moved_is_the_same_and_one_that_changed_is_another(
     assert keys_of(there)["index"] != keys_of(here)["index"]
 
 
+def with_encoder(config: Config) -> Config:
+    """Return a config whose base comes without an encoder: both of its paths may be moved."""
+    model = config.model.model_copy(update={"encoder": SECTIONS["model.encoder"]})
+    return config.model_copy(update={"model": model})
+
+
+def test_settings_of_a_later_start_are_kept_in_the_run_unless_they_decide_it(tmp_path: Path) -> None:
+    config = with_encoder(config_of("rlds", tmp_path, tmp_path / "run"))
+    open_run_folder(config, "name")
+    file, written, kept = tmp_path / "run/config.yaml", config_as_yaml(config), 0
+    keys = [key for key in knobs_of(config) - {"run_dir", "data.source"} if Affects.RUN not in marks_of(Config)[key]]
+    for section in {key.partition(".")[0] for key in keys}:
+        start = config
+        for key in keys:
+            start = with_other(start, key, key, "rlds") if key.startswith(section) else start
+        file.write_text(written)
+        open_run_folder(start, "name")
+        assert yaml.safe_load(file.read_text()) == config_as_dict(start)
+        changes = json.loads((tmp_path / "run/environment.json").read_text())[-1]["config_changes"]
+        assert len(changes) == len(changed_keys(config, start)), "what held before is recorded"
+        kept += len(changes)
+    assert kept > 80
+
+
 def test_a_run_goes_on_only_where_no_knob_that_decides_it_has_changed(tmp_path: Path) -> None:
-    config = config_of("rlds", tmp_path, tmp_path / "run")
+    config = with_encoder(config_of("rlds", tmp_path, tmp_path / "run"))
     (tmp_path / "run").mkdir()
     (tmp_path / "run/config.yaml").write_text(config_as_yaml(config))
     check_run_folder(config)

@@ -17,6 +17,7 @@ from vjepa2_ac.config.loading import (
     config_path,
     config_schema,
     load_config,
+    load_config_of_run,
     packaged_configs,
     parse_config,
 )
@@ -241,3 +242,14 @@ def test_options_that_are_needed_are_asked_for_even_if_none_are_given(monkeypatc
         parse_config(MINIMAL | {"training": {"loss": "mine"}}, where="x.yaml")
     with pytest.raises(InputError, match=r"training\.loss_options: loss 'l1' has no options of its own"):
         parse_config(MINIMAL | {"training": {"loss_options": {"a": 1}}}, where="x.yaml")
+
+
+def test_a_config_larger_than_a_megabyte_is_refused_before_it_is_parsed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vjepa2_ac.config.loading.parse_yaml", lambda *_, **__: pytest.fail("parsed"))
+    path = tmp_path / "config.yaml"
+    path.write_text("#" * 1_000_001)
+    for read in (load_config, load_config_of_run):
+        with pytest.raises(InputError, match="more than 1,000,000 bytes"):
+            read(path)

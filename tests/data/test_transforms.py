@@ -24,6 +24,7 @@ from vjepa2_ac.data.transforms import (
     view,
 )
 from vjepa2_ac.episode import Augmentation
+from vjepa2_ac.errors import InputError
 
 FLOAT16_ROUNDING = 2.0**-10  # half a step between 2 and 4
 
@@ -52,6 +53,12 @@ def test_a_letterbox_shows_every_pixel_between_black_bars(height: int, width: in
     assert np.array_equal(seen[:, top : top + height, left : left + width], frames)
     assert int((seen == 0).sum()) == 2 * 3 * side * (side - min(height, width))
     assert crop_box(height, width, "letterbox") == CropBox(0, 0, height, width)
+
+
+@pytest.mark.parametrize("size", [(16, 20_000), (20_000, 16)])
+def test_a_letterbox_that_would_take_gigabytes_is_refused(size: tuple[int, int]) -> None:
+    with pytest.raises(InputError, match=r"data\.crop: letterbox: 1 images of 20000 x 20000 pixels"):
+        view(np.zeros((1, *size, 3), np.uint8), "letterbox")
 
 
 @pytest.mark.parametrize(("height", "width", "expected"), [(200, 100, (33, 0, 133, 100)), (180, 243, (0, 0, 180, 243))])

@@ -9,8 +9,9 @@ from typing import Any
 import pytest
 import yaml
 
+from adapted_run import write_adapted_run
 from latent_sets import encode_for
-from run_fixtures import one_thread, tiny_config
+from run_fixtures import TINY, MakeConfig, one_thread, tiny_config
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict, parse_config
@@ -18,6 +19,7 @@ from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.decoding.decoder_folder import DecoderCard, save_decoder
 from vjepa2_ac.decoding.network import Decoder, DecoderShape
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.evaluate_run import load_subject
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
@@ -165,6 +167,16 @@ def test_strides_are_calibrated_where_it_is_asked_for(run: str, tmp_path: Path) 
     calibration = figures_of(tmp_path)["strides"]
     assert calibration["split"] == "test"
     assert calibration["strides"]
+
+
+def test_a_run_without_a_base_is_measured_alone_unless_a_base_is_asked_for(
+    make_config: MakeConfig,
+) -> None:
+    config = make_config(model__base=None, model__random=TINY, adapter__kind="none")
+    folder, dataset = write_adapted_run(config), open_dataset(config.data)
+    assert [one.role for one in load_subject(str(folder), config, asked(), dataset).contenders] == ["trained"]
+    with pytest.raises(InputError, match=r"--against base: a model without a base"):
+        load_subject(str(folder), config, asked(against=("base",)), dataset)
 
 
 def changed(config: Config, **data: object) -> Config:

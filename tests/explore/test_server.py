@@ -44,7 +44,7 @@ def test_the_page_is_there_with_rules_for_the_browser(recorded: Views) -> None:
             assert got(url, path).status == 404
 
 
-@pytest.mark.parametrize("origin", ["http://elsewhere.example", "null", "", "http://127.0.0.1:1"])
+@pytest.mark.parametrize("origin", ["http://elsewhere.example", "null", "", "http://127.0.0.1:1", "http://["])
 def test_a_page_of_somebody_else_gets_no_socket(recorded: Views, origin: str) -> None:
     with serving(recorded) as url, pytest.raises(InvalidStatus) as refused:
         socket(url, origin)
@@ -62,6 +62,9 @@ def test_a_key_opens_the_page_once_and_then_a_cookie_does(recorded: Views) -> No
     with serving(recorded, Access("127.0.0.1", KEY)) as url:
         assert got(url, "/").status == 401
         assert got(url, "/?key=wrong-key-of-sixteen").status == 401
+        for path in ("//[", "//[?a=b", "http://["):  # which is no URL
+            assert got(url, path).status == 401
+            assert got(url, path, Authorization=f"Bearer {KEY}").status == 404
         entered = got(url, f"/?key={KEY}")
         cookie = (entered.getheader("Set-Cookie") or "").partition(";")[0]
         assert (entered.status, entered.getheader("Location")) == (303, "/")

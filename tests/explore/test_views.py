@@ -1,6 +1,7 @@
 """What a page is told: pictures and numbers of a place, energies and plans; and what is no request."""
 
 import json
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from vjepa2_ac.episode import no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.explore.explorer import Place
 from vjepa2_ac.explore.messages import GoalFrame, PageRequest, read_request
+from vjepa2_ac.explore.truth import Truth
 from vjepa2_ac.explore.views import Views
 from vjepa2_ac.media.images import decode_image
 from vjepa2_ac.planning.energy import Goal, Scene, WorldModelCost
@@ -127,3 +129,21 @@ def test_a_search_needs_a_goal_that_is_there(recorded: Views, goal: GoalFrame | 
         asked(recorded, kind="plan", goal=goal, teller="base")
     with pytest.raises(InputError):
         asked(recorded, kind="plan", goal=GOAL, teller="nobody")
+
+
+def test_a_simulated_look_that_is_cancelled_ends_before_the_next_action(live: Views) -> None:
+    actions = [UP, STILL, [-one for one in UP], UP]
+    asked_times, request = [], PageRequest(seq=7, kind="look", start=2, actions=actions)
+
+    def cancelled() -> bool:
+        asked_times.append(1)
+        return len(asked_times) == 3
+
+    with pytest.raises(SearchCancelledError):
+        live.answer(request, no_progress, cancelled)
+    assert len(asked_times) == 3
+    again, images = unpacked(live.answer(request, no_progress, lambda: False))
+    fresh = replace(live, truth=Truth(live.explorer))
+    other, expected = asked(fresh, kind="look", start=2, actions=actions)
+    assert again["truth_state"] == other["truth_state"]
+    np.testing.assert_array_equal(images["truth"], expected["truth"])

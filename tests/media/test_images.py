@@ -1,6 +1,7 @@
 """Images: decoded to RGB pixels, or an error that describes them; one size limit for every form of data."""
 
 import io
+import os
 import struct
 import zlib
 from collections.abc import Callable
@@ -113,3 +114,62 @@ def test_every_form_of_data_refuses_images_beyond_the_bound(
         with pytest.raises(InputError, match=message):
             read([0, 2])
         monkeypatch.undo()
+
+
+def tagged(pixels: np.ndarray, orientation: object, form: str) -> bytes:
+    """Return an image file whose EXIF data have an orientation."""
+    exif, file = Image.Exif(), io.BytesIO()
+    exif[0x0112] = orientation
+    options = {"quality": 98, "subsampling": 0} if form == "JPEG" else {}
+    Image.fromarray(pixels).save(file, form, exif=exif, **options)
+    return file.getvalue()
+
+
+STORED_AS = {  # by EXIF orientation: how a camera stores what a viewer shows
+    1: lambda shown: shown,
+    2: lambda shown: shown[:, ::-1],
+    3: lambda shown: shown[::-1, ::-1],
+    4: lambda shown: shown[::-1],
+    5: lambda shown: shown.swapaxes(0, 1),
+    6: lambda shown: np.rot90(shown),
+    7: lambda shown: shown[::-1, ::-1].swapaxes(0, 1),
+    8: lambda shown: np.rot90(shown, -1),
+}
+
+
+@pytest.mark.parametrize("form", ["JPEG", "PNG"])
+@pytest.mark.parametrize("orientation", STORED_AS)
+def test_a_photo_is_turned_as_its_exif_orientation_says(orientation: int, form: str, tmp_path: Path) -> None:
+    shown = np.zeros((24, 40, 3), np.uint8)
+    shown[:8, :8], shown[:8, 32:], shown[16:, :8] = (250, 0, 0), (0, 250, 0), (0, 0, 250)
+    stored = np.ascontiguousarray(STORED_AS[orientation](shown))
+    (tmp_path / "goal").write_bytes(tagged(stored, orientation, form))
+    found = read_image(tmp_path / "goal")
+    assert found.shape == shown.shape
+    assert abs(found.astype(int) - shown).max() < (40 if form == "JPEG" else 1)
+
+
+@pytest.mark.parametrize("form", ["JPEG", "PNG"])
+def test_exif_data_that_cannot_be_used_change_nothing(form: str) -> None:
+    plain = decode_image(tagged(PIXELS, 1, form), "here")
+    broken = tagged(PIXELS, 3, form).replace(b"MM\0*", b"XX\0*").replace(b"II*\0", b"XX*\0")
+    if form == "PNG":  # its chunk needs the right sum
+        start = broken.index(b"eXIf")
+        length = int.from_bytes(broken[start - 4 : start], "big") + 4
+        crc = zlib.crc32(broken[start : start + length]).to_bytes(4, "big")
+        broken = broken[: start + length] + crc + broken[start + length + 4 :]
+    for data in (broken, tagged(PIXELS, 9, form), tagged(PIXELS, 0, form)):
+        np.testing.assert_array_equal(decode_image(data, "here"), plain)
+
+
+def test_an_image_that_may_never_end_or_is_too_large_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    os.mkfifo(tmp_path / "goal.png")
+    for path in (tmp_path / "goal.png", "/dev/zero"):
+        with pytest.raises(InputError, match="a pipe or a device"):
+            read_image(path)
+    monkeypatch.setattr(jpeg, "_MOST_FILE_BYTES", 1000)
+    (tmp_path / "large.png").write_bytes(png(Image.fromarray(PIXELS)))
+    with pytest.raises(InputError, match=r"large\.png: more than 1,000 bytes"):
+        read_image(tmp_path / "large.png")

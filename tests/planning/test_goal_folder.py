@@ -2,6 +2,7 @@
 
 import json
 import logging
+import os
 from pathlib import Path
 from typing import Any
 
@@ -120,3 +121,39 @@ def test_a_folder_without_goals_says_what_makes_one(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no goals"):
         write_goals(tmp_path / "new", [])
     assert not (tmp_path / "new").exists()
+
+
+def test_a_file_out_of_the_folder_is_refused(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "outside.png").write_bytes(encode_png(image(1)))
+    (tmp_path / "goals-too").mkdir()
+    (tmp_path / "goals-too" / "near.png").write_bytes(encode_png(image(1)))
+    (folder / "link.png").symlink_to(tmp_path / "outside.png")
+    (folder / "linked").symlink_to(tmp_path / "goals-too")
+    (folder / "loop.png").symlink_to("loop.png")
+    (folder / "inside.png").symlink_to("goal_1.png")
+    os.mkfifo(folder / "pipe.png")
+    outside = [
+        "../outside.png",
+        "/dev/zero",
+        str(folder / "goal_1.png"),
+        "link.png",
+        "linked/near.png",
+        "a/../goal_1.png",
+    ]
+    for file in [*outside, "a\0.png", "a\n.png", "\x1b[2J.png"]:
+        edit(folder, lambda goals, file=file: goals[1].update(file=file))
+        with pytest.raises(InputError, match=r"goals\.json: goal 2: the file .*needed: a printable path") as caught:
+            read_goal_folder(folder)
+        assert str(caught.value).isprintable()
+    for file, complaint in (("pipe.png", "a pipe or a device"), ("loop.png", "symbolic links"), (".", "directory")):
+        edit(folder, lambda goals, file=file: goals[1].update(file=file))
+        with pytest.raises(InputError, match=complaint):
+            read_goal_folder(folder)
+    edit(folder, lambda goals: goals[1].update(file="inside.png"))
+    assert len(read_goal_folder(folder).goals) == 3
+
+
+def test_an_image_without_contrast_is_no_goal(folder: Path) -> None:
+    (folder / "goal_2.png").write_bytes(encode_png(np.full_like(image(1), 90)))
+    with pytest.raises(InputError, match=r"goal_2\.png: an image without contrast"):
+        read_goal_folder(folder)

@@ -35,6 +35,7 @@ def test_runs_are_compared_with_the_first_one_pair_by_pair(tmp_path: Path) -> No
     assert ("gain_over_first", "half") not in rows
     gain = rows["gain_over_first", "nothing"]
     assert (gain.low, gain.value, gain.high) == pytest.approx((-1.0, -1.0, -1.0), rel=1e-4)
+    assert (gain.better, gain.chance) == ("higher", 0.0)
     assert {row.model for row in found.rows} == {"half", "nothing"}
     assert [one.value for one in found.curves["half"]] == pytest.approx([0.5] * 4, rel=1e-4)
     assert found.notes == ()

@@ -12,13 +12,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from safetensors.torch import load_file
 
+from accidents import without_permission
 from run_fixtures import set_up
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, RefusedError, UnreachableError
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.runs.checkpoint import (
     DataState,
@@ -80,9 +82,78 @@ def test_what_a_killed_writer_left_behind_is_never_resumed_from_and_is_cleaned_u
 def test_when_every_checkpoint_is_damaged_the_run_stops_and_leaves_them(tmp_path: Path) -> None:
     for step in (10, 20):
         (write(tmp_path, step) / "optimizer.pt").write_bytes(b"")
-    with pytest.raises(InputError, match="none of 2 checkpoints is whole"):
+    with pytest.raises(InputError, match="all 2 checkpoints are damaged"):
         newest_checkpoint(tmp_path)
     assert len(list(tmp_path.iterdir())) == 2
+
+
+@pytest.mark.parametrize("name", ["adapter/weights.bin", "state.json", "manifest.json", "adapter", "."])
+def test_a_checkpoint_without_permission_is_neither_skipped_nor_removed(tmp_path: Path, name: str) -> None:
+    write(tmp_path, 10)
+    newest = write(tmp_path, 20)
+    refused = r"Permission denied \(.*mode 0000, owner uid \d+; this process runs as uid \d+\)\. .* chmod; or run"
+    with without_permission(newest / name):
+        for action in (newest_checkpoint, lambda folder: write(folder, 15), lambda folder: write(folder, 20)):
+            with pytest.raises(RefusedError, match=refused) as caught:
+                action(tmp_path)
+            assert caught.value.where.startswith(str(newest))
+    assert find_damage(newest) is None
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+@pytest.mark.parametrize("code", [errno.EIO, errno.ESTALE, errno.EMFILE, errno.ENFILE, errno.ELOOP, errno.ENOTCONN])
+def test_an_error_of_the_disk_does_not_count_as_damage(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int
+) -> None:
+    write(tmp_path, 10)
+    newest = write(tmp_path, 20)
+    opened = Path.open
+
+    def fail(path: Path, *arguments: Any, **options: Any) -> Any:
+        if path.name == "weights.bin" and newest in path.parents:
+            raise OSError(code, os.strerror(code), str(path))
+        return opened(path, *arguments, **options)
+
+    monkeypatch.setattr(Path, "open", fail)
+    for action in (newest_checkpoint, lambda folder: write(folder, 15)):
+        with pytest.raises(UnreachableError, match=r"step-00000020/adapter/weights\.bin: cannot be read: "):
+            action(tmp_path)
+    monkeypatch.undo()
+    assert newest_checkpoint(tmp_path) == newest
+
+
+def test_a_folder_of_checkpoints_that_cannot_be_listed_does_not_count_as_empty(tmp_path: Path) -> None:
+    newest = write(tmp_path / "checkpoints", 20)
+    for folder in (tmp_path / "checkpoints", tmp_path):
+        with without_permission(folder), pytest.raises(PermissionError):
+            newest_checkpoint(tmp_path / "checkpoints")
+    assert newest_checkpoint(tmp_path / "checkpoints") == newest
+    assert newest_checkpoint(tmp_path / "none") is None
+
+
+def test_a_complete_checkpoint_of_another_process_is_never_replaced(tmp_path: Path) -> None:
+    other = write(tmp_path, 20)
+    for step in (20, 10):
+        with pytest.raises(InputError, match=r"step-00000020: a complete checkpoint that another process wrote"):
+            write(tmp_path, step)
+    assert list(tmp_path.iterdir()) == [other]
+
+
+@pytest.mark.parametrize("name", ["optimizer.pt", "manifest.json"])
+def test_a_pipe_in_a_checkpoint_is_damage_and_is_not_waited_for(tmp_path: Path, name: str) -> None:
+    checkpoint = write(tmp_path, 10)
+    (checkpoint / name).unlink()
+    os.mkfifo(checkpoint / name)
+    assert find_damage(checkpoint) == f"{name} is damaged (a pipe or a device)"
+    with pytest.raises(InputError, match="a pipe or a device"):
+        read_torch(checkpoint / name)
+
+
+def test_moments_without_permission_are_not_called_damaged(tmp_path: Path) -> None:
+    with (tmp_path / "optimizer.pt").open("wb") as file:
+        write_torch({}, file)
+    with without_permission(tmp_path / "optimizer.pt"), pytest.raises(RefusedError, match="Permission denied"):
+        read_torch(tmp_path / "optimizer.pt")
 
 
 def test_a_new_checkpoint_replaces_the_damaged_ones_after_it(tmp_path: Path) -> None:
@@ -132,7 +203,7 @@ def test_a_manifest_that_names_too_little_or_a_file_elsewhere_is_no_manifest(tmp
         (manifest_of({name: digest for name, digest in files.items() if name != "state.json"}), "does not name"),
         (manifest_of({**files, **elsewhere}), "names ../../elsewhere, which is outside"),
         (manifest_of({**files, str(tmp_path / "elsewhere"): files["state.json"]}), "which is outside"),
-        *((text, "no readable manifest.json") for text in ("", "[]", "{}", '{"files": 3}')),
+        *((text, "manifest.json is damaged") for text in ("", "[]", "{}", '{"files": 3}')),
     ]:
         (newer / "manifest.json").write_text(text)
         caplog.clear()
@@ -180,8 +251,9 @@ def test_whatever_operation_fails_older_checkpoints_stay_and_nothing_half_is_lef
             write(folder, 20)
         assert find_damage(older) is None
         assert all(find_damage(path) is None for path in folder.iterdir()), "whole or absent"
-        path = write(folder, 20)
-        assert newest_checkpoint(folder) == path, "with room again"
+        if newest_checkpoint(folder) == older:  # else it was renamed before the flush of its folder failed
+            write(folder, 20)
+        assert newest_checkpoint(folder) == folder / checkpoint_name(20), "with room again"
 
 
 def test_what_survives_a_power_cut_is_whole_and_is_there_before_an_older_one_goes(tmp_path, monkeypatch) -> None:
@@ -319,7 +391,7 @@ def test_a_state_or_a_manifest_that_is_none_is_refused(tmp_path: Path, text: str
     with pytest.raises(InputError, match=r"state\.json"):
         read_state(checkpoint)
     (checkpoint / "manifest.json").write_text(text)
-    assert "no readable manifest.json" in str(find_damage(checkpoint))
+    assert "manifest.json is damaged" in str(find_damage(checkpoint))
 
 
 def test_moments_that_are_compressed_or_of_an_older_form_are_not_read(tmp_path: Path) -> None:

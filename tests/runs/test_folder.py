@@ -201,7 +201,7 @@ def test_a_run_is_measured_and_goes_on_from_anywhere_as_from_its_own_folder(
     assert (elsewhere == nearby).all()
     assert there.about.data == str(home / "data")
     assert load_run(Path("../home/run")).config.model.base == str(home / "base")
-    train(read_run_config(home / "run"), reporter)
+    train(read_run_config(home / "run"), reporter, check_only=True)
     assert any("Going on from" in note for note in reporter.notes)
     assert (home / "run/config.yaml").read_text() == as_written
     assert list(Path.cwd().iterdir()) == []
@@ -277,6 +277,7 @@ def test_a_run_that_leads_elsewhere_says_so_before_it_goes_there(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Image.fromarray(np.zeros((64, 64, 3), np.uint8)).save("a.png")
+    Path("b.pt").touch()
     run = tmp_path / "[b]run"  # no markup
     run.mkdir()
     (run / "config.yaml").write_text(config_as_yaml(parse_config(ELSEWHERE, where="")))

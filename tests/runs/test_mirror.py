@@ -14,6 +14,7 @@ from typing import BinaryIO
 
 import pytest
 
+from accidents import without_permission
 from gcs import Failure, Gcs
 from vjepa2_ac import storage
 from vjepa2_ac.config.loading import parse_config
@@ -280,6 +281,24 @@ def test_without_hard_links_a_checkpoint_is_copied(run: Path, monkeypatch: pytes
     write(run, 10)
     send(run)
     assert_same_files(run, checkpoint_name(10))
+
+
+@pytest.mark.usefixtures("bucket")
+def test_a_newest_checkpoint_without_permission_is_reported_and_no_older_one_is_sent_in_its_place(
+    run: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def no_links(*_: object) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", no_links)
+    write(run, 10)
+    newest, mirror = write(run, 20), mirror_of(run)
+    with without_permission(newest / "optimizer.pt"):
+        sent(mirror)
+    assert there() == []
+    assert "Permission denied" in caplog.text
+    sent(mirror)
+    assert there() == names(20)
 
 
 @pytest.mark.parametrize("name", ["/etc/x", "../x", "a/../../x", ""])

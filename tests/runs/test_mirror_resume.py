@@ -10,13 +10,14 @@ from pathlib import Path
 
 import pytest
 
+from accidents import without_permission
 from gcs import Gcs
 from run_fixtures import SilentReporter
 from same_run import assert_same_run
 from vjepa2_ac import storage
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_yaml
-from vjepa2_ac.errors import InputError, UnreachableError
+from vjepa2_ac.errors import InputError, RefusedError, UnreachableError
 from vjepa2_ac.process import StoppedError
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.checkpoint import RunState, checkpoint_name, newest_checkpoint, read_state, write_checkpoint
@@ -117,6 +118,26 @@ def test_a_damaged_checkpoint_there_is_passed_over_by_name(
     assert f"{PLACE}: {checkpoint_name(20)}" in caplog.text
 
 
+@pytest.mark.parametrize("name", ["state.json", "manifest.json", "optimizer.pt"])
+@pytest.mark.parametrize("here", [None, 10])
+def test_a_checkpoint_there_without_permission_stops_the_start_and_is_kept(
+    make_config: MakeConfig, tmp_path: Path, name: str, here: int | None
+) -> None:
+    place = tmp_path / "disk/run"
+    config = make_config(checkpoint__remote=str(place))
+    for step in (10, 20):
+        write(place, step)
+    (place / "config.yaml").write_text(config_as_yaml(config))
+    if here is not None:
+        write(local(config), here)
+    before = files_of(place)
+    refused = place / "checkpoints" / checkpoint_name(20) / name
+    with without_permission(refused), pytest.raises((InputError, RefusedError, PermissionError), match="Permission"):
+        open_remote(config, SILENT)
+    assert files_of(place) == before
+    assert [path.name for path in (local(config) / "checkpoints").glob("step-*")] == [checkpoint_name(10)] * bool(here)
+
+
 @pytest.mark.parametrize(("here", "elsewhere", "taken"), [(10, 20, 20), (20, 10, 20), (20, 20, 20)])
 def test_the_further_one_is_taken(bucket: Gcs, config: Config, here: int, elsewhere: int, taken: int) -> None:
     run_there(bucket, config, elsewhere)
@@ -178,7 +199,9 @@ def test_a_place_without_permission_is_an_error_with_the_way_out(
     bucket: Gcs, config: Config, match: str, failure: int
 ) -> None:
     bucket.fail_next(failure, times=9, match=match)
-    with pytest.raises(InputError, match=r"^checkpoint.remote: gs://bucket/run: no permission.*Log in.*another place"):
+    with pytest.raises(
+        InputError, match=r"^checkpoint.remote: gs://bucket/run\S*: no permission.*Log in.*another place"
+    ):
         open_remote(config, SILENT)
 
 

@@ -43,7 +43,9 @@ def test_the_key_is_the_whole_key(given: str | None, status: int | None) -> None
     ("name", "is_known"),
     [
         ("localhost", True), ("localhost:8000", True), ("LOCALHOST:1", True), ("127.0.0.1:8000", True),
-        ("[::1]:8000", True),
+        ("[::1]:8000", True), ("[::1]", True), ("localhost:", True), ("[::1].evil.example", False), ("[::1", False),
+        ("[::1]8000", False), ("[::1]:8000.evil", False), ("[localhost]", False), ("evil@127.0.0.1", False),
+        ("localhost:80:80", False), ("localhost:evil", False), ("[evil.example]:80", False), ("[]", False),
         ("::1", True), ("10.0.0.3:80", True), ("robot.example:443", True), ("evil.example", False), (None, False),
         ("evil.example:8000", False), ("localhost.evil.example", False), ("", False), ("127.0.0.1.evil.example", False),
     ],

@@ -130,3 +130,37 @@ def test_a_dry_run_records_what_would_have_been_done(tmp_path: Path) -> None:
     (line,) = recorded(tmp_path / "record", dry, [request(0, goal_image=image(100))])
     assert not np.any(line["answer"]["actions"])
     assert line["answer"]["planned"][0][:3] != STATE[:3].tolist()
+
+
+def test_a_stop_between_a_search_and_its_answer_leaves_the_numbers_of_later_decisions_right(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = session()
+    one.recorder = Recorder(tmp_path / "record", {}, 10**8)
+    act = one.controller.act
+
+    def stopped_at_the_end(*seen: object, **how: object) -> object:
+        try:
+            return act(*seen, **how)
+        finally:
+            one.stopped.set()
+
+    whys = []
+    for step in range(3):
+        with monkeypatch.context() as patch:
+            if step == 1:
+                patch.setattr(one.controller, "act", stopped_at_the_end)
+            whys.append(unpack(one.answer(pack(request(step, goal_image=image(100)))))["why"])
+        one.stopped.clear()
+    assert whys == ["planned", "stopped by the page", "planned"]
+    lines = lines_of(tmp_path / "record")
+    assert [(line["decision"], option(line["plan"], "--seed")) for line in lines] == [(0, ["0"]), (2, ["2"])]
+
+
+def test_a_frame_that_cannot_be_used_is_recorded_without_words_of_plan(tmp_path: Path) -> None:
+    asked = [request(0, goal_image=image(100)), request() | {"observation/image": np.zeros_like(image(0))}]
+    lines = recorded(tmp_path / "record", session(), asked)
+    assert [(line["answer"]["why"], line["plan"] is None) for line in lines] == [
+        ("planned", False),
+        ("uniform frame", True),
+    ]

@@ -115,6 +115,8 @@ WRONG = {
     "policy/chunks: None. needed: floats": {**OURS, "endpoint": "score"},
     "policy/chunks: an array of shape \\(4, 7\\)": {**OURS, "policy/chunks": np.zeros((4, 7))},
     "policy/chunks: an array of shape \\(0, 4, 7\\)": {**OURS, "policy/chunks": np.zeros((0, 4, 7))},
+    "1025, 4, 7.* up to 1024 chunks": {**OURS, "policy/chunks": np.zeros((1025, 4, 7))},
+    "1, 257, 7.* up to 256 control steps": {**OURS, "policy/chunks": np.zeros((1, 257, 7))},
     "policy/chunks: an array .* int64": {**OURS, "policy/chunks": np.zeros((1, 4, 7), dtype=np.int64)},
     "policy/form: 'joints'. needed: targets or deltas or offsets": {**OURS, "policy/form": "joints"},
     "endpoint: an array": {**OURS, "endpoint": np.zeros(3)},

@@ -16,6 +16,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from served import STATE, Running, controller, image, request, serving, session
 from vjepa2_ac.errors import InputError, UnreachableError
+from vjepa2_ac.serving import listening
 from vjepa2_ac.serving.access import Access
 from vjepa2_ac.serving.session import Session
 from vjepa2_ac.serving.wire import PlanningClient, pack, unpack
@@ -228,3 +229,44 @@ def test_a_port_that_is_taken_is_told() -> None:
         server = PlanningServer(lambda: Served(session(), {}), ServerOptions(Access("127.0.0.1"), port), print)
         with pytest.raises(InputError, match=f"127.0.0.1:{port}: cannot be listened on"):
             asyncio.run(server.run(asyncio.Event()))
+
+
+def test_a_server_ends_while_something_is_computed_that_nothing_cancels(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(listening, "END_S", 0.1)
+    one, asked, go = session(), threading.Event(), threading.Event()
+    one.answer = lambda *_: (asked.set(), go.wait(120))[1]
+    with contextlib.ExitStack() as client:
+        with serving(lambda: one) as running:
+            connection = client.enter_context(connect(running))
+            connection.recv()
+            connection.send(pack(request(0, endpoint="score")))
+            assert asked.wait(120)
+        assert not go.is_set()
+        go.set()
+
+
+def test_a_client_waits_for_an_answer_as_long_as_it_says_and_no_longer() -> None:
+    slow = SlowSession()
+    with serving(lambda: slow.one) as running:
+        client = PlanningClient(running.url, timeout_s=0.1)
+        with pytest.raises(UnreachableError, match=r"no answer within 0\.1 s.*connect again"):
+            client.infer(request(0, goal_image=image(100)))
+        with pytest.raises(UnreachableError, match="the connection is lost"):  # not the late answer of before
+            client.infer(request(1))
+        assert slow.left.wait(120)
+        slow.go.set()
+
+
+def test_durations_of_decisions_are_counted_when_they_are_made() -> None:
+    with serving(session) as running:
+        with PlanningClient(running.url) as client:
+            for step in range(3):
+                client.infer(request(step, goal_image=image(100)))
+        for _ in range(2):
+            assert "vjepa2_ac_decision_seconds_count 3.0" in get(running, "/metrics")[1]
+
+
+@pytest.mark.parametrize("deadline_s", [5.0, 300.0])
+def test_a_client_waits_longer_than_the_deadline_of_its_server(deadline_s: float) -> None:
+    with serving(session, told=lambda _: {"deadline_s": deadline_s}) as running, PlanningClient(running.url) as client:
+        assert client._timeout_s == max(120.0, 2 * deadline_s)

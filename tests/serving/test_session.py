@@ -6,18 +6,27 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from served import STATE, controller, image, request, session, vector_controller
-from vjepa2_ac.config.planning import LimitsConfig
+from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.chunks import changes_of_chunks
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.goals import SubGoal
-from vjepa2_ac.serving.session import ActionForm, GoneError, Session, SessionOptions, has_black_bars
+from vjepa2_ac.serving.session import (
+    STOPPED,
+    ActionForm,
+    GoneError,
+    Session,
+    SessionOptions,
+    has_black_bars,
+    why_not_sent,
+)
 from vjepa2_ac.serving.wire import pack, unpack
+from vjepa2_ac.spaces import POSE, vector_states
 
 CUP = {"cup": (SubGoal(image(50), "cup"),), "two": (SubGoal(image(51), "a", at_most=1), SubGoal(image(52), "b"))}
 
@@ -182,33 +191,121 @@ class _Liar(Controller):
 @pytest.fixture(scope="module")
 def liar() -> Session:
     true = controller(limits=LIMITS)
-    return Session(_Liar(true._model, true.config))
+    lying, plans = _Liar(true._model, true.config), []
+    search = lying.planner.plan
+
+    def search_once(*given: object) -> object:  # what it finds is replaced
+        plans[:] = plans or [search(*given)]
+        return plans[0]
+
+    lying.planner.plan = search_once
+    return Session(lying)
 
 
-WILD = st.floats(allow_nan=True, allow_infinity=True) | st.floats(-0.2, 0.2)
+LARGEST = np.array([*LIMITS.xyz_m, *[LIMITS.rotation] * 3, 1.0])
+WILD = arrays(np.float64, (2, 7), elements=st.floats(allow_nan=True, allow_infinity=True) | st.floats(-0.2, 0.2))
+SHARES = st.sampled_from([0.0, 0.5, 0.99, 1.5])  # of the limits of position, rotation and gripper
+NEAR = st.builds(
+    lambda shares, parts: shares * np.repeat(parts, [3, 3, 1]) * LARGEST,
+    arrays(np.float64, (2, 7), elements=st.floats(-1.0, 1.0)),
+    st.tuples(SHARES, SHARES, SHARES),
+)
 
 
-@settings(max_examples=150)
-@given(arrays(np.float64, (2, 7), elements=WILD), st.sampled_from(["delta", "pose"]), st.floats(0.26, 0.5))
-def test_whatever_a_controller_says_what_is_sent_is_within_the_limits(liar: Session, lie, form: ActionForm, x) -> None:
+@settings(max_examples=150, deadline=None)
+@example(np.array([[0.04, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]] * 2), "delta", 0.4)  # together they leave the workspace
+@given(WILD | NEAR, st.sampled_from(["delta", "pose"]), st.floats(0.26, 0.5))
+def test_whatever_a_controller_plans_the_action_sent_is_within_the_limits(
+    liar: Session, lie: np.ndarray, form: ActionForm, x: float
+) -> None:
     liar.controller.lie, liar.options = lie, SessionOptions(form)
-    state = np.array([x, *STATE[1:]])
-    answer = liar.answer(pack(request(0, goal_image=image(100)) | {"observation/state": state}))
+    state, frame = np.array([x, *STATE[1:]]), image(int(1e9 * x))  # another frame wherever the arm is
+    answer = liar.answer(pack({"observation/image": frame, "observation/state": state, "goal/image": image(100)}))
     found = unpack(answer)
     sent = found["actions"]
     assert np.isfinite(sent).all()
-    is_zero = not (sent if form == "delta" else sent - state)[:, :3].any()
-    steps = sent[:, :3] if form == "delta" else np.diff(np.concatenate([state[None], sent]), axis=0)[:, :3]
-    assert (abs(steps) <= np.array(LIMITS.xyz_m) + 1e-5).all()
-    assert (np.linalg.norm(steps, axis=1) <= LIMITS.radius + 1e-5).all()
-    last = (state[:3] + np.cumsum(steps, axis=0)) if form == "delta" else sent[-1:, :3]
-    is_inside = (last >= np.array(BOX[0]) - 1e-5).all() and (last <= np.array(BOX[1]) + 1e-5).all()
-    assert is_inside or is_zero
+    steps = sent
+    if form == "pose":
+        assert ((sent[:, 6] >= 0) & (sent[:, 6] <= 1)).all()
+        steps = POSE.differences(np.stack([state, sent[-1]]))
+    assert (abs(steps) <= LARGEST + 1e-5).all()
+    assert (np.linalg.norm(steps[:, :3], axis=1) <= LIMITS.radius + 1e-5).all()
+    targets = state[:3] + np.cumsum(steps[:, :3], axis=0)
+    is_inside = (targets >= np.array(BOX[0]) - 1e-5).all() and (targets <= np.array(BOX[1]) + 1e-5).all()
+    assert is_inside or not abs(steps[:, :3]).max() > 1e-9
     if found["why"].startswith("not sent"):
-        assert is_zero
+        assert not abs(steps).max() > 1e-9
         assert found["target"] == [state.tolist()]
     else:
         assert found["why"] in {"planned", "outside the workspace"}
+
+
+WITHIN = np.array([[0.02, 0.01, 0.0, 0.09, 0.0, 0.0, 0.0]] * 2)
+BOXED = LIMITS.model_copy(update={"ball": "none"})
+PLAIN = BOXED.model_copy(update={"workspace": None})
+
+
+def changed(step: int, axis: int, value: float) -> np.ndarray:
+    changes = WITHIN.copy()
+    changes[step, axis] = value
+    return changes
+
+
+@pytest.mark.parametrize("step", [0, 1])
+@pytest.mark.parametrize(
+    ("axis", "limit", "word"),
+    [(0, 0.05, "xyz"), (1, -0.04, "xyz"), (2, 0.03, "xyz"), (3, 0.1, "rotation"), (4, -0.1, "rotation"),
+     (5, 0.1, "rotation"), (6, -1.0, "gripper")],
+)  # fmt: skip
+def test_one_number_beyond_its_limit_in_any_step_keeps_a_plan_from_being_sent(
+    step: int, axis: int, limit: float, word: str
+) -> None:
+    assert why_not_sent(STATE, changed(step, axis, limit), PLAIN, POSE) == ""
+    for beyond in (limit + np.sign(limit) * 3e-6, 3 * limit):
+        assert word in why_not_sent(STATE, changed(step, axis, beyond), PLAIN, POSE)
+    for wrong in (np.nan, np.inf, -np.inf):
+        assert "not finite" in why_not_sent(STATE, changed(step, axis, wrong), PLAIN, POSE)
+
+
+def test_rounding_of_limits_that_are_searched_in_float32_is_allowed() -> None:
+    for axis, limit in ((0, 0.05), (3, 0.1)):
+        assert why_not_sent(STATE, changed(0, axis, limit + 5e-7), PLAIN, POSE) == ""
+    widest = PLAIN.model_copy(update={"rotation": np.pi})
+    assert why_not_sent(STATE, changed(0, 3, np.pi), widest, POSE) == ""
+    assert "rotation" in why_not_sent(STATE, changed(0, 3, np.pi + 5e-7), widest, POSE), "a half turn, the other way"
+
+
+def test_a_motion_within_the_limit_of_each_axis_and_outside_the_ball_is_not_sent() -> None:
+    ball = PLAIN.model_copy(update={"ball": "l2"})
+    assert why_not_sent(STATE, changed(0, 0, 0.043), ball, POSE) == ""
+    assert "ball" in why_not_sent(STATE, changed(1, 0, 0.0449), ball, POSE)
+
+
+@pytest.mark.parametrize(("steps", "is_sent"), [((0.02, 0.02), True), ((0.04, 0.04), False), ((0.04, -0.04), True)])
+def test_the_targets_of_all_steps_together_are_in_the_workspace(steps: tuple[float, float], is_sent: bool) -> None:
+    changes = np.zeros((2, 7))
+    changes[:, 0] = steps
+    assert why_not_sent(STATE, changes, BOXED, POSE) == ("" if is_sent else "out of planning.limits.workspace")
+    assert why_not_sent(STATE, changes, PLAIN, POSE) == ""
+
+
+def test_outside_the_workspace_only_the_position_has_to_stay() -> None:
+    outside, turn = np.array([0.5, *STATE[1:]]), np.zeros((2, 7))
+    turn[:, 3:] = 0.05
+    assert why_not_sent(outside, turn, BOXED, POSE) == ""
+    turn[0, 0] = -0.01  # not far enough
+    assert "workspace" in why_not_sent(outside, turn, BOXED, POSE)
+
+
+def test_changes_of_vectors_are_within_the_limits_of_their_axes() -> None:
+    space, limits = vector_states(3), LimitsConfig(axes=(0.1, 0.2, 0.0))
+    changes = np.array([[0.1, -0.2, 0.0], [-0.1, 0.2, 0.0]])
+    assert why_not_sent(np.zeros(3), changes, limits, space) == ""
+    for axis, value in ((0, 0.11), (1, -0.21), (2, 0.01)):
+        wrong = changes.copy()
+        wrong[1, axis] = value
+        assert "axes" in why_not_sent(np.zeros(3), wrong, limits, space)
+    assert "axes" in why_not_sent(np.zeros(3), changes, LimitsConfig(), space), "without limits nothing moves"
 
 
 def test_padded_pictures_are_told_of() -> None:
@@ -265,3 +362,110 @@ def test_a_search_starts_from_what_a_policy_would_do() -> None:
     assert not np.array_equal(action, ask(session(), **request(goal_image=image(100)))["actions"][0])
     short = {"policy/chunks": chunks[:, :4], "policy/form": "deltas"}
     assert "samples of a policy" in refused(session(), **request(goal_image=image(100), **short))
+
+
+def test_a_frozen_camera_moves_nothing_once_the_arm_has_moved_and_a_reset_forgets_it() -> None:
+    one, there, moved = session(), STATE.copy(), STATE + np.eye(7)[0] * 0.006
+    for form in ({"session_id": "a"}, {"session_id": "b"}, {"session_id": "b", "reset": True}):
+        assert ask(one, **request(0, goal_image=image(100), **form))["why"] == "planned"
+        for _ in range(2):
+            found = ask(one, **request(0) | {"observation/state": moved})
+            assert (found["why"], found["target"], found["energy"]["now"]) == ("frozen frame", [moved.tolist()], None)
+            assert not found["actions"].any()
+    one.begin()
+    assert ask(one, **request(0, goal_image=image(100)) | {"observation/state": moved})["why"] == "planned"
+    assert ask(one, **request(0) | {"observation/state": there})["why"] == "frozen frame"
+    assert one.counts.decisions == {"planned": 4, "frozen frame": 7}
+
+
+def test_a_black_camera_moves_nothing_and_scores_nothing() -> None:
+    one, black = session(), {"observation/image": np.zeros_like(image(0))}
+    found = ask(one, **request(goal_image=image(100)) | black)
+    assert (found["why"], found["goal"]["index"], found["actions"].any()) == ("uniform frame", 0, np.False_)
+    chunks = np.tile(STATE, (2, 8, 1))
+    assert "frame: an image without contrast" in refused(
+        one, endpoint="score", **request() | black, **{"policy/chunks": chunks}
+    )
+    assert "goal 0: an image without contrast" in refused(one, **request(goal_image=black["observation/image"]))
+
+
+class _OverAfter:
+    """A clock that passes every deadline when it was read so many times."""
+
+    def __init__(self, reads: int) -> None:
+        self.left = reads
+
+    def __call__(self) -> float:
+        self.left -= 1
+        return 0.0 if self.left >= 0 else 1e6
+
+
+CHUNKS = STATE + np.random.default_rng(0).normal(0, 0.01, (300, 4, 7)) * [1, 1, 1, 1, 1, 1, 0]
+SCORE = {"endpoint": "score", "policy/chunks": CHUNKS}
+
+
+@pytest.mark.parametrize("ended_by", ["deadline", "client", "page"])
+def test_a_score_ends_after_the_part_in_which_it_is_cancelled(ended_by: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    one = session(energy=EnergyConfig(samples_at_once=16))
+    ask(one, **request(goal_image=image(100)))
+    parts: list[int] = []
+    rollout = one.controller._model.rollout
+
+    def counted(frame: torch.Tensor, *more: object, **how: object) -> object:
+        parts.append(len(frame))
+        if ended_by == "page":
+            one.stopped.set()
+        return rollout(frame, *more, **how)
+
+    monkeypatch.setattr(one.controller._model, "rollout", counted)
+    message = pack(request(1, **SCORE))
+    if ended_by == "client":
+        with pytest.raises(GoneError):
+            one.answer(message, lambda: bool(parts))
+    else:
+        one._clock = _OverAfter(2) if ended_by == "deadline" else lambda: 0.0
+        answer = one.answer(message)
+        assert answer.startswith(f"request: no answer: {STOPPED if ended_by == 'page' else 'past the deadline'}")
+    assert parts == [16]
+
+
+@pytest.mark.parametrize("endpoint", ["infer", "reset"])
+def test_goals_are_encoded_until_the_deadline(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    one, encoded = session(), []
+    monkeypatch.setattr(one.controller, "encoded", lambda _: encoded.append(1) or torch.zeros(9, 32))
+    one._clock = _OverAfter(3)
+    goals = {"goal/images": np.stack([image(seed) for seed in range(5)]), "goal/durations": [1] * 4}
+    answer = one.answer(pack(request(**goals) | {"endpoint": endpoint}))
+    assert len(encoded) == 2
+    if endpoint == "infer":
+        found = unpack(answer)
+        assert (found["why"], found["goal"], found["actions"].any()) == ("past the deadline", None, np.False_)
+    else:
+        assert answer.startswith("request: no answer: past the deadline")
+    one._clock = lambda: 0.0
+    monkeypatch.undo()
+    assert "no goal in this episode" in refused(one, **request())
+
+
+def test_an_episode_is_counted_once_and_not_for_a_robot_that_leaves() -> None:
+    one = session()
+    one.begin()
+    assert one.counts.episodes == 0
+    ask(one, endpoint="reset", session_id="a")
+    assert one.counts.episodes == 1
+    ask(one, **request(goal_image=image(100), session_id="a"))
+    assert one.counts.episodes == 1
+    ask(one, **request(goal_image=image(100), session_id="b"))
+    ask(one, **request(goal_image=image(100), reset=True))
+    assert one.counts.episodes == 3
+    one.begin()
+    ask(one, **request(goal_image=image(100)))
+    assert one.counts.episodes == 4, "a client may name no episodes"
+
+
+def test_the_duration_of_every_decision_is_observed_at_once() -> None:
+    one, seconds = session(), []
+    one.counts.observe_seconds = seconds.append
+    for step in range(2):
+        ask(one, **request(step, goal_image=image(100)))
+    assert len(seconds) == 2

@@ -15,6 +15,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from accidents import without_permission
 from gcs import Gcs
 from run_fixtures import Popen
 from vjepa2_ac import storage
@@ -331,3 +332,21 @@ def test_the_limit_holds_while_several_processes_and_threads_write(popen: Popen,
     assert size_of(tmp_path) <= limit + most_in_progress
     assert size_of(tmp_path) > limit / 2
     assert not list(tmp_path.rglob("*.partial"))
+
+
+def test_an_entry_without_permission_is_fetched_again_and_not_replaced(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    cache = DiskCache(tmp_path, None)
+    cache.write_parts("key", [b"first", b"second"])
+    entry = cache._path("key")
+    before = entry.read_bytes()
+    with without_permission(entry):
+        for _ in range(2):
+            assert cache.read("key") is None
+            assert cache.read_parts("key", 2, [0]) is None
+            cache.write("key", b"other")
+    (warning,) = (record.getMessage() for record in caplog.records)
+    assert warning.startswith(f"{entry}: cannot be used (Permission denied (mode 0000, owner uid")
+    assert entry.read_bytes() == before
+    assert DiskCache(tmp_path, None).read_parts("key", 2, [1]) == [b"second"]

@@ -1,6 +1,40 @@
-"""Accidents of a file: what disks, copies and editors do to it."""
+"""Accidents of a file: what disks, copies, editors and other users do to it."""
+
+import ctypes
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
+import pytest
+
+_READ_ANYTHING = 1 << 1 | 1 << 2  # CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH
+
+
+@contextmanager
+def without_permission(*paths: Path) -> Iterator[None]:
+    """Remove all permissions of files or folders; root also gives up the right to read every file, in this thread."""
+    modes = {path: path.stat().st_mode for path in paths}
+    libc, header = ctypes.CDLL(None, use_errno=True), (ctypes.c_uint32 * 2)(0x20080522, 0)
+    sets = (ctypes.c_uint32 * 6)()  # effective, permitted, inheritable, twice
+    if os.geteuid() == 0:
+        if sys.platform != "linux":
+            pytest.skip("root may read every file here")
+        assert libc.capget(header, sets) == 0
+    effective = sets[0]
+    for path in paths:
+        path.chmod(0)
+    try:
+        sets[0] = effective & ~_READ_ANYTHING
+        assert os.geteuid() or libc.capset(header, sets) == 0
+        yield
+    finally:
+        sets[0] = effective
+        assert os.geteuid() or libc.capset(header, sets) == 0
+        for path, mode in modes.items():
+            path.chmod(mode)
 
 
 def mutated(data: bytes, generator: np.random.Generator) -> bytes:

@@ -5,9 +5,13 @@ from typing import Any
 
 import pytest
 
+from run_fixtures import set_up
 from same_run import assert_same_run
 from vjepa2_ac.config.loading import parse_config
+from vjepa2_ac.data import loader
+from vjepa2_ac.data.windows import spread
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.action_use import RolloutStart
 from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.checkpoint import checkpoint_name, newest_checkpoint, read_state, select_checkpoint
 from vjepa2_ac.runs.metrics_log import read_metrics_log
@@ -56,6 +60,34 @@ def test_what_is_ranked_does_not_change_the_run(make_config, reporter, tmp_path)
     weights = [newest_checkpoint(folder / "checkpoints") / "adapter/adapter_model.safetensors" for folder in folders]
     assert weights[0].read_bytes() == weights[1].read_bytes()
     assert "action_rank" not in validations(folders[1])[0]
+
+
+def test_clips_that_cannot_be_read_are_replaced_in_the_ranking(make_config, reporter, monkeypatch) -> None:
+    clips = {"validation__clips": 8, "validation__ranking_clips": 3, "data__broken_episodes": "skip"}
+    run = set_up(make_config(**clips), reporter)
+    names = [
+        (run.dataset.table.identity(episode), start)
+        for episode, start in loader.validation_windows(run.dataset, "validation", clips=8)
+    ]
+    chosen = [names[place] for place in spread(8, 3)]
+    others = [name for name in names if name not in chosen]
+    ranked, broken, read = [], {*chosen[:2], others[0]}, loader.read_clip
+
+    def some_read(dataset: object, request: loader.ClipRequest) -> object:
+        if (run.dataset.table.identity(request.episode), request.start) in broken:
+            raise InputError(where="a clip", found="its image is damaged")
+        return read(dataset, request)
+
+    def rank(_model: object, moves: list[RolloutStart], *_: object, **__: object) -> None:
+        ranked.extend((move.episode_id, move.first_step) for move in moves)
+
+    monkeypatch.setattr(loader, "read_clip", some_read)
+    monkeypatch.setattr(validation, "rank_actions", rank)
+    validation.validate(run, reporter)
+    assert ranked == [name for name in (chosen[2], others[1], others[2]) for _ in range(2)], "two moves of each"
+    broken.update(names)
+    with pytest.raises(InputError, match="4 of 8 episodes are broken"):
+        validation.validate(run, reporter)
 
 
 def test_the_lowest_rank_is_selected_though_the_error_falls_on(make_config, reporter, ranks_are) -> None:

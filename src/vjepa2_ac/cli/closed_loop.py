@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import os
 import re
-import shlex
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -14,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, shell_command
 
 if TYPE_CHECKING:
     import ssl
@@ -246,7 +245,7 @@ def _record_world(options: argparse.Namespace, target: Path) -> int:
         seeds = range(options.seed or 0, (options.seed or 0) + (options.episodes or 40))
         solved, shown = record_world(world, target, seeds, reporter.task("recording"))
     done = f"the expert solved {solved} of {shown}, the others are play"
-    cli.show(f"{len(seeds)} episodes are in {target}; {done}. Next: vjepa2-ac init {target}")
+    cli.show(f"{len(seeds)} episodes are in {target}; {done}. Next: {shell_command('init', target)}")
     return 0
 
 
@@ -310,7 +309,7 @@ def _answer(benchmark: ClosedLoopBenchmark) -> Answer:
     from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics
 
     agent, trials = benchmark.agent, benchmark.trials
-    how = "" if cli.is_server(agent.subject) else f"vjepa2-ac evaluate {agent.subject}"
+    how = "" if cli.is_server(agent.subject) else shell_command("evaluate", agent.subject)
     unknown = not_measured("predicts", how), not_measured("uses actions", how)
     measured = f"{trials.task_name}, {trials.place}, {trials.model_steps} steps of {trials.seconds_per_step:.2f} s"
     found = Answer(agent.subject, measured, "doing nothing", *unknown, benchmark.plans)
@@ -324,15 +323,15 @@ def _answer(benchmark: ClosedLoopBenchmark) -> Answer:
 def _next(answer: Answer, options: argparse.Namespace) -> str:
     """Return the command that follows from the answer of a closed loop."""
     if answer.plans.why:
-        what = f"--task {options.task or 'reach'}" if options.world is None else f"--world {shlex.quote(options.world)}"
-        return f"vjepa2-ac simulate {options.subject} {what} --episodes 50"
+        what = ("--task", options.task or "reach") if options.world is None else ("--world", options.world)
+        return shell_command("simulate", options.subject, *what, "--episodes", 50)
     if cli.is_server(options.subject):
         return f"your robot's client at {options.subject} (docs/serving.md)"
     if answer.predicts.share is None:
-        return f"vjepa2-ac evaluate {options.subject}"
+        return shell_command("evaluate", options.subject)
     if answer.plans.word == "yes":
-        return f"vjepa2-ac serve {options.subject}"
-    return f"vjepa2-ac data calibrate {options.subject}/config.yaml --axes {options.subject}"
+        return shell_command("serve", options.subject)
+    return shell_command("data", "calibrate", f"{options.subject}/config.yaml", "--axes", options.subject)
 
 
 @contextmanager

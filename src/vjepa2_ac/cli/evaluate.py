@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli import options as cli
-from vjepa2_ac.errors import InputError, UserError
+from vjepa2_ac.errors import InputError, UserError, shell_command
 from vjepa2_ac.process import is_first
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ def add_compare(commands: cli.Commands) -> None:
 def add_imagine(commands: cli.Commands) -> None:
     """Add `imagine` to a parser."""
     parser = cli.command(commands, "imagine", _imagine, "demo/run --decoder demo/decoder --actions true,up,left")
-    cli.add_planner(parser, such_as="with --image: such as planning.limits.xyz=data")
+    cli.add_planner(parser, such_as="such as model.base=PATH; with --image: planning.limits.xyz=data")
     cli.add_decoder(parser, "what is imagined", required=True)
     text = (
         "with commas between them: true (as recorded), none, up, down, left, right, forward, back, open, close; or"
@@ -90,8 +90,7 @@ def _evaluate(options: argparse.Namespace) -> None:
 
     asked = _asked(options)
     for subject, how in asked:
-        settle(subject, how)
-        cli.require_subject(subject)
+        cli.require_subject(subject, settle(subject, how), options.words)
 
     from vjepa2_ac.cli.console.tables import row_tables
     from vjepa2_ac.distributed import leave_processes
@@ -128,27 +127,29 @@ def _next(measured: Evaluated, data: str | None) -> str:
 
     about, answer = measured.evaluation.about, measured.answer
     if not about.checkpoint:
-        return f"vjepa2-ac train {data}"
+        return shell_command("train", data)
     if answer.predicts.why:
-        return f"vjepa2-ac data check {about.subject}/config.yaml"
+        return shell_command("data", "check", f"{about.subject}/config.yaml")
     if "no" in {answer.predicts.word, answer.uses_actions.word}:
-        return f"vjepa2-ac data check {about.subject}/config.yaml --model {about.subject}"
+        return shell_command("data", "check", f"{about.subject}/config.yaml", "--model", about.subject)
     if answer.plans.says.startswith("solves"):  # the closed loop has been measured
-        return f"vjepa2-ac serve {about.subject}"
+        return shell_command("serve", about.subject)
     try:
         recorded = read_simulation(Path(about.data).resolve(strict=True))
     except (OSError, UserError):
-        return f"vjepa2-ac serve {about.subject}"
-    domain = f" --domain {recorded.worlds.name}" if isinstance(recorded.worlds, Domain) else ""
-    return f"vjepa2-ac simulate {about.subject} --task {recorded.task or 'reach'}{domain}"
+        return shell_command("serve", about.subject)
+    domain = ("--domain", recorded.worlds.name) if isinstance(recorded.worlds, Domain) else ()
+    return shell_command("simulate", about.subject, "--task", recorded.task or "reach", *domain)
 
 
 def _asked(options: argparse.Namespace) -> list[tuple[str, EvaluationOptions]]:
     """Return what is asked of each subject; refuse planning settings that would have no effect: without plans."""
     from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
+    from vjepa2_ac.runs.folder import is_of_moved
 
-    if options.overrides and options.plan_settings is None:
-        found = f"{' '.join(options.overrides)}, and no plans are asked for"
+    of_plans = [word for word in options.overrides if not is_of_moved(word)]
+    if of_plans and options.plan_settings is None:
+        found = f"{' '.join(of_plans)}, and no plans are asked for"
         needed = "--planning beside settings of planning; what else a config says is not changed by evaluate"
         raise InputError(where="command line", found=found, needed=needed, fix="Add --planning")
     several, plan_settings = len(options.subjects) > 1, options.plan_settings
@@ -156,7 +157,7 @@ def _asked(options: argparse.Namespace) -> list[tuple[str, EvaluationOptions]]:
     every = cli.record_of_options(
         EvaluationOptions,
         options,
-        data=cli.read_config(options.data, of_run=True) if options.data else None,
+        data=cli.read_config(options.data) if options.data else None,
         against=tuple(options.against) if options.against else None,
         probes=cli.record_of_options(ProbeOptions, options, planning_clips=clips),
         planning=(*(plan_settings or ()), *options.overrides),
@@ -183,7 +184,7 @@ def _compare(options: argparse.Namespace) -> None:
     tables = row_tables(comparison.rows, comparison.title) if options.all else []
     files = [plot_comparison(comparison, options.out), *write_tables(comparison.rows, options.out)]
     best = options.runs[list(comparison.answers).index(comparison.best)]
-    cli.show(*tables, str(comparison), *comparison.notes, f"Next: vjepa2-ac export {best}", files=files)
+    cli.show(*tables, str(comparison), *comparison.notes, f"Next: {shell_command('export', best)}", files=files)
 
 
 def _imagine(options: argparse.Namespace) -> None:
@@ -224,11 +225,11 @@ def _words(options: argparse.Namespace) -> tuple[str, ...]:
 
 def _of_clip(options: argparse.Namespace, out: Path, reporter: Reporter) -> Imagination:
     from vjepa2_ac.evaluation.imagined import ImagineOptions, imagine_clip
-    from vjepa2_ac.evaluation.request import EvaluationOptions
+    from vjepa2_ac.evaluation.request import EvaluationOptions, settle
     from vjepa2_ac.simulation.counterfactual import with_what_happens
 
     cli.say_places_elsewhere(options.subject)
-    data = None if options.data is None else cli.read_config(options.data, of_run=True)
+    data = None if options.data is None else cli.read_config(options.data)
     asked = ImagineOptions(
         decoder=options.decoder,
         actions=_words(options),
@@ -237,8 +238,11 @@ def _of_clip(options: argparse.Namespace, out: Path, reporter: Reporter) -> Imag
         split=options.split,
         episode=options.episode,
         start=options.start,
-        evaluation=EvaluationOptions(checkpoint=options.checkpoint, data=data, out=out),
+        evaluation=EvaluationOptions(
+            checkpoint=options.checkpoint, data=data, out=out, planning=tuple(options.overrides)
+        ),
     )
+    cli.require_subject(options.subject, settle(options.subject, asked.evaluation), options.words)
     return with_what_happens(imagine_clip(options.subject, asked, reporter=reporter)).imagination
 
 

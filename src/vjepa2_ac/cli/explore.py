@@ -58,7 +58,7 @@ def _explore(options: argparse.Namespace) -> int:
     Press a key and see what the model thinks happens, beside its base and what is true; choose a goal, see the energy,
     let it plan (docs/explore.md). Runs until Ctrl-C.
     """
-    from vjepa2_ac.runs.folder import is_run
+    from vjepa2_ac.runs.folder import is_run, read_run_config
 
     if options.subject is not None and cli.is_override(options.subject):
         options.subject, options.overrides = None, [options.subject, *options.overrides]
@@ -66,7 +66,8 @@ def _explore(options: argparse.Namespace) -> int:
     access = cli.access_of(options)
     if options.export is not None:
         cli.require_new_place(options.export)
-    cli.require_subject(subject)
+    config = read_run_config(Path(subject), options.overrides) if is_run(subject) else None
+    cli.require_subject(subject, config, options.words)
     cli.say_places_elsewhere(subject)
     with _data(subject, options) as data:
         from vjepa2_ac.explore.views import Views
@@ -108,7 +109,7 @@ def _data(subject: str, options: argparse.Namespace) -> Iterator[Config | None]:
     from vjepa2_ac.runs.folder import is_run
 
     if options.data is not None:
-        yield cli.read_config(options.data, of_run=True)
+        yield cli.read_config(options.data)
     elif is_run(subject):
         yield None
     elif subject == _BUILTIN_MODEL:

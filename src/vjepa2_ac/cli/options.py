@@ -12,7 +12,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias, TypeVar
 
-from vjepa2_ac.errors import InputError, did_you_mean, printable
+from vjepa2_ac.errors import InputError, did_you_mean, printable, shell_command
 from vjepa2_ac.process import is_first
 from vjepa2_ac.storage import places
 
@@ -232,7 +232,7 @@ def read_config(path: str | Path, overrides: Sequence[str] = (), *, base: bool =
         path: The YAML file.
         overrides: Such as training.steps=100.
         base: Whether `model.base` and `model.encoder` have to be there, too.
-        of_run: It may be the config of a run that was made.
+        of_run: It is the config of a run, whatever else is in its folder.
 
     Raises:
         InputError: The config is wrong, or one of them is not there.
@@ -251,20 +251,22 @@ def read_config(path: str | Path, overrides: Sequence[str] = (), *, base: bool =
     return config
 
 
-def require_subject(subject: str) -> None:
+def require_subject(subject: str, config: Config | None = None, command: Sequence[str] = ()) -> None:
     """Refuse a run or a model that is not there, before what takes seconds is imported.
 
     Args:
         subject: The folder of a run; or a model: what `model.base` takes.
+        config: The config of a run, with the overrides of the command; None: as it is in the run's folder.
+        command: The words of the command, if it has overrides for the run.
 
     Raises:
-        InputError: There is no such run or model.
+        InputError: There is no such run or model, or the base of the run is gone.
     """
-    from vjepa2_ac.model.base_model import find_base
+    from vjepa2_ac.model.base_model import find_base, require_base_of_run
     from vjepa2_ac.runs.folder import is_run, read_run_config
 
     if is_run(subject):
-        read_run_config(Path(subject))
+        require_base_of_run((config or read_run_config(Path(subject))).model, Path(subject), command)
     else:
         find_base(subject)
 
@@ -278,7 +280,7 @@ def require_to_plan(options: argparse.Namespace) -> Config:
     from vjepa2_ac.planning.settings import planning_settings
 
     config = planning_settings(options.subject, config=options.config, overrides=options.overrides)
-    require_subject(options.subject)
+    require_subject(options.subject, config, options.words)
     return config
 
 
@@ -382,7 +384,7 @@ def _reader(read: Callable[[str], _Read]) -> Callable[[str], _Read]:
 
 def _config_path(text: str) -> str:
     if places.is_url(text):
-        raise ValueError(f"is a URL. If it holds data, run `vjepa2-ac init {text}`, which writes a config")
+        raise ValueError(f"is a URL. If it holds data, run `{shell_command('init', text)}`, which writes a config")
     return places.on_this_machine(text)
 
 

@@ -7,7 +7,7 @@ import contextlib
 from pathlib import Path
 
 from vjepa2_ac.cli import options as cli
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, shell_command
 from vjepa2_ac.process import is_first
 
 
@@ -15,7 +15,9 @@ def add_train(commands: cli.Commands) -> None:
     """Add `train` to a parser."""
     parser = cli.command(commands, "train", _train, "my_robot.yaml training.steps=1000")
     cli.add_config(parser, such_as="training.learning_rate=3e-4", what="a YAML config, or (--resume) a run's folder")
-    cli.add(parser, "--resume", "go on with the run in the folder CONFIG", action="store_true")
+    cli.add(
+        parser, "--resume", "resume the run in the folder CONFIG; key=value changes its config", action="store_true"
+    )
     cli.add(parser, "--check", "do everything that can fail, and stop before the first step", action="store_true")
     cli.add(parser, "--allow-config-change", "go on with a run though the config is another", action="store_true")
 
@@ -41,6 +43,7 @@ def add_export(commands: cli.Commands) -> None:
     parser = cli.command(commands, "export", _export, "runs/my_robot merged")
     cli.add(parser, "run RUN", "folder of a run", cli.as_path)
     cli.add(parser, "folder FOLDER", "what is written: new or empty; official: or a .pt file", cli.as_path)
+    cli.add(parser, "overrides key=value", "model.base=PATH, if the base was moved", nargs="*")
     text = "merged: for model.base; official: a .pt by Meta's names; hub: the adapter in PEFT's format, with a card"
     cli.add(parser, "--to", text, choices=["merged", "official", "hub"], default="merged")
     cli.add_checkpoint(parser)
@@ -52,18 +55,22 @@ def _train(options: argparse.Namespace) -> None:
     SIGTERM, SIGINT, SIGUSR1, SIGHUP: finish the step, write a checkpoint, end with status 75; the same command goes
     on from there. A second signal: end at once.
     """
+    from vjepa2_ac.model.base_model import require_base_of_run
     from vjepa2_ac.runs.folder import is_run, read_run_config
 
     path = Path(options.config)
-    if options.resume and options.overrides:
-        needed = "the run's own config, unchanged"
-        raise InputError(where="command line", found="--resume with overrides", needed=needed)
+    if options.resume and any(override.startswith("run_dir=") for override in options.overrides):
+        needed = "the folder of the run, which is its run_dir"
+        raise InputError(where="command line", found="--resume with run_dir", needed=needed)
     if is_run(options.config) and not options.resume:
         fix = "To resume the run, add --resume"
         raise InputError(where=options.config, found="the folder of a run", needed="a config file", fix=fix)
     if options.resume:
         cli.say_places_elsewhere(options.config)
-    config = read_run_config(path) if options.resume else cli.read_config(path, options.overrides, base=True)
+        config = read_run_config(path, options.overrides)
+        require_base_of_run(config.model, path, options.words)
+    else:
+        config = cli.read_config(path, options.overrides, base=True)
 
     from vjepa2_ac.cli.console.training import TrainingConsole
     from vjepa2_ac.training.loop import train
@@ -71,7 +78,7 @@ def _train(options: argparse.Namespace) -> None:
     with TrainingConsole() as reporter:
         folder = train(config, reporter, check_only=options.check, allow_config_change=options.allow_config_change)
     if is_first() and not options.check:
-        cli.show(f"The run is in {folder}; see how good it is: vjepa2-ac evaluate {folder}")
+        cli.show(f"The run is in {folder}; see how good it is: {shell_command('evaluate', folder)}")
 
 
 def _encode(options: argparse.Namespace) -> None:
@@ -136,18 +143,19 @@ def _decoder(options: argparse.Namespace) -> None:
     card = read_card(folder)
     if card.held_out:
         cli.show(held_out_table(card))
-    cli.show(f"See what a model imagines: vjepa2-ac imagine {config.run_dir} --decoder {folder}")
+    cli.show(f"See what a model imagines: {shell_command('imagine', config.run_dir, '--decoder', folder)}")
 
 
 def _export(options: argparse.Namespace) -> None:
     """Write a run's model, or its adapter, for others to use."""
     from vjepa2_ac.runs.folder import read_run_config
 
-    read_run_config(options.run)
+    config = read_run_config(options.run, options.overrides)
+    cli.require_subject(str(options.run), config, options.words)
 
     from vjepa2_ac.reports.export import export_run
 
-    written = export_run(options.run, options.folder, options.to, options.checkpoint)
+    written = export_run(options.run, options.folder, options.to, options.checkpoint, options.overrides)
     what = {"merged": "merged model", "official": "official checkpoint", "hub": "adapter with its model card"}
     cli.show(f"The {what[options.to]} of checkpoint {written.checkpoint} is in {written.path}")
     if options.to == "hub":

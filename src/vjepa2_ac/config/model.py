@@ -26,6 +26,7 @@ _USUAL_ALPHA = 32.0  # of every config here, at any rank
 Family = Literal["v2", "v2.1"]
 FramePath = Literal["tubelet", "image"]
 EncoderKey = Literal["ema_encoder", "target_encoder", "encoder"]
+EncoderWeights = Literal["target_encoder", "encoder"]
 
 
 class EncoderSizes(Section):
@@ -139,9 +140,10 @@ class ModelSizes(Section):
 class EncoderConfig(Section):
     """An encoder of its own, under a predictor that does not bring one."""
 
-    path: Annotated[str, AfterValidator(places.of_an_encoder)]
+    path: Annotated[str, AfterValidator(places.of_an_encoder), Affects.PLAN]
     """Meta's `.pt` of V-JEPA 2 or 2.1 (`vjepa2-ac download --list`), a transformers folder, the same from the Hub as
-    `hf://owner/name` or `hf://owner/name@revision`, or the folder of a model of this project."""
+    `hf://owner/name` or `hf://owner/name@revision`, or the folder of a model of this project. A run resumes with a path
+    to which it was moved: the fingerprint of the weights decides."""
     key: EncoderKey | None = None
     """Which encoder of a `.pt`; null: the first of these that it has. A predictor knows the one it was trained on."""
     frame: FramePath = "tubelet"
@@ -157,12 +159,16 @@ class EncoderConfig(Section):
 class ModelConfig(Section):
     """Which world model to start from."""
 
-    base: Annotated[Annotated[str, AfterValidator(places.of_a_model)] | None, Affects.RUN] = None
+    base: Annotated[Annotated[str, AfterValidator(places.of_a_model)] | None, Affects.PLAN] = None
     """The model to adapt: the official `.pt`, a folder written by `save_pretrained`, or `builtin:sim-tiny` (the tiny
-    model of the demo, which comes with the package)."""
+    model of the demo, which comes with the package). A run resumes with a path to which its base was moved: the
+    fingerprint of the weights decides."""
     encoder: Annotated[EncoderConfig | None, Affects.RUN] = None
     """A pretrained encoder, for a fresh predictor (`random`) or one that comes without (a `base` that holds a predictor
     alone); null: the base's own. Its family, width, depth, heads and MLP are the file's."""
+    encoder_weights: Annotated[EncoderWeights, Affects.RUN | Affects.PLAN] = "target_encoder"
+    """The encoder of an official `.pt` that holds two different ones. Meta's code trains the predictor on
+    `target_encoder`; a file with one encoder, or with two equal ones, gives the same model with either value."""
     random: Annotated[ModelSizes | None, Affects.RUN] = None
     """Instead of `base`: a fresh predictor of these sizes, and, without `encoder`, a random encoder; with
     `adapter.kind: none` that is training from scratch."""

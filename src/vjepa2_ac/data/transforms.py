@@ -24,6 +24,7 @@ from torch import Tensor
 from vjepa2_ac.config import AugmentConfig, DataConfig
 from vjepa2_ac.episode import Augmentation, Clip
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.media.images import require_bounded
 from vjepa2_ac.registry import TRANSFORMS
 
 Crop = Literal["released", "square", "letterbox"]
@@ -69,6 +70,9 @@ def view(
     """Return the part of the frames that the model sees, at their own resolution; see `DataConfig.crop`.
 
     A view of the same memory, except for letterbox, if bars must be added.
+
+    Raises:
+        InputError: With bars the frames are too large.
     """
     if kind == "letterbox":
         return _with_bars(frames)
@@ -95,7 +99,9 @@ def _with_bars(frames: UInt8[np.ndarray, "time height width 3"]) -> UInt8[np.nda
     height, width = frames.shape[1:3]
     if height == width:
         return frames
-    rows, columns = max(0, width - height), max(0, height - width)  # missing ones, in all
+    side = max(height, width)
+    require_bounded(side, side, "data.crop: letterbox", count=len(frames))
+    rows, columns = side - height, side - width  # missing ones, in all
     return np.pad(frames, ((0, 0), (rows // 2, rows - rows // 2), (columns // 2, columns - columns // 2), (0, 0)))
 
 

@@ -13,14 +13,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from safetensors.torch import save_file
 from torch import Tensor
 
 from vjepa2_ac import __version__
 from vjepa2_ac.decoding.network import Decoder, DecoderShape
 from vjepa2_ac.errors import InputError, MissingFileError
 from vjepa2_ac.model.base_model import ASSETS
-from vjepa2_ac.model.network.pretrained_folder import read_tensors
+from vjepa2_ac.model.network.pretrained_folder import read_tensors, save_tensors
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.storage import folder_writer
 from vjepa2_ac.storage.places import BUILTIN
@@ -101,7 +100,7 @@ def save_decoder(folder: Path, card: DecoderCard, decoder: Mapping[str, Tensor],
     """
     with folder_writer(folder, CARD) as fresh:
         for name, weights in ((WEIGHTS, decoder), (LINEAR, linear)):
-            save_file({key: value.detach().cpu().contiguous() for key, value in weights.items()}, fresh / name)
+            save_tensors(weights, fresh / name)
         (fresh / CARD).write_text(json.dumps(asdict(card), indent=1) + "\n", encoding="utf-8")
 
 

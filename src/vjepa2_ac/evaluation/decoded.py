@@ -33,6 +33,7 @@ from vjepa2_ac.evaluation.result import DecodedRollouts, DecodedStrip, Example
 from vjepa2_ac.intervals import Estimate, ratios
 from vjepa2_ac.media.image_similarity import mean_where, moving_region, psnr, ssim_map
 from vjepa2_ac.reporter import SILENT, Reporter
+from vjepa2_ac.storage import require_content
 
 DECODED_TRUTH, DECODED_PERSISTENCE, RAW_PERSISTENCE = "decoded_truth", "decoded_persistence", "raw_persistence"
 NEIGHBOURS = (DECODED_TRUTH, DECODED_PERSISTENCE, RAW_PERSISTENCE)
@@ -236,6 +237,8 @@ def load_lpips(backbone: Path, heads: Path) -> Lpips:
     Raises:
         InputError: A file cannot be read, or is another one.
     """
+    for path in (backbone, heads):
+        require_content(path)
     try:
         weights, of_heads = (torch.load(path, map_location="cpu", weights_only=True) for path in (backbone, heads))
         network = Lpips("alex" if "features.10.bias" in weights and "features.28.bias" not in weights else "vgg")

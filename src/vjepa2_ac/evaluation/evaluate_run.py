@@ -79,7 +79,7 @@ def load_subject(
     Raises:
         InputError: One of the models cannot be loaded; it does not fit the data, the decoder, or the others.
     """
-    run = load_run(Path(name), asked.checkpoint) if is_run(name) else None
+    run = load_run(Path(name), asked.checkpoint, config) if is_run(name) else None
     world_model = run.world_model if run else load_base(config.model.with_base(name), seed=config.seed)
     require_widths(world_model, dataset.widths, where=name)
     if decoder is not None:
@@ -88,9 +88,9 @@ def load_subject(
     found: list[Contender] = []
     notes: tuple[str, ...] = ()
     if BASE in against and config.model.base is None:
-        if run is None:
-            needed = "a base to compare with"
-            raise InputError(where="--against base", found="a config without model.base", needed=needed)
+        if asked.against is not None:
+            found, needed = "a model without a base (model.base is not set)", "a base to compare with"
+            raise InputError(where="--against base", found=found, needed=needed, fix="Leave out --against base")
     elif BASE in against and run is None:
         found.append(_contender(BASE, "base", _like(name, world_model, str(config.model.base), config, dataset.widths)))
     elif BASE in against and world_model.fresh_heads is not None:

@@ -24,7 +24,7 @@ from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.settings import require_limits, with_taught_limits
 from vjepa2_ac.runs.checkpoint import SELECTED
-from vjepa2_ac.runs.folder import is_run, read_run_config
+from vjepa2_ac.runs.folder import is_of_moved, is_run, read_run_config
 
 if TYPE_CHECKING:
     from vjepa2_ac.planning.prior.action_prior import ActionPrior
@@ -84,7 +84,8 @@ class EvaluationOptions:
     decoder: str | None = None  # folder of a decoder, or builtin:sim-tiny: rollouts are decoded and measured as images
     lpips: Path | None = None  # with a decoder: torchvision's AlexNet or VGG16, for LPIPS
     lpips_heads: Path | None = None  # its heads
-    planning: tuple[str, ...] = ()  # settings in place of the config's, such as planning.samples=200
+    # Settings in place of the config's: planning.samples=200; for a run whose base was moved model.base=PATH, too.
+    planning: tuple[str, ...] = ()
 
 
 def settle(subject: str, asked: EvaluationOptions) -> Config:
@@ -104,8 +105,8 @@ def settle(subject: str, asked: EvaluationOptions) -> Config:
         raise InputError(where="--lpips, --lpips-heads", found="one without the others", needed=needed)
     config = _config_of(subject, asked)
     for setting in asked.planning:
-        if not setting.startswith("planning."):
-            needed = "settings of planning, such as planning.samples=200"
+        if not (setting.startswith("planning.") or (is_run(subject) and is_of_moved(setting))):
+            needed = "settings of planning, such as planning.samples=200; or, for a run, model.base=PATH"
             raise InputError(where="--planning", found=setting, needed=needed)
     config = parse_config(config_as_dict(config), asked.planning, where="--planning")
     if is_run(subject):

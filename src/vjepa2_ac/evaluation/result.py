@@ -227,7 +227,7 @@ class Sensitivity:
 class ActionRanking:
     """The rank of the true action by energy among those that a planner would try: what planning needs of a model.
 
-    It is measured on moves (`one_step.moves_of`) that are as large as planned ones, forwards and backwards in time.
+    It is measured on moves (`action_use.moves_of`) that are as large as planned ones, forwards and backwards in time.
     Chance: 0.5; a perfect model: 0. Two of the same moves may be compared pair by pair.
     """
 

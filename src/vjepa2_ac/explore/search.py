@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -15,10 +15,9 @@ from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.explore.explorer import Explorer, Place
 from vjepa2_ac.planning.energy import EnergySlice, Goal, Scene, WorldModelCost, distance, energy_slices
-from vjepa2_ac.planning.planner import Plan, Planner, SearchCancelledError
+from vjepa2_ac.planning.planner import Cancelled, Plan, Planner, until_cancelled
 from vjepa2_ac.planning.search_space import SearchSpace, search_space
 
-Cancelled = Callable[[], bool]
 _NODES = 7  # of an energy map along each axis
 
 
@@ -75,7 +74,7 @@ class Search:
         """
         around = torch.tensor([list(action)], dtype=torch.float32)
         with self._cost(teller, place, goal) as cost:
-            watched = _ending(progress, cancelled)
+            watched = until_cancelled(cancelled, progress)
             return energy_slices(cost, around, self.space(), self.axes, nodes=_NODES, progress=watched)
 
     def plan(
@@ -87,7 +86,7 @@ class Search:
             InputError: There are no limits.
             SearchCancelledError: It was cancelled.
         """
-        planner = Planner(self._of(steps), self.space(steps), progress=_ending(progress, cancelled))
+        planner = Planner(self._of(steps), self.space(steps), progress=progress)
         with self._cost(teller, place, goal) as cost, torch.no_grad():
             plan = planner.plan(cost, torch.Generator().manual_seed(0), cancelled=cancelled)
             elites = torch.stack([one.elites[0] for one in plan.iterations if len(one.elites)][-8:] or [plan.actions])
@@ -106,14 +105,3 @@ class Search:
         with explorer.autocast(), explorer.contenders[teller].switched():
             goals, config = Goal(goal[None]), self.config.energy
             yield WorldModelCost(explorer.model(teller), scene, goals, config, spaces=explorer.spaces)
-
-
-def _ending(progress: Progress, cancelled: Cancelled) -> Progress:
-    """Return a progress that ends what it reports of once that is cancelled."""
-
-    def report(done: int, total: int) -> None:
-        if cancelled():
-            raise SearchCancelledError
-        progress(done, total)
-
-    return report

@@ -16,7 +16,7 @@ from vjepa2_ac.explore.messages import MOST_BYTES, PageRequest, packed, read_req
 from vjepa2_ac.explore.views import Views
 from vjepa2_ac.planning.planner import SearchCancelledError
 from vjepa2_ac.serving.access import Access
-from vjepa2_ac.serving.listening import listen, until_signalled, url_of
+from vjepa2_ac.serving.listening import ends, listen, until_signalled, url_of
 from vjepa2_ac.serving.pages import Page
 
 logger = logging.getLogger(__name__)
@@ -64,7 +64,7 @@ class ExploreServer:
             await stop.wait()
         finally:
             server.close()
-            await server.wait_closed()
+            await ends(server.wait_closed())
             self._computing.shutdown(wait=False, cancel_futures=True)
 
     def _asked(self, connection: Any, request: Any) -> Any:

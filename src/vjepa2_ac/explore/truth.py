@@ -15,6 +15,7 @@ from vjepa2_ac.data.transforms import frames_as_seen, view
 from vjepa2_ac.encoding.batch import encode_frames
 from vjepa2_ac.explore.explorer import Explorer, Moment, Pixels, Place
 from vjepa2_ac.media.images import decode_jpegs, encode_jpeg
+from vjepa2_ac.planning.planner import Cancelled, SearchCancelledError
 from vjepa2_ac.simulation.closed_loop.rollout import send_action
 from vjepa2_ac.simulation.counterfactual import Resimulation, resimulate
 from vjepa2_ac.simulation.recording.record import JPEG_QUALITY, SIMULATION_FILE, carry_out
@@ -47,10 +48,23 @@ class Truth:
         self.is_simulated = (self._folder / SIMULATION_FILE).is_file()
         self._arms = lru_cache(maxsize=_KEPT)(self._arm)
         self._at: dict[tuple[int, int], Place] = {}  # where each arm is
-        self.outcome = lru_cache(maxsize=64)(self._outcome)
+        self._outcomes = lru_cache(maxsize=64)(self._outcome)
+        self._cancelled: Cancelled = lambda: False
+
+    def outcome(self, place: Place, cancelled: Cancelled = lambda: False) -> TrueFrame | None:
+        """Return what is true at a place; None: it is unknown.
+
+        Args:
+            place: Where.
+            cancelled: Asked before each simulated action.
+
+        Raises:
+            SearchCancelledError: It was cancelled.
+        """
+        self._cancelled = cancelled
+        return self._outcomes(place)
 
     def _outcome(self, place: Place) -> TrueFrame | None:
-        """Return what is true at a place; None: nobody knows."""
         recorded = self._explorer.recorded(place)
         if recorded is not None:
             return _recorded(recorded)
@@ -67,6 +81,8 @@ class Truth:
             carry_out(arm, simulation.number, simulation.spec, until=place.start)
         reached = True
         for action in place.actions[-1:] if is_next else place.actions:
+            if self._cancelled():
+                raise SearchCancelledError
             reached = send_action(arm, np.array(action), explorer.stride)
         self._at[key] = place
         image = encode_jpeg(arm.image(simulation.camera), quality=JPEG_QUALITY)  # as those of the data set

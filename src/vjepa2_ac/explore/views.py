@@ -57,7 +57,7 @@ class Views:
         Args:
             request: From a page.
             progress: Of a search.
-            cancelled: Asked during a search, whether nobody waits for it any more.
+            cancelled: Asked during a search or a simulation, whether its result is still needed.
 
         Raises:
             InputError: There is no such place, goal or model.
@@ -68,7 +68,7 @@ class Views:
         actions = tuple(tuple(one) for one in request.actions)
         place = self.explorer.require(Place(request.episode, request.start, actions))
         if request.kind == "look":
-            return self._look(request, place)
+            return self._look(request, place, cancelled)
         return self._searched(request, place, progress, cancelled)
 
     def hello(self) -> bytes:
@@ -197,10 +197,10 @@ class Views:
         ]
         return packed("episode", request.seq, {"episode": index, "steps": steps}, images)
 
-    def _look(self, request: PageRequest, place: Place) -> bytes:
+    def _look(self, request: PageRequest, place: Place, cancelled: Cancelled) -> bytes:
         explorer, start = self.explorer, self.explorer.moment(place.episode, place.start)
         goal = None if request.goal is None else goal_moment(explorer, request.goal)
-        outcome, states = self.truth.outcome(place), explorer.states(place)
+        outcome, states = self.truth.outcome(place, cancelled), explorer.states(place)
         images = [Image("given", start.pixels, f"the given frame, recorded at control step {place.start}")]
         images += [] if outcome is None else [Image("truth", outcome.pixels, _true_alt(outcome))]
         images += [] if goal is None else [Image("goal", goal.pixels, "the goal frame")]

@@ -1,7 +1,7 @@
 """The page of a robot that is served: what the planner sees, wants and is about to do; and a STOP.
 
-It costs the robot nothing: images are packed and plans decoded in a thread of its own, only while a page is open, and
-only the newest decision.
+Images are packed and plans decoded in a separate thread, only while a page is open, and only for the newest decision.
+With a decoder this thread runs the model on the device of the planner: a page that is open can delay the next decision.
 """
 
 from __future__ import annotations

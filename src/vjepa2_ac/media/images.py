@@ -6,19 +6,22 @@ import io
 import struct
 import zlib
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import simplejpeg
 from jaxtyping import UInt8
-from PIL import Image
+from PIL import ExifTags, Image, ImageOps
+from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage import read_bytes, user_can_read
+from vjepa2_ac.storage import read_bounded, user_can_read
 
 MOST_PIXELS = 100_000_000  # a robot's camera has a tenth; a file of 600 bytes may claim forty times as many
 _MOST_BYTES = 1 << 32  # of images that are decoded together
+_MOST_FILE_BYTES = 1 << 28  # a PNG of the largest image without compression has 300 MB
 _LEAST_SIDE = 16  # pixels of an image of a robot's scene
 
 
@@ -170,22 +173,25 @@ def encode_jpeg(frame: UInt8[np.ndarray, "height width 3"], *, quality: int = 95
 
 
 _PNG = b"\x89PNG"
+_EXIF = b"Exif\0\0"  # begins the EXIF data of a JPEG
 _EIGHT_BIT = {"1", "L", "LA", "P", "RGB", "RGBA"}  # Pillow's modes of at most 8 bits a channel
 
 
 def read_image(path: str | Path) -> UInt8[np.ndarray, "height width 3"]:
-    """Return the RGB pixels of a PNG or JPEG file.
+    """Return the RGB pixels of a PNG or JPEG file, as `decode_image` does.
 
     Raises:
-        InputError: There is no such file, it cannot be read, or it is neither PNG nor JPEG.
+        InputError: There is no such file, it is too large, a pipe or a device, or neither PNG nor JPEG.
     """
     with user_can_read(path, needed="an image: PNG or JPEG"):
-        data = read_bytes(path)
+        data = read_bounded(path, _MOST_FILE_BYTES)
     return decode_image(data, str(path))
 
 
 def decode_image(data: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]:
-    """Return the RGB pixels of PNG or JPEG bytes; transparency is dropped.
+    """Return the RGB pixels of PNG or JPEG bytes, turned and mirrored as their EXIF orientation says.
+
+    Transparency is dropped.
 
     Raises:
         InputError: They are neither, damaged, too large, or of more than 8 bits a channel.
@@ -194,14 +200,28 @@ def decode_image(data: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]
         if data.startswith(b"\xff\xd8"):
             height, width, _, _ = simplejpeg.decode_jpeg_header(data)
             require_bounded(height, width, where)
-            return np.asarray(simplejpeg.decode_jpeg(data, colorspace="RGB"))
+            pixels = np.asarray(simplejpeg.decode_jpeg(data, colorspace="RGB"))
+            if _EXIF not in data:  # a robot's camera writes none; the search is a thousandth of the decoding
+                return pixels
+            with JpegImageFile(io.BytesIO(data)) as image:  # reads the header only
+                return _upright(pixels, image)
         with PngImageFile(io.BytesIO(data)) as image:  # reads the header only
             require_bounded(image.height, image.width, where)
-            return _as_rgb(image)
+            return _upright(_as_rgb(image), image)
     except (OSError, ValueError, SyntaxError, struct.error, zlib.error, EOFError, IndexError) as error:
         found = f"{len(data)} bytes that are no image, starting with {data[:4]!r} ({error})"
         needed = "PNG or JPEG, as a camera's images are stored; depth, as TIFF, is not used"
         raise InputError(where=where, found=found, needed=needed) from None
+
+
+def _upright(pixels: UInt8[np.ndarray, "height width 3"], image: Image.Image) -> UInt8[np.ndarray, "rows columns 3"]:
+    """Return the pixels of an image file as viewers show it: EXIF data that cannot be read change nothing."""
+    with suppress(OSError, ValueError, SyntaxError, struct.error, LookupError):
+        orientation = image.getexif()[ExifTags.Base.Orientation]
+        turned = Image.fromarray(pixels)
+        turned.getexif()[ExifTags.Base.Orientation] = orientation
+        return np.array(ImageOps.exif_transpose(turned))
+    return pixels
 
 
 def _as_rgb(image: Image.Image) -> UInt8[np.ndarray, "height width 3"]:

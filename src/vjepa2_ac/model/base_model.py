@@ -9,7 +9,8 @@ from __future__ import annotations
 import hashlib
 import importlib.resources
 import json
-from collections.abc import Mapping
+import shlex
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -63,6 +64,27 @@ def require_model(config: ModelConfig) -> None:
         find_base(config.base)
     if config.encoder is not None:
         find_encoder_path(config.encoder.path)
+
+
+def require_base_of_run(config: ModelConfig, run: Path, command: Sequence[str] = ()) -> None:
+    """Refuse a run whose base or encoder is no longer at its path.
+
+    Args:
+        config: The model of the run.
+        run: Its folder.
+        command: The words of a command that takes the new path; none: the command that resumes the run is advised.
+
+    Raises:
+        InputError: It is not there; says how to give the new path.
+    """
+    try:
+        require_model(config)
+    except InputError as error:
+        key = error.where.partition(":")[0]
+        words = ["vjepa2-ac", *(command or ("train", str(run), "--resume")), f"{key}=PATH"]
+        needed = f"what {run} was trained on. It may be at any path: the fingerprint of its weights is compared"
+        fix = f"If it was moved, run `{shlex.join(words)}`"
+        raise InputError(where=error.where, found=error.found, needed=needed, fix=fix) from None
 
 
 def _find(name: str, where: str, needed: str, fix: str) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from vjepa2_ac.data.sources.indexed_source import spaces_of
 from vjepa2_ac.data.transforms import Crop, split_views, view
 from vjepa2_ac.encoding.batch import encode_frames
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.media.camera_check import CameraFrame, has_moved, is_uniform, newest_frames, require_contrast
 from vjepa2_ac.media.images import require_image, require_mask
 from vjepa2_ac.model.network.world_model import WorldModel, heads_to_replace, widths_as_text, widths_of_model
 from vjepa2_ac.model.state_integration import states_along
@@ -25,7 +27,7 @@ from vjepa2_ac.planning.chunks import ChunkScores
 from vjepa2_ac.planning.energy import EnergyFunction, Goal, Scene, WorldModelCost, distance, patch_weights
 from vjepa2_ac.planning.goals import REACHED, GoalProgress, GripperMode, SubGoal, timed, with_shares
 from vjepa2_ac.planning.model_setup import Axes, Fingerprints, prepare_for_planning
-from vjepa2_ac.planning.planner import Cancelled, Plan, Planner
+from vjepa2_ac.planning.planner import Cancelled, Plan, Planner, SearchCancelledError, until_cancelled
 from vjepa2_ac.planning.search_space import SearchSpace, Workspace, is_allowed, search_space
 from vjepa2_ac.planning.settings import require_base_frame, warn_beyond_taught, with_taught_limits
 from vjepa2_ac.planning.solvers import PlanStart
@@ -34,7 +36,11 @@ from vjepa2_ac.runs.loading import TrainedRun
 from vjepa2_ac.spaces import EXTRINSICS, POSES, Spaces
 
 Seen = tuple[Tensor, np.ndarray]  # latents of an image, and the state
-Why = Literal["planned", "as planned", "out of time", "at the goal", "no finite energy", "outside the workspace"]
+Unusable = Literal["uniform frame", "frozen frame"]
+Why = (
+    Literal["planned", "as planned", "out of time", "at the goal", "no finite energy", "outside the workspace"]
+    | Unusable
+)
 
 
 @dataclass(frozen=True)
@@ -43,9 +49,10 @@ class Decision:
 
     action: Float[np.ndarray, " dim"]  # for the next model step; nothing changes for some values of `why`
     # as planned: the last plan is carried on. out of time: the best plan so far. at the goal, no finite energy, outside
-    # the workspace: do nothing
+    # the workspace, uniform frame (a camera's image has no contrast), frozen frame (it is the last one, although the
+    # robot has moved): do nothing
     why: Why
-    energy_now: float  # of the current image, if nothing changed: to compare with the plan's
+    energy_now: float  # of the current image, if nothing changed: to compare with the plan's; NaN of an unusable frame
     goals: tuple[int, ...]  # index of the goal that applies now, and after each model step of a plan
     progress: GoalProgress  # which goal that is, since when, and why it changed
     plan: Plan | None = None  # None if the goal is reached, or the robot is outside the workspace
@@ -115,6 +122,8 @@ class Controller:
         self._searched: dict[GripperMode | None, SearchSpace] = {None: self.space}
         self._goals: tuple[SubGoal, ...] = ()
         self._seen: list[Seen] = []  # the newest `planning.context`
+        self._cameras: tuple[CameraFrame, ...] = ()
+        self._progress: GoalProgress | None = None  # at the last usable frame
         self._done = 0
         self.decision: Decision | None = None  # the last one
 
@@ -204,7 +213,13 @@ class Controller:
         """
         self.follow(timed(goals, durations), mask=mask)
 
-    def follow(self, goals: Sequence[SubGoal], *, mask: np.ndarray | None = None) -> None:
+    def follow(
+        self,
+        goals: Sequence[SubGoal],
+        *,
+        mask: np.ndarray | None = None,
+        cancelled: Cancelled = lambda: False,
+    ) -> None:
         """Set goals that take their turns by their own rules, and forget all observations.
 
         A goal gives way to the next one after its `at_least` steps at the earliest and its `at_most` at the latest, in
@@ -215,8 +230,10 @@ class Controller:
         Args:
             goals: In order; images of one size.
             mask: As of `reset`.
+            cancelled: Asked before each goal is encoded.
 
         Raises:
+            SearchCancelledError: It was cancelled; the goals of before apply.
             InputError: An image is invalid, sizes differ, the mask is empty, a goal would never end, the last one has a
                 bound, or a gripper mode is given for a robot whose states are vectors, or leaves nothing to plan.
             ValueError: No goals.
@@ -225,13 +242,18 @@ class Controller:
             raise ValueError("no goal")
         for place, goal in enumerate(goals):
             require_image(goal.image, where=f"goal {place}", like=goals[0].image if place else None)
+            self.require_contrast(goal.image, where=f"goal {place}")
         ruled = with_shares(goals, self.config.goals)
         searched = {goal.gripper: self._space_with(goal.gripper) for goal in goals} | {None: self._searched[None]}
-        latents = torch.stack([self.encoded(goal.image) for goal in goals])
+        latents = []
+        for goal in goals:
+            if cancelled():
+                raise SearchCancelledError
+            latents.append(self.encoded(goal.image))
         weights = self._weights(mask, goals[0].image)
-        self._goals, self._goal_latents, self._patch_weights = ruled, latents, weights
+        self._goals, self._goal_latents, self._patch_weights = ruled, torch.stack(latents), weights
         self._searched, self.space = searched, searched[None]
-        self._seen, self._done, self.decision = [], 0, None
+        self._seen, self._cameras, self._progress, self._done, self.decision = [], (), None, 0, None
 
     def act(
         self,
@@ -261,13 +283,33 @@ class Controller:
             SearchCancelledError: It was cancelled. After any error nothing has changed.
             ValueError: No goal was set.
         """
-        seen = self._with(frame, state)
-        decision = self._decided(seen, samples, cancelled)
-        self._seen, self._done, self.decision = seen, self._done + 1, decision  # after an error nothing has changed
+        state = self._checked(frame, state)
+        cameras = newest_frames(split_views(frame[None], self.config.views), state, self._cameras)
+        why = self._why_unusable(frame, cameras, state)
+        if why is None:
+            seen = self._with(frame, state)
+            decision = self._decided(seen, samples, cancelled)
+            self._progress = decision.progress
+        else:  # the context begins again: it would not be frames that are a model step apart
+            seen, decision = [], self._unusable(state, why)
+        self._seen, self._cameras = seen, cameras  # after an error nothing has changed
+        self._done, self.decision = self._done + 1, decision
         return decision.action
 
+    @property
+    def num_decisions(self) -> int:
+        """Decisions since the goals were set."""
+        return self._done
+
     @torch.no_grad()
-    def score(self, frame: np.ndarray, state: np.ndarray, chunks: Float[np.ndarray, "chunks steps dim"]) -> ChunkScores:
+    def score(
+        self,
+        frame: np.ndarray,
+        state: np.ndarray,
+        chunks: Float[np.ndarray, "chunks steps dim"],
+        *,
+        cancelled: Cancelled = lambda: False,
+    ) -> ChunkScores:
         """Return the energy of what somebody else would do, beside doing nothing, towards the goal that applies now.
 
         Nothing is remembered, and nothing is planned. Limits do not apply: of a chunk that leaves them the model may
@@ -277,30 +319,66 @@ class Controller:
             frame: As of `act`.
             state: As of `act`.
             chunks: Changes of each model step (`planning.chunks.changes_of_chunks`), any number of steps.
+            cancelled: Asked after every `planning.energy.samples_at_once` chunks.
 
         Raises:
-            InputError: As of `act`; or the chunks have another shape.
+            InputError: As of `act`; or the frame has no contrast, or the chunks have another shape.
+            SearchCancelledError: It was cancelled.
             ValueError: No goal was set.
         """
+        state = self._checked(frame, state)
+        self.require_contrast(frame, where="frame")
         seen = self._with(frame, state)
         if chunks.ndim != 3 or 0 in chunks.shape or chunks.shape[2] != self.space.dim:
             needed = f"chunks x model steps x {self.space.dim}"
             raise InputError(where="chunks", found=f"an array of the shape {chunks.shape}", needed=needed)
         progress = self._progressed(seen[-1][0])
         still, _ = self._still(seen[-1][0], progress, chunks.shape[1])
-        energies = self._cost(seen, progress)(
-            torch.from_numpy(np.concatenate([np.zeros_like(chunks[:1]), chunks])).float()
-        ).double()
+        cost = self._cost(seen, progress)
+        cost.progress = until_cancelled(cancelled)
+        energies = cost(torch.from_numpy(np.concatenate([np.zeros_like(chunks[:1]), chunks])).float()).double()
         return ChunkScores(energies[1:].numpy(), float(energies[0]), self._over_steps(still), progress.place)
 
-    def _with(self, frame: np.ndarray, state: np.ndarray) -> list[Seen]:
-        """Return what the model sees at a decision: the present, and what is remembered."""
+    def require_contrast(self, image: UInt8[np.ndarray, "height width 3"], *, where: str) -> None:
+        """Refuse an image in which one of the cameras shows nothing; see `camera_check.is_uniform`.
+
+        Raises:
+            InputError: One is uniform.
+        """
+        require_contrast(self._shown(image), where=where)
+
+    def _checked(self, frame: np.ndarray, state: np.ndarray) -> Float[np.ndarray, " dim"]:
+        """Return the measured state; refuse a frame or a state that cannot be used, and a controller without a goal."""
         if not self._goals:
             raise ValueError("no goal: call reset first")
         require_image(frame, where="frame", like=self._goals[0].image)
         state = self._known(np.asarray(state, dtype=np.float64))
         self.spaces.state.require_state(state, "state")
+        return state
+
+    def _with(self, frame: np.ndarray, state: np.ndarray) -> list[Seen]:
+        """Return what the model sees at a decision: the present, and what is remembered."""
         return [*self._seen, (self.encoded(frame), state)][-self.config.context :]
+
+    def _shown(self, image: np.ndarray) -> UInt8[np.ndarray, "views height width 3"]:
+        """Return the part of each camera's image that the model receives, without the bars of a letterbox."""
+        views = split_views(image[None], self.config.views)
+        return views if self.crop == "letterbox" else view(views, self.crop)
+
+    def _why_unusable(self, frame: np.ndarray, cameras: Sequence[CameraFrame], state: np.ndarray) -> Unusable | None:
+        """Return why a frame must not move the robot: one unusable camera of several is enough. None: it may."""
+        if any(map(is_uniform, self._shown(frame))):
+            return "uniform frame"
+        largest = self.space.upper[0].double().numpy()
+        if any(has_moved(camera.state, state, self.spaces.state, largest) for camera in cameras):
+            return "frozen frame"
+        return None
+
+    def _unusable(self, state: np.ndarray, why: Unusable) -> Decision:
+        """Return the decision to do nothing; goals make no progress, since the frame shows nothing about them."""
+        progress = self._progress or GoalProgress(0, 0, math.nan)
+        places, command = (progress.place,) * self.space.steps, self._command(state, np.zeros(len(state)))
+        return Decision(command, why, math.nan, places, replace(progress, changed=""), done=progress.done)
 
     def _known(self, state: np.ndarray) -> np.ndarray:
         """Return the state; zeros for a vector of another width than an action's, if the model takes no states."""
@@ -322,9 +400,9 @@ class Controller:
         def energy(place: int) -> float:
             return float(distance(latents, self._goal_latents[place], self._energy, self._patch_weights))
 
-        if self.decision is None:
+        if self._progress is None:
             return GoalProgress(0, 0, energy(0))
-        return self.decision.progress.after(self._goals, self._done, energy)
+        return self._progress.after(self._goals, self._done, energy)
 
     def _goal_from(self, place: int) -> Goal:
         """Return a goal and what follows it by count at the latest, for plans of several steps."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from pydantic import ConfigDict, Field
 
 from vjepa2_ac.config.planning import GoalsConfig
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.media.camera_check import require_contrast
 from vjepa2_ac.media.images import encode_png, read_image, require_image
 from vjepa2_ac.storage.files import folder_writer
 from vjepa2_ac.storage.structured import json_text, read_json_object, record_of
@@ -219,19 +221,37 @@ def read_goal_folder(folder: Path) -> GoalFolder:
     """Return the goals of a folder, and what it says about them.
 
     Raises:
-        InputError: There is no goals.json, it says something else, or a file is no image of the first one's size.
+        InputError: There is no goals.json, it says something else, or a file is not in the folder, has no contrast, or
+            is no image of the first one's size.
     """
     path, needed = folder / GOALS_FILE, f"the {GOALS_FILE} that `vjepa2-ac goals` writes"
     found = record_of(_GoalsFile, read_json_object(path, needed=needed), where=str(path), needed=needed)
     goals: list[SubGoal] = []
     for place, entry in enumerate(found.goals, start=1):
-        image = read_image(folder / entry.file)
-        require_image(image, where=str(folder / entry.file), like=goals[0].image if goals else None)
+        image_path = _path_of(entry, folder, where=f"{path}: goal {place}")
+        image = read_image(image_path)
+        require_image(image, where=str(image_path), like=goals[0].image if goals else None)
+        require_contrast([image], where=str(image_path))
         try:
             goals.append(SubGoal(image, entry.name, entry.at_least, entry.at_most, entry.share, entry.gripper))
         except InputError as error:
             raise InputError(where=f"{path}: goal {place}", found=error.found, needed=error.needed) from None
     return GoalFolder(tuple(goals), found.noise, tuple(entry.began for entry in found.goals))
+
+
+def _path_of(entry: GoalEntry, folder: Path, *, where: str) -> Path:
+    """Return the path of a goal's image, which is in the folder: goals.json may be a third party's.
+
+    Raises:
+        InputError: The path leads out of the folder, or has control characters.
+    """
+    name, root = Path(entry.file), os.path.realpath(folder)
+    is_local = entry.file.isprintable() and not name.is_absolute() and ".." not in name.parts
+    if not is_local or not Path(os.path.realpath(folder / name)).is_relative_to(root):  # a link may lead out of it
+        raise InputError(
+            where=where, found=f"the file {entry.file!r}", needed="a printable path to a file in the folder"
+        )
+    return folder / name
 
 
 def write_goals(

@@ -49,6 +49,17 @@ class ReportingCost(Cost, Protocol):
     progress: Progress  # called after each part with the action sequences so far, and all of the call
 
 
+def until_cancelled(cancelled: Cancelled, progress: Progress = no_progress) -> Progress:
+    """Return a progress that raises `SearchCancelledError` in what reports to it, once that is cancelled."""
+
+    def report(done: int, total: int) -> None:
+        if cancelled():
+            raise SearchCancelledError
+        progress(done, total)
+
+    return report
+
+
 @contextmanager
 def reporting(cost: Cost, progress: Progress, *, done: int, share: int, total: int) -> Iterator[None]:
     """Report the progress of the one evaluation within a `with` block: its parts, if the cost says so, and its end.
@@ -166,7 +177,7 @@ class Planner:
             cost: The cost of action sequences. Called without gradients except by planner gradient.
             generator: On the CPU; the same seed gives the same plan. Its initial seed is recorded.
             start: Left by an earlier plan (`Plan.start_after`).
-            cancelled: Asked before every iteration.
+            cancelled: Asked before every iteration, and after each part that the cost reports.
             space: The allowed actions, as many as usual; None: those of the planner.
 
         Raises:
@@ -183,7 +194,8 @@ class Planner:
             if cancelled():
                 raise SearchCancelledError
             done, share = sum(shares[: len(record)]), shares[len(record)]
-            with reporting(cost, self.progress, done=done, share=share, total=total):
+            watched = until_cancelled(cancelled, self.progress)
+            with reporting(cost, watched, done=done, share=share, total=total):
                 record.append(self._iterate(search, cost, space))
         stopped: Stopped = "finished" if len(record) == len(shares) else "out of time"
         actions, energy, evaluated = _chosen(search.result(), record, cost, space, lowest=stopped == "out of time")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 from collections.abc import Sequence
@@ -13,19 +12,21 @@ from typing import Annotated
 from pydantic import Field
 
 from vjepa2_ac.config import Config, DataConfig
-from vjepa2_ac.config.loading import load_config_of_run, parse_config
+from vjepa2_ac.config.loading import load_config, parse_config
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.config.section import Affects, mark_of
 from vjepa2_ac.data.windows import require_stride
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.runs.folder import CHANGES, CONFIG, is_run
+from vjepa2_ac.runs.folder import CHANGES, MOVABLE, is_of_moved, is_run, read_run_config
 from vjepa2_ac.spaces import POSE, REACH_M, vector_states
-from vjepa2_ac.storage.places import literal
 from vjepa2_ac.storage.structured import read_json_object, record_of
 
 logger = logging.getLogger(__name__)
 
-USED = ("planning.…", "seed", "data.stride", "data.crop", "model.sizes.…", "model.dtype", "training.device")
+USED = (
+    "planning.…", "seed", "data.stride", "data.crop", "model.sizes.…", "model.dtype", "model.encoder_weights",
+    "training.device", *MOVABLE,
+)  # fmt: skip
 _ANY_TYPE = "training.precision=bf16"  # of autocast, which planning does without: weights may be of any type beside it
 _SLACK = 1.1  # uniform motion has its 99th percentile below its limit, and that of some episodes is not exact
 
@@ -44,32 +45,34 @@ def planning_settings(
     Raises:
         InputError: A setting is wrong or does not matter.
     """
-    _require_relevant(overrides)
+    _require_relevant(subject, overrides)
     if is_run(subject):
         if config is not None:
             found, fix = f"{subject}, a run, which has a config of its own", "Change single settings by key=value"
             raise InputError(where=f"--config {config}", found=found, fix=fix)
         folder = Path(subject)
-        moved = f"run_dir={json.dumps(literal(folder))}"
-        its = load_config_of_run(folder / CONFIG, [*overrides, moved, _ANY_TYPE])
-        its = with_taught_limits(its, folder)
+        its = with_taught_limits(read_run_config(folder, [*overrides, _ANY_TYPE]), folder)
     elif config is None:
         plain = {"run_dir": "none", "data": {"path": "none"}, "model": {"base": subject, "dtype": dtype}}
         its = parse_config(plain, overrides, where="overrides")
     else:
-        its = load_config_of_run(config, [*overrides, _ANY_TYPE])
+        its = load_config(config, [*overrides, _ANY_TYPE])
         its = its.model_copy(update={"model": its.model.with_base(subject)})
     require_limits(its)
     require_axes(its)
     return its
 
 
-def _require_relevant(overrides: Sequence[str]) -> None:
+def _require_relevant(subject: str, overrides: Sequence[str]) -> None:
     for override in overrides:
+        key = override.partition("=")[0]
         try:
-            is_relevant = Affects.PLAN in mark_of(override.partition("=")[0], Config)
+            is_relevant = Affects.PLAN in mark_of(key, Config)
         except KeyError:  # the config says what is wrong
             continue
+        if is_of_moved(override) and not is_run(subject):
+            found = f"{subject}, which is not the folder of a run"
+            raise InputError(where=f"override {override}", found=found, needed="a run, whose base was moved")
         if not is_relevant:
             found = "a setting that planning does not use"
             raise InputError(where=f"override {override}", found=found, needed=f"one of {', '.join(USED)}")

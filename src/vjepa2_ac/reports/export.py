@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shutil
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
 from typing import Literal
@@ -15,7 +16,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 from vjepa2_ac import __version__
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_yaml
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, escaped
 from vjepa2_ac.evaluation.result import Row
 from vjepa2_ac.model.adapter.adapter_folder import ADAPTER_FILE
 from vjepa2_ac.model.adapter.lora import merge_adapter, trainable_report
@@ -25,8 +26,7 @@ from vjepa2_ac.model.network.world_model import widths_as_text, widths_of_model
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, Metrics, read_metrics
 from vjepa2_ac.reports.write import PLOT
 from vjepa2_ac.runs.checkpoint import ADAPTER, SELECTED, read_state, write_torch
-from vjepa2_ac.runs.folder import read_run_config
-from vjepa2_ac.runs.loading import TrainedRun, load_run
+from vjepa2_ac.runs.loading import TrainedRun, load_run, run_config_of
 from vjepa2_ac.storage import atomic_writer, folder_writer, is_empty, try_writing_at, user_can_write, write_atomically
 
 Form = Literal["merged", "official", "hub"]
@@ -43,7 +43,13 @@ class Exported:
     checkpoint: str  # the one it was made from, as text
 
 
-def export_run(folder: Path, destination: Path, form: Form = "merged", checkpoint: str = SELECTED) -> Exported:
+def export_run(
+    folder: Path,
+    destination: Path,
+    form: Form = "merged",
+    checkpoint: str = SELECTED,
+    overrides: Iterable[str] = (),
+) -> Exported:
     """Export a trained run, atomically.
 
     An adapter is merged in float32, then cast to the type of the base's weights (`model.dtype`).
@@ -54,6 +60,7 @@ def export_run(folder: Path, destination: Path, form: Form = "merged", checkpoin
         form: merged: the model as a folder, which `model.base` takes. official: one `.pt` with Meta's names, q, k
             and v fused, for the official code. hub: the adapter in PEFT's format with a model card, ready to upload.
         checkpoint: selected (the best, else the newest), newest, best, or a number of optimizer steps.
+        overrides: Where the base or the encoder was moved, as `api.load_run` takes them.
 
     Raises:
         InputError: As `load_run`; the destination is occupied or cannot be written; official: Meta's code has no such
@@ -61,13 +68,14 @@ def export_run(folder: Path, destination: Path, form: Form = "merged", checkpoin
             finite, whatever the form.
     """
     _check_free(destination, form)
-    kind = read_run_config(folder).adapter.kind
+    config = run_config_of(folder, overrides)
+    kind = config.adapter.kind
     if form == "hub" and kind != "lora":
         found, needed = f"a run without an adapter (adapter.kind: {kind})", "adapter.kind: lora, for --to hub"
         fix = "Export the whole model with --to merged or --to official"
         raise InputError(where=str(folder), found=found, needed=needed, fix=fix)
     metrics = read_metrics(folder) if form == "hub" and (folder / METRICS_FILE).exists() else None
-    run = load_run(folder, checkpoint)
+    run = load_run(folder, checkpoint, config)
     card = _card(run, folder, metrics) if form == "hub" else ""
     merge_adapter(run.world_model)  # also for the Hub: an adapter that makes it not finite is of no use
     require_finite(
@@ -114,7 +122,7 @@ def _write_hub(run: TrainedRun, folder: Path, destination: Path, card: str, metr
 
 def _card(run: TrainedRun, folder: Path, metrics: Metrics | None) -> str:
     """Return the README.md of an adapter, in Markdown, with the Hub's front matter."""
-    config, model, name = run.config, run.world_model, folder.resolve().name
+    config, model, name = run.config, run.world_model, escaped(folder.resolve().name)
     environment = Environment(  # Markdown is not escaped
         loader=PackageLoader("vjepa2_ac", "assets"),
         undefined=StrictUndefined,
@@ -122,7 +130,8 @@ def _card(run: TrainedRun, folder: Path, metrics: Metrics | None) -> str:
         trim_blocks=True,
         keep_trailing_newline=True,
     )
-    environment.filters |= {"code": lambda name: f"`{name}`", "count": _count, "ratio": _ratio}
+    code = lambda name: f"`{escaped(str(name)).replace('`', '_')}`"  # noqa: E731 - names are no markup in a span of code
+    environment.filters |= {"code": code, "count": _count, "ratio": _ratio}
     measured = None if metrics is None else _measured(metrics)
     front = ModelCardData(
         library_name="peft",
@@ -136,7 +145,7 @@ def _card(run: TrainedRun, folder: Path, metrics: Metrics | None) -> str:
         run=run,
         name=name,
         evaluation=metrics,
-        answer=None if metrics is None else replace(metrics.answer, subject=folder.resolve().name),
+        answer=None if metrics is None else replace(metrics.answer, subject=name),
         measured=measured,
         plot=PLOT if metrics is not None and (folder / PLOT).is_file() else None,
         base=model.adaptation,

@@ -14,11 +14,11 @@ from typing import Any, Literal
 from pydantic import TypeAdapter, ValidationError
 from pydantic_core import to_jsonable_python
 
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, MissingFileError, shell_command
 from vjepa2_ac.evaluation.answer import Answer, answer
 from vjepa2_ac.evaluation.request import SCORED
 from vjepa2_ac.evaluation.result import L1, Evaluation, Row, WrittenAbout
-from vjepa2_ac.storage import write_atomically
+from vjepa2_ac.storage import user_can_read, write_atomically
 from vjepa2_ac.storage.structured import json_text
 
 METRICS_FILE = "metrics.json"
@@ -79,18 +79,19 @@ def read_metrics(folder: Path) -> Metrics:
 
     Raises:
         InputError: There is nothing, it is damaged, or of another format.
+        UnreachableError: It cannot be read.
     """
-    path, fix = folder / METRICS_FILE, f"Write it with `vjepa2-ac evaluate {folder}`"
+    path, fix = folder / METRICS_FILE, f"Write it with `{shell_command('evaluate', folder)}`"
     try:
-        return TypeAdapter(Metrics).validate_json(path.read_bytes())
+        with user_can_read(path):
+            return TypeAdapter(Metrics).validate_json(path.read_bytes())
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"]))
         found = f"metrics that cannot be used ({place}: {first['msg']}, found {first['input']!r:.60})"
         raise InputError(where=str(path), found=found, needed=f"format {FORMAT}", fix=fix) from None
-    except OSError as error:
-        missing = f"no {METRICS_FILE}" if folder.is_dir() else "no such folder"
-        found = missing if isinstance(error, FileNotFoundError) else f"cannot be read ({error})"
+    except MissingFileError:
+        found = f"no {METRICS_FILE}" if folder.is_dir() else "no such folder"
         raise InputError(where=str(folder), found=found, fix=fix) from None
 
 

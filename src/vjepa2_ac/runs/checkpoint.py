@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import logging
 import math
+import os
 import pickle
 import re
 import shutil
@@ -22,8 +23,8 @@ from typing import Annotated, Any, BinaryIO
 from pydantic import Field
 
 from vjepa2_ac.config.section import PositiveInt
-from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage import read_bounded, sha256_of_file, sync
+from vjepa2_ac.errors import InputError, MissingFileError, shell_command
+from vjepa2_ac.storage import is_refusal, read_bounded, sha256_of_file, sync, user_can_read
 from vjepa2_ac.storage.structured import MOST_BYTES, json_object, read_json_object, record_of, shown
 
 logger = logging.getLogger(__name__)
@@ -110,10 +111,16 @@ def step_of(name: str) -> int | None:
 
 
 def listed(folder: Path) -> list[Path]:
-    """Return the checkpoints in a folder, sorted by step, complete or damaged; none if there is no folder."""
-    there = folder.iterdir() if folder.is_dir() else ()
-    found = [path for path in there if step_of(path.name) is not None and path.is_dir()]
-    return sorted(found, key=lambda path: step_of(path.name) or 0)
+    """Return the checkpoints in a folder, sorted by step, complete or damaged; none if there is no folder.
+
+    Raises:
+        OSError: The folder cannot be listed.
+    """
+    try:
+        names = [entry.name for entry in os.scandir(folder) if step_of(entry.name) is not None and entry.is_dir()]
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+    return [folder / name for name in sorted(names, key=lambda name: step_of(name) or 0)]
 
 
 def remove_leavings(folder: Path) -> None:
@@ -134,10 +141,16 @@ def write_checkpoint(folder: Path, state: RunState, write_files: Callable[[Path]
         keep: How many of the newest checkpoints stay; that of `state.best_step` stays, too.
 
     Raises:
-        InputError: The folder cannot be written (full disk, no permission). Older checkpoints are not changed.
+        InputError: The folder cannot be written (full disk, no permission), or has a complete checkpoint of this or a
+            later step, which another process wrote. Older checkpoints are not changed.
+        UnreachableError: It has one of such a step that cannot be read.
     """
     final = folder / checkpoint_name(state.step)
     temporary = folder / f"{_WRITING}{final.name}"
+    damaged = [path for path in listed(folder) if (step_of(path.name) or 0) >= state.step]  # skipped at the start
+    if complete := [path for path in damaged if find_damage(path) is None]:
+        found = "a complete checkpoint that another process wrote; it is left as it is"
+        raise InputError(where=str(complete[0]), found=found, fix="Start again: the run resumes from this checkpoint")
     try:
         remove_leavings(folder)  # they occupy space
         shutil.rmtree(temporary, ignore_errors=True)
@@ -145,9 +158,8 @@ def write_checkpoint(folder: Path, state: RunState, write_files: Callable[[Path]
         write_files(temporary)
         (temporary / STATE).write_text(json.dumps(asdict(state)))
         write_manifest(temporary)
-        for stale in listed(folder):  # damaged ones that were skipped; their steps are being repeated
-            if (step_of(stale.name) or 0) >= state.step:
-                _remove(stale)
+        for path in damaged:
+            _remove(path)
         temporary.rename(final)
         sync(folder)
         for old in listed(folder)[:-keep]:
@@ -166,32 +178,40 @@ def newest_checkpoint(folder: Path) -> Path | None:
 
     Raises:
         InputError: There are checkpoints, and all are damaged.
+        UnreachableError: The newest one that is not known to be damaged cannot be read.
     """
     found = listed(folder)
     for path in reversed(found):
         problem = find_damage(path)
         if problem is None:
             return path
-        logger.warning("%s: %s; passed over", path, problem)
+        logger.warning("%s: %s; this checkpoint is skipped", path, problem)
     if found:
-        damaged, fix = f"none of {len(found)} checkpoints is whole", "To start the run anew, delete this folder"
+        damaged, fix = f"all {len(found)} checkpoints are damaged", "To start again from step 0, delete this folder"
         raise InputError(where=str(folder), found=damaged, fix=fix)
     return None
 
 
 def find_damage(checkpoint: Path) -> str | None:
-    """Return what is wrong with a checkpoint, or None if every file matches the manifest."""
+    """Return what is wrong with a checkpoint, or None if every file matches the manifest.
+
+    Raises:
+        UnreachableError: A file cannot be read, which does not show that it is damaged.
+    """
+    name = MANIFEST
     try:
-        files = named_files(read_bounded(checkpoint / MANIFEST, MOST_BYTES))
+        with user_can_read(checkpoint / MANIFEST):
+            files = named_files(read_bounded(checkpoint / MANIFEST, MOST_BYTES))
         if STATE not in files:
             return f"{MANIFEST} does not name {STATE}"
         for name, digest in files.items():
-            if not (checkpoint / name).is_file():
-                return f"{name} is missing"
-            if sha256_of_file(checkpoint / name) != digest:
-                return f"{name} is damaged (its SHA-256 is not the manifest's)"
-    except (InputError, OSError) as error:
-        return f"no readable {MANIFEST} ({error})"
+            with user_can_read(checkpoint / name):
+                if sha256_of_file(checkpoint / name) != digest:
+                    return f"{name} is damaged (its SHA-256 is not the manifest's)"
+    except MissingFileError:
+        return f"{name} is missing"
+    except InputError as error:
+        return f"{name} is damaged ({error.found})"
     return None
 
 
@@ -279,18 +299,23 @@ def read_torch(path: Path) -> Any:
     """Return the tensors and plain values of a file, on the CPU. Nothing in it is executed.
 
     Raises:
-        InputError: The file cannot be read, or contains more than tensors and plain values.
+        InputError: The file is missing, damaged, or contains more than tensors and plain values.
+        UnreachableError: It cannot be read.
     """
     import torch
 
-    try:
-        _require_as_written(path)
-        return torch.load(path, weights_only=True, map_location="cpu")
-    except Exception as error:  # of a damaged file torch raises anything
-        found = f"cannot be read ({error})"
-        if isinstance(error, pickle.UnpicklingError):
-            found = "more than tensors and plain values: such a file can run foreign code"
-        raise InputError(where=str(path), found=found, needed="a file that this program wrote") from None
+    needed = "a file that this program wrote"
+    with user_can_read(path, needed=needed):
+        try:
+            _require_as_written(path)
+            return torch.load(path, weights_only=True, map_location="cpu")
+        except Exception as error:  # of a damaged file torch raises anything
+            if is_refusal(error):
+                raise
+            found = f"cannot be read ({error})"
+            if isinstance(error, pickle.UnpicklingError):
+                found = "more than tensors and plain values: such a file can run foreign code"
+            raise InputError(where=str(path), found=found, needed=needed) from None
 
 
 def _require_as_written(path: Path) -> None:
@@ -334,7 +359,7 @@ def select_checkpoint(run: Path, by: str = SELECTED) -> SelectedCheckpoint:
     folder = run / CHECKPOINTS
     newest = newest_checkpoint(folder)
     if newest is None:
-        fix = f"Train on with `vjepa2-ac train {run} --resume`"
+        fix = f"Continue the training with `{shell_command('train', run, '--resume')}`"
         raise InputError(where=str(run), found="a run without a whole checkpoint", needed="at least one", fix=fix)
     state = written_state(newest)
     if by == NEWEST or (by == SELECTED and state.best_step is None):

@@ -27,7 +27,7 @@ import re
 import secrets
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -36,9 +36,9 @@ from filelock import FileLock, Timeout
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import changed_keys, config_as_flat_dict, config_as_yaml, load_config_of_run
 from vjepa2_ac.config.section import Affects, mark_of
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, shell_command
 from vjepa2_ac.runs.checkpoint import CHECKPOINTS, remove_leavings
-from vjepa2_ac.storage import read_bounded, try_writing_at, user_can_write, write_atomically
+from vjepa2_ac.storage import read_bounded, try_writing_at, user_can_read, user_can_write, write_atomically
 from vjepa2_ac.storage.places import BUILTIN, is_url, literal
 from vjepa2_ac.storage.structured import MOST_BYTES, json_list, shown, utc_now
 
@@ -61,11 +61,8 @@ NOT_FINITE = "not_finite"  # each process writes its own, on the disk that it se
 
 _NO_LOCKS = frozenset({errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS})
 _OF_DATA = ("path", "idle.ranges", "cache_dir", "disk_cache.dir")
-_PATHS = (
-    *(f"{data}.{key}" for data in ("data", "replay.data") for key in _OF_DATA),
-    "model.base",
-    "model.encoder.path",
-)
+MOVABLE = ("model.base", "model.encoder.path")  # the weights there are recognised by their fingerprint
+_PATHS = (*(f"{data}.{key}" for data in ("data", "replay.data") for key in _OF_DATA), *MOVABLE)
 
 
 def check_run_folder(config: Config, *, allow_config_change: bool = False) -> None:
@@ -85,7 +82,7 @@ def check_run_folder(config: Config, *, allow_config_change: bool = False) -> No
         changed = [] if allow_config_change else changed_keys(read_run_config(folder), config)
         if differing := [key for key in changed if Affects.RUN in mark_of(key, Config)]:
             found = f"a run of another config; it differs in {', '.join(differing)}"
-            same = f"Set another run_dir for a new run, or go on with `vjepa2-ac train {folder} --resume`"
+            same = f"Set another run_dir for a new run, or resume with `{shell_command('train', folder, '--resume')}`"
             fix = f"{same}; where the change is meant, add --allow-config-change"
             raise InputError(where=str(folder), found=found, needed="the same config, to go on with it", fix=fix)
     elif folder.exists() and not all(_is_without_config(path) for path in folder.iterdir()):
@@ -102,7 +99,7 @@ def open_run_folder(config: Config, run_name: str, *, allow_config_change: bool 
     Args:
         config: The run.
         run_name: What `run_id` gave, or a checkpoint from elsewhere.
-        allow_config_change: Go on with this config where the folder has another, and note what changed with this start.
+        allow_config_change: Resume with this config where the folder has another one.
 
     Raises:
         InputError: As `check_run_folder`.
@@ -110,13 +107,8 @@ def open_run_folder(config: Config, run_name: str, *, allow_config_change: bool 
     check_run_folder(config, allow_config_change=allow_config_change)
     folder = Path(config.run_dir)
     start = {"seed": config.seed, "folder": str(Path.cwd()), **environment()}
-    if (changes := config_changes(config)) and allow_config_change:
+    if changes := write_run_config(config):  # the first of all files: it makes the folder a run's
         start["config_changes"] = changes
-    is_new = not (folder / CONFIG).exists()
-    before = [] if is_new else [data.path for data in read_run_config(folder).data_sets]
-    if allow_config_change or before != [data.path for data in config.data_sets]:  # new, or the data were moved
-        # First of all files: it makes the folder a run's.
-        write_atomically(folder / CONFIG, config_as_yaml(config).encode())
     path = folder / ENVIRONMENT
     write_atomically(path, json.dumps([*_earlier_starts(path), start], indent=1).encode())
     write_atomically(folder / RUN_ID, run_name)
@@ -141,6 +133,23 @@ def run_id(folder: Path) -> str:
     return name
 
 
+def write_run_config(config: Config) -> list[str]:
+    """Write the config of this start into the run's folder if it differs, and return what changed since the last one.
+
+    `train RUN --resume` reads it: a setting that was used for one start holds for the next.
+    """
+    path, changes = Path(config.run_dir, CONFIG), config_changes(config)
+    if changes or not path.exists():
+        write_atomically(path, config_as_yaml(config).encode())
+    return changes
+
+
+def asks_nothing_new(config: Config) -> bool:
+    """Return whether a config leaves as they are what its run computes, what it measures, and where it reads."""
+    changed = changed_keys(read_run_config(Path(config.run_dir)), config)
+    return not any(key in _PATHS or (Affects.RUN | Affects.MEASURED) & mark_of(key, Config) for key in changed)
+
+
 def config_changes(config: Config) -> list[str]:
     """Return a line per setting in which a config differs from that of the run in its folder: key, old, new value."""
     folder = Path(config.run_dir)
@@ -152,22 +161,31 @@ def config_changes(config: Config) -> list[str]:
     return [f"{key}: {json.dumps(before.get(key))} -> {json.dumps(now.get(key))}" for key in keys]
 
 
+def is_of_moved(override: str) -> bool:
+    """Return whether a `key=value` gives the path of weights that may have been moved."""
+    return override.partition("=")[0] in MOVABLE
+
+
 def is_run(subject: str) -> bool:
     """Return whether this is the folder of a run; otherwise it names a model."""
     return (Path(subject) / CONFIG).is_file()
 
 
-def read_run_config(folder: Path) -> Config:
+def read_run_config(folder: Path, overrides: Iterable[str] = ()) -> Config:
     """Return the config of a run; relative paths that do not exist here as seen from where the run was started.
 
+    Args:
+        folder: The run's folder.
+        overrides: Such as checkpoint.keep=3.
+
     Raises:
-        InputError: Not the folder of a run.
+        InputError: Not the folder of a run, or an override is wrong.
     """
     if not (folder / CONFIG).is_file():
         found = "no config.yaml" if folder.is_dir() else "no such folder"
         needed = "the folder of a run, which `vjepa2-ac train CONFIG` makes"
         raise InputError(where=str(folder), found=found, needed=needed)
-    overrides = [f"run_dir={json.dumps(literal(folder))}"]
+    overrides = [*overrides, f"run_dir={json.dumps(literal(folder))}"]
     config = load_config_of_run(folder / CONFIG, overrides)
     moved = [f"{key}={json.dumps(path)}" for key, path in _seen_from_start(config, folder)]
     return load_config_of_run(folder / CONFIG, [*overrides, *moved]) if moved else config
@@ -219,8 +237,9 @@ def _is_without_config(path: Path) -> bool:
 
 def _earlier_starts(path: str | Path) -> list[dict[str, Any]]:
     try:
-        starts = json_list(read_bounded(path, MOST_BYTES), where=str(path))
-    except (OSError, InputError):
+        with user_can_read(path):
+            starts = json_list(read_bounded(path, MOST_BYTES), where=str(path))
+    except InputError:  # there is none, or it is damaged
         return []
     return [start for start in starts if isinstance(start, dict)]
 

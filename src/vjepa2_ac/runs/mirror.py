@@ -151,13 +151,14 @@ class RemoteCheckpoints:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         try:
-            manifest = storage.read_bounded(self._path(name, MANIFEST), MOST_BYTES)
+            with storage.user_can_read(source := self._path(name, MANIFEST)):
+                manifest = storage.read_bounded(source, MOST_BYTES)
             for path in named_files(manifest):
                 storage.download(self._path(name, path), folder / path)
         except FileNotFoundError as error:
             return f"a file is missing ({error})"
         except InputError as error:
-            return f"no readable {MANIFEST} ({error.found})"
+            return f"{MANIFEST} is damaged ({error.found})"
         (folder / MANIFEST).write_bytes(manifest)
         return find_damage(folder)
 
@@ -205,8 +206,7 @@ def open_remote(
         raise InputError(where=_KNOB, found=found, needed=needed, fix=fix)
     remote, (step, run_id) = RemoteCheckpoints(place), _where_this_machine_stands(run_dir)
     try:
-        listing = _tried(remote)
-        owner = remote.owner(listing, run_id)
+        listing, owner = _tried(remote, run_id)
     except UnreachableError as error:
         stand = "without a checkpoint" if step is None else f"after step {step}"
         text = "%s: %s. Training begins with what is on this machine, %s, and tries again later"
@@ -225,7 +225,7 @@ def open_remote(
             lock.take()
         is_fetched = _fetch_newest(remote, further, target, reporter, removes_damaged=into is None)
     except UnreachableError as error:
-        if step is None:
+        if step is None or isinstance(error, RefusedError):
             raise
         text = "%s: %s. Training goes on after step %d, though %s is there"
         logger.warning(text, _KNOB, _reason_of(error), step, further[0])
@@ -239,20 +239,21 @@ def open_remote(
     raise InputError(where=_KNOB, found=found, fix=fix)
 
 
-def _tried(remote: RemoteCheckpoints) -> Listing:
-    """Return the checkpoints at a place where a file can be written and removed.
+def _tried(remote: RemoteCheckpoints, run_id: str | None) -> tuple[Listing, str | None]:
+    """Return the checkpoints at a place where a file can be written and removed, and their run.
 
     Raises:
-        InputError: It never can.
+        InputError: It never can, they are of another run, or this user may not read them.
         UnreachableError: It cannot now.
     """
     try:
         with quietly():
             storage.try_writing(remote.place)
-            return remote.listing()
+            listing = remote.listing()
+            return listing, remote.owner(listing, run_id)
     except RefusedError as error:
         fix = f"{error.fix.rstrip('.')}. Or name another place, or leave checkpoint.remote out"
-        raise InputError(where=_KNOB, found=f"{remote.place}: {error.found}", fix=fix) from error
+        raise InputError(where=_KNOB, found=f"{error.where}: {error.found}", fix=fix) from error
 
 
 def _where_this_machine_stands(run_dir: Path) -> tuple[int | None, str | None]:
@@ -486,15 +487,19 @@ class Mirror:
         """Link a checkpoint's files into an own folder, so that training may remove them while they are sent.
 
         None is returned of one that is incomplete, or just being removed.
+
+        Raises:
+            OSError: One that is complete cannot be read.
         """
-        held = self._folder / HELD / name
+        source, held = self._folder / CHECKPOINTS / name, self._folder / HELD / name
         shutil.rmtree(held, ignore_errors=True)
         try:
-            shutil.copytree(self._folder / CHECKPOINTS / name, held, copy_function=_link)
-            files = named_files((held / MANIFEST).read_bytes())
-        except (FileNotFoundError, shutil.Error, InputError):
+            for file in (MANIFEST, *named_files(storage.read_bounded(source / MANIFEST, MOST_BYTES))):
+                (held / file).parent.mkdir(parents=True, exist_ok=True)
+                _link(source / file, held / file)
+        except (FileNotFoundError, InputError):
             return None
-        return held if all((held / file).is_file() for file in files) else None
+        return held
 
     def _release(self) -> None:
         shutil.rmtree(self._folder / HELD, ignore_errors=True)
@@ -523,7 +528,7 @@ def _step(name: str) -> int:
     return step_of(name) or 0
 
 
-def _link(source: str, target: str) -> None:
+def _link(source: Path, target: Path) -> None:
     try:
         os.link(source, target)
     except OSError:  # a file system without hard links

@@ -11,6 +11,7 @@ import numpy as np
 
 from vjepa2_ac import __version__
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.media.camera_check import require_contrast
 from vjepa2_ac.media.images import read_image, require_image
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.goals import GOALS_FILE, GoalFolder, SubGoal, read_goal_folder
@@ -124,6 +125,7 @@ def read_kept_goals(folder: Path) -> KeptGoals:
             kept[path.stem] = read_goal_folder(path)
         else:
             require_image(image := read_image(path), where=str(path))
+            require_contrast([image], where=str(path))
             kept[path.stem] = GoalFolder((SubGoal(image, name=path.stem),))
     if not kept:
         needed = f"pictures (PNG or JPEG), or folders with a {GOALS_FILE} (`vjepa2-ac goals` makes them)"

@@ -5,6 +5,8 @@ from __future__ import annotations
 import hmac
 import ipaddress
 import logging
+import re
+import shlex
 import stat
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -15,6 +17,7 @@ from vjepa2_ac.errors import InputError
 logger = logging.getLogger(__name__)
 
 LEAST_KEY = 16  # characters
+_HOST = re.compile(r"(?:\[([0-9a-f:.]+)\]|([^\[\]:]+))(?::[0-9]*)?|([0-9a-f:]+)")  # [address]:port, name:port, address
 _SCHEMES = ("api-key", "bearer")  # openpi's clients send the first one
 
 
@@ -53,13 +56,10 @@ class Access:
 
     def _is_known(self, host: str | None) -> bool:
         """Return whether a request names this server by an address, or by a name that is its own."""
-        if host is None:
+        parts = _HOST.fullmatch((host or "").strip().lower())
+        if parts is None:
             return False
-        name = host.strip().lower()
-        if name.startswith("["):
-            name = name[1:].partition("]")[0]
-        elif name.count(":") == 1:
-            name = name.partition(":")[0]
+        name = parts[1] or parts[2] or parts[3]
         own = {"localhost", self.host.lower(), *(one.lower() for one in self.names)}
         return name in own or _address(name) is not None
 
@@ -85,11 +85,11 @@ def read_key(path: Path) -> str:
     key = text.partition("\n")[0].strip()
     if len(key) < LEAST_KEY or not key.isprintable() or " " in key:
         found = f"a first line of {len(key)} characters"
-        fix = f"Make one: python -c 'import secrets; print(secrets.token_urlsafe())' > {path}"
+        fix = f"Make one: python -c 'import secrets; print(secrets.token_urlsafe())' > {shlex.quote(str(path))}"
         needed = f"a key of {LEAST_KEY} characters or more, without spaces"
         raise InputError(where=f"--key-file {path}", found=found, needed=needed, fix=fix)
     if mode & (stat.S_IRWXG | stat.S_IRWXO):
-        logger.warning("%s can be read by other users of this machine: chmod 600 %s", path, path)
+        logger.warning("%s can be read by other users of this machine: chmod 600 %s", path, shlex.quote(str(path)))
     return key
 
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import asyncio
 import signal
 import threading
-from collections.abc import Callable, Coroutine
+from collections.abc import Awaitable, Callable, Coroutine
 from typing import Any, TypeVar
 
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.serving.access import Access
 
+END_S = 2.0  # for connections and computations, when a server ends
 _Result = TypeVar("_Result")
 Handler = Callable[[Any], Coroutine[Any, Any, None]]
 
@@ -33,6 +34,12 @@ async def listen(library: Any, handler: Handler, access: Access, port: int, **ho
     except OSError as error:
         where, fix = f"{access.host}:{port}", "Choose another --host or --port; 0 takes a free one"
         raise InputError(where=where, found=f"cannot be listened on: {error.strerror or error}", fix=fix) from None
+
+
+async def ends(*ending: Awaitable[Any]) -> bool:
+    """Wait for all of them, as long as a server may take to end; return whether they are done."""
+    _, late = await asyncio.wait([asyncio.ensure_future(one) for one in ending], timeout=END_S)
+    return not late
 
 
 def url_of(server: Any, scheme: str) -> str:

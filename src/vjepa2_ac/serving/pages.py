@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
-from urllib.parse import parse_qs, quote, unquote, urlsplit
+from urllib.parse import parse_qs, quote, unquote
 
 from vjepa2_ac.serving.access import Access
 
@@ -53,15 +53,16 @@ class Page:
             request: What came over it.
             access: The rules.
         """
-        parts, host = urlsplit(request.path), single_header(request, "Host")
-        key, status = parse_qs(parts.query).get("key"), http.HTTPStatus
+        path, _, query = request.path.partition("?")
+        host, status = single_header(request, "Host"), http.HTTPStatus
+        key = parse_qs(query).get("key")
         cookie = f"vjepa2-ac-{(host or '').rpartition(':')[2]}"  # browsers share cookies among the ports of a host
         refused = access.why_not(host, _authorization(request, cookie) if key is None else f"Bearer {key[0]}")
         if refused is not None:
             hint = f"; in a browser: {self.path}?key=KEY" if refused[0] == status.UNAUTHORIZED else ""
             return connection.respond(status(refused[0]), f"{refused[1]}{hint}\n")
-        name = parts.path[len(self.path) :]
-        if key is not None or f"{parts.path}/" == self.path:
+        name = path[len(self.path) :]
+        if key is not None or f"{path}/" == self.path:
             response = connection.respond(status.SEE_OTHER, "")
             response.headers["Location"] = self.path
             if key is not None:
@@ -69,8 +70,8 @@ class Page:
                 response.headers["Set-Cookie"] = kept
             return response
         if name == SOCKET:
-            origin = urlsplit(single_header(request, "Origin") or "").netloc
-            return None if origin == host else connection.respond(status.FORBIDDEN, "not this server's page\n")
+            is_own = single_header(request, "Origin") in {f"http://{host}", f"https://{host}"}
+            return None if is_own else connection.respond(status.FORBIDDEN, "not this server's page\n")
         if name not in self.contents:
             return connection.respond(status.NOT_FOUND, "no such page\n")
         return _file(connection, name, self.contents[name])

@@ -47,7 +47,7 @@ class Recorder:
         self.folder, self._left = folder, most_bytes
         self._goals: tuple[SubGoal, ...] = ()
         self._mask: np.ndarray | None = None
-        self._episode, self._done = 0, 0
+        self._episode = 0
         self._is_on = True
         require_new_folder(folder)
         with user_can_write(folder):
@@ -56,8 +56,7 @@ class Recorder:
 
     def goal(self, goals: Sequence[SubGoal], mask: np.ndarray | None) -> None:
         """Take note of a goal, with which an episode begins."""
-        self._goals, self._mask = tuple(goals), mask
-        self._episode, self._done = self._episode + 1, 0
+        self._goals, self._mask, self._episode = tuple(goals), mask, self._episode + 1
 
     def decision(self, controller: Controller, frame: np.ndarray, state: np.ndarray, answer: Mapping[str, Any]) -> None:
         """Write down a decision that was made.
@@ -68,9 +67,9 @@ class Recorder:
             state: What was measured.
             answer: What was sent.
         """
-        number, self._done = self._done, self._done + 1
         if not self._is_on:
             return
+        number = controller.num_decisions - 1  # the controller also counts decisions that a stop kept from being sent
         try:
             line = {
                 "time": utc_now(),
@@ -94,7 +93,7 @@ class Recorder:
         if decision is None:
             raise ValueError("nothing was decided")
         if (
-            decision.why in {"out of time", "as planned"}
+            decision.why in {"out of time", "as planned", "uniform frame", "frozen frame"}
             or decision.from_samples
             or (number and (config.context > 1 or config.warm_start))
         ):

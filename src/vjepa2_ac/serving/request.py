@@ -28,7 +28,7 @@ _RULES = ("goal/durations", "goal/at_least", "goal/shares", "goal/floors", "goal
 _MODES = get_args(GripperMode)
 _ENDPOINTS = ("infer", "reset", "score")
 _CHUNKS, _FORM, _FORMS = "policy/chunks", "policy/form", get_args(ChunkForm)
-MOST_CHUNK_NUMBERS = 1_000_000  # of one request
+MOST_CHUNKS, MOST_CHUNK_STEPS = 1024, 256  # of one request; control steps of each
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,15 +92,16 @@ def read_request(message: Mapping[str, Any], image_keys: Sequence[str] = IMAGE_K
     if not isinstance(form, str) or form not in _FORMS:
         raise _wrong(_FORM, form, " or ".join(_FORMS))
     if (chunks is not None or endpoint == "score") and not _is_chunks(chunks):
-        raise _wrong(_CHUNKS, chunks, f"floats, chunks x control steps x numbers, {MOST_CHUNK_NUMBERS:,} at most")
+        needed = f"floats, up to {MOST_CHUNKS} chunks x up to {MOST_CHUNK_STEPS} control steps x numbers of a state"
+        raise _wrong(_CHUNKS, chunks, needed)
     frame, state = _image(message[key], key), _state(message)
     chunks = None if chunks is None else chunks.astype(np.float64)
     return Request(episode, reset, goal, frame, state, chunks, cast("ChunkForm", form), endpoint == "score")
 
 
 def _is_chunks(found: Any) -> bool:
-    is_array = isinstance(found, np.ndarray) and found.ndim == 3 and found.dtype.kind == "f"
-    return is_array and 0 < found.size <= MOST_CHUNK_NUMBERS
+    is_array = isinstance(found, np.ndarray) and found.ndim == 3 and found.dtype.kind == "f" and found.size > 0
+    return is_array and len(found) <= MOST_CHUNKS and found.shape[1] <= MOST_CHUNK_STEPS
 
 
 def _image(found: Any, where: str) -> np.ndarray:

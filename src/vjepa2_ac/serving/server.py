@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from vjepa2_ac.errors import require_library
 from vjepa2_ac.serving.access import Access
-from vjepa2_ac.serving.listening import listen, until_signalled, url_of
+from vjepa2_ac.serving.listening import ends, listen, until_signalled, url_of
 from vjepa2_ac.serving.pages import Page, single_header
 from vjepa2_ac.serving.session import Counts, GoneError
 from vjepa2_ac.serving.wire import MOST_BYTES, pack
@@ -24,7 +24,6 @@ from vjepa2_ac.serving.wire import MOST_BYTES, pack
 if TYPE_CHECKING:  # PyTorch is imported with the model, when the server listens
     from vjepa2_ac.serving.session import Session
 
-_END_S = 3.0  # that a decision may still take when the server ends: an iteration of its search
 _OPEN_S = 10.0  # that a handshake may take
 _WAITING = 2  # messages of a client that are read before they are answered
 
@@ -110,12 +109,11 @@ class PlanningServer:
             self._tell(f"listening on {url_of(server, 'ws' if options.certificate is None else 'wss')}")
             await self._serve(stop)
         finally:
-            server.close()
-            await server.wait_closed()
+            server.close()  # its clients are gone, which ends what is computed for them
             last = asyncio.wrap_future(self._planning.submit(int))
             self._planning.shutdown(wait=False)
-            done, _ = await asyncio.wait([last], timeout=_END_S)
-        return bool(done)
+            has_ended = await ends(server.wait_closed(), last)
+        return has_ended
 
     async def _serve(self, stop: asyncio.Event) -> None:
         loading = asyncio.wrap_future(self._planning.submit(self._load))
@@ -124,6 +122,7 @@ class PlanningServer:
         if stop.is_set():
             return
         self._served = loading.result()
+        self._served.session.counts.observe_seconds = self._seconds.observe
         if self._options.watch is not None:
             self._options.watch.begin(self._served.session, lambda: self._robot)
         self._ready.set()
@@ -219,10 +218,6 @@ class PlanningServer:
 
     def _page(self) -> str:
         """Return the metrics in Prometheus' text format."""
-        counts = self._counts
-        seconds, counts.seconds = counts.seconds, []
-        for one in seconds:
-            self._seconds.observe(one)
         return str(self._metrics.generate_latest(self._registry).decode())
 
     def collect(self) -> Iterator[Any]:

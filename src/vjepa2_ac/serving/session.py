@@ -25,7 +25,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.chunks import changes_of_chunks
 from vjepa2_ac.planning.controller import Controller, Decision
 from vjepa2_ac.planning.goals import SubGoal
-from vjepa2_ac.planning.planner import SearchCancelledError
+from vjepa2_ac.planning.planner import Cancelled, SearchCancelledError
 from vjepa2_ac.planning.search_space import Workspace, is_allowed
 from vjepa2_ac.serving.recording import Recorder
 from vjepa2_ac.serving.request import IMAGE_KEYS, GivenGoal, Request, read_request
@@ -39,7 +39,7 @@ ActionForm = Literal["delta", "pose"]
 Clock = Callable[[], float]  # seconds, from anywhere
 
 _MOST_NAMES = 20  # of goals in a message
-STOPPED = "stopped by the page"
+STOPPED, LATE = "stopped by the page", "past the deadline"
 _ALARM = "what the camera sees departs from what was predicted: look at the robot"
 _BAR = 0.05  # share of an image's height, black at the top and at the bottom: a padded image
 
@@ -66,7 +66,7 @@ class Counts:
     episodes: int = 0
     alarms: int = 0  # frames that departed from what was predicted
     surprise: float = 0.0  # of the last frame that was compared
-    seconds: list[float] = field(default_factory=list)  # of each decision since it was last read
+    observe_seconds: Callable[[float], None] = lambda _: None  # takes the duration of each decision
 
 
 class Observer(Protocol):
@@ -113,6 +113,7 @@ class Session:
         self.stopped = threading.Event()  # while it is set, every answer is an action of zeros
         self._clock = clock
         self._episode: str | None = None
+        self._has_begun = False  # whether there was an episode of this robot
         self._goal: str | None = None  # fingerprint of the present one
         self._names: tuple[str, ...] = ()  # of its parts
         self._notes: list[str] = []  # that hold for this episode
@@ -123,8 +124,7 @@ class Session:
 
     def begin(self) -> None:
         """Begin with another robot: nothing of the last one is left."""
-        self._forget(None)
-        self._last_ms = None
+        self._episode, self._has_begun, self._last_ms = None, False, None
 
     def answer(self, message: bytes, is_gone: Callable[[], bool] = lambda: False) -> bytes | str:
         """Return the answer to a message: a map, or the sentence of an error.
@@ -153,68 +153,77 @@ class Session:
         return pack(found)
 
     def _answered(self, request: Request, began: float, is_gone: Callable[[], bool]) -> dict[str, Any]:
-        if request.begins or request.episode not in (None, self._episode):
+        if request.begins or not self._has_begun or request.episode not in (None, self._episode):
             self._forget(request.episode or self._episode)
+        until = began + self.options.deadline_s
+        try:
+            return self._carried_out(request, began, lambda: is_gone() or self._clock() > until)
+        except SearchCancelledError:
+            if is_gone():
+                raise GoneError from None
+            why = STOPPED if self.stopped.is_set() else LATE
+            if request.frame is None or request.state is None or request.is_score:
+                fix = "Send fewer goals or chunks, or raise --deadline" if why == LATE else ""
+                raise InputError(where="request", found=f"no answer: {why}", fix=fix) from None
+            return self._sent(request.frame, request.state, (None, why), (began, began))
+
+    def _carried_out(self, request: Request, began: float, cancelled: Cancelled) -> dict[str, Any]:
+        """Return the answer to a request; a page that stops the robot cancels decisions and scores, too.
+
+        Raises:
+            SearchCancelledError: It was cancelled.
+        """
         if request.goal is not None and (fingerprint := request.goal.fingerprint) != self._goal:
             self._goal, self._notes = None, []  # a goal that cannot be used leaves none
-            self._set(request.goal)
+            self._set(request.goal, cancelled)
             self._goal = fingerprint
         if request.frame is None or request.state is None:
             return {"status": "reset"}
         if self._goal is None:
             needed = f"a goal first: goal/image, goal/images or goal/name{self._known_names()}"
             raise InputError(where="request", found="no goal in this episode", needed=needed)
-        changes = None
-        if request.chunks is not None:
-            changes = changes_of_chunks(
-                request.chunks,
-                request.state,
-                form=request.form,
-                control_steps=self.options.control_steps,
-                space=self.controller.spaces.state,
-            )
-            if request.is_score:
-                return self._scored(request.frame, request.state, changes)
-        return self._decided(request.frame, request.state, changes, began, is_gone)
+        changes, planning_began, is_stopped = self._changes(request), self._clock(), self.stopped.is_set
+        seen, how = (request.frame, request.state), {"cancelled": lambda: is_stopped() or cancelled()}
+        if request.is_score and changes is not None:  # nothing moves, and no decision is counted
+            found = self.controller.score(*seen, changes, **how)
+            return {**found.as_dict(is_blind=self.options.is_blind), "goal": found.goal}
+        self.controller.act(*seen, samples=changes, **how)
+        decision, why = self._checked(request.state)
+        self._note(request.frame)
+        self._watch(decision)
+        if is_stopped():
+            decision, why = replace(decision, plan=None, states=None), STOPPED
+        return self._sent(*seen, (decision, why), (began, planning_began))
 
-    def _scored(self, frame: np.ndarray, state: np.ndarray, changes: np.ndarray) -> dict[str, Any]:
-        """Return the energies of what a policy would do; nobody moves, and no decision is counted."""
-        found = self.controller.score(frame, state, changes)
-        return {**found.as_dict(is_blind=self.options.is_blind), "goal": found.goal}
+    def _changes(self, request: Request) -> Float[np.ndarray, "chunks model_steps dim"] | None:
+        """Return what a policy would do as changes of model steps."""
+        if request.chunks is None or request.state is None:
+            return None
+        steps, space = self.options.control_steps, self.controller.spaces.state
+        return changes_of_chunks(request.chunks, request.state, form=request.form, control_steps=steps, space=space)
 
-    def _decided(
+    def _sent(
         self,
         frame: np.ndarray,
         state: np.ndarray,
-        samples: np.ndarray | None,
-        began: float,
-        is_gone: Callable[[], bool],
+        decided: tuple[Decision | None, str],
+        began: tuple[float, float],
     ) -> dict[str, Any]:
-        planning_began, until = self._clock(), began + self.options.deadline_s
-        is_stopped = self.stopped.is_set
-        try:
-            self.controller.act(
-                frame, state, samples=samples, cancelled=lambda: is_gone() or is_stopped() or self._clock() > until
-            )
-        except SearchCancelledError:
-            if is_gone():
-                raise GoneError from None
-            decision, why = None, STOPPED if is_stopped() else "past the deadline"
-        else:
-            decision, why = self._checked(state)
-            self._note(frame)
-            self._watch(decision)
-            if is_stopped():
-                decision, why = replace(decision, plan=None, states=None), STOPPED
-        found = self._message(decision, state, why)
-        now = self._clock()
-        found["policy_timing"] = {"infer_ms": 1e3 * (now - planning_began)}
-        found["server_timing"] = {"infer_ms": 1e3 * (now - began)}
+        """Return the answer to a request for an action; it is counted, and told to observers.
+
+        Args:
+            frame: What the camera saw.
+            state: Measured.
+            decided: The decision, if there is one, and its reason.
+            began: When the request and its planning began.
+        """
+        found, now = self._message(decided[0], state, why := decided[1]), self._clock()
+        found["server_timing"], found["policy_timing"] = ({"infer_ms": 1e3 * (now - one)} for one in began)
         if self._last_ms is not None:
             found["server_timing"]["prev_total_ms"] = self._last_ms
         self.counts.decisions[why] += 1
-        self.counts.seconds.append(now - began)
-        if self.recorder is not None and why not in {"past the deadline", STOPPED}:
+        self.counts.observe_seconds(now - began[0])
+        if self.recorder is not None and why not in {LATE, STOPPED}:
             self.recorder.decision(self.controller, frame, state, found)
         if self.watcher is not None:
             self.watcher.decision(self.controller, frame, state, found)
@@ -269,15 +278,15 @@ class Session:
         return changes
 
     def _forget(self, episode: str | None) -> None:
-        self._episode, self._goal, self._notes = episode, None, []
+        self._episode, self._has_begun, self._goal, self._notes = episode, True, None, []
         self.counts.episodes += 1
 
-    def _set(self, goal: GivenGoal) -> None:
+    def _set(self, goal: GivenGoal, cancelled: Cancelled) -> None:
         if goal.name is not None and goal.name not in self.goals:
             needed = f"the name of one{self._known_names()}"
             raise InputError(where="goal", found=f"{goal.name!r}, which names no goal", needed=needed)
         goals = goal.goals if goal.name is None else self.goals[goal.name]
-        self.controller.follow(goals, mask=goal.mask)
+        self.controller.follow(goals, mask=goal.mask, cancelled=cancelled)
         self._names = tuple(one.name for one in goals)
         for observer in (self.recorder, self.watcher):
             if observer is not None:

@@ -22,6 +22,7 @@ MOST_ENTRIES = 64  # of a map or a list
 MOST_CHARACTERS = 4096  # of a text
 MOST_DEPTH = 6
 MOST_AXES = 4  # of an array
+_READY_S, _ANSWER_S = 600.0, 120.0  # how long a client waits: a server may be loading its model
 
 _ARRAY, _SCALAR, _DATA, _DTYPE, _SHAPE = b"__ndarray__", b"__npgeneric__", b"data", b"dtype", b"shape"
 _TYPES = frozenset({"|b1", "|u1", "|i1", "<u2", "<u4", "<u8", "<i2", "<i4", "<i8", "<f2", "<f4", "<f8"})
@@ -168,12 +169,13 @@ class PlanningClient(ExitStack):
         >>>     answer = client.infer({"observation/image": image, "observation/state": state, "goal/image": goal})
     """
 
-    def __init__(self, url: str, key: str | None = None) -> None:
+    def __init__(self, url: str, key: str | None = None, *, timeout_s: float | None = None) -> None:
         """Connect, and wait until the server is ready.
 
         Args:
             url: ws://HOST:PORT, or wss://.
             key: Of the server, if it needs one.
+            timeout_s: For an answer; None: 120 s, or twice the server's deadline if that is longer.
 
         Raises:
             UnreachableError: There is no server, or it refuses; or a library of the extra `serve` is missing.
@@ -187,23 +189,30 @@ class PlanningClient(ExitStack):
             self._connection = self.enter_context(
                 library.connect(url, compression=None, max_size=MOST_BYTES, additional_headers=headers, proxy=None)
             )
-            self.metadata = unpack(self._connection.recv())
+            self.metadata = unpack(self._connection.recv(timeout=_READY_S))
         except Exception as error:
             self.close()
             body = getattr(getattr(error, "response", None), "body", None)  # the server's words, where it refuses
             found = f"{_reason(error)}: {body.decode(errors='replace').strip()}" if body else _reason(error)
             raise UnreachableError(where=url, found=found, needed="a server (`vjepa2-ac serve`)") from None
+        deadline_s = self.metadata.get("deadline_s")
+        self._timeout_s = timeout_s or max(_ANSWER_S, 2 * deadline_s if isinstance(deadline_s, float) else 0.0)
 
     def infer(self, request: dict[str, Any]) -> dict[str, Any]:
         """Return the answer to a request (docs/serving_reference.md).
 
         Raises:
             InputError: The server refuses it.
-            UnreachableError: The connection is lost.
+            UnreachableError: The connection is lost, or there is no answer in time, which closes the connection: a late
+                answer would be taken for the answer to the next request.
         """
         try:
             self._connection.send(pack(request))
-            answer = self._connection.recv()
+            answer = self._connection.recv(timeout=self._timeout_s)
+        except TimeoutError:
+            self.close()
+            found, fix = f"no answer within {self._timeout_s:g} s", "See the server's log, and connect again"
+            raise UnreachableError(where=self.url, found=found, fix=fix) from None
         except Exception as error:
             raise UnreachableError(where=self.url, found=f"the connection is lost: {_reason(error)}") from None
         if isinstance(answer, str):

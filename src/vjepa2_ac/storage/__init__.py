@@ -10,6 +10,7 @@ from vjepa2_ac.storage.files import (
     folder_writer,
     free_bytes,
     is_empty,
+    is_refusal,
     join,
     list_files,
     list_folder,

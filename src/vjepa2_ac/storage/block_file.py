@@ -19,6 +19,7 @@ from contextlib import suppress
 from itertools import accumulate
 from pathlib import Path
 
+from vjepa2_ac.errors import refusal_of
 from vjepa2_ac.storage import remote
 
 logger = logging.getLogger(__name__)
@@ -132,7 +133,7 @@ class DiskCache:
 
     def __init__(self, folder: str | Path, limit_bytes: int | None) -> None:
         self._folder, self._limit = Path(folder), limit_bytes
-        self._is_used, self._warned = False, False
+        self._is_used, self._refused = False, set[Path]()
 
     def read(self, key: str) -> bytes | None:
         """Return the entry of a key, or None if there is none or it is damaged; the entry counts as used now."""
@@ -142,7 +143,8 @@ class DiskCache:
         path = self._path(key)
         try:
             content = path.read_bytes()
-        except OSError:  # usually: absent
+        except OSError as error:
+            self._note_refusal(path, error)
             return None
         with suppress(OSError):  # evicted meanwhile, or in a read-only folder
             os.utime(path)
@@ -152,7 +154,7 @@ class DiskCache:
     def write(self, key: str, data: bytes) -> None:
         """Store bytes under a key, replacing an old entry; a warning is logged if that is not possible."""
         path, content = self._path(key), data + _crc(data)
-        if self._limit is not None and len(content) > self._limit * _KEPT_SHARE:
+        if path in self._refused or (self._limit is not None and len(content) > self._limit * _KEPT_SHARE):
             return
         partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
         try:
@@ -165,9 +167,7 @@ class DiskCache:
             finally:
                 partial.unlink(missing_ok=True)
         except OSError as error:
-            if not self._warned:
-                logger.warning("%s: cannot be used (%s); its data are fetched again", self._folder, error.strerror)
-            self._warned = True
+            self._note_refusal(path, error)
 
     def read_or_make(self, key: str, make: Callable[[], bytes]) -> bytes:
         """Return the entry of a key; make and store it if there is none."""
@@ -190,11 +190,23 @@ class DiskCache:
             with path.open("rb", buffering=0) as file:
                 table = [*_PART.iter_unpack(file.read(count * _PART.size))]
                 parts = [os.pread(file.fileno(), table[number][1], table[number][0]) for number in numbers]
-        except (OSError, OverflowError, MemoryError, IndexError, struct.error):  # usually: absent
+        except OSError as error:
+            self._note_refusal(path, error)
+            return None
+        except (OverflowError, MemoryError, IndexError, struct.error):
             return None
         with suppress(OSError):
             os.utime(path)
         return parts if [zlib.crc32(part) for part in parts] == [table[number][2] for number in numbers] else None
+
+    def _note_refusal(self, path: Path, error: OSError) -> None:
+        """Warn once; an entry that is there, and that the system refuses, is not replaced."""
+        if isinstance(error, FileNotFoundError):
+            return
+        if not self._refused:
+            text = "%s: cannot be used (%s); its data are fetched again"
+            logger.warning(text, error.filename or self._folder, refusal_of(error)[0])
+        self._refused.add(path)
 
     def _path(self, key: str) -> Path:
         name = hashlib.sha256(key.encode()).hexdigest()[:40]

@@ -26,15 +26,15 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from vjepa2_ac.errors import InputError, MissingFileError, UnreachableError, UserError
+from vjepa2_ac.errors import InputError, MissingFileError, RefusedError, UnreachableError, UserError, refusal_of
 from vjepa2_ac.storage import remote
 from vjepa2_ac.storage.block_file import RangedFile, open_remote
 from vjepa2_ac.storage.places import is_url
 from vjepa2_ac.storage.remote import FileInfo, ShortReadError
 
-_ABSENT = frozenset({errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG})
+_ABSENT = frozenset({errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG})
 _FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
-_UNWRITABLE = _FULL | _ABSENT | {errno.EACCES, errno.EPERM, errno.EROFS, errno.EEXIST, errno.EINVAL}
+_UNWRITABLE = _FULL | _ABSENT | {errno.EACCES, errno.EPERM, errno.EROFS, errno.EEXIST, errno.EINVAL, errno.ELOOP}
 _PARTIAL = re.compile(r"\..+\.[0-9a-f]{8}\.partial")
 _NAME_BYTES = 200  # of the 255 that a name may have
 _OLD_S = 86_400.0
@@ -120,7 +120,7 @@ def list_names(folder: str | Path) -> list[str]:
 
 
 def require_content(path: str | Path, size: int | None = None) -> None:
-    """Refuse a git-lfs pointer in place of a file; only the beginning of a small file is read.
+    """Refuse a git-lfs pointer, a pipe or a device in place of a file; only the beginning of a small file is read.
 
     Args:
         path: The file, which may be missing.
@@ -128,14 +128,16 @@ def require_content(path: str | Path, size: int | None = None) -> None:
             anyway as soon as its beginning is read.
 
     Raises:
-        InputError: The file is a pointer.
+        InputError: The file is a pointer; or a pipe or a device, which may never end.
         UnreachableError: The file is at a URL and cannot be read.
     """
     with suppress(OSError):  # the caller reports what cannot be read
         if size is None:
-            if is_url(path) or not Path(path).is_file():
+            if is_url(path) or stat.S_ISDIR((status := Path(path).stat()).st_mode):
                 return
-            size = Path(path).stat().st_size
+            if not stat.S_ISREG(status.st_mode):
+                raise InputError(where=str(path), found="a pipe or a device", needed="a file")
+            size = status.st_size
         if size < _POINTER_BYTES:
             remote.refuse_pointer(str(path), read_range(path, 0, size))
 
@@ -146,7 +148,7 @@ def open_to_read(path: str | Path) -> ByteReader:
     Of a URL only the blocks that are read are fetched, so it can be given to a reader of videos or tables.
 
     Raises:
-        InputError: It is a git-lfs pointer.
+        InputError: It is a git-lfs pointer, a pipe or a device.
         OSError: There is no such file, or it cannot be read.
     """
     require_content(path)
@@ -157,7 +159,8 @@ def unreadable(where: str, error: OSError, *, needed: str = "", fix: str = "") -
     """Return the error of a file that is missing, truncated, or refused by the operating system.
 
     The first is a MissingFileError, the second an InputError. The last (no permission, too many open files, a disk that
-    went away) is temporary and says nothing about the file's content: an UnreachableError, which is never stored.
+    went away) says nothing about the file's content: an UnreachableError, which is never stored and never a reason to
+    remove or replace the file. Without permission it is a RefusedError, with the mode and the owner.
 
     Args:
         where: The file, and its episode.
@@ -171,12 +174,19 @@ def unreadable(where: str, error: OSError, *, needed: str = "", fix: str = "") -
     found = f"cannot be read: {error.strerror or error}"
     if isinstance(error, ShortReadError | IsADirectoryError) or error.errno in _ABSENT:
         return InputError(where=where, found=found, needed=needed, fix=fix)
-    return UnreachableError(where=where, found=found, needed=needed, fix="Check its permissions, and the disk")
+    refusal, fix = refusal_of(error)
+    kind = RefusedError if isinstance(error, PermissionError) else UnreachableError
+    return kind(where=where, found=f"cannot be read: {refusal}", needed=needed, fix=fix)
+
+
+def is_refusal(error: BaseException) -> bool:
+    """Return whether the operating system refused to read: libraries raise other errors for a damaged file."""
+    return isinstance(error, OSError) and error.errno != errno.EINVAL  # a seek before the start of a damaged file
 
 
 @contextmanager
 def user_can_read(path: str | Path, *, needed: str = "", fix: str = "") -> Iterator[None]:
-    """Raise an error for the user if a file cannot be read, or is a git-lfs pointer on this machine.
+    """Raise an error for the user if a file cannot be read, or is a git-lfs pointer, a pipe or a device.
 
     Raises:
         UserError: Instead of any OSError; see `unreadable` and `require_content`.
@@ -207,8 +217,6 @@ def read_bounded(path: str | Path, most_bytes: int) -> bytes:
         OSError: There is no such file, or it cannot be read.
     """
     require_content(path)
-    if not is_url(path) and not (stat.S_ISREG(mode := Path(path).stat().st_mode) or stat.S_ISDIR(mode)):
-        raise InputError(where=str(path), found="a pipe or a device", needed="a file")
     length = min(file_size(path), most_bytes + 1) if is_url(path) else most_bytes + 1
     data = read_range(path, 0, length)
     if len(data) > most_bytes:

@@ -17,8 +17,10 @@ from vjepa2_ac.data.selection import named
 from vjepa2_ac.data.splits import describe_splits
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.adapter.adapter_folder import read_card
+from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import INDEXING, Reporter
-from vjepa2_ac.runs.checkpoint import CHECKPOINTS, newest_checkpoint, written_state
+from vjepa2_ac.runs.checkpoint import ADAPTER, CHECKPOINTS, newest_checkpoint, written_state
 from vjepa2_ac.runs.folder import CONFIG, read_run_config
 
 _STEP_TOLERANCE = 0.01  # by which the time of a model step may differ
@@ -103,6 +105,18 @@ def require_same_data(config: Config, datasets: Sequence[Dataset]) -> None:
             found, needed = "other episodes or files than the run has seen", f"the data set that was at {old.path}"
             fix = f"Set {key} to where that is now; where the change is meant, add --allow-config-change"
             raise InputError(where=f"{key}: {now.path}", found=found, needed=needed, fix=fix)
+
+
+def require_same_base(config: Config, model: WorldModel) -> None:
+    """Refuse a base at another path than the run's if it is not the one that the run was trained on.
+
+    Raises:
+        InputError: It is another one.
+    """
+    folder = Path(config.run_dir)
+    is_moved = (folder / CONFIG).is_file() and read_run_config(folder).model != config.model
+    if is_moved and (checkpoint := newest_checkpoint(folder / CHECKPOINTS)) is not None:
+        read_card(checkpoint / ADAPTER, model)
 
 
 def _form(batch: Batch) -> str:

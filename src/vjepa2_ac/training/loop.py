@@ -28,15 +28,17 @@ from vjepa2_ac.distributed import (
     leave_processes,
     require_same,
 )
+from vjepa2_ac.errors import UnreachableError
 from vjepa2_ac.process import StoppedError, stop_on_signals
 from vjepa2_ac.reporter import SILENT, Reporter
-from vjepa2_ac.runs.folder import CALIBRATION, CHANGES, config_changes
+from vjepa2_ac.runs.checkpoint import RunState
+from vjepa2_ac.runs.folder import CALIBRATION, CHANGES, config_changes, read_run_config, write_run_config
 from vjepa2_ac.runs.metrics_log import MetricsLog
 from vjepa2_ac.runs.open_run import OpenRun, open_run
 from vjepa2_ac.runs.trackers import open_trackers, require_installed
 from vjepa2_ac.storage import write_atomically
 from vjepa2_ac.training.monitoring import Throughput, TimedBatches, WatchedMetricsLog
-from vjepa2_ac.training.optim import require_optimizer
+from vjepa2_ac.training.optim import describe_changed_rate, require_optimizer
 from vjepa2_ac.training.resume import restore, save_checkpoint
 from vjepa2_ac.training.setup import Run, batches_from, set_up
 from vjepa2_ac.training.step import gradients, training_step
@@ -77,22 +79,57 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow
         # The first process is the only one that reports, has trackers and needs to see the run's folder.
         opened = first_only(accelerator, opening)
         config = broadcast_object(accelerator, opened.config if opened else config)
-        changes = {"check_only": check_only, "allow_config_change": allow_config_change}
-        run = restore(set_up(config, reporter, accelerator, **changes), reporter)
-        first = validate_base(run, reporter)
-        for line in config_changes(run.config) if opened and allow_config_change else ():
-            reporter.note(f"The config changes: {line}")
-        if check_only:
-            gradients(run, batches_from(run))
-            reporter.note(_IN_PLACE)
-        else:
-            beginning = partial(_begun, run, opened, reporter, until_the_end)
-            metrics_log, mirror = agreed(accelerator, beginning) or (None, None)
-            if first is not None and record(run, validation_metrics(first), metrics_log):
-                _save(run, metrics_log)  # the base: nothing that is worse is ever selected
-            _loop(run, metrics_log, mirror, reporter)
+        ended = first_only(accelerator, lambda: opened and not check_only and _has_ended(opened, reporter))
+        if not broadcast_object(accelerator, ended):
+            changes = {"check_only": check_only, "allow_config_change": allow_config_change}
+            run = restore(set_up(config, reporter, accelerator, **changes), reporter)
+            first = validate_base(run, reporter)
+            if opened:
+                _report_changes(run, reporter)
+            if check_only:
+                gradients(run, batches_from(run))
+                reporter.note(_IN_PLACE)
+            else:
+                beginning = partial(_begun, run, opened, reporter, until_the_end)
+                metrics_log, mirror = agreed(accelerator, beginning) or (None, None)
+                if first is not None and record(run, validation_metrics(first), metrics_log):
+                    _save(run, metrics_log)  # the base: nothing that is worse is ever selected
+                _loop(run, metrics_log, mirror, reporter)
     leave_processes()
-    return run.folder
+    return Path(config.run_dir)
+
+
+def _has_ended(opened: OpenRun, reporter: Reporter) -> bool:
+    """Return whether the run has ended already; then write its config, and send what `checkpoint.remote` lacks."""
+    config = opened.config
+    if (state := opened.finished(is_done)) is None:
+        return False
+    write_run_config(config)
+    reporter.note(_why_ended(config, state))
+    if (mirror := opened.mirror(state.run_id)) is not None:
+        with mirror:
+            mirror.finish(lambda: False)
+    return True
+
+
+def _why_ended(config: Config, state: RunState) -> str:
+    """Return why training ends at a step."""
+    if state.step >= config.training.steps:
+        return f"Training is finished: all {config.training.steps:,} steps are done (training.steps)."
+    return (
+        f"Training ends at step {state.step:,}: step {state.best_step:,} is the best, and"
+        f" {config.training.patience} validations after it were no better (training.patience)."
+    )
+
+
+def _report_changes(run: Run, reporter: Reporter) -> None:
+    """Print the settings that differ from those of the last start, and a learning rate that follows from them."""
+    changes = config_changes(run.config)
+    for line in changes:
+        reporter.note(f"The config changes: {line}")
+    before = read_run_config(run.folder) if changes else run.config
+    if rate := describe_changed_rate(run.state.step, before.training, run.config.training):
+        reporter.note(rate)
 
 
 def _begun(
@@ -144,30 +181,34 @@ def _loop(run: Run, metrics_log: MetricsLog | None, mirror: Mirror | None, repor
     every_s = math.inf if checkpoint.every_minutes is None else 60.0 * checkpoint.every_minutes
     with stop_on_signals() as stop, contextlib.closing(batches_from(run)) as batches:
         timed, stopped_by = TimedBatches(batches, device), 0
-        while not (stopped_by or is_done(run)):
+        while not (stopped_by or is_done(run.config, run.state)):
             step = run.state.step + 1
             is_logged = step % training.log_every == 0 or step == training.steps
-            metrics = _timed_step(run, timed, step, throughput, measure_update=is_logged)
+            try:
+                metrics = _timed_step(run, timed, step, throughput, measure_update=is_logged)
+            except UnreachableError:  # after a signal, data that do not come end the run before the step
+                if not stop.number or processes > 1:
+                    raise
+                stopped_by = stop.number
+                _save(run, metrics_log)
+                break
             reporter.stepped(step, metrics)
             if is_logged and metrics_log:
                 metrics_log.write("train", step, metrics)
             run.state = replace(run.state, step=step, clips_done=run.state.clips_done + run.clips_per_step)
             is_best = validate_if_due(run, metrics_log, reporter)
             # Agreed among all processes, and read once: a signal after this takes effect at the next step.
-            is_due = step % checkpoint.every == 0 or time.monotonic() - saved_s >= every_s or is_best or is_done(run)
-            is_due = is_due or bool(metrics_log and metrics_log.is_behind)
+            is_due = step % checkpoint.every == 0 or time.monotonic() - saved_s >= every_s or is_best
+            is_due = is_due or is_done(run.config, run.state) or bool(metrics_log and metrics_log.is_behind)
             stopped_by, due = all_reduce_max(run.accelerator, [stop.number, is_due])
             if due or stopped_by:
                 _save(run, metrics_log)
                 saved_s = time.monotonic()
             if mirror:
                 mirror.tick()
-        has_ended = is_done(run)
+        has_ended = is_done(run.config, run.state)
         if has_ended and run.state.step < training.steps:
-            reporter.note(
-                f"Training ends at step {run.state.step:,}: step {run.state.best_step:,} is the best, and"
-                f" {training.patience} validations after it were no better (training.patience)."
-            )
+            reporter.note(_why_ended(run.config, run.state))
         # All wait: the launcher ends all processes once one has ended.
         agreed(run.accelerator, lambda: mirror.finish(lambda: not has_ended or bool(stop.number)) if mirror else None)
     if not has_ended:

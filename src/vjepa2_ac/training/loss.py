@@ -20,7 +20,7 @@ Distance = Callable[[Tensor, Tensor], Tensor]  # of predicted and true latents, 
 
 
 class Objective(nn.Module):
-    """The loss of a world model on latents, as a module: one forward pass per step, as DDP requires.
+    """The loss of a world model on latents, as a module that holds the world model.
 
     Teacher forcing predicts frames 2..T from the true frames 1..T-1. The rollout starts at frame 1; its first
     prediction is the teacher-forced one, each further one sees the predictions before it. States and actions are the
@@ -39,10 +39,7 @@ class Objective(nn.Module):
         self.distance = partial(distance, beta=training.smooth_l1_beta) if is_smooth else distance
 
     def forward(self, batch: LatentBatch) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-        """Return (teacher forcing, rollout), each times its weight, so that the loss is their sum.
-
-        They are plain tensors, which DDP and Accelerate pass through.
-        """
+        """Return (teacher forcing, rollout), each times its weight, so that the loss is their sum."""
         forced, rollout = prediction_losses(self.world_model, batch, self.rollout_steps, self.distance)
         forced_weight, rollout_weight = self.weights
         return forced * forced_weight, rollout * rollout_weight

@@ -97,6 +97,24 @@ def learning_rate_at(step: int, training: TrainingConfig) -> float:
     return peak + (final - peak) * min(1.0, (step - first_decay) / training.decay_steps)
 
 
+def describe_changed_rate(step: int, before: TrainingConfig, now: TrainingConfig) -> str:
+    """Return the learning rate at which a resumed run continues, in words; empty if its config changes no rate.
+
+    Args:
+        step: The last step that was done.
+        before: The config until then.
+        now: The config from then on.
+    """
+    if not 0 < step < now.steps or learning_rate_at(step + 1, before) == (rate := learning_rate_at(step + 1, now)):
+        return ""
+    return (
+        f"The learning rate continues at {rate:.1e} (it had reached {learning_rate_at(step, before):.2g} at step"
+        f" {step:,}). Alternatives: training.learning_rate=RATE with training.schedule=constant, or with"
+        " training.schedule=warmup_stable_decay and training.decay_steps=N; or a new run, whose model.base is the"
+        " folder that `vjepa2-ac export` writes"
+    )
+
+
 def trained_parameters(module: nn.Module) -> Iterable[nn.Parameter]:
     """Return the parameters of the optimizer."""
     return (parameter for parameter in module.parameters() if parameter.requires_grad)

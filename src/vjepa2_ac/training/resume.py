@@ -108,7 +108,7 @@ def _read_newest(run: Run, reporter: Reporter) -> tuple[RunState, dict[str, Any]
         moments = read_torch(checkpoint / OPTIMIZER)
         load_moments(run.optimizer, moments)
         state = read_state(checkpoint)
-    except (OSError, ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:
         fix = "Set back what was changed in the config; or delete this checkpoint, to use an older one"
         raise InputError(where=str(checkpoint), found=f"not the state of this run ({error})", fix=fix) from None
     reporter.note(f"Going on from {checkpoint} ({state.step} of {run.config.training.steps} steps are done).")

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterable, Iterator
 from functools import partial
+from itertools import islice
 from typing import Any
 
+from vjepa2_ac.config import Config
 from vjepa2_ac.data.loader import batches_of, validation_windows
 from vjepa2_ac.data.windows import spread
 from vjepa2_ac.distributed import broadcast_object, gathered, own_part, sharing
@@ -17,6 +19,7 @@ from vjepa2_ac.evaluation.measure import actions_before, prediction_errors
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import Validation
 from vjepa2_ac.reporter import Reporter
+from vjepa2_ac.runs.checkpoint import RunState
 from vjepa2_ac.runs.metrics_log import MetricsLog
 from vjepa2_ac.training.setup import Run, encode
 
@@ -69,14 +72,14 @@ def record(run: Run, metrics: dict[str, Any], metrics_log: MetricsLog | None) ->
     return run.state.best_step != before.best_step
 
 
-def is_done(run: Run) -> bool:
+def is_done(config: Config, state: RunState) -> bool:
     """Return whether training ends: all steps are done, or there were too many validations without a better one."""
-    training, state = run.config.training, run.state
+    training = config.training
     if state.step >= training.steps:
         return True
     if training.patience is None or state.best_step is None:
         return False
-    return state.step - state.best_step >= training.patience * run.config.validation.every
+    return state.step - state.best_step >= training.patience * config.validation.every
 
 
 def validation_metrics(found: Validation) -> dict[str, Any]:
@@ -99,8 +102,9 @@ def validation_metrics(found: Validation) -> dict[str, Any]:
 def validate(run: Run, reporter: Reporter) -> Validation:
     """Measure the held-out clips, and rank the true actions of moves in some of them.
 
-    The processes share the clips, and what the first one computes from all results counts: processes that disagree in
-    the last digits about the best would not end together.
+    In the ranking other clips, in a fixed order, replace those that cannot be read. The processes share the clips, and
+    what the first one computes from all results counts: processes that disagree in the last digits about the best would
+    not end together.
     """
     run.world_model.eval()
     with run.accelerator.autocast(), sharing(run.accelerator):
@@ -122,10 +126,14 @@ def _measured(run: Run) -> Validation:
     errors = prediction_errors(run.world_model, kept, before=actions_before(own, windows, read))
     for name, reason in gathered(list(run.dataset.broken.reasons.items())):
         run.dataset.broken.met(name, reason)
+    config, space = run.config.validation, run.dataset.spaces.action
     moves = gathered_starts(moves, run.accelerator.device)
+    missing = len(chosen) - len({(move.episode_id, move.first_step) for move in moves})
+    others = [window for window, name in zip(windows, names, strict=True) if name not in chosen] if missing else []
+    for batch in islice(batches_of(run.dataset, others, batch_size=1, may_be_none=True), missing):
+        moves += moves_of(encode(run, batch), 0, space, config.ranking_reach_cm / 100)
     if not moves:
         return Validation(errors, None)
-    config, space = run.config.validation, run.dataset.spaces.action
     probes = ProbeOptions(samples=config.ranking_samples, reach_cm=config.ranking_reach_cm, at_once=_AT_ONCE)
     return Validation(errors, rank_actions(run.world_model, moves, space, probes, seed=0))
 

@@ -1,22 +1,26 @@
 """Official checkpoints: the official code's own numbers for both references, and validation of the file."""
 
+import argparse
 import io
 import json
 import os
 import pickle
+import re
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
 from paths import GOLDEN
-from vjepa2_ac.config import EncoderSizes, ModelSizes, PredictorSizes
+from vjepa2_ac.config import EncoderSizes, ModelConfig, ModelSizes, PredictorSizes
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.checkpoints.loading import load_official, to_official
+from vjepa2_ac.model.checkpoints.loading import load_base, load_official, to_official
 from vjepa2_ac.model.checkpoints.meta_file import official_name
 from vjepa2_ac.model.network.world_model import WorldModel
 
@@ -141,12 +145,15 @@ def renamed(weights: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
     return {prefix + name.removeprefix("module."): value for name, value in weights.items()}
 
 
-@pytest.mark.parametrize("prefix", ["", "backbone.", "module.backbone.", "backbone.module."])
+PREFIXES = ["", "backbone.", "module.backbone.", "backbone.module.", "_orig_mod.", "module._orig_mod."]
+
+
+@pytest.mark.parametrize("prefix", [*PREFIXES, "_orig_mod.module.", "module._orig_mod.backbone."])
 def test_prefixes_in_any_order_and_an_unused_pos_embed_are_no_obstacle(rewritten, prefix: str) -> None:
     def change(whole: Whole) -> None:
-        for part in ("encoder", "predictor"):
+        for part in ("encoder", "target_encoder", "predictor"):
             whole[part] = renamed(whole[part], prefix)
-        whole["encoder"][prefix + "pos_embed"] = torch.zeros(1, 16, 48)
+        whole["target_encoder"][prefix + "pos_embed"] = torch.zeros(1, 16, 48)
 
     model = load_official(rewritten(change), TINY_SIZES)
     assert (
@@ -154,8 +161,71 @@ def test_prefixes_in_any_order_and_an_unused_pos_embed_are_no_obstacle(rewritten
     )
 
 
+def test_blocks_that_were_compiled_one_by_one_are_read(rewritten) -> None:
+    def change(whole: Whole) -> None:
+        for part in ("encoder", "target_encoder", "predictor"):
+            whole[part] = {re.sub(r"(locks\.\d+)", r"\1._orig_mod", name): one for name, one in whole[part].items()}
+        assert any("._orig_mod." in name for name in whole["predictor"])
+
+    load_official(rewritten(change), TINY_SIZES)
+
+
+# Two encoders in a file.
+
+
+def trained_encoder(whole: Whole) -> None:
+    """As in training, every value of every tensor differs from that of the target a little."""
+    generator = torch.Generator().manual_seed(1)
+    whole["encoder"] = {
+        name: value * (1 + 0.01 * torch.randn(value.shape, generator=generator))
+        for name, value in whole["target_encoder"].items()
+    }
+
+
+def renamed_encoder(whole: Whole) -> None:
+    whole["encoder"] = {f"other.{name}": value for name, value in whole["encoder"].items()}
+
+
+@pytest.mark.parametrize("change", [trained_encoder, renamed_encoder])
+def test_of_two_different_encoders_the_target_is_used_and_a_warning_names_it(
+    rewritten, change: Callable[[Whole], None], caplog: pytest.LogCaptureFixture
+) -> None:
+    expected = load_official(GOLDEN / "model" / "tiny.pt", TINY_SIZES)
+    caplog.clear()
+    model = load_official(rewritten(change), TINY_SIZES)
+    assert model.encoder_fingerprint() == expected.encoder_fingerprint()
+    (warning,) = (record.getMessage() for record in caplog.records if record.levelname == "WARNING")
+    assert re.search(
+        r"changed\.pt: encoder and target_encoder differ; target_encoder is used.*encoder_weights", warning
+    )
+
+
+def test_the_config_chooses_between_two_different_encoders(rewritten, caplog: pytest.LogCaptureFixture) -> None:
+    path = rewritten(trained_encoder)
+    config = ModelConfig(base=str(path), sizes=TINY_SIZES, dtype="float32")
+    target, encoder = (
+        load_base(config.model_copy(update={"encoder_weights": key}), seed=0) for key in ("target_encoder", "encoder")
+    )
+    assert target.encoder_fingerprint() != encoder.encoder_fingerprint(), "their latent caches have other keys"
+    assert target.predictor_fingerprint() == encoder.predictor_fingerprint()
+    assert "differ; encoder is used" in caplog.text
+    weight = encoder.present_encoder.state_dict()["vit.embeddings.patch_embeddings.proj.weight"]
+    assert torch.equal(weight, torch.load(path)["encoder"]["module.patch_embed.proj.weight"])
+
+
+@pytest.mark.parametrize("key", ["encoder", "target_encoder"])
+def test_equal_encoders_or_a_single_one_are_read_without_a_message(
+    rewritten, key: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    equal = load_official(GOLDEN / "model" / "tiny.pt", TINY_SIZES, encoder_weights=key)
+    single = load_official(rewritten(lambda whole: whole.pop(key) and None), TINY_SIZES, encoder_weights=key)
+    assert equal.encoder_fingerprint() == single.encoder_fingerprint()
+    assert not [record for record in caplog.records if record.levelname == "WARNING"]
+
+
 def rename_one(whole: Whole) -> None:
-    whole["encoder"]["module.blocks.1.norm1.scale"] = whole["encoder"].pop("module.blocks.1.norm1.weight")
+    for part in (whole["encoder"], whole["target_encoder"]):
+        part["module.blocks.1.norm1.scale"] = part.pop("module.blocks.1.norm1.weight")
 
 
 def drop_head(whole: Whole) -> None:
@@ -182,11 +252,22 @@ def other_actions(whole: Whole) -> None:
             r"encoder: 2 tensors do not fit \(missing: blocks.1.norm1.weight; unknown: blocks.1.norm1.scale\)",
         ),
         (drop_head, r"predictor: 1 tensors do not fit \(missing: state_encoder.weight\)"),
-        (drop_predictor, "no weights under 'predictor'"),
+        (drop_predictor, r"no predictor \(keys: encoder, target_encoder, .*torch.save"),
         (narrow, r"predictor_proj.weight is \[24, 64\], not \[48, 64\]"),
         (other_actions, r"action_encoder.weight is \[64, 4\], not \[64, 7\]"),
         (lambda _: [1, 2], "changed.pt: a list. needed: a checkpoint of V-JEPA"),
         (lambda whole: {"model": whole["encoder"]}, r"no encoder \(keys: model\)"),
+        (lambda whole: {"encoder": whole["encoder"]}, r"no predictor \(keys: encoder\)\. needed: both parts"),
+        (lambda whole: {"predictor": whole["predictor"]}, r"no encoder \(keys: predictor\)\. needed: both parts"),
+        (lambda whole: whole["predictor"], r"no encoder \(keys: module\.\w+\..*needed: both parts.*torch\.save\("),
+        (
+            lambda whole: whole | {"target_encoder": renamed(whole["encoder"], "model.")},
+            r"no tensor 'patch_embed.proj.weight' in target_encoder \(its tensors: model\.\w+\.",
+        ),
+        (
+            lambda whole: whole | {"predictor": renamed(whole["predictor"], "model.")},
+            r"no tensor 'action_encoder.weight' in predictor \(its tensors: model\.\w+\.",
+        ),
     ],
 )
 def test_a_checkpoint_that_does_not_fit_is_explained(rewritten, change: Callable[[Whole], Any], message: str) -> None:
@@ -214,7 +295,7 @@ def test_a_truncated_and_a_missing_file_are_refused(tmp_path: Path) -> None:
     (tmp_path / "cut.pt").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(InputError, match=r"cut\.pt: 0.00 GB, beginning with b.PK.*truncated"):
         load_official(tmp_path / "cut.pt", TINY_SIZES)
-    with pytest.raises(InputError, match=r"none\.pt: no such file"):
+    with pytest.raises(InputError, match=r"none\.pt: cannot be read: No such file"):
         load_official(tmp_path / "none.pt", TINY_SIZES)
 
 
@@ -256,6 +337,24 @@ def test_a_file_that_is_no_checkpoint_shows_how_it_begins_and_is_never_executed(
     with pytest.raises(InputError, match=said):
         load_official("a.pt", TINY_SIZES)
     assert not Path("it-was-executed").exists()
+
+
+@pytest.mark.parametrize(
+    "value", [np.float64(0.3), argparse.Namespace(a=1), Path("here")], ids=["numpy", "args", "path"]
+)
+def test_a_file_with_other_objects_prints_the_command_that_saves_its_weights_alone(
+    rewritten, tmp_path: Path, value: object
+) -> None:
+    path = rewritten(lambda whole: whole | {"loss": value}).rename(tmp_path / "it's mine.pt")
+    with pytest.raises(InputError, match=r"would call .*If you trust the file, .*: `python -c ") as caught:
+        load_official(path, TINY_SIZES)
+    python, option, code = shlex.split(str(caught.value).partition("`")[2].rpartition("`")[0])
+    assert (python, option) == ("python", "-c")
+    exec(code, {})  # noqa: S102 - a user pastes it
+    model = load_official(tmp_path / "it's mine.weights.pt", TINY_SIZES)
+    expected = load_official(GOLDEN / "model" / "tiny.pt", TINY_SIZES)
+    assert model.encoder_fingerprint() == expected.encoder_fingerprint()
+    assert model.predictor_fingerprint() == expected.predictor_fingerprint()
 
 
 def test_a_weight_that_is_not_finite_is_named(rewritten) -> None:

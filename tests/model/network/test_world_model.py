@@ -123,7 +123,7 @@ def remove_predictor(folder: Path) -> None:
         (break_format, "config.json: not the config of a world model"),
         (break_sizes, r"model.safetensors: 16 tensors do not fit \(missing: blocks.2.attn.k.bias"),
         (truncate_encoder, "encoder.safetensors: not a whole safetensors file"),
-        (remove_predictor, "predictor/model.safetensors: no such file"),
+        (remove_predictor, "predictor/model.safetensors: cannot be read: No such file"),
     ],
 )
 def test_a_folder_that_is_not_a_whole_model_is_named(

@@ -1,1 +1,1 @@
-"""Calibration: k variants of the same clips, measured and compared. Beside the core, which does not import it."""
+"""Calibration: variants of the same clips, such as other strides or axes, are measured and compared."""

@@ -98,7 +98,7 @@ def load_trained(model: WorldModel, folder: str | Path, trainable: bool | None =
             one.
     """
     folder = Path(folder)
-    fresh, card = model.adaptation is None, _read_card(folder, model)
+    fresh, card = model.adaptation is None, read_card(folder, model)
     heads = card.fresh_heads
     if heads is not None and fresh and model.fresh_heads is None:
         fit_heads(model, Widths(heads.state_dim, heads.action_dim), heads.seed)
@@ -131,7 +131,7 @@ def _load_lora(model: WorldModel, folder: Path) -> None:
     set_peft_model_state_dict(model.predictor, _read_weights(folder / LORA_WEIGHTS, lora_weights(model)))
 
 
-def _read_card(folder: Path, model: WorldModel) -> Card:
+def read_card(folder: Path, model: WorldModel) -> Card:
     """Return the card of trained weights, after checking that they belong to this model.
 
     Raises:
@@ -148,7 +148,7 @@ def _read_card(folder: Path, model: WorldModel) -> Card:
         if found != needed:
             own, others = f"{found[:12]}{this}", f"{needed[:12]}{trained_on}"
             said = f"an adapter trained on another {part} ({others}) than this model's ({own})"
-            fix = "Set model.base (or model.encoder) to what it was trained on"
+            fix = "Set model.base (or model.encoder, model.encoder_weights) to what it was trained on"
             raise InputError(where=str(path), found=said, fix=fix)
     if model.adaptation is not None and model.adaptation.kind != card.kind:
         said = f"an adapter of kind {card.kind}, and the model has one of kind {model.adaptation.kind}"

@@ -154,7 +154,7 @@ def encoder_in_file(file: MetaFile, key: str | None, frame: FramePath, heads: in
         width, *_, patch_size = tensors["patch_embed.proj.weight"].shape
         hidden, depth = tensors["blocks.0.mlp.fc1.weight"].shape[0], depth_of(tensors, "blocks")
     except (KeyError, ValueError) as missing:
-        raise file.lacks(f"tensor {missing} in {key}") from None
+        raise file.lacks(f"tensor {missing}", part=key) from None
     heads = HEADS.get(width, heads)
     if heads is None:
         said = f"an encoder of width {width}, which is none of the published ones: the tensors do not show its heads"

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from vjepa2_ac.config import ModelConfig, ModelSizes
-from vjepa2_ac.config.model import EncoderKey
+from vjepa2_ac.config.model import EncoderWeights
 from vjepa2_ac.episode import POSE_WIDTHS
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.base_model import check_sizes, find_base, read_sizes
@@ -31,14 +31,15 @@ from vjepa2_ac.model.checkpoints.meta_file import (
     to_official_names,
 )
 from vjepa2_ac.model.network.blocks import mlp_ratio_of
-from vjepa2_ac.model.network.world_model import WorldModel, widths_as_text, widths_of_model
+from vjepa2_ac.model.network.world_model import WorldModel, fingerprint, widths_as_text, widths_of_model
 from vjepa2_ac.storage.places import BUILTIN
 from vjepa2_ac.storage.structured import record_of
 
 logger = logging.getLogger(__name__)
 
 _NON_COMMERCIAL = "The weights that jepa-wms publishes so are CC-BY-NC 4.0: for non-commercial use only"
-_KEYS: tuple[EncoderKey, ...] = ("encoder", "target_encoder")  # one encoder twice: it was frozen
+_COMPARED = 65_536  # values of a tensor
+_KEYS: tuple[EncoderWeights, ...] = ("encoder", "target_encoder")  # one encoder twice, unless it was trained
 
 
 def load_base(config: ModelConfig, *, seed: int) -> WorldModel:
@@ -62,7 +63,7 @@ def load_base(config: ModelConfig, *, seed: int) -> WorldModel:
         raise ValueError("a ModelConfig has a base or random sizes")
     path = find_base(config.base)
     if not path.is_dir() and found is None:
-        return load_official(path, config.sizes, dtype)
+        return load_official(path, config.sizes, dtype, config.encoder_weights)
     file = None if path.is_dir() else MetaFile.open(path)
     if found is not None and (file is None or any(key in file.parts for key in ENCODER_KEYS)):
         said = f"an encoder of its own, and model.encoder names another ({found.where}), on which it predicts noise"
@@ -92,7 +93,12 @@ def base_sizes(config: ModelConfig) -> ModelSizes:
     return read_sizes(path) if path.is_dir() else config.sizes
 
 
-def load_official(path: str | Path, sizes: ModelSizes | None = None, dtype: torch.dtype = torch.float32) -> WorldModel:
+def load_official(
+    path: str | Path,
+    sizes: ModelSizes | None = None,
+    dtype: torch.dtype = torch.float32,
+    encoder_weights: EncoderWeights = "target_encoder",
+) -> WorldModel:
     """Read Meta's checkpoint. Every tensor is matched; only a `pos_embed` of the encoder may remain.
 
     The file is mapped: beside the weights in `dtype` there are only pages of the file, which the system takes back.
@@ -102,12 +108,19 @@ def load_official(path: str | Path, sizes: ModelSizes | None = None, dtype: torc
         sizes: Sizes that tensors do not show: image size, heads, extrinsics. Any other size that differs from both the
             default and the tensors is a contradiction.
         dtype: Type of the weights in memory.
+        encoder_weights: The encoder to use, where the file holds two.
 
     Raises:
         InputError: The file is missing, truncated, of another kind, contradicts the sizes, or a weight is not finite.
     """
     file, given = MetaFile.open(Path(path)), sizes or ModelSizes()
-    key = next((one for one in _KEYS if one in file.parts), _KEYS[0])
+    there = [key for key in _KEYS if isinstance(file.parts.get(key), dict)]
+    key = encoder_weights if encoder_weights in there else (there or _KEYS)[0]
+    # Training changes every tensor, so the beginning of each shows it, and few pages of the file are read.
+    beginnings = [{name: value.flatten()[:_COMPARED] for name, value in file.tensors(one).items()} for one in there]
+    if len({fingerprint(one) for one in beginnings}) > 1:
+        text = "%s: encoder and target_encoder differ; %s is used. Set model.encoder_weights for the other one"
+        logger.warning(text, path, key)
     found = encoder_in_file(file, key, given.encoder.frame, given.encoder.heads)
     return _with_predictor(file, found, given, dtype)
 
@@ -190,7 +203,7 @@ def _sizes(file: MetaFile, predictor: Mapping[str, Tensor], encoder: FoundEncode
         width, hidden = len(predictor["action_encoder.weight"]), len(predictor["predictor_blocks.0.mlp.fc1.weight"])
         depth = depth_of(predictor, "predictor_blocks")
     except KeyError as missing:
-        raise file.lacks(f"tensor {missing} in predictor") from None
+        raise file.lacks(f"tensor {missing}", part="predictor") from None
     told = {
         "image_size": given.image_size,
         "patch_size": encoder.patch_size,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,7 @@ from torch import Tensor, nn
 from vjepa2_ac import storage
 from vjepa2_ac.config.model import Family
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.network.pretrained_folder import check_tensors, require_finite
+from vjepa2_ac.model.network.pretrained_folder import check_tensors, require_finite, require_floats
 
 ENCODER_KEYS = ("ema_encoder", "target_encoder", "encoder")
 """Where an encoder can be in a file. The first that is there is taken: an average of weights, which Meta's own use is
@@ -25,9 +26,10 @@ Part = Literal["encoder", "encoder 2.1", "predictor"]
 Rename = Callable[[str], tuple[str, int | None]]
 """Our name of a tensor -> the file's, and which third of a fused one it is (None: all of it)."""
 
+_PARTS = 'both parts, as of torch.save({"encoder": ..., "predictor": ...}, FILE), or model.encoder.path for the encoder'
 _NEEDED = "a checkpoint of V-JEPA 2, 2.1 or 2-AC as Meta publishes it"
 _SPLIT = ("q", "k", "v")
-_PREFIXES = re.compile(r"^(?:(?:module|backbone)\.)+")
+_PREFIXES = re.compile(r"^(?:(?:module|backbone|_orig_mod)\.)+|_orig_mod\.")  # the last: of torch.compile, anywhere
 _IGNORED = "pos_embed"  # may be in a file: a network with rotary positions does not use it
 _ENCODER = [
     (r"^vit\.embeddings\.patch_embeddings\.", "patch_embed."),
@@ -61,15 +63,17 @@ class MetaFile:
         """Map a file; reads no values, and executes nothing.
 
         Raises:
-            InputError: There is no such file, or it is of another kind, truncated, or a git-lfs pointer.
+            InputError: There is no such file, or it is of another kind, truncated, a git-lfs pointer or a pipe.
+            UnreachableError: It cannot be read.
         """
-        if not path.is_file():
-            raise InputError(where=str(path), found="no such file", needed=_NEEDED, fix=FIX)
-        storage.require_content(path)
-        try:
-            whole = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-        except Exception as error:  # a damaged pickle ends in any of them
-            raise InputError(where=str(path), found=_unreadable(path, error), needed=_NEEDED, fix=FIX) from None
+        with storage.user_can_read(path, needed=_NEEDED, fix=FIX):
+            try:
+                whole = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+            except Exception as error:  # a damaged pickle ends in any of them
+                if storage.is_refusal(error):
+                    raise
+                found, fix = _problem_of(path, error)
+                raise InputError(where=str(path), found=found, needed=_NEEDED, fix=fix) from None
         if not isinstance(whole, dict):
             raise InputError(where=str(path), found=f"a {type(whole).__name__}", needed=_NEEDED, fix=FIX)
         return cls(path, {str(key): value for key, value in whole.items()})
@@ -82,15 +86,17 @@ class MetaFile:
         """
         part = self.parts.get(key)
         if not isinstance(part, dict) or not part or not all(isinstance(value, Tensor) for value in part.values()):
-            raise self.lacks(f"weights under {key!r}")
+            raise self.lacks(key if key not in self.parts else f"weights under {key!r}")
         named = {_PREFIXES.sub("", str(name)): value for name, value in part.items()}
         named.pop(_IGNORED, None)
+        require_floats(named, where=f"{self.path}: {key}", fix=FIX)
         return named
 
-    def lacks(self, what: str, fix: str = FIX) -> InputError:
-        """Return the error of a file without a part."""
-        found = f"no {what} (keys: {', '.join(list(self.parts)[:8])})"
-        return InputError(where=str(self.path), found=found, needed=_NEEDED, fix=fix)
+    def lacks(self, what: str, fix: str = FIX, *, part: str | None = None) -> InputError:
+        """Return the error of a file without a part, or of a part without a tensor, with the names that are there."""
+        names = ", ".join(list(self.parts if part is None else self.tensors(part))[:8])
+        found = f"no {what} (keys: {names})" if part is None else f"no {what} in {part} (its tensors: {names})"
+        return InputError(where=str(self.path), found=found, needed=_PARTS, fix=fix)
 
 
 def part_of(family: Family) -> Part:
@@ -121,6 +127,7 @@ def fill(
         for ours, (theirs, third) in names.items()
     }
     check_tensors({name: value.shape for name, value in weights.items()}, needed, where=where, fix=fix)
+    require_floats(weights, where=where, fix=fix)
     for ours, (theirs, third) in names.items():
         value = weights[theirs] if third is None else weights[theirs].chunk(3)[third]
         own[ours] = value.to(dtype, copy=True)
@@ -149,13 +156,20 @@ def depth_of(names: Mapping[str, object], blocks: str) -> int:
     return 1 + max(numbers)
 
 
-def _unreadable(path: Path, error: Exception) -> str:
-    """Return what a file is that torch did not load: its beginning shows a web page, for example."""
+def _problem_of(path: Path, error: Exception) -> tuple[str, str]:
+    """Return what a file is that torch did not load (its beginning shows a web page, for example), and the fix."""
     refused = re.search(r"GLOBAL ([\w.]+)", str(error))
     if refused:
-        return f"a pickle that would call {refused[1]}: it was refused, since loading it could run foreign code"
+        found = f"a pickle that would call {refused[1]}: it was refused, since loading it could run foreign code"
+        code = (
+            f"import torch; old = torch.load({str(path)!r}, map_location='cpu', weights_only=False);"
+            f" torch.save({{k: old[k] for k in {(*ENCODER_KEYS, 'predictor')} if k in old}},"
+            f" {str(path.with_suffix('.weights.pt'))!r})"
+        )
+        return found, f"If you trust the file, save its weights alone: `python -c {shlex.quote(code)}`"
     with path.open("rb") as file:
         head = file.read(24)
     reason = next(iter(str(error).splitlines()), type(error).__name__)[:120]
     size = path.stat().st_size / 1e9
-    return f"{size:.2f} GB, beginning with {head!r}, that torch cannot read ({reason}): truncated, or of another kind"
+    found = f"{size:.2f} GB, beginning with {head!r}, that torch cannot read ({reason}): truncated, or of another kind"
+    return found, FIX

@@ -8,6 +8,7 @@ from __future__ import annotations
 import errno
 import json
 import re
+import stat
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,6 +24,8 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.base_model import CONFIG, FORMAT, NEEDED_MODEL, EncoderOrigin
 from vjepa2_ac.storage.structured import read_json_object, record_of
 
+_FLOAT = "dense weights in float16, bfloat16, float32 or float64"
+_FLOATS = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 ENCODER, PREDICTOR = "encoder.safetensors", "predictor/model.safetensors"
 
 
@@ -48,14 +51,17 @@ def write_folder(folder: Path, card: dict[str, Any], encoder: nn.Module, predict
 
 
 def save_tensors(tensors: Mapping[str, Tensor], path: Path) -> None:
-    """Write tensors to a safetensors file.
+    """Write tensors to a new safetensors file, whose mode follows the umask as that of any other file.
 
     Raises:
         OSError: The disk is full, or another error of the system.
     """
+    path.touch()
+    mode = stat.S_IMODE(path.stat().st_mode)
     try:
         whole = {name: value.detach().to("cpu").contiguous() for name, value in tensors.items()}
         save_file(whole, path, metadata={"format": "pt"})
+        path.chmod(mode)  # safetensors 0.8 makes it 0600
     except SafetensorError as error:  # whose text alone has the system's number
         number = re.search(r"os error (\d+)", str(error))
         raise OSError(int(number[1]) if number else errno.EIO, str(error), str(path)) from None
@@ -102,6 +108,7 @@ def read_tensors(
         found = {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118  # no iterator
         check_tensors(found, {name: value.shape for name, value in like.items()}, where=str(path), fix=fix)
         mapped = {name: file.get_tensor(name) for name in like}
+        require_floats(mapped, where=str(path), fix=fix)
         # copied: the file may be replaced while it is in use
         weights = {name: value.to(dtype or value.dtype, copy=True) for name, value in mapped.items()}
     require_finite(weights, where=str(path), fix=fix)
@@ -113,19 +120,21 @@ def open_safetensors(path: Path, *, needed: str) -> Iterator[Any]:
     """Open a safetensors file, whose header is checked against its size; its tensors are mapped.
 
     Raises:
-        InputError: It is missing, truncated, a git-lfs pointer or of another format; also of a tensor that is read
-            within the block.
+        InputError: It is missing, truncated, a git-lfs pointer, a pipe or of another format; also of a tensor that is
+            read within the block.
+        UnreachableError: It cannot be read.
     """
     again = "Copy or write the folder again"
-    storage.require_content(path)
-    try:
-        with safe_open(path, framework="pt") as file:
-            yield file
-    except FileNotFoundError:
-        raise InputError(where=str(path), found="no such file", needed=needed, fix=again) from None
-    except (SafetensorError, OSError, TypeError) as error:  # the last: of a type that torch does not have
-        found = f"not a whole safetensors file ({error})"
-        raise InputError(where=str(path), found=found, needed=needed, fix=again) from None
+    with storage.user_can_read(path, needed=needed, fix=again):
+        path.open("rb").close()  # safetensors calls a file without permission a missing one
+        try:
+            with safe_open(path, framework="pt") as file:
+                yield file
+        except (SafetensorError, OSError, TypeError) as error:  # the last: of a type that torch does not have
+            if storage.is_refusal(error):
+                raise
+            found = f"not a whole safetensors file ({error})"
+            raise InputError(where=str(path), found=found, needed=needed, fix=again) from None
 
 
 def check_tensors(
@@ -145,6 +154,17 @@ def check_tensors(
         shown = "; ".join(sorted(problems)[:4]) + (f"; and {len(problems) - 4} more" if len(problems) > 4 else "")
         found_text = f"{len(problems)} tensors do not fit ({shown})"
         raise InputError(where=where, found=found_text, needed="every tensor of the model, and no other", fix=fix)
+
+
+def require_floats(tensors: Mapping[str, Tensor], *, where: str, fix: str) -> None:
+    """Refuse weights of another type than float16, bfloat16, float32 and float64, which casting would change.
+
+    Raises:
+        InputError: Names the first such tensor.
+    """
+    for name, value in tensors.items():
+        if value.dtype not in _FLOATS or value.layout is not torch.strided:
+            raise InputError(where=where, found=f"{name} is {value.dtype}, {value.layout}", needed=_FLOAT, fix=fix)
 
 
 def first_not_finite(tensors: Mapping[str, Tensor]) -> str | None:

@@ -133,8 +133,8 @@ class WorldModel(LatentDynamics):
 
         Raises:
             InputError: The folder cannot be written.
-            ValueError: There is an adapter: merge it first, or save it with `lora.save_trained`. Or the encoder was
-                removed.
+            ValueError: There is an adapter: merge it first, or save it with `adapter_folder.save_trained`. Or the
+                encoder was removed.
         """
         if self.predictor is not self.base_predictor:
             raise ValueError("an adapter is on: merge_adapter makes it part of the model, save_trained saves it alone")

@@ -16,13 +16,12 @@ from typing import Annotated, Any, Literal
 import torch
 from jaxtyping import Float, Int
 from pydantic import Field
-from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.nn.functional import gelu
 
 from vjepa2_ac import __version__
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.network.pretrained_folder import read_tensors
+from vjepa2_ac.model.network.pretrained_folder import read_tensors, save_tensors
 from vjepa2_ac.planning.energy import WorldModelCost
 from vjepa2_ac.planning.search_space import SearchSpace
 from vjepa2_ac.planning.solvers import PlanStart
@@ -181,7 +180,7 @@ def save_prior(folder: Path, card: PriorCard, prior: ActionPrior) -> None:
         InputError: The folder cannot be written.
     """
     with folder_writer(folder, CARD) as fresh:
-        save_file({name: one.detach().cpu().contiguous() for name, one in prior.state_dict().items()}, fresh / WEIGHTS)
+        save_tensors(prior.state_dict(), fresh / WEIGHTS)
         (fresh / CARD).write_text(json.dumps(asdict(card), indent=1) + "\n", encoding="utf-8")
 
 

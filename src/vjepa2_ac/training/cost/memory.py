@@ -2,8 +2,8 @@
 
 The predictor's part is measured (`training.cost.step`). Calculated is what needs no pass through it: weights and
 moments from the counts of parameters (bitsandbytes' kernels take no fake tensors), the next batch from its sizes, and
-the encoder at work, whose code would take seconds to import. The total has not yet been compared with the peak that a
-GPU measures.
+the encoder at work, whose code would take seconds to import. On an H100 the peak that PyTorch's allocator reported
+differed from the total by 1 %; the CUDA context was not compared.
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ def estimate_memory(config: Config, sizes: ModelSizes) -> MemoryEstimate:
         trained=parameters.trained * FLOAT32,
         gradients=parameters.trained * FLOAT32,
         moments=sum(_moments(config, elements) for elements in parameters.trained_tensors),
-        arriving=_arriving(config, sizes),
+        arriving=batch_bytes(config, sizes),
         latents=_latents(config, sizes, config.training.batch_size),
         encoding=_encoding(config, sizes, config.training.batch_size),
         step=step,
@@ -191,7 +191,8 @@ def _moments(config: Config, elements: int) -> int:
     return 2 * (elements + -(-elements // _ELEMENTS_OF_A_SCALE) * FLOAT32)
 
 
-def _arriving(config: Config, sizes: ModelSizes) -> int:
+def batch_bytes(config: Config, sizes: ModelSizes) -> int:
+    """Return the bytes of a batch as the loader sends it: latents, or frames, which may be larger or smaller."""
     frames = config.training.batch_size * config.data.frames
     if not config.data.takes_latents:
         return frames * 3 * sizes.image_size**2

@@ -25,11 +25,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 from urllib.parse import quote
 
 import numpy as np
@@ -58,8 +58,9 @@ OPTIONAL = ("commands", "extrinsics", "joint_velocities")
 _LARGEST = 127  # of int8
 _JPEG_QUALITY = 85
 _MOST_BYTES = 1 << 30  # of a table
+Table = TypeVar("Table", EpisodeTable, StepSelection)
 _WHOLE, _BROKEN = ".safetensors", ".broken"
-_FIX = "Delete this file, and then run `vjepa2-ac encode` again, as the cache was made; or copy the file again"
+FIX = "Delete this file, and then run `vjepa2-ac encode` again, as the cache was made; or copy the file again"
 _ENCODE = "Run `vjepa2-ac encode`, which goes on where it was stopped; or copy the cache again"
 
 
@@ -112,15 +113,18 @@ def read_tables(folder: Path | str, *, has_idle_rule: bool) -> tuple[EpisodeTabl
 
     Raises:
         InputError: One of the files is missing or damaged.
+        UnreachableError: One cannot be read.
     """
+    table = _table(storage.join(folder, EPISODES), EpisodeTable.from_bytes)
+    return table, _table(storage.join(folder, KEPT), StepSelection.from_bytes) if has_idle_rule else None
+
+
+def _table(path: str, from_bytes: Callable[[bytes], Table]) -> Table:
     try:
-        table = EpisodeTable.from_bytes(storage.read_bounded(storage.join(folder, EPISODES), _MOST_BYTES))
-        if not has_idle_rule:
-            return table, None
-        return table, StepSelection.from_bytes(storage.read_bounded(storage.join(folder, KEPT), _MOST_BYTES))
-    except (OSError, NotATableError) as error:
-        found = f"{EPISODES} or {KEPT} cannot be read ({error})"
-        raise InputError(where=str(folder), found=found, fix=_ENCODE) from None
+        with storage.user_can_read(path, fix=_ENCODE):
+            return from_bytes(storage.read_bounded(path, _MOST_BYTES))
+    except NotATableError as error:
+        raise InputError(where=path, found=f"damaged ({error})", fix=_ENCODE) from None
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,8 +257,9 @@ class LatentFiles:
     def _found(self, name: str) -> storage.FileInfo | None:
         if storage.is_url(self.folder):
             return self._listed.get(name)
-        path = Path(self.folder, name)
-        return storage.FileInfo(name, path.stat().st_size, "") if path.is_file() else None
+        with suppress(FileNotFoundError, NotADirectoryError):
+            return storage.FileInfo(name, Path(self.folder, name).stat().st_size, "")
+        return None
 
     def _reason(self, note: str) -> str:
         return storage.read_bytes(storage.join(self.folder, note)).decode(errors="replace")
@@ -262,7 +267,7 @@ class LatentFiles:
     def _opened(self, name: str) -> EpisodeFile:
         place, found = storage.join(self.folder, name), self._found(name)
         if found is None:
-            raise InputError(where=place, found="no such file", needed="latents of an episode", fix=_FIX)
+            raise InputError(where=place, found="no such file", needed="latents of an episode", fix=FIX)
         if self.cache is None:
             return EpisodeFile(place, self.key, found.size, partial(storage.read_ranges, place))
         key = f"{place} {found.version} {found.size}"
@@ -349,10 +354,10 @@ class EpisodeFile:
     def _reading(self) -> Iterator[None]:
         """Raise an error for the user if the file is missing, truncated, no safetensors file, or lacks something."""
         try:
-            with storage.user_can_read(self.path, needed="latents of an episode", fix=_FIX):
+            with storage.user_can_read(self.path, needed="latents of an episode", fix=FIX):
                 yield
         except (AttributeError, KeyError, IndexError, RuntimeError, ValueError, TypeError) as error:
             raise self._damaged(f"not a whole file of latents ({error})") from None
 
     def _damaged(self, found: str, needed: str = "") -> InputError:
-        return InputError(where=self.path, found=found, needed=needed, fix=_FIX)
+        return InputError(where=self.path, found=found, needed=needed, fix=FIX)

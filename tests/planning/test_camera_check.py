@@ -1,0 +1,217 @@
+"""Frames that must not move a robot: without contrast, or equal to the last one although the robot has moved."""
+
+import dataclasses
+import io
+import math
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from decisions import STATE, image
+from tiny_models import tiny_model
+from vjepa2_ac.config.planning import CemConfig, LimitsConfig, PlanningConfig
+from vjepa2_ac.data.transforms import Crop
+from vjepa2_ac.episode import Widths
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.media.camera_check import has_moved, is_uniform
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.planning.decision import PlanRequest, decide
+from vjepa2_ac.planning.goals import timed
+from vjepa2_ac.simulation.world.arm import SimulatedArm
+from vjepa2_ac.simulation.world.domains import DOMAIN_A
+from vjepa2_ac.spaces import POSE, Spaces, apply_action, vector_states
+
+QUICK = PlanningConfig(samples=12, iterations=2, horizon=2, cem=CemConfig(elites=4))
+MOVED = STATE + np.eye(7)[1] * 0.0055
+BLACK = np.zeros_like(image(0))
+
+
+def controller(crop: Crop = "released", **changes: object) -> Controller:
+    run = Controller(tiny_model(), QUICK.model_copy(update=changes), crop=crop)
+    run.reset(image(100))
+    return run
+
+
+def why(run: Controller, frame: np.ndarray, state: np.ndarray = STATE) -> str:
+    """Return the reason of a decision, which is to do nothing where the frame cannot be used."""
+    action = run.act(frame, state)
+    assert action.any() == (run.decision.why in {"planned", "as planned"})
+    return run.decision.why
+
+
+def covered(noise: float, seed: int = 0) -> np.ndarray:
+    """Return the image of a covered lens: dark, brighter in the middle, with the noise of a sensor, as JPEG."""
+    rng, (rows, columns) = np.random.default_rng(seed), np.mgrid[-1:1:180j, -1:1:320j]
+    level = 12 - 1.5 * (rows**2 + columns**2)
+    pixels = np.clip(level[..., None] + rng.normal(0, noise, (180, 320, 3)), 0, 255).astype(np.uint8)
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, "JPEG", quality=80)
+    return np.asarray(Image.open(file))
+
+
+def scene() -> np.ndarray:
+    return SimulatedArm(DOMAIN_A).image()
+
+
+@pytest.mark.parametrize("noise", [0.0, 2.0, 10.0])
+def test_a_covered_lens_is_uniform_whatever_its_noise(noise: float) -> None:
+    assert is_uniform(covered(noise))
+    for level in (0, 90, 255):
+        assert is_uniform(np.full((180, 320, 3), level, np.uint8))
+    assert is_uniform(np.full((180, 320, 3), (0, 140, 30), np.uint8)), "a decoder that failed"
+
+
+@pytest.mark.parametrize("share", [1.0, 0.2, 0.05])
+def test_a_dark_scene_is_not_uniform(share: float) -> None:
+    noise = np.random.default_rng(0).normal(0, 2, (*scene().shape[:2], 3))
+    assert not is_uniform(np.clip(share * scene() + noise, 0, 255).astype(np.uint8))
+
+
+def test_a_still_arm_in_a_still_scene_plans_on() -> None:
+    run = controller()
+    noise = np.random.default_rng(0).normal(0, [0.001, 0.001, 0.001, 0.01, 0.01, 0.01, 0.01], (6, 7))
+    assert {why(run, image(0), STATE + one) for one in noise} == {"planned"}
+
+
+def test_a_frozen_frame_moves_nothing_until_another_one_comes() -> None:
+    run = controller()
+    found = [
+        why(run, image(seed), state) for seed, state in ((0, STATE), (0, MOVED), (0, MOVED), (1, MOVED), (1, MOVED))
+    ]
+    assert found == ["planned", "frozen frame", "frozen frame", "planned", "planned"]
+    assert why(run, image(1), STATE) == "frozen frame"
+    run.reset(image(100))
+    assert why(run, image(1), MOVED) == "planned", "a reset forgets"
+
+
+def test_small_motions_add_up_while_the_frame_is_the_same() -> None:
+    run = controller()
+    found = [why(run, image(0), STATE + np.eye(7)[0] * 0.002 * step) for step in range(5)]
+    assert found == ["planned", "planned", "planned", "frozen frame", "frozen frame"]
+
+
+def test_a_driver_that_writes_every_image_into_the_same_memory_is_no_frozen_camera() -> None:
+    run, memory = controller(), image(0)
+    why(run, memory, STATE)
+    memory[:] = image(1)
+    assert why(run, memory, MOVED) == "planned"
+
+
+@pytest.mark.parametrize(
+    ("change", "moves"),
+    [
+        ([0.0049, 0, 0, 0, 0, 0, 0], False), ([0.004, 0.004, 0, 0, 0, 0, 0], True),
+        ([0, 0, 0, 0, 0, math.radians(2.9), 0], False), ([0, 0, 0, math.radians(-3.1), 0, 0, 0], True),
+        ([0, 0, 0, 0, 0, 0, 0.9], False),
+    ],
+)  # fmt: skip
+def test_a_pose_has_moved_by_more_than_half_a_centimetre_or_three_degrees(change: list[float], moves: bool) -> None:
+    for state in (STATE, np.array([0.4, 0, 0.3, math.pi, 0, -math.pi, 0])):  # angles jump from pi to -pi
+        assert has_moved(state, apply_action(state, np.array(change)), POSE, np.ones(7)) == moves
+
+
+def test_a_vector_has_moved_by_more_than_half_of_its_largest_step() -> None:
+    space, largest, still = vector_states(3), np.array([0.1, 0.4, 0.0]), np.zeros(3)
+    for change, moves in (([0.05, 0.2, 9.0], False), ([-0.06, 0, 0], True), ([0, 0.21, 0], True)):
+        assert has_moved(still, np.array(change), space, largest) == moves
+    sizes = tiny_model().sizes
+    predictor = sizes.predictor.model_copy(update={"action_dim": 8, "state_dim": 8})
+    model = WorldModel.random(sizes.model_copy(update={"predictor": predictor}), seed=0)
+    for joined in ("difference", "last"):
+        config = QUICK.model_copy(update={"limits": LimitsConfig(axes=(0.1,))})
+        run = Controller(model, config, spaces=Spaces.of_vectors(Widths(8, 8), joined))
+        run.reset(image(100))
+        states = np.full((3, 8), 0.3) + np.array([[0.0], [0.04], [0.06]])
+        actions = [run.act(image(0), state) for state in states]
+        assert run.decision.why == "frozen frame"
+        np.testing.assert_array_equal(actions[-1], states[-1] if joined == "last" else np.zeros(8))
+
+
+def test_one_unusable_camera_of_two_is_enough() -> None:
+    run = Controller(tiny_model(), QUICK.model_copy(update={"views": 2}))
+    two = lambda left, right: np.hstack([image(left, 48, 48) if left else BLACK[:48, :48], image(right, 48, 48)])  # noqa: E731
+    run.reset(two(100, 101))
+    assert why(run, two(1, 2)) == "planned"
+    assert why(run, two(1, 3), MOVED) == "frozen frame"
+    assert why(run, two(4, 5), MOVED) == "planned"
+    assert why(run, two(0, 6), MOVED) == "uniform frame"
+    with pytest.raises(InputError, match="goal 0: an image without contrast"):
+        run.reset(two(0, 6))
+
+
+@pytest.mark.parametrize("crop", ["released", "square", "letterbox"])
+def test_only_what_the_model_receives_of_an_image_counts(crop: Crop) -> None:
+    wide = image(100, 48, 120)
+    run = Controller(tiny_model(), QUICK, crop=crop)
+    run.reset(wide)
+    edge = np.full_like(wide, 128)
+    edge[:, :20] = wide[:, :20]
+    assert why(run, edge) == ("planned" if crop == "letterbox" else "uniform frame")
+    assert why(run, np.full_like(wide, 128)) == "uniform frame", "bars are no contrast"
+
+
+def test_the_context_begins_again_after_an_unusable_frame() -> None:
+    run, fresh = controller(context=3, warm_start=True), controller(context=3, warm_start=True)
+    states = [STATE + np.eye(7)[0] * 0.01 * step for step in range(5)]
+    for step in range(2):
+        run.act(image(step), states[step])
+    assert why(run, BLACK, states[2]) == "uniform frame"
+    for step in (3, 4):
+        run.act(image(step), states[step])
+    for step in (3, 4):
+        fresh.act(image(step), states[step])
+    assert len(run._seen) == 2
+    np.testing.assert_array_equal(run._scene(run._seen).states, fresh._scene(fresh._seen).states)
+
+
+def test_goals_make_no_progress_on_an_unusable_frame() -> None:
+    run = controller()
+    goals = [dataclasses.replace(goal, share=0.5) for goal in timed([image(100), image(101)], [3])]
+    goals[0] = dataclasses.replace(goals[0], at_least=1)
+    run.follow(goals)
+    assert why(run, BLACK) == "uniform frame"
+    assert (run.decision.goals, math.isnan(run.decision.energy_now)) == ((0, 0), True)
+    run.act(image(1), STATE)
+    began = run.decision.progress.began
+    assert began == pytest.approx(float((run.encoded(image(1)) - run._goal_latents[0]).abs().mean()), rel=1e-5)
+    for _ in range(4):
+        assert why(run, BLACK) == "uniform frame"
+        assert (run.decision.progress.place, run.decision.progress.changed) == (0, "")
+    run.act(image(2), STATE)
+    assert run.decision.progress.place == 1, "its steps are over"
+
+
+def test_after_an_error_the_last_frame_is_the_one_of_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    run = controller()
+    run.act(image(0), STATE)
+    with monkeypatch.context() as patch:
+        patch.setattr(run.planner, "plan", lambda *_: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            run.act(image(1), STATE)
+    assert why(run, image(1), MOVED) == "planned"
+
+
+def test_a_plan_from_an_image_without_contrast_is_refused() -> None:
+    goals = timed([image(100)], [])
+    with pytest.raises(InputError, match=r"start: an image without contrast.*needed: an image of the scene"):
+        decide(controller(), PlanRequest(BLACK, STATE, goals))
+    with pytest.raises(InputError, match="goal 0: an image without contrast"):
+        decide(controller(), PlanRequest(image(0), STATE, timed([BLACK], [])))
+    mask = np.ones(BLACK.shape[:2], bool)  # a mask is uniform by right
+    assert decide(controller(), PlanRequest(image(0), STATE, goals, mask)).decision.why == "planned"
+
+
+def test_every_motion_of_the_simulated_arm_changes_its_image() -> None:
+    """The limits of a still arm must not stop an arm that is rendered, not filmed."""
+    arm, rng = SimulatedArm(DOMAIN_A, size=(48, 60)), np.random.default_rng(0)
+    start = arm.state.copy()
+    for part, size in ((slice(0, 3), 0.005), (slice(3, 6), math.radians(3.0))):
+        for direction in rng.normal(size=(6, 3)):
+            action = np.zeros(7)
+            action[part] = size * direction / np.linalg.norm(direction)
+            arm.set_state(start)
+            before = arm.image().copy()
+            arm.set_state(apply_action(start, action))
+            assert not np.array_equal(arm.image(), before)

@@ -1,0 +1,100 @@
+"""A finished run is left as it is: nothing is loaded, and only settings that decide nothing are written."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from run_fixtures import MakeConfig, SilentReporter
+from same_run import metrics
+from vjepa2_ac.config import TrainingConfig
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.runs.folder import read_run_config
+from vjepa2_ac.training import loop
+from vjepa2_ac.training.loop import train
+from vjepa2_ac.training.optim import describe_changed_rate
+
+
+class LoadedError(Exception):
+    """Stands for everything that takes long."""
+
+
+@pytest.fixture
+def run(whole_run: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(whole_run, tmp_path / "run")
+
+
+@pytest.fixture
+def nothing_is_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
+    def load(*_: object, **__: object) -> None:
+        raise LoadedError
+
+    monkeypatch.setattr(loop, "set_up", load)
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file() and path.name != ".lock"}
+
+
+@pytest.mark.usefixtures("nothing_is_loaded")
+def test_a_finished_run_is_left_as_it_is(make_config: MakeConfig, run: Path, reporter: SilentReporter) -> None:
+    before = content(run)
+    assert train(make_config(), reporter) == run
+    assert reporter.notes == ["Training is finished: all 6 steps are done (training.steps)."]
+    assert content(run) == before
+    with pytest.raises(LoadedError):
+        train(make_config(), reporter, check_only=True)
+
+
+@pytest.mark.usefixtures("nothing_is_loaded")
+def test_a_finished_run_keeps_settings_that_decide_nothing_and_sends_what_its_mirror_lacks(
+    make_config: MakeConfig, run: Path, reporter: SilentReporter, tmp_path: Path
+) -> None:
+    config = make_config(checkpoint__remote=str(tmp_path / "mirror"), checkpoint__keep=1)
+    train(config, reporter)
+    assert read_run_config(run).checkpoint == config.checkpoint
+    assert read_run_config(tmp_path / "mirror").checkpoint.keep == 1
+    assert (tmp_path / "mirror/checkpoints/step-00000006/manifest.json").is_file()
+
+
+@pytest.mark.usefixtures("nothing_is_loaded")
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"training__steps": 7},
+        {"checkpoint__keep_best": "error"},
+        {"data_folder": "elsewhere"},
+        {"base_folder": "moved"},
+    ],
+)
+def test_a_finished_run_starts_where_its_config_asks_for_more_or_reads_elsewhere(
+    make_config: MakeConfig, run: Path, reporter: SilentReporter, changes: dict[str, object]
+) -> None:
+    with pytest.raises(LoadedError):
+        train(make_config(run_dir=run, **changes), reporter, allow_config_change=True)
+    if "training__steps" in changes:
+        with pytest.raises(InputError, match=r"differs in training\.steps"):
+            train(make_config(run_dir=run, **changes), reporter)
+
+
+def test_a_run_that_is_made_longer_says_at_which_rate_it_continues(
+    make_config: MakeConfig, run: Path, reporter: SilentReporter
+) -> None:
+    train(make_config(run_dir=run, training__steps=13, validation__every=100), reporter, allow_config_change=True)
+    said = [note for note in reporter.notes if note.startswith("The learning rate")]
+    rate = next(row["learning_rate"] for row in metrics(run) if row["kind"] == "train" and row["step"] == 7)
+    assert rate == pytest.approx(1e-3 / 2)
+    (line,) = said
+    assert line.startswith("The learning rate continues at 5.0e-04 (it had reached 0 at step 6). ")
+    assert "training.steps: 6 -> 13" in "".join(reporter.notes)
+
+
+def test_a_rate_that_stays_is_not_mentioned() -> None:
+    before = TrainingConfig(steps=12, warmup_steps=2, learning_rate=1e-3)
+    longer, constant = (before.model_copy(update=one) for one in ({"steps": 24}, {"schedule": "constant"}))
+    assert describe_changed_rate(12, before, before) == ""
+    assert describe_changed_rate(12, before, before.model_copy(update={"loss": "l2", "steps": 12})) == ""
+    assert describe_changed_rate(0, before, longer) == "", "nothing was trained"
+    assert "continues at 5.0e-04 (it had reached 0 at step 12)" in describe_changed_rate(12, before, longer)
+    assert "continues at 1.0e-03 (it had reached 0.0005 at step 7)" in describe_changed_rate(7, before, constant)
+    assert describe_changed_rate(1, before, longer) == "", "the warm-up is the same"
