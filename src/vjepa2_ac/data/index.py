@@ -37,7 +37,7 @@ _COLUMNS = ("num_steps", "success", "ids", "id_hash", "id_rank")
 _HASH, _LOCATOR, _LABEL = "state_hash", "locator.", "label."
 _HASH_BYTES = 8
 _CACHE = "VJEPA2_AC_CACHE"
-_VERSION = 5  # of the cache: another number makes all of it be rebuilt
+_VERSION = 6  # of the cache: another number makes all of it be rebuilt
 
 
 class NotATableError(ValueError):
@@ -311,21 +311,26 @@ def get_or_make(
     to_bytes: Callable[[T], bytes],
     from_bytes: Callable[[bytes], T],
 ) -> T:
-    """Return the object cached under a key; make and cache it if it is missing or damaged (a NotATableError)."""
+    """Return the object cached under a key; make and cache it if it is missing or damaged (a NotATableError).
+
+    The file ends with its key, so that the file of another key is not used under this name.
+    """
     path = cache_folder(config) / "index" / f"{key}.index"
     usage = _usage.get()
     if usage:
         usage.files.append(path)
     try:
         if not (usage and usage.rebuild):
-            return from_bytes(path.read_bytes())
+            if not (data := path.read_bytes()).endswith(key.encode()):
+                raise NotATableError("it is damaged, or was made from other data and renamed")  # noqa: TRY301
+            return from_bytes(data.removesuffix(key.encode()))
     except FileNotFoundError:
         pass
     except (OSError, NotATableError) as error:
         logger.warning("%s: cannot be used (%s); the index is built again", path, error)
     made = make()
     try:
-        storage.write_atomically(path, to_bytes(made))
+        storage.write_atomically(path, to_bytes(made) + key.encode())
     except OSError as error:
         logger.warning("%s: cannot be written (%s); the index will be built again next time", path, error)
     return made
