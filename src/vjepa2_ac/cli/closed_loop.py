@@ -79,6 +79,8 @@ def add_simulate(commands: cli.Commands) -> None:
     cli.add(parser, "--seed N", "which problems or demonstrations (0)", cli.whole_number(0, 2**31 - 1))
     text = "instead of our arm a program in an environment of its own: 'PYTHON examples/worlds/robosuite.py Lift'"
     cli.add(parser, "--world COMMAND", text)
+    text = "longest wait for an answer of that program; for its first one, with loading, five times as long (120)"
+    cli.add(parser, "--world-timeout SECONDS", text, cli.number_between(0, 86_400, "seconds"))
     group = parser.add_argument_group("to test a model")
     cli.add_all(group)
     cli.add_checkpoint(group, default=None)
@@ -202,6 +204,8 @@ def _simulate(options: argparse.Namespace) -> int:
     """
     if options.world is not None:
         _refuse(options, ("task", "domain"), needed="none: the world has its own")
+    elif options.world_timeout is not None:
+        raise InputError(where="--world-timeout", found="no --world", needed="the program that it applies to")
     options.domain = options.domain or "A"
     if options.subject == "record":
         _refuse(options, _OF_A_MODEL, needed="a model that steers")
@@ -241,7 +245,7 @@ def _record_world(options: argparse.Namespace, target: Path) -> int:
     from vjepa2_ac.simulation.closed_loop.worlds import OtherWorld
     from vjepa2_ac.simulation.recording.record_world import record_world
 
-    with OtherWorld(options.world) as world, cli.reporter() as reporter:
+    with OtherWorld(options.world, options.world_timeout) as world, cli.reporter() as reporter:
         seeds = range(options.seed or 0, (options.seed or 0) + (options.episodes or 40))
         solved, shown = record_world(world, target, seeds, reporter.task("recording"))
     done = f"the expert solved {solved} of {shown}, the others are play"
@@ -297,10 +301,9 @@ def _in_our_world(options: argparse.Namespace, chosen: BenchmarkOptions, home: P
 def _in_their_world(options: argparse.Namespace, chosen: BenchmarkOptions, home: Path) -> Benchmark:
     from vjepa2_ac.simulation.closed_loop.worlds import OtherWorld, run_world_benchmark
 
-    with OtherWorld(options.world) as world, _agent(options) as agent, cli.reporter() as reporter:
-        about = world.about
-        name = re.sub(r"\W+", "-", f"{about.task} {about.world}").strip("-")
-        return run_world_benchmark(agent, world, chosen, options.out or home / name, reporter)
+    with OtherWorld(options.world, options.world_timeout) as env, _agent(options) as agent, cli.reporter() as reporter:
+        name = re.sub(r"\W+", "-", f"{env.about.task} {env.about.world}", flags=re.ASCII).strip("-")[:200]
+        return run_world_benchmark(agent, env, chosen, options.out or home / name, reporter)
 
 
 def _answer(benchmark: ClosedLoopBenchmark) -> Answer:

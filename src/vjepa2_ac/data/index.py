@@ -40,7 +40,7 @@ _HASH_BYTES = 8
 _NO_MOTION = (np.nan,) * 8
 MEANS, SPANS = slice(2, 5), slice(5, 8)  # of `StatesSummary.motion`
 _CACHE = "VJEPA2_AC_CACHE"
-_VERSION = 5  # of the cache: another number makes all of it be rebuilt
+_VERSION = 6  # of the cache: another number makes all of it be rebuilt
 
 
 class NotATableError(ValueError):
@@ -342,6 +342,8 @@ def get_or_make(
 ) -> T:
     """Return the object cached under a key; make and cache it if it is missing or damaged (a NotATableError).
 
+    The file ends with its key, so that the file of another key is not used under this name.
+
     Raises:
         UnreachableError: It is there and cannot be read.
     """
@@ -352,14 +354,17 @@ def get_or_make(
     try:
         if not (usage and usage.rebuild):
             with storage.user_can_read(path):
-                return from_bytes(path.read_bytes())
+                data = path.read_bytes()
+            if not data.endswith(key.encode()):
+                raise NotATableError("it is damaged, or was made from other data and renamed")  # noqa: TRY301
+            return from_bytes(data.removesuffix(key.encode()))
     except MissingFileError:
         pass
     except (InputError, NotATableError) as error:
         logger.warning("%s: cannot be used (%s); the index is built again", path, error)
     made = make()
     try:
-        storage.write_atomically(path, to_bytes(made))
+        storage.write_atomically(path, to_bytes(made) + key.encode())
     except OSError as error:
         logger.warning("%s: cannot be written (%s); the index will be built again next time", path, error)
     return made

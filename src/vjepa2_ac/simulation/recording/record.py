@@ -110,6 +110,7 @@ def carry_out(
         from vjepa2_ac.simulation.recording.scripted_play import play  # imports torch
 
         return play(arm, spec.task, spec.steps if until is None else until, rng, script=index % 2 == 0, look=look)
+    arm.reset_clock()
     motion = random_reaching(arm.domain, spec.steps, rng, spec.recipe)
     measured = slice(None if until is None else until + 1)
     for joints, closedness in zip(motion.joints[measured], motion.gripper[measured], strict=True):
