@@ -40,7 +40,7 @@ _HASH_BYTES = 8
 _NO_MOTION = (np.nan,) * 8
 MEANS, SPANS = slice(2, 5), slice(5, 8)  # of `StatesSummary.motion`
 _CACHE = "VJEPA2_AC_CACHE"
-_VERSION = 6  # of the cache: another number makes all of it be rebuilt
+_VERSION = 5  # of the cache: another number makes all of it be rebuilt
 
 
 class NotATableError(ValueError):
@@ -356,7 +356,7 @@ def get_or_make(
             with storage.user_can_read(path):
                 data = path.read_bytes()
             if not data.endswith(key.encode()):
-                raise NotATableError("it is damaged, or was made from other data and renamed")  # noqa: TRY301
+                raise NotATableError("it is damaged, from an older version, or of other data")  # noqa: TRY301
             return from_bytes(data.removesuffix(key.encode()))
     except MissingFileError:
         pass
