@@ -229,6 +229,9 @@ def test_an_installed_module_is_not_shadowed_by_one_in_the_working_directory(wri
     install(site, "p_shadowed", "", REGISTERS.format(name="p_shadowed", function="f"))
     import_plugins(["p_shadowed"], where="run/config.yaml", here=False)
     assert LOSSES.find("p_shadowed").__module__ == "p_shadowed"
+    write("p_entry", PWNED)
+    install(site, "p_entry", "[vjepa2_ac.losses]\np_entry = p_entry:thing\n")
+    assert LOSSES.find("p_entry") is print
     assert not Path("PWNED").exists()
     assert sys.path[0] == ""
 

@@ -45,10 +45,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(arguments: Sequence[str] | None) -> int:
     words = sys.argv[1:] if arguments is None else arguments
-    options = parsed(_parser(words), words)
-    options.words = words
-    handler: Handler = options.handler
     try:
+        options = parsed(_parser(words), words)
+        options.words = words
+        handler: Handler = options.handler
         _require_working_directory()
         if options.plugin:
             from vjepa2_ac.config.loading import name_plugins
