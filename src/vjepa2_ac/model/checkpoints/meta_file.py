@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 from collections.abc import Callable, Mapping
@@ -161,11 +162,11 @@ def _problem_of(path: Path, error: Exception) -> tuple[str, str]:
     refused = re.search(r"GLOBAL ([\w.]+)", str(error))
     if refused:
         found = f"a pickle that would call {refused[1]}: it was refused, since loading it could run foreign code"
-        code = (
-            f"import torch; old = torch.load({str(path)!r}, map_location='cpu', weights_only=False);"
-            f" torch.save({{k: old[k] for k in {(*ENCODER_KEYS, 'predictor')} if k in old}},"
-            f" {str(path.with_suffix('.weights.pt'))!r})"
+        old, new, keys = map(
+            json.dumps, (str(path), str(path.with_suffix(".weights.pt")), [*ENCODER_KEYS, "predictor"])
         )
+        code = f'import torch; old = torch.load({old}, map_location="cpu", weights_only=False)'
+        code += f"; torch.save({{key: old[key] for key in {keys} if key in old}}, {new})"
         return found, f"If you trust the file, save its weights alone: `python -c {shlex.quote(code)}`"
     with path.open("rb") as file:
         head = file.read(24)
