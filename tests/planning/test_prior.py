@@ -106,9 +106,9 @@ def test_it_is_refused_for_another_encoder_and_where_a_file_is_damaged(folder: P
 @pytest.mark.parametrize(
     ("changes", "found"),
     [
-        ({"planner": "prior"}, "planner: prior needs prior"),
-        ({"prior": "x", "warm_start": True}, "prior: x excludes warm_start"),
-        ({"prior": "x", "views": 2}, "views: 2 excludes prior"),
+        ({"planner": "prior"}, "planner=prior needs prior"),
+        ({"prior": "x", "warm_start": True}, "prior excludes warm_start"),
+        ({"prior": "x", "views": 2}, "views excludes prior"),
     ],
 )
 def test_settings_that_contradict_are_refused(changes: dict[str, object], found: str) -> None:

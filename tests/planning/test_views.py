@@ -77,9 +77,9 @@ def test_what_cannot_be_split_is_refused() -> None:
     odd = np.zeros((64, 65, 3), dtype=np.uint8)
     with pytest.raises(InputError, match=r"65 pixels wide.* 2 views share"):
         decided(odd, odd, 2)
-    with pytest.raises(ValueError, match="views: 2 excludes context: 2"):
+    with pytest.raises(ValueError, match="views excludes context"):
         PlanningConfig(views=2, context=2)
-    with pytest.raises(ValueError, match="views: 2 excludes axes"):
+    with pytest.raises(ValueError, match="views excludes axes"):
         PlanningConfig(views=2, axes="axes.json")
 
 

@@ -162,7 +162,11 @@ def measure_subject(
     chosen = validation_windows(dataset, asked.split, clips=asked.clips)
     loaded = load_subject(subject, config, asked, dataset, decoder)
     run, world_model, contenders = loaded.run, loaded.world_model, loaded.contenders
-    prior = trained and trained.of(world_model.encoder_fingerprint(), config.data.crop).to(accelerator.device)
+    prior = (
+        None
+        if trained is None
+        else trained.of(world_model.encoder_fingerprint(), config.data.crop).to(accelerator.device)
+    )
     through_cache = with_latents_if_there(config, dataset, world_model)
     if through_cache.config.is_cache and not asked.calibrate:
         world_model.set_encoder_aside()

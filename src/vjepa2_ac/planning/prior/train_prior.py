@@ -123,7 +123,7 @@ def _trained(
             mean, deviation = prior(some.seen, some.wanted, some.remaining, some.states)
             loss = prior_loss(mean, deviation, some.changes / prior.scale)
             optimizer.zero_grad(set_to_none=True)
-            loss.backward()
+            loss.backward()  # type: ignore[no-untyped-call]  # torch
             norm = torch.nn.utils.clip_grad_norm_(prior.parameters(), _CLIP)
             if not math.isfinite(float(norm)):
                 found = f"a loss of step {step} that is not finite"
@@ -133,7 +133,7 @@ def _trained(
     return prior.eval().requires_grad_(False)
 
 
-def prior_loss(mean: Tensor, deviation: Tensor, changes: Tensor) -> Float[Tensor, ""]:
+def prior_loss(mean: Tensor, deviation: Tensor, changes: Tensor) -> Tensor:
     """Return the mean absolute error, plus the negative log-likelihood of a Laplace distribution for the deviation.
 
     The error is detached in the second part: a large predicted deviation does not weaken the gradient of the mean.
